@@ -2,14 +2,17 @@
 PYTHON ?= $(shell command -v python3.11 || command -v python3)
 BIN := .venv/bin
 OUT ?= runs
+# The demo and the tests start many processes, so modules must be compiled only once.
+export PYTHONDONTWRITEBYTECODE :=
 
 .PHONY: help demo test test-vcan lowest fuzz coverage mutation lint docs bench messages supervisor-table clean
 
 help: ## list all targets (default)
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "%-18s %s\n", $$1, $$2 }' $(firstword $(MAKEFILE_LIST))
 
-demo: .venv/installed-all ## walk 30 steps in the air inside each guide shape, on the emulated robot
+demo: .venv/installed-all ## walk in the air inside each guide shape, then on the ground, on the emulated robot
 	$(BIN)/atalante demo --out $(OUT)/demo
+	$(BIN)/atalante walk --steps 4 --xi 0.5 --wearer passive --out $(OUT)/walk
 
 # With worksteal, the tests of a file mostly run in one worker, so their shared fixtures are created only once.
 test: .venv/installed-dev lint ## run `lint` and all tests except those that need SocketCAN
@@ -63,15 +66,22 @@ clean: ## remove the virtual environments, runs and site
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || { echo "Python must be 3.11 or newer: call make PYTHON=/path/to/python3.11" >&2; exit 1; }
 	$(PYTHON) -m venv .venv
 
+# Install an extra, and compile its modules on all cores, because pip compiles on one core. Some packages contain files that are
+# not valid Python; pip ignores them, too.
+define install
+$(BIN)/pip install --quiet --disable-pip-version-check --no-compile --editable '.[$(1)]'
+@$(BIN)/python -W ignore -m compileall -qq -j 0 .venv/lib || true
+endef
+
 # An empty file marks each installed set of packages. The packages are installed again only after a change of pyproject.toml.
 .venv/installed-all: pyproject.toml | .venv/bin/python
-	$(BIN)/pip install --quiet --disable-pip-version-check --editable '.[all]'
+	$(call install,all)
 	@touch $@
 
 .venv/installed-dev: pyproject.toml | .venv/bin/python
-	$(BIN)/pip install --quiet --disable-pip-version-check --editable '.[dev]'
+	$(call install,dev)
 	@touch $@ .venv/installed-all
 
 .venv/installed-docs .venv/installed-mutation .venv/installed-vcan: .venv/installed-%: .venv/installed-dev
-	$(BIN)/pip install --quiet --disable-pip-version-check --editable '.[$*]'
+	$(call install,$*)
 	@touch $@

@@ -18,11 +18,12 @@ from atalante_hal.wire.process_image import TransmitImage
 class Commands:
     """Command frames and SYNC frames of the HAL.
 
-    The commands of a cycle and the SYNC of the next one are encoded together, because one encoding costs less than two.
+    The commands of a cycle and the SYNC of the next cycle are encoded together, because one encoding takes less time
+    than two.
 
     Args:
         network: CAN network that defines the frames.
-        transceiver: Transceiver that sends them.
+        transceiver: Transceiver that sends the frames.
         record: Record of the cycle, in which the sent torques and levels are stored.
         limit: MaxTorque of the drives, shape (12,) [Nm].
 
@@ -48,15 +49,15 @@ class Commands:
         self._sent_torque, self._sent_level = record.torque_command, record.level_command
         self._no_level = np.zeros_like(self._level)
         self.hold()
-        #: HOLD frames (quick stop, zero torque, motors off), encoded in advance, so that a later fault cannot prevent HOLD.
+        #: HOLD frames (quick stop, zero torque, vibration motors off), encoded in advance, so that no later fault prevents HOLD.
         self._prepared_hold = self._image.prepare()
         self._sealed = False  # True: the SYNC of the next cycle is already encoded
 
     def announce(self, state: SupervisorState) -> None:
-        """Set the supervisor state that SYNC carries.
+        """Set the signal HalState in the SYNC frames.
 
         Args:
-            state: Present state of the state machine.
+            state: Current state of the state machine.
         """
         self._state.fill(state)
 
@@ -84,7 +85,7 @@ class Commands:
         """Send the SYNC frames of a cycle.
 
         Args:
-            cycle: Cycle number; SYNC carries its lower 32 bits.
+            cycle: Cycle number; the signal Cycle in SYNC has its lower 32 bits.
         """
         if not self._sealed:
             self._seal(cycle, None)
@@ -95,7 +96,7 @@ class Commands:
         """Send the commands of a cycle.
 
         Args:
-            cycle: Number of the present cycle.
+            cycle: Number of the current cycle.
 
         Returns:
             Torques that were sent, shape (12,) [Nm].
@@ -108,7 +109,7 @@ class Commands:
         """Send the HOLD frames that were encoded in advance, and set the command values for HOLD.
 
         Args:
-            cycle: Number of the present cycle.
+            cycle: Number of the current cycle.
 
         Returns:
             Torques that were sent, shape (12,) [Nm].
@@ -131,7 +132,7 @@ class Commands:
 
 
 class StatusReport:
-    """Sender of HAL_STATUS, the heartbeat of the HAL: state, hashes of its input files, worst diagnostic.
+    """Sender of HAL_STATUS, the heartbeat of the HAL: supervisor state, hashes of DBC, robot file and gait, worst diagnostic.
 
     Args:
         network: CAN network; its hash is sent as DbcHash.
@@ -156,9 +157,9 @@ class StatusReport:
         Args:
             state: State of the state machine.
             assistance_factor: Assistance factor Xi, 0 to 1.
-            overruns: Number of late cycles so far.
+            overruns: Number of cycles so far that began more than a period late.
             diagnostic: Number of the worst active diagnostic, see `diagnostics.number_of`.
-            step: Number of the present step; None is sent as 0.
+            step: Number of the current walking step; None is sent as 0.
         """
         values = {"HalState": state, "AssistanceFactor": assistance_factor, "Overruns": overruns}
         self._write({**values, "DiagnosticCode": diagnostic, "Step": (step or 0) & 0xFFFF})

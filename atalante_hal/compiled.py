@@ -1,10 +1,11 @@
 """Compilation of numeric functions to machine code with numba, at their first call.
 
-The source stays plain Python. With NUMBA_DISABLE_JIT=1 it runs uncompiled and gives the same results, for debuggers, profilers,
-coverage and mutation tests. Functions it calls are compiled, too. The machine code is cached in the user's cache directory. The
-name of its folder contains a hash of the function, its callees and its constants. So a second start does not compile, and every
-change leads to a new compilation. The code is generic for the processor architecture, so all machines of one architecture give
-the same results, and a cache can be used in an emulated machine.
+The source stays plain Python. With NUMBA_DISABLE_JIT=1 it runs uncompiled and gives the same results, for debuggers,
+profilers, coverage and mutation tests. The functions that a compiled function calls are compiled, too. The machine code
+of each function is cached in a folder of the user's cache directory. The folder name contains a hash of the function,
+its callees and its constants. So a second start does not compile, and every change leads to a new compilation. The machine
+code uses only instructions that all processors of an architecture have. So all machines of one architecture give the same
+results, and a virtual machine can use the cache of its host.
 """
 
 from __future__ import annotations
@@ -49,14 +50,14 @@ def compiled(function: Function) -> Function:
 def specialised(function: Callable[P, R], *args: P.args, **kwargs: P.kwargs) -> Callable[P, R]:
     """Call a function once, and return its machine code for the types of the given arguments.
 
-    A call of this machine code skips the type dispatch of numba, which takes about 0.7 us for each `NamedTuple`. So the types are
-    not checked: every later call needs arrays of the same dtype, number of dimensions and memory layout. Pass only arrays that
-    the caller allocated itself.
+    A call of this machine code skips numba's type dispatch, and so saves about 0.7 us for each `NamedTuple`. But it does not
+    check the types: arrays with another dtype, number of dimensions or memory layout lead to undefined behaviour. So pass
+    only arrays that the caller allocated itself.
 
     Args:
-        function: function for `compiled`.
-        *args: arguments of the first call, whose results are discarded.
-        **kwargs: none; machine code takes positional arguments only.
+        function: Function to compile, see `compiled`.
+        *args: Arguments of the first call, whose results are discarded.
+        **kwargs: Must be empty, because machine code takes positional arguments only.
     """
     machine = compiled(function)
     machine(*args, **kwargs)
@@ -81,7 +82,7 @@ def _compiled(function: FunctionType) -> Any:
 
 
 def _twin(function: FunctionType) -> FunctionType:
-    """Return a copy of the function that calls the compiled form of each called function."""
+    """Return a copy of a function in which each called function is replaced by its compiled form."""
     names = {name: value for name, value in function.__globals__.items() if name != function.__name__}
     for name, callee in _callees(function):
         names[name] = _callee(callee)
@@ -129,7 +130,7 @@ def _compile_inputs(function: FunctionType) -> Iterator[bytes]:
 
 
 def _records(annotations: Mapping[str, Any], names: Mapping[str, Any]) -> Iterator[bytes]:
-    """Yield the fields of every `NamedTuple` in the annotations, because numba's cache does not compare them."""
+    """Yield the fields of each `NamedTuple` in the annotations, because numba's cache does not compare these fields."""
     for name in dict.fromkeys(re.findall(r"\w+", " ".join(map(str, annotations.values())))):
         record = names.get(name)
         if isinstance(record, type) and issubclass(record, tuple) and hasattr(record, "_fields"):

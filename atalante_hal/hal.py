@@ -1,4 +1,4 @@
-"""Hardware abstraction layer: `read()` returns the state and `write()` sends a command, each once a cycle.
+"""Hardware abstraction layer: `read()` returns the state and `write()` sends a command, each once per cycle.
 
     bus -> process image -> E2E + plausibility -> state -> safety monitor -> [controller] -> limiter -> process image -> bus
 
@@ -16,6 +16,7 @@ from atalante_dbc import Network
 from atalante_hal.bus import Bus
 from atalante_hal.commands import Commands, StatusReport
 from atalante_hal.record import Record
+from atalante_hal.record_layout import split_bits
 from atalante_hal.robot import JOINTS, Robot
 from atalante_hal.safety.diagnostics import Dtc, number_of
 from atalante_hal.safety.limiter import Limiter
@@ -47,8 +48,8 @@ class Hal:
             In lock-step with another process it should be long, so that a run has the same result on a slow machine.
         assistance_factor: Assistance factor Xi in [0, 1], used until the pendant sets another.
         controller_fields: (name, length) of each field the controller records, see `types.Controller`.
-        gait_hash: CRC-32 of the gait the controller walks, sent in HAL_STATUS.
-        tap: Receiver of a copy of every frame sent and received, for a CAN log.
+        gait_hash: CRC-32 of the gait that the controller uses, sent in HAL_STATUS.
+        tap: Receiver of a copy of every frame that is sent or received, for a CAN log; None if there is no log.
 
     Raises:
         ValueError: If the assistance factor is not between 0 and 1.
@@ -86,16 +87,17 @@ class Hal:
             self._plausibility,
             self._limiter,
         )
-        #: Log of events: one event at the beginning of each diagnostic and at each change of the supervisor state.
+        #: Log of events, such as new diagnostics and changes of the supervisor state.
+        #: Repeats of a diagnostic within a second are logged as one event with a count.
         self.events = self._safety_monitor.memory.events
 
     # -- construction ------------------------------------------------------------------------------------------------
 
     def _build_images(self, controller_fields: Sequence[tuple[str, int]], assistance_factor: float) -> None:
         received = self.network.received_by("HAL")
-        # The rows are in the order in which the buses deliver the messages. The fast path of `ReceiveImage.accept` requires it.
+        # The rows of the process image are in the order in which the buses deliver messages, because `accept` is then fast.
         fast = [m for bus in self.network.buses for m in received if m.bus == bus and m.cycle_ms == 1]
-        #: Name of the message to which each entry of `State.valid` and `State.age` belongs.
+        #: Names of the messages, in the order of the elements of `State.valid` and `State.age`.
         self.messages = tuple(m.name for m in fast)
         parts = self._parts = Record(ReceiveImage(fast).codec, controller_fields)
         #: All values of this cycle in one contiguous vector. `layout` gives the name and the slice of each field.
@@ -106,7 +108,7 @@ class Hal:
         self._plausibility = Plausibility(self.robot, self._image, PERIOD)
         self.state = parts.state(assistance_factor, len(fast))
         per_turn = self.robot.polarity / self.robot.gear
-        # Torques on the bus are already joint torques, so their factor is 1.
+        # Positions and velocities on the bus are at the motor. Torques are already at the joint, so their factor is 1.
         self._to_joint = np.concatenate([per_turn, per_turn, np.ones(len(JOINTS))])
 
     # -- one cycle ---------------------------------------------------------------------------------------------------
@@ -132,7 +134,7 @@ class Hal:
         state, image, transceiver = self.state, self._image, self._transceiver
         state.cycle = cycle = state.cycle + 1
         state.time = cycle * PERIOD
-        late = 0 if image.all_fresh else transceiver.receive()  # answers that arrived after the last cycle's wait
+        late = 0 if image.all_fresh else transceiver.receive()  # late answers to the previous SYNC
         self._commands.synchronise(cycle)
         count = transceiver.receive(late, image, self.patience)
         foreign = image.accept(transceiver.scratch, count, cycle & 0xFF)
@@ -145,7 +147,7 @@ class Hal:
         self._plausibility.check()
         parts = self._parts
         np.multiply(parts.motor_side, self._to_joint, parts.joint_side)
-        verdict = self._safety_monitor.judge(() if transceiver.quiet else transceiver.faults())
+        verdict = self._safety_monitor.evaluate(() if transceiver.quiet else transceiver.faults())
         if verdict is not None:
             self._apply(verdict)
         self._torque_sent[:] = self._limiter.last
@@ -159,18 +161,18 @@ class Hal:
         """Apply a verdict of the safety monitor: set the commands and the header of the record.
 
         Args:
-            verdict: Verdict of the present cycle.
+            verdict: Verdict of the current cycle.
         """
         self._commands.announce(verdict.supervisor)
         self._commands.limit[:] = verdict.torque_limit
         if verdict.acknowledged:
             self._transceiver.acknowledge()
         header = self._header
-        header[2], header[3], header[10] = verdict.supervisor, verdict.assistance_factor, verdict.diagnostics
-        header[8] = self.crc_errors
+        header[2], header[3], header[8] = verdict.supervisor, verdict.assistance_factor, self.crc_errors
+        header[10], header[11] = split_bits(verdict.diagnostics)
 
     def write(self, command: Command) -> Vector:
-        """Limit a command and send it; send HOLD instead while the robot is not `moving`.
+        """Limit a command and send it; send HOLD instead while `moving` is False.
 
         Args:
             command: Torques, shape (12,) [Nm at the joint], and vibration levels, shape (8,), of this cycle.
@@ -190,9 +192,12 @@ class Hal:
             safety_monitor.report(
                 Dtc.TORQUE_SATURATED, "the limiter cuts the torque", cycles > SATURATED_CYCLES, cycles
             )
-        safety_monitor.step = command.step
+        safety_monitor.step, safety_monitor.walking = command.step, command.walking
         if command.outside:
-            safety_monitor.report(Dtc.GUIDE_OUTSIDE, "a joint is outside the virtual guide")
+            safety_monitor.report(Dtc.GUIDE_OUTSIDE, "a joint is outside the virtual guide", command.guide_left)
+        if command.hand_over_exceeded:
+            text = "a step started with a larger deviation than the certificate of its guide assumes (hand-over box)"
+            safety_monitor.report(Dtc.GUIDE_OUTSIDE, text, False)
         self._commands.drive(self._limiter.last, command.vibration)
         return self._send_command()
 
@@ -207,11 +212,15 @@ class Hal:
         if safety_monitor.lowered:
             control[[node in safety_monitor.lowered for node in DRIVE_NODES]] = Controlword.DISABLE_VOLTAGE
         if safety_monitor.start_wanted and state.supervisor in (_S.LOWER, _S.FAULT):
-            # The operator acknowledged: reset the drives that have a fault; the others continue to hold.
+            # The operator acknowledged the faults, so reset the drives in FAULT. All other drives continue to hold.
             control[state.drive_state == DriveState.FAULT] = Controlword.FAULT_RESET
-        elif safety_monitor.start_wanted and state.supervisor in (_S.READY, _S.HOLD) and not safety_monitor.hindered:
+        elif (
+            safety_monitor.start_wanted
+            and state.supervisor in (_S.READY, _S.HOLD)
+            and not safety_monitor.start_prevented
+        ):
             control[:] = [controlword_towards_operation(int(s)) for s in state.drive_state.tolist()]
-            # Command the present holding torque, so that no joint sags before the controller's first torque.
+            # Command the torque that each drive reports, so that no joint sags before the controller's first torque.
             self._follow_drives()
             self._commands.torque[:] = self._limiter.last
         else:
@@ -219,10 +228,10 @@ class Hal:
         return self._send_command()
 
     def _follow_drives(self) -> None:
-        """Set the commanded torques to the present torques of the drives.
+        """Set the commanded torques to the torques that the drives report.
 
-        In the first cycle of a start only the torque limit applies, and then all limits. A drive that is off produces no torque,
-        so its command is 0.
+        In the first cycle of a start only the torque limit applies. In the later cycles of a start all limits apply. A
+        drive that is off produces no torque, so its command is 0.
         """
         torque = np.where(powered(self.state.drive_state), self.state.torque, 0.0)
         if self._safety_monitor.enabling:
@@ -257,16 +266,17 @@ class Hal:
             self._transceiver.discard()
 
     def end(self) -> None:
-        """Request HOLD from the next cycle on and ignore every further START.
+        """Request HOLD, starting with the next cycle, and ignore every later START.
 
-        A signal handler may call it at any time.
+        A signal handler may call this method at any time.
         """
         self._safety_monitor.end()
 
     def stop(self, cycles: int = 10) -> None:
         """Send HOLD for some cycles, so that every drive has time to react.
 
-        Call it at the end of a run, before the bus is closed. It waits `STOP_PATIENCE` at most for the nodes' answers.
+        Call this method at the end of a run, before the bus is closed. It waits at most `STOP_PATIENCE` for the nodes'
+        answers.
 
         Args:
             cycles: Number of cycles in which HOLD is sent.
@@ -278,6 +288,7 @@ class Hal:
             self.read()
             self.hold()
         self.patience = patience
+        self._safety_monitor.memory.log_repeats(self.state.cycle, final=True)
 
     @property
     def moving(self) -> bool:
@@ -286,7 +297,7 @@ class Hal:
 
     @property
     def reason(self) -> str:
-        """Return the reason of the present supervisor state, as one sentence."""
+        """Return the reason for the current supervisor state, as one sentence."""
         return self._safety_monitor.reason
 
     @property
@@ -296,7 +307,7 @@ class Hal:
 
     @property
     def bus(self) -> Bus:
-        """Return the bus that carries the frames."""
+        """Return the bus on which the frames are sent and received."""
         return self._transceiver.bus
 
     @bus.setter
@@ -305,7 +316,7 @@ class Hal:
 
     @property
     def tap(self) -> FrameTap | None:
-        """Return the receiver of a copy of every frame; None if there is none."""
+        """Return the tap, which receives a copy of every frame; None if there is no tap."""
         return self._transceiver.tap
 
     @tap.setter
@@ -319,7 +330,7 @@ class Hal:
 
     @property
     def silent(self) -> bool:
-        """Return whether no node has answered any SYNC so far."""
+        """Return True as long as no node has answered a SYNC."""
         return bool((self._image.age >= NEVER).all())
 
     def missing(self) -> list[str]:
@@ -336,5 +347,5 @@ class Hal:
         if state.cycle % self._status.cycles == 0:
             worst, overruns = number_of(safety_monitor.memory.bits), self._header[6]
             self._status.send(state.supervisor, state.assistance_factor, overruns, worst, safety_monitor.step)
-            safety_monitor.look_for_heartbeats()
+            safety_monitor.check_timeouts()
         return sent

@@ -19,9 +19,9 @@ from atalante_hal.types import PERIOD, Controller, State
 
 #: Number of consecutive late cycles after which the robot goes to HOLD.
 OVERRUNS_TO_HOLD = 3
-#: Gap between two cycles above which the robot goes to HOLD [s]. The watchdog of the drives has the same timeout.
+#: Largest lateness of a cycle [s]. More (a gap) leads to HOLD. The watchdog of the drives has the same timeout.
 GAP_TO_HOLD = 5e-3
-#: Delay against the monotonic clock within `DRIFT_CYCLES` cycles above which the robot goes to HOLD [s].
+#: Largest time by which the loop may fall behind the monotonic clock within `DRIFT_CYCLES` cycles [s]. More leads to HOLD.
 DRIFT_TO_HOLD = 5e-3
 #: Length of the window in which the delay is measured [cycles].
 DRIFT_CYCLES = 50
@@ -36,8 +36,8 @@ class Clock(Protocol):
         """Wait for the beginning of the next cycle.
 
         Returns:
-            Lateness of the cycle against its deadline [s]; 0 when it begins in time. Deadlines are one period apart. A cycle
-            that is late by more than a period moves its own and all later deadlines by that time.
+            Lateness of the cycle against its deadline [s]; 0 when it begins in time. Deadlines are one period apart. If a cycle
+            is late by more than a period, its deadline and all later deadlines are moved by this lateness.
         """
 
 
@@ -52,12 +52,12 @@ class LockStep:
 class WallClock:
     """Clock with absolute deadlines on the monotonic clock, one period apart.
 
-    A cycle that is late by up to one period does not move the deadlines. A later cycle moves them, because a burst of catch-up
-    cycles would send commands for old states.
+    A cycle that is late by up to one period does not move the deadlines. A cycle that is late by more moves the
+    deadlines, because a burst of catch-up cycles would send commands for old states.
 
     Args:
         period: Time between two deadlines [s].
-        now: Function that returns the present time [s].
+        now: Function that returns the current time [s].
         sleep: Function that sleeps for a given time [s].
     """
 
@@ -84,21 +84,21 @@ class WallClock:
 
 
 class Drift:
-    """Measurement of the delay against the monotonic clock over the last `DRIFT_CYCLES` cycles."""
+    """Measurement of how far the loop fell behind the monotonic clock within the last `DRIFT_CYCLES` cycles."""
 
     def __init__(self) -> None:
         self._lost = 0.0
         self._behind = deque([0.0] * DRIFT_CYCLES, maxlen=DRIFT_CYCLES)
 
     def add(self, late: float) -> float:
-        """Add the lateness of one cycle, and return the delay within the window [s].
+        """Add the lateness of one cycle, and return by how much the loop fell behind the clock within the window.
 
         Args:
-            late: Lateness of the cycle [s], as `Clock.wait` returns it. A gap longer than `GAP_TO_HOLD` does not count,
-                because it has a diagnostic of its own.
+            late: Lateness of the cycle [s], as `Clock.wait` returns it. A lateness above `GAP_TO_HOLD` is not added,
+                because another diagnostic reports it.
 
         Returns:
-            Delay within the window [s].
+            Increase of the delay within the window [s].
         """
         if PERIOD < late <= GAP_TO_HOLD:
             self._lost += late
@@ -112,14 +112,14 @@ class Drift:
 class Statistics:
     """Timing statistics of a run.
 
-    The cost of a cycle is its computing time without the wait. On an embedded bus it includes the emulator.
+    The cost of a cycle is its computing time without the wait. On an embedded bus it includes the time of the emulator.
     """
 
     cycles: int = 0
     overruns: int = 0  # cycles that began more than a period late
     lateness_max: float = 0.0  # s
     wall: float = 0.0  # s, elapsed time from the first to the last cycle
-    #: Histogram: number of cycles for each cost of 0, 1, 2, ... us. The last entry counts all longer cycles.
+    #: Histogram: number of cycles with a cost of 0, 1, 2, ... us. The last element counts all longer cycles.
     costs: list[int] = field(default_factory=lambda: [0] * (COST_BINS + 1))
 
     @property
@@ -154,8 +154,8 @@ def run(
         hal: Hardware abstraction layer of the robot.
         controller: Controller to run. An exception in it leads to HOLD, not to the end of the loop.
         clock: Timing source, `WallClock` or `LockStep`.
-        until: Condition that ends the loop, called once a cycle after the command was sent.
-        record: Function called once a cycle when `hal.record` is complete, e.g. `write` of a telemetry ring.
+        until: Condition that ends the loop, called once per cycle after the command was sent.
+        record: Function called once per cycle when `hal.record` is complete, e.g. `write` of a telemetry ring.
 
     Returns:
         Timing of the run.
@@ -173,7 +173,7 @@ def run(
             f"controller.telemetry must have the length that the HAL records ({len(controller_record)}), got "
             f"{len(telemetry)}: construct the HAL with `controller_fields=controller.telemetry_fields`"
         )
-    # Objects created before the run exist until its end, so the garbage collector need not scan them.
+    # All objects created before the run exist until the run ends. `freeze` excludes them from the scans of the garbage collector.
     frozen = gc.get_freeze_count() > 0
     if not frozen:
         gc.collect()
@@ -185,7 +185,7 @@ def run(
             began = time.perf_counter()
             lost = drift.add(late)
             if late:
-                late_in_row = _judge_lateness(hal, statistics, late, late_in_row, lost)
+                late_in_row = _check_lateness(hal, statistics, late, late_in_row, lost)
             state = hal.read()
             if hal.moving:
                 try:
@@ -214,7 +214,7 @@ def run(
     return statistics
 
 
-def _judge_lateness(hal: Hal, statistics: Statistics, late: float, in_row: int, drift: float) -> int:
+def _check_lateness(hal: Hal, statistics: Statistics, late: float, in_row: int, drift: float) -> int:
     """Report a late cycle or a delayed loop, and return the number of consecutive late cycles."""
     statistics.lateness_max = max(statistics.lateness_max, late)
     if drift > DRIFT_TO_HOLD:

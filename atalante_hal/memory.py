@@ -1,4 +1,4 @@
-"""Memory that two processes share: one process creates an anonymous file and passes its descriptor to the other."""
+"""Memory that two processes share: one process creates an anonymous file and passes its descriptor to the other process."""
 
 from __future__ import annotations
 

@@ -16,10 +16,11 @@ from atalante_hal.robot import CELLS, FEET, IMUS, JOINTS, MOTORS
 from atalante_hal.types import State, SupervisorState
 from atalante_hal.wire.codec import Codec, group_of
 
-#: Names of the first fields of the record, one number each. "diagnostics" has one bit for each active `Dtc`.
+#: Names of the first fields of the record. Each field is one number. "diagnostics" and "diagnostics_high" have one bit per active
+#: `Dtc`, see `record_layout.split_bits`.
 HEADER_FIELDS = (
     "cycle", "time", "supervisor", "assistance_factor", "cost_us", "lateness_us",
-    "overruns", "frames", "crc_errors", "dropped", "diagnostics",
+    "overruns", "frames", "crc_errors", "dropped", "diagnostics", "diagnostics_high",
 )  # fmt: skip
 
 
@@ -100,7 +101,7 @@ def _fields(codec: Codec, controller_fields: Sequence[tuple[str, int]]) -> list[
     ]
 
 
-#: Signal group of the DBC -> record field, for groups whose name would be ambiguous.
+#: Field names for signal groups of the DBC whose names would be ambiguous in a record.
 _FIELD_NAMES = {
     "Position": "motor_position",
     "Velocity": "motor_velocity",

@@ -58,3 +58,21 @@ class Layout:
             The layout.
         """
         return cls((name, length) for name, length in json.loads(text))
+
+
+#: Number of bits in the field "diagnostics". A number of the record represents 53 bits exactly.
+LOW_BITS = 48
+
+
+def split_bits(bits: int) -> tuple[int, int]:
+    """Split a bit set of diagnostics into the values of the fields "diagnostics" and "diagnostics_high".
+
+    Args:
+        bits: Bit set of codes, see `diagnostics.Dtc.bit`.
+    """
+    return bits & (1 << LOW_BITS) - 1, bits >> LOW_BITS
+
+
+def joined_bits(low: float, high: float) -> int:
+    """Return the bit set of diagnostics from the values of the fields "diagnostics" and "diagnostics_high"."""
+    return int(low) | int(high) << LOW_BITS

@@ -25,7 +25,7 @@ JOINTS = tuple(f"{side}_{joint}" for side in SIDES for joint in LEG_JOINTS)
 MIRROR_SIGN = (-1, -1, 1, 1, 1, -1)
 IMUS = ("torso", "pelvis", "left_tibia", "right_tibia")
 FEET = SIDES
-#: Force cells of one foot: front or rear, left or right in the foot frame.
+#: Names of the four force cells of a foot: front or rear, then left or right, in the foot frame.
 CELLS = ("FL", "FR", "RL", "RR")
 #: Vibration motors: front and back of each thigh and shank.
 MOTORS = tuple(
@@ -45,9 +45,10 @@ class RobotError(ValueError):
 class Envelope:
     """Reduction of the torque near the limits of position and velocity, see `limiter`."""
 
-    look_ahead: float  # s, time ahead for which a joint at constant velocity must stay inside its position limits
-    position_margin: float  # rad, the outward torque falls to 0 over this distance outside a position limit
-    velocity_margin: float  # rad/s, the accelerating torque falls to 0 over this excess above a velocity limit
+    look_ahead: float  # s, prediction time of the joint position at the present velocity
+    #: Distance of the predicted position outside a position limit at which the outward torque is 0 [rad].
+    position_margin: float
+    velocity_margin: float  # rad/s, excess over the velocity limit at which the accelerating torque is 0
 
 
 @dataclass(frozen=True)
@@ -55,21 +56,23 @@ class Derating:
     """Torque limit of a hot drive as a function of its temperature."""
 
     start: float  # degC, highest temperature at which `torque_max` is allowed
-    end: float  # degC, temperature from which only the share `floor` of `torque_max` is allowed
+    end: float  # degC, lowest temperature at which only the share `floor` of `torque_max` is allowed
     floor: float  # share of torque_max, 0 to 1
 
 
 @dataclass(frozen=True)
 class Sensors:
-    """Tolerances for sensors without a fault, and load thresholds of the force cells, see `plausibility`."""
+    """Tolerances that sensors without a fault meet, and load thresholds of the force cells, see `plausibility`."""
 
-    velocity_error: float  # rad/s at the joint, mean difference between reported velocity and encoder motion
-    attitude_error: float  # rad per axis, difference between the encoders and the IMUs of a leg
-    attitude_change: float  # rad, change of the encoder-to-IMU difference while an encoder reading is constant
-    misalignment: float  # rad of additional tolerance for each rad by which the leg turns
-    quaternion_error: float  # difference between the squared norm of a quaternion and 1
-    cell_free: float  # N, vertical force below which a cell carries no load
-    cell_loaded: float  # N, total vertical force of three cells above which the fourth cell must carry load
+    velocity_error: float  # rad/s at the joint, largest mean difference between reported velocity and encoder motion
+    velocity_bandwidth: float  # Hz, cut-off frequency of the low-pass of the reported velocity
+    #: Largest difference between the attitude of the tibia from the encoders and from the IMUs [rad about each axis].
+    attitude_error: float
+    attitude_change: float  # rad, largest change of this difference while an encoder reports a constant position
+    misalignment: float  # rad, addition to `attitude_change` for each rad by which the leg turns meanwhile
+    quaternion_error: float  # largest difference between the squared norm of a quaternion and 1
+    cell_free: float  # N, largest vertical force at which a cell is regarded as unloaded
+    cell_twist: float  # N, largest difference between the vertical forces on the two diagonals of a foot's cells
 
 
 @dataclass(frozen=True)
@@ -78,13 +81,12 @@ class Thresholds:
 
     supply_low: float  # V at a drive; below this voltage the battery is nearly empty
     supply_under: float  # V at a drive; below this voltage the drives may soon fail to hold
-    #: The robot may walk only if the torque limit of a hot drive is at least this share of the limit of the other leg.
+    #: Lowest torque limit of a hot drive with which the robot walks, as a share of the limit of the same joint in the other leg.
     derated_imbalance: float
     full_assist_ramp: float  # s, time for the ramp of the assistance factor from 0 to 1 in FULL_ASSIST
-    position_tolerance: float  # rad, a joint counts as out of range from this distance outside a position limit
-    idle_torque: (
-        float  # Nm, largest torque that a drive may report while off, and largest excess over its limit while on
-    )
+    position_tolerance: float  # rad, distance outside a position limit above which a joint is out of range
+    #: Largest torque that a drive may report while it is off [Nm]. A drive that is on may exceed its limit by this torque.
+    idle_torque: float
     surplus_frames: float  # largest number of frames in a cycle, in addition to one frame of each cyclic message
 
 
@@ -105,12 +107,17 @@ class Robot:
     hold_kp: Vector  # Nm/rad, stiffness of the position control in the drive
     hold_kd: Vector  # Nm s/rad, damping of the position control in the drive
     encoder_noise: Vector  # rad rms
-    breakaway: Vector  # Nm, change of torque that moves the joint against its dry friction
+    breakaway: Vector  # Nm, change of the drive torque that is sufficient to overcome the dry friction of the joint
     envelope: Envelope
     derating: Derating
     sensors: Sensors
     thresholds: Thresholds
     hash32: int  # CRC-32 of the robot file, as reported in HAL_STATUS
+
+    @property
+    def top_speed(self) -> Vector:
+        """Return the speed from which the limiter permits no accelerating torque, shape (12,) [rad/s]."""
+        return self.velocity_max + self.envelope.velocity_margin
 
     def torque_limit(self, temperature: Vector) -> Vector:
         """Return the torque limit of each drive at its temperature.
@@ -128,7 +135,10 @@ class Robot:
 
 
 class _Key(NamedTuple):
-    """Count, range and unit of the numbers of a key. The wide range rejects only wrong units and misplaced decimal points."""
+    """Rule for the value of one key: how many numbers, their range and their unit.
+
+    The range is wide. It rejects wrong units and misplaced decimal points.
+    """
 
     size: int
     low: float
@@ -161,12 +171,13 @@ _TABLES = {
     },
     "sensors": {
         "velocity_error": _Key(1, 0.01, 10.0, "rad/s"),
+        "velocity_bandwidth": _Key(1, 1.0, 1000.0, "Hz"),
         "attitude_error": _Key(1, 1e-3, 0.5, "rad"),
         "attitude_change": _Key(1, 1e-4, 0.5, "rad"),
         "misalignment": _Key(1, 0.0, 0.5, "rad for each rad"),
         "quaternion_error": _Key(1, 1e-4, 0.5, "without unit"),
         "cell_free": _Key(1, 1.0, 1000.0, "N"),
-        "cell_loaded": _Key(1, 1.0, 3000.0, "N"),
+        "cell_twist": _Key(1, 1.0, 1000.0, "N"),
     },
     "thresholds": {
         "supply_low": _Key(1, 5.0, 100.0, "V"),
@@ -184,7 +195,7 @@ def load_robot(path: Path | None = None) -> Robot:
     """Read the robot file and check every key.
 
     Args:
-        path: Robot file (TOML); None: the `robot.toml` of this package.
+        path: Robot file (TOML). With None, the `robot.toml` of this package is read.
 
     Returns:
         Limits, gear ratios and sensor tolerances of the robot.
@@ -201,7 +212,7 @@ def load_robot(path: Path | None = None) -> Robot:
     except (ValueError, RecursionError) as error:
         raise RobotError(f"{path}: {error}") from error
     if set(document) != {"joints", *_TABLES}:
-        raise RobotError(f"{path}: the top-level tables must be joints, {', '.join(_TABLES)}, got {sorted(document)}")
+        raise RobotError(f"{path} must have exactly the tables joints, {', '.join(_TABLES)}, got {sorted(document)}")
     tables = document["joints"]
     if not isinstance(tables, dict) or set(tables) != set(LEG_JOINTS):
         found = sorted(tables) if isinstance(tables, dict) else tables
@@ -247,7 +258,7 @@ def load_robot(path: Path | None = None) -> Robot:
 
 
 def _table(where: str, table: Any, keys: dict[str, _Key]) -> dict[str, list[float]]:
-    """Return the numbers of each key of a table. The table must have exactly the given keys."""
+    """Return the numbers in a table, by key. The table must have exactly the given keys."""
     if not isinstance(table, dict):
         raise RobotError(f"{where} must be a table with the keys {', '.join(keys)}, got {table!r}")
     if unknown := sorted(set(table) - set(keys)):

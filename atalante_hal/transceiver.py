@@ -1,9 +1,9 @@
-"""Transceiver of the HAL: it sends only permitted frames, limits how many are received in a cycle, and reports bus faults.
+"""Transceiver of the HAL: it sends only permitted frames, limits the frames received per cycle, and reports bus faults.
 
-`bus -> transceiver -> process image`, and back.
+`bus <-> transceiver <-> process image`
 
 Transmission is denied by default. A batch reaches the bus only if the header of each frame belongs to a message of this node.
-A failing bus raises no exception. `faults` returns what was found, and the safety monitor raises the diagnostics.
+A failing bus raises no exception. `faults` returns the faults, and the safety monitor raises their diagnostics.
 """
 
 from __future__ import annotations
@@ -14,23 +14,24 @@ from typing import Protocol
 from atalante_dbc import Message, Network
 from atalante_hal.bus import Bus, BusError, BusFull
 from atalante_hal.safety.diagnostics import Dtc, Finding
+from atalante_hal.wire.e2e import SETTLED, qualify
 from atalante_hal.wire.frame import FLAG_BRS, FLAG_FDF, ID_ERROR, Frames, as_words, header_word, new_frames
 from atalante_hal.wire.process_image import ReceiveImage
 
-#: Largest number of frames received in one cycle. About 20 of them are cyclic.
+#: Largest number of frames received in one cycle. About 20 of these frames are cyclic.
 RECEIVE_BUDGET = 128
-#: Number of consecutive cycles with a flood or a full transmit queue after which the fault is confirmed.
+#: Number of consecutive cycles with too many received frames or a full transmit queue until the fault is confirmed.
 PERSISTENT = 5
 #: Time to listen for another HAL before the first SYNC [s].
 LISTEN = 0.2
-#: Longest wait for answers that are unlikely [s]: no node has answered so far, or the last SYNC was not sent.
+#: Longest wait for answers that are unlikely, because no node has answered so far or the last SYNC was not sent [s].
 _DOUBTFUL_PATIENCE = 0.1
 #: Class bit of an error frame that reports bus-off (linux/can/error.h).
 ERROR_BUS_OFF = 0x40
 
 
 class TransmitDenied(Exception):  # noqa: N818
-    """Error of a frame that this node may not send: a defect of the program."""
+    """Error of a program that tries to send a frame that this node may not send."""
 
 
 class HalDuplicate(BusError):  # noqa: N818
@@ -57,7 +58,7 @@ class FrameTap(Protocol):
 
 
 class Outgoing:
-    """Batch of frames that may be sent, with the headers they had when they were checked.
+    """Batch of frames that may be sent, with a copy of the headers that were checked.
 
     Args:
         frames: Frames, shape (n,); always the same array.
@@ -81,7 +82,7 @@ class Transceiver:
             network: CAN network that defines the messages of the node.
             node: DBC name of the sending node, such as HAL.
             bus: Open bus. The caller owns it.
-            tap: Receiver of a copy of every frame; None: no copy.
+            tap: Receiver of a copy of every frame; None if there is no receiver.
             cyclic: Number of frames received in a cycle without faults.
             surplus: Number of additional frames in a cycle above which a flood is reported, see `robot.Thresholds`.
         """
@@ -97,6 +98,10 @@ class Transceiver:
         self._full_this_cycle = False
         self._asked = True  # True if the last batch was sent completely
         self._floods = 0  # consecutive cycles with a flood
+        self._error_frames = 0  # number of error frames since the last call of `faults`
+        self._errors = SETTLED  # leaky bucket of cycles with error frames
+        #: Number of error frames since the start, without reports of bus-off.
+        self.error_frames = 0
         self._bus_off = 0  # error class of the last bus-off frame; 0 after the operator's acknowledgement
         #: True if the bus has no fault, so that `faults` need not be called.
         self.quiet = True
@@ -129,7 +134,7 @@ class Transceiver:
         """
         if batch.headers.tobytes() != batch.granted:
             raise TransmitDenied(
-                f"a frame of {self._node} must keep the identifier, length and format it was granted with"
+                f"a frame of {self._node} must keep the identifier, length and format that `grant` checked"
             )
         self._asked = False
         try:
@@ -149,8 +154,10 @@ class Transceiver:
 
         Args:
             count: Number of frames already in `scratch`.
-            cycle: Process image of the expected messages; None: do not wait for messages.
-            patience: Longest wait for the expected messages [s]. It is shortened if the last batch (their SYNC) was not sent.
+            cycle: Process image of the expected messages. With None, the call does not wait for messages.
+            patience: Longest wait for the expected messages [s]. If the last batch, which contains the SYNC, was not sent, the
+                call waits at most 0.1 s. Otherwise each SYNC that none of the missing nodes answered halves the longest wait,
+                down to 0.1 s. So in lock-step, a dead node does not cause the full wait in every cycle before it times out.
 
         Returns:
             Number of frames now in `scratch`.
@@ -159,7 +166,7 @@ class Transceiver:
         try:
             count += self.bus.receive(scratch[first:] if first else scratch)
             if cycle is not None and (first or not cycle.begins(scratch, count)):
-                count = self._receive_rest(first, count, cycle.expected_ids(), patience)
+                count = self._receive_rest(first, count, cycle, patience)
         except BusError as error:
             self._find(Dtc.BUS_DOWN, True, 0.0, f"the bus {self.bus.name} cannot receive: {error}")
             count = first
@@ -172,7 +179,7 @@ class Transceiver:
         return count
 
     def foreign(self, frames: Frames) -> None:
-        """Report received frames that are not messages to this node: error frames, messages of this node and unknown frames.
+        """Report received frames that are not for this node: error frames, frames that only this node may send, unknown frames.
 
         Args:
             frames: Received frames that are not in a process image, shape (n,).
@@ -181,7 +188,9 @@ class Transceiver:
             if can_id & ID_ERROR:
                 if can_id & ERROR_BUS_OFF:
                     self._bus_off = can_id & ~ID_ERROR
-                    self.quiet = False
+                else:
+                    self._error_frames += 1
+                self.quiet = False
             elif can_id in self._own_ids:
                 self._find(Dtc.HAL_DUPLICATE, True, can_id, f"another node sends id 0x{can_id:X} of this HAL")
             else:
@@ -190,7 +199,7 @@ class Transceiver:
     def listen(self, seconds: float = LISTEN) -> None:
         """Check that no other HAL sends on the bus. Call this before the first frame of this HAL is sent.
 
-        All frames received meanwhile are dropped.
+        Frames that are received during this check are dropped.
 
         Args:
             seconds: Time to listen [s].
@@ -209,7 +218,7 @@ class Transceiver:
                 )
 
     def discard(self) -> None:
-        """Drop all queued frames, because after a gap between cycles they answer old SYNCs."""
+        """Drop all queued frames. Call this after a gap between cycles, because the queued frames answer old SYNCs."""
         try:
             for _ in range(RECEIVE_BUDGET):
                 if self.bus.receive(self.scratch) < RECEIVE_BUDGET:
@@ -218,34 +227,50 @@ class Transceiver:
             self._find(Dtc.BUS_DOWN, True, 0.0, f"the bus {self.bus.name} cannot receive: {error}")
 
     def acknowledge(self) -> None:
-        """Clear a bus-off after the operator's acknowledgement; it is reported again if the CAN controller reports it again."""
+        """End the report of a bus-off that the operator has acknowledged. A new bus-off starts a new report."""
         self._bus_off = 0
 
     def faults(self) -> list[Finding]:
-        """Return the faults found since the last call, and a bus-off that is not acknowledged; call it once in a cycle."""
+        """Return the faults since the last call, and a bus-off that is not acknowledged. Call this once per cycle."""
         self._refused = self._refused + 1 if self._full_this_cycle else 0
         self._full_this_cycle = False
         self._floods = self._floods + 1 if any(finding.dtc is Dtc.BUS_FLOOD for finding in self._found) else 0
+        self._check_error_frames()
         if self._bus_off:
             self._find(Dtc.BUS_OFF, True, self._bus_off, "")
         found, self._found = self._found, []
-        self.quiet = not (self._refused or self._floods or self._bus_off)
+        self.quiet = self._errors is SETTLED and not (self._refused or self._floods or self._bus_off)
         return found
+
+    def _check_error_frames(self) -> None:
+        """Count the error frames of this cycle. Confirm the fault if more than a fifth of the cycles have error frames."""
+        count, self._error_frames = self._error_frames, 0
+        self.error_frames += count
+        if count or self._errors is not SETTLED:
+            self._errors = qualify(self._errors, good=not count)
+        if count or not self._errors.trusted:
+            text = (
+                f"{self.error_frames} error frames on {self.bus.name} so far: check wiring, termination and bit timing"
+            )
+            self._find(Dtc.BUS_ERROR, not self._errors.trusted, self.error_frames, text)
 
     def _find(self, dtc: Dtc, confirmed: bool, value: float, text: str) -> None:
         self._found.append(Finding(dtc, self._node, value, confirmed, text))
         self.quiet = False
 
-    def _receive_rest(self, first: int, count: int, expected: set[int], patience: float) -> int:
-        """Wait until every expected message has arrived in `scratch[first:]`, at most `patience` [s]."""
+    def _receive_rest(self, first: int, count: int, cycle: ReceiveImage, patience: float) -> int:
+        """Wait until every expected message of `cycle` has arrived in `scratch[first:]`, at most `patience` [s]."""
+        missing = cycle.expected_ages()
+        shortest = min(patience, _DOUBTFUL_PATIENCE)
         # If no node has answered so far, receive until the bus is silent, so that no answer is left for the next cycle.
-        until_silent = not expected
-        unlikely = until_silent or not self._asked
-        deadline = time.monotonic() + (min(patience, _DOUBTFUL_PATIENCE) if unlikely else patience)
+        until_silent = not missing
+        begun = time.monotonic()
         while count < RECEIVE_BUDGET:
-            expected.difference_update(self.scratch["can_id"][first:count].tolist())
-            remaining = deadline - time.monotonic()
-            if remaining <= 0.0 or not (expected or until_silent):
+            for can_id in self.scratch["can_id"][first:count].tolist():
+                missing.pop(can_id, None)
+            longest = max(shortest, patience / 2 ** min(missing.values())) if missing and self._asked else shortest
+            remaining = begun + longest - time.monotonic()
+            if remaining <= 0.0 or not (missing or until_silent):
                 break
             first = count
             got = self.bus.receive(self.scratch[count:], remaining)

@@ -12,14 +12,14 @@ import numpy.typing as npt
 
 Vector = npt.NDArray[np.float64]
 
-#: Period of SYNC, of the HAL and of a controller [s].
+#: Period of the SYNC message, and of the control loop [s].
 PERIOD = 1e-3
 
 
 class SupervisorState(IntEnum):
-    """State of the supervisory state machine, ordered from the best to the worst state.
+    """State of the robot as set by the state machine, ordered from the best to the worst state.
 
-    The values are those of the signal `HalState` on the bus.
+    The signal `HalState` on the bus has the same values.
     """
 
     OFF = 0  # nodes need not answer
@@ -41,7 +41,7 @@ class State:
     """
 
     cycle: int  # SYNC counter
-    time: float  # s, cycle * period
+    time: float  # s, `cycle` times the period
     supervisor: SupervisorState
     assistance_factor: float  # Xi in [0, 1], set by the operator; ramped to 1 in FULL_ASSIST
     position: Vector  # (12,) rad
@@ -49,12 +49,12 @@ class State:
     torque: Vector  # (12,) Nm, measured by the drive
     temperature: Vector  # (12,) degC
     drive_state: Vector  # (12,) values of cia402.DriveState
-    imu_quaternion: Vector  # (4, 4) wxyz, sensor frame to world (REP-103)
+    imu_quaternion: Vector  # (4, 4) quaternions wxyz, rotation from the sensor frame to the world frame (REP-103)
     imu_gyro: Vector  # (4, 3) rad/s
     imu_accel: Vector  # (4, 3) m/s2, specific force
-    foot_force: Vector  # (2, 4, 3) N, on the foot, in the foot frame
+    foot_force: Vector  # (2, 4, 3) N, force on the foot at each force cell, in the foot frame
     vibration: Vector  # (8,) measured level, 0 to 1
-    valid: npt.NDArray[np.bool_]  # (messages,) True if the data is new and plausible and its sender is trusted
+    valid: npt.NDArray[np.bool_]  # (messages,) True if the data is new, plausible and of a trusted sender, see `e2e`
     age: npt.NDArray[np.int64]  # (messages,) age of the data [cycles], counted from the SYNC that the message answers
     joints_valid: bool  # True if all twelve joint states are valid
     imu_rows: tuple[int, ...] = ()  # indices of the IMU messages in `valid` and `age`; empty if unknown
@@ -71,7 +71,12 @@ class Command:
     torque: Vector  # (12,) Nm at the joint
     vibration: Vector  # (8,) level, 0 to 1
     step: int | None = None  # number of the walking step; None for a controller that does not walk
-    outside: bool = False  # True if a joint is outside the virtual guide; this only logs an event
+    walking: bool = False  # True while the robot walks on the ground; STOP then ends the walk before HOLD
+    outside: bool = False  # True if a joint is outside the virtual guide; raises a pending diagnostic
+    #: True if a joint stays outside a guide with a certificate. If `outside` is also True, the robot goes to FULL_ASSIST.
+    guide_left: bool = False
+    #: True if a step starts with a larger deviation than the guide certificate assumes; raises a pending diagnostic.
+    hand_over_exceeded: bool = False
 
 
 class Controller(Protocol):
@@ -89,14 +94,14 @@ class Controller(Protocol):
         """Prepare for a motion. The loop calls this before the first `update` of each motion.
 
         Args:
-            state: State of the present cycle.
+            state: State of the current cycle.
         """
 
     def update(self, state: State) -> Command:
         """Compute the command of one cycle. Any exception brings the robot to HOLD.
 
         Args:
-            state: State of the present cycle.
+            state: State of the current cycle.
 
         Returns:
             Command of this cycle, before the limits.

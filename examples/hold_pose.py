@@ -3,7 +3,7 @@
 Run it:  python examples/hold_pose.py                       on an emulated robot, for two seconds of robot time
          python examples/hold_pose.py socketcan vcan0       on a robot or an emulator on a CAN bus
 
-Prints why the robot changed to HOLD at the end, and the joint angles [deg].
+Prints the reason for HOLD and the joint angles [deg] at the end of the run.
 """
 
 import sys

@@ -2,9 +2,9 @@
 
 Run it:  python examples/own_bus.py
 
-A bus is any object with the members of `atalante_hal.bus.Bus`. `WrappedBus` has all of them and forwards each call to the
-bus that it wraps, so a subclass overrides only what it changes. Prints the state of the robot and the three messages
-with the most frames.
+A bus is any object with the members of `atalante_hal.bus.Bus`. `WrappedBus` has all these members and forwards each call
+to the wrapped bus, so a subclass overrides only the members that it changes. Prints the state of the HAL, and the three
+messages with the most frames.
 """
 
 from collections import Counter
@@ -45,7 +45,7 @@ hal_end, robot_end = lockstep_pair()  # the two ends of a bus in this process
 bus, controller = CountingBus(hal_end), PoseHold(robot)
 with open_body(robot) as body:
     emulator = Emulator(network, robot, body, robot_end, operator=Operator())
-    hal_end.step = emulator.poll  # the emulated robot runs when the HAL receives frames
+    hal_end.step = emulator.poll  # a call of `receive` by the HAL runs the emulated robot
     hal = Hal(network, robot, bus, patience=2.0, controller_fields=controller.telemetry_fields)
     run(hal, controller, LockStep(), until=lambda state: state.time >= 1.0)
     names = {message.frame_id: message.name for message in network.messages}

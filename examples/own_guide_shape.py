@@ -2,9 +2,9 @@
 
 Run it:  python examples/own_guide_shape.py
 
-Prints whether the guide is certified for the assistance factor 0.5. Then prints the largest |e| / q_bound during two steps in
-the air. e is the tracking error, q_bound the distance from the desired trajectory to the guide. If the number is below 1, hip
-and knee of the swing leg stayed inside the guide.
+Prints whether the guide is certified for the assistance factor 0.5, and the largest ratio |e| / q_bound during two steps in the
+air. e is the tracking error, and q_bound is the distance from the desired trajectory to the guide. If the ratio is
+below 1, hip and knee of the swing leg stayed inside the guide.
 """
 
 import numpy as np
@@ -20,11 +20,11 @@ XI = 0.5  # assistance factor
 
 
 def waist(phase, half_width):
-    """Return the upper and the lower bound of the guide as fractions of its half-width, shape (n,) each.
+    """Return the upper and the lower bound of the guide as fractions of the half-width, two arrays of shape (n,).
 
     Args:
         phase: time since the start of the step divided by the step duration, 0 to 1, shape (n,).
-        half_width: half-width of the guide at the assistance factor [rad].
+        half_width: half-width of the guide for the chosen assistance factor [rad].
     """
     narrowest = min(1.0, np.radians(3.0) / half_width)
     fraction = 1.0 - (1.0 - narrowest) * np.sin(np.pi * phase) ** 2

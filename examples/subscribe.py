@@ -1,7 +1,7 @@
 """Subscribe to the joint states of a running HAL with Zenoh and protobuf, and without any module of this project.
 
 Run it:  atalante airwalk --steps 100                          in one terminal
-         python examples/subscribe.py                       in another one, from the root of the project
+         python examples/subscribe.py                       in another terminal, from the root of the project
          python examples/subscribe.py tcp/192.0.2.7:7447    for a HAL on another computer
 
 Prints the cycle number and the twelve joint angles [rad], 100 times per second of robot time. Stop it with Ctrl-C.

@@ -1,4 +1,4 @@
-"""Test that the robot stays ACTIVE after four consecutive lost frames of a drive, and that five lead to HOLD.
+"""Test that four consecutive lost frames of a drive leave the robot in ACTIVE, and that five lost frames lead to HOLD.
 
 Run it:  pytest examples/test_lost_frames.py
 

@@ -1,4 +1,4 @@
-"""What the tests share: the network, the robot, and an embedded rig of HAL and emulator in lock-step."""
+"""Shared fixtures: the network, the robot, and an embedded rig of HAL and emulator in lock-step."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from hypothesis import HealthCheck, Phase, settings
 
 import atalante_dbc
 from atalante_control.model import ExoskeletonParameters, urdf
-from atalante_emulator.body import PyBulletBody
+from atalante_emulator.bodies.pybullet_body import PyBulletBody
 from atalante_emulator.emulator import Emulator
 from atalante_emulator.pendant import Operator
 from atalante_hal.bus import Bus
@@ -31,10 +31,10 @@ from atalante_hal.robot import Robot, load_robot
 from atalante_hal.types import Command, State, SupervisorState
 from atalante_hal.wire.frame import Frames
 
-# How long an example takes says nothing: the first one may compile.
+# Examples have no deadline, because the first example may compile functions.
 settings.register_profile("any time", deadline=None)
 settings.load_profile("any time")
-# For `make mutation`: one example that fails is enough, and making it small is what takes long; its process runs a test twice.
+# Profile for `make mutation`: failing examples are not shrunk, because shrinking is slow. A process runs each test twice.
 settings.register_profile(
     "mutation",
     deadline=None,
@@ -43,22 +43,22 @@ settings.register_profile(
     database=None,
     suppress_health_check=[HealthCheck.differing_executors],
 )
-# For `make coverage`: a line is covered or it is not.
+# Profile for `make coverage`: a few examples are sufficient to cover every line.
 settings.register_profile("coverage", settings.get_profile("mutation"), max_examples=5)
 
 
 class Witness:
-    """Judges what every HAL of this process, and of those it started, has sent: one file of frames each."""
+    """Check of the frames that the HALs of this process and its subprocesses sent. Each HAL writes its frames to one file."""
 
     def __init__(self) -> None:
         self.folder = Path(tempfile.mkdtemp(prefix="atalante-witness-"))
-        self._judges: defaultdict[Path, CommandLimits] = defaultdict(CommandLimits)
-        self._read: Counter[Path] = Counter()  # bytes judged of the files of other processes
+        self._checks: defaultdict[Path, CommandLimits] = defaultdict(CommandLimits)
+        self._read: Counter[Path] = Counter()  # checked bytes of the files of other processes
         self._ours = f"{os.getpid()}-"
 
-    def judge(self) -> list[str]:
-        """Judge what came since the last call; the violations."""
-        told = []
+    def check(self) -> list[str]:
+        """Check the frames since the last call; return the violations."""
+        violations = []
         with os.scandir(self.folder) as entries:
             files = {Path(entry.path): entry.stat().st_size for entry in entries}
         for path, size in sorted(files.items()):
@@ -70,18 +70,18 @@ class Witness:
                 file.seek(done)
                 content = file.read(whole)
             if path.name.startswith(self._ours):
-                os.truncate(path, 0)  # nobody writes now, and a suite sends gigabytes
+                os.truncate(path, 0)  # no HAL writes at this time; otherwise the files would grow to gigabytes
             else:
                 self._read[path] = done + whole
-            judge = self._judges[path]
-            if judge.judge(np.frombuffer(content, RECORD)):
-                told.append(judge.told())
-        return told
+            limits = self._checks[path]
+            if limits.check(np.frombuffer(content, RECORD)):
+                violations.append(limits.summary())
+        return violations
 
     @property
     def counts(self) -> tuple[int, int]:
-        """HALs and command frames judged so far."""
-        return len(self._judges), sum(judge.command_frames for judge in self._judges.values())
+        """Return the number of HALs and the number of command frames that were checked so far."""
+        return len(self._checks), sum(limits.command_frames for limits in self._checks.values())
 
 
 _witness_key = pytest.StashKey[Witness]()
@@ -97,7 +97,7 @@ def pytest_configure(config: pytest.Config) -> None:
 
 
 def pytest_collection_finish() -> None:
-    """Half a million objects of modules and tests: a collection of them all takes as long as many a test."""
+    """Exclude the half million objects of modules and tests from garbage collection, so that a collection takes less time."""
     gc.collect()
     gc.freeze()
 
@@ -109,10 +109,10 @@ def witness(pytestconfig: pytest.Config) -> Witness:
 
 @pytest.fixture(autouse=True)
 def _commands_within_limits(witness: Witness) -> Iterator[None]:
-    """No HAL sends a frame that is not its own or beyond the limits, in no test."""
+    """Fail a test if a HAL sent a frame of another node, or a command beyond the limits."""
     yield
-    if told := witness.judge():
-        pytest.fail("a HAL sent what it must not:\n" + "\n".join(told), pytrace=False)
+    if violations := witness.check():
+        pytest.fail("a HAL sent forbidden frames:\n" + "\n".join(violations), pytrace=False)
 
 
 def pytest_sessionfinish(session: pytest.Session) -> None:
@@ -129,7 +129,7 @@ def pytest_testnodedown(node: Any) -> None:
 
 def pytest_terminal_summary(terminalreporter: Any, config: pytest.Config) -> None:
     hals, frames = (sum(column) for column in zip(*config.stash[_counts_key], strict=True))
-    terminalreporter.write_line(f"{frames} command frames of {hals} HALs judged by cantools and the limits file")
+    terminalreporter.write_line(f"{frames} command frames of {hals} HALs checked with cantools and the limits file")
 
 
 def pytest_unconfigure(config: pytest.Config) -> None:
@@ -152,7 +152,7 @@ def urdf_text(robot: Robot) -> str:
 
 
 class FilterBus(WrappedBus):
-    """A bus that lets a test lose, change or add frames on their way to the HAL or to the nodes."""
+    """A bus on which a test can drop, change or add frames to the HAL or to the nodes."""
 
     def __init__(self, bus: Bus) -> None:
         super().__init__(bus)
@@ -204,26 +204,26 @@ class HoldRig:
             f"not {wanted.name} after {cycles} cycles: {self.hal.reason}, missing {self.hal.missing()}"
         )
 
-    def walk(self, cycles: int, *, outside: bool = False, step: int | None = None) -> State:
-        """A controller that holds its pose, for a while, whatever the supervisor says."""
+    def walk(self, cycles: int, *, step: int | None = None, **flags: bool) -> State:
+        """Run cycles with the commands of a pose hold in every supervisor state; `flags` are fields of `Command`."""
         for _ in range(cycles):
             self.hal.read()
-            self.hal.write(self.hold_torque(outside=outside, step=step))
+            self.hal.write(self.hold_torque(step=step, **flags))
         return self.hal.state
 
-    def hold_torque(self, *, outside: bool = False, step: int | None = None) -> Command:
+    def hold_torque(self, *, step: int | None = None, **flags: bool) -> Command:
         robot, state = self.hal.robot, self.hal.state
         torque = robot.hold_kp * (self._anchor - state.position) - robot.hold_kd * state.velocity
-        return Command(torque, np.zeros(8), step=step, outside=outside)
+        return Command(torque, np.zeros(8), step=step, **flags)
 
     def codes(self) -> list[str]:
         return [event.code for event in self.hal.events]
 
-    def seen(self, *codes: str) -> list[tuple[str, str]]:
+    def events_of(self, *codes: str) -> list[tuple[str, str]]:
         return [(event.code, event.severity) for event in self.hal.events if event.code in codes]
 
     def last_commands(self) -> dict[str, dict[str, float]]:
-        """What cantools reads in the newest command frames, by side."""
+        """Return the newest command frames decoded by cantools, by side."""
         frames = next(f for f in reversed(self.sent) if f["can_id"][0] == 0x100)
         return {
             side: database().decode_message(int(f["can_id"]), f["data"][: f["len"]].tobytes(), decode_choices=False)

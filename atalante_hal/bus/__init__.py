@@ -1,11 +1,11 @@
 """CAN transports: the first and the last stage of each control cycle.
 
-The protocol `Bus` has several transports. The HAL and the emulator run on any of them without change:
+Several transports implement the interface `Bus`. The HAL and the emulator run on each transport without change:
 
 - `socketcan.SocketCanBus`: a Linux CAN interface, such as `can0` of an adapter or `vcan0`;
 - `pair.PairBus`: two ends in one process, in lock-step;
 - `shared.SharedBus`: two ends in two processes, which run in parallel;
-- `python_can.PythonCanBus`: an interface of python-can with CAN FD, see `adapters` (pcan, kvaser, slcan, ...);
+- `python_can.PythonCanBus`: an interface of python-can with CAN FD (pcan, kvaser, slcan, ...), see `adapters`;
 - `replay.ReplayBus`: a recorded log, read only.
 """
 
@@ -44,7 +44,7 @@ class BusFull(BusError):  # noqa: N818
 class Bus(Protocol):
     """Interface of every CAN transport. Frames are contiguous arrays of `frame.FRAME` records, shape (n,).
 
-    Pass the same array objects in every cycle: a bus caches memory views of the arrays passed to it.
+    Pass the same array objects in every cycle, because a bus caches memory views of each array object.
     """
 
     @property
@@ -59,7 +59,7 @@ class Bus(Protocol):
 
     @property
     def dropped(self) -> int:
-        """Return the number of received frames that were lost since the bus was opened."""
+        """Return the number of frames, since the bus was opened, that arrived but were lost or are not valid CAN frames."""
         ...
 
     def send(self, frames: Frames) -> None:
@@ -78,12 +78,11 @@ class Bus(Protocol):
     def receive(self, frames: Frames, timeout: float = 0.0) -> int:
         """Write the received frames to `frames[:n]`, oldest first, and return n.
 
-        The rest of `frames` does not change. Own frames are not received. Payload bytes beyond the length of a frame are
-        undefined.
+        The rest of `frames` does not change. Own frames are not received. The bytes after the payload of a frame are undefined.
 
         Args:
             frames: Receive buffer, shape (m,) with m >= n.
-            timeout: Longest wait for the first frame [s]; 0: return without waiting.
+            timeout: Longest wait for the first frame [s]. With 0 the call does not wait.
 
         Returns:
             Number of received frames n; 0 if none arrived in time.
@@ -102,7 +101,7 @@ def open_bus(interface: str, channel: str, **options: Any) -> Bus:
     """Open one channel of a CAN interface.
 
     Args:
-        interface: Name of the interface in python-can. `socketcan` uses `SocketCanBus`; all others use python-can.
+        interface: Name of the interface in python-can. `socketcan` opens a `SocketCanBus`, every other name a `PythonCanBus`.
         channel: Name of the channel, such as `can0`.
         **options: Keyword arguments of the bus class. `PythonCanBus` passes its options to python-can.
 

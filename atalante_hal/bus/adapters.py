@@ -1,9 +1,10 @@
-"""Facts about the interfaces of python-can: CAN FD support, driver, channel, bit timing, and whether each was tried.
+"""Facts about the interfaces of python-can: CAN FD support, driver, channel, bit timing, tests with this project.
 
-    interface -> Adapter -> refusal, for the commands, `PythonCanBus` and `atalante doctor` alike
+    name of an interface -> `Adapter` -> `refusal()`
 
-The facts are read from the sources of python-can 4.6.1, unless `Adapter.source` names another source. A test compares them with
-the installed python-can. No adapter hardware was tried.
+The commands, `PythonCanBus` and `atalante doctor` call `refusal()`. The facts come from the source code of python-can 4.6.1,
+unless `Adapter.source` names another source. A test compares the facts with the installed python-can. No test was run with the
+hardware of an adapter.
 """
 
 from __future__ import annotations
@@ -13,7 +14,7 @@ from dataclasses import dataclass
 from typing import Final, Literal
 
 #: Entries of python-can's configuration file for 1 Mbit/s and 5 Mbit/s with a CAN clock of 80 MHz. The sample points are at 75 %.
-#: The Linux kernel also chooses 75 % above 800 kbit/s (drivers/net/can/dev/calc_bittiming.c).
+#: The Linux kernel also sets the sample point to 75 % above 800 kbit/s (drivers/net/can/dev/calc_bittiming.c).
 SEGMENTS: Final = (
     ("f_clock", "80000000"),
     ("nom_brp", "1"),
@@ -25,9 +26,9 @@ SEGMENTS: Final = (
     ("data_tseg2", "4"),
     ("data_sjw", "4"),
 )
-#: Entries for the same bit rates, for backends that calculate the bit segments themselves.
+#: Entries for 1 Mbit/s and 5 Mbit/s in python-can's configuration file, for backends that calculate the bit segments.
 BIT_RATES: Final = (("bitrate", "1000000"), ("data_bitrate", "5000000"))
-#: Source of most facts.
+#: Source of the facts, if an adapter names no other source.
 SOURCES: Final = "sources of python-can 4.6.1"
 NOT_TRIED: Final = "not tried"
 
@@ -40,14 +41,17 @@ class Adapter:
         name: Name of the interface, for the option `-i`.
         can_fd: Whether the backend sends and receives CAN FD frames.
         channel: Form of the channel, for the option `-c`, with an example.
-        install: What must be installed beside python-can: a pip command or the driver of the vendor. Empty: nothing.
-        library: Module or driver library that the backend loads. Empty: none.
+        install: Software that must be installed in addition to python-can: a pip command or the driver of the vendor. Empty
+            if python-can is sufficient.
+        library: Module or driver library that the backend loads. Empty if it loads no library.
         options: Entries of python-can's configuration file that this network requires.
-        setup: Shell command that sets the bit timing, for a backend that takes it from elsewhere.
-        stamps: Clock of the receive timestamps: of the adapter (hardware), of the kernel, or of the process (software).
-        reports_can_fd: Whether `can.BusABC.protocol` of the open bus is CAN FD. If not, `PythonCanBus` relies on `can_fd`.
-        unusable: Reason why a HAL and a robot in two processes cannot use the interface. Empty: they can.
-        note: What else an operator must know.
+        setup: Shell command that sets the bit timing, for a backend that does not set it.
+        stamps: Clock that gives the receive timestamps: the clock of the adapter (hardware), of the kernel, or of the
+            process (software).
+        reports_can_fd: Whether `can.BusABC.protocol` of a bus that was opened for CAN FD is CAN FD. If False, `PythonCanBus`
+            does not check `protocol`, and relies on `can_fd`.
+        unusable: Reason why the interface cannot connect a HAL and a robot in two processes. Empty if it can.
+        note: Further information for the operator.
         tried: Test that was run on this interface with this project.
         source: Where the facts come from.
     """
@@ -68,7 +72,7 @@ class Adapter:
 
     @property
     def configuration(self) -> str:
-        """Return the section `[default]` of ~/can.conf that sets the bit timing. Empty: no entry is required."""
+        """Return the section `[default]` of ~/can.conf that sets the bit timing; empty if no section is required."""
         return "\n".join(["[default]", *(f"{key} = {value}" for key, value in self.options)]) if self.options else ""
 
 
@@ -236,20 +240,21 @@ ADAPTERS: Final = {adapter.name: adapter for adapter in _ADAPTERS}
 
 
 def refusal(interface: str, *, one_process: bool = False) -> str:
-    """Return why an interface cannot connect a HAL with a robot. Empty: it can, if its driver and its hardware are present.
+    """Return why an interface cannot connect a HAL with a robot. Return an empty text if it can.
 
     Args:
         interface: Name of the interface in python-can.
         one_process: Whether HAL and robot are in one process, as in a test.
 
     Returns:
-        One sentence that names the interface, the reason and the remedy.
+        One sentence that names the interface, the reason and the remedy. The text is empty if the interface can connect
+        HAL and robot. The check assumes that the driver and the adapter are present.
     """
     adapter = ADAPTERS.get(interface)
     if adapter is None:
         import can
 
-        if interface in can.VALID_INTERFACES:  # for a plug-in, only the open bus reports whether it has CAN FD
+        if interface in can.VALID_INTERFACES:  # a plug-in; `PythonCanBus` checks its CAN FD support after opening it
             return ""
         known = ", ".join(sorted(can.VALID_INTERFACES))
         return f"there is no CAN interface {interface!r}; use one of {known}"
@@ -264,10 +269,13 @@ def refusal(interface: str, *, one_process: bool = False) -> str:
 
 
 def reports_can_fd(interface: str) -> bool:
-    """Return whether the protocol that python-can reports for an open bus of this interface is correct.
+    """Return whether the attribute `protocol` of an open python-can bus correctly states that the bus uses CAN FD.
 
     Args:
         interface: Name of the interface in python-can.
+
+    Returns:
+        `Adapter.reports_can_fd`; True for a plug-in, because nothing else is known about it.
     """
     adapter = ADAPTERS.get(interface)
     return adapter is None or adapter.reports_can_fd

@@ -1,7 +1,7 @@
 """Byte views of frame arrays, cached for each array that is passed to `Bus.send()` or `Bus.receive()`.
 
-Creating a byte view of an array costs more than copying the frames of a cycle, so the views are cached. Header patterns that were
-found valid are cached, too, because headers rarely change from cycle to cycle.
+Creating a byte view of an array takes longer than copying the frames of a cycle, so the views are cached. The header words of
+each valid batch are cached, too: the next batch has the same headers in most cycles, and then needs no check.
 """
 
 from __future__ import annotations
@@ -22,7 +22,8 @@ from atalante_hal.wire.frame import (
     as_words,
 )
 
-#: Largest number of cached arrays. It is also the limit for header patterns. A HAL or an emulator uses about five.
+#: Largest number of cached arrays. Also the largest number of batches whose header words are cached.
+#: A HAL or an emulator uses about five arrays and five batches.
 REMEMBERED = 64
 CLASSIC_LENGTHS = tuple(range(9))
 
@@ -31,12 +32,12 @@ class Batch(NamedTuple):
     """Array of frames, with a view of its bytes and a view of its header words."""
 
     frames: Frames
-    memory: memoryview  # bytes of the array, length 72 n
+    memory: memoryview  # bytes of the array of n frames, 72 bytes per frame
     headers: npt.NDArray[np.uint64]  # identifier, length and flags of each frame, shape (n,)
 
 
 class Batches:
-    """Cache of the arrays that were passed to one bus, each with its views."""
+    """Cache of the arrays that were passed to one bus. Each array is stored with its views."""
 
     def __init__(self) -> None:
         self._batches: list[Batch] = []

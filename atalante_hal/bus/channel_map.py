@@ -9,14 +9,14 @@ from atalante_hal.bus import Bus, BusError, open_bus
 
 
 class ChannelMapError(ValueError):
-    """Error in the text of a channel map; the message contains a valid example."""
+    """Error in the text of a channel map; the message states what is expected."""
 
 
 def parse_channel_map(text: str, buses: Sequence[str]) -> dict[str, str]:
     """Parse the text of a channel map.
 
     Args:
-        text: `vcan0` for all buses on one channel, or `left_leg=can0,right_leg=can1,...` with a channel for each bus.
+        text: One channel for all buses, such as `vcan0`, or a channel for each bus, such as `left_leg=can0,right_leg=can1,...`.
         buses: Names of the robot's buses.
 
     Returns:
@@ -63,7 +63,7 @@ def open_channels(interface: str, channels: Mapping[str, str], **options: Any) -
         Open bus of each of the robot's buses. Buses on the same channel share one `Bus` object.
 
     Raises:
-        BusAbsent: If a channel cannot be opened. The channels opened before are closed again.
+        BusAbsent: If a channel cannot be opened. The channels that are already open are closed.
     """
     opened: dict[str, Bus] = {}
     try:

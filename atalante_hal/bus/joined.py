@@ -1,7 +1,7 @@
 """Bus that joins several channels, for a robot whose buses are on more than one CAN interface.
 
-Identifiers are unique in the whole network. So the identifier of a frame determines its channel, and frames received on different
-channels can be mixed: the process image finds its rows by identifier.
+Identifiers are unique in the whole network. So the identifier of a sent frame determines its channel. Frames that are received on
+different channels can be mixed, because the process image finds the row of a frame by its identifier.
 """
 
 from __future__ import annotations
@@ -23,18 +23,18 @@ POLLING_PERIOD: Final = 100e-6
 
 
 class Share(NamedTuple):
-    """Frames of a batch that go to one channel."""
+    """Frames of a batch that are sent on one channel."""
 
     link: Bus
     indices: list[int]  # indices of these frames in the batch
-    frames: Frames  # always the same array, because a bus caches memory views of it
+    frames: Frames  # always the same array object, because a bus caches memory views of each array
 
 
 class JoinedBus:
     """Bus that joins all buses of the robot.
 
-    Each frame goes to the bus of its message. The order of frames is kept on each channel, but not between channels. If one
-    channel cannot send its frames, the others still send theirs.
+    Each frame goes to the bus of its message. Frames on one channel keep their order, but frames on different channels
+    do not. If one channel cannot send its frames, the other channels still send.
 
     Args:
         network: CAN network that assigns each message to a bus.
@@ -60,12 +60,11 @@ class JoinedBus:
         self._capacity = capacity
         self._batches = Batches()
         self._shares: dict[bytes, list[Share]] = {}
-        self._tails: list[list[Frames]] = []  # for each receive buffer: its slices `frames[i:]` for all i
-        self._turn = (
-            0  # index of the channel that is read first; rotates, because a busy channel could block the others
-        )
+        self._tails: list[list[Frames]] = []  # receive buffer -> all slices `frames[i:]` of this buffer
+        self._turn = 0  # index of the channel to read first; it rotates, so that no busy channel blocks the rest
         self._closed = False
-        self._failure: BusError | None = None  # error of a channel in the present `receive`
+        self._failure: BusError | None = None  # error that a channel raised in the current call of `receive`
+        self._down: dict[int, str] = {}  # error message of each lost channel, by `id()` of its bus object
         files = [_file_of(link) for link in self._links]
         self._files = [file for file in files if file is not None]
         self._all_have_files = len(self._files) == len(files)
@@ -74,6 +73,14 @@ class JoinedBus:
     def dropped(self) -> int:
         """Return the number of frames lost on all channels."""
         return sum(link.dropped for link in self._links)
+
+    @property
+    def down(self) -> str:
+        """Return the error message of a lost channel; empty if no channel is lost.
+
+        A lost channel counts as back as soon as a frame was sent or received on it.
+        """
+        return next(iter(self._down.values()), "")
 
     def send(self, frames: Frames) -> None:
         """Send each frame on the channel of its message.
@@ -101,8 +108,10 @@ class JoinedBus:
                 failure = failure or error
             except BusError as error:
                 failure = failure or error
+                self._lost(share.link, error)
             else:
                 sent += len(share.indices)
+                self._down.pop(id(share.link), None)
         if isinstance(failure, BusFull):
             raise BusFull(str(failure), sent)
         if failure is not None:
@@ -119,7 +128,7 @@ class JoinedBus:
             Number of received frames n.
 
         Raises:
-            BusDown: If a channel is closed or down, and no frame was received on the others.
+            BusDown: If a channel is closed or down, and no frame was received on the other channels.
         """
         if self._closed:
             raise BusDown(f"{self.name} is closed")
@@ -143,6 +152,10 @@ class JoinedBus:
         for link in self._links:
             link.close()
 
+    def _lost(self, link: Bus, error: BusError) -> None:
+        if isinstance(error, BusDown):
+            self._down[id(link)] = str(error)
+
     def _gather(self, tails: list[Frames]) -> int:
         size = len(tails[0])
         room = min(size, self._capacity)
@@ -156,8 +169,10 @@ class JoinedBus:
                 got = link.receive(tails[count] if room == size else tails[count][: room - count])
             except BusError as error:
                 self._failure = error
+                self._lost(link, error)
                 continue
             if got:
+                self._down.pop(id(link), None)
                 self.stamps[count : count + got] = link.stamps[:got]
                 count += got
         return count

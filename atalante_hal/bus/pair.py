@@ -1,7 +1,8 @@
 """Embedded bus with two ends in one process, in lock-step.
 
-The HAL has one end and the emulator the other. If the HAL calls `receive()` and its queue is empty, its end calls `step`. In this
-call the emulator receives the HAL's frames and sends its answers. Both sides run the same code as on a real bus.
+The HAL has one end and the emulator has the other end. If the HAL calls `receive()` and no frame is queued for the HAL, the
+HAL's end calls `step`. In this call the emulator receives the frames of the HAL and sends the answers. Both sides run the same
+code as on a real bus.
 """
 
 from __future__ import annotations
@@ -20,11 +21,12 @@ class PairBus:
 
     Args:
         name: Name of this end.
-        capacity: Number of frames that can be queued for this end. Further frames raise `BusFull` at the peer.
+        capacity: Number of frames that can be queued for this end. If the queue is full, `send` of the other end (the peer)
+            raises `BusFull`.
 
     Attributes:
-        step: Function that `receive()` calls when no frame is queued; None: no function is called.
-        now_ns: Virtual time of received frames [ns], set by the owner of this end.
+        step: Function that `receive()` calls when no frame is queued. With None, `receive()` returns 0 instead.
+        now_ns: Current virtual time [ns], set by the owner of this end. Received frames get this time.
         dropped: Always 0, because no frame is lost here.
     """
 
@@ -95,7 +97,7 @@ class PairBus:
         peer._tail = end
 
     def receive(self, frames: Frames, timeout: float = 0.0) -> int:
-        """Move queued frames to `frames[:n]` and return n. If the queue is empty, call `step` first, if it is set.
+        """Move queued frames to `frames[:n]` and return n. If no frame is queued and `step` is set, call `step` first.
 
         Args:
             frames: Receive buffer, shape (m,) with m >= n.
@@ -135,7 +137,7 @@ class PairBus:
         self._head = self._tail = 0
 
     def _move_to_start(self) -> int:
-        """Move the queued frames to the start of the queue, and return the offset of their end [bytes]."""
+        """Move the queued frames to the start of the queue, and return the offset where the queued frames end [bytes]."""
         size = self._tail - self._head
         self._queue[:size] = self._queue[self._head : self._tail]
         self._head = 0

@@ -1,6 +1,7 @@
 """Bus on a python-can interface with CAN FD, for adapters without SocketCAN and for tests.
 
-It takes about 6 us for each frame. Use `socketcan.SocketCanBus` for interfaces that the kernel supports, because it is faster.
+The bus takes about 6 us for each frame. For an interface that the kernel supports, use `socketcan.SocketCanBus`, which is
+faster.
 """
 
 from __future__ import annotations
@@ -31,7 +32,7 @@ from atalante_hal.wire.frame import (
 RECORD = struct.Struct("<IBB2x64s")
 ID_NUMBER = 0x1FFF_FFFF
 LINK_LOST = (errno.ENETDOWN, errno.ENODEV, errno.ENXIO, errno.EBADF)
-#: Errors of the backends at opening: kvaser raises NameError without its library, pcan KeyError for an unknown channel.
+#: Exceptions that `can.Bus` raises if it cannot open a channel. For example, kvaser without its driver library raises NameError.
 _OPEN_ERRORS = (can.CanError, OSError, ValueError, TypeError, ImportError, NameError, LookupError, AttributeError)
 
 
@@ -108,7 +109,7 @@ class PythonCanBus:
                 message = self._bus.recv(0.0 if count else timeout)
             except self._link_errors as error:
                 raise BusDown(f"{self.name} cannot receive: {error}") from error
-            except (ValueError, LookupError):  # slcan cannot parse a damaged line
+            except (ValueError, LookupError):  # raised by the backend `slcan` for a damaged line
                 self.dropped += 1
                 continue
             if message is None:
@@ -162,7 +163,7 @@ def message_of(can_id: int, length: int, flags: int, data: bytes) -> can.Message
 
 
 def pack(message: can.Message, memory: memoryview, offset: int) -> bool:
-    """Write a python-can message as one `FRAME`, unless it is not a valid frame.
+    """Write a python-can message as one `FRAME` if the message is a valid CAN frame.
 
     Args:
         message: Received message.
@@ -175,7 +176,7 @@ def pack(message: can.Message, memory: memoryview, offset: int) -> bool:
     can_id = message.arbitration_id
     if message.is_extended_id and not message.is_error_frame:
         can_id |= ID_EXTENDED
-    remote = message.is_remote_frame and not message.is_fd  # the .asc reader marks an empty CAN FD frame as remote
+    remote = message.is_remote_frame and not message.is_fd  # .asc logs mark empty CAN FD frames as remote
     if remote:
         can_id |= ID_REMOTE
     if message.is_error_frame:
@@ -207,7 +208,7 @@ def _open(interface: str, channel: str, options: dict[str, Any]) -> can.BusABC:
         raise BusAbsent(refused)
     if interface == "virtual":
         options = {"protocol": can.CanProtocol.CAN_FD} | options
-    # Own frames are not received: neovi, unlike the other backends, returns them by default.
+    # The backend `neovi` receives its own frames by default, unlike the other backends.
     options = {"fd": True, "receive_own_messages": False} | options
     try:
         bus = can.Bus(interface=interface, channel=channel, **options)

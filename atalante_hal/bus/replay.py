@@ -1,7 +1,7 @@
 """Bus that replays a recorded log, for the HAL, the validator or the viewer.
 
-Frames have the order and the time stamps of the log. With `cycle_id`, the identifier of the first frame of a cycle (SYNC),
-each call of `receive()` returns the frames of one cycle.
+The frames are returned in the order and with the time stamps of the log. If `cycle_id` is given, each call of
+`receive()` returns the frames of one cycle. `cycle_id` is the identifier of the first frame of a cycle (SYNC).
 """
 
 from __future__ import annotations
@@ -53,7 +53,8 @@ class ReplayBus:
 
     Args:
         path: Log file.
-        cycle_id: Identifier of the first frame of a cycle. `receive()` stops before it, unless it is the first frame returned.
+        cycle_id: Identifier of the first frame of a cycle. Each call of `receive()` stops before the next frame with this
+            identifier. With None, the frames are not divided into cycles.
         capacity: Largest number of frames that one `receive()` returns.
 
     Attributes:

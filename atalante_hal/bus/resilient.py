@@ -1,6 +1,6 @@
 """Bus for a program that continues to run while its CAN link is lost.
 
-A link is lost when an interface goes down or an adapter is unplugged. It is back when the interface is up again.
+A link is lost when an interface goes down or an adapter is unplugged.
 """
 
 from __future__ import annotations
@@ -9,21 +9,26 @@ import time
 from collections.abc import Callable
 
 from atalante_hal.bus import Bus, BusDown
+from atalante_hal.bus.joined import JoinedBus
 from atalante_hal.bus.wrapped import WrappedBus
 from atalante_hal.wire.frame import Frames
 
-#: Longest wait of one `receive` on a lost link [s]. The next call tries the link again.
+#: Longest time for which `receive` waits after an error of a lost link [s]. The next call tries the link again.
 RETRY_PERIOD = 0.1
+#: Time for which an error message must be unchanged before it is reported [s]. When an interface is removed, the first error
+#: message states only that the interface is down. The message about the removal follows.
+SETTLE_TIME = 0.1
 
 
 class ResilientBus(WrappedBus):
-    """Bus that behaves like a disconnected cable while its link is lost: it drops sent frames and receives none.
+    """Bus that drops sent frames and receives no frames while its link is lost, as with a disconnected cable.
 
-    The first frame that is sent or received after a loss proves that the link is back.
+    A lost link counts as back as soon as a frame was sent or received. If one channel of a `JoinedBus` is lost, the other
+    channels continue.
 
     Args:
         bus: Wrapped bus. `close` closes it, too.
-        report: Function called with the error message when the link is lost, and with a message when it is back.
+        report: Function called with the error message when the link is lost, and with a message when the link is back.
 
     Attributes:
         down: Error message of the link while it is lost; empty otherwise.
@@ -35,9 +40,11 @@ class ResilientBus(WrappedBus):
         self._report = report
         self.down = ""
         self.losses = 0
+        self._reported = ""  # error message that was reported for the current loss; empty if none was reported
+        self._changed_at = 0.0  # time of the last change of `down` [s]
 
     def send(self, frames: Frames) -> None:
-        """Send frames as `Bus.send`, but drop them while the link is lost.
+        """Send frames like `Bus.send`, but drop the frames while the link is lost.
 
         Args:
             frames: Frames to send, shape (n,).
@@ -45,12 +52,12 @@ class ResilientBus(WrappedBus):
         try:
             super().send(frames)
         except BusDown as error:
-            self._lost(error)
+            self._lost(str(error))
         else:
-            self._back()
+            self._update_down(proven=True)
 
     def receive(self, frames: Frames, timeout: float = 0.0) -> int:
-        """Receive frames as `Bus.receive`, but wait and return 0 while the link is lost.
+        """Receive frames like `Bus.receive`; while the link is lost, wait and return 0.
 
         Args:
             frames: Receive buffer, shape (m,).
@@ -62,20 +69,34 @@ class ResilientBus(WrappedBus):
         try:
             count = super().receive(frames, timeout)
         except BusDown as error:
-            self._lost(error)
+            self._lost(str(error))
             time.sleep(min(timeout, RETRY_PERIOD))
             return 0
-        if count:
-            self._back()
+        self._update_down(proven=count > 0)
         return count
 
-    def _lost(self, error: BusDown) -> None:
-        if not self.down:
-            self.losses += 1
-            self._report(f"{error}; waiting for it")
-        self.down = str(error)
+    def _update_down(self, *, proven: bool) -> None:
+        """Update `down` after a call that raised no error.
 
-    def _back(self) -> None:
-        if self.down:
-            self.down = ""
-            self._report(f"{self.name} is back")
+        Args:
+            proven: Whether a frame was sent or received.
+        """
+        if isinstance(self.bus, JoinedBus) and self.bus.down:
+            self._lost(self.bus.down)
+        elif proven and self.down:
+            self._report(f"{self.name} is back" if self._reported else f"{self.name} was lost and is back")
+            self.down = self._reported = ""
+        elif self.down:
+            self._report_settled()
+
+    def _lost(self, message: str) -> None:
+        self.losses += not self.down
+        if message != self.down:
+            self.down, self._changed_at = message, time.monotonic()
+        self._report_settled()
+
+    def _report_settled(self) -> None:
+        """Report the error message if it was not reported yet and has not changed for `SETTLE_TIME`."""
+        if self.down != self._reported and time.monotonic() - self._changed_at >= SETTLE_TIME:
+            self._reported = self.down
+            self._report(f"{self.down}; waiting for the link")

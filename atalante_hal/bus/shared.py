@@ -1,14 +1,15 @@
 """Embedded bus between two processes, in shared memory. The module `pair` is the variant within one process.
 
-Each end has a queue that only it writes and only the other end reads. It stores the frames and then a frame counter, which makes
-them visible to the reader. This requires that stores become visible in program order, as on x86-64. A waiting end polls the
-counter for a short time and then sleeps until the other end wakes it with a byte through a socket pair. The socket also reports
-that the other process has terminated, whatever the cause. Polling helps only if the two processes run on different cores.
+Each end has a queue, which only this end writes and only the other end reads. The writer stores the frames and then its
+frame counter. The reader reads only the frames that the counter includes. This requires that stores become visible in
+program order, as on x86-64. A waiting end polls the counter for a short time and then sleeps until the other end wakes it
+with a byte through a socket pair. If the other process terminates for any reason, the kernel closes its socket, and this
+end raises `BusDown`. Polling saves time only if the two processes run on different cores.
 
-In lock-step one end is the client and the other the server. `receive()` of the client publishes its sent frames, requests one
-step of the server, and returns the frames that the server sends, or none when the step has ended. So both ends make the same
-sequence of calls as those of a `PairBus` and produce the same bytes. Only the work that the server does after its answer
-runs in parallel with the client.
+In lock-step one end is the client and the other end is the server. `receive()` of the client publishes the frames that the
+client sent, and requests one step of the server. It returns the frames that the server sends in this step, if there are any.
+So the sequence of calls and the bytes on the bus are identical to those of a `PairBus`. Only the work that the server does
+after its answer runs in parallel with the client.
 """
 
 from __future__ import annotations
@@ -29,18 +30,18 @@ from atalante_hal.bus.batch import Batches
 from atalante_hal.memory import anonymous_file
 from atalante_hal.wire.frame import FRAME_BYTES, Frames
 
-#: Indices of the counters of each end: frames sent, frames received, calls of `step` requested, calls of `step` completed.
+#: Indices of the counters of each end: two of frames, then two of the calls of `step`, which a client requests.
 _SENT, _RECEIVED, _REQUESTED, _COMPLETED = range(4)
-#: Indices of the flags of each end: it is in `serve`, it sleeps, it is closed.
+#: Indices of the flags of each end. A flag is 1 while its name describes the state of the end.
 _SERVING, _SLEEPING, _CLOSED = range(4, 7)
 #: Number of 64-bit header words of each end: one cache line.
 _END_WORDS = 8
 _HEADER_BYTES = mmap.PAGESIZE
-#: Time for which a waiting end polls before it sleeps [s]. It is longer than the computing time of a cycle.
+#: Time for which a waiting end polls before it sleeps [s], longer than the computing time of a cycle.
 _POLL_TIME = 500e-6
-#: Number of waits that sleep without polling, after a wait in which polling found nothing. This saves computing time.
+#: After a wait in which polling found no frame, this number of waits begins without polling. This saves computing time.
 _WAITS_WITHOUT_POLLING = 32
-#: Longest sleep [ms]. Then the shared memory is read again, because a new value may become visible after its wake-up byte.
+#: Longest sleep [ms]. After it, the end reads the memory again, because a value may become visible after its wake-up byte.
 _SLEEP = 20
 _WAKE_UP = b"\0"
 _REASON_BYTES = 4096
@@ -49,10 +50,11 @@ _REASON_BYTES = 4096
 class SharedBus:
     """One end of an embedded bus between two processes.
 
-    `shared_pair()` creates both ends in one process. `descriptors()` creates the descriptors to construct an end in each process.
+    `shared_pair()` creates both ends in one process. For two processes, `descriptors()` creates the file descriptors from which
+    each process constructs its end.
 
     Attributes:
-        patience: Longest wait of the client in lock-step for an answer [s]; 0: this end is not a client.
+        patience: Longest wait of the client in lock-step for an answer [s]; 0 if this end is not a client.
         dropped: Always 0, because no frame is lost here.
     """
 
@@ -61,9 +63,9 @@ class SharedBus:
 
         Args:
             name: Name of this end.
-            memory: Descriptor of the shared memory. The bus takes it over and closes it.
-            wake_socket: Descriptor of the socket that wakes this end. The bus takes it over and closes it.
-            end: Number of this end, 0 or 1.
+            memory: Descriptor of the shared memory. The bus owns the descriptor and closes it.
+            wake_socket: Descriptor of the socket that wakes this end. The bus owns the descriptor and closes it.
+            end: Number of this end of the bus, 0 or 1.
         """
         self.name = name
         self.patience = 0.0
@@ -82,16 +84,16 @@ class SharedBus:
         self._outgoing, self._incoming = queues[end], queues[1 - end]
         self._size = size
         self._sent = self._received = 0
-        self._waits_without_polling = 0  # remaining waits that sleep without polling
+        self._waits_without_polling = 0  # number of remaining waits without polling
         self._closed = False
-        self._close_reason = ""  # reason that the other end sent when it closed
+        self._close_reason = ""  # reason for closing that the other end sent
         self._stamps: Stamps = np.zeros(size // FRAME_BYTES, np.int64)
         self._received_at = 0
         self._batches = Batches()
 
     @property
     def stamps(self) -> Stamps:
-        """Return the time of the last `receive()` that returned frames, once for each frame. Shape (capacity,), int64 [ns]."""
+        """Return the time of the last `receive()` that returned frames, repeated per frame. Shape (capacity,), int64 [ns]."""
         self._stamps.fill(self._received_at)
         return self._stamps
 
@@ -165,7 +167,7 @@ class SharedBus:
         return count
 
     def serve(self, step: Callable[[], object]) -> None:
-        """Serve the other end: call `step` for each of its requests, until the bus is down.
+        """Serve the other end: call `step` for each request of the other end, until the bus is down.
 
         Args:
             step: Function that receives the queued frames and sends the answers. While it runs, `receive` does not wait.
@@ -177,7 +179,7 @@ class SharedBus:
         own[_SERVING] = 1
         while True:
             completed = own[_COMPLETED]
-            self._until(lambda: peers[_REQUESTED] != completed, math.inf)  # noqa: B023 - called in this iteration
+            self._until(lambda: peers[_REQUESTED] != completed, math.inf)  # noqa: B023 - the lambda is called only in this iteration
             step()
             own[_COMPLETED] = completed + 1
             if peers[_SLEEPING]:
@@ -200,7 +202,7 @@ class SharedBus:
         """Close this end. The other end can still receive the frames that were sent.
 
         Args:
-            reason: Reason for closing, which the other end adds to its `BusDown`; empty: none.
+            reason: Reason for closing, which the other end states in its `BusDown`; empty if there is none.
         """
         if self._closed:
             return
@@ -214,12 +216,12 @@ class SharedBus:
         self._map.close()
 
     def _wake_peer(self) -> None:
-        # If the socket is full, it already contains a wake-up. The next `receive` detects a closed peer.
+        # Errors are ignored: a full socket already contains a wake-up, and the next `receive` detects a closed peer.
         with contextlib.suppress(OSError):
             self._wake_socket.send(_WAKE_UP)
 
     def _request_step(self) -> bool:
-        """Request a step from the other end and return whether it sent frames."""
+        """Request a step from the other end, and return whether the other end sent frames."""
         peers, received = self._peers, self._received
         self._own[_SENT] = self._sent
         self._own[_REQUESTED] = requested = self._own[_REQUESTED] + 1
@@ -270,7 +272,7 @@ class SharedBus:
         return True
 
     def _sleep(self, longest: float) -> None:
-        """Sleep until the other end wakes this one, at most `longest` [ms]; raise `BusDown` if the other end is closed."""
+        """Sleep until the other end wakes this end, at most `longest` [ms]; raise `BusDown` if the other end is closed."""
         if self._wake_poll.poll(longest):
             self._read_wake_ups()
 
@@ -282,7 +284,7 @@ class SharedBus:
             except BlockingIOError:
                 return
             except ConnectionResetError:
-                continue  # the other end closed before it read all wake-ups; its reason can still be read
+                continue  # the other end closed without reading all wake-ups; the next `recv` returns its reason for closing
             if not received:
                 raise BusDown(f"{self.name}: {self._close_reason or 'the other end is closed'}")
             if received != _WAKE_UP:

@@ -26,7 +26,7 @@ from atalante_hal.wire.frame import FLAG_FDF, FRAME_BYTES, Frames, as_words, new
 CLASSIC_BYTES = 16  # struct can_frame
 CAN_RAW_ERR_FILTER: Final = 2
 SO_RCVBUFFORCE: Final = 33
-SO_TIMESTAMPNS: Final = 35  # number of the socket option and of its control message
+SO_TIMESTAMPNS: Final = 35  # the socket option and its control message have the same number
 SO_RXQ_OVFL: Final = 40
 SIOCGIFFLAGS: Final = 0x8913
 SIOCGIFMTU: Final = 0x8921
@@ -34,10 +34,12 @@ IFF_UP: Final = 1
 #: Classes of error frames to receive (linux/can/error.h): transmit timeout, controller problem, bus-off, controller restarted.
 ERROR_FRAMES = 0x0001 | 0x0004 | 0x0040 | 0x0100
 LINK_DOWN: Final = errno.ENETDOWN
-#: Error codes of a removed interface. The socket stays unbound, even if an interface of the same name is created later.
+#: Error codes of calls after the interface was removed. The kernel unbinds the socket, and does not bind it again.
 LINK_REMOVED: Final = (errno.ENODEV, errno.ENXIO)
 #: Shortest time between two attempts to open a removed interface again [s].
 REOPEN_PERIOD: Final = 0.1
+#: When the link is lost, queued frames are dropped in at most this number of batches.
+DROPPED_BATCHES: Final = 64
 NO_ROOM = (errno.ENOBUFS, errno.EAGAIN)
 
 #: Mask of the used fields of a received header word. The reserved bytes may contain garbage.
@@ -80,17 +82,18 @@ STAMP_ONLY = 32  # size of the control messages without drop counter [bytes]
 class SocketCanBus:
     """Bus on a raw CAN FD socket that is bound to one Linux interface.
 
-    It does not receive its own frames. It receives error frames about the state of the CAN controller. Time stamps are
-    CLOCK_REALTIME, taken by the kernel when the driver delivers the frame.
+    The bus does not receive its own frames. It receives error frames about the state of the CAN controller. The kernel takes
+    the time stamp of a frame (CLOCK_REALTIME) when the driver delivers the frame.
 
     If the interface is removed (an adapter is unplugged), the next call raises `BusDown`. Later calls open the interface again
-    under the same file descriptor as soon as it is present and up, and raise `BusDown` until then.
+    under the same file descriptor as soon as it is present and up, and raise `BusDown` until then. Frames that are queued when
+    the link is lost are dropped. So a frame that is received after `BusDown` proves that the link is back.
 
     Args:
         channel: Name of the interface, such as `can0`.
         capacity: Largest number of frames in one system call and in the result of one `receive()`.
-        receive_buffer: Requested size of the kernel's receive buffer [bytes]; a frame takes about 1 kB. Without CAP_NET_ADMIN
-            the kernel grants at most net.core.rmem_max.
+        receive_buffer: Requested size of the kernel's receive buffer [bytes]. A queued frame takes about 1 kB. Without
+            CAP_NET_ADMIN the kernel grants at most net.core.rmem_max.
 
     Attributes:
         dropped: Number of frames lost because the receive buffer was full.
@@ -108,7 +111,7 @@ class SocketCanBus:
         self._batches = Batches()
         self._closed = False
         self._receive_buffer = receive_buffer
-        self._removed = False
+        self._removed = ""  # error message of a removed interface; empty otherwise
         self._next_attempt = 0.0  # monotonic time of the next attempt to open a removed interface [s]
         self._socket = _bound_socket(channel, receive_buffer)
         self._file = self._socket.fileno()
@@ -285,13 +288,28 @@ class SocketCanBus:
         return self._link_error(code) or BusError(f"{self.name} cannot send: {reason}")
 
     def _link_error(self, code: int) -> BusDown | None:
-        """Return the error of an interface that is down or removed; None for other codes."""
-        if code == LINK_DOWN:
+        """Return the error of an interface that is down or removed, and drop its queued frames; None for other codes."""
+        if code != LINK_DOWN and code not in LINK_REMOVED:
+            return None
+        self._drop_queued()
+        # An interface goes down before it is removed, and `_drop_queued` may have dropped the error of the removal.
+        if code == LINK_DOWN and self._is_bound():
             return BusDown(f"{self.name} is down: type `ip link set {self.name} up`")
-        if code in LINK_REMOVED:
-            self._removed = True
-            return BusDown(f"{self.name} was removed: plug the adapter in again; it is opened again when it is up")
-        return None
+        self._removed = f"{self.name} was removed: plug the adapter in again; the link is opened again when it is up"
+        return BusDown(self._removed)
+
+    def _is_bound(self) -> bool:
+        """Return whether the socket is bound to an interface. If the interface is removed, the kernel unbinds the socket."""
+        return bool(self._socket.getsockname()[0])
+
+    def _drop_queued(self) -> None:
+        """Drop the queued frames and the queued error. While the socket contains any of them, `poll` reports it as readable."""
+        for _ in range(DROPPED_BATCHES):
+            count = self._recvmmsg(self._file, self._rx_address, self._capacity, socket.MSG_DONTWAIT, None)
+            if count > 0:
+                self._read_control(count)
+            elif ctypes.get_errno() in NO_ROOM:
+                return
 
     def _reopen(self) -> None:
         """Open a removed interface again, under the same file descriptor.
@@ -301,16 +319,19 @@ class SocketCanBus:
         """
         now = time.monotonic()
         if now < self._next_attempt:
-            raise BusDown(f"{self.name} was removed and is not open again")
+            raise BusDown(self._removed)
         self._next_attempt = now + REOPEN_PERIOD
+        if not is_present(self.name):
+            raise BusDown(self._removed)
         try:
             require_channel(self.name)
             with _bound_socket(self.name, self._receive_buffer) as again:
                 os.dup2(again.fileno(), self._file, inheritable=False)
         except (BusAbsent, OSError) as error:
-            raise BusDown(f"{self.name} was removed and cannot be opened again: {error}") from error
-        self._removed = False
-        self._lost_before = 0  # the kernel counts the lost frames of each socket from 0
+            self._removed = f"{self.name} was removed and cannot be opened again: {error}"
+            raise BusDown(self._removed) from error
+        self._removed = ""
+        self._lost_before = 0  # the kernel counts lost frames per socket, and the new socket starts at 0
 
 
 def require_channel(channel: str) -> None:
@@ -320,7 +341,7 @@ def require_channel(channel: str) -> None:
         channel: Name of the interface.
 
     Raises:
-        BusAbsent: If it is not such an interface; the message contains the command that helps.
+        BusAbsent: If the interface is missing, is down or has no CAN FD; the message contains the command that helps.
     """
     doctor = "run `atalante doctor`"
     create = f"ip link add {channel} type vcan && ip link set {channel} mtu 72 txqueuelen 1000 up"
@@ -332,12 +353,8 @@ def require_channel(channel: str) -> None:
             f"(`make test-vcan` boots one), and {doctor}"
         ) from error
     with raw:
-        try:
-            socket.if_nametoindex(channel)
-        except OSError as error:
-            raise BusAbsent(
-                f"there is no interface {channel}: plug the adapter in, or type `{create}`; {doctor}"
-            ) from error
+        if not is_present(channel):
+            raise BusAbsent(f"there is no interface {channel}: plug the adapter in, or type `{create}`; {doctor}")
         (flags,) = struct.unpack_from("<H", _ioctl(raw, SIOCGIFFLAGS, channel))
         (mtu,) = struct.unpack_from("<i", _ioctl(raw, SIOCGIFMTU, channel))
         try:
@@ -348,12 +365,23 @@ def require_channel(channel: str) -> None:
             ) from error
     if mtu < FRAME_BYTES:
         raise BusAbsent(
-            f"{channel} carries classic CAN only (mtu {mtu}): type `ip link set {channel} down`, then for a vcan "
-            f"`ip link set {channel} mtu 72 up`, for an adapter `ip link set {channel} up type can bitrate 1000000 "
-            f"dbitrate 5000000 fd on`; {doctor}"
+            f"{channel} supports classic CAN only (mtu {mtu}): type `ip link set {channel} down`, and then one of two "
+            f"commands: `ip link set {channel} mtu 72 up` for a vcan, or `ip link set {channel} up type can bitrate "
+            f"1000000 dbitrate 5000000 fd on` for an adapter; {doctor}"
         )
     if not flags & IFF_UP:
         raise BusAbsent(f"{channel} is down: type `ip link set {channel} up`; {doctor}")
+
+
+def is_present(channel: str) -> bool:
+    """Return whether an interface exists.
+
+    `if_nametoindex` would take milliseconds for an absent interface, because the kernel then starts modprobe.
+
+    Args:
+        channel: Name of the interface.
+    """
+    return channel in [name for _, name in socket.if_nameindex()]
 
 
 def _ioctl(any_socket: socket.socket, request: int, channel: str) -> bytes:

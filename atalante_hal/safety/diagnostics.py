@@ -16,7 +16,7 @@ class Reaction(IntEnum):
     """Reaction to a confirmed diagnostic, ordered from the mildest to the most severe."""
 
     INFO = 0  # record only
-    NOT_READY = 1  # no reaction of a moving robot, but START is refused while the diagnostic is active
+    NOT_READY = 1  # a moving robot does not react, but START is refused while the diagnostic is active
     FULL_ASSIST = 2  # ramp the assistance factor to 1
     FINISH_STEP = 3  # finish the walking step, then HOLD
     HOLD = 4  # all drives hold their positions
@@ -36,7 +36,7 @@ _R, _S = Reaction, Severity
 
 
 class Dtc(StrEnum):
-    """Diagnostic trouble code; its value is the code used in events, recordings and the fault matrix."""
+    """Diagnostic trouble code. The value of a member is its name in events, recordings and the fault matrix."""
 
     reaction: Reaction
     severity: Severity
@@ -46,7 +46,7 @@ class Dtc(StrEnum):
     bit: int
 
     def __new__(cls, code: str, reaction: Reaction, severity: Severity, meaning: str) -> Dtc:
-        """Create a member from its code, reaction, severity and meaning."""
+        """Create a member of the enumeration from its code, reaction, severity and meaning."""
         member = str.__new__(cls, code)
         member._value_ = code
         member.reaction, member.severity, member.meaning = reaction, severity, meaning
@@ -59,10 +59,12 @@ class Dtc(StrEnum):
     E2E_SEQUENCE = "E2E_SEQUENCE", _R.HOLD, _S.ERROR, "the counter jumped: an old frame, or more than 4 frames lost"
     E2E_CRC = "E2E_CRC", _R.HOLD, _S.ERROR, "the CRC is wrong: a damaged frame, or a frame of another node"
     E2E_FROZEN = "E2E_FROZEN", _R.HOLD, _S.ERROR, "the alive counter of a sending node does not change"
+    E2E_REPEAT_RATE = "E2E_REPEAT_RATE", _R.HOLD, _S.ERROR, "frames of a node are received twice"
     E2E_LOSS_RATE = "E2E_LOSS_RATE", _R.HOLD, _S.ERROR, "more than a fifth of a node's frames are lost"
     NODE_TIMEOUT = "NODE_TIMEOUT", _R.HOLD, _S.ERROR, "a node timed out"
     NODE_LATE = "NODE_LATE", _R.HOLD, _S.ERROR, "a node answers an earlier SYNC than the latest one"
     NODE_DUPLICATE = "NODE_DUPLICATE", _R.HOLD, _S.ERROR, "two senders of one message"
+    NODE_ERROR_PASSIVE = "NODE_ERROR_PASSIVE", _R.HOLD, _S.WARNING, "the CAN controller of a node is error passive"
     FRAME_LENGTH = "FRAME_LENGTH", _R.HOLD, _S.ERROR, "length or format of a frame differs from the DBC"
     FRAME_UNKNOWN = "FRAME_UNKNOWN", _R.INFO, _S.WARNING, "a frame has an identifier that the DBC does not define"
     SIGNAL_RANGE = "SIGNAL_RANGE", _R.HOLD, _S.ERROR, "a signal is outside its range in the DBC"
@@ -100,6 +102,7 @@ class Dtc(StrEnum):
     # Bus.
     BUS_FLOOD = "BUS_FLOOD", _R.HOLD, _S.ERROR, "more frames arrived than the HAL reads in a cycle"
     BUS_OFF = "BUS_OFF", _R.HOLD, _S.ERROR, "the CAN controller is bus-off"
+    BUS_ERROR = "BUS_ERROR", _R.HOLD, _S.WARNING, "the CAN controller of the HAL reports errors on the bus"
     BUS_DOWN = "BUS_DOWN", _R.HOLD, _S.ERROR, "the bus interface is down"
     BUS_TX_FULL = "BUS_TX_FULL", _R.HOLD, _S.ERROR, "the transmit queue is full"
     HAL_DUPLICATE = "HAL_DUPLICATE", _R.HOLD, _S.ERROR, "another HAL sends on this bus"
@@ -107,7 +110,7 @@ class Dtc(StrEnum):
     CONTROLLER_ERROR = "CONTROLLER_ERROR", _R.HOLD, _S.ERROR, "the controller raised an exception"
     CMD_NONFINITE = "CMD_NONFINITE", _R.HOLD, _S.ERROR, "the controller requested a torque of NaN or infinity"
     TORQUE_SATURATED = "TORQUE_SATURATED", _R.FULL_ASSIST, _S.WARNING, "the limiter cuts the torque"
-    GUIDE_OUTSIDE = "GUIDE_OUTSIDE", _R.INFO, _S.INFO, "a joint is outside the virtual guide"
+    GUIDE_OUTSIDE = "GUIDE_OUTSIDE", _R.FULL_ASSIST, _S.WARNING, "a joint is outside the virtual guide"
     CYCLE_GAP = "CYCLE_GAP", _R.HOLD, _S.ERROR, "the time between two cycles is too long"
     OVERRUN = "OVERRUN", _R.HOLD, _S.ERROR, "several consecutive cycles are late, or the loop falls behind the clock"
     OPERATOR_STOP = "OPERATOR_STOP", _R.HOLD, _S.INFO, "STOP pressed, dead-man switch released, or pendant timed out"
@@ -127,9 +130,9 @@ class Finding:
 
     dtc: Dtc
     node: str  # DBC name of the affected node
-    value: float  # measured value; quantity and unit depend on the code
-    confirmed: bool  # True: confirmed, its reaction follows; False: pending, no reaction yet
-    text: str  # one sentence for the operator; empty: node name and meaning of the code
+    value: float  # measured value, whose quantity and unit depend on the code
+    confirmed: bool  # whether the diagnostic is confirmed (its reaction follows) or pending (no reaction)
+    text: str  # one sentence for the operator; if empty, the event shows the node name and the code's meaning
 
 
 def number_of(bits: int) -> int:
@@ -168,7 +171,7 @@ def dtcs_of(bits: int) -> tuple[Dtc, ...]:
     return tuple(dtc for dtc in Dtc if bits & dtc.bit)
 
 
-#: Emergency error code (CiA 301, CiA 402-1) -> diagnostic, for the codes that have a specific diagnostic.
+#: Diagnostic of each emergency error code (CiA 301, CiA 402-1) that has a specific diagnostic.
 _EMERGENCIES = {
     0x3120: Dtc.UNDER_VOLTAGE,  # mains too low
     0x3220: Dtc.UNDER_VOLTAGE,  # DC link too low
@@ -179,7 +182,7 @@ _EMERGENCIES = {
     0x8250: Dtc.CMD_TIMEOUT,  # RPDO timeout
     0x8700: Dtc.SYNC_LOST,  # SYNC controller
 }
-#: Highest hexadecimal digit of any other emergency error code -> its diagnostic.
+#: Diagnostic of every other emergency error code, by the highest hexadecimal digit of the code.
 _EMERGENCY_CLASSES = {
     0x2: Dtc.EMCY_CURRENT,
     0x3: Dtc.EMCY_VOLTAGE,
@@ -196,7 +199,7 @@ def emergency(error_code: int) -> Dtc | None:
         error_code: emergency error code (CiA 301), 16 bits.
 
     Returns:
-        The diagnostic; None for code 0, which reports that the error has cleared.
+        The diagnostic; None for code 0, which reports that the node has no error any more.
     """
     if error_code == 0:
         return None
@@ -204,7 +207,7 @@ def emergency(error_code: int) -> Dtc | None:
 
 
 def event_code(dtc: Dtc, value: float) -> str:
-    """Return the code of a diagnostic in an event. An emergency includes its error code, as in EMCY_8130.
+    """Return the code that an event shows for a diagnostic. The code of an emergency includes its error code, as in EMCY_8130.
 
     Args:
         dtc: diagnostic trouble code.

@@ -10,8 +10,8 @@ from dataclasses import dataclass
 
 #: Severity names, in the order of the enum `Severity` in messages.proto.
 SEVERITIES = ("info", "warning", "error")
-#: Packed fields: run number, cycle, value, severity, code, node, text.
-_RECORD = struct.Struct("<qqdB39s32s216s")
+#: Packed fields: run number, cycle, value, count, severity, code, node, text.
+_RECORD = struct.Struct("<qqdIB39s32s220s")
 EVENT_BYTES = _RECORD.size
 EVENT_SLOTS = 1024
 
@@ -22,10 +22,11 @@ class Event:
 
     cycle: int
     code: str  # e.g. NODE_TIMEOUT; cut to 39 bytes when packed
-    text: str  # one sentence for the operator; cut to 216 bytes when packed
+    text: str  # one sentence for the operator; cut to 220 bytes when packed
     severity: str = "info"  # one of `SEVERITIES`
     node: str = "HAL"  # DBC name of the node; cut to 32 bytes when packed
-    value: float = 0.0  # measured value; quantity and unit depend on the code
+    value: float = 0.0  # measured value, whose quantity and unit depend on the code
+    count: int = 1  # number of occurrences that this event reports
 
     def __post_init__(self) -> None:
         if self.severity not in SEVERITIES:
@@ -45,6 +46,7 @@ def pack(event: Event, run: int) -> bytes:
         run,
         event.cycle,
         event.value,
+        event.count,
         SEVERITIES.index(event.severity),
         event.code.encode(),
         event.node.encode(),
@@ -54,8 +56,8 @@ def pack(event: Event, run: int) -> bytes:
 
 def unpack(packed: bytes) -> tuple[Event, int]:
     """Unpack an event and the number of its run."""
-    run, cycle, value, severity, code, node, text = _RECORD.unpack(packed)
-    return Event(cycle, _text(code), _text(text), SEVERITIES[severity], _text(node), value), run
+    run, cycle, value, count, severity, code, node, text = _RECORD.unpack(packed)
+    return Event(cycle, _text(code), _text(text), SEVERITIES[severity], _text(node), value, count), run
 
 
 def _text(packed: bytes) -> str:

@@ -1,22 +1,24 @@
 """Fault memory, which contains the active diagnostics and logs an event for each new diagnostic.
 
 `monitors, transceiver, plausibility, loop -> fault memory -> state machine (confirmed codes), telemetry (events)`
+
+If a diagnostic toggles, its first event is logged at once. Repeats within `FOLD_CYCLES` are counted, and then one event with the
+count is logged. So for each diagnostic of a node, at most one event of the pending diagnostic and one event of the confirmed
+diagnostic are logged per second. Every occurrence is counted.
 """
 
 from __future__ import annotations
 
 from collections import deque
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import islice
 
 from atalante_hal.safety.diagnostics import Dtc, Finding, Reaction, Severity, event_code, worst
 from atalante_hal.safety.events import Event
 
-#: Shortest time between two events of the same pending diagnostic [cycles].
-QUIET_PENDING = 1000
-#: Shortest time between two events of the same confirmed diagnostic [cycles].
-QUIET_CONFIRMED = 20
+#: Length of the window after a logged event in which equal events are counted instead of logged [cycles].
+FOLD_CYCLES = 1000
 #: Number of events that the log keeps. They need about 2 MB of memory.
 EVENTS_KEPT = 4096
 
@@ -24,8 +26,8 @@ EVENTS_KEPT = 4096
 class EventLog:
     """Log of the newest events, and number of all events.
 
-    Events are numbered from 0 in the order they are appended. The number of an event never changes. Its index in the log
-    changes when older events are dropped.
+    Events are numbered in the order in which they are appended, starting at 0. The number of an event never changes. The
+    index of an event in the log changes when older events are dropped.
 
     Args:
         capacity: maximum number of events in the log.
@@ -33,7 +35,7 @@ class EventLog:
 
     def __init__(self, capacity: int = EVENTS_KEPT) -> None:
         self._kept: deque[Event] = deque(maxlen=capacity)
-        #: Number of events appended so far, which is the number of the next event.
+        #: Number of all events appended so far. The next appended event gets this value as its number.
         self.count = 0
 
     def append(self, event: Event) -> None:
@@ -78,11 +80,21 @@ class Entry:
     cycle: int  # cycle in which the diagnostic was last raised
 
 
+@dataclass(slots=True)
+class Window:
+    """Window of time after a logged event. Equal events in this window are counted."""
+
+    end: int  # first cycle after the window
+    latest: Event
+    repeats: int = 0
+
+
 class FaultMemory:
     """Set of active diagnostics of all nodes.
 
-    Call `raise_dtc` for every fault that is present in a cycle, and then `close_cycle`. It ends every diagnostic that was not
-    raised in this cycle. An event is logged when a diagnostic becomes active, and another one when it becomes confirmed.
+    Call `raise_dtc` for every fault that is present in a cycle, and then `close_cycle`. `close_cycle` ends every
+    diagnostic that was not raised in this cycle. An event is logged when a diagnostic becomes active, and again when
+    the diagnostic is confirmed.
     """
 
     def __init__(self) -> None:
@@ -92,7 +104,7 @@ class FaultMemory:
         #: Bit set of all pending and confirmed codes, as updated by the last `close_cycle`, see `diagnostics.dtcs_of`.
         self.bits = 0
         self.confirmed: frozenset[Dtc] = frozenset()
-        self._logged_at: dict[tuple[Dtc, str, bool], int] = {}
+        self._windows: dict[tuple[str, str, bool], Window] = {}  # key: code, node, whether the diagnostic is confirmed
 
     def raise_dtc(
         self, cycle: int, dtc: Dtc, node: str, *, value: float = 0.0, confirmed: bool = True, text: str = ""
@@ -103,7 +115,7 @@ class FaultMemory:
             cycle: number of the current cycle.
             dtc: diagnostic trouble code.
             node: DBC name of the affected node.
-            value: measured value; quantity and unit depend on the code.
+            value: measured value. Its quantity and unit depend on the code.
             confirmed: True if the fault exceeds its limit, so that its reaction is due.
             text: one sentence for the operator; default: node name and meaning of the code.
         """
@@ -116,6 +128,8 @@ class FaultMemory:
         if not before or not entry.text:
             entry.text = text or f"{node}: {dtc.meaning}"
             self._log(cycle, dtc, node, entry)
+        elif text:
+            entry.text = text
 
     def raise_finding(self, cycle: int, finding: Finding) -> None:
         """Mark the diagnostic of a finding as active in this cycle, see `raise_dtc`.
@@ -128,16 +142,18 @@ class FaultMemory:
         self.raise_dtc(cycle, finding.dtc, finding.node, value=value, confirmed=confirmed, text=text)
 
     def close_cycle(self, cycle: int) -> None:
-        """Remove the diagnostics that were not raised in this cycle, then update `bits` and `confirmed`."""
+        """Remove the diagnostics that were not raised in this cycle, update `bits` and `confirmed`, and log repeats."""
         self.active = {key: entry for key, entry in self.active.items() if entry.cycle == cycle}
         bits = 0
         for dtc, _ in self.active:
             bits |= dtc.bit
         self.bits = bits
         self.confirmed = frozenset(dtc for (dtc, _), entry in self.active.items() if entry.confirmed)
+        if self.window_over(cycle):
+            self.log_repeats(cycle)
 
     def worst(self) -> frozenset[Dtc]:
-        """Return the confirmed codes with the most severe reaction; empty if the reaction is INFO."""
+        """Return those confirmed codes that have the most severe reaction; empty if this reaction is INFO."""
         reaction = worst(self.confirmed)
         return frozenset(dtc for dtc in self.confirmed if dtc.reaction is reaction is not Reaction.INFO)
 
@@ -149,14 +165,49 @@ class FaultMemory:
         """Return the text of the first active diagnostic with one of the codes; empty if none is active."""
         return next((entry.text for (dtc, _), entry in self.active.items() if dtc in dtcs), "")
 
+    def log(self, event: Event, *, confirmed: bool) -> None:
+        """Log an event, or count it if an event with the same code and node was logged within `FOLD_CYCLES`.
+
+        Args:
+            event: event of the current cycle.
+            confirmed: False for a pending diagnostic. Pending and confirmed diagnostics are counted separately.
+        """
+        key = event.code, event.node, confirmed
+        window = self._windows.get(key)
+        if window is None:
+            self._windows[key] = Window(event.cycle + FOLD_CYCLES, event)
+            self.events.append(event)
+        else:
+            window.latest, window.repeats = event, window.repeats + 1
+
+    def window_over(self, cycle: int) -> bool:
+        """Return whether the window of any event is over. Then `log_repeats` must be called.
+
+        Args:
+            cycle: number of the current cycle.
+        """
+        return any(cycle >= window.end for window in self._windows.values())
+
+    def log_repeats(self, cycle: int, *, final: bool = False) -> None:
+        """Remove each window that is over. For a window with repeats, log one event with their count and begin a new window.
+
+        Args:
+            cycle: number of the current cycle.
+            final: True at the end of a run: every window is over.
+        """
+        over = [(key, window) for key, window in self._windows.items() if final or cycle >= window.end]
+        for key, window in over:
+            del self._windows[key]
+            if window.repeats:
+                text = f"{window.latest.text} ({window.repeats} times since the last such event)"
+                self.events.append(replace(window.latest, cycle=cycle, text=text, count=window.repeats))
+                if not final:
+                    self._windows[key] = Window(cycle + FOLD_CYCLES, window.latest)
+
     def _log(self, cycle: int, dtc: Dtc, node: str, entry: Entry) -> None:
-        key = dtc, node, entry.confirmed
-        last = self._logged_at.get(key)
-        if last is not None and cycle - last < (QUIET_CONFIRMED if entry.confirmed else QUIET_PENDING):
-            return
-        self._logged_at[key] = cycle
         severity = dtc.severity if entry.confirmed else min(dtc.severity, Severity.WARNING, key=_SEVERITY_ORDER.index)
-        self.events.append(Event(cycle, event_code(dtc, entry.value), entry.text, severity.value, node, entry.value))
+        event = Event(cycle, event_code(dtc, entry.value), entry.text, severity.value, node, entry.value)
+        self.log(event, confirmed=entry.confirmed)
 
 
 _SEVERITY_ORDER = list(Severity)

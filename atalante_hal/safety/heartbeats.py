@@ -2,12 +2,13 @@
 
     slow process image -> heartbeats -> fault memory
 
-It follows CiA 301: each heartbeat has a timeout, a boot-up message reports a reset of its node, and an emergency stays active
-until the node sends error code 0 or the operator acknowledges it.
+The monitor follows CiA 301. Each heartbeat has a timeout. A boot-up message reports that the sender was reset. An emergency
+stays active until the sender reports error code 0, or until the operator acknowledges the emergency.
 """
 
 from __future__ import annotations
 
+from collections import defaultdict
 from typing import NamedTuple
 
 import numpy as np
@@ -21,7 +22,7 @@ from atalante_hal.wire.e2e import FULL, Check, suspect
 from atalante_hal.wire.frame import Frames
 from atalante_hal.wire.process_image import NEVER, ReceiveImage
 
-#: Values of NodeState (NMT states, CiA 301): the node has just started; the node is in normal operation.
+#: Values of the signal NodeState (CiA 301): 0 after the node has started, 5 in normal operation.
 BOOT_UP, OPERATIONAL = 0, 5
 #: Largest `Check` result of a frame with new data. It is a plain integer, because numpy compares integers ten times faster.
 _FRESH = int(Check.SOME_LOST)
@@ -29,7 +30,7 @@ _FRESH = int(Check.SOME_LOST)
 
 class _Status(NamedTuple):
     node: str
-    drive: bool  # True if the node is a drive, which the motor supply powers
+    drive: bool  # True if the node is a drive; only drives measure the motor supply voltage
     row: int  # row of the status message in the process image
     timeout: int  # timeout of the status message [cycles]
     state: int  # index of NodeState in the values of the process image
@@ -40,7 +41,7 @@ class _Status(NamedTuple):
 class Heartbeats:
     """Monitor of the status messages and emergencies of all nodes.
 
-    While `quiet` is True no node has a fault, and `judge` need not be called.
+    While `quiet` is True no node has a fault, and `evaluate` need not be called.
     """
 
     def __init__(self, network: Network, thresholds: Thresholds) -> None:
@@ -63,7 +64,7 @@ class Heartbeats:
         self._status_rows = np.array([s.row for s in self._statuses])
         self._timeouts = np.array([s.timeout for s in self._statuses])
         self._needed = {s.node for s in self._statuses if network.node(s.node).kind != "pendant"}
-        self._heard: set[str] = set()  # nodes that have sent a status message
+        self._reported: set[str] = set()  # nodes that have sent a status message
         self._emergency_of = {
             m.frame_id: (m.sender, codec.rows[m.name], codec.index(m.name, "ErrorCode"))
             for m in messages
@@ -72,22 +73,23 @@ class Heartbeats:
         self._status_of = {codec.messages[s.row].frame_id: s for s in self._statuses}
         self._amplitude, self._amplitude_row = codec.slice("Amplitude"), codec.rows["HAPTICS_STATE"]
         self._seen = 0  # cycle of the last call of `image.new_cycle`
-        #: Node -> diagnostic and error code of its active emergency. The entry is removed when the error is cleared.
+        #: Diagnostic and error code of the active emergency of each node. A cleared emergency is removed.
         self.emergencies: dict[str, tuple[Dtc, int]] = {}
         self._cleared: set[str] = set()  # nodes whose emergency was cleared in this cycle
-        #: Emergencies with the reaction INFO since the last `judge`: node, diagnostic, error code.
+        #: Emergencies with the reaction INFO and frames of error passive nodes since the last `evaluate`: node, diagnostic, error
+        #: code or 0.
         self._notices: list[tuple[str, Dtc, int]] = []
-        self._reset: set[str] = set()  # nodes that restarted since the last `judge`
-        #: Row of a message -> evidence that the message has two senders, 0 to `FULL`. A missing row has no evidence.
-        self._evidence: dict[int, int] = {}
-        #: Nodes that sent a boot-up message. The safety monitor clears this set after it has used it.
+        self._reset: set[str] = set()  # nodes that restarted since the last `evaluate`
+        #: Row -> counter that detects two senders of the message, 0 to `FULL`. A row without an entry has the counter 0.
+        self._evidence: defaultdict[int, int] = defaultdict(int)
+        #: Nodes that sent a boot-up message. The safety monitor empties this set after each use.
         self.booted: set[str] = set()
         #: True when every required node (all but the pendant) has sent a status message.
-        self.known = False
+        self.all_reported = False
         self.quiet = True
 
     def accept(self, frames: Frames, cycle: int, vibration: Vector) -> list[int]:
-        """Process the received frames that do not belong to the fast process image, one by one and in order.
+        """Process the frames that do not belong to the 1 ms process image, one by one in order of arrival.
 
         Args:
             frames: received frames, shape (n,).
@@ -100,15 +102,20 @@ class Heartbeats:
         image = self.image
         self._age(cycle)
         unknown = []
-        for place, frame_id in enumerate(frames["can_id"].tolist()):
+        for index, frame_id in enumerate(frames["can_id"].tolist()):
             refused = len(image.refused)
-            if image.accept_each(frames[place:], 1):
-                unknown.append(place)
+            if image.accept_each(frames[index:], 1):
+                unknown.append(index)
                 continue
             row = image.frame_ids[frame_id]
-            self._suspect(row, rival=image.refused[refused:] == [(row, Check.CONFLICT)])
-            if image.check[row] > _FRESH:
+            if image.error_passive:
+                self._notices.append((image.codec.messages[row].sender, Dtc.NODE_ERROR_PASSIVE, 0))
+                image.error_passive.clear()
                 self.quiet = False
+            self._suspect(row, rival=image.refused[refused:] == [(row, Check.CONFLICT)])
+            if len(image.refused) > refused:
+                self.quiet = False
+            if image.check[row] > _FRESH:
                 continue
             if frame_id in self._status_of:
                 self._take_status(self._status_of[frame_id])
@@ -119,7 +126,7 @@ class Heartbeats:
             vibration[:] = image.values[self._amplitude]
         return unknown
 
-    def judge(self, cycle: int, memory: FaultMemory) -> None:
+    def evaluate(self, cycle: int, memory: FaultMemory) -> None:
         """Raise the diagnostics of all nodes in the fault memory."""
         self._age(cycle)
         messages = self.image.codec.messages
@@ -142,26 +149,26 @@ class Heartbeats:
             memory.raise_dtc(cycle, dtc, node, value=code, text=text)
         self.quiet = not (self.emergencies or two_senders)
         for status in self._statuses:
-            self._judge_status(cycle, memory, status)
+            self._check_status(cycle, memory, status)
 
     def overdue(self, cycle: int) -> bool:
-        """Return whether a status message timed out. Call this periodically, because a lost message causes no call of `judge`."""
+        """Return whether a status message timed out. Call this periodically, because a lost message triggers no `evaluate`."""
         self._age(cycle)
         ages = self.image.age[self._status_rows]
         return bool(((ages >= self._timeouts) & (ages < NEVER)).any())
 
     def acknowledge(self, still_faulty: set[str]) -> None:
-        """Clear the emergencies of all nodes except the drives that are still in FAULT. Call this when START is pressed.
+        """Remove the emergencies of all nodes except the drives that are still in FAULT. Call this when START is pressed.
 
         Args:
             still_faulty: DBC names of the drives that are still in FAULT.
         """
-        self.emergencies = {node: said for node, said in self.emergencies.items() if node in still_faulty}
+        self.emergencies = {node: active for node, active in self.emergencies.items() if node in still_faulty}
 
-    def explains_fault(self, node: str) -> bool:
-        """Return whether an emergency explains the drive state FAULT of a node in this cycle.
+    def has_emergency(self, node: str) -> bool:
+        """Return whether a drive has an active emergency. If so, its drive state FAULT raises no additional diagnostic.
 
-        An emergency that was cleared in this cycle also counts, because the state frame of this cycle may still report FAULT.
+        The result is also True in the cycle in which the emergency is cleared, because the drive may still report FAULT.
 
         Args:
             node: DBC name of the drive.
@@ -171,8 +178,8 @@ class Heartbeats:
     def missing(self) -> set[str]:
         """Return the required nodes that have sent no status message, and the nodes that use a different DBC."""
         values = self.image.values
-        return (self._needed - self._heard) | {
-            s.node for s in self._statuses if s.node in self._heard and values[s.dbc_hash] != self._hash
+        return (self._needed - self._reported) | {
+            s.node for s in self._statuses if s.node in self._reported and values[s.dbc_hash] != self._hash
         }
 
     def _age(self, cycle: int) -> None:
@@ -184,18 +191,16 @@ class Heartbeats:
             self._seen = cycle
 
     def _suspect(self, row: int, *, rival: bool) -> None:
-        """Update the evidence that a message has two senders. Call this for each frame of the message.
+        """Update the counter that detects two senders of one message. Call this for each frame of the message.
 
-        A restarted sender can repeat the last counter once. Two senders repeat it often.
+        A restarted sender can repeat the last alive counter once, so one repeat is no proof of two senders. Two senders of one
+        message often send the same alive counter.
 
         Args:
             row: row of the frame in the process image.
-            rival: True if the frame has the same counter as the previous frame, but other bytes.
+            rival: True if the frame has the same alive counter as the previous frame, but other bytes.
         """
-        before = self._evidence.get(row, 0)
-        if rival or before:
-            self.quiet = False
-            self._evidence[row] = suspect(before, rival=rival)
+        self._evidence[row] = suspect(self._evidence[row], rival=rival)
 
     def _take_status(self, status: _Status) -> None:
         values = self.image.values
@@ -204,11 +209,11 @@ class Heartbeats:
             self.quiet = False
         if values[status.state] == BOOT_UP:
             self.booted.add(status.node)
-        if status.node not in self._heard:
-            self._heard.add(status.node)
-            self.known = self._heard.issuperset(self._needed)
-            if self.known:
-                self.quiet = False  # all required nodes are known, so the safety monitor must evaluate this cycle
+        if status.node not in self._reported:
+            self._reported.add(status.node)
+            self.all_reported = self._reported.issuperset(self._needed)
+            if self.all_reported:
+                self.quiet = False  # all required nodes have reported, so the safety monitor must evaluate this cycle
         elif values[status.state] != OPERATIONAL:
             self._reset.add(status.node)
 
@@ -223,7 +228,7 @@ class Heartbeats:
         else:
             self.emergencies[node] = dtc, code
 
-    def _judge_status(self, cycle: int, memory: FaultMemory, status: _Status) -> None:
+    def _check_status(self, cycle: int, memory: FaultMemory, status: _Status) -> None:
         age, values, node = int(self.image.age[status.row]), self.image.values, status.node
         if age >= NEVER:
             return

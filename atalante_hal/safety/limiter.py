@@ -2,13 +2,14 @@
 
     requested torque -> derated torque limit, envelope of position and velocity -> torque rate -> torque sent
 
-*Envelope.* The limit of the torque towards a position limit depends on the predicted position of the joint: the position after
-the time `look_ahead` at the present velocity. The torque limit is full up to the position limit and falls to zero over
-`position_margin` outside it. In the same way the limit of the torque in the direction of the velocity falls to zero between
-`velocity_max` and `velocity_max + velocity_margin`. A torque in the opposite direction brakes, and keeps the full limit: the
-envelope never reverses a torque and never weakens braking. The envelope is not a controller: without braking a joint reaches its
-end stop. The end stop is at the position limit or less than `position_margin` outside it, and must withstand the torque that
-presses the joint against it at rest. A gait may use the full range.
+*Envelope.* The limit of a torque that acts towards a position limit depends on the predicted position of the joint: the
+position after the time `look_ahead` at the current velocity. The torque limit is full while the predicted position is inside
+the position limit, and falls to zero over a distance of `position_margin` outside this limit. In the same way the limit of a
+torque in the direction of the velocity falls to zero between `velocity_max` and `velocity_max + velocity_margin`. A torque in
+the opposite direction brakes the joint and keeps the full limit. So the envelope never reverses a torque and never weakens
+braking. The envelope is not a controller: without braking a joint reaches its end stop. The end stop is at most
+`position_margin` outside the position limit. It must withstand the torque that presses a resting joint against it. A gait may
+use the full range.
 
 *Rate.* The torque changes by at most `torque_rate_max`, without exception. If the derating or the envelope reduces the limit
 below the torque of the last cycle, the torque approaches the new limit at this rate.
@@ -44,15 +45,15 @@ from atalante_hal.robot import JOINTS, Robot
 from atalante_hal.types import Vector
 
 _COUNT = len(JOINTS)
-#: Results of `limit`: all torques unchanged, torque of at least one joint reduced, an input not finite.
-_AS_ASKED, _CUT, _NOT_FINITE = range(3)
+#: Results of `limit`: all torques are unchanged, the torque of at least one joint was reduced, an input is not finite.
+_UNCHANGED, _CUT, _NOT_FINITE = range(3)
 
 
 @dataclass(frozen=True)
 class Limited:
     """Result of limiting one command."""
 
-    finite: bool  # False: an input was NaN or infinite and the whole command was ignored
+    finite: bool  # whether all inputs were finite; if not, the whole command was ignored
     clamped: bool  # the torque of at least one joint was cut
 
 
@@ -67,20 +68,21 @@ class JointLimits(NamedTuple):
     position_max: Vector  # (12,) highest position [rad]
     velocity_max: Vector  # (12,) highest velocity [rad/s]
     look_ahead: float  # prediction time of the position [s]
-    position_margin: float  # the torque falls to zero over this distance outside a position limit [rad]
-    velocity_margin: float  # the torque falls to zero over this excess above the highest velocity [rad/s]
+    position_margin: float  # distance outside a position limit at which the torque is zero [rad]
+    velocity_margin: float  # excess over `velocity_max` at which the torque is zero [rad/s]
 
 
 class Limiter:
     """Torque limiter of all joints, applied once per cycle.
 
-    A torque within the limits is passed on bit for bit.
+    A torque within the limits is not changed in any bit.
 
     Attributes:
         last: torque sent last, shape (12,) [Nm]; the rate limit is relative to it.
-        limit: present torque limit, shape (12,) [Nm].
-        cut: True for each joint whose torque was cut in the last `apply`, shape (12,); used for the anti-windup of a controller.
-        saturated: number of consecutive cycles, up to the last `apply`, in which a torque was cut.
+        limit: current torque limit, shape (12,) [Nm].
+        cut: True for each joint whose torque was reduced in the last `apply`, shape (12,). Controllers use it for
+            anti-windup.
+        saturated: number of consecutive cycles, up to the last `apply`, in which the torque of any joint was reduced.
     """
 
     def __init__(self, robot: Robot, period: float) -> None:
@@ -130,10 +132,10 @@ class Limiter:
         np.minimum(limit, self._torque_max, out=self.limit)
 
     def restart(self, torque: Vector) -> None:
-        """Restart the rate limit from the torque that the drives exert, clipped to the torque limit.
+        """Set the start value of the rate limit: the torque that the drives report, clipped to the torque limit.
 
         Args:
-            torque: torque reported by the drives, shape (12,) [Nm]; NaN and infinity count as 0.
+            torque: torque reported by the drives, shape (12,) [Nm]; NaN and infinity are replaced by 0.
         """
         finite = np.nan_to_num(torque, nan=0.0, posinf=0.0, neginf=0.0)
         np.clip(finite, -self.limit, self.limit, out=self.last)
@@ -141,35 +143,37 @@ class Limiter:
         self.cut.fill(False)
 
 
-_LIMITED = {_AS_ASKED: Limited(finite=True, clamped=False), _CUT: Limited(finite=True, clamped=True)}
+_LIMITED = {_UNCHANGED: Limited(finite=True, clamped=False), _CUT: Limited(finite=True, clamped=True)}
 
 
 def limit(
-    asked: Vector,
+    requested: Vector,
     motion: Vector,
     limits: JointLimits,
     torque_limit: Vector,
     last: Vector,
     cut: npt.NDArray[np.bool_],
 ) -> int:
-    """Limit the torque of all joints by torque limit, envelope and rate, as described in the module docstring.
+    """Limit the torque of all joints: torque limit, envelope and torque rate, as described in the module docstring.
 
     Args:
-        asked: requested torque, shape (12,) [Nm].
+        requested: requested torque, shape (12,) [Nm].
         motion: position [rad] and velocity [rad/s], shape (2, 12).
         limits: constant limits of the joints.
-        torque_limit: present torque limit, shape (12,) [Nm].
+        torque_limit: current torque limit, shape (12,) [Nm].
         last: torque sent in the last cycle, shape (12,) [Nm]; overwritten with the torque to be sent in this cycle.
         cut: True for each joint whose torque differs from the requested torque, shape (12,); overwritten.
 
     Returns:
-        `_AS_ASKED`, `_CUT`, or `_NOT_FINITE`; with `_NOT_FINITE` no output is changed.
+        `_UNCHANGED`, `_CUT`, or `_NOT_FINITE`; with `_NOT_FINITE` no output is changed.
     """
-    for joint in range(len(asked)):
-        if not (math.isfinite(asked[joint]) and math.isfinite(motion[0, joint]) and math.isfinite(motion[1, joint])):
+    for joint in range(len(requested)):
+        if not (
+            math.isfinite(requested[joint]) and math.isfinite(motion[0, joint]) and math.isfinite(motion[1, joint])
+        ):
             return _NOT_FINITE
-    done = _AS_ASKED
-    for joint in range(len(asked)):
+    done = _UNCHANGED
+    for joint in range(len(requested)):
         velocity, ahead = motion[1, joint], motion[0, joint] + limits.look_ahead * motion[1, joint]
         too_high = (ahead - limits.position_max[joint]) / limits.position_margin
         too_low = (limits.position_min[joint] - ahead) / limits.position_margin
@@ -179,8 +183,8 @@ def limit(
         down = torque_limit[joint] * share(max(too_low, too_fast_down))
         # If the torque limit falls below the torque of the last cycle, the torque decreases at the rate limit.
         lowest, highest = last[joint] - limits.step[joint], last[joint] + limits.step[joint]
-        sent = min(max(asked[joint], within(-down, lowest, highest)), within(up, lowest, highest))
-        cut[joint] = sent != asked[joint]
+        sent = min(max(requested[joint], within(-down, lowest, highest)), within(up, lowest, highest))
+        cut[joint] = sent != requested[joint]
         if cut[joint]:
             done = _CUT
         last[joint] = sent

@@ -1,17 +1,24 @@
-"""Message monitor, which decides from E2E result, age and trust of each cyclic message whether its data is valid.
+"""Decide whether the data of each cyclic message is valid: by its E2E result, its age and the trust in its sender.
 
     process image -> message monitor -> validity of each message; diagnostics -> fault memory -> state machine
 
-A message that was not committed raises a pending diagnostic. The diagnostic is confirmed when the data is as old as the timeout
-in the DBC. A leaky bucket for each message fills when more than a fifth of its frames are lost. A message whose bucket is full
-loses its trust. It is trusted again after 16 good cycles in a row.
+A received message that fails a check raises a pending diagnostic. The diagnostic is confirmed when the age of the data
+reaches the timeout in the DBC. Each message has a leaky bucket, which counts lost frames. The bucket fills if more than a fifth
+of the frames are lost. A message with a full bucket is no longer trusted. The message is trusted again after 16 good cycles in
+a row.
 
-Two senders of one message are detected by a second intact frame in the same cycle. This frame has the same counter as the
-accepted frame and other bytes, or a counter out of sequence. Four such cycles in a row confirm the diagnostic, and the message
-loses its trust.
+The robot tolerates single disturbances of a message: a frame that is received twice, a value outside its range or with the
+invalid code, a sender that is error passive. A leaky bucket of the same size counts each kind of disturbance of each message. It
+is full after 16 disturbed cycles in a row, or if more than a fifth of the cycles are disturbed. Then the diagnostic is confirmed,
+until 16 cycles in a row are undisturbed.
+
+Two senders of one message are detected by a second intact frame in the same cycle. The second frame has either the
+alive counter of the accepted frame but other bytes, or an alive counter out of sequence. Four such cycles in a row
+confirm the diagnostic. Then the message is no longer trusted.
 
 In single support it is safer to finish the walking step than to stop. So if a joint of the swing leg times out, the robot first
-finishes the step. If no message has arrived after twice the timeout (10 cycles), the robot goes to HOLD as for any other joint.
+finishes the step. It goes to HOLD if no message has arrived after twice the timeout (10 cycles). If any other joint times out,
+the robot goes to HOLD without a delay.
 """
 
 from __future__ import annotations
@@ -29,17 +36,17 @@ from atalante_hal.safety.fault_memory import FaultMemory
 from atalante_hal.wire.e2e import FULL, SETTLED, Check, Qualification, qualify, suspect
 from atalante_hal.wire.process_image import NEVER, ReceiveImage
 
-#: Check result of a rejected message -> diagnostic that becomes pending in the same cycle.
+#: Diagnostic that becomes pending when a message is rejected, by the check result of the message.
 PENDING = {
     Check.REPEATED: Dtc.E2E_REPEATED,
-    Check.CONFLICT: Dtc.E2E_REPEATED,  # only for one frame in a cycle; two frames are evidence of two senders, see `rivals_of`
+    Check.CONFLICT: Dtc.E2E_REPEATED,  # if only one frame of the message arrived in the cycle; otherwise see `rivals_of`
     Check.WRONG_SEQUENCE: Dtc.E2E_SEQUENCE,
     Check.CRC: Dtc.E2E_CRC,
     Check.LENGTH: Dtc.FRAME_LENGTH,
     Check.RANGE: Dtc.SIGNAL_RANGE,
     Check.INVALID: Dtc.SIGNAL_RANGE,
 }
-#: Last check result of a message -> diagnostic that is confirmed when the message times out.
+#: Diagnostic that is confirmed when a message times out, by the last check result of the message.
 CONFIRMED = {
     **PENDING,
     Check.OK: Dtc.NODE_LATE,
@@ -53,6 +60,13 @@ _RIVAL = (Check.CONFLICT, Check.WRONG_SEQUENCE)
 #: Check results of rejected frames that have the correct format and CRC.
 _INTACT = (*_RIVAL, Check.RANGE, Check.INVALID)
 _FRESH = int(Check.SOME_LOST)
+#: Diagnostic of a disturbance that is tolerated in single cycles, by the check result of the rejected frame. An INVALID frame of
+#: an IMU has another diagnostic, see `MessageMonitor`.
+_DISTURBANCES = {
+    Check.REPEATED: Dtc.E2E_REPEAT_RATE,
+    Check.RANGE: Dtc.SIGNAL_RANGE,
+    Check.INVALID: Dtc.SIGNAL_RANGE,
+}
 #: The robot goes to HOLD when the age of the data of a swing leg joint reaches this multiple of the message timeout.
 SWING_TIMEOUTS = 2
 
@@ -60,7 +74,8 @@ SWING_TIMEOUTS = 2
 class MessageMonitor:
     """Monitor of the cyclic messages in the 1 ms process image.
 
-    The pendant message is monitored in the same way, but confirms no diagnostic here: its loss counts as a stop by the operator.
+    The pendant message is monitored like all other messages, but its timeout confirms no diagnostic. If the pendant
+    message is lost, the robot stops as after the request STOP.
     """
 
     def __init__(self, network: Network, image: ReceiveImage) -> None:
@@ -76,31 +91,33 @@ class MessageMonitor:
         self._confirms = [kind != "pendant" for kind in kinds]
         self._needed = [row for row, kind in enumerate(kinds) if kind != "pendant"]
         self.qualification = [Qualification()] * len(messages)
-        #: For each row: evidence that its message has two senders, 0 to `FULL`.
+        #: For each row: counter that detects two senders of its message, 0 to `FULL`.
         self._evidence = [0] * len(messages)
+        #: Leaky bucket of each disturbance, by row and diagnostic. A disturbance without an entry has an empty bucket.
+        self._disturbed: dict[tuple[int, Dtc], Qualification] = {}
         #: True for each row that was trusted at least once. Other rows may belong to nodes that are not connected.
-        self._known = [False] * len(messages)
+        self._was_trusted = [False] * len(messages)
         #: True for each row with new, intact, trusted and plausible data, shape (rows,).
         self.valid: npt.NDArray[np.bool_] = np.zeros(len(messages), np.bool_)
         self.joints_valid = False
-        #: True if all rows are trusted and all leaky buckets are empty. Then a cycle with new data in all rows changes no result.
+        #: True if all rows are trusted and all leaky buckets are empty. Then cycles with new data in all rows change no result.
         self.settled = False
 
     @property
-    def nodes_well(self) -> bool:
+    def nodes_ready(self) -> bool:
         """Return whether every message except the pendant message is trusted."""
         return all(self.qualification[row].trusted for row in self._needed)
 
-    def trusts(self, row: int) -> bool:
-        """Return whether the sender of the message in a row is trusted."""
+    def is_trusted(self, row: int) -> bool:
+        """Return whether the sender of a message is trusted, by the row of the message."""
         return self.qualification[row].trusted
 
-    def hears(self, row: int) -> bool:
+    def in_time(self, row: int) -> bool:
         """Return whether the data of a row is younger than the timeout of its message."""
         return bool(self._image.age[row] < self._timeouts[row])
 
-    def judge(self, cycle: int, memory: FaultMemory, swing: int | None = None) -> None:
-        """Check all rows in one cycle. While `settled` is True, the call may be omitted in a cycle with new data in all rows.
+    def evaluate(self, cycle: int, memory: FaultMemory, swing: int | None = None) -> None:
+        """Check all rows in one cycle. If `settled` is True and all rows have new data, this call may be omitted.
 
         Args:
             cycle: number of the current cycle.
@@ -112,20 +129,47 @@ class MessageMonitor:
         rivals = rivals_of(image.refused, checks) if image.refused else frozenset()
         for row, result in image.refused:
             if result is Check.CONFLICT and row in rivals:
-                continue  # `_judge_senders` raises this diagnostic
+                continue  # `_check_senders` raises this diagnostic
             dtc = self._invalid[row] if result is Check.INVALID else PENDING[result]
             value = ages[row] if ages[row] < NEVER else 0
             memory.raise_dtc(cycle, dtc, self._senders[row], value=value, confirmed=False)
+        self._check_disturbances(cycle, memory)
         for row, check in enumerate(checks):
             rival = row in rivals
             if check or ages[row] or rival or self._evidence[row] or self.qualification[row] is not SETTLED:
-                self._judge_row(cycle, memory, row, Check(check), ages[row], swing, rival)
-        self.valid[:] = [check <= _FRESH and self.trusts(row) for row, check in enumerate(checks)]
+                self._check_row(cycle, memory, row, Check(check), ages[row], swing, rival)
+        self.valid[:] = [check <= _FRESH and self.is_trusted(row) for row, check in enumerate(checks)]
         self.joints_valid = bool(self.valid[self._joint_rows].all())
-        self.settled = image.all_fresh and not any(self._evidence) and all(q is SETTLED for q in self.qualification)
+        undisturbed = not (self._disturbed or any(self._evidence))
+        self.settled = image.all_fresh and undisturbed and all(q is SETTLED for q in self.qualification)
 
-    def _judge_senders(self, cycle: int, memory: FaultMemory, row: int, rival: bool) -> bool:
-        """Update the evidence that a message has two senders, and return whether two senders are confirmed.
+    def _check_disturbances(self, cycle: int, memory: FaultMemory) -> None:
+        """Update the leaky buckets of all disturbances, and raise the diagnostics of full buckets.
+
+        Args:
+            cycle: number of the current cycle.
+            memory: fault memory in which diagnostics are raised.
+        """
+        image = self._image
+        for row in image.error_passive:
+            memory.raise_dtc(cycle, Dtc.NODE_ERROR_PASSIVE, self._senders[row], confirmed=False)
+        now = [(row, Dtc.NODE_ERROR_PASSIVE) for row in image.error_passive]
+        now += [(row, self._disturbance_of(row, result)) for row, result in image.refused if result in _DISTURBANCES]
+        for key in dict.fromkeys([*now, *self._disturbed]):
+            bucket = self._disturbed[key] = qualify(self._disturbed.get(key, SETTLED), good=key not in now)
+            row, dtc = key
+            if bucket is SETTLED:
+                del self._disturbed[key]
+            elif not bucket.trusted:
+                sender = self._senders[row]
+                text = f"{sender}: {dtc.meaning}, more than a fifth of {self._messages[row]}"
+                memory.raise_dtc(cycle, dtc, sender, value=bucket.bucket, text=text)
+
+    def _disturbance_of(self, row: int, result: Check) -> Dtc:
+        return self._invalid[row] if result is Check.INVALID else _DISTURBANCES[result]
+
+    def _check_senders(self, cycle: int, memory: FaultMemory, row: int, rival: bool) -> bool:
+        """Update the counter that detects two senders of one message, and return whether two senders are confirmed.
 
         Args:
             cycle: number of the current cycle.
@@ -145,7 +189,7 @@ class MessageMonitor:
             memory.raise_dtc(cycle, Dtc.NODE_DUPLICATE, sender, value=evidence, confirmed=confirmed, text=text)
         return confirmed
 
-    def _judge_row(
+    def _check_row(
         self,
         cycle: int,
         memory: FaultMemory,
@@ -155,14 +199,15 @@ class MessageMonitor:
         swing: int | None,
         rival: bool,
     ) -> None:
-        sender, two_senders = self._senders[row], self._judge_senders(cycle, memory, row, rival)
+        sender, two_senders = self._senders[row], self._check_senders(cycle, memory, row, rival)
         fresh, late = check <= Check.SOME_LOST, age >= self._timeouts[row]
         # Impossible signal values do not reduce the trust, because the frame was transmitted correctly.
         good = (fresh or check >= Check.RANGE) and not rival
         now = self.qualification[row] = qualify(self.qualification[row], good=good, timed_out=late or two_senders)
-        self._known[row] |= now.trusted
-        confirmed = late and self._known[row] and self._confirms[row]
-        if confirmed and check is not Check.IMPLAUSIBLE:  # `plausibility` raises the diagnostic of this check result
+        self._was_trusted[row] |= now.trusted
+        confirmed = late and self._was_trusted[row] and self._confirms[row]
+        # A plausibility check that rejects the values of a message (IMPLAUSIBLE) raises its own diagnostic.
+        if confirmed and check is not Check.IMPLAUSIBLE:
             dtc = self._invalid[row] if check is Check.INVALID else CONFIRMED[check]
             text = f"{sender}: {dtc.meaning}; its data is {age} cycles old"
             in_swing = swing is not None and self._legs[row] == swing
@@ -173,7 +218,7 @@ class MessageMonitor:
             memory.raise_dtc(cycle, Dtc.NODE_LATE, sender, value=age, confirmed=False)
         if check is Check.SOME_LOST:
             memory.raise_dtc(cycle, Dtc.E2E_SOME_LOST, sender, value=age, confirmed=False)
-        if now.bucket == FULL and not now.trusted and self._known[row] and self._confirms[row]:
+        if now.bucket == FULL and not now.trusted and self._was_trusted[row] and self._confirms[row]:
             memory.raise_dtc(cycle, Dtc.E2E_LOSS_RATE, sender, value=now.bucket)
 
     def missing(self) -> set[str]:
@@ -182,9 +227,10 @@ class MessageMonitor:
 
 
 def rivals_of(refused: Sequence[tuple[int, Check]], checks: Sequence[int]) -> frozenset[int]:
-    """Return the rows with evidence of a second sender in this cycle.
+    """Return the rows whose frames in this cycle cannot all be from one sender.
 
-    Each of these rows received at least two intact frames in this cycle that cannot be from the same sender.
+    Each of these rows has at least two intact frames in this cycle. The check result of at least one rejected frame is
+    CONFLICT or WRONG_SEQUENCE.
 
     Args:
         refused: row and check result of each rejected frame.
@@ -192,7 +238,7 @@ def rivals_of(refused: Sequence[tuple[int, Check]], checks: Sequence[int]) -> fr
     """
     intact = Counter(row for row, result in refused if result in _INTACT)
     for row in intact:
-        intact[row] += checks[row] <= _FRESH or checks[row] == Check.IMPLAUSIBLE  # the committed frame counts as well
+        intact[row] += checks[row] <= _FRESH or checks[row] == Check.IMPLAUSIBLE  # the accepted frame is intact, too
     return frozenset(row for row, result in refused if result in _RIVAL and intact[row] > 1)
 
 

@@ -2,9 +2,9 @@
 
     process image, heartbeats, bus faults, plausibility, loop, controller -> fault memory -> state machine -> verdict
 
-The HAL transfers the data of each cycle and acts on the verdict. The safety monitor itself sends nothing. The evaluation is
-skipped in a cycle without a fault in which the pendant and the drives report the same values as before, because the result could
-not change.
+The HAL transfers the data of each cycle and acts on the verdict. The safety monitor itself sends no frames. The
+evaluation is skipped in a cycle without a fault if the pendant and the drives report the same values as before, because
+then the result cannot change.
 """
 
 from __future__ import annotations
@@ -28,11 +28,12 @@ from atalante_hal.safety.start import ENABLE_CYCLES, Refusal, StartRequest, entr
 from atalante_hal.safety.state_machine import MOVING, Conditions, next_state
 from atalante_hal.types import PERIOD, State, SupervisorState, Vector
 from atalante_hal.wire.cia402 import DriveState
+from atalante_hal.wire.e2e import SETTLED, Check, Qualification, qualify
 from atalante_hal.wire.frame import Frames
 from atalante_hal.wire.process_image import ReceiveImage
 
-#: Maximum duration of FINISH_STEP [cycles]; longer than a walking step.
-FINISH_STEP_CYCLES = 2000
+#: Maximum duration of FINISH_STEP [cycles]; longer than the rest of a walking step, a stop step and the shift of the weight back.
+FINISH_STEP_CYCLES = 6000
 
 #: DBC names of the drives, in joint order.
 DRIVE_NODES = tuple(joint.upper() for joint in JOINTS)
@@ -48,20 +49,23 @@ class Verdict(NamedTuple):
 
     supervisor: SupervisorState  # state of the state machine
     assistance_factor: float  # Xi in [0, 1]
-    torque_limit: Vector  # (12,) Nm, present torque limit of the drives; owned by the limiter
+    torque_limit: Vector  # (12,) Nm, torque limit of the drives in this cycle; the limiter owns the array
     diagnostics: int  # bit set of the active diagnostics, see `diagnostics.dtcs_of`
-    acknowledged: bool  # True: the operator pressed START, which acknowledges a bus-off
+    acknowledged: bool  # True if the operator pressed START, which acknowledges a bus-off
 
 
 class SafetyMonitor:
     """Safety monitor of one HAL.
 
     Attributes:
-        reason: reason for the present state, one sentence for the operator.
+        reason: reason for the current supervisor state, as one sentence for the operator.
         moving: True if the controller's torques are sent to the drives.
         step: number of the walking step, reported by the controller; None if the controller does not walk.
-        start_wanted: cycles left in which a pressed START can change the state; 0 if no START is being processed.
-        enabling: True while drives are being enabled; a drive that is already enabled receives torque.
+        walking: True while the robot walks on the ground, reported by the controller.
+        start_wanted: number of cycles in which a pressed START can still change the state; 0 if no START is being
+            processed.
+        enabling: True while drives are being enabled. In this time, drives that are already enabled receive a torque
+            command.
         lowered: DBC names of the drives that cannot hold and are being lowered.
     """
 
@@ -83,8 +87,8 @@ class SafetyMonitor:
             image: process image of the fast messages.
             state: state of the HAL; supervisor state, assistance factor and message validity are written to it.
             drive_side: drive states and temperatures [degC] of `state` as one view, shape (24,).
-            plausibility: plausibility checks, run by the HAL before `judge`.
-            limiter: torque limiter; its limit is derated with the drive temperatures.
+            plausibility: plausibility checks, run by the HAL before `evaluate`.
+            limiter: torque limiter; its torque limit is reduced when drives are hot.
         """
         self._robot, self._image, self._state, self._drive_side = robot, image, state, drive_side
         self._plausibility, self._limiter = plausibility, limiter
@@ -97,22 +101,25 @@ class SafetyMonitor:
         self.reason = "nothing has happened yet"
         self.moving = False
         self.step: int | None = None
+        self.walking = False
         self.start_wanted = 0
         self.enabling = False
         self.lowered: set[str] = set()
-        #: True if `judge` may skip cycles with new data and no fault in which the pendant and drive values have not changed.
+        #: True if `evaluate` may skip a cycle that has new data, no fault and the same pendant and drive values as before.
         self._steady = False
-        self._reports: list[Finding] = []  # faults that loop and controller reported since the last `judge`
+        self._reports: list[Finding] = []  # faults that loop and controller reported since the last `evaluate`
         self._acknowledged = False  # True if START was pressed in this cycle
+        #: Leaky bucket of each drive that is far weaker than the same drive of the other leg; no entry: the bucket is empty.
+        self._weak: dict[str, Qualification] = {}
         self._ending = False
-        self._barred = False  # True if another HAL was detected while this HAL was in OFF or READY
+        self._duplicate_found = False  # True if another HAL was detected while this HAL was in OFF or READY
         self._assistance_factor = state.assistance_factor  # assistance factor set by the operator
-        self._leading = False  # True while the assistance factor ramps to 1 or back
+        self._ramping = False  # True while the assistance factor ramps to 1 or back to the operator's value
         #: Number of the walking step in which FINISH_STEP began, and latest end of FINISH_STEP [cycle number].
         self._finish: tuple[int | None, int] = None, 0
-        self._drives_judged = b""  # drive states and temperatures of the last evaluation
+        self._drives_evaluated = b""  # drive states and temperatures of the last evaluation
 
-    def judge(self, bus_faults: Sequence[Finding] = ()) -> Verdict | None:
+    def evaluate(self, bus_faults: Sequence[Finding] = ()) -> Verdict | None:
         """Evaluate this cycle, unless all inputs are unchanged. Call this method after the plausibility checks.
 
         Args:
@@ -127,17 +134,17 @@ class SafetyMonitor:
             and self._image.all_fresh
             and not self._plausibility.findings
             and not bus_faults
-            and pendant.signals.tobytes() == pendant.heard
-            and self._drive_side.tobytes() == self._drives_judged
+            and pendant.signals.tobytes() == pendant.evaluated
+            and self._drive_side.tobytes() == self._drives_evaluated
         ):
             return None
-        self._judge(bus_faults)
+        self._evaluate(bus_faults)
         state = self._state
         limit, diagnostics = self._limiter.limit, self.memory.bits
         return Verdict(state.supervisor, state.assistance_factor, limit, diagnostics, self._acknowledged)
 
     def accept(self, frames: Frames) -> list[int]:
-        """Process the frames that are not fast cyclic messages to the HAL: status, emergencies and unknown frames.
+        """Process all frames except the 1 ms messages to the HAL: status messages, emergencies and unknown frames.
 
         Args:
             frames: received frames, shape (n,).
@@ -151,13 +158,13 @@ class SafetyMonitor:
         return unknown
 
     def report(self, dtc: Dtc, text: str, confirmed: bool = True, value: float = 0.0, cycle: int | None = None) -> None:
-        """Report a fault of the loop or the controller: log it immediately, and evaluate it in the next `judge`.
+        """Report a fault of the loop or the controller. The fault is logged immediately and evaluated in the next `evaluate`.
 
         Args:
             dtc: diagnostic trouble code.
             text: one sentence for the operator.
             confirmed: True if the reaction is due, False if the diagnostic is pending.
-            value: measured value; quantity and unit depend on the code.
+            value: measured value. Its quantity and unit depend on the code.
             cycle: cycle in which the fault occurred; default: the current cycle.
         """
         cycle = self._state.cycle if cycle is None else cycle
@@ -167,12 +174,16 @@ class SafetyMonitor:
         self._steady = False
 
     def end(self) -> None:
-        """Request HOLD from the next cycle on, because the program is ending."""
+        """Request HOLD, starting with the next cycle, because the program is ending."""
         self._ending, self._steady = True, False
 
-    def look_for_heartbeats(self) -> None:
-        """Check whether a status message timed out. Call this periodically, because cycles without a fault are not evaluated."""
-        if self._heartbeats.overdue(self._state.cycle):
+    def check_timeouts(self) -> None:
+        """Check whether a status message timed out, or whether repeats of an event must be logged.
+
+        Call this periodically, because cycles without a fault are not evaluated.
+        """
+        cycle = self._state.cycle
+        if self._heartbeats.overdue(cycle) or self.memory.window_over(cycle):
             self._steady = False
 
     @property
@@ -184,91 +195,117 @@ class SafetyMonitor:
         """Return the nodes that prevent READY: timed out, not trusted yet, without a status message, or with a different DBC."""
         return self._message_monitor.missing() | self._heartbeats.missing()
 
-    def _judge(self, bus_faults: Sequence[Finding]) -> None:
+    def _evaluate(self, bus_faults: Sequence[Finding]) -> None:
         """Raise all diagnostics of this cycle, run the state machine, and apply the reactions."""
         state, memory, cycle = self._state, self.memory, self._state.cycle
         message_monitor, pendant = self._message_monitor, self._pendant
-        message_monitor.judge(cycle, memory, self._plausibility.swing)
+        message_monitor.evaluate(cycle, memory, self._plausibility.swing)
         state.joints_valid = message_monitor.joints_valid
-        self._heartbeats.judge(cycle, memory)
+        self._heartbeats.evaluate(cycle, memory)
         for node in self._heartbeats.booted:
             self._plausibility.reference(node)
         self._heartbeats.booted.clear()
         for finding in (*bus_faults, *self._plausibility.findings, *self._reports):
             memory.raise_finding(cycle, finding)
         self._reports.clear()
-        nodes_well = message_monitor.nodes_well and self._heartbeats.known
-        self._judge_drives(nodes_well)
-        if self._barred:
+        nodes_ready = message_monitor.nodes_ready and self._heartbeats.all_reported
+        self._check_drives(nodes_ready)
+        if self._duplicate_found:
             memory.raise_dtc(
                 cycle, Dtc.HAL_DUPLICATE, "HAL", text="another HAL sends on this bus: end one, start again"
             )
         row = pendant.row
-        pendant.hear(message_monitor.trusts(row), qualifying=message_monitor.hears(row), beside=self._image.beside(row))
+        pendant.evaluate(
+            message_monitor.is_trusted(row),
+            qualifying=message_monitor.in_time(row),
+            new=bool(self._image.check[row] <= Check.SOME_LOST),
+            further_frames=self._image.decode_further_frames(row),
+        )
+        walk_end_requested = self.walking and pendant.stop_requested and not pendant.hold_requested
         memory.close_cycle(cycle)
-        self._barred |= Dtc.HAL_DUPLICATE in memory.confirmed and state.supervisor in (_S.OFF, _S.READY)
-        self._judge_start(nodes_well)
+        self._duplicate_found |= Dtc.HAL_DUPLICATE in memory.confirmed and state.supervisor in (_S.OFF, _S.READY)
+        self._process_start(nodes_ready)
         self.conditions = Conditions(
             diagnostics=memory.confirmed,
-            nodes_well=nodes_well,
+            nodes_ready=nodes_ready,
             drives_enabled=state.drive_state.tobytes() == _ENABLED,
             dead_man=pendant.dead_man,
-            stop_requested=pendant.stop_requested or self._ending,
+            stop_requested=(pendant.stop_requested and not walk_end_requested) or self._ending,
             start_wanted=self.start_wanted > 0,
             step_finished=self.step is None or self.step != self._finish[0] or cycle >= self._finish[1],
+            walk_end_requested=walk_end_requested,
         )
         before = state.supervisor
         after, reasons = next_state(before, self.conditions)
         if after is not before:
             self._enter(before, after, reasons)
-        elif after is _S.OFF and reasons:
+        elif reasons and (after is _S.OFF or Dtc.BUS_DOWN in reasons):
+            # The state stays, but its reason is updated. Example: a lost interface was down, and has been removed since.
             self.reason = memory.text_of(reasons)
-        self._lead_assistance()
-        self._let_down()
+        self._update_assistance()
+        self._update_lowered()
         self._steady = (
             after is before
             and message_monitor.settled
             and self._heartbeats.quiet
-            and not (memory.active or self.start_wanted or self._leading or after is _S.FINISH_STEP or self._ending)
+            and not (
+                memory.active
+                or self._weak
+                or self.start_wanted
+                or self._ramping
+                or after is _S.FINISH_STEP
+                or self._ending
+            )
         )
 
-    def _judge_drives(self, nodes_well: bool) -> None:
+    def _check_drives(self, nodes_ready: bool) -> None:
         state, memory = self._state, self.memory
         drives = self._drive_side.tobytes()
-        if drives != self._drives_judged:
-            self._drives_judged = drives
+        if drives != self._drives_evaluated:
+            self._drives_evaluated = drives
             self._limiter.derate(self._robot.torque_limit(state.temperature))
-        self._judge_derating()
+        self._check_derating()
         if state.drive_state.tobytes() == _ENABLED:
             return
         for node, drive in zip(DRIVE_NODES, state.drive_state.tolist(), strict=True):
             if drive in _FAULTY:
-                # If the drive sent an emergency, the reaction follows from the emergency and not from the drive state.
-                if not self._heartbeats.explains_fault(node) and (nodes_well or state.supervisor is not _S.OFF):
+                # If the drive sent an emergency, the reaction depends on the emergency and not on the drive state.
+                if not self._heartbeats.has_emergency(node) and (nodes_ready or state.supervisor is not _S.OFF):
                     memory.raise_dtc(state.cycle, Dtc.DRIVE_FAULT, node, value=drive)
             elif drive != DriveState.OPERATION_ENABLED and self.moving:
                 memory.raise_dtc(state.cycle, Dtc.DRIVE_STATE, node, value=drive)
 
-    def _judge_derating(self) -> None:
+    def _check_derating(self) -> None:
+        """Report each drive whose torque limit is reduced because of its temperature.
+
+        A single high temperature is no reason to stop. The diagnostic is confirmed if a drive is far weaker than the same drive
+        of the other leg in 16 cycles in a row, or in more than a fifth of the cycles.
+        """
         limit, full = self._limiter.limit, self._robot.torque_max
-        if limit.tobytes() == full.tobytes():
+        if limit.tobytes() == full.tobytes() and not self._weak:
             return
         share = (limit / full).tolist()
-        for place, (node, mine, twins) in enumerate(
+        for index, (node, mine, twins) in enumerate(
             zip(DRIVE_NODES, share, share[len(share) // 2 :] + share, strict=False)
         ):
-            if mine < 1.0:
-                text = f"{node}: its torque limit is {limit[place]:.0f} of {full[place]:.0f} Nm because it is hot"
-                confirmed = mine < self._robot.thresholds.derated_imbalance * twins
+            weak = mine < self._robot.thresholds.derated_imbalance * twins
+            bucket = qualify(self._weak.pop(node, SETTLED), good=not weak)
+            if bucket is not SETTLED:
+                self._weak[node] = bucket
+            if mine < 1.0 or not bucket.trusted:
+                text = f"{node}: its torque limit is {limit[index]:.0f} of {full[index]:.0f} Nm because it is hot"
+                if not weak and not bucket.trusted:
+                    text = f"{node}: its temperature changes between normal and hot"
+                confirmed = not bucket.trusted
                 self.memory.raise_dtc(
-                    self._state.cycle, Dtc.DERATED, node, value=limit[place], confirmed=confirmed, text=text
+                    self._state.cycle, Dtc.DERATED, node, value=limit[index], confirmed=confirmed, text=text
                 )
 
-    def _judge_start(self, nodes_well: bool) -> None:
+    def _process_start(self, nodes_ready: bool) -> None:
         """Process a START until the state changes, `ENABLE_CYCLES` are over, or the start is refused.
 
         Args:
-            nodes_well: True if every required node is trusted and has sent a status message.
+            nodes_ready: True if every required node is trusted and has sent a status message.
         """
         state, pendant = self._state, self._pendant
         self._acknowledged = False
@@ -283,15 +320,15 @@ class SafetyMonitor:
             self.start_wanted -= 1
         else:
             return
-        if ended := refusal(self._robot, self._start_request(nodes_well)):
+        if ended := refusal(self._robot, self._start_request(nodes_ready)):
             self._end_start(ended)
 
     @property
-    def hindered(self) -> bool:
+    def start_prevented(self) -> bool:
         """Return whether a confirmed diagnostic prevents the drives from being enabled."""
         return bool(self.memory.worst())
 
-    def _start_request(self, nodes_well: bool) -> StartRequest:
+    def _start_request(self, nodes_ready: bool) -> StartRequest:
         state, pendant = self._state, self._pendant
         return StartRequest(
             supervisor=state.supervisor,
@@ -301,7 +338,7 @@ class SafetyMonitor:
             stop_requested=pendant.stop_requested,
             dead_man=pendant.dead_man,
             diagnostic=self.memory.text_of(self.memory.worst()),
-            nodes_well=nodes_well,
+            nodes_ready=nodes_ready,
             missing=self.missing(),
             drive_state=state.drive_state,
             torque=state.torque,
@@ -309,51 +346,55 @@ class SafetyMonitor:
 
     def _end_start(self, ended: Refusal) -> None:
         self.start_wanted = 0
+        # Each START of the operator gets its own event; events of several STARTs within one second are not merged.
         self.memory.events.append(Event(self._state.cycle, ended.code, ended.text, ended.severity))
         self.reason = ended.text
 
     def _enter(self, before: SupervisorState, after: SupervisorState, reasons: frozenset[Dtc]) -> None:
         state, memory = self._state, self.memory
         state.supervisor = after
-        # Clear the START request, because one START may change the state only once.
+        # Remove the START request, because one START may change the state only once.
         self.start_wanted = 0
-        self._pendant.forget_press()
+        self._pendant.clear_press()
         self.moving = after in MOVING
+        self.walking = self.walking and self.moving
         if Dtc.OPERATOR_STOP in reasons:
             text = "the program is ending" if self._ending else stop_text(self._pendant.stop_requested)
             memory.raise_dtc(state.cycle, Dtc.OPERATOR_STOP, "PENDANT", text=text)
         if reasons:
             self.reason = memory.text_of(reasons) or self.reason
-        elif before is not _S.FINISH_STEP:  # after FINISH_STEP, HOLD has the same reason
+        elif before is not _S.FINISH_STEP:  # FINISH_STEP and the HOLD that follows have the same reason
             self.reason = entry_text(after, self.missing())
+        if after is _S.ACTIVE and before not in MOVING:
+            memory.log_repeats(state.cycle, final=True)  # the reason for the next HOLD has an event of its own
         if after is _S.ACTIVE and before not in MOVING and not self.enabling:
             self._limiter.restart(state.torque)
         if after is _S.FINISH_STEP:
             self._finish = self.step, state.cycle + FINISH_STEP_CYCLES
-        self._leading = self.moving and before in MOVING
+        self._ramping = self.moving and before in MOVING
         severity = "error" if after is _S.FAULT else "info"
-        text = f"{before.name} -> {after.name}" + (f": {self.reason}" if reasons else "")
+        text = f"{before.name} -> {after.name}" + (f": {self.reason}" if reasons or after is _S.FINISH_STEP else "")
         self.memory.events.append(Event(state.cycle, after.name, text, severity, value=after))
 
-    def _lead_assistance(self) -> None:
+    def _update_assistance(self) -> None:
         """Set the assistance factor to the operator's value, or ramp it to 1 in FULL_ASSIST and FINISH_STEP.
 
-        If the robot is ACTIVE again, the factor is ramped back to the operator's value.
+        When the robot returns to ACTIVE, ramp the factor back to the operator's value.
         """
         state, wanted = self._state, self._pendant.assistance_factor
         if wanted is not None:
             self._assistance_factor = wanted
-        led = state.supervisor in (_S.FULL_ASSIST, _S.FINISH_STEP)
-        target = 1.0 if led else self._assistance_factor
-        if self._leading:
+        full = state.supervisor in (_S.FULL_ASSIST, _S.FINISH_STEP)
+        target = 1.0 if full else self._assistance_factor
+        if self._ramping:
             step, way = PERIOD / self._robot.thresholds.full_assist_ramp, target - state.assistance_factor
             state.assistance_factor += max(-step, min(step, way))
-            self._leading = state.assistance_factor != target
-        elif not led:
+            self._ramping = state.assistance_factor != target
+        elif not full:
             state.assistance_factor = target
 
-    def _let_down(self) -> None:
-        """Update `lowered`: in LOWER and FAULT the drives with a confirmed LOWER diagnostic, otherwise none."""
+    def _update_lowered(self) -> None:
+        """Add drives with a confirmed LOWER diagnostic to `lowered` in LOWER and FAULT; empty `lowered` in other states."""
         if self._state.supervisor in (_S.LOWER, _S.FAULT):
             lower = frozenset(dtc for dtc in self.memory.confirmed if dtc.reaction is Reaction.LOWER)
             self.lowered.update(node for node in self.memory.nodes_of(lower) if node in DRIVE_NODES)

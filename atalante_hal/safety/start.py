@@ -1,9 +1,9 @@
-"""Refusal of a START: one pure function decides in each cycle whether the drives may be enabled.
+"""Refusal of a START: the function `refusal` decides in each cycle whether the drives may be enabled.
 
     pendant, diagnostics, nodes, drive state, reported torque -> refusal -> safety monitor, event START_REFUSED or START_FAILED
 
-At a start the HAL first commands the torque that the drives report, so that no joint sags. Without the check of the reported
-torques it would also command a torque that a drive cannot produce.
+At a start the HAL first commands the torque that the drives report, so that no joint sags. Without a check of the
+reported torques, the HAL would also command a torque that a drive cannot produce.
 """
 
 from __future__ import annotations
@@ -18,16 +18,18 @@ from atalante_hal.robot import JOINTS, Robot
 from atalante_hal.types import SupervisorState, Vector
 from atalante_hal.wire.cia402 import DriveState
 
-#: Time from START within which all drives must reach OPERATION ENABLED [cycles].
+#: Longest time after START until all drives must be in OPERATION ENABLED [cycles].
 ENABLE_CYCLES = 200
 #: Prefix of the event text for a refused START.
 REFUSED = "START refused: "
+#: Reason for FINISH_STEP and the HOLD that follows, if the operator requested STOP while the robot walked on the ground.
+WALK_ENDS = "the operator asked to stop, so the walk ends on both feet"
 _S = SupervisorState
-#: States in which START only acknowledges faults. An acknowledged fault may take some cycles to clear.
+#: States in which START only acknowledges faults. An acknowledged fault may stay active for some cycles.
 _ACKNOWLEDGING = (_S.LOWER, _S.FAULT)
 #: States in which START enables the drives.
 _ENABLING = (_S.READY, _S.HOLD)
-#: States in which a drive produces torque. In all other states it can at most brake.
+#: States in which a drive produces torque. In all other states a drive can only brake its joint.
 POWERED = (DriveState.OPERATION_ENABLED, DriveState.QUICK_STOP_ACTIVE)
 _NAMES = {float(state): state.name for state in DriveState}
 
@@ -53,9 +55,9 @@ class StartRequest(NamedTuple):
     ending: bool  # True if the program is ending
     stop_requested: bool  # True if the operator requests STOP or HOLD
     dead_man: bool  # True if the dead-man is pressed and the pendant has not timed out
-    diagnostic: str  # text of the worst confirmed diagnostic that demands a reaction; empty: none
-    nodes_well: bool  # True if every required node is trusted and has sent its status
-    missing: Collection[str]  # DBC names of the nodes that prevent `nodes_well`
+    diagnostic: str  # text of the worst confirmed diagnostic that demands a reaction; empty if there is none
+    nodes_ready: bool  # True if every required node is trusted and has sent its status
+    missing: Collection[str]  # DBC names of the nodes that make `nodes_ready` False
     drive_state: Vector  # (12,) values of `DriveState`
     torque: Vector  # (12,) Nm, torque reported by each drive
 
@@ -71,14 +73,15 @@ class Refusal(NamedTuple):
 def refusal(robot: Robot, request: StartRequest) -> Refusal | None:
     """Return why a START must end in this cycle; None if it may continue.
 
-    In the cycle in which START is pressed, diagnostics count only in OFF, because START may just have acknowledged them.
+    In the cycle in which START is pressed, diagnostics are ignored in all states except OFF, because the same START may
+    have acknowledged them. A released dead-man, a STOP or the end of the program refuses the START at once.
 
     Args:
-        robot: source of the torque limits and of the torque that an idle drive may report.
+        robot: torque limits, and `idle_torque`, the largest torque that an idle drive may report.
         request: conditions of the START in this cycle.
     """
     if request.pressed:
-        reason = request.diagnostic if request.supervisor is _S.OFF else ""
+        reason = _stop_reason(request) or (request.diagnostic if request.supervisor is _S.OFF else "")
     else:
         reason = _reason(request)
         if not (reason or request.cycles_left):
@@ -90,33 +93,40 @@ def refusal(robot: Robot, request: StartRequest) -> Refusal | None:
 
 
 def _reason(request: StartRequest) -> str:
-    """Return why the start must end, without a check of the drive torques; empty if the start may continue."""
+    """Return why the start must end, or an empty text if it may continue. The drive torques are not checked here."""
+    if reason := _stop_reason(request):
+        return reason
+    if request.supervisor in _ACKNOWLEDGING:
+        return ""
+    if request.diagnostic or request.nodes_ready:
+        return request.diagnostic
+    return missing_text(request.missing)
+
+
+def _stop_reason(request: StartRequest) -> str:
+    """Return why the operator or the program forbids a start, or an empty text."""
     if request.ending:
         return "the program is ending"
     if request.stop_requested or not request.dead_man:
         return stop_text(request.stop_requested)
-    if request.supervisor in _ACKNOWLEDGING:
-        return ""
-    if request.diagnostic or request.nodes_well:
-        return request.diagnostic
-    return missing_text(request.missing)
+    return ""
 
 
 def missing_text(missing: Collection[str]) -> str:
     """Return which nodes prevent READY, as one sentence.
 
     Args:
-        missing: DBC names of the nodes that are not well.
+        missing: DBC names of the nodes that prevent READY.
     """
     return f"no answer or not trusted yet: {', '.join(sorted(missing))}"
 
 
 def entry_text(state: SupervisorState, missing: Collection[str]) -> str:
-    """Return the reason for a state that no diagnostic demanded, as one sentence.
+    """Return one sentence that explains why the HAL entered a state, for a state entered without a diagnostic.
 
     Args:
         state: state that was entered.
-        missing: DBC names of the nodes that are not well.
+        missing: DBC names of the nodes that prevent READY.
     """
     match state:
         case _S.OFF:
@@ -125,6 +135,8 @@ def entry_text(state: SupervisorState, missing: Collection[str]) -> str:
             return "every required node answers and no diagnostic prevents a start"
         case _S.ACTIVE:
             return "the operator pressed START"
+        case _S.FINISH_STEP:
+            return WALK_ENDS
         case _:
             return "the operator acknowledged the fault with START"
 
@@ -139,17 +151,17 @@ def stop_text(stop_requested: bool) -> str:
 
 
 def implausible_torque(robot: Robot, drive_state: Vector, torque: Vector) -> str | None:
-    """Return which drive reports a torque that is impossible in its state; None if all torques are plausible.
+    """Return a sentence about a drive whose reported torque is impossible in its state; None if there is no such drive.
 
     Args:
-        robot: source of the torque limits and of the torque that an idle drive may report.
+        robot: torque limits, and `idle_torque`, the largest torque that an idle drive may report.
         drive_state: values of `DriveState`, shape (12,).
         torque: torque reported by each drive, shape (12,) [Nm at the joint].
     """
     idle = robot.thresholds.idle_torque
     on = powered(drive_state)
     allowed = np.where(on, robot.torque_max, 0.0) + idle
-    wrong = np.flatnonzero(~(np.abs(torque) <= allowed))  # the negation also rejects NaN
+    wrong = np.flatnonzero(~(np.abs(torque) <= allowed))  # `~(... <= ...)` is also True for NaN
     if not wrong.size:
         return None
     joint = int(wrong[0])

@@ -1,5 +1,5 @@
-"""Telemetry: the loop writes to shared-memory rings, and a separate process publishes and records their contents.
+"""Telemetry: the loop writes to ring buffers in shared memory, and a separate process publishes and records the data.
 
-`ring`, `frames` and `process` are used in the process of the loop and import no network, recording or CAN library. `publisher`
-(Zenoh), `recorder` (MCAP), `can_log` (python-can) and `messages` (protobuf) are used only in the telemetry process.
+`ring`, `frames` and `process` are used in the process of the loop. They import no library for networks, recordings or CAN.
+`publisher` (Zenoh), `recorder` (MCAP), `can_log` (python-can) and `messages` (protobuf) are used only in the telemetry process.
 """

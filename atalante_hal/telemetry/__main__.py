@@ -1,13 +1,15 @@
-"""Telemetry process, started by `process.TelemetryProcess` as `python -m atalante_hal.telemetry ARGUMENTS`.
+"""Telemetry process, started by `child.TelemetryChild` as `python -m atalante_hal.telemetry`.
 
-ARGUMENTS is a JSON object with the configuration, the inherited descriptors of the rings, the number of telemetry processes that
-this one replaces, and the endpoint of the last of them. The process prints one JSON line when everything is open or opening has
-failed, and another line with a summary at the end.
+The process imports its modules, then reads its arguments from standard input: a JSON object with the configuration, the inherited
+file descriptors of the rings, the number of restarts in this session, and the endpoint of the telemetry process that this
+process replaces. The process prints one JSON line when all files and sockets are open, or when a file or a socket cannot be
+opened. At its end the process prints another JSON line with a summary.
 """
 
 from __future__ import annotations
 
 import contextlib
+import importlib
 import json
 import logging
 import os
@@ -30,7 +32,7 @@ if TYPE_CHECKING:
 _INSTALL = "install it with `pip install 'atalante-hal[telemetry]'`"
 
 
-#: Time limit for closing the Zenoh session [s]. If it is exceeded, SIGALRM ends the process; the files are already closed.
+#: Time limit for closing the Zenoh session [s]. After this time SIGALRM ends the process; its files are already closed.
 _SESSION_END = 1.0
 
 
@@ -43,12 +45,12 @@ class Outlets:
         config: Telemetry configuration.
         records: Reader of the ring of cycle records.
         frames: Reader of the ring of CAN frames; None without a CAN log.
-        restarts: Number of telemetry processes that this one replaces.
-        before: Endpoint of the last replaced process; None if there is none.
+        restarts: Number of earlier telemetry processes of this session.
+        before: Endpoint of the telemetry process that this process replaces; None if there is none.
 
     Raises:
-        SinkError: If a requested file or endpoint cannot be opened. A failure of the default endpoint (a free port of the
-            loopback) or of any endpoint after a restart is only a notice, so that the recording continues.
+        SinkError: If a requested file cannot be opened, or if the requested endpoint cannot be opened at the first start.
+            After a restart, or if no endpoint was requested, a missing publisher is only added to `notices`.
     """
 
     def __init__(
@@ -95,13 +97,13 @@ class Outlets:
         return self.publisher.endpoint if self.publisher is not None else None
 
     def sinks(self, config: TelemetryConfig) -> list[tuple[MessageSink, int]]:
-        """Return recorder and publisher, each with the number of cycles between two messages of a stream.
+        """Return the open recorder and publisher, each with its message period [cycles].
 
         Args:
             config: Telemetry configuration with the rates.
 
         Returns:
-            (sink, cycles) of each open sink.
+            (sink, number of cycles from one message of a stream to the next) of each open sink.
         """
         pairs = ((self.recorder, config.record_rate), (self.publisher, config.stream_rate))
         return [(sink, CYCLES_PER_SECOND // rate) for sink, rate in pairs if sink is not None]
@@ -153,22 +155,26 @@ def _open_publisher(config: TelemetryConfig, streams: list[tuple[str, str]], bef
 
 
 def _print_line(line: dict[str, Any]) -> None:
-    """Print one JSON line for the parent process. A parent process that has ended causes no error."""
+    """Print one JSON line for the parent process. If the parent process has ended, do nothing."""
     with contextlib.suppress(BrokenPipeError):
         os.write(sys.stdout.fileno(), json.dumps(line).encode() + b"\n")
 
 
 def _leave_realtime() -> None:
-    """Leave the real-time scheduling that this process inherited from the control loop."""
+    """Return to normal scheduling, because this process inherits the real-time scheduling of the control loop."""
     if os.sched_getscheduler(0) != os.SCHED_OTHER:
         os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
 
 
-def main(text: str) -> int:
-    """Run the telemetry process until the rings are closed or SIGTERM arrives.
+def _import_outlets() -> None:
+    """Import the modules of the sinks, so that they open quickly. A package that is missing is reported later."""
+    for name in ("messages", "recorder", "publisher"):
+        with contextlib.suppress(ImportError):
+            importlib.import_module(f"atalante_hal.telemetry.{name}")
 
-    Args:
-        text: JSON object, see the module docstring.
+
+def main() -> int:
+    """Run the telemetry process until the rings are closed or SIGTERM arrives.
 
     Returns:
         Exit code: 0, or 1 if a sink could not be opened.
@@ -178,9 +184,13 @@ def main(text: str) -> int:
     signal.signal(signal.SIGTERM, lambda number, _: stop.append(number))
     logging.basicConfig(level=logging.WARNING)
     _leave_realtime()
+    _import_outlets()
+    text = sys.stdin.read()
+    if not text:
+        return 0  # the session ended before its start
     arguments = json.loads(text)
-    config = TelemetryConfig.from_json(arguments["config"])
     fds: dict[str, int] = arguments["rings"]
+    config = TelemetryConfig.from_json(arguments["config"])
     with contextlib.ExitStack() as stack:
         records, events = (stack.enter_context(RingReader(fds[name])) for name in ("records", "events"))
         frames = stack.enter_context(RingReader(fds["frames"])) if "frames" in fds else None
@@ -216,4 +226,4 @@ def main(text: str) -> int:
 
 
 if __name__ == "__main__":
-    sys.exit(main(sys.argv[1]))
+    sys.exit(main())

@@ -1,4 +1,4 @@
-"""Access control of the telemetry endpoint: TLS certificates and users, and the telemetry file with these settings.
+"""Access control of the telemetry endpoint: TLS certificates, users, and the telemetry file with these settings.
 
 `telemetry file -> TelemetryConfig -> publisher`. Without these settings every client that reaches the endpoint may subscribe. The
 default endpoint (loopback) can be reached only from this machine. A subscriber can only receive, see `publisher`.
@@ -12,11 +12,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-#: Keys of a telemetry file. The values of the first group are texts; those of the second are paths relative to that file.
+# Keys of a telemetry file. The value of a key in _TEXTS is a text, in _FILES a path relative to the telemetry file.
 _TEXTS, _FILES = ("robot", "listen"), ("certificate", "private_key", "client_ca", "users")
 
 
-#: Valid protocols of an endpoint with a TLS certificate and of an endpoint without one. The first of each group is the default.
+# Valid protocols of an endpoint: _PROTECTED if there is a TLS certificate, otherwise _UNPROTECTED. The first is the default.
 _PROTECTED, _UNPROTECTED = ("tls", "quic"), ("tcp",)
 #: Valid endpoint: protocol, host, port. Zenoh's suffixes `?` and `#` are rejected, because they override TLS settings.
 _ENDPOINT = re.compile(r"(?P<protocol>[^/]+)/(?:[A-Za-z0-9._-]+|\[[0-9A-Fa-f:.]+\]):(?P<port>[0-9]{1,5})", re.ASCII)
@@ -24,7 +24,7 @@ _LARGEST_PORT = 65535
 
 
 class AccessError(RuntimeError):
-    """Error in the telemetry file or in a file it names; the message names the key and its valid values."""
+    """Error in the telemetry file or in a file that it refers to; the message names the key and its valid values."""
 
     code = "CONFIG_INVALID"
 
@@ -33,10 +33,10 @@ class AccessError(RuntimeError):
 class Access:
     """Files that restrict the access to the endpoint. Without these files, every client may subscribe."""
 
-    certificate: Path | None = None  # PEM certificate of the publisher; if it is given, the endpoint uses TLS
-    private_key: Path | None = None  # PEM private key of the publisher; only its owner may have access
+    certificate: Path | None = None  # PEM certificate of the publisher; the endpoint uses TLS only if it is given
+    private_key: Path | None = None  # PEM private key of the publisher; only the owner of the file may have access
     client_ca: Path | None = None  # PEM certificate of the authority that signs the certificates of the subscribers
-    users: Path | None = None  # file with one line "name:password" per user; only its owner may have access
+    users: Path | None = None  # file of lines "name:password", one per user; only the owner of the file may have access
 
     def __post_init__(self) -> None:
         if (self.certificate is None) != (self.private_key is None):
@@ -96,10 +96,10 @@ def load_telemetry_file(path: Path) -> dict[str, Any]:
 
     Args:
         path: TOML file with the keys `robot` (name), `listen` (Zenoh endpoint), `certificate`, `private_key`, `client_ca` and
-            `users` (files); all are optional.
+            `users` (files). All keys are optional.
 
     Returns:
-        Value of each key that is set, by the names of `TelemetryConfig`.
+        Value of each key that is set, under the field names of `TelemetryConfig`.
 
     Raises:
         AccessError: If a file cannot be read, a key is unknown or a value is not valid.

@@ -1,8 +1,9 @@
 """CAN log with every frame that the HAL sent or received, in a file format of python-can.
 
 The suffix determines the format: `.log` (candump), `.asc`, `.blf`, `.log.gz` or `.asc.gz`. Each bus of the network is a channel.
-In `.log` the channel is the name of the bus (left_leg). In the other formats it is the number of the bus in the DBC, from 1. The
-same frames give identical `.log` and `.blf` files. Files in `.asc` and `.gz` differ, because they contain the date of writing.
+In `.log` and `.log.gz` the channel is the name of the bus (left_leg). In the other formats the channel is the number of the
+bus in the order of the DBC, starting at 1. Two logs of the same frames are identical in `.log` and in `.blf`. They differ in
+`.asc` and `.gz`, because such files contain the date of writing.
 """
 
 from __future__ import annotations
@@ -21,7 +22,7 @@ from atalante_hal.wire.frame import FLAG_BRS, FLAG_ESI, FLAG_FDF, ID_ERROR, ID_E
 
 #: File formats of python-can that store CAN FD frames completely.
 FORMATS = (".log", ".asc", ".blf", ".log.gz", ".asc.gz")
-#: Name of the channel in the log for frames with an identifier that is not in the DBC.
+#: Channel name in the log for a frame whose identifier is not in the DBC.
 FOREIGN = "foreign"
 
 

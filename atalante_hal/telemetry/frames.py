@@ -1,8 +1,8 @@
 """Ring records with the CAN frames of the HAL, for a CAN log.
 
-The HAL passes its frame arrays to a `RingTap`. It copies each array into a record of up to 64 frames, and writes the record to
-the ring when it is full, every second or third cycle. The record does not contain the bus of a frame. The telemetry
-process derives it from the identifier, which is unique in the network.
+The HAL passes its frame arrays to a `RingTap`. The tap collects the frames in a record of up to 64 frames. The record is
+full after two or three cycles, and then the tap writes it to the ring. The record does not contain the bus of a frame.
+The telemetry process derives the bus from the frame identifier, which is unique in the network.
 """
 
 from __future__ import annotations
@@ -17,7 +17,8 @@ from atalante_hal.telemetry.ring import RingWriter
 from atalante_hal.wire.frame import FRAME, FRAME_BYTES, Frames
 
 FRAMES_PER_RECORD = 64
-#: Record of the ring. The time of a frame is `base_ns` plus its stamp [ns]. `sent` is 1 for a sent frame.
+#: Record of the ring. Its first `count` frames are used. The time of a frame is `base_ns` plus its stamp [ns].
+#: `sent` is 1 for a sent frame and 0 for a received frame.
 FRAME_RECORD = np.dtype(
     [
         ("count", "<i8"),
@@ -37,8 +38,8 @@ class RingTap:
     Args:
         ring: Ring of `FRAME_RECORD` records.
         now: Function that returns the time of a sent frame [ns]; virtual time in lock-step.
-        stamps: Function that returns the times of the frames received last [ns], e.g. `lambda: bus.stamps`. Without it, received
-            frames also get the time `now()`.
+        stamps: Function that returns the times of the frames received last [ns], e.g. `lambda: bus.stamps`. If None,
+            received frames also get the time `now()`.
     """
 
     def __init__(
@@ -53,7 +54,7 @@ class RingTap:
         self._used = 0
 
     def begin_run(self, base_ns: int) -> None:
-        """Set the time base of all following frames. Their stamps are relative to it.
+        """Set the time base to which the stamps of all following frames are relative.
 
         Args:
             base_ns: Time of stamp 0 [ns]: 0 on the wall clock, the start of the run in virtual time.

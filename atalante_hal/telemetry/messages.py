@@ -12,14 +12,14 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from atalante_hal.record_layout import CONTROLLER, Layout
+from atalante_hal.record_layout import CONTROLLER, Layout, joined_bits
 from atalante_hal.robot import CELLS, FEET, IMUS, JOINTS, MOTORS
 from atalante_hal.safety.events import SEVERITIES, Event
 from atalante_hal.telemetry.schema import message_class
 
-#: Assisted joints (sagittal hip and knee of the swing leg) in left stance and in right stance.
+#: Assisted joints in left stance and in right stance: sagittal hip and knee of the swing leg.
 ASSISTED = (("right_SH", "right_SK"), ("left_SH", "left_SK"))
-#: Field of the message `Guide` -> name of the controller's field in the record.
+#: Name of the controller's field in the record, for each field of the message `Guide`.
 _GUIDE_FIELDS = {"error": "error", "bound": "q_bound", "h": "h", "lambda": "lambda", "desired_position": "q_des"}
 _GUIDE_OTHERS = ("filter_active", "step", "phase", "stance")
 
@@ -96,6 +96,7 @@ class Encoder:
             node=event.node,
             value=event.value,
             text=event.text,
+            count=event.count,
         )
         _begin(message, Sample([], event.cycle, timestamp))
         return bytes(message.SerializeToString())
@@ -234,14 +235,16 @@ def _controller(layout: Layout, fields: Sequence[str]) -> Callable[[Sample], byt
 
 def _system_state(layout: Layout, diagnostics: Sequence[str]) -> Callable[[Sample], bytes]:
     message = message_class("SystemState")()
-    supervisor, assistance, bits = (layout[name].start for name in ("supervisor", "assistance_factor", "diagnostics"))
+    supervisor, assistance, low, high = (
+        layout[name].start for name in ("supervisor", "assistance_factor", "diagnostics", "diagnostics_high")
+    )
 
     def encode(sample: Sample) -> bytes:
         _begin(message, sample)
         message.run, message.run_name = sample.run, sample.run_name
         message.supervisor = int(sample.values[supervisor])
         message.assistance_factor = sample.values[assistance]
-        message.diagnostics = found = int(sample.values[bits])
+        message.diagnostics = found = joined_bits(sample.values[low], sample.values[high])
         message.diagnostic[:] = [name for bit, name in enumerate(diagnostics) if found >> bit & 1] if found else ()
         return bytes(message.SerializeToString())
 
@@ -280,10 +283,10 @@ class LoopWindow:
             self._lateness_max = max(self._lateness_max, float(records[:, self._lateness].max()))
 
     def encode(self, sample: Sample, lost: int) -> bytes:
-        """Encode the statistics of the cycles up to a sample as a message, then reset the statistics.
+        """Encode the statistics as one message, and reset the statistics.
 
         Args:
-            sample: Last sample of the window; its counters are copied to the message.
+            sample: Sample of the last cycle that was added. Its counters are copied to the message.
             lost: Number of cycles that telemetry has lost so far.
 
         Returns:
@@ -302,7 +305,7 @@ class LoopWindow:
 
 
 def _named(repeated: Any, names: Sequence[str]) -> list[Any]:
-    """Add one sub-message for each name to a repeated field, and return the sub-messages."""
+    """Append one sub-message per name to a repeated field, and return the sub-messages."""
     for name in names:
         repeated.add(name=name)
     return list(repeated)

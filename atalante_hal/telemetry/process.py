@@ -1,21 +1,18 @@
 """Telemetry in the process of the control loop: a context manager that owns the rings and the telemetry subprocess.
 
-The subprocess is a new interpreter (`python -m atalante_hal.telemetry`, see `service`), not a fork. It has its own process group,
-so Ctrl-C in the terminal ends only the loop, which then closes the rings. The subprocess may be killed or suspended (SIGSTOP)
-at any time. `write` does not wait for it, except in lock-step with a recording or a CAN log, and then at most for `patience`.
+The subprocess (see `child` and `service`) has its own process group, so Ctrl-C in the terminal ends only the loop, which then
+closes the rings. The subprocess may be killed or suspended (SIGSTOP) at any time. On the wall clock, the loop never waits for
+the subprocess. In lock-step with a recording or a CAN log, the loop waits when a ring is full, for at most `patience`.
 
-If the loop calls `tend` a few times a second, a subprocess that ended or hangs is replaced. The new one reads the same rings and
-listens on the same endpoint, or on another endpoint if the first is in use. It writes new files beside the first ones.
+If the loop calls `tend` several times per second, a subprocess that ended or hangs is replaced. The new subprocess reads the
+same rings and writes new files. The old files are kept. The new subprocess listens on the same endpoint, or on another endpoint
+if the first endpoint is in use.
 """
 
 from __future__ import annotations
 
-import json
 import os
 import re
-import selectors
-import subprocess
-import sys
 import threading
 import time
 from collections.abc import Callable, Mapping, Sequence
@@ -29,6 +26,7 @@ from atalante_hal.closing import Closing
 from atalante_hal.record_layout import Layout
 from atalante_hal.safety.events import EVENT_BYTES, EVENT_SLOTS, Event, pack
 from atalante_hal.telemetry.access import Access, AccessError
+from atalante_hal.telemetry.child import TelemetryChild
 from atalante_hal.telemetry.frames import FRAME_RECORD, RingTap, Stamps
 from atalante_hal.telemetry.ring import RingWriter
 
@@ -38,17 +36,17 @@ CYCLE_NS = 1_000_000_000 // CYCLES_PER_SECOND
 RUN_GAP_NS = 1_000_000_000
 
 
-#: Time after which the subprocess counts as hung if it reads none of the records in the ring [s].
+#: If the subprocess reads no record from a non-empty ring for this time [s], it is regarded as hung.
 HANGS_AFTER = 2.0
 #: Largest number of restarts in a session.
 RESTARTS = 3
-#: Time between two attempts to kill a subprocess that is not ready in time [s].
+#: Time between two attempts of `close` to kill a subprocess that is still starting [s].
 _KILLED = 0.1
 #: Time limit for the subprocess to end its Zenoh session, after it has printed its summary [s].
 _SESSION_END = 2.0
 #: Time limit for a restarted subprocess to become ready [s].
 _RESTART = 30.0
-#: Time limit for a subprocess to become ready during a run [s]. If it takes longer, it is replaced.
+#: Time limit for a subprocess to become ready during a run [s]. A subprocess that takes longer is replaced.
 _JOIN = 60.0
 
 
@@ -66,14 +64,15 @@ class TelemetryConfig:
 
     robot: str = "exo"  # name of the robot in the Zenoh keys atalante/<robot>/...
     publish: bool = True  # publish on Zenoh
-    listen: str | None = None  # Zenoh endpoint; None: first free port from tcp/127.0.0.1:7447 on
+    listen: str | None = None  # Zenoh endpoint; None for the first free port, starting at tcp/127.0.0.1:7447
     stream_rate: int = 100  # Hz in robot time, publishing rate of each stream
     loop_rate: int = 10  # Hz in robot time, rate of the messages with loop statistics
-    recording: Path | None = None  # MCAP file; None: no recording
+    recording: Path | None = None  # MCAP file; None if nothing is recorded
     record_rate: int = 100  # Hz in robot time, recording rate of each stream; 1000: every cycle
-    can_log: Path | None = None  # log of every CAN frame, format by suffix; None: no CAN log
+    can_log: Path | None = None  # log of every CAN frame, whose suffix determines the format; None if there is no log
     lock_step: bool = False  # True: virtual time, and the loop waits for recorder and CAN log
-    slots: int = 1024  # capacity of each ring [records]; a cycle adds about one record
+    #: capacity of each ring [records]. The ring of cycle records gets one record per cycle, the other rings get fewer on average.
+    slots: int = 1024
     patience: float = 5.0  # s, longest wait of the loop for the recorder in lock-step
     certificate: Path | None = None  # TLS certificate, see `access.Access`
     private_key: Path | None = None  # key of the certificate, see `access.Access`
@@ -124,12 +123,13 @@ class TelemetryConfig:
 class Recording:
     """Files of the recording of a session, and whether they are complete.
 
-    At a recording rate below 1000 Hz, the cycles between two messages count as recorded as soon as the second message is.
+    At a recording rate below 1000 Hz not every cycle has a message. The cycles between two messages count as recorded as soon
+    as the second message is recorded.
     """
 
     files: tuple[str, ...]  # file names in order; each restart of the subprocess begins a new file
     complete: bool  # True if there is one file, with an index and with all cycles
-    missing_cycles: int  # number of cycles missing in the files
+    missing_cycles: int  # number of cycles that are not recorded in the files
 
 
 @dataclass(frozen=True)
@@ -141,11 +141,11 @@ class TelemetrySummary:
     recorded: int = 0  # messages
     frames_logged: int = 0
     can_log_complete: bool = True  # False if a requested CAN log lacks frames, has several files or was not closed
-    lost: int = 0  # cycles that telemetry lost
-    frames_lost: int = 0  # lost records of the CAN frame ring; a cycle adds about one record
-    restarts: int = 0  # restarts of the subprocess after it ended or hung
-    notices: tuple[str, ...] = field(default=())  # faults of the session, one sentence each
-    recording: Recording | None = None  # None: no recording was requested
+    lost: int = 0  # cycles that telemetry lost, because it read more slowly than the loop wrote
+    frames_lost: int = 0  # number of lost records with CAN frames; a record contains up to 64 frames
+    restarts: int = 0  # number of restarts of the subprocess after it ended or hung
+    notices: tuple[str, ...] = field(default=())  # one sentence for each fault of the session
+    recording: Recording | None = None  # None if no recording was requested
 
 
 class TelemetryProcess(Closing):
@@ -160,6 +160,7 @@ class TelemetryProcess(Closing):
         buses: Buses of the network in the order of the DBC, for the CAN log.
         diagnostics: Names of the bits of the field "diagnostics", lowest bit first.
         about: Metadata of the recording (hashes, versions, seed).
+        child: Subprocess that was started early and is not configured yet. None: `start` starts one.
     """
 
     def __init__(
@@ -171,28 +172,30 @@ class TelemetryProcess(Closing):
         buses: Sequence[str] = (),
         diagnostics: Sequence[str] = (),
         about: Mapping[str, object] | None = None,
+        child: TelemetryChild | None = None,
     ) -> None:
         self.config, self.layout = config, layout
         self.endpoint: str | None = None  # endpoint for subscribers; a restart may change it
-        self.notices: tuple[str, ...] = ()  # faults during the start, one sentence each
+        self.notices: tuple[str, ...] = ()  # one sentence for each fault during the start
         self._start_ns = 0 if config.lock_step else time.time_ns()
         self._runs = 0
         self._closed = False
         self._tap: RingTap | None = None
-        self._child: subprocess.Popen[bytes] | None = None
-        self._unread = b""  # output of the subprocess after the last line that was read
+        self._early = child  # subprocess for the first start
+        self._child: TelemetryChild | None = None
         self._restarts = 0
-        self._faults: list[str] = []  # faults of subprocesses, one sentence each
+        self._faults: list[str] = []  # one sentence for each fault of a subprocess
         self._recordings: list[str] = []  # names of the files begun so far
         self._last_endpoint: str | None = None  # last endpoint in use; None before the first endpoint was opened
-        self._restarting: threading.Thread | None = None  # start or restart of the subprocess in the background
-        self._progress = (0, 0.0)  # number of records read, and time [s], at the last progress
+        self._restarting: threading.Thread | None = None  # thread that starts or restarts the subprocess
+        self._progress = (0, 0.0)  # number of records that the subprocess has read, and time of the last change [s]
         meta = {
             "layout": layout.to_json(),
             "diagnostics": list(diagnostics),
             "about": {name: str(value) for name, value in (about or {}).items()},
             "start_ns": self._start_ns,
         }
+        files = child.take_files() if child is not None else {}
         lossless = config.lock_step
         self.records = RingWriter(
             layout.size * 8,
@@ -200,22 +203,31 @@ class TelemetryProcess(Closing):
             lossless=lossless and config.recording is not None,
             patience=config.patience,
             meta=meta,
+            fd=files.get("records"),
         )
-        #: Function that copies the record of a cycle, shape (layout.size,), to the ring. A memoryview is fastest.
+        #: Function that copies the record of a cycle, shape (layout.size,), to the ring. It is fastest with a memoryview.
         self.write = self.records.write
-        self.events = RingWriter(EVENT_BYTES, EVENT_SLOTS)
+        self.events = RingWriter(EVENT_BYTES, EVENT_SLOTS, fd=files.get("events"))
         self.frames: RingWriter | None = None
         if config.can_log is not None:
             frame_meta = {"buses": list(buses), "bus_of": {str(key): bus for key, bus in (bus_of or {}).items()}}
             self.frames = RingWriter(
-                FRAME_RECORD.itemsize, config.slots, lossless=lossless, patience=config.patience, meta=frame_meta
+                FRAME_RECORD.itemsize,
+                config.slots,
+                lossless=lossless,
+                patience=config.patience,
+                meta=frame_meta,
+                fd=files.get("frames"),
             )
+        elif "frames" in files:
+            os.close(files["frames"])
 
     def start(self, timeout: float = 60.0) -> None:
         """Start the subprocess and wait until it has opened its files and its Zenoh session.
 
-        On the wall clock, a subprocess that is not ready in time joins later. Until then the rings keep the newest records, and
-        older records are counted as lost. In lock-step the loop needs the subprocess from the first cycle on.
+        On the wall clock, a subprocess that is not ready in time begins to read later. Until then the rings keep the
+        newest records, and older records are counted as lost. In lock-step a subprocess that is not ready in time is an
+        error, because the loop would wait for it.
 
         Args:
             timeout: Longest wait [s].
@@ -234,7 +246,7 @@ class TelemetryProcess(Closing):
             raise
 
     def _start_in_background(self, timeout: float) -> None:
-        """Start the subprocess in a thread and wait for it.
+        """Start the subprocess in a thread and wait until the subprocess is ready.
 
         Args:
             timeout: Longest wait [s]. If it is exceeded, the thread continues in the background.
@@ -251,7 +263,7 @@ class TelemetryProcess(Closing):
                 result.append(error)
                 self._faults.append(str(error))
                 if self._child is not None:
-                    self._end(self._child, 0.0)
+                    self._child.close()
             else:
                 result.append(notices)
                 self._faults.extend(notices)
@@ -274,24 +286,17 @@ class TelemetryProcess(Closing):
             timeout: Longest wait [s].
 
         Returns:
-            Notices of the subprocess, one sentence each.
+            One sentence for each notice of the subprocess.
 
         Raises:
-            TelemetryError: As `start`.
+            TelemetryError: If a file or endpoint cannot be opened, or if the subprocess is not ready in time.
         """
         rings = {"records": self.records, "events": self.events, "frames": self.frames}
         fds = {name: ring.fd for name, ring in rings.items() if ring is not None}
         before = {"restarts": self._restarts, "endpoint": self._last_endpoint}
-        arguments = json.dumps({"config": config.to_json(), "rings": fds, **before})
-        self._unread = b""
-        self._child = subprocess.Popen(
-            [sys.executable, "-P", "-m", "atalante_hal.telemetry", arguments],
-            stdin=subprocess.DEVNULL,
-            stdout=subprocess.PIPE,
-            pass_fds=tuple(fds.values()),
-            process_group=0,
-        )
-        report = self._read_line(timeout)
+        self._child, self._early = self._early or TelemetryChild(fds), None
+        self._child.configure({"config": config.to_json(), "rings": fds, **before})
+        report = self._child.report(timeout)
         if report is None:
             limit = "at the end of the run" if self._closed else f"within {timeout:.0f} s"
             raise TelemetryError(f"the telemetry process was not ready {limit}")
@@ -304,10 +309,11 @@ class TelemetryProcess(Closing):
         return tuple(report["notices"])
 
     def tend(self) -> None:
-        """Restart the subprocess in the background if it has ended or hangs. Call this a few times a second.
+        """Restart the subprocess in the background if it has ended or hangs. Call this several times per second.
 
-        The new subprocess reads the records that the old one has not read, and writes numbered files. It listens on the same
-        endpoint. If this endpoint is in use, it listens on another (`endpoint` changes) or does not publish (`endpoint` is None).
+        The new subprocess reads the records that the old subprocess has not read, and writes files with numbered names.
+        It listens on the same endpoint. If this endpoint is in use, the new subprocess listens on another endpoint
+        (`endpoint` changes) or does not publish (`endpoint` is None).
         """
         if self._closed or self._child is None or (self._restarting is not None and self._restarting.is_alive()):
             return
@@ -320,14 +326,14 @@ class TelemetryProcess(Closing):
         cycle = int(np.frombuffer(last)[self.layout["cycle"]][0]) if last else 0
         text = f"telemetry {fault}; it is {'restarted' if restart else f'not restarted after {RESTARTS} restarts'}"
         self._faults.append(text)
-        self.event(cycle, "TELEMETRY_DOWN", text, "error", "TELEMETRY", self._restarts)
+        self.event(Event(cycle, "TELEMETRY_DOWN", text, "error", "TELEMETRY", self._restarts))
         if restart:
-            # The restart runs in a thread, because it takes longer than a cycle.
+            # The restart runs in a thread, because a restart takes longer than a cycle.
             self._restarting = threading.Thread(target=self._restart, daemon=True)
             self._restarting.start()
 
     def _fault(self, now: float) -> str:
-        """Return the fault of the subprocess, such as "has ended"; empty if there is no fault."""
+        """Return the fault of the subprocess, "has ended" or "hangs"; empty if there is no fault."""
         if not self.alive:
             return "has ended"
         taken = self.records.taken
@@ -337,7 +343,7 @@ class TelemetryProcess(Closing):
 
     def _restart(self) -> None:
         assert self._child is not None
-        self._end(self._child, 0.0)
+        self._child.close()
         self._progress = 0, 0.0
         config = replace(
             self.config,
@@ -348,15 +354,15 @@ class TelemetryProcess(Closing):
             self._faults.extend(self._launch(config, _RESTART))
         except TelemetryError as error:
             self._faults.append(str(error))
-            self._end(self._child, 0.0)
+            self._child.close()
 
     def tap(self, now: Callable[[], int] = time.time_ns, stamps: Callable[[], Stamps] | None = None) -> RingTap:
         """Create the frame tap, which passes the HAL's frames to the CAN log. A new tap replaces the previous tap.
 
         Args:
             now: Function that returns the time of a sent frame [ns]; in lock-step the virtual time since the start of the run.
-            stamps: Function that returns the times of the frames received last [ns], such as `lambda: bus.stamps`. Without
-                it, received frames also get the time `now()`.
+            stamps: Function that returns the times of the frames received last [ns], such as `lambda: bus.stamps`. If
+                None, received frames also get the time `now()`.
 
         Returns:
             Tap for the HAL.
@@ -373,10 +379,10 @@ class TelemetryProcess(Closing):
         return self._tap
 
     def begin_run(self, name: str, about: Mapping[str, object] | None = None) -> None:
-        """Begin a run, e.g. one guide shape; all following records belong to it.
+        """Begin a run, such as a walk with one guide shape. All following records belong to this run.
 
-        The time in the records of a run begins at 0. Its log time begins at the present time, or in lock-step 1 s after the last
-        record.
+        The robot time of a run begins at 0. The log time of a run begins at the current time of day. In lock-step the
+        log time begins 1 s after the log time of the last record.
 
         Args:
             name: Name of the run.
@@ -389,28 +395,21 @@ class TelemetryProcess(Closing):
         if self._tap is not None:
             self._tap.begin_run(self._start_ns if self.config.lock_step else 0)
         facts = {key: str(value) for key, value in (about or {}).items()}
-        self.records.note({"run": self._runs, "name": name, "start_ns": self._start_ns, "about": facts})
+        self.records.add_note({"run": self._runs, "name": name, "start_ns": self._start_ns, "about": facts})
         self._runs += 1
 
-    def event(
-        self, cycle: int, code: str, text: str, severity: str = "info", node: str = "HAL", value: float = 0.0
-    ) -> None:
+    def event(self, event: Event) -> None:
         """Publish and record an event.
 
         Args:
-            cycle: Cycle number.
-            code: Code of the event, such as the name of a diagnostic.
-            text: One sentence.
-            severity: Severity, one of `events.SEVERITIES`.
-            node: DBC name of the node, or HAL.
-            value: Measured value; its meaning depends on the code.
+            event: Event of the current run.
         """
-        self.events.write(pack(Event(cycle, code, text, severity, node, value), max(0, self._runs - 1)))
+        self.events.write(pack(event, max(0, self._runs - 1)))
 
     @property
     def alive(self) -> bool:
-        """Return whether the subprocess exists, even if it is suspended. Do not call this in every cycle: it is slow."""
-        return self._child is not None and self._child.poll() is None
+        """Return whether the subprocess exists, even if it is suspended. This is too slow to be called in every cycle."""
+        return self._child is not None and self._child.alive
 
     @property
     def lost(self) -> int:
@@ -418,7 +417,7 @@ class TelemetryProcess(Closing):
         return self.records.lost
 
     def close(self, timeout: float = 10.0) -> TelemetrySummary:
-        """Let the subprocess close its files, then end it and release the rings.
+        """Let the subprocess close its files, then end the subprocess and release the rings.
 
         Nothing can be written afterwards. A second call has no effect. A failed subprocess raises no exception here.
 
@@ -439,16 +438,18 @@ class TelemetryProcess(Closing):
             ring.finish()
         self._await_start(timeout)
         if self._child is not None:
-            report = self._read_line(timeout)
-            self._end(self._child, _SESSION_END if report is not None else 0.0)
+            report = self._child.report(timeout)
+            self._child.close(_SESSION_END if report is not None else 0.0)
             self._child = None
+        if self._early is not None:
+            self._early.close()
         summary = self._summary(report if report is not None and "error" not in report else None)
         for ring in rings:
             ring.close()
         return summary
 
     def _await_start(self, timeout: float) -> None:
-        """Wait until a start in the background has finished, and kill the subprocess if it is not ready in time.
+        """Wait until a start in the background has finished. If it takes too long, kill the subprocess.
 
         Args:
             timeout: Longest wait [s].
@@ -465,7 +466,7 @@ class TelemetryProcess(Closing):
         """Summarise the session after its last subprocess has ended.
 
         Args:
-            report: Last line of the last subprocess; None if it ended without one.
+            report: Last line that the last subprocess printed; None if it printed no line.
 
         Returns:
             Result of the session.
@@ -484,37 +485,6 @@ class TelemetryProcess(Closing):
             recording=recording if self.config.recording is not None else None,
             **facts,
         )
-
-    @staticmethod
-    def _end(child: subprocess.Popen[bytes], patience: float) -> None:
-        try:
-            child.wait(patience)
-        except subprocess.TimeoutExpired:
-            child.kill()
-            child.wait()
-        assert child.stdout is not None
-        child.stdout.close()
-
-    def _read_line(self, timeout: float) -> dict[str, Any] | None:
-        """Return the next JSON line of the subprocess; None if none arrives within `timeout` [s] or it has ended."""
-        assert self._child is not None
-        assert self._child.stdout is not None
-        if self._child.stdout.closed:
-            return None
-        pipe = self._child.stdout.fileno()
-        give_up = time.monotonic() + timeout
-        with selectors.DefaultSelector() as selector:
-            selector.register(pipe, selectors.EVENT_READ)
-            while b"\n" not in self._unread:
-                if not selector.select(max(0.0, give_up - time.monotonic())):
-                    return None
-                read = os.read(pipe, 1 << 16)
-                if not read:
-                    return None
-                self._unread += read
-        line, _, self._unread = self._unread.partition(b"\n")
-        report: dict[str, Any] = json.loads(line)
-        return report
 
     def __enter__(self) -> Self:
         self.start()

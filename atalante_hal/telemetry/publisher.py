@@ -1,11 +1,12 @@
 """Zenoh publisher, the only telemetry module with a network socket. It sends data and accepts no commands.
 
 The session is a Zenoh peer without scouting and gossip. By default it listens on the loopback, and subscribers connect to it.
-Access control permits only the output of our own keys, and nothing in this process subscribes. Messages of a stream are dropped
-for a slow subscriber. Events are cached for late subscribers, which can also detect lost events (advanced publisher).
+Zenoh's access control lets this process publish only its own keys, and the process has no subscription. If a subscriber
+reads too slowly, Zenoh drops messages to this subscriber. Events are cached for subscribers that connect late. Subscribers
+can detect lost events (Zenoh's advanced publisher).
 
-Keys are `atalante/<robot>/<stream>`, payloads protobuf of `messages.proto`, encodings
-`application/protobuf;atalante.v1.<Message>`.
+The key of a message is `atalante/<robot>/<stream>`. The payload is a protobuf message of `messages.proto`. The encoding
+is `application/protobuf;atalante.v1.<Message>`.
 """
 
 from __future__ import annotations
@@ -25,11 +26,11 @@ from atalante_hal.telemetry.schema import encoding
 from atalante_hal.telemetry.sink import EVENTS, SinkError
 
 DEFAULT_HOST, DEFAULT_PORT = "127.0.0.1", 7447
-#: Number of ports that are tried if no endpoint is configured. Several demos can then run on one machine.
+#: Number of ports that are tried if no endpoint is configured, so that several demos can run on one machine.
 PORTS_TRIED = 16
 #: Number of events cached for late subscribers.
 EVENTS_KEPT = 256
-#: Access without TLS and users: every client that reaches the endpoint may subscribe.
+#: Access without TLS and without users: every client that reaches the endpoint may subscribe.
 OPEN = Access()
 
 _log = logging.getLogger(__name__)
@@ -38,15 +39,15 @@ _log = logging.getLogger(__name__)
 class Publisher(Closing):
     """Zenoh session with one publisher for each stream.
 
-    Use it as a context manager, because an open session prevents the end of the process.
+    Use it as a context manager, because the process does not end while a session is open.
 
     Args:
         robot: Name of the robot, a part of the keys.
         streams: (key, message type) of each stream; the stream of events is always added.
-        listen: Zenoh endpoint such as tcp/127.0.0.1:7447; None: the first free port of the loopback from 7447 on.
+        listen: Zenoh endpoint, such as tcp/127.0.0.1:7447. With None, the first free port of the loopback from 7447 on is used.
         access: TLS and users.
-        before: Endpoint of the publisher that this one replaces. Its subscribers reconnect there, so this endpoint is tried first
-            if `listen` is None.
+        before: Endpoint of the earlier publisher that this publisher replaces. If `listen` is None, this endpoint is
+            tried first, because the subscribers reconnect to it.
 
     Raises:
         SinkError: If the endpoint cannot be opened.
@@ -133,10 +134,8 @@ def configuration(robot: str, listen: str) -> dict[str, Any]:
     Returns:
         Configuration as JSON types, without the settings of `Access`.
     """
-    own = [
-        f"atalante/{robot}/**",
-        f"atalante/{robot}/**/@adv/**",
-    ]  # "**" does not match key parts such as @adv
+    # the wildcard "**" does not match key parts such as @adv
+    own = [f"atalante/{robot}/**", f"atalante/{robot}/**/@adv/**"]
     return {
         "mode": "peer",
         "listen": {"endpoints": [listen]},
@@ -148,7 +147,7 @@ def configuration(robot: str, listen: str) -> dict[str, Any]:
                     "queue": {
                         # Number of message batches in the queue. With the default of 2, publishing took ten times longer.
                         "size": {"real_time": 16},
-                        # Longest wait for a subscriber that reads nothing, before it is disconnected [us]. The default is 5 s.
+                        # Time after which a subscriber that reads nothing is disconnected [us]. The default is 5 s.
                         "congestion_control": {"block": {"wait_before_close": 100_000}},
                     }
                 }
@@ -181,7 +180,7 @@ def configuration(robot: str, listen: str) -> dict[str, Any]:
 
 
 def _open(robot: str, listen: str | None, access: Access, before: str | None) -> tuple[zenoh.Session, str]:
-    """Open a session and return it with its endpoint."""
+    """Open a session, and return the session and its endpoint."""
     if listen is not None:
         try:
             return zenoh.open(_parsed(robot, listen, access)), listen
@@ -198,7 +197,7 @@ def _open(robot: str, listen: str | None, access: Access, before: str | None) ->
             return zenoh.open(_parsed(robot, endpoint, access)), endpoint
         except zenoh.ZError as error:
             refused = _reason(error)
-            _log.info("%s is not free, trying the next", endpoint)
+            _log.info("%s is not free, trying the next endpoint", endpoint)
     raise SinkError(
         f"Zenoh found no free port from {ports[0]} to {ports[-1]} on {DEFAULT_HOST}: {refused}", "TELEMETRY_DOWN"
     )
@@ -212,6 +211,6 @@ def _parsed(robot: str, listen: str, access: Access) -> zenoh.Config:
 
 
 def _reason(error: zenoh.ZError) -> str:
-    """Return the text of a Zenoh error without the positions in Zenoh's source code."""
+    """Return the text of a Zenoh error without the source file and line of Zenoh in which it was raised."""
     text = str(error)
     return "the port is taken" if "os error 98" in text else text.split(" at /")[0]

@@ -1,7 +1,8 @@
 """Recorder of telemetry messages in an MCAP file, which also contains the protobuf schema.
 
-One file contains all runs of a session in order of log time. Each run has a metadata record `run/<number>` with its name and
-start time, and every `SystemState` message contains the number. The topics are the keys of the streams.
+One file contains all runs of a session in order of log time. Each run has a metadata record `run/<number>` with the
+name and the start time of the run. Every `SystemState` message contains the number of its run. The topics are the keys
+of the streams.
 """
 
 from __future__ import annotations
@@ -16,7 +17,7 @@ from atalante_hal.closing import Closing
 from atalante_hal.telemetry.schema import PACKAGE, descriptor_set
 from atalante_hal.telemetry.sink import EVENTS, SinkError
 
-#: Size of an MCAP chunk [bytes]. A crash of the telemetry process loses at most one chunk, about 2 s at 100 Hz.
+#: Size of an MCAP chunk [bytes]. A crash of the telemetry process loses at most one chunk, about 2 s of a recording at 100 Hz.
 _CHUNK_BYTES = 1 << 18
 
 
@@ -36,7 +37,7 @@ class Recorder(Closing):
         self.path = path
         self.messages = 0
         self.saved = 0  # number of messages that remain in the file if this process is killed
-        self.finished = False  # True if the file was closed with its index, so that it has every message
+        self.finished = False  # True if the file was closed without an error, with its index and every message
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
             self._file = path.open("wb")
@@ -82,7 +83,7 @@ class Recorder(Closing):
         """Write the metadata record of a run that begins.
 
         Args:
-            number: Number of the run in the session, from 0.
+            number: Number of the run in the session, starting at 0.
             about: Metadata of the run.
 
         Raises:
@@ -98,7 +99,7 @@ class Recorder(Closing):
         """Write the index and the statistics, and close the file.
 
         Raises:
-            SinkError: If the end of the file cannot be written. Readers then scan the file, because it has no index.
+            SinkError: If the end of the file cannot be written. The file then has no index, and readers scan it.
         """
         if self._file.closed:
             return

@@ -1,17 +1,18 @@
 """Ring buffer in shared memory. The control loop writes records of fixed size, and the telemetry process reads them.
 
 A ring has one writer and one reader. `write` needs no lock and no system call: it copies the record and then stores the counter
-of written records. The slot after the newest record may be written at any time. So a reader copies a batch, reads the counter
-again and discards the records that were overwritten meanwhile (a seqlock for the whole batch). This requires that stores become
-visible in program order, as on x86-64. On other processors a record could be read before its last bytes arrive.
+of written records. The writer may overwrite the oldest records while the reader copies them. So the reader copies a batch, reads
+the counter again and discards the records that may have been overwritten meanwhile (a seqlock for the whole batch). This requires
+that stores become visible in program order, as on x86-64. Otherwise a record could be read before its last bytes are visible.
 
-When the ring is full, the oldest record is overwritten and the reader counts the loss. The writer of a lossless
-ring waits for the reader instead, in short sleeps. It overwrites the oldest record only if the reader's process has ended or the
-longest wait (`patience`) is over.
+When the ring is full, the oldest record is overwritten and the reader counts the loss. The writer of a lossless ring
+waits for the reader instead, in short sleeps. A lossless writer overwrites the oldest record only after the reader's
+process has ended, or after the longest wait (`patience`).
 
 The memory is an anonymous file (memfd). It has no name, so nothing is left in /dev/shm after a crash. Its descriptor is passed
-to the reader's process (`pass_fds`). Writer and reader each hold a POSIX lock on one byte of the file. The kernel releases the
-lock when the process ends, for any cause, so each end can detect the end of the other process.
+to the reader's process (`pass_fds`). Writer and reader each hold a POSIX lock on one byte of the file. When a process ends for
+any reason, the kernel releases its lock. So the writer detects that the reader's process has ended, and the reader detects that
+the writer's process has ended.
 """
 
 from __future__ import annotations
@@ -34,14 +35,14 @@ from atalante_hal.memory import anonymous_file
 MAGIC = int.from_bytes(b"ATLRING\0", "little")
 VERSION = 1
 
-# Indices of the 64-bit header words. The words of the writer and of the reader are in separate cache lines.
+# Indices of the 64-bit header words: constant words, words of the writer, words of the reader. Each group has its own cache line.
 _MAGIC, _VERSION, _RECORD_SIZE, _STRIDE, _SLOTS, _META_LENGTH, _NOTES_SIZE, _DATA = range(8)
 _WRITTEN, _CLOSED, _WRITER_PID, _NOTES_LENGTH, _LOSSLESS = range(8, 13)
 _READ, _LOST, _READER_PID, _KEPT = range(16, 20)
 _HEADER_BYTES = 256
 
 _WRITER_BYTE, _READER_BYTE = 0, 1  # offsets of the bytes that writer and reader lock
-_LOCK_TRIES = 50  # attempts to lock a byte; the other end may lock the same byte for some microseconds in `_held`
+_LOCK_TRIES = 50  # attempts to lock a byte, because `_held` of the other end also locks this byte for some microseconds
 
 _WAIT = 0.0002  # s, polling period
 NOTES_BYTES = 1 << 16
@@ -82,7 +83,7 @@ class _Ring:
 
     @property
     def kept(self) -> int:
-        """Return the number of records that readers have saved to disk so far."""
+        """Return the number of records that readers have marked as saved with `keep` so far."""
         return self._header[_KEPT]
 
     @property
@@ -146,14 +147,15 @@ class _Ring:
 
 
 class RingWriter(_Ring, Closing):
-    """Writing end of a ring. It creates the memory.
+    """Writing end of a ring.
 
     Args:
         record_size: Size of a record [bytes].
         slots: Number of slots, at least 2. `slots` - 1 records can wait for the reader.
-        lossless: True: wait for the reader when the ring is full.
-        patience: Longest wait for the reader [s]. After a longer wait the ring is no longer lossless.
+        lossless: Whether `write` waits for the reader when the ring is full.
+        patience: Longest wait for the reader [s]. After this time the ring is no longer lossless.
         meta: Metadata for the reader, such as the layout of the records, as JSON types.
+        fd: Descriptor of an empty file for the memory, which the writer owns from now on. None: the writer creates the file.
 
     Raises:
         RingError: If a size is too small.
@@ -167,6 +169,7 @@ class RingWriter(_Ring, Closing):
         lossless: bool = False,
         patience: float = 5.0,
         meta: Mapping[str, Any] | None = None,
+        fd: int | None = None,
     ) -> None:
         if record_size < 1 or slots < 2:
             raise RingError(
@@ -175,7 +178,9 @@ class RingWriter(_Ring, Closing):
         packed = json.dumps(dict(meta or {})).encode()
         stride = -(-record_size // 8) * 8
         data = -(-(_HEADER_BYTES + len(packed) + NOTES_BYTES) // mmap.PAGESIZE) * mmap.PAGESIZE
-        super().__init__(anonymous_file("atalante-telemetry", data + stride * slots))
+        fd = anonymous_file("atalante-telemetry", 0) if fd is None else fd
+        os.ftruncate(fd, data + stride * slots)
+        super().__init__(fd)
         header = self._header
         header[_MAGIC], header[_VERSION] = MAGIC, VERSION
         header[_RECORD_SIZE], header[_STRIDE], header[_SLOTS], header[_DATA] = record_size, stride, slots, data
@@ -228,14 +233,14 @@ class RingWriter(_Ring, Closing):
         offset = self._begin + (self._count - 1) % self._slots * self._stride
         return bytes(self._map[offset : offset + self._size])
 
-    def note(self, note: Mapping[str, Any]) -> None:
+    def add_note(self, note: Mapping[str, Any]) -> None:
         """Append a note, which the reader receives with the next record. Use notes only for rare data.
 
         Args:
             note: JSON types.
 
         Raises:
-            RingError: If there is no room; all notes of a ring together have 64 KiB.
+            RingError: If all notes of the ring would need more than `NOTES_BYTES` in total.
         """
         packed = json.dumps({**note, "from": self._count}).encode() + b"\n"
         used = self._header[_NOTES_LENGTH]
@@ -271,7 +276,7 @@ class RingReader(_Ring, Closing):
     """Reading end of a ring.
 
     Args:
-        fd: Descriptor of the writer (`RingWriter.fd`, inherited or duplicated). The reader takes it over and closes it.
+        fd: Descriptor of the writer (`RingWriter.fd`, inherited or duplicated). The reader owns and closes it.
 
     Raises:
         RingError: If the descriptor is not a ring of this version, or another process reads the ring.
@@ -329,7 +334,7 @@ class RingReader(_Ring, Closing):
     def notes(self) -> list[dict[str, Any]]:
         """Return the notes written since the last call. The key "from" is the number of the record that follows the note.
 
-        Call it after `read` to get every note that belongs to the records read.
+        Call this method after `read`. Then the result contains every note that belongs to the records read.
         """
         start, length = self._notes_start, self._header[_NOTES_LENGTH]
         packed = bytes(self._bytes[start + self._notes_read : start + length])

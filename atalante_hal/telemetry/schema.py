@@ -1,6 +1,6 @@
 """Protobuf messages of `messages.proto`, loaded from the committed descriptor set.
 
-Generated `_pb2` modules depend on the protobuf release. A descriptor set read through `message_factory` does not.
+Generated `_pb2` modules work only with certain protobuf releases. A descriptor set does not depend on the release.
 """
 
 from __future__ import annotations

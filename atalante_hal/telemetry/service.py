@@ -35,7 +35,7 @@ _DROPPED_EVERY = 1.0  # s, shortest time between two reports of lost cycles
 
 @dataclass(frozen=True)
 class Run:
-    """Run of a session, as described by its note in the ring."""
+    """Run of a session. The control loop describes each run in a note of the ring."""
 
     number: int
     name: str
@@ -50,9 +50,9 @@ class Service:
         records: Reader of the ring of cycle records.
         events: Reader of the ring of events.
         frames: Reader of the ring of CAN frames; None without a CAN log.
-        encoder: Encoder for the layout of the records; None without a sink for messages.
-        sinks: Each sink with the number of cycles between two messages of a stream.
-        loop_every: Number of cycles between two messages of loop statistics.
+        encoder: Encoder for the layout of the records; None if `sinks` is empty.
+        sinks: Each sink for messages, with the number of cycles from one message of a stream to the next.
+        loop_every: Number of cycles from one message of loop statistics to the next.
         can_log: Writer of the CAN log; None without a CAN log.
         recorder: The element of `sinks` that writes the recording; its saved records are counted in the ring.
     """
@@ -72,7 +72,7 @@ class Service:
         self._records, self._events, self._frames = records, events, frames
         self._encoder, self._sinks, self._loop_every, self._can_log = encoder, list(sinks), loop_every, can_log
         self._runs = [Run(0, "", records.meta["start_ns"], 0)]
-        self._cycle, self._timestamp = 0, self._runs[0].start_ns  # cycle and log time of the last record
+        self._cycle, self._timestamp = 0, self._runs[0].start_ns  # cycle number and log time [ns] of the last record
         self._lost, self._lost_reported = 0, -math.inf
         self._recorder, self._saved = recorder, 0  # recorder, and its number of saved messages at the last check
         self._handled = 0  # number of records whose messages have been passed to all sinks
@@ -80,7 +80,7 @@ class Service:
         self.notices: list[str] = []  # faults, one sentence each
 
     def run(self, stop: Sequence[object]) -> None:
-        """Handle records until the writer closes the rings or its process ends, or until a stop is requested.
+        """Handle records until the writer closes the rings, the writer's process ends, or a stop is requested.
 
         At the end the remaining contents of the rings are handled.
 
@@ -105,7 +105,8 @@ class Service:
 
     def step(self) -> bool:
         """Process the new contents of the rings, and return whether a ring had any."""
-        # Read the events before the notes. The note of a run is written before its events, so the run of each event is known.
+        # The loop writes the note of a run before the events of the run. Here the events are read before the notes. The note of
+        # the run of each event read is therefore already in the ring.
         events = [unpack(bytes(event)) for event in self._events.read()]
         records = self._records.read()
         first = self._records.position - len(records)
@@ -137,7 +138,7 @@ class Service:
         return next((run for run in reversed(self._runs) if run.first <= record), self._runs[0])
 
     def _handle_records(self, encoder: Encoder, records: npt.NDArray[np.float64], first: int) -> None:
-        """Encode the records that are due at the rate of a sink, and pass the messages to the sinks.
+        """Encode the records that are due at the message rate of a sink, and pass the messages to this sink.
 
         Args:
             encoder: Encoder for the layout of the records.
@@ -168,7 +169,7 @@ class Service:
         self._timestamp = self._run_of(first + len(records) - 1).start_ns + round(records[-1, encoder.time_at] * 1e9)
 
     def _handle_frames(self, records: npt.NDArray[np.uint8]) -> bool:
-        """Write records of the frame ring to the CAN log, and return whether any record was given."""
+        """Write the given records of the frame ring to the CAN log, and return whether there was any record."""
         if self._can_log is None or not len(records):
             return False
         try:

@@ -39,10 +39,10 @@ class MessageSink(Protocol):
         """
 
     def begin_run(self, number: int, about: Mapping[str, object]) -> None:
-        """Begin a run; all following messages belong to it.
+        """Begin a run. All following messages belong to this run.
 
         Args:
-            number: Number of the run in the session, from 0.
+            number: Number of the run in the session, starting at 0.
             about: Metadata of the run.
 
         Raises:

@@ -1,8 +1,8 @@
 """CiA 402 power drive state machine as a pure function, used by the HAL and by the emulated drive.
 
-Names and transitions follow IEC 61800-7-201 (CiA 402-2). The mode of operation is cyclic synchronous torque. The quick stop
-option code is 6: after a quick stop the drive stays in QUICK STOP ACTIVE and holds its position. This is the latched local hold
-of the robot.
+Names and transitions follow IEC 61800-7-201 (CiA 402-2). The mode of operation is cyclic synchronous torque. The quick
+stop option code is 6: after a quick stop the drive stays in QUICK STOP ACTIVE and holds its position. The robot uses
+this state for HOLD.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ class Controlword(IntEnum):
 
 _S, _C = DriveState, Controlword
 
-#: (state, controlword) -> next state. A pair that is not listed leaves the state unchanged.
+#: Next state for each pair (state, controlword). A pair that is not listed leaves the state unchanged.
 TRANSITIONS: dict[tuple[DriveState, Controlword], DriveState] = {
     (_S.SWITCH_ON_DISABLED, _C.SHUTDOWN): _S.READY_TO_SWITCH_ON,
     (_S.READY_TO_SWITCH_ON, _C.SWITCH_ON): _S.SWITCHED_ON,
@@ -55,7 +55,7 @@ TRANSITIONS: dict[tuple[DriveState, Controlword], DriveState] = {
     (_S.FAULT, _C.FAULT_RESET): _S.SWITCH_ON_DISABLED,
 }
 
-#: Transitions without a controlword: transition 1 of CiA 402 after the start of a drive, and 14 after its fault reaction.
+#: Transitions that need no controlword: transition 1 of CiA 402 after the start, transition 14 after the fault reaction.
 AUTOMATIC: dict[DriveState, DriveState] = {
     _S.NOT_READY_TO_SWITCH_ON: _S.SWITCH_ON_DISABLED,
     _S.FAULT_REACTION_ACTIVE: _S.FAULT,
@@ -68,10 +68,11 @@ def next_state(state: DriveState, controlword: int, *, latched: bool = False) ->
     A controlword that is unknown, or has no transition in this state, leaves the state unchanged.
 
     Args:
-        state: present state.
-        controlword: received controlword.
+        state: Current state.
+        controlword: Received controlword.
         latched: True if the drive stopped without a command and the HAL has not yet acknowledged the stop with QUICK_STOP.
-            ENABLE_OPERATION then does not leave QUICK STOP ACTIVE, so that a HAL cannot cancel a stop it has not detected.
+            Then the drive ignores ENABLE_OPERATION in QUICK STOP ACTIVE, so that a HAL cannot cancel a stop that it has
+            not detected.
 
     Returns:
         The next state.
@@ -84,7 +85,7 @@ def next_state(state: DriveState, controlword: int, *, latched: bool = False) ->
         return state
 
 
-#: State -> controlword for the next transition towards OPERATION ENABLED.
+#: Controlword for the next transition towards OPERATION ENABLED, by state.
 TOWARDS_OPERATION: dict[int, Controlword] = {
     _S.SWITCH_ON_DISABLED: _C.SHUTDOWN,
     _S.READY_TO_SWITCH_ON: _C.SWITCH_ON,
@@ -99,9 +100,9 @@ def controlword_towards_operation(state: int) -> Controlword:
     """Return the next controlword on the path to OPERATION ENABLED.
 
     Args:
-        state: present state of the drive, a value of `DriveState`.
+        state: Current state of the drive, a value of `DriveState`.
 
     Returns:
-        The controlword; DISABLE_VOLTAGE in a state without such a command (booting, fault reaction).
+        The controlword. DISABLE_VOLTAGE in NOT READY TO SWITCH ON and FAULT REACTION ACTIVE, which the drive leaves itself.
     """
     return TOWARDS_OPERATION.get(state, Controlword.DISABLE_VOLTAGE)

@@ -1,12 +1,13 @@
 """Signal codec that decodes or encodes all signals of a list of messages in one pass of compiled code.
 
 The decoding plan (word, shift, mask, range, factor of each signal) is built once from the DBC. No signal crosses the boundary of
-a 64-bit payload word. So a signal is decoded with one word, one shift, one mask, one addition and one multiplication.
+a 64-bit payload word. So a signal is decoded with one word, one shift, one mask, two additions and one multiplication.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
@@ -19,14 +20,16 @@ from atalante_hal.wire.frame import FLAG_BRS, FLAG_FDF, WORDS, Frames, new_frame
 
 Words = npt.NDArray[np.int64]
 
-#: Row indices of the decoding plan: word, shift, mask, largest code, lowest and highest code of the range, invalid code.
+# Row indices of the decoding plan. WORD, SHIFT and MASK give the bits of the signal. LARGEST is the largest code that these bits
+# can have. LOW and HIGH are the limits of the DBC range. INVALID is the invalid code.
 WORD, SHIFT, MASK, LARGEST, LOW, HIGH, INVALID = range(7)
-#: Row indices of the scales. They are used as in: value = (code + base) * factor + offset.
+#: Row indices of the scales, for the formula value = (code + base) * factor + offset.
 BASE, FACTOR, OFFSET = range(3)
-#: Value in the row INVALID of the plan for a signal without an invalid code; also the result of `encode` if there was no error.
+#: Value of `plan[INVALID, i]` if signal i has no invalid code. The function `encode` returns it if all values were encoded.
 NO_CODE = -1
-#: Results of `read_row`: all signals in range, a signal out of range, a signal with its invalid code.
-INSIDE, OUTSIDE, SAYS_INVALID = range(3)
+# Results of `read_row`. INSIDE: all signals are in range. OUTSIDE: a signal is out of range, and none has its invalid code.
+# MARKED_INVALID: a signal is out of range, and a signal has its invalid code.
+INSIDE, OUTSIDE, MARKED_INVALID = range(3)
 #: A float64 is rounded to an integer if this number is added and then subtracted.
 _ROUND = 1.5 * 2.0**52
 _LONGEST = 51  # largest signal length that `_ROUND` supports [bits]
@@ -35,8 +38,8 @@ _LONGEST = 51  # largest signal length that `_ROUND` supports [bits]
 class SignalTable(NamedTuple):
     """Arrays that describe the coding of all signals of a codec, for the compiled functions of this module.
 
-    Column i of `plan` and `scales` and entry i of `codes` belong to decoded value i. The codec owns the arrays.
-    Only `codes` changes: every decoding and encoding overwrites it.
+    Column i of `plan`, column i of `scales` and element i of `codes` belong to decoded value i. The codec owns the
+    arrays. Only `codes` changes: every decoding and encoding overwrites it.
     """
 
     plan: Words  # (7, size) decoding plan, with the rows WORD to INVALID
@@ -44,19 +47,20 @@ class SignalTable(NamedTuple):
     codes: Words  # (size,) raw codes of the last decoding or encoding
     words: Words  # (n,) indices of the 64-bit words that contain a signal
     by_row: Words  # (size,) signal indices, sorted by row
-    row_begins: Words  # (rows + 1,) index in `by_row` of the first signal of each row, then size
+    row_begins: Words  # (rows + 1,) index in `by_row` of the first signal of each row; the last element is `size`
 
 
+@lru_cache(maxsize=4096)
 def group_of(signal: str) -> str:
-    """Return the quantity in a signal name, such as Quaternion for `QuaternionW`."""
+    """Return the quantity in a signal name, without the prefix and the axis: Force for `FL_ForceZ`."""
     return signal.rsplit("_", 1)[-1].rstrip("WXYZ")
 
 
 class Codec:
     """Compiled codec for a fixed list of messages. Row i of a frame array contains messages[i].
 
-    The decoded values are ordered by sign (signed signals first), then by quantity, then by frame id, independent of the order of
-    the rows. So the positions of the twelve joints are one contiguous slice in joint order.
+    The decoded values are ordered by sign (signed signals first), then by quantity, then by frame id. The order of the rows has
+    no effect on this order. So the positions of the twelve joints are one contiguous slice in joint order.
     """
 
     def __init__(self, messages: Sequence[Message]) -> None:
@@ -66,8 +70,8 @@ class Codec:
         for _, message, signal in entries:
             if signal.length > _LONGEST or signal.start // 64 != (signal.start + signal.length - 1) // 64:
                 raise ValueError(
-                    f"{message.name}.{signal.name} must have at most {_LONGEST} bits in one 64-bit word of the payload, got "
-                    f"{signal.length} bits from bit {signal.start}"
+                    f"{message.name}.{signal.name} must have at most {_LONGEST} bits and must not cross a 64-bit boundary of the "
+                    f"payload, got {signal.length} bits starting at bit {signal.start}"
                 )
         groups = dict.fromkeys((not s.signed, group_of(s.name)) for _, _, s in entries)
         order = {key: index for index, key in enumerate(sorted(groups, key=lambda key: key[0]))}
@@ -132,7 +136,7 @@ class Codec:
         found = [i for i, name in enumerate(self._groups) if name == group]
         if not found or found[-1] - found[0] + 1 != len(found):
             valid = ", ".join(dict.fromkeys(self._groups))
-            raise KeyError(f"quantity must be contiguous and one of {valid}, got {group!r}")
+            raise KeyError(f"the quantity must be one of {valid}, and contiguous in the decoded values, got {group!r}")
         return slice(found[0], found[-1] + 1)
 
     def template(self) -> Frames:
@@ -151,12 +155,12 @@ class Codec:
             out: output for the physical values, shape (size,), in DBC units.
 
         Returns:
-            Whether every signal is inside its DBC range; an invalid code counts as outside.
+            Whether every signal is inside its DBC range. An invalid code is outside the range.
         """
         return self._decode(frames.view(np.int64), self.table, out)
 
     def rows_outside(self) -> list[int]:
-        """Return the rows with a signal outside its range in the last `decode`."""
+        """Return the rows with a signal that was outside its range in the last `decode`."""
         codes, plan = self.table.codes, self.table.plan
         outside = (codes < plan[LOW]) | (codes > plan[HIGH])
         return sorted(set(self.row_of[outside].tolist()))
@@ -233,8 +237,8 @@ def signed(raw: int, mask: int, largest: int) -> int:
 
     Args:
         raw: raw bits, right-aligned.
-        mask: all bits of the signal set, right-aligned.
-        largest: largest code of the signal; larger raw bits are negative codes.
+        mask: mask of the bits of the signal, right-aligned.
+        largest: largest code of the signal; raw bits above it represent a negative code.
     """
     return raw - mask - 1 if raw > largest else raw
 
@@ -257,13 +261,13 @@ def read_row(words: Words, offset: int, row: int, table: SignalTable) -> int:
 
     Args:
         words: frames as a flat array of 64-bit words.
-        offset: position of the frame in `words` minus the position that the plan assumes for its row [words].
+        offset: position of the frame in `words`, relative to the position that the decoding plan assumes for the row [words].
         row: row of the message of the frame.
-        table: signals of the codec; the entries of the row in `codes` are overwritten.
+        table: signals of the codec; the elements of `codes` that belong to the row are overwritten.
 
     Returns:
-        `INSIDE` if all codes are in range, `SAYS_INVALID` if a code is out of range and a signal has its invalid code, otherwise
-        `OUTSIDE`.
+        `INSIDE` if all codes are in range, `MARKED_INVALID` if a code is out of range and a signal has its invalid code,
+        otherwise `OUTSIDE`.
     """
     plan, codes = table.plan, table.codes
     inside, invalid = True, False
@@ -274,7 +278,7 @@ def read_row(words: Words, offset: int, row: int, table: SignalTable) -> int:
         inside &= plan[LOW, i] <= code <= plan[HIGH, i]
     if inside:
         return INSIDE
-    return SAYS_INVALID if invalid else OUTSIDE
+    return MARKED_INVALID if invalid else OUTSIDE
 
 
 def scale_row(row: int, table: SignalTable, values: Vector) -> None:
@@ -283,7 +287,7 @@ def scale_row(row: int, table: SignalTable, values: Vector) -> None:
     Args:
         row: row of the message.
         table: signals of the codec, with the raw codes of the row.
-        values: output for the physical values, shape (size,), in DBC units; only those of the row are written.
+        values: output for the physical values, shape (size,), in DBC units; only the values of the row are written.
     """
     codes, scales = table.codes, table.scales
     for i in table.by_row[table.row_begins[row] : table.row_begins[row + 1]]:

@@ -1,8 +1,8 @@
 """AUTOSAR E2E Profile 5, which protects each frame with an alive counter and a CRC over payload and Data ID.
 
 The CRC is CRC-16/CCITT-FALSE (polynomial 0x1021, initial value 0xFFFF) over the payload after the CRC field, followed by the Data
-ID, low byte first. It detects frames that are damaged, truncated, or sent with a wrong identifier. The counter detects lost,
-repeated and replayed frames (AUTOSAR PRS_E2EProtocol, Profile 5).
+ID, low byte first. The CRC detects frames that are damaged, truncated, or sent with a wrong identifier. The alive
+counter detects lost, repeated and replayed frames (AUTOSAR PRS_E2EProtocol, Profile 5).
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ class Check(IntEnum):
     """Result of checking one message in one cycle."""
 
     OK = 0
-    SOME_LOST = 1  # new data, but 1 to 4 frames before it are missing
+    SOME_LOST = 1  # new data, but the 1 to 4 previous frames were lost
     NO_DATA = 2  # no frame was received
     REPEATED = 3  # same counter and same bytes as the last accepted frame
     CONFLICT = 4  # same counter as the last accepted frame, but other bytes
@@ -42,7 +42,7 @@ class Check(IntEnum):
     CRC = 6  # wrong CRC: the frame is damaged or belongs to another message
     LENGTH = 7  # length or frame format differs from the DBC
     RANGE = 8  # a signal is outside its DBC range
-    INVALID = 9  # a signal has its invalid code: the node has no value for it
+    INVALID = 9  # a signal has its invalid code, because the node has no value for the signal
     IMPLAUSIBLE = 10  # the frame is intact, but its values are physically impossible
 
     @property
@@ -66,18 +66,18 @@ def crc(protected: bytes | memoryview, data_id: bytes) -> int:
     return crc_hqx(data_id, crc_hqx(protected, CRC_START))
 
 
-#: Lookup table of the CRC: remainder for each byte value.
+#: Lookup table of the CRC: remainder of each byte value.
 _TABLE = np.array([crc_hqx(bytes([octet]), 0) for octet in range(256)], np.int64)
 
 
 def protected_spans(messages: Sequence[Message]) -> Words:
-    """Return for each row the begin and end of its payload [bytes], and its Data ID.
+    """Return three values for each message: start and end of its payload [byte offsets], and its Data ID.
 
     Args:
-        messages: message of each row of frames.
+        messages: message in each row of an array of frames.
 
     Returns:
-        Byte offsets in the flat view of the frames and Data ID, shape (rows, 3).
+        Shape (rows, 3), one row per message. The offsets count from the start of the array of frames.
     """
     spans = []
     for row, message in enumerate(messages):
@@ -103,12 +103,12 @@ def checksum(octets: Octets, begin: int, end: int, data_id: int) -> int:
 
 
 def intact(octets: Octets, spans: Words, counters: Words) -> bool:
-    """Return whether every row of frames has the expected counter and a correct CRC.
+    """Return whether every frame has the expected counter and a correct CRC.
 
     Args:
         octets: frames as a flat array of bytes, shape (rows * 72,).
         spans: result of `protected_spans`, shape (rows, 3).
-        counters: expected counter of each row, shape (rows,).
+        counters: expected counter of each frame, shape (rows,).
     """
     for row in range(len(spans)):
         begin, end, data_id = spans[row]
@@ -123,12 +123,12 @@ def intact(octets: Octets, spans: Words, counters: Words) -> bool:
 
 
 def protect(octets: Octets, spans: Words, counters: Words) -> None:
-    """Write counter and CRC into every row of frames.
+    """Write counter and CRC into every frame.
 
     Args:
         octets: frames as a flat array of bytes, shape (rows * 72,); overwritten.
         spans: result of `protected_spans`, shape (rows, 3).
-        counters: counter of each row, shape (rows,).
+        counters: counter of each frame, shape (rows,).
     """
     for row in range(len(spans)):
         begin, end, data_id = spans[row]
@@ -144,8 +144,8 @@ _OK, _SOME_LOST, _REPEATED, _WRONG_SEQUENCE = map(
 )
 
 
-def judge_counter(expected: int, received: int) -> int:
-    """Check an alive counter. This is the variant of `check_counter` for compiled code.
+def classify_counter(expected: int, received: int) -> int:
+    """Compare an alive counter with the expected counter. This is the variant of `check_counter` for compiled code.
 
     Args:
         expected: last accepted counter plus 1, modulo 256, or `NOTHING`.
@@ -169,30 +169,31 @@ def check_counter(last: int | None, received: int) -> Check:
         last: last accepted counter, 0 to 255; None if no frame was accepted before.
         received: counter of the received frame, 0 to 255.
     """
-    return Check(judge_counter(NOTHING if last is None else last + 1 & 0xFF, received))
+    return Check(classify_counter(NOTHING if last is None else last + 1 & 0xFF, received))
 
 
-#: Units that a bad cycle adds to the leaky bucket of a message.
+# Each message has an error counter (leaky bucket), which rises in cycles without good data and falls in cycles with good data.
+#: Increase of the error counter in a bad cycle.
 BAD_CYCLE = 4
-#: Units that a good cycle removes from the bucket. The bucket fills if more than a fifth of the frames are lost.
+#: Decrease of the error counter in a good cycle. The counter rises on average if more than a fifth of the frames are lost.
 GOOD_CYCLE = 1
-#: Level of the leaky bucket at which the message loses its trust.
+#: Limit of the error counter. At this value the message is no longer trusted.
 FULL = 64
 #: Number of consecutive good cycles after which a message is trusted. Until then the inputs of a pendant are ignored.
 REQUALIFY = 16
-#: Increase of the evidence of two senders after a cycle with frames of both. Four such cycles reach `FULL`.
+#: Increase of the counter that detects two senders (see `suspect`) in a cycle with two senders. Four such cycles reach `FULL`.
 RIVAL_CYCLE = 16
 
 
 class Qualification(NamedTuple):
-    """Qualification of the sender of one message, with its leaky bucket."""
+    """Trust in the sender of one message, and the error counter on which the trust depends."""
 
-    bucket: int = 0  # level of the leaky bucket, 0 to `FULL`
+    bucket: int = 0  # error counter (leaky bucket), 0 to `FULL`
     good: int = 0  # good cycles in a row, counted up to `REQUALIFY`
-    trusted: bool = False
+    trusted: bool = False  # True if the values of the message may be used
 
 
-#: Qualification of a trusted message with an empty leaky bucket. Further good cycles do not change it.
+#: Best qualification: the message is trusted and its error counter is 0. A good cycle does not change this.
 SETTLED = Qualification(0, REQUALIFY, True)
 
 
@@ -202,8 +203,8 @@ def qualify(before: Qualification, *, good: bool, timed_out: bool = False) -> Qu
     Args:
         before: qualification after the previous cycle.
         good: True if new and intact data was received.
-        timed_out: True if the data is as old as its timeout, or if two senders are confirmed. The message loses its trust in this
-            cycle.
+        timed_out: True if the age of the data has reached the timeout, or if two senders are confirmed. Then the
+            message is not trusted.
     """
     if timed_out:
         return Qualification(before.bucket, 0, False)
@@ -216,13 +217,14 @@ def qualify(before: Qualification, *, good: bool, timed_out: bool = False) -> Qu
 
 
 def suspect(evidence: int, *, rival: bool) -> int:
-    """Return the evidence that two nodes send the same message, after one more cycle.
+    """Return the counter that detects two senders of one message, after one more cycle.
 
     Args:
-        evidence: evidence after the previous cycle, 0 to `FULL`.
+        evidence: counter after the previous cycle, 0 to `FULL`.
         rival: True if this cycle has a frame that cannot be from the sender of the accepted frame.
 
     Returns:
-        Evidence, 0 to `FULL`. `FULL` confirms two senders. A cycle without a rival removes `GOOD_CYCLE`.
+        The counter, 0 to `FULL`. `FULL` confirms two senders. A cycle without a rival frame reduces the counter by
+        `GOOD_CYCLE`.
     """
     return min(evidence + RIVAL_CYCLE, FULL) if rival else max(evidence - GOOD_CYCLE, 0)

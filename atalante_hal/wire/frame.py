@@ -1,7 +1,7 @@
 """Memory layout of a CAN FD frame: the Linux kernel's `struct canfd_frame`.
 
-All stages of the data flow (bus, E2E, codec) work on arrays of this record. So the bytes received from the socket are the same
-bytes that the CRC protects and the decoder reads. The record size of 72 bytes keeps every payload aligned to 8 bytes.
+All stages of the data flow (bus, E2E, codec) work on arrays of this record. So the CRC check and the decoder read the bytes
+directly from the receive buffer of the socket. The record size of 72 bytes keeps every payload aligned to 8 bytes.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ def new_frames(count: int) -> Frames:
 
 def joined(parts: Sequence[Frames]) -> Frames:
     """Concatenate several arrays of frames, shape (total number of frames,)."""
-    # Concatenate bytes, because numpy takes 40 times as long to concatenate records.
+    # The arrays are concatenated as bytes, because numpy takes 40 times as long to concatenate records.
     return np.frombuffer(bytearray().join([part.tobytes() for part in parts]), FRAME)
 
 

@@ -1,8 +1,8 @@
-"""Process image: the last good values of every message, with check result and age.
+"""Process image: the last good values of every message, with their age and the result of the last check.
 
-`ReceiveImage` takes the frames of a cycle in the order of the bus. It commits a message only if identifier, length, CRC, counter
-and signal ranges are correct. Otherwise the message keeps its values, its age grows, and its check result gives the reason.
-`TransmitImage` encodes values into protected frames to be sent.
+`ReceiveImage` processes the frames of a cycle in order of arrival. It commits a message only if identifier, length,
+CRC, alive counter and signal ranges are correct. Otherwise the message keeps its previous values, their age grows, and
+the check result of the message gives the reason. `TransmitImage` encodes values into protected frames to be sent.
 """
 
 from __future__ import annotations
@@ -18,8 +18,8 @@ from atalante_hal.compiled import specialised
 from atalante_hal.types import Vector
 from atalante_hal.wire.codec import (
     INSIDE,
+    MARKED_INVALID,
     NO_CODE,
-    SAYS_INVALID,
     Codec,
     SignalTable,
     Words,
@@ -35,35 +35,48 @@ from atalante_hal.wire.e2e import (
     Check,
     Octets,
     checksum,
+    classify_counter,
     intact,
-    judge_counter,
     protect,
     protected_spans,
 )
-from atalante_hal.wire.frame import FRAME_BYTES, HEADER_BYTES, WORDS, Frames, as_words, new_frames
+from atalante_hal.wire.frame import (
+    FLAG_ESI,
+    FLAG_FDF,
+    FRAME_BYTES,
+    HEADER_BYTES,
+    WORDS,
+    Frames,
+    as_words,
+    new_frames,
+)
 
-#: Value of the argument `tag` if each sender uses its own counter, so that no frame carries a cycle number.
+#: Flags of a CAN FD frame whose sender is error passive.
+_PASSIVE = FLAG_ESI | FLAG_FDF
+#: Value of the argument `tag` if each sender increments its own alive counter instead of sending the cycle number.
 _NO_TAG = -1
-#: Values of `Check` as plain integers. A check result of at most `_FRESH` means new, usable data.
+#: Values of `Check` as plain integers. A value of at most `_FRESH` means new, usable data.
 _FRESH = _SOME_LOST = int(Check.SOME_LOST)
 _REPEATED, _CONFLICT, _WRONG_SEQUENCE = int(Check.REPEATED), int(Check.CONFLICT), int(Check.WRONG_SEQUENCE)
 _CRC, _LENGTH, _RANGE, _INVALID = int(Check.CRC), int(Check.LENGTH), int(Check.RANGE), int(Check.INVALID)
 #: Values of `Check` for frames without new values: damaged frames and repeats of the accepted frame.
-_SAYS_NOTHING_NEW = frozenset({Check.CRC, Check.LENGTH, Check.REPEATED})
-#: Marker instead of a row: the frame is not a message of this process image.
+_NO_NEW_VALUES = frozenset({Check.CRC, Check.LENGTH, Check.REPEATED})
+#: Value in place of a row: the frame is not a message of this process image.
 _FOREIGN = -1
 #: Age of a message that has never been received [cycles].
 NEVER = 1 << 30
-#: Age from which an answer to a SYNC counts as replayed; a younger answer counts as late [cycles].
+#: Lowest age at which an answer to a SYNC is rejected as replayed [cycles].
 LATEST = 16
-#: Half the counter period. A larger increase counts as a decrease, unless the message was missing for this many cycles.
+#: Half the period of the alive counter. If the counter of a frame is ahead by this number or more, the frame is an older one,
+#: except after a long gap.
 _HALF_TURN = 128
 
 
 class E2EState(NamedTuple):
-    """State of the E2E check: for each row of a process image its expected format, expected counter and last frame.
+    """State of the E2E check: expected format, expected counter and last frame of each row of a process image.
 
-    The `ReceiveImage` owns the arrays. `headers` and `spans` are constant; the others change with every accepted frame.
+    The `ReceiveImage` owns the arrays. The arrays `headers` and `spans` are constant. The other arrays change with
+    every accepted frame.
     """
 
     headers: Words  # (rows,) header word of the message: identifier, length and flags
@@ -74,7 +87,7 @@ class E2EState(NamedTuple):
 
 
 class RowStatus(NamedTuple):
-    """Result of the check of each row of a process image in this cycle.
+    """Age and check result of each row of a process image in this cycle.
 
     The `ReceiveImage` owns the arrays.
     """
@@ -84,18 +97,20 @@ class RowStatus(NamedTuple):
 
 
 class ReceiveImage:
-    """Process image of received messages, with the values of all signals, and check result and age of each row.
+    """Process image of received messages: the values of all signals, and the check result and age of each row.
 
-    `values` holds the last good values, shape (codec.size,), in DBC units. `check` and `age` have one element per row.
+    `values` are the last good values, shape (codec.size,), in DBC units. `check` and `age` have one element per row.
 
-    A node answers each SYNC with a frame whose counter is the cycle tag: the low byte of the Cycle signal in the SYNC. If the
-    caller passes the tag of the current cycle, age is counted from the SYNC that a frame answers, even if the frame is late.
+    A node answers each SYNC with a frame whose alive counter is the tag of the cycle: the low byte of the signal Cycle in the
+    SYNC. If the caller passes the tag of the current cycle, the age of the values is counted from the SYNC that their frame
+    answers, even if the frame arrives late.
 
     Args:
         messages: messages of this process image, one per row.
-        values: array for the decoded values, shape (codec.size,); default: a new array of NaN.
-        restarts: True if a sender may restart at any counter (status, emergencies). Then only a repetition of the last frame is
-            rejected. A frame with the last counter and other bytes is committed, and also listed in `refused` as CONFLICT.
+        values: array for the decoded values, shape (codec.size,). By default, a new array of NaN is created.
+        restarts: True if a sender may restart at any counter (status, emergencies). In this case the counter leads to a
+            rejection only if a frame repeats the last frame. A frame with the last counter and other bytes is committed, and
+            also listed in `refused` as CONFLICT.
     """
 
     def __init__(self, messages: Sequence[Message], values: Vector | None = None, *, restarts: bool = False) -> None:
@@ -107,8 +122,10 @@ class ReceiveImage:
         #: Age of the values of each row [cycles], shape (rows,).
         self.age: npt.NDArray[np.int64] = np.full(count, NEVER)
         self.crc_errors = 0
-        #: Row and check result of each frame rejected in this cycle.
+        #: Row and `Check` of each frame that was rejected in this cycle.
         self.refused: list[tuple[int, Check]] = []
+        #: Rows with an intact or damaged frame in this cycle whose sender is error passive.
+        self.error_passive: list[int] = []
         self._restarts = restarts
         #: Last frame of each row with correct format, CRC and sequence, shape (rows,).
         self.frames = self.codec.template()
@@ -125,13 +142,13 @@ class ReceiveImage:
         #: Values before the last `accept`, shape (codec.size,).
         self.values_before = self.values.copy()
         self._age_before: npt.NDArray[np.int64] = self.age.copy()
-        #: True if the last cycle was perfect: every row was committed with the expected frame.
+        #: True if every row was committed with the expected frame in the last `accept` (a perfect cycle).
         self.all_fresh = self._was_fresh = False
         #: Frames given to the last `accept_each`, with the row and `Check` of each frame.
         self._offered: tuple[Frames, Words] | None = None
         self._ordered = _Received(new_frames(count), count)
         self._received = self._ordered
-        # Compile both functions for the types of these arguments. No frames have been received, so the calls change nothing.
+        # Compile the functions for the types of these arguments. No frames have been received, so the calls change nothing.
         words, table = self._ordered.words, self.codec.table
         self._accept_exact = specialised(
             accept_exact, words, self._e2e, _NO_TAG, table, self.values, self.values_before
@@ -141,7 +158,7 @@ class ReceiveImage:
         )
 
     def new_cycle(self, elapsed: int = 1) -> None:
-        """Begin a new cycle: increase the age of every row, and mark it as without data until a frame arrives.
+        """Begin a new cycle: increase the age of every row, and set the check result of every row to NO_DATA.
 
         Args:
             elapsed: number of cycles since the last call.
@@ -150,7 +167,7 @@ class ReceiveImage:
         self.age += elapsed
         np.add(self._e2e.silent, elapsed, out=self._e2e.silent)
         self.check.fill(Check.NO_DATA)
-        self.refused = []
+        self.refused, self.error_passive = [], []
 
     def accept(self, frames: Frames, count: int, tag: int | None = None) -> Sequence[int]:
         """Check and commit all frames of one cycle, in any order.
@@ -174,9 +191,9 @@ class ReceiveImage:
             return range(rows, count)
         if count >= rows:
             found = [row_of.get(can_id, -1) for can_id in frames["can_id"][:count].tolist()]
-            foreign = [place for place, row in enumerate(found) if row < 0]
+            foreign = [index for index, row in enumerate(found) if row < 0]
             if len(foreign) == count - rows and len(set(found) - {-1}) == rows:
-                # Every message arrived once, but not in the order of the rows, or mixed with other frames. Sort the messages.
+                # Every message arrived once, but in another order than the rows or mixed with other frames. Sort the messages.
                 self._ordered.words[:] = as_words(frames)[np.argsort(found)[count - rows :]].view(np.int64).ravel()
                 if self._accept(self._ordered, tag):
                     return foreign
@@ -196,7 +213,7 @@ class ReceiveImage:
         self.all_fresh = False
 
     def begins(self, frames: Frames, count: int) -> bool:
-        """Return whether the buffer begins with all messages of this process image in order, so that the cycle is complete.
+        """Return whether the buffer begins with one frame of every row, in row order. Then the cycle is complete.
 
         Args:
             frames: receive buffer.
@@ -204,10 +221,10 @@ class ReceiveImage:
         """
         return count >= len(self.check) and self._received_in(frames).headers.tobytes() == self._expected_headers
 
-    def expected_ids(self) -> set[int]:
-        """Return the identifiers of the messages that have not timed out, by the timeout in the DBC."""
-        ages = self.age.tolist()
-        return {m.frame_id for row, m in enumerate(self.codec.messages) if ages[row] <= m.timeout_ms}
+    def expected_ages(self) -> dict[int, int]:
+        """Return the age [cycles] of each message that has not timed out according to the DBC, by frame identifier."""
+        ages = zip(self.codec.messages, self.age.tolist(), strict=True)
+        return {m.frame_id: age for m, age in ages if age <= m.timeout_ms}
 
     def _received_in(self, frames: Frames) -> _Received:
         if self._received.frames is not frames:
@@ -234,12 +251,15 @@ class ReceiveImage:
             self.age.fill(0)
             self._e2e.silent.fill(0)
             self.check.fill(Check.OK)
-            self.refused = []
+            self.refused, self.error_passive = [], []
             self.all_fresh = True
         return True
 
     def accept_each(self, frames: Frames, count: int, tag: int | None = None) -> list[int]:
-        """Check the frames one by one in order of arrival, and decode and commit the good ones; call `new_cycle` before.
+        """Check the frames one by one in order of arrival, and commit the good frames. Call `new_cycle` before.
+
+        A sender that is error passive sets the flag ESI of its frames. Its frames are valid, so this flag is removed from the
+        received frames, and the rows are added to `error_passive`.
 
         Args:
             frames: receive buffer.
@@ -250,6 +270,12 @@ class ReceiveImage:
             Indices in `frames` of the frames that are not messages of this process image.
         """
         self.values_before[:] = self.values
+        flags = frames["flags"][:count]
+        passive = np.flatnonzero(flags & _PASSIVE == _PASSIVE)
+        if passive.size:
+            flags[passive] ^= FLAG_ESI
+            senders = (self.frame_ids.get(can_id) for can_id in frames["can_id"][passive].tolist())
+            self.error_passive = [row for row in senders if row is not None]
         found = _results(count)
         self._accept_frames(
             _words_of(frames),
@@ -263,16 +289,16 @@ class ReceiveImage:
         )
         self._offered = frames, found
         foreign = []
-        for place, (row, check) in enumerate(found.tolist()):
+        for index, (row, check) in enumerate(found.tolist()):
             if row == _FOREIGN:
-                foreign.append(place)
+                foreign.append(index)
             elif check > _FRESH:
                 self.refused.append((row, Check(check)))
                 self.crc_errors += check == _CRC
         return foreign
 
-    def beside(self, row: int) -> list[Vector]:
-        """Decode the intact frames of a row in this cycle, except the frame committed last.
+    def decode_further_frames(self, row: int) -> list[Vector]:
+        """Decode the intact frames that a row received in this cycle, except the frame that was committed last.
 
         Repetitions of an accepted frame are left out. Call this method before the receive buffer is used again.
 
@@ -286,12 +312,12 @@ class ReceiveImage:
         if self._offered is None:
             return []
         frames, found = self._offered
-        mine = [(place, check) for place, (of, check) in enumerate(found.tolist()) if of == row]
-        committed = max((place for place, check in mine if check <= _FRESH), default=None)
+        mine = [(index, check) for index, (of, check) in enumerate(found.tolist()) if of == row]
+        committed = max((index for index, check in mine if check <= _FRESH), default=None)
         return [
-            self._decoded(frames, place, row)
-            for place, check in mine
-            if place != committed and check not in _SAYS_NOTHING_NEW
+            self._decoded(frames, index, row)
+            for index, check in mine
+            if index != committed and check not in _NO_NEW_VALUES
         ]
 
     def _decoded(self, frames: Frames, index: int, row: int) -> Vector:
@@ -304,7 +330,7 @@ class ReceiveImage:
 
 
 class _Received:
-    """Views of the first frames of a receive buffer. They are created once; the fast path reads them in every cycle.
+    """Views of the frames at the beginning of a receive buffer, created once. The fast path reads the views in every cycle.
 
     Args:
         frames: receive buffer.
@@ -335,7 +361,7 @@ def accept_exact(
 
     Args:
         words: received frames as a flat array of 64-bit words, shape (rows * 9,).
-        e2e: expected format and sequence of each row; the expected counters are advanced by 1, and the frames are kept.
+        e2e: expected format and counter of each row; the counters are increased by 1, and the frames are stored in `kept`.
         tag: counter that all frames must have, or `_NO_TAG`.
         table: signals of the codec; `codes` is overwritten.
         values: decoded values, shape (size,), in DBC units; overwritten with the new values.
@@ -368,12 +394,12 @@ def accept_frames(
     values: Vector,
     status: RowStatus,
 ) -> None:
-    """Check frames one by one in order of arrival, and commit the good ones.
+    """Check frames one by one in order of arrival, and commit the good frames.
 
     Args:
         words: received frames as a flat array of 64-bit words, shape (at least count * 9,).
-        found: output for the row of each frame, or `_FOREIGN`, and its `Check`, shape (count, 2).
-        e2e: expected format and sequence of each row; the sequence is updated with each accepted frame.
+        found: output, shape (count, 2): row and `Check` of each frame. Both are `_FOREIGN` if the frame has no row.
+        e2e: expected format and counter of each row; the counters are updated with each accepted frame.
         tag: expected counter of all frames in this cycle, or `_NO_TAG`.
         restarts: True if a sender may restart at any counter.
         table: signals of the codec; `codes` is updated.
@@ -388,12 +414,12 @@ def accept_frames(
         if row == _FOREIGN:
             continue
         offset = (index - row) * FRAME_BYTES
-        result = judge_frame(words, row, offset, e2e, tag, restarts)
+        result = classify_frame(words, row, offset, e2e, tag, restarts)
         new = result <= _FRESH or (restarts and result == _CONFLICT)
         if new:
             coding = read_row(words, first - row * WORDS, row, table)
             if coding != INSIDE:
-                new, result = False, _INVALID if coding == SAYS_INVALID else _RANGE
+                new, result = False, _INVALID if coding == MARKED_INVALID else _RANGE
         found[index, 1] = result
         if new:
             scale_row(row, table, values)
@@ -405,7 +431,7 @@ def accept_frames(
 
 
 def row_of(header: int, headers: Words) -> int:
-    """Return the row of the message with the identifier of a frame, or `_FOREIGN`.
+    """Return the row of the message that has the identifier of a frame, or `_FOREIGN`.
 
     Args:
         header: header word of the frame.
@@ -417,16 +443,16 @@ def row_of(header: int, headers: Words) -> int:
     return _FOREIGN
 
 
-def judge_frame(words: Words, row: int, offset: int, e2e: E2EState, tag: int, restarts: bool) -> int:
+def classify_frame(words: Words, row: int, offset: int, e2e: E2EState, tag: int, restarts: bool) -> int:
     """Check format, CRC and counter of a frame.
 
-    If the counter is accepted, the expected counter is updated and the frame is kept.
+    If the counter is accepted, the expected counter is updated and the frame is stored in `kept`.
 
     Args:
         words: received frames as a flat array of 64-bit words.
         row: row of the message of the frame.
-        offset: position of the frame minus the position of its row in the frame array [bytes].
-        e2e: expected format and sequence of each row; the sequence is updated if the counter is accepted.
+        offset: position of the frame, relative to the position of its row in the frame array [bytes].
+        e2e: expected format and counter of each row; updated if the counter is accepted.
         tag: expected counter of all frames in this cycle, or `_NO_TAG`.
         restarts: True if a sender may restart at any counter.
 
@@ -443,10 +469,10 @@ def judge_frame(words: Words, row: int, offset: int, e2e: E2EState, tag: int, re
         return _CRC
     counter = int(octets[begin + COUNTER_BYTE])
     in_time = tag == _NO_TAG or tag - counter & 0xFF < LATEST
-    # After a gap of half the counter period, the counter of a message no longer gives the order of its frames.
+    # After a gap of at least half a counter period, the counter no longer gives the order of the frames of a message.
     # Then a frame is new if it answers one of the last `LATEST` SYNCs.
     back = tag != _NO_TAG and in_time and expected[row] != NOTHING and silent[row] >= _HALF_TURN
-    result = judge_counter(expected[row], counter)
+    result = classify_counter(expected[row], counter)
     if back and result == _REPEATED:
         result = _WRONG_SEQUENCE
     if result == _REPEATED:
@@ -456,8 +482,8 @@ def judge_frame(words: Words, row: int, offset: int, e2e: E2EState, tag: int, re
             return _CONFLICT
         result = _CONFLICT
     elif tag != _NO_TAG and not back:
-        # The expected counter must not change if a frame answers no recent SYNC.
-        # It must not change either if the frame answers an earlier SYNC than the last accepted frame.
+        # A frame is rejected if it answers no recent SYNC, or an earlier SYNC than the last accepted frame.
+        # The expected counter then does not change.
         backwards = expected[row] != NOTHING and counter - expected[row] + 1 & 0xFF >= _HALF_TURN
         if not in_time or backwards:
             return _WRONG_SEQUENCE
@@ -484,7 +510,7 @@ class TransmitImage:
         rows = len(self.codec.messages)
         self._counters: Words = np.zeros(rows, np.int64)
         self._singles = [self.frames[row : row + 1] for row in range(rows)]
-        # `specialised` calls both functions once. These calls leave every counter at 0xFF, so the first sent frame has counter 0.
+        # `specialised` calls each function once. These calls leave every counter at 0xFF, so the first frame has counter 0.
         self._protect = specialised(protect, self._octets, self._spans, self._counters)
         self._seal = specialised(seal, self.values, self.codec.table, self._words, self._spans, self._counters, 0xFF)
 
@@ -492,7 +518,7 @@ class TransmitImage:
         """Encode the values and protect every row with counter and CRC.
 
         Args:
-            counter: alive counter of every row, 0 to 255; None: the last counter of each row plus 1.
+            counter: alive counter of every row, 0 to 255. With None, each row gets its last counter plus 1.
 
         Returns:
             The frames to send, shape (rows,).
@@ -513,7 +539,7 @@ class TransmitImage:
         return int(self._counters[0])
 
     def prepare(self) -> bytes:
-        """Return the frames with the present values as bytes, for a later `seal_prepared`."""
+        """Return the frames with the current values as bytes, for a later `seal_prepared`."""
         self.codec.encode(self.values, self.frames)
         return self._octets.tobytes()
 
@@ -546,11 +572,11 @@ class TransmitImage:
         return self._singles[row]
 
     def resume(self, row: int, counter: int) -> None:
-        """Set the counter of a row to that of a frame from another sender, so that the next frame continues its sequence.
+        """Set the counter of a row, so that the next frame continues the sequence of another sender.
 
         Args:
             row: row of the message.
-            counter: alive counter of that frame, 0 to 255.
+            counter: alive counter of the last frame of the other sender, 0 to 255.
         """
         self._counters[row] = counter
 

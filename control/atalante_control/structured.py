@@ -1,7 +1,7 @@
-"""Structured arrays for compiled kernels. A record class declares their fields. `record class -> dtype, array`.
+"""Structured arrays for compiled kernels. A record class declares the fields of an array. `record class -> dtype, array`.
 
-A record class only declares fields; it is never instantiated. Its arrays are NumPy structured arrays, whose fields numba reads
-and writes as attributes. The class gives the type checker the type of each field and the reader its unit.
+A record class only declares fields; it is never instantiated. The arrays are NumPy structured arrays, whose fields numba reads
+and writes as attributes. The class states the type of each field for the type checker, and the unit of each field for the reader.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ class Records(Protocol[Record]):
         """Return the number of records."""
 
     def __getitem__(self, index: int, /) -> Record:
-        """Return a view of a record; writing to its fields changes the array.
+        """Return a view of a record; writing to a field of the view changes the array.
 
         Args:
             index: index of the record.
@@ -36,7 +36,7 @@ def dtype_of(record: type) -> np.dtype[np.void]:
         record: class whose annotations are `float`, `int`, `bool`, or `Annotated[array type, shape]` for an array.
 
     Raises:
-        TypeError: If an annotation is none of these.
+        TypeError: If an annotation is of another type.
     """
     fields = [(name, *_field(record, name, hint)) for name, hint in get_type_hints(record, include_extras=True).items()]
     # `np.record` allows attribute access where the kernels run as plain Python.
@@ -58,6 +58,8 @@ def _field(record: type, name: str, hint: object) -> tuple[Any, tuple[int, ...]]
         return _SCALARS[hint], ()
     if get_origin(hint) is Annotated:
         array, shape = get_args(hint)
-        scalar = get_args(get_args(array)[1])[0]  # NDArray[scalar] is ndarray[shape, dtype[scalar]]
+        # NDArray[scalar] is ndarray[shape, dtype[scalar]] up to Python 3.11, and an alias with the argument `scalar` later.
+        argument = get_args(array)[-1]
+        scalar = get_args(argument)[0] if get_origin(argument) is np.dtype else argument
         return scalar, shape if isinstance(shape, tuple) else (shape,)
     raise TypeError(f"{record.__name__}.{name} must be float, int, bool or Annotated[array, shape], got {hint!r}")

@@ -1,7 +1,7 @@
-"""Check of the attribute values in a DBC text before cantools parses it: `text -> attributes -> loader`.
+"""Check of the attribute values in a DBC text before cantools parses it: `text -> attributes -> parser`.
 
-cantools accepts a value of any type for an attribute of any type. An invalid value then causes an error later or remains
-undetected.
+cantools does not check whether a value has the type that its attribute requires. Without this check, an invalid value causes
+an error later or remains undetected.
 """
 
 from __future__ import annotations
@@ -9,7 +9,7 @@ from __future__ import annotations
 import re
 from collections.abc import Iterator
 
-#: Attributes that the loader requires. Each needs a definition (`BA_DEF_`) and a default (`BA_DEF_DEF_`).
+#: Attributes that the parser requires. Each needs a definition (`BA_DEF_`) and a default (`BA_DEF_DEF_`).
 _REQUIRED = (
     "NominalBitrate", "DataBitrate", "NodeKind", "NodeNumber", "VFrameFormat", "Bus", "GenMsgSendType", "GenMsgCycleTime",
     "GenMsgDelayTime", "TimeoutTime", "E2EDataId", "InvalidRaw",
@@ -21,7 +21,7 @@ _RAW = re.compile(r"(0[xX][0-9a-fA-F]{1,16}|\d{1,20})?")
 
 
 def wrong_values(text: str) -> Iterator[tuple[int, str]]:
-    """Yield (line number, message) for each value that is invalid or whose attribute has no definition above it."""
+    """Yield (line number, problem) for each value that is invalid, or whose attribute is not defined above the value."""
     definitions: dict[str, tuple[str, str]] = {}
     for number, line in enumerate(text.splitlines(), start=1):
         if match := _DEFINITION.match(line):
@@ -35,7 +35,7 @@ def wrong_values(text: str) -> Iterator[tuple[int, str]]:
 
 
 def missing(text: str) -> Iterator[tuple[int, str]]:
-    """Yield (line number 1, message) for each missing definition and each missing default of a required attribute."""
+    """Yield (1, problem) for each required attribute that has no definition or no default."""
     for name in _REQUIRED:
         for keyword, part in (("BA_DEF_", "definition"), ("BA_DEF_DEF_", "default")):
             if not re.search(rf'^{keyword}\s+[^"]*"{name}"', text, re.MULTILINE):
@@ -47,10 +47,10 @@ def _valid_values(name: str, kind: str, domain: str, value: str, *, by_name: boo
 
     Args:
         name: name of the attribute.
-        kind: type in its definition, for example INT or ENUM.
-        domain: rest of its definition: the range of a number, or the names of an enumeration.
-        value: value as written in the DBC, with quotes.
-        by_name: True: an enumeration must be given by name (defaults). False: its index is also valid.
+        kind: type in the definition of the attribute, for example INT or ENUM.
+        domain: rest of the definition, which is the range of a number or the names of an enumeration.
+        value: value as written in the DBC, with its quotes if it has any.
+        by_name: True if an enumeration value must be given by name, as in a default. False if its index is also valid.
     """
     if kind == "INT":
         low, high = [*domain.split(), "0", "0"][:2]

@@ -1,7 +1,7 @@
 """Lenient loader for any DBC: message layouts for the validator and for bulk decoding.
 
 `loader.load` is strict, because its result controls a robot. This loader accepts every DBC that cantools can parse. It uses the
-attributes of this project if the file contains them. A message with an ambiguous layout is rejected with the reason.
+attributes of this project if the file contains them. It rejects a message with an ambiguous layout, and stores the reason.
 """
 
 from __future__ import annotations
@@ -22,18 +22,18 @@ from cantools.database.can import Message as RawMessage
 from cantools.database.can import Signal as RawSignal
 from cantools.database.errors import Error as CantoolsError
 
-from atalante_dbc.loader import DbcError
+from atalante_dbc.network import DbcError
 
 #: Longest payload of a CAN FD frame and of a classic CAN frame [byte].
 _FRAME_BYTES, _CLASSIC_BYTES = 64, 8
 _WORD = 64
 _FLOAT_BITS = (16, 32, 64)
-#: E2E Profile 5 header: name -> (start bit, number of bits), as in `loader`.
+#: Signals of the E2E Profile 5 header: start bit and number of bits, as in `parser`.
 _E2E_HEADER = {"Crc": (0, 16), "Counter": (16, 8)}
 #: Values of GenMsgSendType for cyclic messages, in lower case. The empty text stands for a missing GenMsgSendType.
 _CYCLIC = ("", "cyclic", "cyclicx", "periodic", "fixedperiodic", "fixed_periodic")
-#: J1939: masks of the identifier bits that identify a parameter group, with and without destination address. If the PDU format
-#: is below 240, the identifier contains the destination address, which is not part of the group.
+# J1939: an identifier with a PDU format below _PDU2 contains a destination address, which is not part of the parameter group.
+# _PGN_PEER masks the group of such an identifier, _PGN_BROADCAST the group of all other identifiers.
 _PGN_PEER, _PGN_BROADCAST, _PDU2 = 0x03FF0000, 0x03FFFF00, 240
 _QUOTED = re.compile(r'"[^"]*"')
 _WRITTEN = re.compile(r"\bBO_\s+(\d+)\s+(\w+)\s*:|\bSG_\s+(\w+)\s+(M|m\d+M?)?\s*:")
@@ -46,17 +46,17 @@ class Field:
     name: str
     start: int  # start bit in DBC numbering: least significant bit for Intel, most significant bit for Motorola
     length: int  # bits
-    big_endian: bool  # True: Motorola byte order; False: Intel byte order
+    big_endian: bool  # True for Motorola byte order, False for Intel byte order
     kind: str  # "unsigned", "signed" or "float" (IEEE 754)
     factor: int | float
     offset: int | float
-    minimum: float | None  # smallest valid physical value; None: the DBC has no range
-    maximum: float | None  # largest valid physical value; None: the DBC has no range
+    minimum: float | None  # smallest valid physical value; None if the DBC has no range
+    maximum: float | None  # largest valid physical value; None if the DBC has no range
     unit: str
-    invalid_raw: int | None  # unsigned raw code that means "no value"; None: no such code
-    choices: Mapping[int, str]  # raw value -> name; empty: no value table
+    invalid_raw: int | None  # unsigned raw code that means "no value"; None if the signal has no such code
+    choices: Mapping[int, str]  # name of each raw value; empty if the signal has no value table
     receivers: tuple[str, ...]
-    #: Multiplexers of the signal, each with the raw values that select the signal; empty: the signal is in every frame.
+    #: Multiplexers of the signal, each with the raw values that select the signal; empty if the signal is in every frame.
     selectors: tuple[tuple[str, frozenset[int]], ...]
 
     @property
@@ -81,28 +81,28 @@ class Layout:
     name: str
     frame_id: int
     extended: bool  # 29-bit identifier
-    fd: bool | None  # CAN FD frame; None: unknown
-    bit_rate_switch: bool | None  # None: unknown
+    fd: bool | None  # True for a CAN FD frame; None if unknown
+    bit_rate_switch: bool | None  # True if the payload has the data bit rate; None if unknown
     length: int  # bytes
     sender: str | None
     fields: tuple[Field, ...]
     bus: str | None
-    cyclic: bool  # True: sent every `cycle_ms`; False: event message
+    cyclic: bool  # True if the message is sent every `cycle_ms`, False for an event message
     cycle_ms: float | None
     timeout_ms: float | None
     inhibit_ms: float | None  # ms, minimum time between two frames of an event message
-    data_id: int | None  # Data ID of AUTOSAR E2E Profile 5; None: the message is not protected
+    data_id: int | None  # Data ID of AUTOSAR E2E Profile 5; None if the message is not protected
     pgn_mask: (
-        int  # mask of the identifier bits that identify the message: all bits, or those of a J1939 parameter group
+        int  # mask of the identifier bits that identify the message: all bits, or the bits of a J1939 parameter group
     )
-    #: Multiplexer -> raw values for which the DBC defines a layout.
+    #: Name of each multiplexer -> raw values for which the DBC defines a layout.
     multiplexers: Mapping[str, frozenset[int]]
 
     def field(self, name: str) -> Field:
         """Return the signal with the given name.
 
         Raises:
-            KeyError: If there is no such name; the message lists the valid names.
+            KeyError: If there is no such name; the error lists the valid names.
         """
         for field in self.fields:
             if field.name == name:
@@ -127,7 +127,7 @@ class Catalogue:
     path: Path
     layouts: tuple[Layout, ...]
     refused: tuple[Refused, ...]
-    nodes: Mapping[str, str]  # name of a node -> its kind; "" if the DBC has no NodeKind
+    nodes: Mapping[str, str]  # kind of each node, by the name of the node; "" if the DBC has no NodeKind
     buses: tuple[str, ...]
     nominal_bitrate: float | None  # bit/s, arbitration phase
     data_bitrate: float | None  # bit/s, data phase
@@ -141,7 +141,7 @@ class Catalogue:
         """Return the layout of the message with the given name.
 
         Raises:
-            KeyError: If the message is rejected or unknown. The text states the reason or the valid names.
+            KeyError: If the message is rejected or unknown. The error states the reason or the valid names.
         """
         if name in self._by_name:
             return self._by_name[name]
@@ -181,13 +181,13 @@ def catalogue(path: Path) -> Catalogue:
 
 
 class _DbcText:
-    """Identifiers, names and multiplexer marks of a DBC text, including duplicates. cantools removes the duplicates."""
+    """Identifiers, names and multiplexer marks of a DBC text, including the duplicates that cantools removes."""
 
     def __init__(self, text: str) -> None:
         self.ids: Counter[int] = Counter()
         self.names: Counter[str] = Counter()
         self.signals: dict[int, Counter[str]] = {}
-        self.multiplexed: Counter[int] = Counter()  # frame id -> number of signals marked m0, m1, ...
+        self.multiplexed: Counter[int] = Counter()  # number of signals marked m0, m1, ..., by frame id
         current = -1
         for match in _WRITTEN.finditer(_QUOTED.sub('""', text)):
             if match[1]:

@@ -1,287 +1,121 @@
-"""Strict loader of a DBC. It parses with cantools and rejects ambiguous or unsafe definitions with their line numbers.
+"""Loader of the network: `DBC file -> parser -> Network`.
 
-cantools accepts duplicate identifiers, duplicate names, factor 0 and signals without receiver. This loader rejects them.
+Importing cantools and parsing the DBC take about half a second. So the result for the network of the robot is cached in
+`__pycache__`, like the byte code of a module. The DBC is parsed again when the DBC, the parser, Python or cantools has changed.
 """
 
 from __future__ import annotations
 
-import math
-import re
-import zlib
-from collections.abc import Iterator
+import hashlib
+import os
+import pickle
+import sys
+from contextlib import suppress
 from functools import cache
-from itertools import chain
+from importlib.metadata import version
+from importlib.util import cache_from_source
 from pathlib import Path
-from typing import Any
 
-import cantools
-from cantools.database.can import Database
-from cantools.database.can import Message as RawMessage
-from cantools.database.can import Signal as RawSignal
-from cantools.database.errors import Error as CantoolsError
-
-from atalante_dbc.attributes import missing, wrong_values
-from atalante_dbc.network import Message, Network, Node, Signal
+from atalante_dbc.network import Network
 
 DBC_FILE = Path(__file__).with_name("atalante.dbc")
-
-#: Valid payload lengths of CAN FD [byte] (ISO 11898-1).
-_LENGTHS = (*range(9), 12, 16, 20, 24, 32, 48, 64)
-#: E2E Profile 5 header at the start of every frame: name -> (start bit, number of bits).
-_HEADER = {"Crc": (0, 16), "Counter": (16, 8)}
-_FD_FORMATS = ("StandardCAN_FD", "ExtendedCAN_FD")
-_BO = re.compile(r"BO_\s+(\d+)\s+(\w+)\s*:\s*(\d+)\s+(\w+)")
-_SG = re.compile(r"SG_\s+(\w+)\s*(\w*)\s*:")
-
-
-class DbcError(ValueError):
-    """Invalid DBC. Each line of the message states one problem with its line number in the file."""
-
-    code = "DBC_INVALID"
+#: Source files of the parser and of its result.
+SOURCES = tuple(Path(__file__).with_name(name) for name in ("parser.py", "attributes.py", "network.py"))
+#: Length of the digest at the start of a cache file [byte].
+_DIGEST = hashlib.sha256().digest_size
 
 
 def load(path: Path | None = None) -> Network:
     """Load and check a DBC file.
 
     Args:
-        path: DBC file; None: the network of the robot, which is read once per process.
+        path: DBC file. With None, the network of the robot is returned. It is cached on disk, and read once per process.
 
     Raises:
-        DbcError: If the file cannot be parsed or violates a rule (see `_problems`).
+        DbcError: If the file cannot be parsed or violates a rule, see `atalante_dbc.parser`.
     """
-    return _read_once(DBC_FILE) if path is None else _read(path)
+    return _load_once(DBC_FILE) if path is None else _parse(path)
 
 
-def _read(path: Path) -> Network:
+def load_cached(path: Path) -> Network:
+    """Load and check a DBC file, or read the result from the cache on disk.
+
+    Args:
+        path: DBC file.
+
+    Raises:
+        DbcError: If the file cannot be parsed or violates a rule, see `atalante_dbc.parser`.
+    """
     try:
-        raw = path.read_bytes()
-        text = raw.decode("cp1252")
-        lines = _Lines(text)
-        # These checks come first, because cantools removes duplicates and reports invalid values without a line number.
-        _require_no_problems(path, chain(_duplicates(lines), wrong_values(text)))
-        database = cantools.database.load_string(text, database_format="dbc", strict=False)
-    except DbcError:
-        raise
-    except OSError as error:
-        raise DbcError(f"{path} cannot be read: {error.strerror}") from error
-    except (ValueError, CantoolsError) as error:
-        raise DbcError(f"{path}: {error}") from error
-    assert isinstance(database, Database)
-    _require_no_problems(path, missing(text))
-    _require_no_problems(path, _problems(database, lines))
-    return Network(
-        nodes=tuple(
-            Node(n.name, str(_attribute(n, "NodeKind")), int(_attribute(n, "NodeNumber"))) for n in database.nodes
-        ),
-        messages=tuple(_message(m) for m in database.messages),
-        buses=tuple(_definitions(database)["Bus"].choices),
-        nominal_bitrate=int(_global(database, "NominalBitrate")),
-        data_bitrate=int(_global(database, "DataBitrate")),
-        hash32=zlib.crc32(raw),
-    )
+        key = _key(path)
+    except OSError:
+        return _parse(path)  # the parser reports the file that cannot be read
+    file = Path(cache_from_source(str(path)))
+    network = _cached(file, key)
+    if network is None:
+        network = _parse(path)
+        if not sys.dont_write_bytecode:
+            _store(file, key, network)
+    return network
 
 
-_read_once = cache(_read)
+_load_once = cache(load_cached)
 
 
-def _require_no_problems(path: Path, found: Iterator[tuple[int, str]]) -> None:
-    if problems := sorted(set(found)):
-        raise DbcError("\n".join(f"{path}:{line}: {problem}" for line, problem in problems))
+def _parse(path: Path) -> Network:
+    from atalante_dbc.parser import parse  # the import of cantools is slow
+
+    return parse(path)
 
 
-class _Lines:
-    """Line numbers of messages and signals. cantools does not store them."""
+def _key(path: Path) -> bytes:
+    """Return the digest of everything that determines the parsed network.
 
-    def __init__(self, text: str) -> None:
-        self.messages: list[tuple[int, int, str]] = []  # (line, frame id, name) of each message, with duplicates
-        self.signals: list[tuple[int, str, str, str]] = []  # (line, message, signal, multiplexer mark) of each signal
-        for number, line in enumerate(text.splitlines(), start=1):
-            if match := _BO.match(line):
-                self.messages.append((number, int(match[1]), match[2]))
-            elif (match := _SG.match(line.lstrip())) and self.messages:
-                self.signals.append((number, self.messages[-1][2], match[1], match[2]))
-        self._signal = {(message, name): number for number, message, name, _ in self.signals}
-        self._message = {name: number for number, _, name in self.messages}
-
-    def message(self, message: RawMessage) -> int:
-        return self._message[message.name]
-
-    def signal(self, message: RawMessage, signal: RawSignal) -> int:
-        return self._signal[message.name, signal.name]
+    Args:
+        path: DBC file.
+    """
+    digest = hashlib.sha256(f"{sys.version} {version('cantools')}".encode())
+    for source in (path, *SOURCES):
+        digest.update(hashlib.sha256(source.read_bytes()).digest())
+    return digest.digest()
 
 
-def _problems(database: Database, lines: _Lines) -> Iterator[tuple[int, str]]:
-    """Yield each violation of a rule as (line number, message)."""
-    data_ids: dict[int, str] = {}
-    nodes = {node.name for node in database.nodes}
-    for message in database.messages:
-        line = lines.message(message)
-        yield from ((line, f"{message.name} {problem}") for problem in _message_problems(message, nodes))
-        data_id = int(_attribute(message, "E2EDataId"))
-        if other := data_ids.get(data_id):
-            yield line, f"{message.name} must have a unique E2EDataId, got {data_id}, which {other} also has"
-        data_ids[data_id] = message.name
-        for signal in message.signals:
-            signal_line = lines.signal(message, signal)
-            name = f"{message.name}.{signal.name}"
-            yield from ((signal_line, f"{name} {problem}") for problem in _signal_problems(message, signal, nodes))
-        yield from _overlaps(message, lines)
+def _cached(file: Path, key: bytes) -> Network | None:
+    """Return the network in a cache file. Return None if the file is missing, is damaged, or has another key.
+
+    Args:
+        file: Cache file: digest of key and content, then the content.
+        key: Key of the parsed DBC, see `_key`.
+    """
+    try:
+        data = file.read_bytes()
+    except OSError:
+        return None
+    if data[:_DIGEST] != _digest(key, data[_DIGEST:]):
+        return None
+    network = pickle.loads(data[_DIGEST:])
+    assert isinstance(network, Network)
+    return network
 
 
-def _duplicates(lines: _Lines) -> Iterator[tuple[int, str]]:
-    ids: dict[int, int] = {}
-    names: dict[str, int] = {}
-    for line, frame_id, name in lines.messages:
-        if frame_id in ids:
-            yield line, f"{name} must have a unique frame id, got {frame_id:#x}, which line {ids[frame_id]} also has"
-        if name in names:
-            yield line, f"the message name {name} must be unique; line {names[name]} has it too"
-        ids.setdefault(frame_id, line)
-        names.setdefault(name, line)
-    signals: dict[tuple[str, str], int] = {}
-    for line, message, signal, multiplexer in lines.signals:
-        if (message, signal) in signals:
-            yield line, f"the signal name {message}.{signal} must be unique; line {signals[message, signal]} has it too"
-        signals.setdefault((message, signal), line)
-        if multiplexer:
-            yield line, f"{message}.{signal} must not be multiplexed; every message has one layout"
+def _store(file: Path, key: bytes, network: Network) -> None:
+    """Write a cache file. If the folder is not writable, the DBC is parsed at each start.
+
+    Args:
+        file: Cache file. Another process may read or write it at the same time.
+        key: Key of the parsed DBC, see `_key`.
+        network: Parsed network.
+    """
+    content = pickle.dumps(network)
+    temporary = file.with_name(f"{file.name}.{os.getpid()}")
+    try:
+        file.parent.mkdir(parents=True, exist_ok=True)
+        temporary.write_bytes(_digest(key, content) + content)
+        temporary.replace(file)
+    except OSError:
+        with suppress(OSError):
+            temporary.unlink()
 
 
-def _message_problems(message: RawMessage, nodes: set[str]) -> Iterator[str]:
-    if message.length not in _LENGTHS:
-        yield f"must have a length of {', '.join(map(str, _LENGTHS))} bytes, got {message.length} bytes"
-    if _attribute(message, "VFrameFormat") not in _FD_FORMATS:
-        yield "must be a CAN FD frame; set VFrameFormat to StandardCAN_FD"
-    if not set(message.senders) <= nodes or len(message.senders) != 1:
-        yield f"must have one sender from BU_, got {', '.join(message.senders) or 'none'}"
-    for name, (start, length) in _HEADER.items():
-        found = next((s for s in message.signals if s.name == name), None)
-        if found is None or (found.start, found.length, found.is_signed) != (start, length, False):
-            yield f"must have the unsigned signal {name} : {start}|{length}@1+ of the E2E header"
-    cyclic = _attribute(message, "GenMsgSendType") == "cyclic"
-    if cyclic and not int(_attribute(message, "GenMsgCycleTime")):
-        yield "is cyclic and must have a GenMsgCycleTime above 0"
-    if cyclic and int(_attribute(message, "TimeoutTime")) <= int(_attribute(message, "GenMsgCycleTime")):
-        yield "is cyclic and must have a TimeoutTime above its cycle time"
-    if not cyclic and not int(_attribute(message, "GenMsgDelayTime")):
-        yield "is an event and must have a GenMsgDelayTime above 0, which limits its bus load"
-    if not int(_attribute(message, "E2EDataId")):
-        yield "must have an E2EDataId above 0"
-
-
-def _signal_problems(message: RawMessage, signal: RawSignal, nodes: set[str]) -> Iterator[str]:
-    if signal.byte_order != "little_endian":
-        yield "must be little endian (@1), got big endian (@0)"
-        return
-    if signal.is_float:
-        yield "must be a scaled integer, got a float"
-    end = signal.start + signal.length
-    if end > 8 * message.length:
-        yield f"must end within the {8 * message.length} bits of the message, got end bit {end}"
-    if signal.start // 64 != (end - 1) // 64:
-        yield f"must not cross the 64-bit word boundary at bit {(end - 1) // 64 * 64}"
-    if not signal.unit:
-        yield 'must have a unit; write "1" for a number without unit'
-    if not signal.receivers or not set(signal.receivers) <= nodes:
-        yield f"must have receivers from BU_, got {', '.join(signal.receivers) or 'none'}"
-    if signal.scale == 0 or not math.isfinite(signal.scale) or not math.isfinite(signal.offset):
-        yield f"must have a finite offset and a finite factor other than 0, got factor {signal.scale} and offset {signal.offset}"
-        return
-    yield from _range_problems(signal)
-
-
-def _range_problems(signal: RawSignal) -> Iterator[str]:
-    if signal.minimum is None or signal.maximum is None or not signal.minimum < signal.maximum:
-        yield f"must have a range [min|max] with min < max, got [{signal.minimum}|{signal.maximum}]"
-        return
-    low, high = (
-        (-(1 << signal.length - 1), (1 << signal.length - 1) - 1) if signal.is_signed else (0, (1 << signal.length) - 1)
-    )
-    raw = sorted(((signal.minimum - signal.offset) / signal.scale, (signal.maximum - signal.offset) / signal.scale))
-    if raw[0] < low - 1e-6 or raw[1] > high + 1e-6:
-        yield (
-            f"must have a range that fits {signal.length} bits with factor {signal.scale}, "
-            f"got [{signal.minimum}|{signal.maximum}]"
-        )
-    invalid = _invalid_raw(signal)
-    if invalid is not None:
-        value = invalid - (1 << signal.length) if signal.is_signed and invalid >> signal.length - 1 else invalid
-        if not 0 <= invalid < 1 << signal.length:
-            yield f"must have an InvalidRaw of at most {signal.length} bits, got {invalid:#x}"
-        elif raw[0] - 0.5 <= value <= raw[1] + 0.5:
-            yield f"must have an InvalidRaw outside its valid range, got {invalid:#x}"
-
-
-def _overlaps(message: RawMessage, lines: _Lines) -> Iterator[tuple[int, str]]:
-    """Yield each signal that overlaps an earlier signal of the same message."""
-    owner: dict[int, RawSignal] = {}
-    for signal in sorted(message.signals, key=lambda s: lines.signal(message, s)):
-        if signal.byte_order != "little_endian":
-            continue
-        bits = range(signal.start, signal.start + signal.length)
-        if other := next((owner[bit] for bit in bits if bit in owner), None):
-            yield lines.signal(message, signal), f"{message.name}.{signal.name} overlaps {other.name}"
-        owner.update(dict.fromkeys(bits, signal))
-
-
-def _message(message: RawMessage) -> Message:
-    return Message(
-        name=message.name,
-        frame_id=message.frame_id,
-        length=message.length,
-        sender=message.senders[0],
-        signals=tuple(_signal(s) for s in message.signals),
-        bus=str(_attribute(message, "Bus")),
-        send_type=str(_attribute(message, "GenMsgSendType")),
-        cycle_ms=int(_attribute(message, "GenMsgCycleTime")),
-        timeout_ms=int(_attribute(message, "TimeoutTime")),
-        inhibit_ms=int(_attribute(message, "GenMsgDelayTime")),
-        data_id=int(_attribute(message, "E2EDataId")),
-        comment=message.comment or "",
-    )
-
-
-def _signal(signal: RawSignal) -> Signal:
-    assert signal.minimum is not None
-    assert signal.maximum is not None
-    return Signal(
-        name=signal.name,
-        start=signal.start,
-        length=signal.length,
-        signed=signal.is_signed,
-        factor=float(signal.scale),
-        offset=float(signal.offset),
-        minimum=float(signal.minimum),
-        maximum=float(signal.maximum),
-        unit=signal.unit or "",
-        invalid_raw=_invalid_raw(signal),
-        choices={int(k): str(v) for k, v in (signal.choices or {}).items()},
-        receivers=tuple(signal.receivers),
-    )
-
-
-def _invalid_raw(signal: RawSignal) -> int | None:
-    text = str(_attribute(signal, "InvalidRaw"))
-    return int(text, 0) if text else None
-
-
-def _attribute(item: Any, name: str) -> int | str:
-    """Return the value of an attribute, or its default if the value is not set. An enumeration value is returned by name."""
-    attributes = item.dbc.attributes if item.dbc is not None else {}
-    if name in attributes:
-        definition, value = attributes[name].definition, attributes[name].value
-    else:
-        definition = item.dbc.attribute_definitions.get(name) if item.dbc is not None else None
-        value = definition.default_value if definition is not None else ""
-    if definition is not None and definition.choices and isinstance(value, int):
-        return str(definition.choices[value])
-    return value  # type: ignore[no-any-return]
-
-
-def _definitions(database: Database) -> dict[str, Any]:
-    return database.dbc.attribute_definitions if database.dbc is not None else {}
-
-
-def _global(database: Database, name: str) -> Any:
-    attributes = database.dbc.attributes if database.dbc is not None else {}
-    return attributes[name].value if name in attributes else _definitions(database)[name].default_value
+def _digest(key: bytes, content: bytes) -> bytes:
+    return hashlib.sha256(key + content).digest()

@@ -8,6 +8,12 @@ from functools import cached_property
 from typing import TypeVar
 
 
+class DbcError(ValueError):
+    """Error of an invalid DBC. Each line of the error text states one problem with its line number in the file."""
+
+    code = "DBC_INVALID"
+
+
 @dataclass(frozen=True)
 class Signal:
     """Signal of a payload, little endian: physical = raw * factor + offset."""
@@ -21,8 +27,8 @@ class Signal:
     minimum: float  # smallest valid physical value
     maximum: float  # largest valid physical value
     unit: str
-    invalid_raw: int | None  # unsigned raw code that means "no value"; None: no such code
-    choices: Mapping[int, str]  # raw value -> name; empty: the signal is a number
+    invalid_raw: int | None  # unsigned raw code that means "no value"; None if the signal has no such code
+    choices: Mapping[int, str]  # name of each raw value; empty if the signal is a number
     receivers: tuple[str, ...]  # nodes that receive the signal
 
 
@@ -37,8 +43,8 @@ class Message:
     signals: tuple[Signal, ...]
     bus: str
     send_type: str  # "cyclic" or "event"
-    cycle_ms: int  # ms, 0 for an event message
-    timeout_ms: int  # ms; 0: no timeout
+    cycle_ms: int  # ms, period of a cyclic message; 0 for an event message
+    timeout_ms: int  # ms; 0 if the message has no timeout
     inhibit_ms: int  # ms, minimum time between two frames of an event message
     data_id: int  # AUTOSAR E2E Data ID
     comment: str
@@ -47,7 +53,7 @@ class Message:
         """Return the signal with the given name.
 
         Raises:
-            KeyError: If there is no such name; the message lists the valid names.
+            KeyError: If there is no such name; the error lists the valid names.
         """
         return _named(self.signals, name, f"signal of {self.name}")
 
@@ -75,7 +81,7 @@ class Network:
     buses: tuple[str, ...]
     nominal_bitrate: int  # bit/s, arbitration phase
     data_bitrate: int  # bit/s, data phase
-    hash32: int  # CRC-32 of the DBC file; nodes send it in their heartbeat (DbcHash)
+    hash32: int  # CRC-32 of the DBC file, which each node sends in its heartbeat (DbcHash)
 
     @cached_property
     def _by_name(self) -> dict[str, Message]:
@@ -85,7 +91,7 @@ class Network:
         """Return the message with the given name.
 
         Raises:
-            KeyError: If there is no such name; the message lists the valid names.
+            KeyError: If there is no such name; the error lists the valid names.
         """
         try:
             return self._by_name[name]
@@ -96,7 +102,7 @@ class Network:
         """Return the node with the given name.
 
         Raises:
-            KeyError: If there is no such name; the message lists the valid names.
+            KeyError: If there is no such name; the error lists the valid names.
         """
         return _named(self.nodes, name, "node")
 
@@ -113,7 +119,7 @@ class Network:
         return tuple(m for m in self.messages if node in m.receivers)
 
     def bus_load(self) -> dict[str, float]:
-        """Return the worst-case load of each bus, 0 to 1. The period of an event message is its inhibit time."""
+        """Return the worst-case load of each bus, 0 to 1. An event message counts as sent once per inhibit time."""
         load = dict.fromkeys(self.buses, 0.0)
         for message in self.messages:
             period = (message.cycle_ms or message.inhibit_ms) * 1e-3
@@ -125,12 +131,11 @@ _T = TypeVar("_T", Signal, Node)
 
 
 def wire_time(length: int, nominal_bitrate: float = 1e6, data_bitrate: float = 5e6) -> float:
-    """Return the longest time [s] for which a CAN FD frame occupies the bus, with 11-bit identifier and stuff bits.
+    """Return the longest time [s] for which a CAN FD frame with an 11-bit identifier occupies the bus, including stuff bits.
 
-    The bit counts are those of ISO 11898-1.
-
-    The nominal phase with interframe space has 33 bits. The data phase has 5 + 8 n bits for n payload bytes, and one stuff bit
-    per four of these bits. The CRC with fixed stuff bits and delimiters adds 28 bits, or 33 bits if n is above 16.
+    The bit counts are those of ISO 11898-1. The nominal phase with the interframe space has 33 bits. The data phase has 5 + 8 n
+    bits for n payload bytes, and one stuff bit per four of these bits. The CRC with its fixed stuff bits and the delimiters adds
+    28 bits, or 33 bits if n is above 16.
 
     Args:
         length: payload length n [byte].

@@ -1,1 +1,1 @@
-"""Emulated robot on a CAN bus: nodes, mechanics in PyBullet, and fault injection."""
+"""Emulated robot on a CAN bus: nodes, mechanics in PyBullet or MuJoCo, and fault injection."""

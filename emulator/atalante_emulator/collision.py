@@ -1,8 +1,8 @@
-"""Detection of two senders that send the same message, from the alive counters of their frames.
+"""Detection of two senders of the same message, by the alive counters of the received frames.
 
-A sender increments its counter by one with each frame. CAN may lose or repeat a frame, but it keeps the order of the frames.
-Two different frames with the same counter therefore come from two senders. The same holds for two frames of one cycle with
-counters that are not consecutive.
+A sender increments its counter by one with each frame. CAN may lose or repeat a frame, but it keeps the order of the frames. So
+two different frames with the same counter, one directly after the other, come from two senders. Two successive frames of one
+cycle also come from two senders if their counters are not consecutive.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from atalante_hal.wire.frame import Frames
 
 
 class Senders:
-    """Detector for two senders of one message. The emulator runs it only in cycles with missing, rejected or extra frames."""
+    """Detector of two senders of one message. The emulator runs it only in cycles with missing, rejected or extra frames."""
 
     def __init__(self, message: Message) -> None:
         self._message = message
@@ -21,11 +21,11 @@ class Senders:
         self._last_cycle = -1
 
     def are_two(self, frames: Frames, cycle: int) -> bool:
-        """Return whether the message's frames of a cycle come from two senders.
+        """Return whether two senders sent the message in this cycle.
 
         Args:
             frames: all frames received in the cycle, in the order of reception, shape (n,). Other messages are ignored.
-            cycle: number of the cycle. It increases by one per cycle.
+            cycle: number of the cycle. If the previous call was not in the previous cycle, its frames are not compared.
         """
         if self._last_cycle != cycle - 1:
             self._last = None

@@ -5,11 +5,12 @@ the HAL. `drive` computes the torques of the next millisecond.
 
 The drives are the last safety layer. They react to errors without the HAL, in one of two ways:
 
-- Local hold. Causes: no valid new command or no SYNC for `WATCHDOG` cycles, two senders of one command, low supply voltage.
-  The drive latches QUICK STOP ACTIVE, and its motor holds the position of its own encoder.
+- Local hold. Causes: the last valid command is `WATCHDOG` cycles old, no SYNC for `WATCHDOG` cycles, two senders of one
+  command, low supply voltage. The drive stays in QUICK STOP ACTIVE until the HAL acknowledges the hold, and its motor holds the
+  present position of its own encoder.
 - Lowering. Causes: over-temperature, over-current, encoder error. The drive cannot hold the joint. It enters FAULT REACTION
   ACTIVE and then FAULT. The power stage is off, and the brake lets the joint sink slowly. The same brake acts in every drive
-  without power, so the HAL lowers a joint with DISABLE_VOLTAGE.
+  whose power stage is off, so the HAL can lower a joint with DISABLE_VOLTAGE.
 """
 
 from __future__ import annotations
@@ -28,9 +29,9 @@ from atalante_hal.robot import JOINTS, LEG_JOINTS, SIDES, Robot
 from atalante_hal.types import PERIOD, Vector
 from atalante_hal.wire.cia402 import AUTOMATIC, Controlword, DriveState, next_state
 
-#: Timeout of commands and of SYNC [cycles]. After it, an enabled drive starts its local hold.
+#: Timeout of the commands, and of SYNC [cycles]. When it is reached, an enabled drive starts its local hold.
 WATCHDOG: Final = 5
-#: Period of the temperature update and of the standstill check of lowered joints [cycles].
+#: Period of the temperature update, and of the check whether lowered joints are at rest [cycles].
 SLOW_CYCLES: Final = 100
 #: Names of the drive nodes, in the order of JOINTS.
 NODES: Final = tuple(joint.upper() for joint in JOINTS)
@@ -47,11 +48,11 @@ class DriveParameters:
     velocity_bandwidth: float = 80.0  # cut-off frequency of the velocity low-pass [Hz]
     torque_noise: float = 0.05  # noise of the torque measurement [Nm rms]
     trip_temperature: float = 120.0  # winding temperature that switches the power stage off [degC]
-    cool_enough: float = 100.0  # highest winding temperature at which a tripped drive may be enabled again [degC]
+    cool_enough: float = 100.0  # highest winding temperature at which an over-temperature error can end [degC]
     supply: float = 48.0  # nominal supply voltage [V]
     hold_below: float = 40.0  # lowest supply voltage without a local hold [V]
     off_below: float = 20.0  # lowest supply voltage at which the power stage works [V]
-    rest_speed: float = 0.05  # joint speed below which a lowered joint counts as at rest [rad/s]
+    rest_speed: float = 0.05  # joint speed below which the lowering of a joint has ended [rad/s]
 
 
 class DriveSignals(NamedTuple):
@@ -85,8 +86,8 @@ class Drives:
         Args:
             robot: joint properties that the firmware uses: torque limits, gear ratios and hold gains.
             parameters: true parameters of the drives.
-            signals: arrays that receive the signals of the state frames.
-            outbox: list that receives the emergencies to send. None creates one.
+            signals: arrays to which the signals of the state frames are written.
+            outbox: list to which emergencies to send are appended. With None, the drives create a list.
         """
         self._robot = robot
         self.parameters = parameters
@@ -98,19 +99,20 @@ class Drives:
         self.errors = Errors(NODES, self.emergencies)
         #: Supply voltage of each drive [V].
         self.voltage = [parameters.supply] * len(JOINTS)
-        #: Number of consecutive cycles without a new command, per leg.
+        #: Age of the last valid command, per leg [cycles].
         self.missed = [0] * len(SIDES)
         self._unsynced = [0] * len(SIDES)  # number of consecutive cycles without SYNC, per leg
         self._unsynced_at = [-1] * len(SIDES)  # number of the last cycle without SYNC, per leg
         self.encoders = Encoders(robot, parameters.velocity_bandwidth, signals.position, signals.velocity)
         self.motors = Motors(robot, parameters.motor, signals.torque, signals.temperature)
         self._slow_phase = 0
-        self._steady = b""  # the last controlwords if they changed no drive state, otherwise empty
+        #: Controlwords that changed nothing when they were last evaluated; empty if the next controlwords must be evaluated.
+        self._steady = b""
         self._hold_at = np.zeros(len(JOINTS))  # setpoint of the local hold of each drive [rad]
         self._target, self._limit = np.zeros((2, len(JOINTS)))
-        self._own_limit = robot.torque_max.copy()  # torque limit of each drive at its present temperature [Nm]
+        self._own_limit = robot.torque_max.copy()  # torque limit of each drive at the current winding temperature [Nm]
         self._within = compiled(_within)
-        # Compiles the kernel now, because compilation takes longer than a cycle.
+        # Compile the kernel now, because compilation takes longer than a cycle.
         self._within(self._target, self._limit, self._own_limit, self.motors.wanted)
         self._states_changed()
 
@@ -124,7 +126,14 @@ class Drives:
         """
         self.encoders.sample(position)
 
-    def command(self, fresh: tuple[bool, bool], controlword: Vector, target: Vector, limit: Vector) -> None:
+    def command(
+        self,
+        fresh: tuple[bool, bool],
+        controlword: Vector,
+        target: Vector,
+        limit: Vector,
+        delay: tuple[int, int] = (0, 0),
+    ) -> None:
         """Latch the last valid command and run the watchdog and the state machines.
 
         Every call of `drive` reads the arrays `target` and `limit` until the next command.
@@ -134,11 +143,13 @@ class Drives:
             controlword: `Controlword` values, shape (12,).
             target: target torques, shape (12,) [Nm at the joint].
             limit: torque limits from the signal MaxTorque of the HAL, shape (12,) [Nm]. The drive's own limit applies too.
+            delay: per leg, age of the new command on arrival [cycles], less than `WATCHDOG`. The watchdog adds the cycles since
+                the arrival to this age.
         """
         missed = self.missed
         for leg in (0, 1):
             if fresh[leg]:
-                missed[leg] = 0
+                missed[leg] = delay[leg]
             else:
                 missed[leg] += 1
                 if missed[leg] >= WATCHDOG:
@@ -171,12 +182,12 @@ class Drives:
 
         Args:
             generator: source of the random numbers.
-            out: array that receives the noise, shape (cycles, 12) [Nm].
+            out: output for the noise, shape (cycles, 12) [Nm].
         """
         np.multiply(generator.standard_normal(out.shape), self.parameters.torque_noise, out=out)
 
     def _without_command(self, wanted: Vector) -> None:
-        """Set the torque of drives that are not enabled: hold torque in local hold, otherwise zero."""
+        """Set the torque of drives in a state other than OPERATION ENABLED: hold torque in QUICK STOP ACTIVE, otherwise zero."""
         robot, limit = self._robot, self._own_limit
         # The filtered velocity has too much delay for this loop, so the loop uses the raw encoder difference.
         hold = robot.hold_kp * (self._hold_at - self.encoders.angle) - robot.hold_kd * self.encoders.speed
@@ -190,14 +201,14 @@ class Drives:
 
         Args:
             leg: index of the leg, 0 is left.
-            code: emergency error code of the communication error that causes the hold.
+            code: error code of the emergency that reports the cause.
         """
         for drive in range(leg * _LEG, (leg + 1) * _LEG):
             if self.state[drive] is DriveState.OPERATION_ENABLED:
                 self.fail(drive, code)
 
     def miss_sync(self, leg: int, cycle: int) -> None:
-        """Count a cycle without SYNC on the bus of a leg. Start the local hold of the leg after `WATCHDOG` such cycles in a row.
+        """Count a cycle without SYNC on the bus of a leg. After `WATCHDOG` such cycles in a row, start the local hold.
 
         Args:
             leg: index of the leg, 0 is left.
@@ -218,7 +229,7 @@ class Drives:
         self._unsynced[leg] = 0
 
     def warn(self, leg: int, code: int) -> None:
-        """Report an error in the command of a leg as a warning, to which the drives do not react.
+        """Report an error in the command of a leg as a warning of its drives. The drives do not react to a warning.
 
         Args:
             leg: index of the leg, 0 is left.
@@ -233,7 +244,7 @@ class Drives:
         Args:
             drive: index of the drive.
             code: emergency error code.
-            persists: whether the cause persists until `recover`. The HAL cannot acknowledge the error before that.
+            persists: True if the cause lasts until a call of `recover`. Until then the HAL cannot acknowledge the error.
         """
         self.errors.begin(drive, code, persists=persists)
         state = self.state[drive]
@@ -248,7 +259,7 @@ class Drives:
         self._states_changed()
 
     def recover(self, drive: int, code: int) -> None:
-        """Mark the cause of an error as gone. The reaction continues until the HAL acknowledges the error.
+        """Mark the cause of an error as gone. The reaction to the error continues until the HAL acknowledges the error.
 
         Args:
             drive: index of the drive.
@@ -257,7 +268,8 @@ class Drives:
         self.errors.end(drive, code)
         if not self.latched[drive] and self.state[drive] not in _FAULTY:
             self.errors.acknowledge(drive)
-        self._steady = b""  # the present controlword may now acknowledge the error
+        # Evaluate the next controlwords even if they are unchanged, because they may now acknowledge the error.
+        self._steady = b""
 
     def leave(self, drive: int, state: DriveState) -> None:
         """Force a state change without a command, to emulate defective firmware.
@@ -320,7 +332,7 @@ class Drives:
             self._steady = words
 
     def _apply_controlword(self, drive: int, word: int) -> bool:
-        """Apply a controlword to a drive. Return whether it changed the drive state or acknowledged a local hold."""
+        """Apply a controlword to a drive. Return whether it changed the drive state or acknowledged an error."""
         state, latched = self.state[drive], self.latched[drive]
         after = next_state(state, word, latched=latched)
         if self.errors.any_persists(drive) and (state is DriveState.FAULT or after is DriveState.OPERATION_ENABLED):
@@ -362,7 +374,7 @@ class Drives:
     def _check_temperature(self) -> None:
         """Reduce the torque limit of hot drives and switch off drives above the trip temperature."""
         temperature, parameters = self.motors.temperature, self.parameters
-        # The temperature is rounded as in the state frame, from which the HAL computes the same limit.
+        # The temperature is rounded as in the state frame, so that drive and HAL compute the same limit.
         self._own_limit[:] = self._robot.torque_limit(np.rint(temperature))
         for drive, degrees in enumerate(temperature.tolist()):
             if degrees >= parameters.trip_temperature:

@@ -1,7 +1,7 @@
 """Emergency messages of the nodes: error codes of CiA 301 and CiA 402, and the reaction of a drive to each code.
 
-A node sends an emergency when an error begins, and an emergency with code 0 when its last error ends. The HAL cannot
-acknowledge an error while its cause persists.
+A node sends an emergency when an error begins, and an emergency with code 0 when its last error ends. An error with a local
+reaction ends when the HAL acknowledges it. The HAL cannot acknowledge an error while its cause persists.
 """
 
 from __future__ import annotations
@@ -22,11 +22,11 @@ TWO_SENDERS: Final = 0x8150  # identifier collision: two nodes send the same com
 COMMAND_REJECTED: Final = 0x8200  # protocol error: command with wrong CRC, length or value range
 COMMAND_TIMEOUT: Final = 0x8250  # command timed out
 
-#: First hex digit of an error code -> value of the CiA 301 error register (generic bit plus the bit of the error class).
+#: First hex digit of an error code -> value of the CiA 301 error register: generic bit plus bit of the error class.
 _REGISTER: Final = {0x2: 0x03, 0x3: 0x05, 0x4: 0x09, 0x7: 0x21, 0x8: 0x11}
 _GENERIC: Final = 0x01
 
-#: Two ages of a warning [calls of `Errors.advance`]: at the end of the warning, and at the end of its inhibit time.
+# Ages of a warning [calls of `Errors.advance`]: at _ENDED the warning ends, at _REPEATABLE it may be reported again.
 _ENDED, _REPEATABLE = 2, 3
 
 
@@ -41,8 +41,8 @@ class FaultReaction(Enum):
 def reaction_to(code: int) -> FaultReaction:
     """Return the reaction of a drive to an error.
 
-    A drive cannot hold its joint with a current, temperature or encoder error, or without supply voltage. It then lowers the
-    joint.
+    A drive cannot hold its joint without supply voltage, or with an error of motor current, temperature or encoder. So these
+    errors lead to the lowering of the joint.
 
     Args:
         code: emergency error code.
@@ -75,11 +75,11 @@ class Emergency(NamedTuple):
 
 
 class Errors:
-    """Active errors of several nodes. Each change appends the emergency to send to the list `outbox`."""
+    """Active errors of several nodes. Each change adds an emergency to `outbox`, the list of emergencies to send."""
 
     def __init__(self, nodes: Sequence[str], outbox: list[Emergency]) -> None:
         self._nodes, self._outbox = nodes, outbox
-        self._active: list[dict[int, bool]] = [{} for _ in nodes]  # error code -> whether its cause persists
+        self._active: list[dict[int, bool]] = [{} for _ in nodes]  # error code -> whether the cause persists
         self._warnings: dict[tuple[int, int], int] = {}  # (node, error code) -> age of the warning [calls of `advance`]
 
     def begin(self, node: int, code: int, *, persists: bool = False) -> None:
@@ -88,7 +88,7 @@ class Errors:
         Args:
             node: index of the node.
             code: emergency error code.
-            persists: whether the cause persists until `end`.
+            persists: True if the cause lasts until a call of `end`.
         """
         active = self._active[node]
         new = code not in active
@@ -97,7 +97,7 @@ class Errors:
             self._report(node, code)
 
     def end(self, node: int, code: int) -> None:
-        """Mark the cause of an error as gone.
+        """Mark the cause of an error as gone. The error stays active until it is acknowledged.
 
         Args:
             node: index of the node.
@@ -143,7 +143,7 @@ class Errors:
         self._active[node] = {}
 
     def warn(self, node: int, code: int) -> None:
-        """Report a warning, which is an error without a reaction. Report it again only after the inhibit time.
+        """Report a warning, which is an error without a reaction, unless the same warning was reported a short time ago.
 
         Args:
             node: index of the node.

@@ -1,13 +1,13 @@
 """Emulator of the robot: runs all nodes except the HAL, and answers each SYNC of the HAL.
 
-    bus -> process image -> E2E + validity -> nodes -> body (PyBullet) -> nodes -> process image -> bus
+    bus -> process image -> E2E + validity -> nodes -> body -> nodes -> process image -> bus
 
 A cycle begins with SYNC. Every node latches the command of the previous cycle and sends its samples. Then the body moves for
 one millisecond. Then the nodes sample the sensors for the next cycle, and the emulator adds counter and CRC to the next
-frames. The next SYNC is therefore answered without delay, and a HAL in another process computes while the body moves.
+frames. So the next SYNC is answered without delay, and a HAL in another process can compute while the body moves.
 
-`poll` answers an embedded HAL in lock-step, as the `step` of a `PairBus`. `run` answers a HAL in another process. The same
-seed gives the same sequence of bytes.
+`poll` answers an embedded HAL in lock-step, as the `step` function of a `PairBus`. `run` answers a HAL in another process. With
+the same seed and the same frames of the HAL, the emulator sends the same bytes.
 """
 
 from __future__ import annotations
@@ -19,8 +19,9 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from atalante_dbc import Network
-from atalante_emulator.body import Body
+from atalante_emulator.bodies import Body
 from atalante_emulator.collision import Senders
+from atalante_emulator.crane import Crane
 from atalante_emulator.drive import WATCHDOG, DriveParameters, Drives, DriveSignals
 from atalante_emulator.emergency import COMMAND_LOST, COMMAND_REJECTED, LIFE_GUARD, TWO_SENDERS, Emergency
 from atalante_emulator.faults import LINK_KINDS, NODE_KINDS, SENSOR_KINDS, Fault
@@ -32,11 +33,13 @@ from atalante_emulator.link import FaultyBus
 from atalante_emulator.node_faults import NodeFaults
 from atalante_emulator.noise import NOISE_CYCLES, SensorNoise
 from atalante_emulator.pendant import Operator, PendantNode
+from atalante_emulator.virtual_operator import VirtualOperator
+from atalante_emulator.wearer import PassiveWearer
 from atalante_hal.bus import Bus, BusFull
 from atalante_hal.robot import CELLS, FEET, IMUS, JOINTS, SIDES, Robot
 from atalante_hal.types import PERIOD, Vector
 from atalante_hal.wire.codec import Codec
-from atalante_hal.wire.e2e import Check
+from atalante_hal.wire.e2e import COUNTER_BYTE, Check
 from atalante_hal.wire.frame import FRAME_BYTES, Frames, new_frames
 from atalante_hal.wire.process_image import ReceiveImage, TransmitImage
 
@@ -46,7 +49,9 @@ _RECEIVE_BUDGET = 128
 _BATCH = 128
 #: Values of `Check` for which a received command frame is rejected.
 _REJECTED = (Check.CRC, Check.LENGTH, Check.RANGE, Check.INVALID)
-#: Longest wait after the first SYNC of a cycle for its SYNCs on the other buses [s].
+#: Half the period of the alive counter.
+_HALF_TURN = 128
+#: After the first SYNC of a cycle, the emulator waits at most this time for the SYNCs on the other buses [s].
 _SYNC_SKEW = 200e-6
 
 
@@ -63,8 +68,12 @@ class EmulatorParameters:
 class Emulator:
     """All nodes of the network except the HAL, connected to one body.
 
-    `before_send` is a list of callables `(cycle, values)`. They are called after the SYNC of a cycle and may change the values
-    before the nodes send them. `values` is in the order of `signals`.
+    `before_send` is a list of callables `(cycle, values)`. They are called after the SYNC of a cycle and may change `values`, the
+    signal values that the nodes then send. The values are in the order of `signals`.
+
+    `pelvis_forces` is a list of callables `(hal_state) -> wrench`. They are called once per time step, also without SYNC. The sum
+    of the returned wrenches acts on the pelvis: force [N] and moment [Nm] in world axes, shape (6,). For example, a `Crane` is
+    such a callable.
     """
 
     def __init__(
@@ -85,14 +94,14 @@ class Emulator:
             network: nodes and messages of the DBC.
             robot: joint properties that the nodes use.
             body: mechanics of the robot. The emulator steps it, and the caller closes it.
-            bus: bus that carries the frames of all buses. A `JoinedBus` combines several channels.
+            bus: bus on which the nodes of all buses send and receive. A `JoinedBus` combines several channels.
             seed: seed of all random numbers: sensor noise, biases and random faults.
             operator: emulated operator of the pendant. None if another process runs the pendant node.
-            parameters: true parameters of the nodes. None means the default ones.
-            faults: faults to inject. Their cycles count from 0.
+            parameters: true parameters of the nodes. With None, the default parameters are used.
+            faults: faults to inject. The first cycle of the emulator has number 0.
 
         Raises:
-            FaultError: If the network has no such target or signal.
+            FaultError: If the target or a signal of a fault is not in the network.
         """
         parameters = parameters or EmulatorParameters()
         self.network, self.body, self.bus, self.operator = network, body, bus, operator
@@ -102,6 +111,10 @@ class Emulator:
         self.cycle = 0
         self.frames_lost = 0  # number of frames lost because the transmit queue of the bus was full
         self.before_send: list[Callable[[int, Vector], None]] = []
+        self.pelvis_forces: list[Callable[[int], Vector]] = []
+        self.crane: Crane | None = None  # crane of a robot on the ground, also an element of `pelvis_forces`
+        self.virtual_operator: VirtualOperator | None = None  # also an element of `pelvis_forces`
+        self.wearer: PassiveWearer | None = None  # wearer whose limbs act on the joints
         self._build_images()
         self._bind_commands()
         self._build_nodes(robot, parameters)
@@ -117,7 +130,7 @@ class Emulator:
 
     @property
     def signals(self) -> Codec:
-        """Codec of the 1 ms messages of the nodes. It defines the order of their signals."""
+        """Codec of the 1 ms messages of the nodes. The codec defines the order of the signals."""
         return self._tx.codec
 
     # -- construction ------------------------------------------------------------------------------------------------
@@ -130,7 +143,7 @@ class Emulator:
         cyclic = [m for bus in network.buses for m in sent if m.bus == bus and m.cycle_ms == 1]
         self._tx = TransmitImage(cyclic)
         self._sealed = False  # whether the next frames already have counter and CRC
-        self._tag = 0  # alive counter of the next frames: low byte of their cycle number
+        self._tag = 0  # alive counter of the next frames: low byte of the cycle number
         self._haptics_tx = TransmitImage([network.message("HAPTICS_STATE")])
         self._heartbeats = Heartbeats(network, [m for m in sent if m.name.endswith("_STATUS")])
         self._emergencies: list[Emergency] = []  # emergencies to send in this cycle
@@ -138,7 +151,7 @@ class Emulator:
 
         received = [m for m in network.sent_by("HAL") if m.cycle_ms == 1]
         syncs = [m for m in received if m.name.startswith("SYNC_")]
-        # An embedded bus delivers the commands of the previous cycle, then SYNC. The process image has the same order.
+        # The rows are in the order in which an embedded bus delivers the frames: commands of the previous cycle, then SYNC.
         self._rx = ReceiveImage([m for m in received if m not in syncs] + syncs)
         self._rx.values.fill(0.0)  # values until the first command: zero torque, zero vibration, HAL state OFF
         self._scratch = new_frames(_RECEIVE_BUDGET)
@@ -147,14 +160,14 @@ class Emulator:
 
         self._sync_rows = [self._rx.codec.rows[m.name] for m in syncs]
         self._sync_ids = {m.frame_id for m in syncs}
-        self._shares: list[Frames] = []  # answer to each SYNC: the frames of the nodes on its bus
+        self._shares: list[Frames] = []  # for each SYNC: answer of the nodes on the bus of this SYNC
         for sync in syncs:
             rows = [row for row, m in enumerate(cyclic) if m.bus == sync.bus]
             self._shares.append(self._tx.frames[rows[0] : rows[-1] + 1])
         self._whole = [self._tx.frames]
         #: Index of each leg's SYNC in the list of SYNCs.
         self._leg_syncs = [[m.name for m in syncs].index(f"SYNC_{side.upper()}_LEG") for side in SIDES]
-        self._answered = self._shares  # answers in the last cycle with missing or rejected frames, one for each SYNC
+        self._answered = self._shares  # for each SYNC: answer in the last cycle with a missing, rejected or late frame
         batch = new_frames(_BATCH)
         self._batch = batch.view(np.uint8).data
         self._batch_up_to = [batch[:count] for count in range(_BATCH + 1)]
@@ -169,8 +182,15 @@ class Emulator:
         self._sync_cycles = values[codec.slice("Cycle")]
         self._command_rows = [codec.rows[f"COMMAND_{side.upper()}_LEG"] for side in SIDES]
         self._senders = [Senders(self._rx.codec.messages[row]) for row in self._command_rows]
+        #: For each leg: rows of its SYNC and of its command.
+        self._leg_rows = [
+            (self._sync_rows[sync], row) for sync, row in zip(self._leg_syncs, self._command_rows, strict=True)
+        ]
+        #: Alive counter of the last frame of each row, a view of the process image.
+        self._counters = self._rx.frames["data"][:, COUNTER_BYTE]
         self._level_row = codec.rows["HAPTICS_COMMAND"]
         self._commanded = [False] * len(SIDES)
+        self._delay = [0] * len(SIDES)  # delay of the last valid command of each leg [cycles]
         self._last_sync: int | None = None
 
     def _build_nodes(self, robot: Robot, parameters: EmulatorParameters) -> None:
@@ -197,7 +217,9 @@ class Emulator:
                 truth[codec.slice("Accel")].reshape(len(IMUS), 3),
             ),
         )
-        self._feet = Feet(parameters.foot, truth[codec.slice("Force")].reshape(len(FEET), len(CELLS), 3))
+        self._feet = Feet(
+            parameters.foot, self.body.soles, truth[codec.slice("Force")].reshape(len(FEET), len(CELLS), 3)
+        )
         for kind, temperature in (("IMU", parameters.imu.temperature), ("FOOT", parameters.foot.temperature)):
             for message in codec.messages:
                 if message.name.startswith(f"{kind}_"):
@@ -225,7 +247,7 @@ class Emulator:
                 return self._cycle_without_sync()
         self._waiting = 0
         self._rx.accept(self._scratch, count)
-        if self._rx.all_fresh:
+        if self._rx.all_fresh and self._commands_in_step():
             self._commanded = [False] * len(SIDES)
             self._complete_answer(int(self._sync_cycles[0]))
             self._cycle((True, True), self._whole)
@@ -239,7 +261,7 @@ class Emulator:
             count: frames already in the scratch buffer.
 
         Returns:
-            Number of frames in the scratch buffer. 0 if no SYNC is among them. The frames are then kept for the next call.
+            Number of frames in the scratch buffer; 0 if there is no SYNC yet. Then the frames are kept for the next call.
         """
         ids = self._scratch["can_id"]
         deadline = None
@@ -259,11 +281,12 @@ class Emulator:
         return count
 
     def _imperfect_cycle(self, count: int) -> bool:
-        """Handle a cycle with missing or rejected frames, and return whether the cycle was run.
+        """Process the frames of a cycle in which a frame is missing, rejected or late. Return whether a cycle was run.
 
         Args:
             count: frames in the scratch buffer.
         """
+        self._check_delays()
         checks = self._rx.check.tolist()
         self._check_commands(checks, count)
         synced = [sync for sync, row in enumerate(self._sync_rows) if checks[row] <= Check.SOME_LOST]
@@ -278,26 +301,46 @@ class Emulator:
             return False
         self._last_sync = number
         fresh = self._commanded[0], self._commanded[1]
+        delay = self._delay[0], self._delay[1]
         self._commanded = [False] * len(SIDES)
         self._complete_answer(number)
         self._answered = [share.copy() for share in self._shares]
         for leg, sync in enumerate(self._leg_syncs):
             if sync not in synced:
                 self.drives.miss_sync(leg, self.cycle)
-        self._cycle(fresh, [self._answered[sync] for sync in synced])
+        self._cycle(fresh, [self._answered[sync] for sync in synced], delay)
         return True
 
+    def _commands_in_step(self) -> bool:
+        """Return whether each command was sent in the cycle before its SYNC. Then the two frames have the same alive counter."""
+        counters = self._counters
+        return all(counters[sync] == counters[command] for sync, command in self._leg_rows)
+
+    def _check_delays(self) -> None:
+        """Measure the delay of each valid new command, and reject commands that are late by `WATCHDOG` cycles or more.
+
+        The HAL sends a command and the SYNC of the next cycle with the same alive counter. So their difference is the delay of
+        the command in cycles. It is negative if the SYNC is missing.
+        """
+        for leg, (sync, command) in enumerate(self._leg_rows):
+            if self._rx.check[command] <= Check.SOME_LOST:
+                delay = (int(self._counters[sync]) - int(self._counters[command]) + _HALF_TURN & 0xFF) - _HALF_TURN
+                if -WATCHDOG <= delay < WATCHDOG:
+                    self._delay[leg] = max(delay, 0)
+                else:
+                    self._rx.refuse(command)
+
     def _check_commands(self, checks: list[int], count: int) -> None:
-        """Report lost and rejected commands to the drives of each leg, and start their local hold if two nodes send commands.
+        """Report lost and rejected commands to the drives of each leg. Start a local hold if two nodes send commands to a leg.
 
         Args:
-            checks: check result of each received message, by row of the process image.
+            checks: value of `Check` of each row of the process image.
             count: frames in the scratch buffer.
         """
         for leg, row in enumerate(self._command_rows):
             check = checks[row]
             self._commanded[leg] |= check <= Check.SOME_LOST
-            if check == Check.SOME_LOST:
+            if check in (Check.SOME_LOST, Check.IMPLAUSIBLE):  # IMPLAUSIBLE means here that the command is too late
                 self.drives.warn(leg, COMMAND_LOST)
             elif check in _REJECTED:
                 self.drives.warn(leg, COMMAND_REJECTED)
@@ -305,7 +348,7 @@ class Emulator:
                 self.drives.hold(leg, TWO_SENDERS)
 
     def _cycle_without_sync(self) -> bool:
-        """Run a cycle without an answer if an injected fault removed its SYNC. Return whether a cycle was run."""
+        """Run a cycle without answers if an injected fault removed the SYNC. Return whether a cycle was run."""
         lost = self._link is not None and self._link.synced
         if lost:
             for leg in range(len(SIDES)):
@@ -329,14 +372,14 @@ class Emulator:
     # -- steps of one cycle ------------------------------------------------------------------------------------------
 
     def _sample_next(self) -> None:
-        """Sample the sensors for the next cycle, and prepare its frames in advance if `before_send` is empty."""
+        """Sample the sensors for the next cycle. If `before_send` is empty, also encode the frames of the next cycle."""
         body = self.body
         position = body.position
         if self._node_faults is not None:
             position = self._node_faults.begin(self.cycle, position)
         self.drives.sample(position)
         self._imus.sample(body.imu)
-        self._feet.sample(body.contact, body.foot_rotation)
+        self._feet.sample(body.sole_force, body.touching)
         if not self.cycle % NOISE_CYCLES:
             self._noise.draw()
         if not self.before_send:
@@ -350,7 +393,7 @@ class Emulator:
         self._sealed = True
 
     def _complete_answer(self, number: int) -> None:
-        """Add counter and CRC to the answer, unless they were added in advance and are valid for this SYNC.
+        """Add the counter that the SYNC requires, and the CRC, to the answer. Keep an answer that was encoded for this SYNC.
 
         Args:
             number: cycle number received in SYNC.
@@ -362,19 +405,34 @@ class Emulator:
         self._tag = self._tag + 1 & 0xFF
         self._sealed = False
 
-    def _cycle(self, fresh: tuple[bool, bool], answer: list[Frames]) -> None:
+    def _cycle(self, fresh: tuple[bool, bool], answer: list[Frames], delay: tuple[int, int] = (0, 0)) -> None:
         """Latch the command, send the answer, step the body and sample the sensors.
 
-        The command of cycle k-1 acts in the interval [k, k+1].
+        The command of cycle k-1 acts from the start of cycle k to the start of cycle k+1.
 
         Args:
             fresh: per leg, whether a valid new command arrived.
             answer: frames to send.
+            delay: per leg, delay of the new command [cycles].
         """
         drives = self.drives
-        drives.command(fresh, self._controlword, self._target, self._limit)
+        drives.command(fresh, self._controlword, self._target, self._limit, delay)
         self._send(self._with_slow(answer))
-        self.body.step(drives.drive(self.body.velocity))
+        self._step_body()
+
+    def _step_body(self) -> None:
+        """Move the body by one millisecond, and sample the sensors."""
+        if self.pelvis_forces:
+            hal_state = int(self._rx.values[self._hal_state_index])
+            first, *others = self.pelvis_forces
+            wrench = first(hal_state)
+            for force in others:
+                wrench = wrench + force(hal_state)
+            fx, fy, fz, mx, my, mz = wrench.tolist()
+            self.body.push((fx, fy, fz), (mx, my, mz))
+        if self.wearer is not None:
+            self.wearer.act(self.body.position, self.body.velocity, self.drives.motors.limb)
+        self.body.step(self.drives.drive(self.body.velocity))
         self.cycle += 1
         self._sample_next()
 
@@ -408,7 +466,7 @@ class Emulator:
         After `WATCHDOG` milliseconds without SYNC, the drives start their local hold. Body and heartbeats continue in real time.
 
         Args:
-            stop: end condition, called about once per millisecond. It returns True to end the run.
+            stop: function that is called about once per millisecond and returns True to end the run.
         """
         alone_from = time.monotonic() + WATCHDOG * PERIOD
         while not stop():
@@ -434,6 +492,4 @@ class Emulator:
         drives.command((False, False), self._controlword, self._target, self._limit)
         if parts := self._with_slow([]):
             self._send(parts)
-        self.body.step(drives.drive(self.body.velocity))
-        self.cycle += 1
-        self._sample_next()
+        self._step_body()

@@ -23,7 +23,17 @@ def _sample(
     position: Vector,
     velocity: Vector,
 ) -> None:
-    """Compute counts, motor position [rad] and motor velocity [rad/s] of all encoders. Shape (12,) each."""
+    """Compute counts, motor position [rad] and motor velocity [rad/s] of all encoders.
+
+    Args:
+        joint: joint positions, shape (12,) [rad].
+        counts_per_rad: encoder counts for each rad of the joint, with sign, shape (12,).
+        keep: factor of the previous velocity in the low-pass, 0 to 1.
+        counts: counts of the previous sample, shape (12,); NaN before the first sample. Updated here.
+        before: output for the counts of the previous sample, shape (12,).
+        position: output for the motor positions, shape (12,) [rad].
+        velocity: motor velocities after the low-pass, shape (12,) [rad/s]. Updated here.
+    """
     for i in range(len(joint)):
         count = np.rint(joint[i] * counts_per_rad[i])
         before[i] = count if math.isnan(counts[i]) else counts[i]
@@ -49,14 +59,14 @@ class Encoders:
         self._counts, self._before = np.zeros((2, len(JOINTS)))
         self._position, self._velocity = position, velocity
         self._sample = compiled(_sample)
-        self.sample(np.zeros(len(JOINTS)))  # compiles the kernel now, because compilation takes longer than a cycle
+        self.sample(np.zeros(len(JOINTS)))  # this first call compiles the kernel, which takes longer than a cycle
         self._counts.fill(math.nan)  # no sample yet
 
     def sample(self, position: Vector) -> None:
-        """Sample all encoders. Must be called once per `PERIOD`.
+        """Sample all encoders. Call this once per `PERIOD`.
 
         Args:
-            position: true joint positions, shape (12,) [rad].
+            position: joint positions, shape (12,) [rad]. An injected encoder fault is already included.
         """
         self._sample(
             position, self._counts_per_rad, self._keep, self._counts, self._before, self._position, self._velocity
@@ -64,12 +74,12 @@ class Encoders:
 
     @property
     def angle(self) -> Vector:
-        """Joint position with the resolution of the counts, shape (12,) [rad]."""
+        """Joint positions computed from the last counts, shape (12,) [rad]."""
         angle: Vector = self._counts / self._counts_per_rad
         return angle
 
     @property
     def speed(self) -> Vector:
-        """Joint velocity without low-pass, from the last two counts, shape (12,) [rad/s]. The local hold uses it."""
+        """Joint velocities computed from the last two counts, without low-pass, shape (12,) [rad/s]. The local hold uses them."""
         speed: Vector = (self._counts - self._before) / (self._counts_per_rad * PERIOD)
         return speed

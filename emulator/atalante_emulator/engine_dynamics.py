@@ -1,4 +1,4 @@
-"""Rigid-body dynamics of a URDF, computed by PyBullet. They are a reference for the Pinocchio model of the gaits.
+"""Rigid-body dynamics of a URDF, computed by PyBullet. The results are a reference for the Pinocchio model of the gaits.
 
 `URDF -> mass matrix, gravity, inverse dynamics, centre of mass`. The emulator does not use this module.
 """
@@ -10,7 +10,8 @@ from collections.abc import Sequence
 import numpy as np
 import pybullet
 
-from atalante_emulator.body import GRAVITY, load_urdf
+from atalante_emulator.bodies import GRAVITY
+from atalante_emulator.bodies.pybullet_body import load_urdf
 from atalante_hal.closing import Closing
 from atalante_hal.robot import JOINTS
 from atalante_hal.types import Vector
@@ -21,7 +22,7 @@ Pose = tuple[Sequence[float], Sequence[float]]  # position [m], quaternion xyzw
 class EngineDynamics(Closing):
     """Dynamics of a robot with a fixed pelvis in PyBullet. Joint vectors are in the order of `JOINTS`.
 
-    Used as a context manager, the object disconnects from PyBullet after the block.
+    As a context manager, it disconnects from PyBullet at the end of the block.
     """
 
     def __init__(self, urdf: str) -> None:
@@ -111,7 +112,7 @@ class EngineDynamics(Closing):
         return np.asarray(matrix[np.ix_(self._order, self._order)])
 
     def centre_of_mass(self, q: Vector) -> Vector:
-        """Return the centre of mass of a pose in the pelvis frame.
+        """Return the centre of mass of the robot for given joint angles, in the pelvis frame.
 
         Args:
             q: joint positions, shape (12,) [rad].

@@ -1,9 +1,8 @@
 """Definition of the faults that the emulator can inject. A `Fault` has a kind, a target, a start, a duration and parameters.
 
-    Fault -> link (frames on the wire) or node_faults (inside the nodes) -> emulator
-
-The constructor of `Fault` checks the parameters. The emulator checks the names of messages, nodes, buses and signals. All
-faults act inside the emulator, so the HAL cannot distinguish them from real faults.
+`link` applies communication faults to the frames on the wire. `node_faults` applies faults inside the nodes. The constructor of
+`Fault` checks the parameters. The emulator checks the names of messages, nodes, buses and signals. All faults act outside the
+HAL, so the HAL cannot distinguish an injected fault from a real fault.
 """
 
 from __future__ import annotations
@@ -31,7 +30,7 @@ class Parameter:
 
     valid: str  # description of the valid values, for error messages
     holds: Callable[[Any], bool]  # function that returns whether a value is valid
-    default: Value | None = None  # None: the user must give a value
+    default: Value | None = None  # None if the parameter is required
 
 
 @dataclass(frozen=True)
@@ -39,7 +38,7 @@ class Kind:
     """Definition of a kind of fault: its effect, its valid targets and its parameters."""
 
     does: str  # description of the effect in one line
-    targets: str  # valid targets: message, node, bus, or a type of node
+    targets: str  # valid types of the target: message, node, bus, or a kind of node such as drive
     parameters: Mapping[str, Parameter] = field(default_factory=dict)  # name -> definition
     signals: bool = False  # whether the signals of the target message are additional parameters
 
@@ -114,7 +113,7 @@ LINK_KINDS: Final[Mapping[str, Kind]] = {
         },
     ),
     "silence": Kind("a node sends nothing", "node"),
-    "heartbeat_lost": Kind("a node sends no status message, but its other messages", "node"),
+    "heartbeat_lost": Kind("a node sends its messages except the status message", "node"),
     "reset": Kind(
         "a node is off, then restarts with a boot-up heartbeat; a drive that is off brakes its joint", "node"
     ),
@@ -144,7 +143,7 @@ NODE_KINDS: Final[Mapping[str, Kind]] = {
         {"code": _whole(1, 0xFFFF)},
     ),
     "leave_operation": Kind(
-        "a drive enters a state without a command, in every cycle",
+        "a drive enters a given state in every cycle, without a command",
         "drive",
         {"state": _choice([state.name for state in DriveState])},
     ),
@@ -174,7 +173,7 @@ NODE_KINDS: Final[Mapping[str, Kind]] = {
     ),
 }
 
-#: Kinds of sensor faults. They replace the values of a node after the noise was added to them.
+#: Kinds of sensor faults. A sensor fault changes signal values of a node after the noise was added.
 SENSOR_KINDS: Final[Mapping[str, Kind]] = {
     "imu_invalid": Kind("an IMU sends the invalid code in all measured signals", "imu"),
     "imu_saturated": Kind("gyroscope and accelerometer report the end of their range", "imu"),
@@ -191,7 +190,7 @@ KINDS: Final[Mapping[str, Kind]] = {**LINK_KINDS, **NODE_KINDS, **SENSOR_KINDS}
 
 @dataclass(frozen=True, init=False)
 class Fault:
-    """Fault to inject: its kind, its target, its first cycle, its duration and its parameters.
+    """Fault to inject: kind, target, first cycle, duration and parameters.
 
     Examples: `Fault("drop", "LEFT_SK_STATE", 1000, 5)`, `Fault("value", "LEFT_SK_STATE", 1000, 1, Position=0.3)`.
     """
@@ -208,9 +207,9 @@ class Fault:
         Args:
             kind: name of the kind, a key of `KINDS`.
             target: name of a message, node or bus.
-            start: first cycle of the fault, counted by the emulator.
-            cycles: duration in cycles. None means permanent.
-            **parameters: parameters of the kind. Some kinds also take signals of the message.
+            start: first cycle of the fault, as a cycle number of the emulator.
+            cycles: duration in cycles. With None, the fault is permanent.
+            **parameters: parameters of the kind. Some kinds also take signals of the target message, as signal name = value.
 
         Raises:
             FaultError: If the kind or a parameter is unknown, or a value is invalid.
@@ -238,12 +237,12 @@ class Fault:
 
     @property
     def end(self) -> float:
-        """Number of the first cycle after the fault. Infinity for a permanent fault."""
+        """Number of the first cycle after the fault; infinity if the fault is permanent."""
         return math.inf if self.cycles is None else self.start + self.cycles
 
     @property
     def signals(self) -> dict[str, float]:
-        """Signals that the fault sets, as signal name -> value."""
+        """Values of the signals that the fault sets, by signal name."""
         known = KINDS[self.kind].parameters
         return {name: float(value) for name, value in self.parameters if name not in known}
 
@@ -262,20 +261,20 @@ class Fault:
 
 
 def _checked(kind: str, given: Mapping[str, Value]) -> tuple[tuple[str, Value], ...]:
-    """Check the parameters of a fault. Return them together with the defaults of omitted parameters."""
+    """Check the parameters of a fault, and return them together with the defaults of the omitted parameters."""
     rule = KINDS[kind]
     known = rule.parameters
     for name, value in given.items():
         if name in known:
             if not known[name].holds(value):
-                raise FaultError(f"{kind}: {name} must be {known[name].valid}, got {value!r}")
+                raise FaultError(f"{kind}: the parameter {name!r} must be {known[name].valid}, got {value!r}")
         elif not rule.signals:
             raise FaultError(f"{kind}: unknown parameter {name!r}; valid parameters: {', '.join(known) or 'none'}")
         elif not _is_number(value):
             raise FaultError(f"{kind}: signal {name} must be a finite number, got {value!r}")
     for name, parameter in known.items():
         if name not in given and parameter.default is None:
-            raise FaultError(f"{kind}: {name} must be {parameter.valid}, got no value")
+            raise FaultError(f"{kind}: the parameter {name!r} must be {parameter.valid}, got no value")
     defaults = {name: parameter.default for name, parameter in known.items() if parameter.default is not None}
     if kind in ("value", "raw") and not given.keys() - known.keys():
         raise FaultError(f"{kind}: the fault must set a signal, for example Position=0.3, got no signal")
@@ -286,11 +285,11 @@ def messages_of(fault: Fault, network: Network) -> tuple[Message, ...]:
     """Return the messages that a communication fault affects.
 
     Args:
-        fault: communication fault. Its target is a message, a node (all messages it sends) or a bus (all its messages).
+        fault: communication fault. A node as target means all its messages, a bus means all messages on the bus.
         network: nodes and messages of the DBC.
 
     Raises:
-        FaultError: If the network has no such message, node, bus or signal.
+        FaultError: If the target or a signal of the fault is not in the network.
     """
     wanted = LINK_KINDS[fault.kind].targets
     targets: dict[str, tuple[Message, ...]] = {}
@@ -306,7 +305,7 @@ def messages_of(fault: Fault, network: Network) -> tuple[Message, ...]:
     messages = targets[fault.target]
     if "like" in dict(fault.parameters) and fault["like"] not in (known := [m.name for m in network.messages]):
         raise FaultError(
-            f"{fault.kind}: like must be the name of a message, got {fault['like']!r}; valid: {', '.join(known)}"
+            f"{fault.kind}: the parameter 'like' must be the name of a message, got {fault['like']!r}; valid: {', '.join(known)}"
         )
     for signal in fault.signals:
         if signal not in (known := [s.name for s in messages[0].signals]):
@@ -317,14 +316,14 @@ def messages_of(fault: Fault, network: Network) -> tuple[Message, ...]:
 
 
 def nodes_of(fault: Fault, network: Network) -> tuple[str, ...]:
-    """Return the nodes that a node or sensor fault affects. A fault of the battery affects all drives.
+    """Return the nodes that a node fault or sensor fault affects. A fault of the battery affects all drives.
 
     Args:
-        fault: node or sensor fault.
+        fault: node fault or sensor fault.
         network: nodes and messages of the DBC.
 
     Raises:
-        FaultError: If the network has no such node of the type that the fault needs.
+        FaultError: If the target is not a node of a kind to which the fault applies.
     """
     wanted = KINDS[fault.kind].targets
     drives = tuple(node.name for node in network.of_kind("drive"))
@@ -342,5 +341,5 @@ def nodes_of(fault: Fault, network: Network) -> tuple[str, ...]:
 def _check_target(fault: Fault, wanted: str, targets: Sequence[str]) -> None:
     if fault.target not in targets:
         raise FaultError(
-            f"{fault.kind}: target must be of type {wanted}, got {fault.target!r}; valid targets: {', '.join(targets)}"
+            f"{fault.kind}: the target must be of type {wanted}, got {fault.target!r}; valid targets: {', '.join(targets)}"
         )

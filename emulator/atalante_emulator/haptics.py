@@ -7,19 +7,19 @@ from dataclasses import dataclass
 
 from atalante_hal.types import PERIOD, Vector
 
-#: Timeout of the vibration command [cycles]. The motors stop after it.
+#: Timeout of the vibration command [cycles]. At this age of the last command, the commanded level becomes 0.
 WATCHDOG = 50
 
 
 @dataclass(frozen=True)
 class HapticsParameters:
-    """Time response of the emulated vibration motors."""
+    """Time response of the emulated vibration motors to a change of the level."""
 
     rise_time: float = 0.04  # time constant of a small eccentric-mass motor [s]
 
 
 class Haptics:
-    """Vibration motors of the haptics node. `advance` updates `amplitude`, shape (8,), from 0 to 1."""
+    """Vibration motors of the haptics node. `advance` updates the array `amplitude`, shape (8,), range 0 to 1."""
 
     def __init__(self, parameters: HapticsParameters, amplitude: Vector) -> None:
         self.amplitude = amplitude
@@ -30,7 +30,7 @@ class Haptics:
 
         Args:
             level: last valid command, shape (8,), 0 to 1.
-            silence: age of that command [cycles].
+            silence: age of the last valid command [cycles].
             cycles: time to advance [cycles].
         """
         lag = math.exp(-cycles * PERIOD / self._parameters.rise_time)

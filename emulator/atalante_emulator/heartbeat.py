@@ -1,4 +1,4 @@
-"""Heartbeats of the emulated nodes. The first status message of a node reports BOOTUP, all later ones report OPERATIONAL."""
+"""Heartbeats of the emulated nodes. The first status message of a node reports BOOTUP, all later messages report OPERATIONAL."""
 
 from __future__ import annotations
 
@@ -20,10 +20,10 @@ _SUPPLY_VOLTAGE: Final = 48.0  # V
 
 @dataclass
 class _Status:
-    """Status message of one node and the indices of its signals."""
+    """Status message of one node."""
 
     tx: TransmitImage
-    at: dict[str, int]
+    at: dict[str, int]  # signal name -> index in `tx.values`
     booted: int = 0  # number of the cycle in which the node started
 
 
@@ -58,7 +58,7 @@ class Heartbeats:
         status.tx.values[status.at[signal]] = value
 
     def boot(self, node: str, cycle: int) -> None:
-        """Restart a node. It sends BOOTUP in this cycle, and its uptime and alive counter restart at 0.
+        """Restart a node. The node sends BOOTUP in this cycle. Its uptime and the counter of its status message restart at 0.
 
         Args:
             node: name of the node.

@@ -1,7 +1,7 @@
-"""Four emulated IMUs: compute attitude, angular rate and specific force from the motion of their links.
+"""Four emulated IMUs: compute attitude, angular rate and specific force from the motion of the links that have an IMU.
 
-The specific force is the change of the link velocity over the last millisecond plus gravity, in the sensor frame. The module
-also draws the noise and the bias of the IMUs.
+The specific force is the mean acceleration of the link over the last millisecond plus 9.81 m/s2 upwards, in the sensor frame.
+The module also draws the noise and the bias of the IMUs.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from atalante_emulator.body import GRAVITY, LINK_STATE
+from atalante_emulator.bodies import GRAVITY, LINK_STATE
 from atalante_hal.compiled import compiled
 from atalante_hal.types import PERIOD, Vector
 
@@ -25,6 +25,9 @@ class ImuParameters:
     gyro_bias: float = 5.2e-5  # standard deviation of the bias over all devices [rad/s], equal to 0.003 deg/s
     accel_noise: float = 0.05  # noise [m/s2 rms]
     accel_bias: float = 0.02  # standard deviation of the bias over all devices [m/s2]
+    attitude_error: float = 0.0  # slowly changing error of the attitude about each axis of the world [rad rms]
+    attitude_time: float = 10.0  # time constant of the attitude error [s]
+    heading_drift: float = 0.0  # constant drift of the heading, standard deviation over all devices [rad/s]
     temperature: float = 32.0  # constant temperature of all IMUs [degC]
 
 
@@ -41,10 +44,10 @@ def _sample(links: Vector, before: Vector, quaternion: Vector, gyro: Vector, acc
 
     Args:
         links: attitude and velocities of the links, as in `Body.imu`, shape (4, 10).
-        before: velocities of the previous sample, shape (4, 3) [m/s]; NaN if there is none. Updated here.
-        quaternion: receives the attitudes, as in `ImuSignals`.
-        gyro: receives the angular rates, as in `ImuSignals`.
-        accel: receives the specific forces, as in `ImuSignals`.
+        before: velocities of the previous sample, shape (4, 3) [m/s]; NaN before the first sample. Updated here.
+        quaternion: output for the attitudes, as in `ImuSignals`.
+        gyro: output for the angular rates, as in `ImuSignals`.
+        accel: output for the specific forces, as in `ImuSignals`.
     """
     for i in range(len(links)):
         x, y, z, w, vx, vy, vz, wx, wy, wz = links[i]
@@ -65,6 +68,73 @@ def _sample(links: Vector, before: Vector, quaternion: Vector, gyro: Vector, acc
         accel[i] = r00 * ax + r01 * ay + r02 * az, r10 * ax + r11 * ay + r12 * az, r20 * ax + r21 * ay + r22 * az
 
 
+class AttitudeError:
+    """Rotations from the true to the estimated attitudes of the IMUs, as small rotation vectors in world axes.
+
+    Each component is a Gauss-Markov process of first order. The heading also drifts at a constant rate, because no sensor of an
+    IMU measures the heading.
+    """
+
+    def __init__(self, parameters: ImuParameters, count: int, interval: float, generator: np.random.Generator) -> None:
+        """Start the errors at random values, and the drift of the heading at zero.
+
+        Args:
+            parameters: size and time constant of the errors.
+            count: number of IMUs.
+            interval: time between two calls of `draw` [s].
+            generator: source of the random numbers.
+        """
+        self.active = bool(parameters.attitude_error or parameters.heading_drift)
+        self._generator, self._interval = generator, interval
+        self._keep = math.exp(-interval / parameters.attitude_time)
+        self._new = parameters.attitude_error * math.sqrt(1.0 - self._keep**2)
+        self._slow = generator.standard_normal((count, 3)) * parameters.attitude_error
+        self._rate = generator.standard_normal(count) * parameters.heading_drift
+        self._heading = np.zeros(count)
+        self._next = self._slow.copy()
+        self._last = self._next
+        self._turn = compiled(_turn)
+        if self.active:  # compile the kernel now, because compilation takes longer than a cycle
+            self.apply(0.0, np.tile([1.0, 0.0, 0.0, 0.0], (count, 1)))
+
+    def draw(self) -> None:
+        """Draw the errors at the end of the next interval."""
+        self._slow = self._keep * self._slow + self._new * self._generator.standard_normal(self._slow.shape)
+        self._heading += self._rate * self._interval
+        self._last, self._next = self._next, self._slow.copy()
+        self._next[:, 2] += self._heading
+
+    def apply(self, share: float, quaternion: Vector) -> None:
+        """Turn the attitudes by the attitude errors.
+
+        Args:
+            share: elapsed share of the current interval, 0 to 1.
+            quaternion: attitudes wxyz, shape (count, 4). Updated here, with w >= 0.
+        """
+        self._turn(share, self._last, self._next, quaternion)
+
+
+def _turn(share: float, last: Vector, following: Vector, quaternion: Vector) -> None:
+    """Turn attitudes by small rotations, which change linearly with time.
+
+    Args:
+        share: elapsed share of the interval, 0 to 1.
+        last: rotation vectors at the start of the interval, in world axes, shape (count, 3) [rad].
+        following: rotation vectors at the end of the interval, shape (count, 3) [rad].
+        quaternion: attitudes wxyz, shape (count, 4). Updated here, with w >= 0.
+    """
+    for row in range(len(quaternion)):
+        x = 0.5 * (last[row, 0] + share * (following[row, 0] - last[row, 0]))
+        y = 0.5 * (last[row, 1] + share * (following[row, 1] - last[row, 1]))
+        z = 0.5 * (last[row, 2] + share * (following[row, 2] - last[row, 2]))
+        w, i, j, k = quaternion[row, 0], quaternion[row, 1], quaternion[row, 2], quaternion[row, 3]
+        a, b = w - x * i - y * j - z * k, i + x * w + y * k - z * j
+        c, d = j + y * w + z * i - x * k, k + z * w + x * j - y * i
+        norm = math.copysign(math.sqrt(a * a + b * b + c * c + d * d), a)
+        quaternion[row, 0], quaternion[row, 1] = a / norm, b / norm
+        quaternion[row, 2], quaternion[row, 3] = c / norm, d / norm
+
+
 class Imus:
     """Emulated IMUs of the robot. Row i of the signals belongs to IMU i of `robot.IMUS`."""
 
@@ -73,17 +143,26 @@ class Imus:
         self._count = len(signals.quaternion)
         self._before = np.zeros((self._count, 3))
         self._sample = compiled(_sample)
-        # Compiles the kernel now, because compilation takes longer than a cycle.
+        # Compile the kernel now, because compilation takes longer than a cycle.
         self.sample(np.zeros((self._count, LINK_STATE)))
         self._before.fill(math.nan)
 
     def sample(self, links: Vector) -> None:
-        """Sample all IMUs. Must be called once per `PERIOD`.
+        """Sample all IMUs. Call this once per `PERIOD`.
 
         Args:
             links: attitude and velocities of each IMU after the last time step, as in `Body.imu`, shape (4, 10).
         """
         self._sample(links, self._before, *self._signals)
+
+    def attitude_error(self, interval: float, generator: np.random.Generator) -> AttitudeError:
+        """Create the attitude errors of the IMUs.
+
+        Args:
+            interval: time between two calls of `AttitudeError.draw` [s].
+            generator: source of the random numbers.
+        """
+        return AttitudeError(self._parameters, self._count, interval, generator)
 
     def draw_bias(self, generator: np.random.Generator) -> tuple[Vector, Vector]:
         """Draw the constant biases of the IMUs.
@@ -105,8 +184,8 @@ class Imus:
         Args:
             generator: source of the random numbers.
             bias: gyroscope and accelerometer biases from `draw_bias`.
-            gyro: receives noise plus bias of the gyroscopes, shape (cycles, 12) [rad/s], in signal order.
-            accel: receives noise plus bias of the accelerometers, shape (cycles, 12) [m/s2], in signal order.
+            gyro: output for noise plus bias of the gyroscopes, shape (cycles, 12) [rad/s], in signal order.
+            accel: output for noise plus bias of the accelerometers, shape (cycles, 12) [m/s2], in signal order.
         """
         parameters = self._parameters
         for out, scale, offset in ((gyro, parameters.gyro_noise, bias[0]), (accel, parameters.accel_noise, bias[1])):

@@ -3,7 +3,7 @@
     HAL <- bus <- FaultyBus.send <- nodes
     HAL -> bus -> FaultyBus.receive -> nodes
 
-The same seed gives the same sequence of frames. Frames without an active fault pass unchanged.
+With the same seed and the same frames on both sides, the result is the same. Frames without an active fault pass unchanged.
 """
 
 from __future__ import annotations
@@ -29,25 +29,25 @@ _CLASSIC_LENGTH: Final = 8
 
 
 class _Late(NamedTuple):
-    """Delayed frame and the cycle in which it goes on the wire."""
+    """Delayed frame, and the number of the cycle in which this frame is sent."""
 
     due: int
     frame: Frames
 
 
 class _Disturbance:
-    """Runtime state of one communication fault, and its effect on the frames."""
+    """State of one communication fault during a run, and its effect on the frames."""
 
     def __init__(self, fault: Fault, network: Network, seed: str) -> None:
         self.fault = fault
-        # `inject` sends copies of a received frame. It is active one cycle earlier, so that it has received a frame at its start.
+        # The fault `inject` copies a received frame. So it becomes active one cycle before it sends the first copy.
         self.from_cycle = fault.start - (fault.kind == "inject")
         self.messages = {message.frame_id: message for message in messages_of(fault, network)}
         self.random = random.Random(seed)
         self.late: list[_Late] = []
         self._network = network
         self._counters: dict[int, int] = {}  # identifier -> frozen counter
-        self._held: dict[int, Frames] = {}  # identifier -> frame kept back until the next frame of its message
+        self._held: dict[int, Frames] = {}  # identifier -> frame kept back by `reorder` until the next frame
         self._last: Frames | None = None  # last received frame, which `inject` copies
         self._effect = _EFFECTS[fault.kind]
         self.babble: Babble | None = None
@@ -56,10 +56,10 @@ class _Disturbance:
         self._chance = float(dict(fault.parameters).get("p", 1.0))
 
     def frames(self, frame: Frames, cycle: int) -> Sequence[Frames]:
-        """Apply the fault to a frame, and return the frames to pass on instead, shape (1,) each.
+        """Apply the fault to a frame. Return the frames that replace this frame on the bus, each of shape (1,).
 
         Args:
-            frame: frame to which the fault is applied, shape (1,).
+            frame: frame to which the fault is applied, shape (1,). It may be changed.
             cycle: number of the cycle.
         """
         message = self.messages.get(_id(frame))
@@ -70,7 +70,7 @@ class _Disturbance:
         return self._effect(self, frame, message, cycle)
 
     def due(self, cycle: int) -> list[Frames]:
-        """Return the delayed frames that are due, shape (1,) each, and remove them from `late`.
+        """Return the delayed frames that must be delivered by now, each of shape (1,), and remove these frames from `late`.
 
         Args:
             cycle: number of the cycle.
@@ -80,7 +80,7 @@ class _Disturbance:
         return due
 
     def added(self, cycle: int) -> Iterable[Frames]:
-        """Return the frames that the fault adds in a cycle, shape (1,) each.
+        """Return the frames that the fault adds in a cycle, each of shape (1,).
 
         Args:
             cycle: number of the cycle.
@@ -118,7 +118,7 @@ class _Disturbance:
         earlier = self._held.pop(message.frame_id, None)
         if earlier is not None:
             return frame, earlier
-        if cycle + 1 < self.fault.end:  # a later frame can still overtake this frame
+        if cycle + 1 < self.fault.end:  # the fault lasts until the next frame arrives, which can overtake this one
             self._held[message.frame_id] = frame
             return ()
         return (frame,)
@@ -205,27 +205,28 @@ _EFFECTS: Final[dict[str, Callable[[_Disturbance, Frames, Message, int], Sequenc
 class FaultyBus(WrappedBus):
     """Bus of the emulated nodes with injected communication faults.
 
-    Delayed and added frames go on the wire when the SYNC of their cycle arrives. The nodes receive them before the frames of
-    the HAL. The HAL receives them before the answers of the nodes. Added frames reach both ends.
+    Delayed frames, and frames that a fault adds, are sent when the SYNC of their cycle arrives. The nodes receive these frames
+    before the frames of the HAL, and the HAL receives them before the answers of the nodes. Added frames reach both the HAL and
+    the nodes, except error frames, which reach only the HAL.
     """
 
     def __init__(
         self, bus: Bus, network: Network, faults: Sequence[Fault], clock: Callable[[], int], *, seed: int = 0
     ) -> None:
-        """Wrap a bus with faults.
+        """Wrap the bus of the nodes, and prepare the faults.
 
         Args:
             bus: bus to the HAL.
             network: nodes and messages of the DBC.
-            faults: faults to inject. Faults of other kinds than `LINK_KINDS` are ignored.
+            faults: faults to inject. Faults whose kind is not in `LINK_KINDS` are ignored.
             clock: function that returns the cycle number of the emulator.
             seed: seed of the random faults.
 
         Raises:
-            FaultError: If the network has no such target or signal.
+            FaultError: If the target or a signal of a fault is not in the network.
         """
         super().__init__(bus)
-        #: Whether the HAL sent a SYNC that arrived in the last `receive`. True even if an injected fault removed this SYNC.
+        #: Whether a SYNC of the HAL arrived in the last `receive`. True even if an injected fault removed this SYNC.
         self.synced = False
         self._clock, self._cycle, self._begun = clock, -1, -1
         self._all = [
@@ -241,13 +242,13 @@ class FaultyBus(WrappedBus):
         self.wire = Wire(network)
 
     def send(self, frames: Frames) -> None:
-        """Send frames of the nodes to the HAL through the active faults.
+        """Apply the active faults to frames of the nodes, and send the resulting frames to the HAL.
 
         Args:
             frames: frames of the nodes, shape (n,).
 
         Raises:
-            BusError: If the wrapped bus raises it.
+            BusError: If the wrapped bus raises this error.
         """
         if self._now() or not self.wire.idle:
             frames = joined(self._passed(frames, from_hal=False))
@@ -255,7 +256,7 @@ class FaultyBus(WrappedBus):
             self.bus.send(frames)
 
     def receive(self, frames: Frames, timeout: float = 0.0) -> int:
-        """Receive frames of the HAL for the nodes through the active faults.
+        """Receive frames of the HAL, and apply the active faults before the nodes get the frames.
 
         Args:
             frames: receive buffer, shape (n,).
@@ -265,13 +266,13 @@ class FaultyBus(WrappedBus):
             Number of frames in the buffer.
 
         Raises:
-            BusError: If the wrapped bus raises it.
+            BusError: If the wrapped bus raises this error.
         """
         count = self.bus.receive(frames, timeout)
         self.synced = not self._syncs.isdisjoint(frames["can_id"][:count].tolist())
         if self.synced:
             self._begin_cycle()
-        # Faults also apply to frames received without SYNC, because the commands of a cycle may arrive before its SYNC.
+        # Faults also apply to frames received without SYNC, because commands may arrive before the SYNC of their cycle.
         if self._now() or not self.wire.idle:
             self._for_nodes += self._passed(frames[:count], from_hal=True)
         elif self._for_nodes:
@@ -293,14 +294,14 @@ class FaultyBus(WrappedBus):
         return self._active
 
     def _passed(self, frames: Frames, *, from_hal: bool) -> list[Frames]:
-        """Apply all active faults to each frame. Return the frames that get on the wire in this cycle, shape (1,) each."""
+        """Apply all active faults to each frame. Return the frames that are sent in this cycle, each of shape (1,)."""
         passing = [frames[row : row + 1].copy() for row in range(len(frames))]
         for disturbance in self._active:
             passing = [after for frame in passing for after in disturbance.frames(frame, self._cycle)]
         return passing if self.wire.idle else self.wire.carry(passing, from_hal=from_hal)
 
     def _begin_cycle(self) -> None:
-        """Send the due delayed frames and the frames that the faults add. Only the first call in a cycle has an effect."""
+        """Send delayed frames that are due, and frames that faults add. Only the first call in a cycle has an effect."""
         self._now()
         if self._begun == self._cycle:
             return
@@ -324,7 +325,10 @@ def _cut(frame: Frames, length: int) -> None:
 
 
 def _sealed(frame: Frames, message: Message, *, counter: int | None = None) -> Frames:
-    """Write the counter and the CRC with the Data ID of a message into a frame, and return it. Leave short frames unchanged."""
+    """Write the alive counter, if it is given, and the CRC with the Data ID of a message into a frame, and return the frame.
+
+    A frame that is too short for an alive counter stays unchanged.
+    """
     payload = frame["data"][0]
     length = int(frame["len"][0])
     if length > COUNTER_BYTE:

@@ -1,4 +1,4 @@
-"""Twelve emulated motors with current loop, friction, brake and winding temperature: compute the torques on the joints."""
+"""Twelve emulated motors with current loop, friction, brake and winding temperature. They compute the torques on the joints."""
 
 from __future__ import annotations
 
@@ -15,21 +15,22 @@ from atalante_hal.types import PERIOD, Vector
 
 @dataclass(frozen=True)
 class MotorParameters:
-    """True parameters of the emulated motors. A tuple has one value per leg joint: FH, TH, SH, SK, SA, HA."""
+    """True parameters of the emulated motors. A tuple has one value per joint of a leg, in the order of `LEG_JOINTS`."""
 
     coulomb: tuple[float, ...] = (4.1, 3.1, 5.15, 4.9, 2.06, 0.97)  # dry friction at the joint [Nm]
     viscous: tuple[float, ...] = (6.2, 3.9, 5.9, 4.1, 1.03, 0.49)  # viscous friction at the joint [Nm s/rad]
     friction_speed: float = 0.05  # joint speed at which dry friction reaches 76 % of its full value [rad/s]
-    # While the power stage is off, a relay shorts the windings, and the motor brakes the joint.
-    brake: tuple[float, ...] = (150.0, 40.0, 125.0, 80.0, 20.0, 8.0)  # damping of the brake [Nm s/rad]
+    # While the power stage is off, a relay shorts the windings. The motor then brakes the joint with this additional damping.
+    brake: tuple[float, ...] = (150.0, 40.0, 125.0, 80.0, 20.0, 8.0)  # Nm s/rad
     current_loop: float = 0.5e-3  # time constant of the torque [s]
     ambient: float = 25.0  # ambient temperature [degC]
-    heating: float = 70.0  # final temperature rise at half the torque limit [K]
+    heating: float = 70.0  # temperature rise after a long time at half the torque limit [K]
     thermal_time: float = 300.0  # time constant of the winding temperature [s]
 
 
-#: Rows of the motor array: torque setpoint, torque ratio, dry friction, damping, external torque, joint torque.
-_WANTED, _STRENGTH, _DRY, _DAMPING, _PUSH, _JOINT = range(6)
+# Rows of the motor array: setpoint of the motor torque, ratio of true to measured motor torque, dry friction and damping of the
+# joint, external torque, resulting joint torque, torque of the wearer's limb.
+_WANTED, _STRENGTH, _DRY, _DAMPING, _PUSH, _JOINT, _LIMB = range(7)
 
 
 def _advance(velocity: Vector, motors: Vector, tracking: float, friction_speed: float, torque: Vector) -> None:
@@ -37,15 +38,15 @@ def _advance(velocity: Vector, motors: Vector, tracking: float, friction_speed: 
 
     Args:
         velocity: true joint velocities, shape (12,) [rad/s].
-        motors: motor array, shape (6, 12). Its joint torques are updated.
+        motors: motor array, shape (7, 12). Its joint torques are updated.
         tracking: share of the torque deviation that the current loop removes per `PERIOD`.
         friction_speed: joint speed at which dry friction reaches 76 % of its full value [rad/s].
-        torque: motor torques, shape (12,) [Nm]. Updated here.
+        torque: measured motor torques, shape (12,) [Nm]. Updated here.
     """
     for i in range(len(torque)):
         torque[i] += tracking * (motors[_WANTED, i] - torque[i])
         friction = motors[_DRY, i] * math.tanh(velocity[i] / friction_speed) + motors[_DAMPING, i] * velocity[i]
-        motors[_JOINT, i] = motors[_STRENGTH, i] * torque[i] - friction + motors[_PUSH, i]
+        motors[_JOINT, i] = motors[_STRENGTH, i] * torque[i] - friction + motors[_PUSH, i] + motors[_LIMB, i]
 
 
 class Motors:
@@ -55,8 +56,10 @@ class Motors:
         both = len(SIDES)
         self._parameters, self._torque, self.temperature = parameters, torque, temperature
         self._tracking = 1.0 - math.exp(-PERIOD / parameters.current_loop)
-        self._motors = np.zeros((6, len(JOINTS)))
+        self._motors = np.zeros((7, len(JOINTS)))
         self.wanted, self._joint = self._motors[_WANTED], self._motors[_JOINT]
+        #: Torques of the wearer's limbs on the joints, shape (12,) [Nm]. The emulator writes into this array.
+        self.limb = self._motors[_LIMB]
         self._viscous = np.array(parameters.viscous * both)
         self._braked = self._viscous + parameters.brake * both
         self._motors[_STRENGTH] = 1.0
@@ -65,10 +68,10 @@ class Motors:
         self._heat = parameters.heating / (0.5 * robot.torque_max) ** 2
         temperature.fill(parameters.ambient)
         self._advance = compiled(_advance)
-        self.advance(np.zeros(len(JOINTS)))  # compiles the kernel now, because compilation takes longer than a cycle
+        self.advance(np.zeros(len(JOINTS)))  # this first call compiles the kernel, which takes longer than a cycle
 
     def power(self, powered: npt.NDArray[np.bool_]) -> None:
-        """Switch the power stage of each motor on or off. A motor without power brakes its joint.
+        """Switch the power stage of each motor on or off. A motor whose power stage is off brakes its joint.
 
         Args:
             powered: whether each power stage is on, shape (12,).
@@ -85,19 +88,19 @@ class Motors:
         self._motors[_STRENGTH, motor] = strength
 
     def push(self, joint: int, torque: float) -> None:
-        """Set an external torque on a joint. It is added to the motor torque.
+        """Set an external torque on a joint, which is added to the motor torque.
 
         Args:
             joint: index of the joint.
-            torque: external torque [Nm], 0 for none.
+            torque: external torque [Nm].
         """
         self._motors[_PUSH, joint] = torque
 
     def advance(self, velocity: Vector) -> list[float]:
         """Advance the motors by one `PERIOD` and return the torques on the joints.
 
-        The motor torque follows the setpoint `wanted`. The joint torque is the motor torque minus friction and brake torque,
-        plus the external torque.
+        The measured motor torque follows the setpoint `wanted`. The joint torque is the true motor torque (see `weaken`) minus
+        friction and brake torque, plus the external torque and the torque of the wearer's limb.
 
         Args:
             velocity: true joint velocities, shape (12,) [rad/s]. The friction depends on them.
@@ -110,10 +113,10 @@ class Motors:
         return torque
 
     def warm(self, seconds: float) -> None:
-        """Advance the winding temperatures. The heat is proportional to the squared torque, with a first-order lag.
+        """Advance the winding temperatures. The temperature rise follows the squared torque with a first-order lag.
 
         Args:
-            seconds: time to advance at the present torque [s].
+            seconds: time to advance, during which the torque is constant [s].
         """
         final = self._parameters.ambient + self._heat * self._torque**2
         self.temperature += seconds / self._parameters.thermal_time * (final - self.temperature)

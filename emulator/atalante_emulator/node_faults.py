@@ -1,6 +1,6 @@
 """Injected faults inside the nodes: faults of drives, supply, encoders, status messages and sensor values.
 
-body -> NodeFaults.begin -> encoders, drives -> truth + noise -> NodeFaults.rewrite -> frames
+body -> NodeFaults.begin -> encoders, drives -> true values + noise -> NodeFaults.rewrite -> frames
 """
 
 from __future__ import annotations
@@ -43,16 +43,16 @@ class NodeFaults:
         """Connect the faults to the nodes.
 
         Args:
-            faults: faults to inject. Faults of other kinds are ignored.
+            faults: faults to inject. Faults that are neither node faults nor sensor faults are ignored.
             network: nodes and messages of the DBC.
-            robot: joint properties, from which the energy consumption of the drives is computed.
+            robot: torque limits of the joints, from which the energy consumption of the drives is computed.
             codec: codec of the 1 ms messages.
             drives: emulated drives.
             heartbeats: status messages of all nodes.
-            outbox: list that receives the emergencies of nodes other than drives.
+            outbox: list to which the emergencies of nodes other than drives are appended.
 
         Raises:
-            FaultError: If a target does not exist or has another type than the fault needs.
+            FaultError: If a target does not exist, or the fault does not apply to this kind of node.
         """
         self._network, self._robot, self._codec = network, robot, codec
         self._drives, self._heartbeats, self._outbox = drives, heartbeats, outbox
@@ -65,14 +65,14 @@ class NodeFaults:
         self._hold_up: dict[Fault, HoldUp] = {}
 
     def begin(self, cycle: int, position: Vector) -> Vector:
-        """Apply the node faults that are active in this cycle, and end those whose duration is over.
+        """Apply the node faults that are active in this cycle, and end the faults whose duration is over.
 
         Args:
             cycle: number of the cycle.
             position: true joint positions, shape (12,) [rad].
 
         Returns:
-            Joint positions that the encoders measure, shape (12,) [rad]. They contain the effects of the faults.
+            Joint positions that the encoders measure, including the encoder faults, shape (12,) [rad].
         """
         self._position = position.copy()
         for fault, nodes in self._faults:
@@ -114,7 +114,7 @@ class NodeFaults:
             self._drives.leave(drive, AUTOMATIC[self._drives.state[drive]])
 
     def _reset(self, fault: Fault, nodes: Nodes, cycle: int) -> None:
-        """Boot the node at the end of the fault. Until then a drive stays in its reset state, and `link` drops its frames."""
+        """Keep a drive in reset during the fault, and boot the node at the end. Meanwhile `link` drops the frames of the node."""
         (node,) = nodes
         if cycle == fault.end:
             self._heartbeats.boot(node, cycle)

@@ -1,4 +1,4 @@
-"""Sensor noise of the emulated nodes. It is drawn for many cycles at once to save time."""
+"""Sensor noise of the emulated nodes. The noise is drawn for many cycles at once to save time."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import numpy as np
 from atalante_emulator.drive import Drives
 from atalante_emulator.foot import Feet
 from atalante_emulator.imu import Imus
-from atalante_hal.types import Vector
+from atalante_hal.types import PERIOD, Vector
 from atalante_hal.wire.codec import Codec
 
 #: Number of cycles for which one call of `draw` draws the noise.
@@ -25,11 +25,13 @@ class SensorNoise:
         self._torque, self._gyro, self._accel, self._force = (
             noise[:, codec.slice(quantity)] for quantity in ("Torque", "Gyro", "Accel", "Force")
         )
-        # Drives, IMUs and feet have separate generators: a change of the IMU model leaves the noise of the feet unchanged.
-        self._of_drives, self._of_imus, self._of_feet = (
-            np.random.default_rng(s) for s in np.random.SeedSequence(seed).spawn(3)
+        # Drives, IMUs and feet have separate generators, so that a change of the IMU model does not change the noise of the feet.
+        self._of_drives, self._of_imus, self._of_feet, of_attitude = (
+            np.random.default_rng(s) for s in np.random.SeedSequence(seed).spawn(4)
         )
         self._bias = imus.draw_bias(self._of_imus)
+        self._attitude = imus.attitude_error(NOISE_CYCLES * PERIOD, of_attitude)
+        self._quaternion = codec.slice("Quaternion")
 
     def add(self, cycle: int, truth: Vector, values: Vector) -> None:
         """Add the noise of a cycle to the true values.
@@ -37,12 +39,16 @@ class SensorNoise:
         Args:
             cycle: number of the cycle.
             truth: values without noise, shape (codec.size,).
-            values: array that receives the values with noise, shape (codec.size,).
+            values: output for the values with noise, shape (codec.size,).
         """
         np.add(truth, self._noise[cycle % NOISE_CYCLES], values)
+        if self._attitude.active:
+            self._attitude.apply(cycle % NOISE_CYCLES / NOISE_CYCLES, values[self._quaternion].reshape(-1, 4))
 
     def draw(self) -> None:
         """Draw the noise of the next `NOISE_CYCLES` cycles."""
         self._drives.draw_noise(self._of_drives, self._torque)
         self._imus.draw_noise(self._of_imus, self._bias, self._gyro, self._accel)
         self._feet.draw_noise(self._of_feet, self._force)
+        if self._attitude.active:
+            self._attitude.draw()

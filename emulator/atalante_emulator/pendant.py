@@ -16,7 +16,7 @@ HAL_READY = 1
 
 
 class Request(IntEnum):
-    """Button that the operator pressed last: values of the signal `PENDANT_STATE.Request`."""
+    """Button that the operator pressed last. The values are those of the signal `PENDANT_STATE.Request`."""
 
     NONE = 0
     START = 1
@@ -36,17 +36,17 @@ class PendantSignals(NamedTuple):
 class Operator:
     """Emulated operator: keeps the dead-man switch pressed, and presses START while the HAL is in READY.
 
-    A robot in HOLD stays in HOLD until `start()` is called, because only the operator may end HOLD.
+    In HOLD the emulated operator does not press START. Call `start()` to end HOLD.
     """
 
-    #: Time in READY until the operator presses START, and period of further presses [cycles].
+    #: Period of START while the HAL is in READY [cycles]. The first START follows one period after the change to READY.
     REACTION = 200
 
     def __init__(self, assistance_factor: float | None = None, *, starts: bool = True) -> None:
         """Press the dead-man switch and set the dial.
 
         Args:
-            assistance_factor: assistance factor Xi on the dial, 0 to 1. None: the HAL keeps its own factor.
+            assistance_factor: assistance factor Xi on the dial, 0 to 1. With None, the HAL keeps its own factor.
             starts: whether the operator presses START when the HAL is in READY.
 
         Raises:
@@ -62,7 +62,7 @@ class Operator:
         """Turn the assistance dial.
 
         Args:
-            factor: assistance factor Xi, 0 to 1. None: the HAL keeps its own factor.
+            factor: assistance factor Xi, 0 to 1. With None, the HAL keeps its own factor.
 
         Raises:
             ValueError: If the factor is outside [0, 1].
@@ -76,12 +76,12 @@ class Operator:
         self._press(Request.START)
 
     def stop(self) -> None:
-        """Press the STOP button. From now on, START is pressed only by a call of `start()`."""
+        """Press the STOP button. After that, only a call of `start()` presses START."""
         self._starts = False
         self._press(Request.STOP)
 
     def hold(self) -> None:
-        """Press the HOLD button. From now on, START is pressed only by a call of `start()`."""
+        """Press the HOLD button. After that, only a call of `start()` presses START."""
         self._starts = False
         self._press(Request.HOLD)
 
@@ -112,7 +112,7 @@ class Operator:
 
 
 class PendantNode:
-    """Emulated pendant node: passes the HAL state to the operator, and fills the signals of `PENDANT_STATE`."""
+    """Emulated pendant node: passes the HAL state to the operator, and writes the signals of `PENDANT_STATE`."""
 
     def __init__(self, operator: Operator, codec: Codec, values: Vector) -> None:
         """Connect the node to its signals.
@@ -120,7 +120,7 @@ class PendantNode:
         Args:
             operator: operator of the pendant.
             codec: codec of the 1 ms messages.
-            values: array that receives the signals, shape (codec.size,).
+            values: array to which the signals are written, shape (codec.size,).
         """
         self._operator = operator
         self._values = values

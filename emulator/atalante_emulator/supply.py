@@ -22,7 +22,7 @@ class HoldUp:
         """Charge the DC link to a voltage.
 
         Args:
-            robot: torque limits of the joints, to scale the copper losses.
+            robot: torque limits of the joints, at which the copper loss of a motor is `COPPER`.
             capacity: capacitance of the DC link [F].
             voltage: voltage at the start [V].
         """

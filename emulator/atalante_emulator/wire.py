@@ -1,7 +1,7 @@
-"""CAN arbitration of the emulated buses during a flood: decides which frames get on the wire in each cycle.
+"""CAN arbitration of the emulated buses during a flood: decides which frames are transmitted in each cycle.
 
-All other frames wait for the next cycle. A sender keeps only the newest waiting frame of each identifier. Without a flood
-there is no need for arbitration, because each bus has enough time for its cyclic messages (`Network.bus_load`).
+Frames that are not transmitted wait for the next cycle. A sender keeps only the newest waiting frame of each identifier.
+Without a flood there is no need for arbitration, because each bus has enough time for all its messages (`Network.bus_load`).
 """
 
 from __future__ import annotations
@@ -23,11 +23,11 @@ class Babble:
     can_id: int
     length: int  # payload length [bytes]
     load: float  # share of the bus time that the node tries to use, 0 to 1
-    taken: float = 0.0  # wire time that the node gets in this cycle [s]
-    rest: float = 0.0  # wire time left over from earlier cycles, shorter than one frame [s]
+    taken: float = 0.0  # wire time that the node takes in this cycle [s]
+    rest: float = 0.0  # unused wire time of earlier cycles, less than that of one frame [s]
 
     def frames(self, network: Network) -> int:
-        """Return how many flood frames fit into a cycle. Messages with smaller identifiers have priority over them.
+        """Return how many flood frames fit into this cycle. Messages with smaller identifiers have priority over the flood.
 
         Args:
             network: messages and bit rates of the buses.
@@ -62,7 +62,7 @@ class Wire:
         return not (self._babbles or self._from_hal or self._from_nodes)
 
     def load(self, bus: str) -> float:
-        """Return the load of a bus in the present cycle, as a share of the cycle time.
+        """Return the load of a bus in this cycle, as a share of the cycle time.
 
         Args:
             bus: name of the bus.
@@ -70,7 +70,7 @@ class Wire:
         return (self._used.get(bus, 0.0) + sum(one.taken for one in self._babbles if one.bus == bus)) / PERIOD
 
     def begin(self, babbles: Sequence[Babble]) -> list[Frames]:
-        """Begin a cycle. Return the flood frames that get on the wire in this cycle, shape (1,) each.
+        """Begin a cycle. Return the flood frames that are transmitted in this cycle, each of shape (1,).
 
         Args:
             babbles: floods that are active in this cycle.
@@ -80,11 +80,11 @@ class Wire:
         return [_babbled(one) for one in babbles for _ in range(one.frames(self._network))]
 
     def carry(self, frames: Sequence[Frames], *, from_hal: bool) -> list[Frames]:
-        """Return the frames that get on the wire in this cycle, in the order of arbitration. All other frames wait.
+        """Return the frames that are transmitted in this cycle, in the order of arbitration. All other frames wait.
 
         Args:
             frames: frames to send now, shape (1,) each.
-            from_hal: whether the HAL sends them. False for frames of the nodes.
+            from_hal: True if the HAL sends the frames, False if the nodes send the frames.
         """
         waiting = self._from_hal if from_hal else self._from_nodes
         newer = {_id(frame) for frame in frames}

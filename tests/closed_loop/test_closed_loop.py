@@ -1,6 +1,6 @@
-"""Closed loop of HAL, controller and emulator: the same test on each bus; a subclass per bus connects the two ends.
+"""Closed loop of HAL, controller and emulator. Each bus has a subclass, which connects the two ends of the bus.
 
-The SocketCAN subclass is in tests/vcan, where the emulator is a process of its own.
+The SocketCAN subclass is in tests/vcan, where the emulator runs in another process.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from atalante_control.airwalk.controller import AirwalkConfig, AirwalkController
 from atalante_control.gait.gait import AIRWALK_GAIT, load_gait
 from atalante_control.guide.shapes import SHAPES
 from atalante_dbc import Network
-from atalante_emulator.body import PyBulletBody
+from atalante_emulator.bodies.pybullet_body import PyBulletBody
 from atalante_emulator.emulator import Emulator
 from atalante_emulator.pendant import Operator
 from atalante_hal.bus import Bus, open_bus
@@ -34,15 +34,15 @@ CONFIG = AirwalkConfig(startup=0.5)
 
 
 class ClosedLoop:
-    """One and a half steps, from OFF to HOLD."""
+    """Walk of one and a half steps: OFF, ACTIVE, HOLD."""
 
-    #: Longest wait for the frames of the nodes [s]. In lock-step, a slow machine only takes longer.
+    #: Longest wait for the frames of the nodes [s]. On a slow machine, a run in lock-step takes longer but does not fail.
     patience = 5.0
     until_phase = 1.5  # steps
 
     @pytest.fixture
     def bus(self) -> Iterator[Bus]:
-        """The end of the HAL; the emulator with an operator at Xi = 0.5 is at the other end."""
+        """Return the HAL's end of the bus. At the other end is the emulator, whose operator sets Xi = 0.5."""
         raise NotImplementedError("a subclass connects the ends")  # pragma: no cover
 
     @pytest.fixture

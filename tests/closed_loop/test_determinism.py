@@ -1,4 +1,4 @@
-"""Determinism: one seed gives one sequence of frames, in one process or in two."""
+"""Determinism: runs with the same seed exchange identical frames, in one process and in two processes."""
 
 from __future__ import annotations
 

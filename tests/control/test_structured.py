@@ -47,6 +47,6 @@ def test_machine_code_and_python_write_the_same_fields():
     assert machine["matrix"][1, 1, 2] == 4
 
 
-def test_rejects_a_field_that_no_record_can_hold():
+def test_field_of_an_unsupported_type_is_rejected():
     with pytest.raises(TypeError, match=r"Wrong\.text must be float, int, bool or Annotated"):
         dtype_of(Wrong)

@@ -62,6 +62,7 @@ def test_worst_case_load_of_every_bus_is_at_most_sixty_percent():
     assert set(load_of) == {"left_leg", "right_leg", "left_sense", "right_sense"}
     assert 0.57 < load_of["left_leg"] <= 0.60
     assert max(load_of.values()) <= 0.60
+    assert sum(load_of.values()) == pytest.approx(2.05, abs=0.005)  # docs/quickstart.md and docs/howto/real-bus.md
 
 
 def test_unknown_name_is_rejected_with_the_valid_names():

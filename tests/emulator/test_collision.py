@@ -11,8 +11,8 @@ from atalante_hal.wire.process_image import TransmitImage
 NAME = "COMMAND_LEFT_LEG"
 
 
-class Source:
-    """Makes right frames of the message: counter, and a torque that tells who sent it."""
+class FrameSource:
+    """Source of command frames with a given counter and torque. The two senders use different torques."""
 
     def __init__(self, network: Network) -> None:
         self._tx = TransmitImage([network.message(NAME)])
@@ -25,11 +25,11 @@ class Source:
 
 
 @pytest.fixture
-def frame(network: Network) -> Source:
-    return Source(network)
+def frame(network: Network) -> FrameSource:
+    return FrameSource(network)
 
 
-def judge(network: Network, *cycles: list[Frames]) -> list[bool]:
+def second_sender_found(network: Network, *cycles: list[Frames]) -> list[bool]:
     senders = Senders(network.message(NAME))
     return [
         senders.are_two(np.concatenate(frames) if frames else new_frames(0), cycle)
@@ -37,53 +37,59 @@ def judge(network: Network, *cycles: list[Frames]) -> list[bool]:
     ]
 
 
-def test_one_sender_is_one(network: Network, frame: Source) -> None:
-    assert judge(network, *([frame(n, n)] for n in range(250, 270))) == [False] * 20
+def test_frames_of_one_sender_are_not_reported(network: Network, frame: FrameSource) -> None:
+    assert second_sender_found(network, *([frame(n, n)] for n in range(250, 270))) == [False] * 20
 
 
 @pytest.mark.parametrize("lost", [1, 4, 5, 100])
-def test_lost_frames_are_lost(network: Network, frame: Source, lost: int) -> None:
-    assert not any(judge(network, [frame(7)], *([[]] * lost), [frame(8 + lost, 1.0)]))
-    assert not any(judge(network, [frame(7)], [frame(8 + lost, 1.0)]))
+def test_lost_frames_are_not_reported_as_a_second_sender(network: Network, frame: FrameSource, lost: int) -> None:
+    assert not any(second_sender_found(network, [frame(7)], *([[]] * lost), [frame(8 + lost, 1.0)]))
+    assert not any(second_sender_found(network, [frame(7)], [frame(8 + lost, 1.0)]))
 
 
-def test_the_same_frame_twice_is_one_sender(network: Network, frame: Source) -> None:
-    assert not any(judge(network, [frame(7), frame(7)], [frame(7), frame(8, 1.0), frame(8, 1.0)], [frame(8, 1.0)]))
+def test_identical_repeated_frames_are_not_reported_as_a_second_sender(network: Network, frame: FrameSource) -> None:
+    assert not any(
+        second_sender_found(network, [frame(7), frame(7)], [frame(7), frame(8, 1.0), frame(8, 1.0)], [frame(8, 1.0)])
+    )
 
 
-def test_a_backlog_is_one_sender(network: Network, frame: Source) -> None:
-    assert not any(judge(network, [], [frame(255), frame(0, 1.0), frame(1, 2.0)]))
+def test_consecutive_frames_in_one_cycle_are_not_reported_as_a_second_sender(
+    network: Network, frame: FrameSource
+) -> None:
+    assert not any(second_sender_found(network, [], [frame(255), frame(0, 1.0), frame(1, 2.0)]))
 
 
 @pytest.mark.parametrize("ahead", [1, 2, 5, 6, 100, 254, 255])
-def test_another_sender_before_the_true_one(network: Network, frame: Source, ahead: int) -> None:
+def test_second_sender_ahead_of_the_counter_is_reported_in_the_same_cycle(
+    network: Network, frame: FrameSource, ahead: int
+) -> None:
     true = 9
-    assert judge(network, [frame(8)], [frame(8 + ahead, 50.0), frame(true)])[1]
+    assert second_sender_found(network, [frame(8)], [frame(8 + ahead, 50.0), frame(true)])[1]
 
 
-def test_another_sender_with_the_counter_of_the_last_frame(network: Network, frame: Source) -> None:
-    assert judge(network, [frame(8)], [frame(8, 50.0), frame(9)]) == [False, True]
+def test_second_sender_that_repeats_the_last_counter_is_reported(network: Network, frame: FrameSource) -> None:
+    assert second_sender_found(network, [frame(8)], [frame(8, 50.0), frame(9)]) == [False, True]
 
 
-def test_another_sender_behind_the_true_one_is_found_in_the_next_cycle(network: Network, frame: Source) -> None:
-    assert judge(network, [frame(8), frame(9, 50.0)], [frame(9)]) == [False, True]
-    assert judge(network, [frame(8), frame(9, 50.0)], [frame(9), frame(10, 50.0)]) == [False, True]
+def test_second_sender_after_the_true_frame_is_reported_in_the_next_cycle(network: Network, frame: FrameSource) -> None:
+    assert second_sender_found(network, [frame(8), frame(9, 50.0)], [frame(9)]) == [False, True]
+    assert second_sender_found(network, [frame(8), frame(9, 50.0)], [frame(9), frame(10, 50.0)]) == [False, True]
 
 
-def test_what_was_heard_long_ago_says_nothing(network: Network, frame: Source) -> None:
+def test_frames_more_than_one_cycle_apart_are_not_compared(network: Network, frame: FrameSource) -> None:
     senders = Senders(network.message(NAME))
     assert not senders.are_two(frame(8), 1)
     assert not senders.are_two(frame(8, 50.0), 3)
     assert senders.are_two(frame(8), 4)
 
 
-@pytest.mark.parametrize("spoil", ["crc", "length", "other"])
-def test_frames_that_are_not_right_are_not_heard(network: Network, frame: Source, spoil: str) -> None:
+@pytest.mark.parametrize("defect", ["crc", "length", "other"])
+def test_invalid_or_unrelated_frames_are_ignored(network: Network, frame: FrameSource, defect: str) -> None:
     wrong = frame(9, 50.0)
-    if spoil == "crc":
+    if defect == "crc":
         wrong["data"][0, 40] ^= 1
-    elif spoil == "length":
+    elif defect == "length":
         wrong["len"] = 64
     else:
         wrong["can_id"] = network.message("COMMAND_RIGHT_LEG").frame_id
-    assert not any(judge(network, [frame(8)], [wrong, frame(9)]))
+    assert not any(second_sender_found(network, [frame(8)], [wrong, frame(9)]))

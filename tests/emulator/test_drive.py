@@ -24,7 +24,7 @@ BOTH = (True, True)
 
 @dataclass
 class DriveBench:
-    """Drives on a bench: somebody else turns the joints."""
+    """Drives without a body: the test sets positions and velocities of the joints."""
 
     parameters: DriveParameters = field(default_factory=DriveParameters)
     robot: Robot = ROBOT
@@ -58,7 +58,7 @@ def states(bench: DriveBench) -> set[DriveState]:
     return set(bench.drives.state)
 
 
-def test_cia402_walk_up_one_state_a_cycle_and_down(bench: DriveBench) -> None:
+def test_each_controlword_moves_all_drives_by_one_transition(bench: DriveBench) -> None:
     seen = [states(bench)]
     for word in (
         Controlword.SHUTDOWN,
@@ -79,7 +79,7 @@ def test_cia402_walk_up_one_state_a_cycle_and_down(bench: DriveBench) -> None:
     ]
 
 
-def test_a_drive_obeys_its_own_controlword(bench: DriveBench) -> None:
+def test_controlword_changes_only_its_own_drive(bench: DriveBench) -> None:
     bench.enable()
     bench.word[4] = Controlword.QUICK_STOP
     bench.cycle()
@@ -88,7 +88,7 @@ def test_a_drive_obeys_its_own_controlword(bench: DriveBench) -> None:
     assert not any(bench.drives.latched)
 
 
-def test_without_operation_enabled_there_is_no_torque() -> None:
+def test_torque_is_zero_before_operation_is_enabled() -> None:
     bench = DriveBench(SMOOTH)
     bench.target[:] = 50.0
     for word in (Controlword.DISABLE_VOLTAGE, Controlword.SHUTDOWN, Controlword.SWITCH_ON):
@@ -96,7 +96,7 @@ def test_without_operation_enabled_there_is_no_torque() -> None:
         assert not bench.cycle().any()
 
 
-def test_drives_without_power_rub_and_brake(bench: DriveBench) -> None:
+def test_unpowered_drive_has_friction_and_brake_torque(bench: DriveBench) -> None:
     bench.velocity[:] = 1.0
     p = bench.parameters.motor
     expected = -(np.array(p.coulomb * 2) * math.tanh(1.0 / p.friction_speed) + np.array(p.viscous * 2))
@@ -105,13 +105,13 @@ def test_drives_without_power_rub_and_brake(bench: DriveBench) -> None:
 
 
 @pytest.mark.parametrize("speed", [-3.0, -0.01, 0.0, 0.002, 1.5])
-def test_friction_takes_power_and_never_gives_it(bench: DriveBench, speed: float) -> None:
+def test_friction_always_opposes_the_motion(bench: DriveBench, speed: float) -> None:
     bench.velocity[:] = speed
     power = bench.cycle() * speed
     assert (power < 0).all() if speed else not power.any()
 
 
-def test_torque_follows_as_a_first_order_lag() -> None:
+def test_torque_follows_its_target_as_a_first_order_lag() -> None:
     bench = DriveBench(SMOOTH)
     bench.enable()
     bench.target[:] = 20.0
@@ -123,7 +123,7 @@ def test_torque_follows_as_a_first_order_lag() -> None:
 
 
 @pytest.mark.parametrize("sign", [1.0, -1.0])
-def test_torque_stays_inside_both_limits(sign: float) -> None:
+def test_torque_stays_within_commanded_and_joint_limits(sign: float) -> None:
     bench = DriveBench(SMOOTH)
     bench.enable()
     bench.target[:] = sign * 1e4
@@ -134,7 +134,7 @@ def test_torque_stays_inside_both_limits(sign: float) -> None:
     np.testing.assert_allclose(sign * torque, np.r_[np.full(6, 15.0), ROBOT.torque_max[6:]], rtol=1e-6)
 
 
-def test_watchdog_trips_at_exactly_the_fifth_cycle_without_command(bench: DriveBench) -> None:
+def test_watchdog_trips_in_the_fifth_cycle_without_command(bench: DriveBench) -> None:
     bench.enable()
     for _ in range(WATCHDOG - 1):
         bench.cycle((False, False))
@@ -149,7 +149,20 @@ def test_watchdog_trips_at_exactly_the_fifth_cycle_without_command(bench: DriveB
     assert bench.drives.emergencies == [Emergency(node, 0x11, 0x8250) for node in NODES]
 
 
-def test_lost_commands_below_the_watchdog_repeat_the_last(bench: DriveBench) -> None:
+def test_watchdog_counts_the_delay_of_a_late_command(bench: DriveBench) -> None:
+    bench.enable()
+    bench.drives.command(BOTH, bench.word, bench.target, bench.limit, (0, WATCHDOG - 1))
+    assert states(bench) == {DriveState.OPERATION_ENABLED}
+    bench.cycle((False, False))
+    assert bench.drives.state == [DriveState.OPERATION_ENABLED] * 6 + [DriveState.QUICK_STOP_ACTIVE] * 6
+    bench.drives.command((True, False), bench.word, bench.target, bench.limit, (1, 0))
+    for _ in range(WATCHDOG - 1):
+        assert bench.drives.state[0] is DriveState.OPERATION_ENABLED
+        bench.cycle((False, False))
+    assert states(bench) == {DriveState.QUICK_STOP_ACTIVE}
+
+
+def test_last_torque_is_repeated_while_fewer_than_five_commands_are_lost(bench: DriveBench) -> None:
     bench = DriveBench(SMOOTH)
     bench.enable()
     bench.target[:] = 12.0
@@ -159,7 +172,7 @@ def test_lost_commands_below_the_watchdog_repeat_the_last(bench: DriveBench) -> 
         np.testing.assert_allclose(bench.cycle((False, False)), 12.0, rtol=1e-6)
 
 
-def test_a_silent_leg_holds_alone(bench: DriveBench) -> None:
+def test_only_the_leg_without_commands_holds(bench: DriveBench) -> None:
     bench.enable()
     for _ in range(WATCHDOG):
         bench.cycle((True, False))
@@ -167,18 +180,18 @@ def test_a_silent_leg_holds_alone(bench: DriveBench) -> None:
     assert set(bench.drives.state[6:]) == {DriveState.QUICK_STOP_ACTIVE}
 
 
-def test_watchdog_leaves_drives_alone_that_are_not_enabled(bench: DriveBench) -> None:
+def test_watchdog_does_not_trip_drives_that_are_not_enabled(bench: DriveBench) -> None:
     for _ in range(3 * WATCHDOG):
         bench.cycle((False, False))
     assert states(bench) == {DriveState.SWITCH_ON_DISABLED}
     assert not bench.drives.emergencies
 
 
-def test_latch_needs_quick_stop_before_enable(bench: DriveBench) -> None:
+def test_latched_drive_needs_quick_stop_before_enable(bench: DriveBench) -> None:
     bench.enable()
     for _ in range(WATCHDOG):
         bench.cycle((False, False))
-    for _ in range(20):  # a HAL that noticed nothing
+    for _ in range(20):  # the HAL continues to send ENABLE_OPERATION
         bench.cycle()
     assert states(bench) == {DriveState.QUICK_STOP_ACTIVE}
     bench.word[:] = Controlword.QUICK_STOP
@@ -191,13 +204,13 @@ def test_latch_needs_quick_stop_before_enable(bench: DriveBench) -> None:
 
 
 @pytest.mark.parametrize("polarity", [1.0, -1.0])
-def test_hold_pulls_back_to_where_it_stopped(polarity: float) -> None:
+def test_hold_torque_is_proportional_to_the_displacement_within_the_limit(polarity: float) -> None:
     robot = dataclasses.replace(ROBOT, polarity=np.full(12, polarity))
     bench = DriveBench(SMOOTH, robot)
     bench.position[:] = 0.1
     bench.enable()
     bench.word[:] = Controlword.QUICK_STOP
-    bench.target[:] = -40.0  # means nothing in a hold
+    bench.target[:] = -40.0  # ignored in a hold
     for _ in range(30):
         torque = bench.cycle()
     np.testing.assert_allclose(torque, 0.0, atol=0.01)
@@ -212,7 +225,7 @@ def test_hold_pulls_back_to_where_it_stopped(polarity: float) -> None:
         np.testing.assert_allclose(torque, sign * robot.torque_max, rtol=1e-6)
 
 
-def test_holds_where_it_stopped_and_not_where_it_was_enabled() -> None:
+def test_hold_position_is_the_position_at_the_quick_stop() -> None:
     bench = DriveBench(SMOOTH)
     bench.enable()
     bench.position[:] = 0.2
@@ -223,13 +236,13 @@ def test_holds_where_it_stopped_and_not_where_it_was_enabled() -> None:
     np.testing.assert_allclose(torque, 0.0, atol=0.02)
 
 
-def test_before_the_first_command_there_is_none() -> None:
+def test_torque_is_zero_before_the_first_command() -> None:
     bench = DriveBench(SMOOTH)
     bench.drives.sample(bench.position)
     assert bench.drives.drive(bench.velocity) == [0.0] * 12
 
 
-def test_the_encoders_are_what_the_frames_say(bench: DriveBench) -> None:
+def test_position_and_velocity_signals_are_at_the_motor(bench: DriveBench) -> None:
     bench.cycle()
     bench.position[:] = 0.05
     bench.cycle()
@@ -237,7 +250,7 @@ def test_the_encoders_are_what_the_frames_say(bench: DriveBench) -> None:
     assert (bench.signals.velocity * ROBOT.polarity > 0.0).all()
 
 
-def test_hold_damps_motion() -> None:
+def test_hold_torque_opposes_the_velocity() -> None:
     bench = DriveBench(SMOOTH)
     bench.enable()
     bench.word[:] = Controlword.QUICK_STOP
@@ -250,7 +263,7 @@ def test_hold_damps_motion() -> None:
     np.testing.assert_allclose(stretched, -speed * ROBOT.hold_kd, rtol=0.1)
 
 
-def test_torque_noise_is_seeded_and_of_the_stated_size(bench: DriveBench) -> None:
+def test_torque_noise_is_reproducible_and_has_the_configured_deviation(bench: DriveBench) -> None:
     first, again, other = np.zeros((3, 500, 12))
     bench.drives.draw_noise(np.random.default_rng(1), first)
     bench.drives.draw_noise(np.random.default_rng(1), again)
@@ -260,7 +273,7 @@ def test_torque_noise_is_seeded_and_of_the_stated_size(bench: DriveBench) -> Non
 
 
 class TestHeat:
-    """A drive warms up, gives less when it is hot, and trips when it is too hot."""
+    """A drive heats up, reduces its torque when hot, and trips when too hot."""
 
     @pytest.mark.exhaustive
     def test_winding_temperature_follows_the_closed_form(self) -> None:
@@ -276,18 +289,18 @@ class TestHeat:
         np.testing.assert_allclose(bench.signals.temperature, expected, rtol=1e-3)
 
     @pytest.mark.parametrize("degrees", [20.0, 89.0, 90.4, 91.0, 100.2, 115.0, 119.9])
-    def test_the_torque_limit_is_the_curve_at_the_temperature_that_is_told(self, degrees: float) -> None:
+    def test_torque_limit_follows_the_curve_at_the_reported_temperature(self, degrees: float) -> None:
         bench = DriveBench(SMOOTH)
         bench.enable()
         bench.target[:] = 1e4
         bench.drives.heat(3, degrees)
         for _ in range(30):
             torque = bench.cycle()
-        told = np.full(12, SMOOTH_MOTOR.ambient)
-        told[3] = round(degrees)
-        np.testing.assert_allclose(torque, ROBOT.torque_limit(told), rtol=1e-6)
+        codes = np.full(12, SMOOTH_MOTOR.ambient)
+        codes[3] = round(degrees)
+        np.testing.assert_allclose(torque, ROBOT.torque_limit(codes), rtol=1e-6)
 
-    def test_a_hot_drive_holds_with_what_it_has_left(self) -> None:
+    def test_hot_drive_holds_with_its_derated_torque(self) -> None:
         bench = DriveBench(SMOOTH)
         bench.enable()
         bench.drives.heat(3, 118.0)
@@ -299,7 +312,7 @@ class TestHeat:
         assert torque[3] == pytest.approx(ROBOT.derating.floor * ROBOT.torque_max[3])
         assert torque[2] == pytest.approx(ROBOT.torque_max[2])
 
-    def test_all_of_them_hot(self) -> None:
+    def test_every_hot_drive_is_derated(self) -> None:
         bench = DriveBench(SMOOTH)
         bench.enable()
         bench.target[:] = 1e4
@@ -309,7 +322,7 @@ class TestHeat:
             torque = bench.cycle()
         np.testing.assert_allclose(torque, ROBOT.torque_limit(np.full(12, 110.0)), rtol=1e-6)
 
-    def test_a_drive_that_has_cooled_gives_all_again(self) -> None:
+    def test_cooled_drive_has_its_full_torque_again(self) -> None:
         bench = DriveBench(SMOOTH)
         bench.enable()
         bench.target[:] = 1e4
@@ -320,7 +333,7 @@ class TestHeat:
             torque = bench.cycle()
         np.testing.assert_allclose(torque, ROBOT.torque_max, rtol=1e-6)
 
-    def test_what_is_heated_by_torque_is_noticed_by_the_slow_turn(self) -> None:
+    def test_overheating_trips_the_drive_in_a_slow_cycle(self) -> None:
         bench = DriveBench(DriveParameters(dataclasses.replace(SMOOTH_MOTOR, thermal_time=1.0, heating=600.0)))
         bench.enable()
         bench.target[3] = 0.5 * ROBOT.torque_max[3]
@@ -333,7 +346,7 @@ class TestHeat:
         assert tripped % SLOW_CYCLES == 0
         assert bench.drives.emergencies == [Emergency("LEFT_SK", 0x09, 0x4310)]
 
-    def test_a_trip_lowers_the_joint_and_the_others_go_on(self) -> None:
+    def test_overheated_drive_lowers_its_joint_and_the_others_stay_enabled(self) -> None:
         bench = DriveBench(SMOOTH)
         bench.enable()
         bench.target[:] = 30.0
@@ -347,7 +360,7 @@ class TestHeat:
         assert torque[4] == pytest.approx(30.0)
         assert bench.signals.torque[3] == pytest.approx(0.0, abs=1e-6)
 
-    def test_fault_when_the_joint_has_come_to_rest(self) -> None:
+    def test_fault_reaction_ends_when_the_joint_is_at_rest(self) -> None:
         bench = DriveBench(SMOOTH)
         bench.enable()
         bench.drives.heat(3, 120.0)
@@ -361,7 +374,7 @@ class TestHeat:
         assert bench.drives.state[3] is DriveState.FAULT
         assert bench.signals.state[3] == DriveState.FAULT
 
-    def test_a_joint_at_the_speed_of_rest_still_moves(self) -> None:
+    def test_joint_at_exactly_the_rest_speed_counts_as_moving(self) -> None:
         counts = ROBOT.gear[3] * COUNTS / (2.0 * math.pi)
         bench = DriveBench(dataclasses.replace(SMOOTH, rest_speed=4.0 / (counts * PERIOD)))
         bench.enable()
@@ -372,7 +385,7 @@ class TestHeat:
                 bench.cycle()
             assert bench.drives.state[3] is state
 
-    def test_a_fault_cannot_be_reset_while_the_drive_is_hot(self) -> None:
+    def test_fault_cannot_be_reset_while_the_drive_is_hot(self) -> None:
         bench = DriveBench(SMOOTH)
         bench.enable()
         bench.drives.heat(3, 125.0)
@@ -391,10 +404,10 @@ class TestHeat:
 
 
 class TestErrors:
-    """What a drive does by itself about each class of error."""
+    """Reactions of a drive to each class of error."""
 
     @pytest.mark.parametrize("code", [0x2310, 0x2110, 0x3222, 0x4110, 0x4310, 0x7305, 0x7121])
-    def test_a_drive_that_cannot_hold_lowers(self, bench: DriveBench, code: int) -> None:
+    def test_error_that_prevents_a_hold_starts_the_fault_reaction(self, bench: DriveBench, code: int) -> None:
         bench.enable()
         bench.drives.fail(7, code)
         assert bench.drives.state[7] is DriveState.FAULT_REACTION_ACTIVE
@@ -402,19 +415,19 @@ class TestErrors:
         assert [e.code for e in bench.drives.emergencies] == [code]
 
     @pytest.mark.parametrize("code", [0x1000, 0x3210, 0x3220, 0x6100, 0x8130, 0x8150, 0x8250, 0xFF00])
-    def test_a_drive_that_can_hold_holds(self, bench: DriveBench, code: int) -> None:
+    def test_error_that_permits_a_hold_latches_the_hold(self, bench: DriveBench, code: int) -> None:
         bench.enable()
         bench.drives.fail(7, code)
         assert bench.drives.state[7] is DriveState.QUICK_STOP_ACTIVE
         assert [d for d in range(12) if bench.drives.latched[d]] == [7]
 
     @pytest.mark.parametrize("code", [0x3220, 0x8250])
-    def test_a_drive_without_power_has_nothing_to_hold(self, bench: DriveBench, code: int) -> None:
+    def test_disabled_drive_stays_disabled_when_an_error_occurs(self, bench: DriveBench, code: int) -> None:
         bench.drives.fail(7, code)
         assert bench.drives.state[7] is DriveState.SWITCH_ON_DISABLED
         assert not bench.drives.latched[7]
 
-    def test_a_hold_that_was_commanded_becomes_the_drives_own_where_it_is(self, bench: DriveBench) -> None:
+    def test_commanded_hold_keeps_its_position_when_an_error_latches_it(self, bench: DriveBench) -> None:
         bench.position[:] = 0.1
         bench.enable()
         bench.word[:] = Controlword.QUICK_STOP
@@ -424,10 +437,10 @@ class TestErrors:
         bench.drives.fail(7, 0x8250)
         for _ in range(30):
             torque = bench.cycle()
-        assert bench.drives.latched[7] is False  # acknowledged by the QUICK_STOP that goes on
+        assert bench.drives.latched[7] is False  # acknowledged by the QUICK_STOP that is still commanded
         np.testing.assert_allclose(torque, -0.01 * ROBOT.hold_kp, rtol=0.02)
 
-    def test_a_latched_hold_that_cannot_go_on_is_a_fault_and_no_hold(self, bench: DriveBench) -> None:
+    def test_error_that_prevents_a_hold_ends_a_latched_hold(self, bench: DriveBench) -> None:
         bench.enable()
         bench.drives.fail(7, 0x8250)
         bench.drives.fail(7, 0x7305)
@@ -435,7 +448,7 @@ class TestErrors:
         assert bench.drives.latched[7] is False
         assert bench.signals.state[7] == DriveState.FAULT_REACTION_ACTIVE
 
-    def test_disabling_a_latched_hold_acknowledges_it(self, bench: DriveBench) -> None:
+    def test_disabling_a_latched_hold_acknowledges_its_error(self, bench: DriveBench) -> None:
         bench.enable()
         bench.drives.fail(7, 0x8250)
         bench.word[7] = Controlword.DISABLE_VOLTAGE
@@ -443,7 +456,7 @@ class TestErrors:
         assert (bench.drives.state[7], bench.drives.latched[7]) == (DriveState.SWITCH_ON_DISABLED, False)
         assert [e.code for e in bench.drives.emergencies] == [0x8250, 0]
 
-    def test_every_other_command_leaves_a_latched_hold_and_its_error(self, bench: DriveBench) -> None:
+    def test_other_controlwords_keep_a_latched_hold_and_its_error(self, bench: DriveBench) -> None:
         bench.enable()
         bench.drives.fail(7, 0x8250)
         for word in (
@@ -457,7 +470,7 @@ class TestErrors:
             assert (bench.drives.state[7], bench.drives.latched[7]) == (DriveState.QUICK_STOP_ACTIVE, True)
         assert [e.code for e in bench.drives.emergencies] == [0x8250]
 
-    def test_a_fault_reset_acknowledges_all_that_is_over(self, bench: DriveBench) -> None:
+    def test_fault_reset_acknowledges_every_ended_error(self, bench: DriveBench) -> None:
         bench.drives.fail(7, 0x2310)
         bench.drives.fail(7, 0x4310)
         bench.drives.leave(7, DriveState.FAULT)
@@ -466,7 +479,7 @@ class TestErrors:
         assert bench.drives.state[7] is DriveState.SWITCH_ON_DISABLED
         assert [e.code for e in bench.drives.emergencies] == [0x2310, 0x4310, 0]
 
-    def test_the_end_of_an_error_is_not_its_acknowledgement(self, bench: DriveBench) -> None:
+    def test_fault_remains_after_the_end_of_its_error(self, bench: DriveBench) -> None:
         bench.drives.fail(7, 0x2310, persists=True)
         for _ in range(SLOW_CYCLES):
             bench.cycle()
@@ -475,7 +488,7 @@ class TestErrors:
         assert bench.drives.state[7] is DriveState.FAULT
         assert [e.code for e in bench.drives.emergencies] == [0x2310]
 
-    def test_commands_of_a_leg_that_are_not_fresh_acknowledge_nothing(self, bench: DriveBench) -> None:
+    def test_stale_commands_of_a_leg_do_not_acknowledge_a_latched_hold(self, bench: DriveBench) -> None:
         bench.enable()
         bench.drives.fail(7, 0x8250)
         bench.drives.fail(1, 0x8250)
@@ -490,19 +503,19 @@ class TestErrors:
         bench.cycle()
         assert not bench.drives.latched[7]
 
-    def test_emergencies_go_where_they_are_wanted(self) -> None:
+    def test_emergencies_are_appended_to_the_given_list(self) -> None:
         outbox: list[Emergency] = []
         drives = Drives(ROBOT, SMOOTH, DriveSignals(*np.zeros((5, 12))), outbox)
         drives.fail(0, 0x4310)
         assert outbox == [Emergency("LEFT_FH", 0x09, 0x4310)]
 
-    def test_an_error_in_a_fault_changes_nothing(self, bench: DriveBench) -> None:
+    def test_error_in_a_fault_does_not_change_the_state(self, bench: DriveBench) -> None:
         bench.drives.fail(7, 0x4310)
         bench.drives.leave(7, DriveState.FAULT)
         bench.drives.fail(7, 0x2310)
         assert bench.drives.state[7] is DriveState.FAULT
 
-    def test_an_error_that_stands_cannot_be_acknowledged(self, bench: DriveBench) -> None:
+    def test_persistent_error_cannot_be_acknowledged(self, bench: DriveBench) -> None:
         bench.enable()
         bench.drives.fail(7, 0x3220, persists=True)
         bench.word[:] = Controlword.QUICK_STOP
@@ -515,7 +528,7 @@ class TestErrors:
         assert not bench.drives.latched[7]
         assert bench.drives.emergencies == [Emergency("RIGHT_TH", 0x05, 0x3220), Emergency("RIGHT_TH", 0, 0)]
 
-    def test_a_drive_with_an_error_that_stands_can_be_lowered_and_not_enabled(self, bench: DriveBench) -> None:
+    def test_drive_with_a_persistent_error_can_be_disabled_and_not_enabled(self, bench: DriveBench) -> None:
         bench.enable()
         bench.drives.fail(7, 0x3220, persists=True)
         bench.word[7] = Controlword.DISABLE_VOLTAGE
@@ -530,14 +543,14 @@ class TestErrors:
         bench.cycle()
         assert bench.drives.state[7] is DriveState.OPERATION_ENABLED
 
-    def test_nobody_leaves_a_fault_reaction(self, bench: DriveBench) -> None:
+    def test_no_controlword_ends_a_fault_reaction(self, bench: DriveBench) -> None:
         bench.drives.fail(7, 0x2310)
         for word in Controlword:
             bench.word[:] = word
             bench.cycle()
         assert bench.drives.state[7] is DriveState.FAULT_REACTION_ACTIVE
 
-    def test_a_reset_drive_has_forgotten_everything(self, bench: DriveBench) -> None:
+    def test_reset_removes_errors_and_latch_without_an_emergency(self, bench: DriveBench) -> None:
         bench.enable()
         bench.drives.fail(7, 0x3220, persists=True)
         bench.drives.reset(7)
@@ -545,13 +558,13 @@ class TestErrors:
         assert not bench.drives.errors.any_persists(7)
         assert [e.code for e in bench.drives.emergencies] == [0x3220]
 
-    def test_leaving_unasked_is_told_by_the_state_alone(self, bench: DriveBench) -> None:
+    def test_unrequested_state_change_sends_no_emergency(self, bench: DriveBench) -> None:
         bench.enable()
         bench.drives.leave(7, DriveState.SWITCHED_ON)
         assert bench.signals.state[7] == DriveState.SWITCHED_ON
         assert not bench.drives.emergencies
 
-    def test_notices_go_on_and_are_told_by_the_whole_leg(self, bench: DriveBench) -> None:
+    def test_warning_is_sent_by_every_drive_of_the_leg_and_keeps_it_enabled(self, bench: DriveBench) -> None:
         bench.enable()
         bench.drives.warn(1, emergency.COMMAND_LOST)
         assert states(bench) == {DriveState.OPERATION_ENABLED}
@@ -562,7 +575,7 @@ class TestErrors:
 
 
 class TestSync:
-    def test_holds_at_exactly_the_fifth_cycle_without_sync(self, bench: DriveBench) -> None:
+    def test_leg_holds_in_the_fifth_cycle_without_sync(self, bench: DriveBench) -> None:
         bench.enable()
         for cycle in range(100, 100 + WATCHDOG - 1):
             bench.drives.miss_sync(1, cycle)
@@ -572,7 +585,7 @@ class TestSync:
         assert set(bench.drives.state[6:]) == {DriveState.QUICK_STOP_ACTIVE}
         assert bench.drives.emergencies == [Emergency(node, 0x11, 0x8130) for node in NODES[6:]]
 
-    def test_the_first_cycle_counts_as_any_other(self, bench: DriveBench) -> None:
+    def test_sync_missed_in_cycle_zero_counts(self, bench: DriveBench) -> None:
         bench.enable()
         for cycle in range(WATCHDOG - 1):
             bench.drives.miss_sync(0, cycle)
@@ -580,13 +593,13 @@ class TestSync:
         bench.drives.miss_sync(0, WATCHDOG - 1)
         assert set(bench.drives.state[:6]) == {DriveState.QUICK_STOP_ACTIVE}
 
-    def test_only_cycles_in_a_row_count(self, bench: DriveBench) -> None:
+    def test_only_consecutive_missed_syncs_count(self, bench: DriveBench) -> None:
         bench.enable()
         for cycle in (1, 2, 3, 4, 6, 7, 8, 9, 11):
             bench.drives.miss_sync(0, cycle)
         assert states(bench) == {DriveState.OPERATION_ENABLED}
 
-    def test_a_sync_that_came_late_was_not_missed(self, bench: DriveBench) -> None:
+    def test_late_sync_restarts_the_sync_watchdog(self, bench: DriveBench) -> None:
         bench.enable()
         for cycle in range(20):
             bench.drives.miss_sync(0, cycle)
@@ -601,7 +614,7 @@ class TestSync:
 
 class TestSupply:
     @pytest.mark.parametrize(
-        ("volts", "state", "told"),
+        ("volts", "state", "codes"),
         [
             (48.0, DriveState.OPERATION_ENABLED, []),
             (40.0, DriveState.OPERATION_ENABLED, []),
@@ -610,16 +623,18 @@ class TestSupply:
             (19.9, DriveState.FAULT_REACTION_ACTIVE, [0x3220, 0x3222]),
         ],
     )
-    def test_thresholds(self, bench: DriveBench, volts: float, state: DriveState, told: list[int]) -> None:
+    def test_voltage_thresholds_for_hold_and_fault_reaction(
+        self, bench: DriveBench, volts: float, state: DriveState, codes: list[int]
+    ) -> None:
         bench.enable()
         for _ in range(3):
             bench.drives.supply(2, volts)
         assert bench.drives.state[2] is state
-        assert [e.code for e in bench.drives.emergencies] == told
+        assert [e.code for e in bench.drives.emergencies] == codes
         assert bench.drives.voltage == [48.0, 48.0, volts] + [48.0] * 9
 
     @pytest.mark.parametrize("volts", [30.0, 10.0])
-    def test_nothing_is_acknowledged_while_the_voltage_is_low(self, bench: DriveBench, volts: float) -> None:
+    def test_under_voltage_cannot_be_acknowledged_while_it_lasts(self, bench: DriveBench, volts: float) -> None:
         bench.enable()
         bench.drives.supply(2, volts)
         for _ in range(2 * SLOW_CYCLES):
@@ -629,7 +644,7 @@ class TestSupply:
         assert bench.drives.latched[2] is (volts >= 20.0)
         assert [e.code for e in bench.drives.emergencies][-1] != 0
 
-    def test_the_hold_stays_when_the_voltage_is_back(self, bench: DriveBench) -> None:
+    def test_hold_remains_until_acknowledged_when_the_voltage_returns(self, bench: DriveBench) -> None:
         bench.enable()
         bench.drives.supply(2, 30.0)
         bench.drives.supply(2, 48.0)

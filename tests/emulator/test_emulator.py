@@ -1,12 +1,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
+from functools import partial
 
 import numpy as np
 import pytest
 
 from atalante_dbc import Network
-from atalante_emulator.body import PyBulletBody
+from atalante_emulator.bodies.pybullet_body import PyBulletBody
 from atalante_emulator.drive import WATCHDOG
 from atalante_emulator.emulator import Emulator
 from atalante_emulator.pendant import Operator
@@ -24,7 +25,7 @@ CROUCHED = [0.0, 0.0, -0.4, 0.7, -0.1, 0.0] * 2
 
 
 class Master:
-    """The least that speaks as the HAL: SYNC and commands out, everything else in."""
+    """A minimal HAL: sends SYNC and commands, and receives the frames of the nodes."""
 
     def __init__(self, network: Network, robot: Robot, bus: Bus) -> None:
         self.bus, self.robot, self.cycle = bus, robot, 0
@@ -60,7 +61,7 @@ class Master:
         self.slow.accept_each(frames, count)
 
     def command(self, only: Callable[[Frames], Frames] = lambda frames: frames) -> None:
-        frames = only(self.commands.seal())
+        frames = only(self.commands.seal(self.syncs.counter + 1 & 0xFF))  # the counter of the next SYNC
         if len(frames):
             self.bus.send(np.ascontiguousarray(frames))
 
@@ -114,7 +115,7 @@ def make(network: Network, robot: Robot, urdf_text: str) -> Iterator[Callable[..
 
 
 def walk(setup: Setup, cycles: int) -> bytes:
-    """Enable, swing both legs, let go; everything the nodes said."""
+    """Enable the drives, swing both legs, and return every frame of the nodes as bytes."""
     master, _ = setup
     master.enable()
     start = master.position.copy()
@@ -128,12 +129,12 @@ def walk(setup: Setup, cycles: int) -> bytes:
 
 
 class TestDeterminism:
-    def test_one_seed_gives_one_sequence_of_bytes(self, make: Callable[..., Setup]) -> None:
+    def test_same_seed_gives_the_same_bytes(self, make: Callable[..., Setup]) -> None:
         first = walk(make(seed=5, operator=Operator(0.5)), 400)
         again = walk(make(seed=5, operator=Operator(0.5)), 400)
         assert first == again
 
-    def test_another_seed_gives_another(self, make: Callable[..., Setup]) -> None:
+    def test_another_seed_gives_other_bytes(self, make: Callable[..., Setup]) -> None:
         assert walk(make(seed=5), 50) != walk(make(seed=6), 50)
 
 
@@ -151,13 +152,13 @@ class TestCycle:
             master.command()
         assert master.rx.crc_errors == master.slow.crc_errors == 0
 
-    def test_without_operator_the_pendant_is_silent(self, make: Callable[..., Setup]) -> None:
+    def test_pendant_sends_nothing_without_an_operator(self, make: Callable[..., Setup]) -> None:
         master, _ = make()
         for _ in range(120):
             master.sync()
         assert not any(name.startswith("PENDANT") for names in master.trace for name in names)
 
-    def test_state_is_sampled_before_the_body_moves_on(self, make: Callable[..., Setup]) -> None:
+    def test_state_is_sampled_before_the_body_moves(self, make: Callable[..., Setup]) -> None:
         master, emulator = make()
         for _ in range(20):
             before = emulator.body.position.copy()
@@ -165,7 +166,7 @@ class TestCycle:
             np.testing.assert_allclose(master.position, before, atol=1e-6)
             assert (emulator.body.position != before).any()
 
-    def test_command_acts_between_the_next_sync_and_the_one_after(self, make: Callable[..., Setup]) -> None:
+    def test_command_acts_from_the_next_sync_on(self, make: Callable[..., Setup]) -> None:
         master, _ = make()
         master.enable()
         master.target[:] = 0.0
@@ -175,10 +176,10 @@ class TestCycle:
         master.sync()  # k
         master.target[3] = 100.0
         master.command()  # command(k)
-        master.sync()  # k + 1: latched now
+        master.sync()  # k + 1: the drive latches command(k)
         assert abs(master.joints("Torque")[3]) < 1.0
         master.command()
-        master.sync()  # k + 2: it has acted for 1 ms
+        master.sync()  # k + 2: command(k) has acted for 1 ms
         assert master.joints("Torque")[3] > 50.0
 
     def test_nodes_of_a_bus_without_sync_do_not_answer(self, make: Callable[..., Setup], network: Network) -> None:
@@ -191,7 +192,7 @@ class TestCycle:
         assert buses == {"left_leg", "left_sense", "right_sense"}
         assert emulator.cycle == before + 1
 
-    def test_a_late_sync_is_answered_without_a_second_cycle(self, make: Callable[..., Setup], network: Network) -> None:
+    def test_late_sync_is_answered_without_a_second_cycle(self, make: Callable[..., Setup], network: Network) -> None:
         master, emulator = make()
         late: list[Frames] = []
 
@@ -208,8 +209,8 @@ class TestCycle:
         assert len(master.trace[-1]) == 6
         assert emulator.cycle == cycle
 
-    def test_commands_that_come_before_their_sync_wait_for_it(self, make: Callable[..., Setup]) -> None:
-        """As on a wire, where commands and the next SYNC are a millisecond apart."""
+    def test_commands_received_before_their_sync_take_effect_with_it(self, make: Callable[..., Setup]) -> None:
+        """On a real bus, about a millisecond passes between a command and the next SYNC."""
         master, emulator = make()
         master.enable()
         for _ in range(50):
@@ -232,10 +233,10 @@ class TestCycle:
         assert emulator.drives.missed == [0, 0]
         assert master.states == {DriveState.OPERATION_ENABLED}
 
-    def test_the_answer_is_one_batch_and_goes_out_before_the_body_moves(
+    def test_answer_is_sent_in_one_batch_before_the_body_moves(
         self, make: Callable[..., Setup], monkeypatch: pytest.MonkeyPatch
     ) -> None:
-        """Whoever waits for it in another process gets all of it or none, and works while the body moves."""
+        """So a HAL in another process receives the whole batch or nothing, and can compute while the body moves."""
         master, emulator = make(operator=Operator())
         master.sync()
         done: list[str] = []
@@ -251,29 +252,29 @@ class TestCycle:
                 sizes.add(len(frames))
                 self._send(frames)
 
-        def noted(what: str, call: Callable[..., object]) -> Callable[..., object]:
+        def recorded(what: str, call: Callable[..., object]) -> Callable[..., object]:
             return lambda *arguments: (done.append(what), call(*arguments))[1]
 
         emulator.bus = Recorder(emulator.bus)  # type: ignore[assignment]
-        monkeypatch.setattr(emulator.body, "step", noted("step", emulator.body.step))
-        monkeypatch.setattr(emulator.drives, "sample", noted("sample", emulator.drives.sample))
+        monkeypatch.setattr(emulator.body, "step", recorded("step", emulator.body.step))
+        monkeypatch.setattr(emulator.drives, "sample", recorded("sample", emulator.drives.sample))
         for _ in range(200):
             master.sync()
         assert done == ["send", "step", "sample"] * 200
         assert sizes == {19, 20, 21}
 
-    def test_what_is_rewritten_before_sending_is_what_is_sent(self, make: Callable[..., Setup]) -> None:
+    def test_value_changed_by_a_before_send_hook_is_sent(self, make: Callable[..., Setup]) -> None:
         master, emulator = make()
-        place = emulator.signals.index("IMU_PELVIS_STATE", "AccelX")
+        accel = emulator.signals.index("IMU_PELVIS_STATE", "AccelX")
         emulator.before_send.append(
-            lambda cycle, values: values.__setitem__(place, 7.0 if cycle == 1 else values[place])
+            lambda cycle, values: values.__setitem__(accel, 7.0 if cycle == 1 else values[accel])
         )
         master.sync()
         assert master.rx.values[master.rx.codec.index("IMU_PELVIS_STATE", "AccelX")] < 1.0
         master.sync()
         assert master.rx.values[master.rx.codec.index("IMU_PELVIS_STATE", "AccelX")] == 7.0
 
-    def test_four_channels_are_as_good_as_one(
+    def test_four_channels_give_the_same_values_as_one(
         self, network: Network, robot: Robot, urdf_text: str, make: Callable[..., Setup]
     ) -> None:
         pairs = {bus: lockstep_pair() for bus in network.buses}
@@ -282,13 +283,13 @@ class TestCycle:
         emulator = Emulator(network, robot, body, JoinedBus(network, {n: p[1] for n, p in pairs.items()}), seed=1)
         for ours, _ in pairs.values():
             ours.step = emulator.poll
-        apart = Master(network, robot, JoinedBus(network, {n: p[0] for n, p in pairs.items()}))
+        separate = Master(network, robot, JoinedBus(network, {n: p[0] for n, p in pairs.items()}))
         joined, _ = make(seed=1)
-        walk((apart, emulator), 100)
+        walk((separate, emulator), 100)
         walk((joined, emulator), 100)
         body.close()
-        assert apart.rx.values.tobytes() == joined.rx.values.tobytes()
-        assert [sorted(names) for names in apart.trace] == [sorted(names) for names in joined.trace]
+        assert separate.rx.values.tobytes() == joined.rx.values.tobytes()
+        assert [sorted(names) for names in separate.trace] == [sorted(names) for names in joined.trace]
 
 
 class TestDrives:
@@ -302,7 +303,7 @@ class TestDrives:
         assert np.abs(emulator.body.velocity).max() < 0.3
         assert np.abs(master.joints("Torque")).max() < 0.5
 
-    def test_command_loss_trips_at_exactly_five(self, make: Callable[..., Setup]) -> None:
+    def test_drives_hold_after_five_lost_commands_and_not_after_four(self, make: Callable[..., Setup]) -> None:
         for lost, expected in ((WATCHDOG - 1, DriveState.OPERATION_ENABLED), (WATCHDOG, DriveState.QUICK_STOP_ACTIVE)):
             master, emulator = make()
             master.enable()
@@ -316,12 +317,12 @@ class TestDrives:
             assert master.states == {expected}
 
     @pytest.mark.parametrize("how", ["crc", "length", "repeated", "range"])
-    def test_a_bad_command_is_no_command(self, make: Callable[..., Setup], how: str) -> None:
+    def test_invalid_commands_trip_the_command_watchdog(self, make: Callable[..., Setup], how: str) -> None:
         master, emulator = make()
         master.enable()
         good: list[Frames] = []
 
-        def spoil(frames: Frames) -> Frames:
+        def damage(frames: Frames) -> Frames:
             frames = frames.copy()
             if how == "crc":
                 frames["data"][:, 20] ^= 0x10
@@ -341,11 +342,11 @@ class TestDrives:
         master.sync()
         for _ in range(WATCHDOG):
             assert not any(emulator.drives.latched)
-            master.command(only=spoil)
+            master.command(only=damage)
             master.sync()
         assert all(emulator.drives.latched)
 
-    def test_latched_hold_keeps_the_legs_up_and_survives_a_hal_that_goes_on(self, make: Callable[..., Setup]) -> None:
+    def test_latched_hold_keeps_the_pose_until_a_quick_stop_acknowledges_it(self, make: Callable[..., Setup]) -> None:
         master, emulator = make()
         master.enable()
         hold = master.position.copy()
@@ -354,15 +355,16 @@ class TestDrives:
             master.track(hold)
             master.command()
         before = emulator.body.position.copy()
-        for _ in range(600):  # the HAL is gone
+        for _ in range(600):  # the HAL sends no commands
             master.sync()
         assert set(emulator.drives.state) == {DriveState.QUICK_STOP_ACTIVE}
         assert np.abs(emulator.body.position - before).max() < np.radians(1.5)
         assert np.abs(emulator.body.velocity).max() < 0.01
-        for _ in range(300):  # it comes back as if nothing had been
+        for _ in range(300):  # the HAL sends commands again without an acknowledgement
             master.sync()
             master.command()
         assert set(emulator.drives.state) == {DriveState.QUICK_STOP_ACTIVE}
+        master.sync()
         master.word[:] = Controlword.QUICK_STOP
         master.command()
         master.sync()
@@ -371,7 +373,37 @@ class TestDrives:
         master.sync()
         assert set(emulator.drives.state) == {DriveState.OPERATION_ENABLED}
 
-    def test_a_hold_from_full_swing_comes_to_rest(self, make: Callable[..., Setup]) -> None:
+    @pytest.mark.parametrize(
+        ("delays", "state"), [((4,), DriveState.OPERATION_ENABLED), ((4, 8), DriveState.QUICK_STOP_ACTIVE)]
+    )
+    def test_growing_delay_of_commands_leads_to_a_hold(
+        self, make: Callable[..., Setup], delays: tuple[int, ...], state: DriveState
+    ) -> None:
+        master, emulator = make()
+        master.enable()
+        waiting: list[Frames] = []
+
+        def delayed(delay: int, frames: Frames) -> Frames:
+            waiting.append(frames.copy())
+            return waiting.pop(0) if len(waiting) > delay else frames[:0]
+
+        for delay in delays:
+            for _ in range(20):
+                master.sync()
+                master.command(only=partial(delayed, delay))
+        master.sync()
+        assert set(emulator.drives.state) == {state}
+
+    def test_command_far_ahead_of_its_sync_is_rejected(self, make: Callable[..., Setup]) -> None:
+        master, emulator = make()
+        master.enable()
+        for _ in range(WATCHDOG + 1):
+            master.sync()
+            master.bus.send(np.ascontiguousarray(master.commands.seal(master.syncs.counter + 1 + 100 & 0xFF)))
+        master.sync()
+        assert set(emulator.drives.state) == {DriveState.QUICK_STOP_ACTIVE}
+
+    def test_hold_during_a_fast_swing_comes_to_rest(self, make: Callable[..., Setup]) -> None:
         setup = make()
         master, emulator = setup
         walk(setup, 260)
@@ -380,7 +412,7 @@ class TestDrives:
             master.sync()
         assert np.abs(emulator.body.velocity).max() < 0.01
 
-    def test_a_leg_without_sync_holds(self, make: Callable[..., Setup]) -> None:
+    def test_only_the_leg_without_sync_holds(self, make: Callable[..., Setup]) -> None:
         master, emulator = make()
         master.enable()
         for _ in range(2 * WATCHDOG):
@@ -389,20 +421,20 @@ class TestDrives:
         assert set(emulator.drives.state[:6]) == {DriveState.OPERATION_ENABLED}
         assert set(emulator.drives.state[6:]) == {DriveState.QUICK_STOP_ACTIVE}
 
-    def test_a_trip_is_told_once_by_every_drive(self, make: Callable[..., Setup]) -> None:
+    def test_every_drive_sends_one_emergency_when_commands_time_out(self, make: Callable[..., Setup]) -> None:
         master, _ = make()
         master.enable()
         del master.trace[:]
         for _ in range(40):
             master.sync()
-        told = [name for names in master.trace for name in names if name.endswith("_EMCY")]
-        assert told == [f"{joint.upper()}_EMCY" for joint in JOINTS]
+        emergencies = [name for names in master.trace for name in names if name.endswith("_EMCY")]
+        assert emergencies == [f"{joint.upper()}_EMCY" for joint in JOINTS]
         code = master.slow.codec.index("LEFT_SK_EMCY", "ErrorCode")
         assert master.slow.values[code] == 0x8250
 
 
 class TestSensors:
-    def test_hanging_imus_read_gravity_with_noise(self, make: Callable[..., Setup]) -> None:
+    def test_suspended_imus_measure_gravity_with_noise(self, make: Callable[..., Setup]) -> None:
         master, _ = make(seed=2)
         accel, gyro = [], []
         for _ in range(400):
@@ -416,7 +448,7 @@ class TestSensors:
         assert np.std(accel, axis=0).max() < 0.06
         assert np.abs(np.mean(gyro)) < 1e-3
 
-    def test_cells_read_noise_in_the_air_and_weight_on_the_ground(self, make: Callable[..., Setup]) -> None:
+    def test_cells_measure_noise_in_the_air_and_weight_on_the_ground(self, make: Callable[..., Setup]) -> None:
         sums = []
         for ground in (None, -0.90):
             master, emulator = make(ground=ground)
@@ -431,7 +463,7 @@ class TestSensors:
                     force = master.rx.values[master.rx.codec.slice("Force")].reshape(2, 4, 3)
                     total += force.sum(axis=1) / 100
             sums.append(total)
-            assert bool(len(emulator.body.contact)) == (ground is not None)
+            assert emulator.body.touching == (ground is not None)
         assert np.abs(sums[0]).max() < 15.0
         assert (sums[1][:, 2] > 100.0).all()
 
@@ -451,7 +483,7 @@ class TestSensors:
 
 
 class TestStatus:
-    def test_each_node_reports_every_100_ms_and_never_two_at_once(
+    def test_each_node_sends_its_status_every_100_ms_and_never_two_in_a_cycle(
         self, make: Callable[..., Setup], network: Network
     ) -> None:
         master, _ = make(operator=Operator())
@@ -477,7 +509,7 @@ class TestStatus:
 
 
 class TestOperator:
-    def test_the_operator_hears_sync_and_answers_with_the_pendant(self, make: Callable[..., Setup]) -> None:
+    def test_pendant_reports_the_reactions_of_the_operator_to_the_hal_state(self, make: Callable[..., Setup]) -> None:
         operator = Operator(0.25)
         master, _ = make(operator=operator)
         index = master.rx.codec.index
@@ -499,7 +531,7 @@ class TestOperator:
 
 
 class TestWallClock:
-    def test_without_sync_the_drives_hold_and_the_heartbeat_goes_on(self, make: Callable[..., Setup]) -> None:
+    def test_without_sync_the_drives_hold_and_the_heartbeats_continue(self, make: Callable[..., Setup]) -> None:
         master, emulator = make()
         master.enable()
         for _ in range(50):
@@ -518,7 +550,7 @@ class TestWallClock:
         assert sum(name.endswith("_STATUS") for name in names) == 19
         assert sum(name.endswith("_EMCY") for name in names) == 12
 
-    def test_run_answers_a_hal_that_is_there(self, make: Callable[..., Setup]) -> None:
+    def test_run_answers_every_sync_and_keeps_the_drives_enabled(self, make: Callable[..., Setup]) -> None:
         master, emulator = make()
         master.enable()
         beats = 0

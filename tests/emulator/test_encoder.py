@@ -20,7 +20,7 @@ class EncoderBench:
 
 
 @pytest.mark.parametrize("polarity", [1.0, -1.0])
-def test_quantised_at_the_motor(robot: Robot, polarity: float) -> None:
+def test_position_is_quantised_in_counts_at_the_motor(robot: Robot, polarity: float) -> None:
     robot = dataclasses.replace(robot, polarity=np.full(12, polarity))
     bench, rng = EncoderBench(robot), np.random.default_rng(2)
     for _ in range(100):
@@ -45,7 +45,7 @@ def test_velocity_estimate_is_a_low_pass_of_the_encoder(robot: Robot, bandwidth:
 
 
 @pytest.mark.parametrize("polarity", [1.0, -1.0])
-def test_the_bare_speed_is_not_late(robot: Robot, polarity: float) -> None:
+def test_unfiltered_speed_has_no_lag(robot: Robot, polarity: float) -> None:
     bench = EncoderBench(dataclasses.replace(robot, polarity=np.full(12, polarity)))
     for position in (0.1, 0.1, 0.102):
         bench.encoders.sample(np.full(12, position))
@@ -53,7 +53,7 @@ def test_the_bare_speed_is_not_late(robot: Robot, polarity: float) -> None:
     assert np.abs(bench.velocity / (robot.gear * polarity)).max() < 1.0
 
 
-def test_a_joint_that_stands_somewhere_at_switch_on_does_not_seem_to_jump(robot: Robot) -> None:
+def test_velocity_is_zero_in_the_first_sample_at_any_position(robot: Robot) -> None:
     bench = EncoderBench(robot)
     bench.encoders.sample(np.full(12, 0.3))
     assert not bench.velocity.any()

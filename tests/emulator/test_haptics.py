@@ -20,7 +20,7 @@ def test_step_response_is_first_order() -> None:
 
 
 @pytest.mark.parametrize("split", [(30,), (10, 20), (1,) * 30])
-def test_response_does_not_depend_on_how_time_is_cut(split: tuple[int, ...]) -> None:
+def test_response_does_not_depend_on_the_step_length(split: tuple[int, ...]) -> None:
     motors = Haptics(HapticsParameters(), np.full(8, 0.3))
     for cycles in split:
         motors.advance(LEVEL, 0, cycles)
@@ -37,7 +37,7 @@ def test_amplitude_stays_between_zero_and_one() -> None:
         assert (motors.amplitude <= 1.0).all()
 
 
-def test_motors_stop_when_nobody_commands() -> None:
+def test_motors_stop_when_commands_time_out() -> None:
     motors = Haptics(HapticsParameters(), np.ones(8))
     motors.advance(LEVEL + 1.0, WATCHDOG - 1, 10)
     assert (motors.amplitude >= 1.0).all()

@@ -7,7 +7,8 @@ import pinocchio
 import pytest
 
 from atalante_control.model import imu_link, pinocchio_model
-from atalante_emulator.body import GRAVITY, PyBulletBody
+from atalante_emulator.bodies import GRAVITY
+from atalante_emulator.bodies.pybullet_body import PyBulletBody
 from atalante_emulator.imu import ImuParameters, Imus, ImuSignals
 from atalante_hal.robot import IMUS
 from atalante_hal.types import PERIOD
@@ -22,11 +23,11 @@ def links(
     velocity: tuple[float, ...] = (0.0,) * 3,
     rate: tuple[float, ...] = (0.0,) * 3,
 ) -> np.ndarray:
-    """Four that move alike: quaternion xyzw, m/s, rad/s."""
+    """Return the link states of four links with the same motion: quaternion xyzw, velocity [m/s], rate [rad/s], shape (4, 10)."""
     return np.tile([*rotation, *velocity, *rate], (4, 1))
 
 
-def test_at_rest_the_specific_force_points_up() -> None:
+def test_specific_force_at_rest_points_up() -> None:
     out = signals()
     Imus(ImuParameters(), out).sample(links())
     assert out.quaternion.tolist() == [[1.0, 0.0, 0.0, 0.0]] * 4
@@ -34,23 +35,23 @@ def test_at_rest_the_specific_force_points_up() -> None:
     assert out.accel.tolist() == [[0.0, 0.0, GRAVITY]] * 4
 
 
-def test_gravity_is_seen_in_the_sensor_s_axes() -> None:
-    """Pitched by +30 degrees (nose down) the x axis points 30 degrees below the horizon."""
+def test_gravity_is_measured_in_sensor_axes() -> None:
+    """If the sensor is pitched by +30 degrees (nose down), its x axis points 30 degrees below the horizon."""
     out = signals()
     half = math.radians(15.0)
     Imus(ImuParameters(), out).sample(links((0.0, math.sin(half), 0.0, math.cos(half))))
     np.testing.assert_allclose(out.accel[0], [-0.5 * GRAVITY, 0.0, math.sqrt(0.75) * GRAVITY])
 
 
-def test_quaternion_has_one_sign() -> None:
+def test_scalar_part_of_the_quaternion_is_not_negative() -> None:
     out = signals()
     half = math.radians(20.0)
     Imus(ImuParameters(), out).sample(links((-math.sin(half), 0.0, 0.0, -math.cos(half))))
     np.testing.assert_allclose(out.quaternion[2], [math.cos(half), math.sin(half), 0.0, 0.0])
 
 
-def test_a_carousel_feels_its_centripetal_acceleration() -> None:
-    """Constant rate about z at 0.5 m: the sensor, turning with it, feels r w^2 inwards, and its own rate."""
+def test_rotating_sensor_measures_its_centripetal_acceleration() -> None:
+    """A sensor that turns at rate w about a vertical axis at distance r measures r w^2 inwards, and the rate w."""
     out = signals()
     imus = Imus(ImuParameters(), out)
     radius, rate = 0.5, 2.0
@@ -63,7 +64,7 @@ def test_a_carousel_feels_its_centripetal_acceleration() -> None:
     np.testing.assert_allclose(out.gyro[1], [0.0, 0.0, rate], atol=1e-12)
 
 
-def test_free_fall_feels_nothing() -> None:
+def test_specific_force_in_free_fall_is_zero() -> None:
     out = signals()
     imus = Imus(ImuParameters(), out)
     for step in range(3):
@@ -71,7 +72,7 @@ def test_free_fall_feels_nothing() -> None:
     np.testing.assert_allclose(out.accel, 0.0, atol=1e-12)
 
 
-def test_a_moving_exoskeleton_agrees_with_pinocchio(urdf_text: str) -> None:
+def test_signals_of_a_moving_robot_agree_with_pinocchio(urdf_text: str) -> None:
     model, q_index, v_index = pinocchio_model(urdf_text)
     data = model.createData()
     body, out = PyBulletBody(urdf_text), signals()
@@ -80,7 +81,7 @@ def test_a_moving_exoskeleton_agrees_with_pinocchio(urdf_text: str) -> None:
     body.reset(centre.tolist())
     imus.sample(body.imu)
     errors = []
-    for step in range(400):  # a leg swing of walking speed
+    for step in range(400):  # a leg swing as fast as in walking
         reference = centre + np.array([0, 0, 0.25, 0.3, 0, 0, 0, 0, -0.25, -0.3, 0, 0]) * np.sin(5.0 * step * PERIOD)
         torque = 400.0 * (reference - body.position) - 20.0 * body.velocity
         q, v, a = np.zeros((3, 12))
@@ -103,12 +104,12 @@ def test_a_moving_exoskeleton_agrees_with_pinocchio(urdf_text: str) -> None:
                 errors.append(np.abs(out.accel[imu] - acceleration - rotation.T @ [0.0, 0.0, GRAVITY]).max())
     body.close()
     assert body.velocity.max() > 0.5
-    # The difference over the last millisecond is the acceleration half of one ago.
+    # The tolerance is larger, because the velocity difference over a millisecond is the acceleration half a millisecond ago.
     assert max(errors) < 0.02
     assert float(np.median(errors)) < 2e-3
 
 
-def test_noise_and_bias_are_seeded_and_of_the_stated_size() -> None:
+def test_noise_and_bias_are_reproducible_and_have_the_configured_size() -> None:
     parameters = ImuParameters()
     imus = Imus(parameters, signals())
 
@@ -131,7 +132,7 @@ def test_noise_and_bias_are_seeded_and_of_the_stated_size() -> None:
 
 
 @pytest.mark.parametrize("moved", range(4))
-def test_each_sees_its_own_link(moved: int) -> None:
+def test_each_imu_measures_only_its_own_link(moved: int) -> None:
     out = signals()
     imus = Imus(ImuParameters(), out)
     imus.sample(links())
@@ -144,7 +145,7 @@ def test_each_sees_its_own_link(moved: int) -> None:
     assert (np.delete(out.accel, moved, axis=0) == [0.0, 0.0, GRAVITY]).all()
 
 
-def test_a_link_that_moves_at_switch_on_does_not_seem_to_be_hit() -> None:
+def test_first_sample_of_a_moving_link_has_no_acceleration() -> None:
     out = signals()
     Imus(ImuParameters(), out).sample(links(velocity=(1.0, -2.0, 0.5)))
     assert (out.accel == [0.0, 0.0, GRAVITY]).all()

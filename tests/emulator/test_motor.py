@@ -10,8 +10,8 @@ from atalante_hal.robot import Robot
 from atalante_hal.types import PERIOD
 
 SMOOTH = MotorParameters(coulomb=(0.0,) * 6, viscous=(0.0,) * 6)
-ALL, NONE = np.ones(12, np.bool_), np.zeros(12, np.bool_)
-STILL = np.zeros(12)
+POWERED, UNPOWERED = np.ones(12, np.bool_), np.zeros(12, np.bool_)
+AT_REST = np.zeros(12)
 
 
 @pytest.fixture
@@ -19,45 +19,45 @@ def motors(robot: Robot) -> Motors:
     return Motors(robot, SMOOTH, *np.zeros((2, 12)))
 
 
-def settle(motors: Motors, velocity: np.ndarray = STILL) -> np.ndarray:
+def settle(motors: Motors, velocity: np.ndarray = AT_REST) -> np.ndarray:
     for _ in range(30):
         torque = motors.advance(velocity)
     return np.array(torque)
 
 
-def test_torque_follows_as_a_first_order_lag(robot: Robot) -> None:
+def test_torque_follows_its_setpoint_as_a_first_order_lag(robot: Robot) -> None:
     measured = np.zeros(12)
     motors = Motors(robot, SMOOTH, measured, np.zeros(12))
-    motors.power(ALL)
+    motors.power(POWERED)
     motors.wanted[:] = 20.0
     for n in range(1, 6):
         expected = 20.0 * (1.0 - math.exp(-n * PERIOD / SMOOTH.current_loop))
-        np.testing.assert_allclose(motors.advance(STILL), expected, rtol=1e-12)
+        np.testing.assert_allclose(motors.advance(AT_REST), expected, rtol=1e-12)
         np.testing.assert_allclose(measured, expected, rtol=1e-12)
 
 
 @pytest.mark.parametrize("speed", [-3.0, -0.01, 0.0, 0.002, 1.5])
-@pytest.mark.parametrize("powered", [ALL, NONE], ids=["powered", "braked"])
-def test_friction_and_brake_take_power_and_never_give_it(robot: Robot, powered: np.ndarray, speed: float) -> None:
+@pytest.mark.parametrize("powered", [POWERED, UNPOWERED], ids=["powered", "braked"])
+def test_friction_and_brake_always_oppose_the_motion(robot: Robot, powered: np.ndarray, speed: float) -> None:
     motors = Motors(robot, MotorParameters(), *np.zeros((2, 12)))
     motors.power(powered)
     power = np.array(motors.advance(np.full(12, speed))) * speed
     assert (power < 0.0).all() if speed else not power.any()
 
 
-def test_only_a_motor_without_power_brakes(motors: Motors) -> None:
+def test_brake_torque_acts_only_on_an_unpowered_motor(motors: Motors) -> None:
     motors.power(np.arange(12) != 3)
     torque = np.array(motors.advance(np.full(12, 0.5)))
     assert torque[3] == pytest.approx(-0.5 * SMOOTH.brake[3])
     assert not np.delete(torque, 3).any()
-    motors.power(ALL)
+    motors.power(POWERED)
     assert not np.array(motors.advance(np.full(12, 0.5))).any()
 
 
-def test_a_weak_motor_measures_what_it_should_make(robot: Robot) -> None:
+def test_weak_motor_makes_less_torque_than_it_measures(robot: Robot) -> None:
     measured = np.zeros(12)
     motors = Motors(robot, SMOOTH, measured, np.zeros(12))
-    motors.power(ALL)
+    motors.power(POWERED)
     motors.weaken(2, 0.25)
     motors.wanted[:] = 40.0
     np.testing.assert_allclose(settle(motors), [40.0, 40.0, 10.0] + [40.0] * 9, rtol=1e-6)
@@ -66,23 +66,23 @@ def test_a_weak_motor_measures_what_it_should_make(robot: Robot) -> None:
     np.testing.assert_allclose(settle(motors), 40.0, rtol=1e-6)
 
 
-def test_a_push_is_on_the_joint_and_not_measured(robot: Robot) -> None:
+def test_push_acts_on_the_joint_and_is_not_measured(robot: Robot) -> None:
     measured = np.zeros(12)
     motors = Motors(robot, SMOOTH, measured, np.zeros(12))
     motors.push(5, 30.0)
     motors.push(6, -10.0)
-    np.testing.assert_allclose(motors.advance(STILL), [0.0] * 5 + [30.0, -10.0] + [0.0] * 5)
+    np.testing.assert_allclose(motors.advance(AT_REST), [0.0] * 5 + [30.0, -10.0] + [0.0] * 5)
     motors.push(5, 0.0)
-    np.testing.assert_allclose(motors.advance(STILL), [0.0] * 6 + [-10.0] + [0.0] * 5)
+    np.testing.assert_allclose(motors.advance(AT_REST), [0.0] * 6 + [-10.0] + [0.0] * 5)
     motors.push(6, 0.0)
-    assert not any(motors.advance(STILL))
+    assert not any(motors.advance(AT_REST))
     assert not measured.any()
 
 
-def test_heat_goes_with_torque_squared_and_time(robot: Robot) -> None:
+def test_temperature_rises_with_torque_squared_and_time(robot: Robot) -> None:
     motors = Motors(robot, SMOOTH, *np.zeros((2, 12)))
     assert set(motors.temperature) == {SMOOTH.ambient}
-    motors.power(ALL)
+    motors.power(POWERED)
     motors.wanted[:] = 0.5 * robot.torque_max
     motors.wanted[0] *= 0.5
     settle(motors)

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from atalante_dbc import Network
-from atalante_emulator.body import PyBulletBody
+from atalante_emulator.bodies.pybullet_body import PyBulletBody
 from atalante_emulator.emulator import Emulator
 from atalante_emulator.faults import Fault, FaultError
 from atalante_emulator.pendant import Operator
@@ -21,12 +21,12 @@ from atalante_hal.wire.process_image import ReceiveImage, TransmitImage
 CROUCHED = [0.0, 0.0, -0.4, 0.7, -0.1, 0.0] * 2
 KNEE, HENKE = 3, 5  # of the left leg
 ENABLED, HOLDING = DriveState.OPERATION_ENABLED, DriveState.QUICK_STOP_ACTIVE
-#: Cycle in which the faults of most tests begin, drives enabled and holding their pose.
+#: Cycle in which the faults of most tests begin. By then the drives are enabled and hold their pose.
 BEGIN = 30
 
 
-class Walker:
-    """The least that speaks as a HAL: enables the drives and holds the pose with its own position loop."""
+class PoseHolder:
+    """A minimal HAL: enables the drives and holds the pose with a position loop."""
 
     def __init__(self, network: Network, robot: Robot, bus: PairBus) -> None:
         cyclic = [m for m in network.sent_by("HAL") if m.cycle_ms == 1]
@@ -44,7 +44,7 @@ class Walker:
         self._sync_cycle = codec.slice("Cycle")
         self._names = {m.frame_id: m.name for m in network.messages} | {0: "flood"}
         self._buffer = new_frames(128)
-        self.said: list[list[str]] = []
+        self.sent: list[list[str]] = []
         self.frames: list[Frames] = []
         self.states: list[list[int]] = []
         self.enabling = True
@@ -56,7 +56,7 @@ class Walker:
             self.bus.send(self.tx.seal())
             count = self.bus.receive(self._buffer)
             self.frames.append(self._buffer[:count].copy())
-            self.said.append([self._names[i] for i in self.frames[-1]["can_id"].tolist()])
+            self.sent.append([self._names[i] for i in self.frames[-1]["can_id"].tolist()])
             self.fast.accept(self._buffer, count)
             self.slow.new_cycle()
             self.slow.accept_each(self._buffer, count)
@@ -77,11 +77,11 @@ class Walker:
         return float(image.values[image.codec.index(message, signal)])
 
     def emergencies(self) -> list[tuple[int, str]]:
-        """Cycle and name of every emergency."""
-        return [(cycle, name) for cycle, names in enumerate(self.said) for name in names if name.endswith("_EMCY")]
+        """Return the cycle and the message name of every emergency."""
+        return [(cycle, name) for cycle, names in enumerate(self.sent) for name in names if name.endswith("_EMCY")]
 
 
-World = tuple[Walker, Emulator]
+World = tuple[PoseHolder, Emulator]
 
 
 @pytest.fixture
@@ -95,9 +95,9 @@ def world(network: Network, robot: Robot, urdf_text: str) -> Iterator[Callable[.
         bodies.append(body)
         emulator = Emulator(network, robot, body, theirs, seed=seed, operator=Operator(), faults=faults)
         ours.step = emulator.poll
-        walker = Walker(network, robot, ours)
-        walker.run(cycles)
-        return walker, emulator
+        hal = PoseHolder(network, robot, ours)
+        hal.run(cycles)
+        return hal, emulator
 
     yield build
     for body in bodies:
@@ -107,7 +107,7 @@ def world(network: Network, robot: Robot, urdf_text: str) -> Iterator[Callable[.
 Make = Callable[..., World]
 
 
-def test_without_an_active_fault_every_byte_is_the_same(world: Make) -> None:
+def test_inactive_faults_do_not_change_any_byte(world: Make) -> None:
     plain, _ = world(cycles=150)
     waiting, _ = world(
         Fault("encoder_jump", "LEFT_SK", 10_000, by=1.0),
@@ -121,132 +121,132 @@ def test_without_an_active_fault_every_byte_is_the_same(world: Make) -> None:
 
 class TestDrives:
     @pytest.mark.parametrize("state", ["SWITCHED_ON", "READY_TO_SWITCH_ON", "FAULT", "QUICK_STOP_ACTIVE"])
-    def test_leave_operation(self, world: Make, state: str) -> None:
-        walker, _ = world(Fault("leave_operation", "LEFT_SK", BEGIN, 3, state=state), cycles=BEGIN + 3)
-        assert [row[KNEE] for row in walker.states[BEGIN - 1 :]] == [ENABLED] + [DriveState[state]] * 3
-        assert {s for row in walker.states[BEGIN:] for d, s in enumerate(row) if d != KNEE} == {ENABLED}
+    def test_drive_leaves_operation_for_the_requested_state(self, world: Make, state: str) -> None:
+        hal, _ = world(Fault("leave_operation", "LEFT_SK", BEGIN, 3, state=state), cycles=BEGIN + 3)
+        assert [row[KNEE] for row in hal.states[BEGIN - 1 :]] == [ENABLED] + [DriveState[state]] * 3
+        assert {s for row in hal.states[BEGIN:] for d, s in enumerate(row) if d != KNEE} == {ENABLED}
 
     @pytest.mark.parametrize(
         ("state", "after"), [("FAULT_REACTION_ACTIVE", "FAULT"), ("NOT_READY_TO_SWITCH_ON", "SWITCH_ON_DISABLED")]
     )
-    def test_states_that_a_drive_leaves_by_itself(self, world: Make, state: str, after: str) -> None:
-        walker, _ = world(Fault("leave_operation", "LEFT_SK", BEGIN, 2, state=state), cycles=BEGIN + 3)
-        assert [row[KNEE] for row in walker.states[BEGIN:]] == [DriveState[state]] * 2 + [DriveState[after]]
+    def test_transitional_state_ends_in_its_cia402_successor(self, world: Make, state: str, after: str) -> None:
+        hal, _ = world(Fault("leave_operation", "LEFT_SK", BEGIN, 2, state=state), cycles=BEGIN + 3)
+        assert [row[KNEE] for row in hal.states[BEGIN:]] == [DriveState[state]] * 2 + [DriveState[after]]
 
-    def test_push(self, world: Make) -> None:
-        walker, emulator = world(Fault("push", "LEFT_SK", BEGIN, 100, torque=60.0), cycles=BEGIN + 60)
+    def test_push_moves_the_joint_while_it_lasts(self, world: Make) -> None:
+        hal, emulator = world(Fault("push", "LEFT_SK", BEGIN, 100, torque=60.0), cycles=BEGIN + 60)
         _, quiet = world(cycles=BEGIN + 60)
         moved = emulator.body.position - quiet.body.position
-        assert 0.5 < moved[KNEE] * walker.robot.hold_kp[KNEE] / 60.0 < 1.0
+        assert 0.5 < moved[KNEE] * hal.robot.hold_kp[KNEE] / 60.0 < 1.0
         assert np.abs(moved[6:]).max() < 1e-3
-        walker.run(300)
+        hal.run(300)
         quiet_end = world(cycles=BEGIN + 360)[1].body.position
         assert emulator.body.position[KNEE] == pytest.approx(quiet_end[KNEE], abs=2e-3)
 
-    def test_emergency_of_a_drive(self, world: Make) -> None:
-        walker, emulator = world(Fault("emergency", "LEFT_HA", BEGIN, 50, code=0x7305), cycles=BEGIN + 1)
-        assert walker.emergencies() == [(BEGIN, "LEFT_HA_EMCY")]
-        said = [walker.value("LEFT_HA_EMCY", signal) for signal in ("ErrorCode", "ErrorRegister")]
-        assert said == [0x7305, 0x21]
-        assert walker.states[BEGIN][HENKE] == DriveState.FAULT_REACTION_ACTIVE
-        walker.run(250)
-        assert [name for _, name in walker.emergencies()] == ["LEFT_HA_EMCY"] * 2
-        assert walker.value("LEFT_HA_EMCY", "ErrorCode") == 0
-        assert emulator.drives.state[HENKE] is ENABLED  # by a HAL that acknowledges everything
+    def test_emergency_of_a_drive_starts_a_fault_reaction_and_ends_with_the_fault(self, world: Make) -> None:
+        hal, emulator = world(Fault("emergency", "LEFT_HA", BEGIN, 50, code=0x7305), cycles=BEGIN + 1)
+        assert hal.emergencies() == [(BEGIN, "LEFT_HA_EMCY")]
+        sent = [hal.value("LEFT_HA_EMCY", signal) for signal in ("ErrorCode", "ErrorRegister")]
+        assert sent == [0x7305, 0x21]
+        assert hal.states[BEGIN][HENKE] == DriveState.FAULT_REACTION_ACTIVE
+        hal.run(250)
+        assert [name for _, name in hal.emergencies()] == ["LEFT_HA_EMCY"] * 2
+        assert hal.value("LEFT_HA_EMCY", "ErrorCode") == 0
+        assert emulator.drives.state[HENKE] is ENABLED  # the HAL acknowledges every fault
 
-    def test_an_emergency_that_stands_cannot_be_reset(self, world: Make) -> None:
-        walker, _ = world(Fault("emergency", "LEFT_HA", BEGIN, code=0x2310), cycles=BEGIN + 300)
-        assert walker.states[-1][HENKE] == DriveState.FAULT
-        assert len(walker.emergencies()) == 1
+    def test_permanent_emergency_of_a_drive_cannot_be_reset(self, world: Make) -> None:
+        hal, _ = world(Fault("emergency", "LEFT_HA", BEGIN, code=0x2310), cycles=BEGIN + 300)
+        assert hal.states[-1][HENKE] == DriveState.FAULT
+        assert len(hal.emergencies()) == 1
 
-    def test_emergency_of_a_sensor(self, world: Make) -> None:
-        walker, _ = world(Fault("emergency", "IMU_TORSO", BEGIN, 5, code=0x5000), cycles=BEGIN + 1)
-        assert walker.value("IMU_TORSO_EMCY", "ErrorCode") == 0x5000
-        walker.run(10)
-        assert walker.emergencies() == [(BEGIN, "IMU_TORSO_EMCY"), (BEGIN + 5, "IMU_TORSO_EMCY")]
-        assert walker.value("IMU_TORSO_EMCY", "ErrorCode") == 0
+    def test_emergency_of_a_sensor_is_sent_at_its_begin_and_end(self, world: Make) -> None:
+        hal, _ = world(Fault("emergency", "IMU_TORSO", BEGIN, 5, code=0x5000), cycles=BEGIN + 1)
+        assert hal.value("IMU_TORSO_EMCY", "ErrorCode") == 0x5000
+        hal.run(10)
+        assert hal.emergencies() == [(BEGIN, "IMU_TORSO_EMCY"), (BEGIN + 5, "IMU_TORSO_EMCY")]
+        assert hal.value("IMU_TORSO_EMCY", "ErrorCode") == 0
 
-    def test_error_register_in_the_heartbeat(self, world: Make) -> None:
-        walker, _ = world(Fault("emergency", "LEFT_SK", BEGIN, code=0x2310), cycles=BEGIN + 120)
-        assert walker.value("LEFT_SK_STATUS", "ErrorFlags") == 0x03
-        assert walker.value("LEFT_SH_STATUS", "ErrorFlags") == 0
+    def test_heartbeat_contains_the_error_register(self, world: Make) -> None:
+        hal, _ = world(Fault("emergency", "LEFT_SK", BEGIN, code=0x2310), cycles=BEGIN + 120)
+        assert hal.value("LEFT_SK_STATUS", "ErrorFlags") == 0x03
+        assert hal.value("LEFT_SH_STATUS", "ErrorFlags") == 0
 
-    def test_weak_torque(self, world: Make) -> None:
-        walker, emulator = world(Fault("torque_weak", "LEFT_SK", BEGIN, 200, share=0.5), cycles=BEGIN + 100)
+    def test_joint_with_weak_torque_sags_and_recovers(self, world: Make) -> None:
+        hal, emulator = world(Fault("torque_weak", "LEFT_SK", BEGIN, 200, share=0.5), cycles=BEGIN + 100)
         sag = CROUCHED[KNEE] - emulator.body.position[KNEE]
         healthy, other = world(cycles=BEGIN + 100)
         assert sag > 1.5 * (CROUCHED[KNEE] - other.body.position[KNEE])
-        assert walker.joints("Torque")[KNEE] > 1.2 * healthy.joints("Torque")[KNEE] > 0.0
-        walker.run(400)
+        assert hal.joints("Torque")[KNEE] > 1.2 * healthy.joints("Torque")[KNEE] > 0.0
+        hal.run(400)
         assert CROUCHED[KNEE] - emulator.body.position[KNEE] < 0.9 * sag
 
-    def test_over_temperature(self, world: Make) -> None:
-        walker, emulator = world(Fault("over_temperature", "LEFT_SK", BEGIN, 20, degrees=130.0), cycles=BEGIN + 1)
-        assert walker.joints("Temperature")[KNEE] == 130.0
-        assert walker.states[-1][KNEE] == DriveState.FAULT_REACTION_ACTIVE
-        assert walker.value("LEFT_SK_EMCY", "ErrorCode") == 0x4310
+    def test_over_temperature_lowers_the_joint_slowly(self, world: Make) -> None:
+        hal, emulator = world(Fault("over_temperature", "LEFT_SK", BEGIN, 20, degrees=130.0), cycles=BEGIN + 1)
+        assert hal.joints("Temperature")[KNEE] == 130.0
+        assert hal.states[-1][KNEE] == DriveState.FAULT_REACTION_ACTIVE
+        assert hal.value("LEFT_SK_EMCY", "ErrorCode") == 0x4310
         before = emulator.body.position[KNEE]
-        walker.run(150)
+        hal.run(150)
         assert emulator.body.position[KNEE] < before - 0.005  # sinks
         assert np.abs(emulator.body.velocity).max() < 0.4  # slowly
 
-    def test_heat_ramp(self, world: Make) -> None:
-        walker, _ = world(Fault("heat_ramp", "LEFT_SK", BEGIN, rate=1000.0, up_to=110.0), cycles=BEGIN + 40)
-        assert walker.joints("Temperature")[KNEE] == pytest.approx(25.0 + 40.0, abs=1.0)
-        walker.run(60)
-        assert walker.joints("Temperature")[KNEE] == 110.0
-        assert walker.states[-1][KNEE] == ENABLED
+    def test_temperature_rises_linearly_during_a_heat_ramp(self, world: Make) -> None:
+        hal, _ = world(Fault("heat_ramp", "LEFT_SK", BEGIN, rate=1000.0, up_to=110.0), cycles=BEGIN + 40)
+        assert hal.joints("Temperature")[KNEE] == pytest.approx(25.0 + 40.0, abs=1.0)
+        hal.run(60)
+        assert hal.joints("Temperature")[KNEE] == 110.0
+        assert hal.states[-1][KNEE] == ENABLED
 
-    def test_reset(self, world: Make) -> None:
-        walker, _ = world(Fault("reset", "LEFT_SK", BEGIN, 40), cycles=BEGIN + 100)
-        mine = [[n for n in names if n.startswith("LEFT_SK_")] for names in walker.said]
+    def test_reset_drive_is_silent_then_boots_disabled(self, world: Make) -> None:
+        hal, _ = world(Fault("reset", "LEFT_SK", BEGIN, 40), cycles=BEGIN + 100)
+        mine = [[n for n in names if n.startswith("LEFT_SK_")] for names in hal.sent]
         assert mine[BEGIN - 1] == ["LEFT_SK_STATE"]
         assert mine[BEGIN : BEGIN + 40] == [[]] * 40
         assert mine[BEGIN + 40] == ["LEFT_SK_STATE", "LEFT_SK_STATUS"]
-        status = next(f for f in walker.frames[BEGIN + 40] if int(f["can_id"]) == 0x704)
+        status = next(f for f in hal.frames[BEGIN + 40] if int(f["can_id"]) == 0x704)
         assert (status["data"][2], status["data"][3]) == (0, 0)  # counter, BOOTUP
-        assert walker.states[BEGIN + 42][KNEE] == DriveState.SWITCH_ON_DISABLED
-        walker.run(100)
-        assert walker.value("LEFT_SK_STATUS", "NodeState") == 5
+        assert hal.states[BEGIN + 42][KNEE] == DriveState.SWITCH_ON_DISABLED
+        hal.run(100)
+        assert hal.value("LEFT_SK_STATUS", "NodeState") == 5
 
-    def test_reset_of_a_sensor(self, world: Make) -> None:
-        walker, _ = world(Fault("reset", "FOOT_LEFT", BEGIN, 5), cycles=BEGIN + 6)
-        assert "FOOT_LEFT_STATE" not in walker.said[BEGIN + 4]
-        assert {"FOOT_LEFT_STATE", "FOOT_LEFT_STATUS"} <= set(walker.said[BEGIN + 5])
-        assert walker.value("FOOT_LEFT_STATUS", "NodeState") == 0
+    def test_reset_sensor_is_silent_then_sends_bootup(self, world: Make) -> None:
+        hal, _ = world(Fault("reset", "FOOT_LEFT", BEGIN, 5), cycles=BEGIN + 6)
+        assert "FOOT_LEFT_STATE" not in hal.sent[BEGIN + 4]
+        assert {"FOOT_LEFT_STATE", "FOOT_LEFT_STATUS"} <= set(hal.sent[BEGIN + 5])
+        assert hal.value("FOOT_LEFT_STATUS", "NodeState") == 0
 
 
 class TestEncoders:
-    def test_stuck(self, world: Make) -> None:
-        walker, emulator = world(Fault("encoder_stuck", "LEFT_SK", 0, 60), cycles=1)
-        seen = walker.joints("Position")[KNEE]
+    def test_stuck_encoder_repeats_its_position(self, world: Make) -> None:
+        hal, emulator = world(Fault("encoder_stuck", "LEFT_SK", 0, 60), cycles=1)
+        stuck_at = hal.joints("Position")[KNEE]
         emulator.body.reset([angle + 0.1 for angle in CROUCHED])
         for _ in range(58):
-            walker.run(1)
-            assert walker.joints("Position")[KNEE] == seen
-        walker.run(5)
-        assert abs(walker.joints("Position")[KNEE] - seen) > 0.05 * 100
+            hal.run(1)
+            assert hal.joints("Position")[KNEE] == stuck_at
+        hal.run(5)
+        assert abs(hal.joints("Position")[KNEE] - stuck_at) > 0.05 * 100
 
     @pytest.mark.parametrize("by", [0.02, -0.02])
-    def test_jump(self, world: Make, by: float) -> None:
-        walker, _ = world(Fault("encoder_jump", "LEFT_SK", BEGIN, 1, by=by), cycles=BEGIN)
-        before = walker.joints("Position")
-        walker.run(1)
-        moved = (walker.joints("Position") - before) / 100.0
+    def test_encoder_jump_shifts_one_position_while_it_lasts(self, world: Make, by: float) -> None:
+        hal, _ = world(Fault("encoder_jump", "LEFT_SK", BEGIN, 1, by=by), cycles=BEGIN)
+        before = hal.joints("Position")
+        hal.run(1)
+        moved = (hal.joints("Position") - before) / 100.0
         assert moved[KNEE] == pytest.approx(by, abs=2e-3)
         assert np.abs(np.delete(moved, KNEE)).max() < 2e-3
-        walker.run(1)
-        assert walker.joints("Position")[KNEE] == pytest.approx(before[KNEE], abs=0.5)
+        hal.run(1)
+        assert hal.joints("Position")[KNEE] == pytest.approx(before[KNEE], abs=0.5)
 
-    def test_drift(self, world: Make) -> None:
-        walker, emulator = world(Fault("encoder_drift", "LEFT_SK", BEGIN, rate=0.5), cycles=BEGIN + 101)
-        error = walker.joints("Position")[KNEE] / 100.0 - emulator.body.position[KNEE]
+    def test_encoder_drift_grows_linearly(self, world: Make) -> None:
+        hal, emulator = world(Fault("encoder_drift", "LEFT_SK", BEGIN, rate=0.5), cycles=BEGIN + 101)
+        error = hal.joints("Position")[KNEE] / 100.0 - emulator.body.position[KNEE]
         assert error == pytest.approx(0.5 * 100 * PERIOD, abs=2e-3)
 
-    def test_the_drives_own_hold_is_deceived_too(self, world: Make) -> None:
-        walker, emulator = world(Fault("encoder_drift", "LEFT_SK", BEGIN, rate=0.2), cycles=BEGIN)
+    def test_local_hold_of_a_drive_follows_its_drifting_encoder(self, world: Make) -> None:
+        hal, emulator = world(Fault("encoder_drift", "LEFT_SK", BEGIN, rate=0.2), cycles=BEGIN)
         before = emulator.body.position.copy()
-        walker.bus.step = None
+        hal.bus.step = None
         for _ in range(300):
             emulator.idle()
         moved = emulator.body.position - before
@@ -254,173 +254,179 @@ class TestEncoders:
 
 
 class TestSupply:
-    def test_one_drive(self, world: Make) -> None:
-        walker, emulator = world(Fault("under_voltage", "LEFT_SK", BEGIN, 150, volts=30.0), cycles=BEGIN + 1)
-        assert walker.emergencies() == [(BEGIN, "LEFT_SK_EMCY")]
-        assert [s == HOLDING for s in walker.states[-1]] == [d == KNEE for d in range(12)]
-        walker.run(110)
-        assert walker.value("LEFT_SK_STATUS", "SupplyVoltage") == pytest.approx(30.0)
-        assert walker.value("LEFT_SH_STATUS", "SupplyVoltage") == pytest.approx(48.0)
-        walker.run(150)
+    def test_under_voltage_of_one_drive_holds_only_this_drive(self, world: Make) -> None:
+        hal, emulator = world(Fault("under_voltage", "LEFT_SK", BEGIN, 150, volts=30.0), cycles=BEGIN + 1)
+        assert hal.emergencies() == [(BEGIN, "LEFT_SK_EMCY")]
+        assert [s == HOLDING for s in hal.states[-1]] == [d == KNEE for d in range(12)]
+        hal.run(110)
+        assert hal.value("LEFT_SK_STATUS", "SupplyVoltage") == pytest.approx(30.0)
+        assert hal.value("LEFT_SH_STATUS", "SupplyVoltage") == pytest.approx(48.0)
+        hal.run(150)
         assert emulator.drives.voltage == [48.0] * 12
-        assert walker.value("LEFT_SK_STATUS", "SupplyVoltage") == pytest.approx(48.0)
+        assert hal.value("LEFT_SK_STATUS", "SupplyVoltage") == pytest.approx(48.0)
 
-    def test_battery_removed(self, world: Make) -> None:
-        walker, emulator = world(Fault("battery_removed", "battery", BEGIN, capacity=0.02), cycles=BEGIN)
+    def test_battery_removed_holds_the_drives_until_the_voltage_is_too_low(self, world: Make) -> None:
+        hal, emulator = world(Fault("battery_removed", "battery", BEGIN, capacity=0.02), cycles=BEGIN)
         volts = [48.0]
         for _ in range(60):
-            walker.run(10)
+            hal.run(10)
             volts.append(emulator.drives.voltage[0])
         assert volts == sorted(volts, reverse=True)
         assert volts[-1] < 20.0
-        hold, dead = [cycle for cycle, name in walker.emergencies() if name == "LEFT_SK_EMCY"]
-        assert set(walker.states[hold]) == {HOLDING}
-        assert dead - hold > 150  # cycles of hold on what is left
-        assert set(walker.states[dead]) == {DriveState.FAULT_REACTION_ACTIVE}
+        hold, dead = [cycle for cycle, name in hal.emergencies() if name == "LEFT_SK_EMCY"]
+        assert set(hal.states[hold]) == {HOLDING}
+        assert dead - hold > 150  # cycles for which the remaining voltage is sufficient to hold
+        assert set(hal.states[dead]) == {DriveState.FAULT_REACTION_ACTIVE}
 
-    def test_battery_back(self, world: Make) -> None:
+    def test_voltage_returns_when_the_battery_is_back(self, world: Make) -> None:
         _, emulator = world(Fault("battery_removed", "battery", BEGIN, 20, capacity=0.5), cycles=BEGIN + 21)
         assert emulator.drives.voltage == [48.0] * 12
 
 
 class TestSensors:
-    def test_invalid(self, world: Make) -> None:
-        walker, _ = world(Fault("imu_invalid", "IMU_TORSO", BEGIN, 2), cycles=BEGIN + 1)
-        raw = next(f for f in walker.frames[-1] if int(f["can_id"]) == 397)["data"][8:30].tobytes()
+    def test_invalid_imu_sends_invalid_codes_in_every_measured_signal(self, world: Make) -> None:
+        hal, _ = world(Fault("imu_invalid", "IMU_TORSO", BEGIN, 2), cycles=BEGIN + 1)
+        raw = next(f for f in hal.frames[-1] if int(f["can_id"]) == 397)["data"][8:30].tobytes()
         assert {raw[i : i + 2] for i in (*range(0, 14, 2), *range(16, 22, 2))} == {b"\x00\x80"}
-        row = walker.fast.codec.rows["IMU_TORSO_STATE"]
-        assert (walker.fast.check > 1).nonzero()[0].tolist() == [row]
-        walker.run(2)
-        assert walker.fast.check[row] <= 1
+        row = hal.fast.codec.rows["IMU_TORSO_STATE"]
+        assert (hal.fast.check > 1).nonzero()[0].tolist() == [row]
+        hal.run(2)
+        assert hal.fast.check[row] <= 1
 
-    def test_saturated(self, world: Make) -> None:
-        walker, _ = world(Fault("imu_saturated", "IMU_PELVIS", BEGIN), cycles=BEGIN + 1)
-        assert walker.value("IMU_PELVIS_STATE", "GyroX") == pytest.approx(40.95875)
-        assert walker.value("IMU_PELVIS_STATE", "AccelZ") == pytest.approx(163.835)
-        assert walker.value("IMU_PELVIS_STATE", "QuaternionW") == pytest.approx(1.0, abs=0.2)
-        assert abs(walker.value("IMU_TORSO_STATE", "GyroX")) < 1.0
+    def test_saturated_imu_sends_the_end_of_its_ranges(self, world: Make) -> None:
+        hal, _ = world(Fault("imu_saturated", "IMU_PELVIS", BEGIN), cycles=BEGIN + 1)
+        assert hal.value("IMU_PELVIS_STATE", "GyroX") == pytest.approx(40.95875)
+        assert hal.value("IMU_PELVIS_STATE", "AccelZ") == pytest.approx(163.835)
+        assert hal.value("IMU_PELVIS_STATE", "QuaternionW") == pytest.approx(1.0, abs=0.2)
+        assert abs(hal.value("IMU_TORSO_STATE", "GyroX")) < 1.0
 
-    def test_frozen(self, world: Make) -> None:
-        walker, _ = world(Fault("imu_frozen", "IMU_TORSO", BEGIN, 20), cycles=BEGIN + 22)
-        payloads = [next(f for f in frames if int(f["can_id"]) == 397)["data"] for frames in walker.frames[BEGIN - 1 :]]
+    def test_frozen_imu_repeats_its_measurement_with_new_counters(self, world: Make) -> None:
+        hal, _ = world(Fault("imu_frozen", "IMU_TORSO", BEGIN, 20), cycles=BEGIN + 22)
+        payloads = [next(f for f in frames if int(f["can_id"]) == 397)["data"] for frames in hal.frames[BEGIN - 1 :]]
         measured = [p[8:30].tobytes() for p in payloads]
         assert len(set(measured[1:21])) == 1
         assert len({measured[0], measured[1], measured[21]}) == 3
         assert len({int(p[2]) for p in payloads}) == len(payloads)
 
-    def test_cell(self, world: Make) -> None:
-        walker, _ = world(Fault("cell_stuck", "FOOT_RIGHT", BEGIN, cell="RL", force=321.0), cycles=BEGIN + 2)
-        assert walker.value("FOOT_RIGHT_STATE", "RL_ForceZ") == pytest.approx(321.0)
-        assert abs(walker.value("FOOT_RIGHT_STATE", "RR_ForceZ")) < 100.0
-        assert abs(walker.value("FOOT_LEFT_STATE", "RL_ForceZ")) < 100.0
+    def test_stuck_cell_reports_its_force_in_one_foot_only(self, world: Make) -> None:
+        hal, _ = world(Fault("cell_stuck", "FOOT_RIGHT", BEGIN, cell="RL", force=321.0), cycles=BEGIN + 2)
+        assert hal.value("FOOT_RIGHT_STATE", "RL_ForceZ") == pytest.approx(321.0)
+        assert abs(hal.value("FOOT_RIGHT_STATE", "RR_ForceZ")) < 100.0
+        assert abs(hal.value("FOOT_LEFT_STATE", "RL_ForceZ")) < 100.0
 
 
-def test_dbc_hash(world: Make, network: Network) -> None:
-    walker, _ = world(Fault("dbc_hash", "LEFT_SK", 0, 150, hash=7), cycles=140)
-    assert walker.value("LEFT_SK_STATUS", "DbcHash") == 7
-    assert walker.value("LEFT_SH_STATUS", "DbcHash") == network.hash32
-    walker.run(130)
-    assert walker.value("LEFT_SK_STATUS", "DbcHash") == network.hash32
+def test_dbc_hash_fault_changes_the_hash_of_one_node_while_it_lasts(world: Make, network: Network) -> None:
+    hal, _ = world(Fault("dbc_hash", "LEFT_SK", 0, 150, hash=7), cycles=140)
+    assert hal.value("LEFT_SK_STATUS", "DbcHash") == 7
+    assert hal.value("LEFT_SH_STATUS", "DbcHash") == network.hash32
+    hal.run(130)
+    assert hal.value("LEFT_SK_STATUS", "DbcHash") == network.hash32
 
 
-def test_heartbeat_lost(world: Make) -> None:
-    walker, _ = world(Fault("heartbeat_lost", "LEFT_SK"), cycles=210)
-    said = {name for names in walker.said for name in names}
-    assert "LEFT_SK_STATUS" not in said
-    assert {"LEFT_SK_STATE", "LEFT_SH_STATUS"} <= said
+def test_heartbeat_lost_suppresses_only_the_status_of_the_node(world: Make) -> None:
+    hal, _ = world(Fault("heartbeat_lost", "LEFT_SK"), cycles=210)
+    sent = {name for names in hal.sent for name in names}
+    assert "LEFT_SK_STATUS" not in sent
+    assert {"LEFT_SK_STATE", "LEFT_SH_STATUS"} <= sent
 
 
 class TestWire:
-    """What the drives make of a disturbed wire."""
+    """Reactions of the drives to lost, damaged and additional frames."""
 
-    def test_lost_command_is_told_and_ridden_through(self, world: Make) -> None:
-        walker, emulator = world(Fault("drop", "COMMAND_LEFT_LEG", BEGIN, 1), cycles=BEGIN + 5)
-        told = walker.emergencies()
-        assert {cycle for cycle, _ in told} == {BEGIN + 1}
-        assert len(told) == 6
-        assert walker.value("LEFT_SK_EMCY", "ErrorCode") == 0x8110
+    def test_lost_command_is_reported_and_the_drives_stay_enabled(self, world: Make) -> None:
+        hal, emulator = world(Fault("drop", "COMMAND_LEFT_LEG", BEGIN, 1), cycles=BEGIN + 5)
+        reports = hal.emergencies()
+        assert {cycle for cycle, _ in reports} == {BEGIN + 1}
+        assert len(reports) == 6
+        assert hal.value("LEFT_SK_EMCY", "ErrorCode") == 0x8110
         assert set(emulator.drives.state) == {ENABLED}
 
-    def test_damaged_command_is_told(self, world: Make) -> None:
-        walker, _ = world(Fault("flip", "COMMAND_RIGHT_LEG", BEGIN, 1), cycles=BEGIN + 1)
-        assert walker.value("RIGHT_SK_EMCY", "ErrorCode") == 0x8200
-        assert {name[:5] for _, name in walker.emergencies()} == {"RIGHT"}
+    def test_damaged_command_is_reported_by_its_leg(self, world: Make) -> None:
+        hal, _ = world(Fault("flip", "COMMAND_RIGHT_LEG", BEGIN, 1), cycles=BEGIN + 1)
+        assert hal.value("RIGHT_SK_EMCY", "ErrorCode") == 0x8200
+        assert {name[:5] for _, name in hal.emergencies()} == {"RIGHT"}
 
     @pytest.mark.parametrize(("lost", "state"), [(4, ENABLED), (5, HOLDING)])
-    def test_commands(self, world: Make, lost: int, state: DriveState) -> None:
-        walker, emulator = world(Fault("drop", "COMMAND_LEFT_LEG", BEGIN, lost), cycles=BEGIN + lost + 2)
+    def test_leg_holds_after_five_lost_commands_and_not_after_four(
+        self, world: Make, lost: int, state: DriveState
+    ) -> None:
+        hal, emulator = world(Fault("drop", "COMMAND_LEFT_LEG", BEGIN, lost), cycles=BEGIN + lost + 2)
         assert set(emulator.drives.state[:6]) == {state}
         assert set(emulator.drives.state[6:]) == {ENABLED}
-        assert walker.value("LEFT_SK_EMCY", "ErrorCode") == (0x8250 if lost == 5 else 0x8110)
+        assert hal.value("LEFT_SK_EMCY", "ErrorCode") == (0x8250 if lost == 5 else 0x8110)
 
     @pytest.mark.parametrize(("lost", "state"), [(4, ENABLED), (5, HOLDING)])
     @pytest.mark.parametrize("kind", ["drop", "flip"])
-    def test_sync_of_a_leg(self, world: Make, kind: str, lost: int, state: DriveState) -> None:
-        walker, emulator = world(Fault(kind, "SYNC_LEFT_LEG", BEGIN, lost), cycles=BEGIN + lost + 2)
+    def test_leg_holds_after_five_lost_syncs_and_not_after_four(
+        self, world: Make, kind: str, lost: int, state: DriveState
+    ) -> None:
+        hal, emulator = world(Fault(kind, "SYNC_LEFT_LEG", BEGIN, lost), cycles=BEGIN + lost + 2)
         assert emulator.cycle == BEGIN + lost + 2
-        assert not any(name.endswith("LEFT_SK_STATE") for names in walker.said[BEGIN : BEGIN + lost] for name in names)
+        assert not any(name.endswith("LEFT_SK_STATE") for names in hal.sent[BEGIN : BEGIN + lost] for name in names)
         assert set(emulator.drives.state[:6]) == {state}
         assert set(emulator.drives.state[6:]) == {ENABLED}
-        assert lost != 5 or walker.value("LEFT_SK_EMCY", "ErrorCode") == 0x8130
+        assert lost != 5 or hal.value("LEFT_SK_EMCY", "ErrorCode") == 0x8130
 
     @pytest.mark.parametrize(("lost", "state"), [(4, ENABLED), (5, HOLDING)])
     @pytest.mark.parametrize("kind", ["drop", "flip"])
-    def test_every_sync(self, world: Make, kind: str, lost: int, state: DriveState) -> None:
+    def test_every_leg_holds_after_five_cycles_without_any_sync(
+        self, world: Make, kind: str, lost: int, state: DriveState
+    ) -> None:
         faults = [
             Fault(kind, f"SYNC_{bus}", BEGIN, lost) for bus in ("LEFT_LEG", "RIGHT_LEG", "LEFT_SENSE", "RIGHT_SENSE")
         ]
-        walker, emulator = world(*faults, cycles=BEGIN + lost)
+        hal, emulator = world(*faults, cycles=BEGIN + lost)
         assert emulator.cycle == BEGIN + lost
         assert not any(
-            name.endswith("_STATE") and name != "HAPTICS_STATE" for names in walker.said[BEGIN:] for name in names
+            name.endswith("_STATE") and name != "HAPTICS_STATE" for names in hal.sent[BEGIN:] for name in names
         )
-        walker.run(2)
+        hal.run(2)
         assert set(emulator.drives.state) == {state}
-        assert lost != 5 or walker.value("RIGHT_SK_EMCY", "ErrorCode") == 0x8130
+        assert lost != 5 or hal.value("RIGHT_SK_EMCY", "ErrorCode") == 0x8130
 
-    def test_a_flood_starves_one_leg(self, world: Make) -> None:
-        walker, emulator = world(Fault("flood", "left_leg", BEGIN, 20), cycles=BEGIN + 20)
+    def test_flood_of_one_bus_holds_only_its_leg(self, world: Make) -> None:
+        hal, emulator = world(Fault("flood", "left_leg", BEGIN, 20), cycles=BEGIN + 20)
         assert emulator.cycle == BEGIN + 20
         assert set(emulator.drives.state[:6]) == {HOLDING}
         assert set(emulator.drives.state[6:]) == {ENABLED}
-        for names, frames in zip(walker.said[BEGIN:], walker.frames[BEGIN:], strict=True):
+        for names, frames in zip(hal.sent[BEGIN:], hal.frames[BEGIN:], strict=True):
             assert frames["can_id"].tolist()[:17] == [0] * 17
             assert not any(name.startswith("LEFT_SK") for name in names)
             assert "RIGHT_SK_STATE" in names
-        walker.run(10)
-        assert "LEFT_SK_STATE" in walker.said[-1]
-        assert walker.value("LEFT_SK_EMCY", "ErrorCode") == 0x8130
-        assert 0 not in walker.frames[-1]["can_id"].tolist()
+        hal.run(10)
+        assert "LEFT_SK_STATE" in hal.sent[-1]
+        assert hal.value("LEFT_SK_EMCY", "ErrorCode") == 0x8130
+        assert 0 not in hal.frames[-1]["can_id"].tolist()
 
-    def test_a_flood_of_every_bus_stops_the_robot_and_not_the_clock(self, world: Make, network: Network) -> None:
-        walker, emulator = world(*(Fault("flood", bus, BEGIN) for bus in network.buses), cycles=BEGIN + 20)
+    def test_flood_of_every_bus_holds_all_drives_while_cycles_continue(self, world: Make, network: Network) -> None:
+        hal, emulator = world(*(Fault("flood", bus, BEGIN) for bus in network.buses), cycles=BEGIN + 20)
         assert emulator.cycle == BEGIN + 20
         assert set(emulator.drives.state) == {HOLDING}
-        assert {int(i) for frames in walker.frames[BEGIN:] for i in frames["can_id"]} == {0}
+        assert {int(i) for frames in hal.frames[BEGIN:] for i in frames["can_id"]} == {0}
 
-    def test_second_sender(self, world: Make) -> None:
-        walker, emulator = world(Fault("inject", "COMMAND_LEFT_LEG", BEGIN, 1, SK_TargetTorque=100.0), cycles=BEGIN + 2)
-        assert walker.value("LEFT_SK_EMCY", "ErrorCode") == 0x8150
-        assert {cycle for cycle, _ in walker.emergencies()} == {BEGIN}
+    def test_second_sender_of_a_command_latches_the_hold_of_its_leg(self, world: Make) -> None:
+        hal, emulator = world(Fault("inject", "COMMAND_LEFT_LEG", BEGIN, 1, SK_TargetTorque=100.0), cycles=BEGIN + 2)
+        assert hal.value("LEFT_SK_EMCY", "ErrorCode") == 0x8150
+        assert {cycle for cycle, _ in hal.emergencies()} == {BEGIN}
         assert set(emulator.drives.state[:6]) == {HOLDING}
         assert all(emulator.drives.latched[:6])
 
-    def test_a_frame_that_comes_twice_is_no_second_sender(self, world: Make) -> None:
-        walker, emulator = world(Fault("duplicate", "COMMAND_LEFT_LEG", BEGIN, 10, copies=3), cycles=BEGIN + 12)
-        assert walker.emergencies() == []
+    def test_duplicated_command_is_not_reported_as_a_second_sender(self, world: Make) -> None:
+        hal, emulator = world(Fault("duplicate", "COMMAND_LEFT_LEG", BEGIN, 10, copies=3), cycles=BEGIN + 12)
+        assert hal.emergencies() == []
         assert set(emulator.drives.state) == {ENABLED}
 
 
 @pytest.mark.parametrize(
-    ("fault", "says"),
+    ("fault", "expected"),
     [
         (
             Fault("encoder_stuck", "IMU_TORSO"),
-            "encoder_stuck: target must be of type drive, got 'IMU_TORSO'; valid targets: LEFT_FH, .*, RIGHT_HA$",
+            "encoder_stuck: the target must be of type drive, got 'IMU_TORSO'; valid targets: LEFT_FH, .*, RIGHT_HA$",
         ),
         (
             Fault("imu_frozen", "LEFT_SK"),
-            "imu_frozen: target must be of type imu, got 'LEFT_SK'; valid targets: IMU_TORSO, .*, IMU_RIGHT_TIBIA$",
+            "imu_frozen: the target must be of type imu, got 'LEFT_SK'; valid targets: IMU_TORSO, .*, IMU_RIGHT_TIBIA$",
         ),
         (
             Fault("cell_stuck", "IMU_TORSO", cell="FL"),
@@ -428,11 +434,11 @@ class TestWire:
         ),
         (
             Fault("reset", "HAL", 0, 5),
-            "reset: target must be of type node, got 'HAL'; valid targets: LEFT_FH, .*, PENDANT$",
+            "reset: the target must be of type node, got 'HAL'; valid targets: LEFT_FH, .*, PENDANT$",
         ),
         (
             Fault("battery_removed", "LEFT_SK"),
-            "battery_removed: target must be of type battery, got 'LEFT_SK'; valid targets: battery$",
+            "battery_removed: the target must be of type battery, got 'LEFT_SK'; valid targets: battery$",
         ),
         (
             Fault("under_voltage", "HAPTICS", volts=1.0),
@@ -440,36 +446,42 @@ class TestWire:
         ),
         (
             Fault("heartbeat_lost", "left_leg"),
-            "heartbeat_lost: target must be of type node, got 'left_leg'; valid targets: HAL, LEFT_FH, ",
+            "heartbeat_lost: the target must be of type node, got 'left_leg'; valid targets: HAL, LEFT_FH, ",
         ),
     ],
     ids=str,
 )
-def test_a_fault_that_fits_no_node(world: Make, fault: Fault, says: str) -> None:
-    with pytest.raises(FaultError, match=says):
+def test_fault_with_a_wrong_target_type_is_rejected_with_the_valid_targets(
+    world: Make, fault: Fault, expected: str
+) -> None:
+    with pytest.raises(FaultError, match=expected):
         world(fault)
 
 
 @pytest.mark.parametrize(
-    ("kind", "options", "says"),
+    ("kind", "options", "expected"),
     [
         (
             "leave_operation",
             {"state": "LIMP"},
-            "leave_operation: state must be one of NOT_READY_TO_SWITCH_ON, .*, got 'LIMP'",
+            "leave_operation: the parameter 'state' must be one of NOT_READY_TO_SWITCH_ON, .*, got 'LIMP'",
         ),
-        ("cell_stuck", {"cell": "FLL"}, "cell_stuck: cell must be one of FL, FR, RL, RR, got 'FLL'"),
-        ("torque_weak", {}, "torque_weak: share must be a number from 0 to 1, got no value"),
-        ("emergency", {"code": 0}, "emergency: code must be an integer from 1 to 65535, got 0"),
-        ("under_voltage", {"volts": -1.0}, re.escape("under_voltage: volts must be a number from 0 to 60 V, got -1.0")),
+        ("cell_stuck", {"cell": "FLL"}, "cell_stuck: the parameter 'cell' must be one of FL, FR, RL, RR, got 'FLL'"),
+        ("torque_weak", {}, "torque_weak: the parameter 'share' must be a number from 0 to 1, got no value"),
+        ("emergency", {"code": 0}, "emergency: the parameter 'code' must be an integer from 1 to 65535, got 0"),
+        (
+            "under_voltage",
+            {"volts": -1.0},
+            re.escape("under_voltage: the parameter 'volts' must be a number from 0 to 60 V, got -1.0"),
+        ),
     ],
 )
-def test_what_is_valid_is_said(kind: str, options: dict, says: str) -> None:
-    with pytest.raises(FaultError, match=says):
+def test_invalid_parameter_error_lists_the_valid_ones(kind: str, options: dict, expected: str) -> None:
+    with pytest.raises(FaultError, match=expected):
         Fault(kind, "LEFT_SK", **options)
 
 
-def test_one_seed_gives_one_sequence_of_bytes(world: Make) -> None:
+def test_bytes_under_faults_are_reproducible_for_one_seed_and_differ_for_another(world: Make) -> None:
     faults = (
         Fault("drop", "left_leg", 10, p=0.2),
         Fault("flip", "IMU_TORSO", 5, p=0.5),

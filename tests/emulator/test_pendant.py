@@ -6,11 +6,11 @@ from atalante_emulator.pendant import HAL_READY, Operator, Request
 from atalante_hal.types import SupervisorState
 
 
-def test_ready_on_the_wire_is_the_supervisor_s() -> None:
+def test_pendant_uses_the_ready_code_of_the_supervisor() -> None:
     assert SupervisorState.READY == HAL_READY
 
 
-def test_operator_starts_a_robot_that_is_ready_and_only_then() -> None:
+def test_operator_presses_start_only_after_ready_for_the_reaction_time() -> None:
     operator = Operator()
     for state in SupervisorState:
         if state is not SupervisorState.READY:
@@ -24,14 +24,14 @@ def test_operator_starts_a_robot_that_is_ready_and_only_then() -> None:
     assert (operator.signals.request, operator.signals.request_counter) == (Request.START, 1)
 
 
-def test_operator_presses_again_while_nothing_happens() -> None:
+def test_operator_presses_start_again_while_the_robot_stays_ready() -> None:
     operator = Operator()
     for _ in range(3 * Operator.REACTION):
         operator.receive(HAL_READY)
     assert operator.signals.request_counter == 3
 
 
-def test_readiness_must_last() -> None:
+def test_operator_does_not_press_start_when_ready_is_shorter_than_the_reaction() -> None:
     operator = Operator()
     for _ in range(10):
         for _ in range(Operator.REACTION - 1):
@@ -41,7 +41,7 @@ def test_readiness_must_last() -> None:
 
 
 @pytest.mark.parametrize(("press", "request_"), [("stop", Request.STOP), ("hold", Request.HOLD)])
-def test_after_stop_the_operator_waits_to_be_told(press: str, request_: Request) -> None:
+def test_operator_does_not_press_start_after_stop_or_hold(press: str, request_: Request) -> None:
     operator = Operator()
     getattr(operator, press)()
     for _ in range(3 * Operator.REACTION):
@@ -51,21 +51,21 @@ def test_after_stop_the_operator_waits_to_be_told(press: str, request_: Request)
     assert (operator.signals.request, operator.signals.request_counter) == (Request.START, 2)
 
 
-def test_an_operator_told_not_to_start_does_not() -> None:
+def test_operator_configured_without_start_never_presses_it() -> None:
     operator = Operator(starts=False)
     for _ in range(3 * Operator.REACTION):
         operator.receive(HAL_READY)
     assert operator.signals.request is Request.NONE
 
 
-def test_every_press_counts_and_the_counter_wraps() -> None:
+def test_request_counter_increments_with_every_press_and_wraps_at_256() -> None:
     operator = Operator()
     for press in range(300):
         operator.start()
         assert operator.signals.request_counter == (press + 1) % 256
 
 
-def test_dead_man() -> None:
+def test_dead_man_signal_follows_release_and_squeeze() -> None:
     operator = Operator()
     assert operator.signals.dead_man
     operator.release()
@@ -74,7 +74,7 @@ def test_dead_man() -> None:
     assert operator.signals.dead_man
 
 
-def test_dial() -> None:
+def test_assistance_dial_accepts_zero_to_one_or_none() -> None:
     operator = Operator(0.5)
     assert operator.signals.assistance_factor == 0.5
     operator.assist(None)
@@ -84,7 +84,7 @@ def test_dial() -> None:
             operator.assist(wrong)
 
 
-def test_signals_are_another_object_when_they_change_and_the_same_when_not() -> None:
+def test_signals_object_is_replaced_only_when_a_value_changes() -> None:
     operator = Operator(0.5)
     before = operator.signals
     operator.receive(0)

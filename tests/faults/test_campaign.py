@@ -1,4 +1,4 @@
-"""Campaigns: what they run, over processes or a cluster with the same results, what they report, and how the command ends."""
+"""Tests of campaigns: their plan, equal results in processes or a cluster, their report and the exit code of the command."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def by_case(results: Sequence[object]) -> list[object]:
     return sorted(results, key=str)
 
 
-def test_a_plan_has_every_case_and_every_pair_once() -> None:
+def test_plan_contains_every_case_and_every_pair_once() -> None:
     planned = plan(list(SCENARIOS), endurance=True, pairs=True)
     cases = [task for task in planned if isinstance(task, CaseTask)]
     assert len(cases) == len(set(cases)) == sum(len(scenario.cases) for scenario in SCENARIOS.values())
@@ -49,20 +49,20 @@ def test_a_plan_has_every_case_and_every_pair_once() -> None:
     }
 
 
-def test_processes_give_what_this_process_gives() -> None:
+def test_results_in_subprocesses_equal_those_in_process() -> None:
     here = list(campaign.results(OVERRUN))
     assert by_case(list(campaign.results(OVERRUN, jobs=2))) == by_case(here)
     assert all(isinstance(verdict, Verdict) and verdict.passed for verdict in here)
 
 
 @pytest.mark.filterwarnings("ignore")  # dask's own
-def test_a_cluster_gives_what_this_process_gives() -> None:
+def test_results_in_a_cluster_equal_those_in_process() -> None:
     with LocalCluster(n_workers=1, threads_per_worker=2, host="127.0.0.1", dashboard_address=None) as cluster:
         there = list(campaign.results(OVERRUN, dask=cluster.scheduler_address))
     assert by_case(there) == by_case(list(campaign.results(OVERRUN)))
 
 
-def test_no_scheduler_and_no_library_are_said_in_a_sentence(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_missing_scheduler_or_library_fails_with_a_remedy(monkeypatch: pytest.MonkeyPatch) -> None:
     with pytest.raises(Failed, match="start one with `dask scheduler`"):
         list(campaign.results(OVERRUN, dask="not an address"))
     monkeypatch.setitem(sys.modules, "distributed", None)
@@ -73,28 +73,28 @@ def test_no_scheduler_and_no_library_are_said_in_a_sentence(monkeypatch: pytest.
         list(campaign.results(OVERRUN, jobs=2))
 
 
-def test_a_crash_of_the_stack_is_a_failed_case(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_exception_in_a_run_fails_its_case(monkeypatch: pytest.MonkeyPatch) -> None:
     def crash(case: Case, bound: int, *, recovery: bool) -> None:
-        raise RuntimeError("the stack fell")
+        raise RuntimeError("the run failed")
 
     monkeypatch.setattr(tasks, "observe", crash)
     verdict = tasks.run_case("F44", SCENARIOS["F44"].cases[0])
-    assert verdict.failures == ("exception in the run: RuntimeError: the stack fell",)
+    assert verdict.failures == ("exception in the run: RuntimeError: the run failed",)
     pair = PairTask(("F44", SCENARIOS["F44"].cases[0].name), ("F44", SCENARIOS["F44"].cases[1].name))()
-    assert pair.failures == ("exception in the run: RuntimeError: the stack fell",)
+    assert pair.failures == ("exception in the run: RuntimeError: the run failed",)
 
 
-def test_how_long_is_the_last_length_that_is_survived() -> None:
+def test_endurance_is_the_longest_duration_that_stays_active() -> None:
     assert EnduranceTask("F44")() == Endurance("F44", SCENARIOS["F44"].permanent.name, 2)
 
 
-def test_what_never_ends_the_walk_is_survived_to_the_end_of_the_watch(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_endurance_is_none_for_a_fault_that_never_ends_the_walk(monkeypatch: pytest.MonkeyPatch) -> None:
     harmless = Scenario("F44", (), permanent=Case("in time", (HostFault("late", 0, None, 0.0),)))
     monkeypatch.setitem(tasks.SCENARIOS, "F44", harmless)
     assert EnduranceTask("F44")() == Endurance("F44", "in time", None)
 
 
-def test_two_faults_end_as_badly_as_the_worse_of_them() -> None:
+def test_pair_of_faults_ends_in_the_worse_state() -> None:
     late, raised = (("F44", "3 cycles"), ("F45", "ValueError"))
     assert PairTask(late, raised)() == PairVerdict("F44 3 cycles", "F45 ValueError", "HOLD", ())
 
@@ -104,7 +104,7 @@ BAD = replace(GOOD, case="4 cycles", cycles=9, failures=("HOLD after 9 cycles, a
 PAIR = PairVerdict("F03 4 frames", "F04 LEFT_SK", "HOLD", ("exception in the run: X: y",))
 
 
-def test_the_worst_case_speaks_for_its_fault() -> None:
+def test_summary_line_shows_the_worst_case_of_its_fault() -> None:
     near, far = replace(GOOD, case="b", cycles=3), replace(GOOD, case="a", cycles=1)
     assert Summary.of([far, near]).lines[0].cycles == 3
     line = Summary.of([near, BAD]).lines[0]
@@ -112,7 +112,7 @@ def test_the_worst_case_speaks_for_its_fault() -> None:
     assert line.failures == ("4 cycles: HOLD after 9 cycles, and 3 are allowed",)
 
 
-def test_a_report_says_what_failed_how_long_and_which_pairs(tmp_path: Path) -> None:
+def test_report_lists_failures_endurance_and_pairs(tmp_path: Path) -> None:
     summary = Summary.of([PAIR, Endurance("F03", "for good", 4), Endurance("F11", "for good", None), BAD], 12.0)
     assert not summary.passed
     summary.write(tmp_path / "new")
@@ -133,13 +133,13 @@ def test_a_report_says_what_failed_how_long_and_which_pairs(tmp_path: Path) -> N
     assert Summary.of([GOOD]).passed
 
 
-def test_list_is_the_matrix() -> None:
+def test_list_prints_every_row_of_the_matrix() -> None:
     shown = [json.loads(line) for line in atalante("list", "--json").stdout.splitlines()]
     assert [line["id"] for line in shown] == list(load_matrix())
     assert "F44" in atalante("list").stdout
 
 
-def test_run_prints_a_table_or_one_object() -> None:
+def test_run_prints_a_table_or_one_json_object() -> None:
     result = atalante("run", "f44")
     assert result.exit_code == 0
     assert "3 cycles" in result.stdout
@@ -149,7 +149,7 @@ def test_run_prints_a_table_or_one_object() -> None:
 
 
 @pytest.mark.parametrize(
-    ("arguments", "says"),
+    ("arguments", "message"),
     [
         (("run", "F99"), "got 'F99'"),
         (("run", "F52"), "run `pytest tests/faults/test_refusals.py"),
@@ -158,14 +158,14 @@ def test_run_prints_a_table_or_one_object() -> None:
         (("campaign", "--jobs", "0"), "--jobs"),
     ],
 )
-def test_what_cannot_be_run_is_misuse(arguments: tuple[str, ...], says: str) -> None:
+def test_invalid_arguments_end_with_exit_code_two(arguments: tuple[str, ...], message: str) -> None:
     result = atalante(*arguments)
     assert result.exit_code == 2
-    assert says in result.stderr
+    assert message in result.stderr
 
 
 @pytest.mark.parametrize("arguments", [("run", "F28"), ("campaign", "F28", "--no-endurance", "--jobs=1")])
-def test_without_pybullet_no_case_is_run(
+def test_missing_pybullet_fails_before_any_case(
     arguments: tuple[str, ...], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     monkeypatch.chdir(tmp_path)
@@ -176,7 +176,7 @@ def test_without_pybullet_no_case_is_run(
     assert "crashed" not in refused.output
 
 
-def test_a_campaign_writes_its_report_and_fails_with_its_faults(
+def test_campaign_writes_its_report_and_fails_when_a_fault_fails(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     arguments = ("campaign", "F44", "--jobs", "1", "--out", str(tmp_path), "--json")
@@ -190,7 +190,7 @@ def test_a_campaign_writes_its_report_and_fails_with_its_faults(
     assert "1 of 1 faults and 0 of 0 pairs failed" in result.stderr
 
 
-def test_ctrl_c_ends_a_campaign_and_its_processes(tmp_path: Path) -> None:
+def test_ctrl_c_ends_a_campaign_and_its_subprocesses(tmp_path: Path) -> None:
     command = [sys.executable, "-c", "from atalante_tools.cli import main; main()", "faults", "campaign", "--jobs", "2"]
     command += ["--out", str(tmp_path)]
     process = subprocess.Popen(
@@ -204,7 +204,7 @@ def test_ctrl_c_ends_a_campaign_and_its_processes(tmp_path: Path) -> None:
     assert "Traceback" not in stderr
     deadline = time.monotonic() + 10.0
     while group_alive(process.pid):
-        assert time.monotonic() < deadline, "a process of the campaign is still there"
+        assert time.monotonic() < deadline, "a subprocess of the campaign is still running"
         time.sleep(0.05)
 
 

@@ -1,4 +1,4 @@
-"""Tests of the additional checks of single scenarios: each passes at its bound and fails just past it."""
+"""Tests of the additional checks of single scenarios: each check passes at its bound and fails just beyond the bound."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ class Commanded:
 
 
 @pytest.fixture
-def seen(network: Network, robot: Robot) -> Any:
+def make_observation(network: Network, robot: Robot) -> Any:
     def make(**changes: Any) -> Observation:
         """Return a run of 30 cycles with the fault from cycle 11 and START in cycle 21."""
         joints = np.zeros((CYCLES, 12))
@@ -59,22 +59,25 @@ def at(value: Any, *cycles: int, of: Any = 0.0) -> np.ndarray:
     return array
 
 
-def test_half_a_degree_outside_the_guide_is_the_bound(seen: Any) -> None:
+def test_guide_exit_up_to_half_a_degree_passes(make_observation: Any) -> None:
     bound = math.radians(0.5)
-    assert checks.guide_kept(seen(guide_exit=at(bound - 1e-9, FIRST, CYCLES))) is None
+    assert checks.guide_kept(make_observation(guide_exit=at(bound - 1e-9, FIRST, CYCLES))) is None
     for cycle in (FIRST, CYCLES):
-        assert checks.guide_kept(seen(guide_exit=at(bound + 1e-4, cycle))) == "a joint was 0.51 deg outside its guide"
+        assert (
+            checks.guide_kept(make_observation(guide_exit=at(bound + 1e-4, cycle)))
+            == "a joint was 0.51 deg outside its guide"
+        )
 
 
-def test_the_guide_counts_while_the_robot_walks_with_the_fault(seen: Any) -> None:
-    assert checks.guide_kept(seen(guide_exit=at(1.0, FIRST - 1))) is None
+def test_guide_exit_fails_only_while_active_with_the_fault(make_observation: Any) -> None:
+    assert checks.guide_kept(make_observation(guide_exit=at(1.0, FIRST - 1))) is None
     states = (S.ACTIVE,) * FIRST + (S.HOLD,) * (CYCLES - FIRST)
-    assert checks.guide_kept(seen(states=states, guide_exit=at(1.0, FIRST + 1))) is None
-    assert checks.guide_kept(seen(states=states, guide_exit=at(1.0, FIRST))) is not None
+    assert checks.guide_kept(make_observation(states=states, guide_exit=at(1.0, FIRST + 1))) is None
+    assert checks.guide_kept(make_observation(states=states, guide_exit=at(1.0, FIRST))) is not None
 
 
 @pytest.mark.parametrize(
-    ("outside", "says"),
+    ("outside", "message"),
     [
         ((), "no joint left its guide"),
         ((FIRST - 1,), "no joint left its guide"),
@@ -82,23 +85,25 @@ def test_the_guide_counts_while_the_robot_walks_with_the_fault(seen: Any) -> Non
         ((FIRST, CYCLES), "a joint is still 0.1 deg outside its guide"),
     ],
 )
-def test_the_guide_is_left_and_regained(seen: Any, outside: tuple[int, ...], says: str | None) -> None:
-    assert checks.guide_regained(seen(guide_exit=at(math.radians(0.1), *outside))) == says
+def test_joint_must_leave_its_guide_and_return(
+    make_observation: Any, outside: tuple[int, ...], message: str | None
+) -> None:
+    assert checks.guide_regained(make_observation(guide_exit=at(math.radians(0.1), *outside))) == message
 
 
-def test_data_may_not_be_one_cycle_old_during_the_fault(seen: Any) -> None:
-    for cycle, says in ((FIRST - 1, None), (FIRST, "data must have age 0, got 1 cycles"), (PRESSED, None)):
+def test_data_of_age_one_fails_only_during_the_fault(make_observation: Any) -> None:
+    for cycle, message in ((FIRST - 1, None), (FIRST, "data must have age 0, got 1 cycles"), (PRESSED, None)):
         age = np.zeros((CYCLES, 18), np.int64)
         age[cycle - 1, 7] = 1
-        assert checks.data_stays_fresh(seen(age=age, over=PRESSED - 1)) == says
+        assert checks.data_stays_fresh(make_observation(age=age, over=PRESSED - 1)) == message
 
 
-def test_the_knee_stays_off_until_the_start(seen: Any) -> None:
-    for cycle, says in ((FIRST, None), (FIRST + 1, "cycle 12"), (PRESSED - 1, "cycle 20"), (PRESSED, None)):
+def test_knee_enabled_between_fault_and_start_fails(make_observation: Any) -> None:
+    for cycle, message in ((FIRST, None), (FIRST + 1, "cycle 12"), (PRESSED - 1, "cycle 20"), (PRESSED, None)):
         drives = np.full((CYCLES, 12), D.SWITCH_ON_DISABLED)
         drives[cycle - 1, KNEE] = D.OPERATION_ENABLED
-        expected = says and f"the drive was enabled in {says}"
-        assert checks.not_enabled_in_motion(seen(drive_state=drives)) == expected
+        expected = message and f"the drive was enabled in {message}"
+        assert checks.not_enabled_in_motion(make_observation(drive_state=drives)) == expected
 
 
 @pytest.mark.parametrize(
@@ -110,8 +115,10 @@ def test_the_knee_stays_off_until_the_start(seen: Any) -> None:
         (Dtc.NODE_TIMEOUT, "LEFT_SK", False),
     ],
 )
-def test_a_drive_of_the_left_leg_reports_two_senders(seen: Any, code: Dtc, node: str, passes: bool) -> None:
-    found = checks.drives_report_two_senders(seen(events=(Event(FIRST, code, "", node=node),)))
+def test_two_senders_must_be_reported_by_a_drive_of_the_left_leg(
+    make_observation: Any, code: Dtc, node: str, passes: bool
+) -> None:
+    found = checks.drives_report_two_senders(make_observation(events=(Event(FIRST, code, "", node=node),)))
     assert (found is None) is passes
 
 
@@ -123,43 +130,45 @@ def test_a_drive_of_the_left_leg_reports_two_senders(seen: Any, code: Dtc, node:
         (Dtc.NODE_TIMEOUT, Dtc.BUS_TX_FULL.severity, False),
     ],
 )
-def test_a_full_queue_is_confirmed_by_its_own_severity(seen: Any, code: Dtc, severity: Severity, passes: bool) -> None:
-    found = checks.full_queue_is_confirmed(seen(events=(Event(FIRST, code, "", severity=severity),)))
+def test_full_queue_must_be_reported_with_its_severity(
+    make_observation: Any, code: Dtc, severity: Severity, passes: bool
+) -> None:
+    found = checks.full_queue_is_confirmed(make_observation(events=(Event(FIRST, code, "", severity=severity),)))
     assert (found is None) is passes
 
 
-def test_every_drive_of_the_left_leg_holds_from_the_fifth_cycle_on(seen: Any) -> None:
+def test_left_leg_must_hold_from_the_fifth_cycle_to_the_start(make_observation: Any) -> None:
     held = np.full((CYCLES, 12), D.OPERATION_ENABLED)
     held[FIRST + 3 : PRESSED - 1, :6] = D.QUICK_STOP_ACTIVE
-    assert checks.left_leg_in_local_hold(seen(drive_state=held)) is None
+    assert checks.left_leg_in_local_hold(make_observation(drive_state=held)) is None
     for cycle in (FIRST + 4, PRESSED - 1):
         for joint in range(6):
             drives = held.copy()
             drives[cycle - 1, joint] = D.OPERATION_ENABLED
-            assert checks.left_leg_in_local_hold(seen(drive_state=drives)) == (
+            assert checks.left_leg_in_local_hold(make_observation(drive_state=drives)) == (
                 f"a drive of the left leg did not hold in cycle {cycle}"
             )
 
 
-def test_no_drive_is_enabled_after_a_rejected_start(seen: Any) -> None:
+def test_drive_enabled_after_a_rejected_start_fails(make_observation: Any) -> None:
     refused = (Event(PRESSED, "START_REFUSED", "LEFT_SK is out of range"),)
     enabled = [Controlword.SHUTDOWN] * 11 + [Controlword.ENABLE_OPERATION]
-    assert checks.start_is_rejected(seen()) == "no START was rejected"
-    assert checks.start_is_rejected(seen(events=refused, commands=Commanded({PRESSED - 1: enabled}))) is None
+    assert checks.start_is_rejected(make_observation()) == "no START was rejected"
+    assert (
+        checks.start_is_rejected(make_observation(events=refused, commands=Commanded({PRESSED - 1: enabled}))) is None
+    )
     for cycle in (PRESSED, CYCLES):
-        found = checks.start_is_rejected(seen(events=refused, commands=Commanded({cycle: enabled})))
+        found = checks.start_is_rejected(make_observation(events=refused, commands=Commanded({cycle: enabled})))
         assert found == f"a drive was enabled in cycle {cycle}, after LEFT_SK is out of range"
 
 
 @pytest.mark.parametrize("temperature", [25.0, 100.0, 120.0])
-def test_the_torque_limit_follows_the_temperature_to_the_resolution_of_the_wire(
-    seen: Any, robot: Robot, temperature: float
-) -> None:
+def test_torque_limit_above_the_derating_curve_fails(make_observation: Any, robot: Robot, temperature: float) -> None:
     reported = np.full((CYCLES, 12), temperature)
     allowed = float(robot.torque_limit(reported[0])[KNEE])
 
     def found(limit: np.ndarray) -> str | None:
-        return checks.limit_follows_temperature(seen(temperature=reported, commands=Commanded(limit=limit)))
+        return checks.limit_follows_temperature(make_observation(temperature=reported, commands=Commanded(limit=limit)))
 
     assert found(np.full(CYCLES, allowed + 0.019)) is None
     assert found(at(allowed + 1.0, FIRST - 1)) is None

@@ -1,4 +1,4 @@
-"""The witness decodes what a HAL sends as cantools does, and finds every kind of command that must not leave."""
+"""Tests of the check of sent commands: it decodes as cantools does and reports every kind of violation."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ HIP = JOINTS.index("right_SH")
 
 
 class Hal:
-    """Sends commands of any kind, well sealed."""
+    """Seal commands with any values and record them as sent."""
 
     def __init__(self, network: Network) -> None:
         self.tx = TransmitImage([network.message(f"COMMAND_{side}_LEG") for side in ("LEFT", "RIGHT")])
@@ -45,7 +45,7 @@ def hal(network: Network, robot: Robot) -> Hal:
     return made
 
 
-def test_decodes_like_cantools(hal: Hal) -> None:
+def test_decoded_torques_agree_with_cantools(hal: Hal) -> None:
     random = np.random.default_rng(1)
     database = cantools.database.load_file(atalante_dbc.DBC_FILE)
     frames: list[Frames] = []
@@ -57,20 +57,20 @@ def test_decodes_like_cantools(hal: Hal) -> None:
         cycles, torque = hal.commands().torque_of(joint)
         assert cycles.tolist() == list(range(1, 20))
         leg = joint // 6
-        said = [
+        expected = [
             database.decode_message(int(f["can_id"][leg]), f["data"][leg, : f["len"][leg]].tobytes())[
                 f"{name.split('_')[1]}_TargetTorque"
             ]
             for f in frames
         ]
-        assert torque == pytest.approx(said, abs=1e-9)
+        assert torque == pytest.approx(expected, abs=1e-9)
 
 
-def test_nothing_is_found_in_what_may_be_sent(hal: Hal, robot: Robot) -> None:
+def test_valid_commands_have_no_violations(hal: Hal, robot: Robot) -> None:
     for cycle in range(1, 30):
         hal.torque[:] = np.minimum(robot.torque_max, 0.9 * cycle * robot.torque_rate_max * 1e-3)
         hal.send(cycle)
-    hal.word[:], hal.torque[:] = Controlword.QUICK_STOP, 0.0  # from the largest torque to none at once: the drive holds
+    hal.word[:], hal.torque[:] = Controlword.QUICK_STOP, 0.0  # QUICK_STOP: the torque may fall to 0 at once
     hal.send(30)
     assert hal.commands().violations(robot) == []
     assert hal.commands().words(29) == [Controlword.ENABLE_OPERATION] * 12
@@ -78,7 +78,7 @@ def test_nothing_is_found_in_what_may_be_sent(hal: Hal, robot: Robot) -> None:
     assert hal.commands().words(31) == []
 
 
-def test_a_torque_a_limit_a_step_and_a_torque_while_stopped_are_found(hal: Hal, robot: Robot) -> None:
+def test_torque_limit_rate_and_quick_stop_violations_are_reported(hal: Hal, robot: Robot) -> None:
     hal.send(1)
     hal.torque[KNEE] = robot.torque_max[KNEE] + 0.1
     hal.send(2)
@@ -95,7 +95,7 @@ def test_a_torque_a_limit_a_step_and_a_torque_while_stopped_are_found(hal: Hal, 
 
 
 @pytest.mark.parametrize("sign", [1.0, -1.0])
-def test_a_step_may_be_the_rate_of_its_joint_over_one_cycle(hal: Hal, robot: Robot, sign: float) -> None:
+def test_torque_step_is_bounded_by_the_rate_limit_of_the_joint(hal: Hal, robot: Robot, sign: float) -> None:
     step = sign * robot.torque_rate_max * 1e-3
     hal.send(1)
     hal.torque[:] = step
@@ -109,13 +109,13 @@ def test_a_step_may_be_the_rate_of_its_joint_over_one_cycle(hal: Hal, robot: Rob
     ]
 
 
-def test_a_step_over_a_cycle_without_a_frame_is_no_step(hal: Hal, robot: Robot) -> None:
+def test_torque_step_over_missing_frames_is_no_violation(hal: Hal, robot: Robot) -> None:
     hal.send(1)
     hal.torque[KNEE] = 100.0
     hal.send(5)
     assert hal.commands().violations(robot) == []
 
 
-def test_another_nodes_identifier_is_found(hal: Hal, network: Network, robot: Robot) -> None:
+def test_identifier_of_another_node_is_reported(hal: Hal, network: Network, robot: Robot) -> None:
     hal.recorded.sent(TransmitImage([network.message("LEFT_SK_STATE")]).seal())
     assert hal.commands().violations(robot) == ["the HAL must send only its own identifiers, got 0x184"]

@@ -1,4 +1,4 @@
-"""Faults of the host, in their cycles and in no other."""
+"""Tests of the host faults, which are faults of the computer of the HAL: each acts in its cycles and in no other."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from atalante_tools.faults.scenario import HostFault
 BEGINS = 10
 
 
-class Still:
+class ConstantController:
     telemetry, telemetry_fields = np.zeros(3), (("nothing", 3),)
 
     def __init__(self) -> None:
@@ -31,25 +31,25 @@ class Still:
         return Command(np.ones(12), np.zeros(8))
 
 
-class AtCycle:
-    """All a controller here reads of a state."""
+class StateAtCycle:
+    """The part of a state that the controllers in this file read."""
 
     def __init__(self, cycle: int) -> None:
         self.cycle = cycle
 
 
-def at(moment: HostFaults, cycle: int) -> HostFaults:
-    moment.cycle = cycle
-    return moment
+def at(host_faults: HostFaults, cycle: int) -> HostFaults:
+    host_faults.cycle = cycle
+    return host_faults
 
 
-def test_a_fault_is_on_from_its_start_for_its_cycles_and_remembers_when_it_struck() -> None:
-    moment = HostFaults([HostFault("late", 2, 3, 1.0)], BEGINS)
-    assert [cycle for cycle in range(20) if at(moment, cycle).of("late")] == [12, 13, 14]
-    assert moment.first_active == 12
+def test_host_fault_is_active_in_its_cycles_and_records_the_first() -> None:
+    host_faults = HostFaults([HostFault("late", 2, 3, 1.0)], BEGINS)
+    assert [cycle for cycle in range(20) if at(host_faults, cycle).of("late")] == [12, 13, 14]
+    assert host_faults.first_active == 12
     assert at(HostFaults([HostFault("late", 0, None)], BEGINS), 10**6).of("late")
     assert at(HostFaults([HostFault("late", 0, None)], BEGINS), 9).of("late") is None
-    assert at(moment, 12).of("raise", "request") is None
+    assert at(host_faults, 12).of("raise", "request") is None
 
 
 @pytest.mark.parametrize(
@@ -61,43 +61,43 @@ def test_a_fault_is_on_from_its_start_for_its_cycles_and_remembers_when_it_struc
         (HostFault("late", value=1.0), [1.0] * 12),
     ],
 )
-def test_what_the_controller_asks_for(fault: HostFault, torque: list[float]) -> None:
-    controller = DisturbedController(Still(), at(HostFaults([fault], BEGINS), BEGINS))
-    assert np.array_equal(controller.update(AtCycle(BEGINS)).torque, torque, equal_nan=True)
-    assert controller.telemetry is Still.telemetry
-    assert controller.telemetry_fields == Still.telemetry_fields
+def test_disturbed_controller_requests_the_faulty_torque(fault: HostFault, torque: list[float]) -> None:
+    controller = DisturbedController(ConstantController(), at(HostFaults([fault], BEGINS), BEGINS))
+    assert np.array_equal(controller.update(StateAtCycle(BEGINS)).torque, torque, equal_nan=True)
+    assert controller.telemetry is ConstantController.telemetry
+    assert controller.telemetry_fields == ConstantController.telemetry_fields
 
 
-def test_the_controller_raises_where_it_is_asked_to() -> None:
-    inner = Still()
+def test_disturbed_controller_raises_in_reset_or_update() -> None:
+    inner = ConstantController()
     controller = DisturbedController(
         inner, at(HostFaults([HostFault("raise_in_reset", value="KeyError")], BEGINS), BEGINS)
     )
     with pytest.raises(KeyError):
-        controller.reset(AtCycle(BEGINS))
+        controller.reset(StateAtCycle(BEGINS))
     assert inner.resets == 1
-    controller.update(AtCycle(BEGINS))
+    controller.update(StateAtCycle(BEGINS))
     controller = DisturbedController(inner, at(HostFaults([HostFault("raise", value="MemoryError")], BEGINS), BEGINS))
-    controller.reset(AtCycle(BEGINS))
+    controller.reset(StateAtCycle(BEGINS))
     with pytest.raises(MemoryError):
-        controller.update(AtCycle(BEGINS))
+        controller.update(StateAtCycle(BEGINS))
 
 
-def test_the_clock_is_late_when_asked() -> None:
-    moment = HostFaults([HostFault("late", 0, 1, 4e-3)], BEGINS)
-    clock = DisturbedClock(moment)
-    assert [at(moment, cycle) and clock.wait() for cycle in (9, 10, 11)] == [0.0, 4e-3, 0.0]
+def test_disturbed_clock_is_late_in_the_cycle_of_the_fault() -> None:
+    host_faults = HostFaults([HostFault("late", 0, 1, 4e-3)], BEGINS)
+    clock = DisturbedClock(host_faults)
+    assert [at(host_faults, cycle) and clock.wait() for cycle in (9, 10, 11)] == [0.0, 4e-3, 0.0]
 
 
-def test_the_bus_refuses_when_asked_and_is_the_bus_otherwise() -> None:
+def test_disturbed_bus_raises_during_faults_and_sends_otherwise() -> None:
     ours, theirs = lockstep_pair()
-    moment = HostFaults([HostFault("bus_full", 0, 1), HostFault("bus_down", 1, 1)], BEGINS)
-    bus, frames = DisturbedBus(ours, moment), new_frames(2)
+    host_faults = HostFaults([HostFault("bus_full", 0, 1), HostFault("bus_down", 1, 1)], BEGINS)
+    bus, frames = DisturbedBus(ours, host_faults), new_frames(2)
     assert bus.name == ours.name
     for cycle, error in ((10, BusFull), (11, BusDown)):
-        moment.cycle = cycle
+        host_faults.cycle = cycle
         with pytest.raises(error):
             bus.send(frames)
-    moment.cycle = 12
+    host_faults.cycle = 12
     bus.send(frames)
     assert theirs.receive(new_frames(8)) == 2

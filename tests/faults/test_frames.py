@@ -1,7 +1,8 @@
-"""Frames that must not be believed, exhaustively where the space is finite: bits flipped, wrong identifier, length, range.
+"""Invalid frames are rejected, exhaustively where the space is finite: flipped bits, wrong identifier, length, range.
 
-F08 to F12 of the matrix, on every message the HAL receives. The CRC is affine: what an error pattern does to it depends on the
-pattern alone, so one bit's syndrome each is enough to know what any pattern does, and a rank says that none of 2^16 is missed.
+These tests prove F08 to F12 of the fault matrix for every message that the HAL receives. The CRC is affine: flipped bits change
+it by a syndrome that depends only on the positions of these bits. So the syndromes of single bits give the syndrome of every
+pattern. If 16 such syndromes have rank 16, all patterns of these 16 bits are detected.
 """
 
 from __future__ import annotations
@@ -24,20 +25,20 @@ def received(network: Network) -> list[Message]:
 
 @pytest.fixture(scope="module")
 def lengths(received: list[Message]) -> list[Message]:
-    """One message of each length."""
+    """Return one message of each length."""
     return list({message.length: message for message in received}.values())
 
 
 def valid_frame(message: Message) -> Frames:
-    """A frame with every signal somewhere inside its range, sealed."""
+    """Return a sealed frame with every signal inside its range."""
     image = TransmitImage([message])
-    for place, (_, signal) in enumerate(image.codec.signals):
-        image.values[place] = signal.minimum + 0.25 * (signal.maximum - signal.minimum)
+    for index, (_, signal) in enumerate(image.codec.signals):
+        image.values[index] = signal.minimum + 0.25 * (signal.maximum - signal.minimum)
     return image.seal().copy()
 
 
-def listening(message: Message) -> tuple[ReceiveImage, Frames]:
-    """An image that has believed one frame of a message, and that frame."""
+def receiving(message: Message) -> tuple[ReceiveImage, Frames]:
+    """Return a receive image that has accepted one frame of a message, and this frame."""
     image, frame = ReceiveImage([message]), valid_frame(message)
     image.new_cycle()
     image.accept_each(frame, 1)
@@ -45,25 +46,25 @@ def listening(message: Message) -> tuple[ReceiveImage, Frames]:
     return image, frame
 
 
-def refused(image: ReceiveImage, frames: Frames) -> list[int]:
-    """Offer a frame: nothing of it may be taken over. Returns the places of frames that are nobody's."""
+def assert_rejected(image: ReceiveImage, frames: Frames) -> list[int]:
+    """Assert that the process image accepts no value of a frame; return the indices of unknown frames."""
     before = image.values.tobytes(), image.age.tolist()
     image.new_cycle()
-    foreign = list(image.accept_each(frames, len(frames)))
+    unknown_rows = list(image.accept_each(frames, len(frames)))
     assert image.values.tobytes() == before[0]
     assert image.age.tolist() == [age + 1 for age in before[1]]
-    return foreign
+    return unknown_rows
 
 
 def following(frame: Frames, message: Message) -> Frames:
-    """The frame after this one, right in everything."""
+    """Return the valid frame that follows this one."""
     after = frame.copy()
     after["data"][0, 2] += 1
     return sealed(after, message)
 
 
 def sealed(frame: Frames, message: Message) -> Frames:
-    """With the CRC that belongs to the payload."""
+    """Return the frame with the CRC of its payload."""
     payload = frame["data"][0, : message.length].tobytes()
     checksum = crc(payload[CRC_BYTES:], data_id_bytes(message.data_id))
     frame["data"][0, :CRC_BYTES] = list(checksum.to_bytes(2, "little"))
@@ -71,7 +72,7 @@ def sealed(frame: Frames, message: Message) -> Frames:
 
 
 def syndromes(message: Message) -> np.ndarray:
-    """What flipping each bit of the payload does to CRC received xor CRC computed, in the order of the wire. Shape (8 n,)."""
+    """Return the change of (received CRC xor computed CRC) by each flipped bit, in the order of the wire. Shape (8 n,)."""
     payload, data_id = valid_frame(message)["data"][0, : message.length].tobytes(), data_id_bytes(message.data_id)
 
     def difference(data: bytes) -> int:
@@ -90,7 +91,7 @@ def syndromes(message: Message) -> np.ndarray:
 
 
 def rank(vectors: list[int]) -> int:
-    """Over GF(2)."""
+    """Return the rank over GF(2)."""
     basis: list[int] = []
     for vector in vectors:
         for element in basis:
@@ -100,7 +101,7 @@ def rank(vectors: list[int]) -> int:
     return len(basis)
 
 
-def test_f08_one_two_and_any_odd_number_of_bits_flipped_are_noticed(lengths: list[Message]) -> None:
+def test_f08_one_two_or_an_odd_number_of_flipped_bits_are_detected(lengths: list[Message]) -> None:
     for message in lengths:
         found = syndromes(message).tolist()
         assert 0 not in found
@@ -108,9 +109,12 @@ def test_f08_one_two_and_any_odd_number_of_bits_flipped_are_noticed(lengths: lis
         assert {syndrome.bit_count() % 2 for syndrome in found} == {1}
 
 
-def test_f08_bursts_up_to_sixteen_bits_are_noticed(lengths: list[Message]) -> None:
-    """Profile 5 sends the CRC first and its low byte before the high one, so a burst over an edge of that field is no burst
-    of the code: of the 65535 patterns in such a window up to three pass, and CAN FD's own CRC has to find them."""
+def test_f08_bursts_up_to_sixteen_bits_are_detected(lengths: list[Message]) -> None:
+    """Every burst after the CRC field is detected, and all but three patterns of a burst that overlaps this field.
+
+    Profile 5 sends the CRC field first, with its low byte before its high byte. At the edges of this field, bits that are
+    adjacent on the wire are therefore not adjacent in the code word. Of the 65535 patterns of such a burst, Profile 5 misses at
+    most three. The CRC of CAN FD detects them."""
     for message in lengths:
         found = syndromes(message).tolist()
         for start in range(len(found) - 15):
@@ -118,7 +122,7 @@ def test_f08_bursts_up_to_sixteen_bits_are_noticed(lengths: list[Message]) -> No
             assert rank(found[start : start + 16]) >= least, f"a burst from bit {start} of {message.name}"
 
 
-def test_f08_of_random_even_weights_fewer_than_six_in_a_hundred_thousand_pass(lengths: list[Message]) -> None:
+def test_f08_at_most_six_in_a_hundred_thousand_even_patterns_pass(lengths: list[Message]) -> None:
     random = np.random.default_rng(8)
     for message in lengths:
         found = syndromes(message)
@@ -130,46 +134,46 @@ def test_f08_of_random_even_weights_fewer_than_six_in_a_hundred_thousand_pass(le
         assert passed / tried <= 6e-5, message.name
 
 
-def test_f08_a_damaged_frame_changes_nothing(received: list[Message]) -> None:
+def test_f08_damaged_frame_does_not_change_any_value(received: list[Message]) -> None:
     for message in received:
-        image, frame = listening(message)
+        image, frame = receiving(message)
         for bit in range(8 * message.length):
             damaged = following(frame, message)
             damaged["data"][0, bit // 8] ^= 1 << bit % 8
-            refused(image, damaged)
+            assert_rejected(image, damaged)
             assert image.check[0] == Check.CRC
 
 
-def test_f09_no_message_passes_under_the_identifier_of_another(received: list[Message]) -> None:
+def test_f09_frame_with_the_identifier_of_another_message_is_rejected(received: list[Message]) -> None:
     for claimed, true in itertools.permutations(received, 2):
         if claimed.length != true.length:
             continue
-        image, _ = listening(claimed)
+        image, _ = receiving(claimed)
         frame = following(valid_frame(true), true)
         frame["can_id"] = claimed.frame_id
-        refused(image, frame)
+        assert_rejected(image, frame)
         assert image.check[0] == Check.CRC, f"{true.name} as {claimed.name}"
 
 
-def test_f10_every_other_length_and_format_is_refused(received: list[Message]) -> None:
+def test_f10_every_wrong_length_and_format_is_rejected(received: list[Message]) -> None:
     for message in received:
-        image, frame = listening(message)
+        image, frame = receiving(message)
         for length in (n for n in range(65) if n != message.length):
             wrong = following(frame, message)
             wrong["len"] = length
-            refused(image, wrong)
+            assert_rejected(image, wrong)
             assert image.check[0] == Check.LENGTH
         for flags in (0, FLAG_BRS, FLAG_FDF):
             wrong = following(frame, message)
             wrong["flags"] = flags
             if flags != frame["flags"][0]:
-                refused(image, wrong)
+                assert_rejected(image, wrong)
                 assert image.check[0] == Check.LENGTH
         image.accept_each(following(frame, message), 1)
         assert image.check[0] == Check.OK
 
 
-def test_f11_every_other_identifier_is_nobodys(received: list[Message]) -> None:
+def test_f11_unknown_identifiers_are_ignored(received: list[Message]) -> None:
     image = ReceiveImage(received)
     known = set(image.frame_ids)
     for can_id in (*range(2048), *(ID_EXTENDED | bit for bit in (0, *(1 << n for n in range(29)), *known))):
@@ -177,22 +181,22 @@ def test_f11_every_other_identifier_is_nobodys(received: list[Message]) -> None:
             for length in (0, 8, 12, 64):
                 frame = new_frames(1)
                 frame["can_id"], frame["len"], frame["flags"] = can_id, length, FLAG_FDF | FLAG_BRS
-                assert refused(image, frame) == [0]
+                assert assert_rejected(image, frame) == [0]
 
 
-def test_f12_every_code_outside_the_range_of_a_signal_is_refused(received: list[Message]) -> None:
+def test_f12_codes_outside_the_range_of_a_signal_are_rejected(received: list[Message]) -> None:
     tried = 0
     for message in received:
-        image, frame = listening(message)
+        image, frame = receiving(message)
         for signal in message.signals:
             for raw in codes_outside(signal):
-                frame = wrong = following(frame, message)  # a refused frame moves the counter on all the same
+                frame = wrong = following(frame, message)  # a rejected frame also advances the counter
                 word, shift = divmod(signal.start, 64)
                 words = wrong["data"].view("<u8")[0]
                 mask = (1 << signal.length) - 1
                 right = int(words[word])
                 words[word] = right & ~(mask << shift) & (1 << 64) - 1 | raw << shift
-                refused(image, sealed(wrong, message))
+                assert_rejected(image, sealed(wrong, message))
                 words[word] = right
                 expected = Check.INVALID if raw == signal.invalid_raw else Check.RANGE
                 assert image.check[0] == expected, f"{message.name}.{signal.name} = {raw:#x}"
@@ -201,7 +205,7 @@ def test_f12_every_code_outside_the_range_of_a_signal_is_refused(received: list[
 
 
 def codes_outside(signal) -> list[int]:
-    """Raw codes, as unsigned bits, just outside the range, at the end of the code space, and the invalid code."""
+    """Return raw codes that must be rejected: just outside the range, at the ends of the code space, and the invalid code."""
     low, high = (round((limit - signal.offset) / signal.factor) for limit in (signal.minimum, signal.maximum))
     first, last = (
         (-(1 << signal.length - 1), (1 << signal.length - 1) - 1) if signal.signed else (0, (1 << signal.length) - 1)
@@ -211,5 +215,5 @@ def codes_outside(signal) -> list[int]:
     return sorted(unsigned | ({signal.invalid_raw} if signal.invalid_raw is not None else set()))
 
 
-def test_lengths_are_those_of_can_fd(received: list[Message]) -> None:
+def test_every_received_message_has_a_can_fd_length(received: list[Message]) -> None:
     assert {message.length for message in received} <= set(FD_LENGTHS)

@@ -1,4 +1,4 @@
-"""Steady random loss: when a node trips, against the table below the matrix."""
+"""Compare the table below the fault matrix with the simulated time until a node with random frame loss is untrusted."""
 
 from __future__ import annotations
 
@@ -14,7 +14,10 @@ SEEDS = 200
 
 
 def cycles_to_trip(loss: float, seed: int, longest: int) -> int:
-    """Cycles until a node that loses frames at random is not trusted any more: five in a row, or its bucket is full."""
+    """Return the number of cycles until a node with random frame loss is untrusted.
+
+    A node is untrusted after five losses in a row, or when too many of its frames are lost, see `qualify`.
+    """
     lost = np.random.default_rng((round(1000 * loss), seed)).random(longest) < loss
     now, age = SETTLED, 0
     for cycle, bad in enumerate(lost.tolist(), 1):
@@ -31,7 +34,7 @@ def milliseconds(text: str) -> float:
 
 
 def table() -> dict[float, tuple[float, float | None]]:
-    """Loss -> median and, where it is given, the time [ms] within which 95 % have tripped."""
+    """Return the rows of the table, by loss: median time, and time for 95 % of the nodes or None [ms]."""
     found = re.findall(
         r"^\| (\d+) % \| ([\d.]+ m?s)(?: \(95 % within ([\d.]+ ms)\))? \|$", MATRIX_FILE.read_text(), re.MULTILINE
     )
@@ -41,7 +44,7 @@ def table() -> dict[float, tuple[float, float | None]]:
 
 
 @pytest.mark.parametrize("loss", [0.2, 0.3, 0.5])
-def test_f02_the_first_trip_comes_when_the_table_says(loss: float) -> None:
+def test_f02_time_to_the_first_trip_agrees_with_the_table(loss: float) -> None:
     median, most = table()[loss]
     trips = [cycles_to_trip(loss, seed, 10_000) for seed in range(SEEDS)]
     assert np.median(trips) == pytest.approx(median, rel=0.2)
@@ -49,10 +52,10 @@ def test_f02_the_first_trip_comes_when_the_table_says(loss: float) -> None:
         assert np.percentile(trips, 95) == pytest.approx(most, rel=0.2)
 
 
-def test_f02_ten_percent_is_ridden_through_for_seconds() -> None:
+def test_f02_ten_percent_loss_does_not_trip_for_seconds() -> None:
     trips = [cycles_to_trip(0.1, seed, 20_000) for seed in range(20)]
     assert np.median(trips) == 20_000
 
 
-def test_f01_one_percent_never_trips() -> None:
+def test_f01_one_percent_loss_never_trips() -> None:
     assert all(cycles_to_trip(0.01, seed, 60_000) == 60_000 for seed in range(3))

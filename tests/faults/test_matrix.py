@@ -1,4 +1,4 @@
-"""The table of record, the scenarios and the tests say the same: each differs from the others on purpose or fails here."""
+"""Check that the fault matrix, the scenarios and the names of the tests agree."""
 
 from __future__ import annotations
 
@@ -21,34 +21,34 @@ from atalante_tools.faults.verdict import Expectation
 TESTS = Path(__file__).parents[1]
 MATRIX = load_matrix()
 S = SupervisorState
-#: A test that proves a row is named after it.
+#: The name of a test that proves a row of the matrix begins with the ID of this row.
 PROOF = re.compile(r"test_f(\d\d)_")
 
 
 @cache
 def functions_of(path: Path) -> frozenset[str]:
-    """Functions and methods of a test file."""
+    """Return the names of the functions and methods of a test file."""
     tree = ast.parse(path.read_text())
     return frozenset(node.name for node in ast.walk(tree) if isinstance(node, ast.FunctionDef))
 
 
-def test_ids_count_up_without_a_gap() -> None:
+def test_fault_ids_are_consecutive() -> None:
     assert list(MATRIX) == [f"F{number:02d}" for number in range(1, len(MATRIX) + 1)]
 
 
-def test_a_row_is_proved_by_a_scenario_exactly_if_there_is_one() -> None:
+def test_row_names_a_scenario_exactly_if_one_exists() -> None:
     assert {id_ for id_, row in MATRIX.items() if SCENARIO in row.proof} == set(SCENARIOS)
 
 
 @pytest.mark.parametrize("row", MATRIX.values(), ids=list(MATRIX))
-def test_the_tests_a_row_names_are_there(row) -> None:
+def test_tests_named_by_a_row_exist(row) -> None:
     for proof in row.tests:
         path, name = proof.split("::")
         assert (TESTS / path).is_file(), f"{row.id}: no {path}"
         assert fnmatch.filter(functions_of(TESTS / path), name), f"{row.id}: no {name} in {path}"
 
 
-def test_a_test_named_after_a_row_is_in_its_row() -> None:
+def test_row_names_every_test_with_its_id() -> None:
     for path in TESTS.rglob("test_*.py"):
         for name in functions_of(path):
             if match := PROOF.match(name):
@@ -58,12 +58,12 @@ def test_a_test_named_after_a_row_is_in_its_row() -> None:
 
 
 @pytest.mark.parametrize("row", [row for row in MATRIX.values() if row.dtc], ids=lambda row: row.id)
-def test_the_code_of_a_row_is_one_the_hal_knows(row) -> None:
+def test_diagnostic_code_of_a_row_exists_in_the_hal(row) -> None:
     assert any(re.fullmatch(row.dtc.replace("x", "[0-9A-Fx]"), dtc.value) for dtc in Dtc)
 
 
 @pytest.mark.parametrize("scenario", SCENARIOS.values(), ids=list(SCENARIOS))
-def test_cases_are_told_apart_and_have_a_bound(scenario) -> None:
+def test_cases_of_a_scenario_have_unique_names_and_a_bound(scenario) -> None:
     names = [case.name for case in scenario.cases]
     assert len(set(names)) == len(names) > 0
     for case in scenario.cases:
@@ -72,13 +72,13 @@ def test_cases_are_told_apart_and_have_a_bound(scenario) -> None:
         assert scenario.permanent.ends is None
 
 
-def test_representatives_are_cases_of_a_dozen_faults() -> None:
+def test_representatives_are_existing_cases_of_at_least_twelve_faults() -> None:
     assert len({id_ for id_, _ in REPRESENTATIVES}) == len(REPRESENTATIVES) >= 12
     for id_, name in REPRESENTATIVES:
         assert name in [case.name for case in SCENARIOS[id_].cases]
 
 
-def test_what_is_not_a_table_is_refused(tmp_path) -> None:
+def test_invalid_matrix_is_rejected_with_line_and_value(tmp_path) -> None:
     good = "| F01 | a | b | 1 / 5 | c | HOLD | - | scenario, `test_x.py::test_y` |"
     head = f"| {' | '.join(COLUMNS)} |\n|---|\n"
 
@@ -90,7 +90,7 @@ def test_what_is_not_a_table_is_refused(tmp_path) -> None:
     row = load(head + good)["F01"]
     assert (row.detected, row.reacted, row.state, row.dtc) == (1, 5, S.HOLD, "")
     assert row.tests == ("test_x.py::test_y",)
-    for text, says in (
+    for text, message in (
         ("", "must have a table"),
         (head + good + "\n" + good, "line 4: ID must be unique, got F01 twice"),
         (head + good.replace("F01", "X1"), "got 'X1'"),
@@ -98,5 +98,5 @@ def test_what_is_not_a_table_is_refused(tmp_path) -> None:
         (head + good.replace("| - ", ""), "got 7 columns"),
         (head + good.replace("scenario", "sure"), "got proof 'sure'"),
     ):
-        with pytest.raises(MatrixError, match=says):
+        with pytest.raises(MatrixError, match=message):
             load(text)

@@ -1,4 +1,4 @@
-"""What is read at start and is not right is refused: F52 (DBC), F54 (robot file), F55 (gait), each in one sentence with its code.
+"""Invalid files are rejected at the start: F52 (DBC), F54 (robot file), F55 (gait), each in one sentence with its code.
 
 Every field of robot and gait file is mutated, the DBC line by line.
 """
@@ -34,11 +34,11 @@ from atalante_tools.cli import cli
 ROBOT = tomllib.loads(ROBOT_FILE.read_text())
 KEYS = tuple(ROBOT["joints"]["FH"])
 GAIT = json.loads(AIRWALK_GAIT.read_text())
-#: No number of any robot or gait.
-NONSENSE = st.sampled_from(
+#: Values that are valid in no field of a robot or gait.
+INVALID = st.sampled_from(
     [math.nan, math.inf, -math.inf, 1e300, -1e300, 10**400, True, False, "4 rad/s", "", [], [[1.0, 2.0]], {}, {"a": 1}]
 )
-anywhere = settings(suppress_health_check=[HealthCheck.function_scoped_fixture])
+with_tmp_path = settings(suppress_health_check=[HealthCheck.function_scoped_fixture])
 
 
 def toml(value: Any) -> str:
@@ -62,7 +62,7 @@ def robot_with(path: Path, joint: str, change: Callable[[dict[str, Any]], object
     return path
 
 
-def refusal_of(path: Path) -> str:
+def rejection_of(path: Path) -> str:
     with pytest.raises(RobotError) as refused:
         load_robot(path)
     assert "\n" not in str(refused.value)
@@ -70,71 +70,73 @@ def refusal_of(path: Path) -> str:
 
 
 class TestF54ConfigInvalid:
-    @anywhere
-    @given(st.sampled_from(LEG_JOINTS), st.sampled_from(KEYS), NONSENSE, st.integers(0, 1))
-    def test_f54_nonsense_in_any_field_is_refused_by_its_name(
-        self, tmp_path: Path, joint: str, key: str, value: Any, place: int
+    @with_tmp_path
+    @given(st.sampled_from(LEG_JOINTS), st.sampled_from(KEYS), INVALID, st.integers(0, 1))
+    def test_f54_invalid_value_in_any_field_is_rejected_with_its_key(
+        self, tmp_path: Path, joint: str, key: str, value: Any, position: int
     ) -> None:
         def change(table: dict[str, Any]) -> None:
             if isinstance(table[key], list):
-                table[key] = [*table[key][:place], value, *table[key][place + 1 :]]
+                table[key] = [*table[key][:position], value, *table[key][position + 1 :]]
             else:
                 table[key] = value
 
-        said = refusal_of(robot_with(tmp_path / "robot.toml", joint, change))
-        assert f"joints.{joint}.{key} must be " in said
+        error_text = rejection_of(robot_with(tmp_path / "robot.toml", joint, change))
+        assert f"joints.{joint}.{key} must be " in error_text
 
-    @anywhere
+    @with_tmp_path
     @given(
         st.sampled_from(LEG_JOINTS),
         st.sampled_from([key for key in KEYS if key not in ("position", "polarity")]),
         st.floats(max_value=0.0) | st.integers(max_value=0),
     )
-    def test_f54_no_limit_is_negative_or_zero(self, tmp_path: Path, joint: str, key: str, value: float) -> None:
+    def test_f54_negative_or_zero_limit_is_rejected_with_its_key(
+        self, tmp_path: Path, joint: str, key: str, value: float
+    ) -> None:
         old = ROBOT["joints"][joint][key]
-        said = refusal_of(
+        error_text = rejection_of(
             robot_with(
                 tmp_path / "robot.toml",
                 joint,
                 lambda table: table.update({key: [value, old[1]] if isinstance(old, list) else value}),
             )
         )
-        assert f"joints.{joint}.{key} must be " in said
+        assert f"joints.{joint}.{key} must be " in error_text
 
     @pytest.mark.parametrize("joint", LEG_JOINTS)
     @pytest.mark.parametrize("key", KEYS)
-    def test_f54_a_missing_a_misspelt_and_a_doubled_key(self, tmp_path: Path, joint: str, key: str) -> None:
+    def test_f54_missing_unknown_or_repeated_key_is_rejected(self, tmp_path: Path, joint: str, key: str) -> None:
         path = tmp_path / "robot.toml"
-        assert f"joints.{joint}.{key} is missing" in refusal_of(robot_with(path, joint, lambda t: t.pop(key)))
-        said = refusal_of(robot_with(path, joint, lambda t: t.update({f"{key}_": 1.0})))
-        assert f"joints.{joint}.{key}_ is unknown; valid keys are position" in said
+        assert f"joints.{joint}.{key} is missing" in rejection_of(robot_with(path, joint, lambda t: t.pop(key)))
+        error_text = rejection_of(robot_with(path, joint, lambda t: t.update({f"{key}_": 1.0})))
+        assert f"joints.{joint}.{key}_ is unknown; valid keys are position" in error_text
         line = f"\njoints.{joint}.{key} = {toml(ROBOT['joints'][joint][key])}"
         path.write_text(robot_with(path, joint, lambda t: None).read_text() + line)
-        assert "overwrite" in refusal_of(path)
+        assert "overwrite" in rejection_of(path)
 
     @pytest.mark.parametrize("joint", LEG_JOINTS)
     @pytest.mark.parametrize("key", ["position", "velocity_max"])
-    def test_f54_degrees_are_not_radians(self, tmp_path: Path, joint: str, key: str) -> None:
+    def test_f54_value_in_degrees_is_rejected(self, tmp_path: Path, joint: str, key: str) -> None:
         value = np.degrees(ROBOT["joints"][joint][key]).tolist()
-        said = refusal_of(robot_with(tmp_path / "robot.toml", joint, lambda t: t.update({key: value})))
-        assert re.search(rf"joints\.{joint}\.{key} must be .* \(rad", said)
+        error_text = rejection_of(robot_with(tmp_path / "robot.toml", joint, lambda t: t.update({key: value})))
+        assert re.search(rf"joints\.{joint}\.{key} must be .* \(rad", error_text)
 
-    @anywhere
+    @with_tmp_path
     @given(st.sampled_from(LEG_JOINTS), st.floats(0.1, 400.0))
-    def test_a_valid_limit_arrives_to_the_bit(self, tmp_path: Path, joint: str, value: float) -> None:
+    def test_valid_limit_is_loaded_exactly_and_changes_the_hash(self, tmp_path: Path, joint: str, value: float) -> None:
         robot = load_robot(robot_with(tmp_path / "robot.toml", joint, lambda t: t.update(torque_max=value)))
         assert (robot.torque_max[[LEG_JOINTS.index(joint), LEG_JOINTS.index(joint) + 6]] == value).all()
         assert robot.hash32 != load_robot().hash32
 
-    @anywhere
+    @with_tmp_path
     @given(st.binary(max_size=200) | st.text(max_size=200).map(str.encode) | st.just(b"a=" + b"[" * 100_000))
-    def test_f54_a_file_of_anything_is_refused_in_a_sentence(self, tmp_path: Path, content: bytes) -> None:
+    def test_f54_file_of_random_bytes_is_rejected_with_its_path(self, tmp_path: Path, content: bytes) -> None:
         path = tmp_path / "robot.toml"
         path.write_bytes(content)
-        assert str(path) in refusal_of(path)
+        assert str(path) in rejection_of(path)
 
 
-#: (where, how to reach it) of every field of a gait.
+#: Keys that lead to each field of a gait file.
 FIELDS: list[tuple[str | int, ...]] = [
     *((key,) for key in GAIT),
     *(("joints", joint) for joint in JOINTS),
@@ -145,15 +147,15 @@ FIELDS: list[tuple[str | int, ...]] = [
 def gait_with(path: Path, field: tuple[str | int, ...], value: Any) -> Path:
     document = json.loads(AIRWALK_GAIT.read_text())
     *parents, last = field
-    place = document
+    container = document
     for parent in parents:
-        place = place[parent]
-    place[last] = value
+        container = container[parent]
+    container[last] = value
     path.write_text(json.dumps(document))
     return path
 
 
-def gait_refusal_of(path: Path) -> str:
+def gait_rejection_of(path: Path) -> str:
     with pytest.raises(GaitError) as refused:
         load_gait(path, load_robot())
     assert "\n" not in str(refused.value)
@@ -161,31 +163,38 @@ def gait_refusal_of(path: Path) -> str:
 
 
 class TestF55GaitInvalid:
-    @anywhere
-    @given(st.sampled_from(FIELDS), NONSENSE)
-    def test_f55_nonsense_in_any_field_is_refused_by_its_name(self, tmp_path: Path, field: Any, value: Any) -> None:
+    @with_tmp_path
+    @given(st.sampled_from(FIELDS), INVALID)
+    def test_f55_invalid_value_in_any_field_is_rejected_with_its_key(
+        self, tmp_path: Path, field: Any, value: Any
+    ) -> None:
         if field in (("parameters",), ("solver",)) and isinstance(value, dict):
-            return  # those may say anything
+            return  # free content
         if field == ("name",) and value:
             value = 3
-        said = gait_refusal_of(gait_with(tmp_path / "gait.json", field, value))
-        # A jump is reported for the joint at the end of the step, whose mirrored start it is; a missing joint by its own name.
-        wanted = ".".join(str(part) for part in field[:2]).replace("left_", "right_").replace("right_", "(left|right)_")
-        assert re.search(f"{wanted}[ .]|must be finite, got (NaN|-?Infinity)", said)
+        error_text = gait_rejection_of(gait_with(tmp_path / "gait.json", field, value))
+        # The end of each joint is compared with the start of the same joint of the other leg, so a jump can be reported for the
+        # other leg. A missing joint is reported by its own name.
+        expected = (
+            ".".join(str(part) for part in field[:2]).replace("left_", "right_").replace("right_", "(left|right)_")
+        )
+        assert re.search(f"{expected}[ .]|must be finite, got (NaN|-?Infinity)", error_text)
 
-    @anywhere
+    @with_tmp_path
     @given(st.sampled_from(JOINTS), st.floats(0.05, 1e6), st.sampled_from([0, 1, 6, 7]), st.sampled_from([-1, 1]))
-    def test_f55_a_jump_at_the_step_change(self, tmp_path: Path, joint: str, by: float, point: int, sign: int) -> None:
+    def test_f55_jump_at_the_step_change_is_rejected(
+        self, tmp_path: Path, joint: str, by: float, point: int, sign: int
+    ) -> None:
         moved = GAIT["joints"][joint][point] + sign * by
-        said = gait_refusal_of(gait_with(tmp_path / "gait.json", ("joints", joint, point), moved))
-        assert re.search(r"joints\.(left|right)_(FH|TH|SH|SK|SA|HA) (at the step change )?must be ", said)
+        error_text = gait_rejection_of(gait_with(tmp_path / "gait.json", ("joints", joint, point), moved))
+        assert re.search(r"joints\.(left|right)_(FH|TH|SH|SK|SA|HA) (at the stance change )?must be ", error_text)
 
-    def test_f55_degrees_are_not_radians(self, tmp_path: Path) -> None:
+    def test_f55_gait_in_degrees_is_rejected(self, tmp_path: Path) -> None:
         degrees = {joint: np.degrees(points).tolist() for joint, points in GAIT["joints"].items()}
-        assert " deg beyond" in gait_refusal_of(gait_with(tmp_path / "gait.json", ("joints",), degrees))
+        assert " deg beyond" in gait_rejection_of(gait_with(tmp_path / "gait.json", ("joints",), degrees))
 
     @pytest.mark.parametrize("joint", JOINTS)
-    def test_f55_a_feedforward_beyond_the_torque_limit(self, tmp_path: Path, joint: str) -> None:
+    def test_f55_feedforward_beyond_the_torque_limit_is_rejected(self, tmp_path: Path, joint: str) -> None:
         robot = load_robot()
         most = robot.torque_max[JOINTS.index(joint)]
         for factor in (1.0, -1.0, 1.01, -1.01):
@@ -194,21 +203,21 @@ class TestF55GaitInvalid:
             if abs(factor) == 1.0:
                 load_gait(path, robot)
             else:
-                said = gait_refusal_of(path)
-                assert f"feedforward of joints.{joint} must be {-most:.4g} to {most:.4g} Nm, got " in said
-                assert f", {0.01 * most:.2g} Nm beyond" in said
+                error_text = gait_rejection_of(path)
+                assert f"feedforward of joints.{joint} must be {-most:.4g} to {most:.4g} Nm, got " in error_text
+                assert f", {0.01 * most:.2g} Nm beyond" in error_text
 
-    def test_f55_a_key_given_twice(self, tmp_path: Path) -> None:
+    def test_f55_repeated_key_is_rejected(self, tmp_path: Path) -> None:
         path = tmp_path / "gait.json"
         path.write_text(AIRWALK_GAIT.read_text().replace("{", '{"duration": 0.8, ', 1))
-        assert "every key must occur once, got duration 2 times" in gait_refusal_of(path)
+        assert "every key must occur once, got duration 2 times" in gait_rejection_of(path)
 
-    @anywhere
+    @with_tmp_path
     @given(st.binary(max_size=200) | st.text(max_size=200).map(str.encode) | st.just(b"[" * 100_000))
-    def test_f55_a_file_of_anything_is_refused_in_a_sentence(self, tmp_path: Path, content: bytes) -> None:
+    def test_f55_file_of_random_bytes_is_rejected_with_its_path(self, tmp_path: Path, content: bytes) -> None:
         path = tmp_path / "gait.json"
         path.write_bytes(content)
-        assert str(path) in gait_refusal_of(path)
+        assert str(path) in gait_rejection_of(path)
 
 
 LINES = DBC_FILE.read_text().splitlines(keepends=True)
@@ -216,44 +225,44 @@ NUMBERS = ("0", "-1", "65", "1e999", "1.5", "99999999999999999999", "nan")
 
 
 def mutant(rng: random.Random) -> str:
-    """The DBC with one line gone, doubled, swapped, cut short, or one character or number of it changed."""
+    """Return the DBC with one line removed, doubled, swapped or cut, or one character or number changed."""
     lines = list(LINES)
-    place, other = rng.randrange(len(lines)), rng.randrange(len(lines))
-    kind, line = rng.choice(("gone", "doubled", "swapped", "cut", "character", "number", "number")), lines[place]
-    if kind == "gone":
-        del lines[place]
+    position, other = rng.randrange(len(lines)), rng.randrange(len(lines))
+    kind, line = rng.choice(("removed", "doubled", "swapped", "cut", "character", "number", "number")), lines[position]
+    if kind == "removed":
+        del lines[position]
     elif kind == "doubled":
         lines.insert(other, line)
     elif kind == "swapped":
-        lines[place], lines[other] = lines[other], line
+        lines[position], lines[other] = lines[other], line
     elif kind == "cut":
-        lines = [*lines[:place], line[: len(line) // 2]]
+        lines = [*lines[:position], line[: len(line) // 2]]
     elif kind == "character":
         at = rng.randrange(len(line))
-        lines[place] = line[:at] + chr(rng.randrange(32, 127)) + line[at + 1 :]
+        lines[position] = line[:at] + chr(rng.randrange(32, 127)) + line[at + 1 :]
     elif numbers := list(re.finditer(r"-?\d+(\.\d+)?", line)):
         number = rng.choice(numbers)
-        lines[place] = line[: number.start()] + rng.choice(NUMBERS) + line[number.end() :]
+        lines[position] = line[: number.start()] + rng.choice(NUMBERS) + line[number.end() :]
     return "".join(lines)
 
 
 @pytest.mark.parametrize("seed", range(60))
-def test_f52_a_mutated_dbc_is_refused_in_sentences_or_is_a_network_like_any_other(seed: int, tmp_path: Path) -> None:
+def test_f52_mutated_dbc_is_rejected_with_its_path_or_loads_completely(seed: int, tmp_path: Path) -> None:
     path = tmp_path / "mutant.dbc"
     path.write_text(mutant(random.Random(seed)))
-    said = ""
+    error_text = ""
     try:
         network = atalante_dbc.load(path)
     except DbcError as error:
-        said = str(error)
+        error_text = str(error)
     else:
         images = [ReceiveImage(network.messages), TransmitImage(network.messages)]
         assert [len(image.frames) for image in images] == [len(network.messages)] * 2
-    assert not said or said.startswith(f"{path}:")
+    assert not error_text or error_text.startswith(f"{path}:")
 
 
 @pytest.mark.parametrize(
-    ("module", "name", "file", "old", "new", "said"),
+    ("module", "name", "file", "old", "new", "error_text"),
     [
         (atalante_dbc.loader, "DBC_FILE", DBC_FILE, "(0.0125,0)", "(0,0)", "DBC_INVALID: "),
         (atalante_hal.robot, "ROBOT_FILE", ROBOT_FILE, "torque_max = 350.0", "torque_max = -350.0", "CONFIG_INVALID: "),
@@ -268,8 +277,15 @@ def test_f52_a_mutated_dbc_is_refused_in_sentences_or_is_a_network_like_any_othe
     ],
     ids=["f52", "f54", "f55"],
 )
-def test_the_command_line_refuses_to_start_in_one_sentence(
-    module: Any, name: str, file: Path, old: str, new: str, said: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+def test_command_with_an_invalid_file_fails_with_one_line(
+    module: Any,
+    name: str,
+    file: Path,
+    old: str,
+    new: str,
+    error_text: str,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     assert old in file.read_text()
     path = tmp_path / file.name
@@ -277,7 +293,7 @@ def test_the_command_line_refuses_to_start_in_one_sentence(
     monkeypatch.setattr(module, name, path)
     result = CliRunner().invoke(cli, ["demo", "--steps", "1", "--out", str(tmp_path / "run")])
     assert result.exit_code == 1
-    assert result.stderr.startswith(f"atalante: {said}{path}")
+    assert result.stderr.startswith(f"atalante: {error_text}{path}")
     assert result.stderr.count("\n") == 1
     assert not (tmp_path / "run").exists()
 
@@ -293,7 +309,7 @@ def test_the_command_line_refuses_to_start_in_one_sentence(
     ],
     ids=["robot", "gait", "DBC", "rules", "library"],
 )
-def test_a_file_that_cannot_be_read_is_named_with_the_reason(
+def test_unreadable_file_is_rejected_with_its_path_and_reason(
     tmp_path: Path, load: Callable[[Path], object], error: type[Exception]
 ) -> None:
     folder = tmp_path / "grid.json"
@@ -303,6 +319,6 @@ def test_a_file_that_cannot_be_read_is_named_with_the_reason(
     assert str(refused.value) == f"{folder} cannot be read: Is a directory"
 
 
-def test_the_gait_that_is_shipped_is_checked_without_its_file() -> None:
+def test_installed_gait_passes_the_check_of_the_controller() -> None:
     gait = load_gait(AIRWALK_GAIT, load_robot())
     check_gait(gait, load_robot())

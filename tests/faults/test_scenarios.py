@@ -1,4 +1,4 @@
-"""One fault, one ID, one test: every case of every scenario of the matrix, HAL and emulated robot in lock-step."""
+"""Run every case of every scenario of the matrix, with HAL and emulated robot in lock-step."""
 
 from __future__ import annotations
 
@@ -12,6 +12,6 @@ CASES = [(scenario.id, case) for scenario in SCENARIOS.values() for case in scen
 
 
 @pytest.mark.parametrize(("id_", "case"), CASES, ids=[f"{id_}-{case.name}" for id_, case in CASES])
-def test_fault(id_: str, case: Case) -> None:
+def test_case_has_the_documented_reaction(id_: str, case: Case) -> None:
     verdict = run_case(id_, case)
     assert verdict.passed, "\n".join(verdict.failures)

@@ -1,4 +1,4 @@
-"""The judge: each of the four questions can be answered with no."""
+"""Tests of the verdict: each of its four conditions can fail."""
 
 from __future__ import annotations
 
@@ -23,22 +23,22 @@ from atalante_tools.faults.verdict import Expectation, Verdict, evaluate
 S = SupervisorState
 FIRST, PRESSED = 11, 41
 ROW = Row("F99", "", "", "2 / 5", "", S.HOLD, "NODE_TIMEOUT", ())
-#: Walks, holds in the fifth faulty cycle, walks again on the operator's word.
+#: ACTIVE, HOLD from the fifth faulty cycle, ACTIVE again after START.
 HELD = [S.ACTIVE] * 14 + [S.HOLD] * 28 + [S.ACTIVE] * 8
-NOTED = (Event(12, "NODE_TIMEOUT", "", node="LEFT_SK"),)
+EXPECTED_EVENTS = (Event(12, "NODE_TIMEOUT", "", node="LEFT_SK"),)
 
 
 @pytest.fixture
-def seen(network: Network, robot: Robot) -> Any:
+def make_observation(network: Network, robot: Robot) -> Any:
     def make(
         states: Sequence[S] = HELD,
-        events: Sequence[Event] = NOTED,
+        events: Sequence[Event] = EXPECTED_EVENTS,
         *,
         held: int | None = None,
         pressed: int | None = PRESSED,
         **arrays: Any,
     ) -> Observation:
-        """A robot in these states, whose HOLD frames begin in cycle `held` or with the state."""
+        """Return an observation with these states. HOLD frames begin in cycle `held`, or when the state is HOLD or worse."""
         sent = SentFrames()
         tx = TransmitImage([network.message(f"COMMAND_{side}_LEG") for side in ("LEFT", "RIGHT")])
         for cycle, state in enumerate(states, 1):
@@ -61,16 +61,16 @@ def verdict(observation: Observation, **case: Any) -> Verdict:
     return evaluate(ROW, Case("a case", (), **case), observation)
 
 
-def test_what_should_be_passes(seen: Any) -> None:
-    assert verdict(seen(), node="LEFT_SK") == Verdict("F99", "a case", "HOLD", 5, 5, "NODE_TIMEOUT", ())
+def test_expected_reaction_passes(make_observation: Any) -> None:
+    assert verdict(make_observation(), node="LEFT_SK") == Verdict("F99", "a case", "HOLD", 5, 5, "NODE_TIMEOUT", ())
 
 
-def test_the_hold_frame_counts_before_the_state_does(seen: Any) -> None:
-    assert verdict(seen(held=12)).cycles == 2
+def test_reaction_time_is_measured_to_the_first_hold_frame(make_observation: Any) -> None:
+    assert verdict(make_observation(held=12)).cycles == 2
 
 
 @pytest.mark.parametrize(
-    ("states", "case", "says"),
+    ("states", "case", "expected"),
     [
         ([S.ACTIVE] * 15 + [S.HOLD] * 27 + [S.ACTIVE], {}, ["HOLD must come within 5 cycles, got 6"]),
         ([S.ACTIVE] * 50, {}, ["no HOLD within 30 cycles"]),
@@ -82,12 +82,14 @@ def test_the_hold_frame_counts_before_the_state_does(seen: Any) -> None:
         (HELD, {"recovers": False}, ["the robot must not be ACTIVE after START, because the fault persists"]),
     ],
 )  # fmt: skip
-def test_a_wrong_state_is_told(seen: Any, states: list[S], case: dict[str, Any], says: list[str]) -> None:
-    assert list(verdict(seen(states), **case).failures) == says
+def test_wrong_state_fails_with_its_reason(
+    make_observation: Any, states: list[S], case: dict[str, Any], expected: list[str]
+) -> None:
+    assert list(verdict(make_observation(states), **case).failures) == expected
 
 
 @pytest.mark.parametrize(
-    ("event", "says"),
+    ("event", "expected"),
     [
         (Event(12, "BUS_DOWN", "", node="LEFT_SK"), "no NODE_TIMEOUT; reported codes: BUS_DOWN"),
         (Event(10, "NODE_TIMEOUT", "", node="LEFT_SK"), "no NODE_TIMEOUT; reported codes: none"),
@@ -95,17 +97,17 @@ def test_a_wrong_state_is_told(seen: Any, states: list[S], case: dict[str, Any],
         (Event(12, "NODE_TIMEOUT", "", node="LEFT_SH"), "NODE_TIMEOUT must name LEFT_SK, got LEFT_SH"),
     ],
 )
-def test_a_wrong_diagnostic_is_told(seen: Any, event: Event, says: str) -> None:
-    assert verdict(seen(events=[event]), node="LEFT_SK").failures == (says,)
+def test_wrong_diagnostic_fails_with_its_reason(make_observation: Any, event: Event, expected: str) -> None:
+    assert verdict(make_observation(events=[event]), node="LEFT_SK").failures == (expected,)
 
 
-def test_one_of_several_diagnostics_is_enough(seen: Any) -> None:
-    assert verdict(seen(), dtc="E2E_LOSS_RATE|NODE_TIMEOUT").dtc == "NODE_TIMEOUT"
-    assert verdict(seen(), dtc="").passed
+def test_one_of_several_accepted_diagnostics_passes(make_observation: Any) -> None:
+    assert verdict(make_observation(), dtc="E2E_LOSS_RATE|NODE_TIMEOUT").dtc == "NODE_TIMEOUT"
+    assert verdict(make_observation(), dtc="").passed
 
 
 @pytest.mark.parametrize(
-    ("quantity", "value", "says"),
+    ("quantity", "value", "expected"),
     [
         ("torque", 400.0, "a motor's torque was above its limit: left_FH in cycle 3"),
         ("position", 1.0, "a joint was outside its position range: left_FH in cycle 3"),
@@ -113,39 +115,43 @@ def test_one_of_several_diagnostics_is_enough(seen: Any) -> None:
         ("velocity", -6.0, "a joint was above its velocity limit: left_FH in cycle 3"),
     ],
 )
-def test_what_must_never_be_is_told(seen: Any, quantity: str, value: float, says: str) -> None:
+def test_violated_limit_fails_with_joint_and_cycle(
+    make_observation: Any, quantity: str, value: float, expected: str
+) -> None:
     array = np.zeros((len(HELD), 12))
     array[2, 0] = value
-    assert verdict(seen(**{quantity: array})).failures == (says,)
+    assert verdict(make_observation(**{quantity: array})).failures == (expected,)
 
 
 @pytest.mark.parametrize("sign", [1.0, -1.0])
 @pytest.mark.parametrize(
     ("quantity", "factor", "overshoot"), [("torque", 1.0, 0.0), ("position", 1.0, 0.05), ("velocity", 1.2, 0.0)]
 )
-def test_a_joint_may_go_to_its_bound_and_not_past_it(
-    seen: Any, robot: Robot, quantity: str, factor: float, overshoot: float, sign: float
+def test_joint_at_its_bound_passes_and_beyond_it_fails(
+    make_observation: Any, robot: Robot, quantity: str, factor: float, overshoot: float, sign: float
 ) -> None:
     limit = robot.position_min if quantity == "position" and sign < 0.0 else sign * getattr(robot, f"{quantity}_max")
     bound = factor * limit + sign * overshoot
-    assert verdict(seen(**{quantity: np.tile(bound, (len(HELD), 1))})).passed
+    assert verdict(make_observation(**{quantity: np.tile(bound, (len(HELD), 1))})).passed
     for joint, name in enumerate(JOINTS):
         array = np.tile(bound, (len(HELD), 1))
         array[2, joint] += sign * 1e-6
-        (failure,) = verdict(seen(**{quantity: array})).failures
+        (failure,) = verdict(make_observation(**{quantity: array})).failures
         assert failure.endswith(f": {name} in cycle 3")
 
 
-def test_a_check_of_the_case_is_asked(seen: Any) -> None:
-    assert verdict(seen(), checks=(lambda observation: f"{observation.first} it is",)).failures == ("11 it is",)
+def test_failed_check_of_the_case_fails_the_verdict(make_observation: Any) -> None:
+    assert verdict(
+        make_observation(), checks=(lambda observation: f"failed in cycle {observation.first}",)
+    ).failures == ("failed in cycle 11",)
 
 
-def test_ridden_through_is_measured_by_its_diagnostic(seen: Any) -> None:
-    judged = verdict(seen([S.ACTIVE] * 30, pressed=None), state=S.ACTIVE)
-    assert (judged.passed, judged.state, judged.cycles, judged.bound) == (True, "ACTIVE", 2, 2)
+def test_detection_time_is_measured_when_the_robot_stays_active(make_observation: Any) -> None:
+    result = verdict(make_observation([S.ACTIVE] * 30, pressed=None), state=S.ACTIVE)
+    assert (result.passed, result.state, result.cycles, result.bound) == (True, "ACTIVE", 2, 2)
 
 
-def test_a_bound_has_to_be_said_somewhere() -> None:
+def test_case_without_any_bound_is_rejected() -> None:
     with pytest.raises(
         ValueError, match="F99 x: `detected` and `reacted` must be given, because the bound of the row is '1 step'"
     ):

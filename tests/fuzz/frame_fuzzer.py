@@ -1,8 +1,13 @@
-"""Random and mutated frames at the HAL and at every emulated node: nothing raises, nothing invalid has an effect.
+"""Fuzzer of the HAL and every emulated node. It checks that no frame raises an exception, and no invalid frame has an effect.
 
-Frames are of four kinds: a sweep over every identifier, length and flag; anything at all, headers no bus would deliver included;
-frames of the robot with damage; frames of the robot with other content and a CRC that is right again, as from a rogue node.
-They are put among the robot's own frames where a bus hands them over.
+There are four kinds of fuzzed frames:
+
+- sweep: every combination of identifier, length and flags;
+- random: random frames, including headers that no bus would deliver;
+- damaged: frames of the robot with inverted bits;
+- resealed: frames of the robot with changed content and a correct CRC, as a defective node would send.
+
+The fuzzed frames are mixed with the frames of the robot in each batch that a bus delivers.
 
     python tests/fuzz/frame_fuzzer.py --frames 10000000     or `make fuzz`
 """
@@ -24,7 +29,7 @@ import numpy as np
 import atalante_dbc
 from atalante_control.model import ExoskeletonParameters, urdf
 from atalante_dbc import Message, Network
-from atalante_emulator.body import PyBulletBody
+from atalante_emulator.bodies.pybullet_body import PyBulletBody
 from atalante_emulator.emulator import Emulator
 from atalante_emulator.pendant import Operator
 from atalante_hal.bus import Bus
@@ -35,18 +40,18 @@ from atalante_hal.robot import Robot, load_robot
 from atalante_hal.types import Command, SupervisorState
 from atalante_hal.wire.frame import FLAG_FDF, FRAME_BYTES, Frames, as_words, header_word, new_frames
 from atalante_hal.wire.process_image import ReceiveImage, TransmitImage
-from atalante_tools.console.terminal import Progress, say
+from atalante_tools.console.terminal import Progress, print_message
 
-SWEEP = 2048 * 65 * 8  # identifiers, lengths, flags (BRS, ESI, FDF)
-#: Frames one `receive` of HAL and emulator can take.
+SWEEP = 2048 * 65 * 8  # number of combinations of identifier, length and flags (BRS, ESI, FDF)
+#: Largest number of frames that one `receive` of the HAL or the emulator returns.
 RECEIVE_BUDGET = 128
-#: Of the frames at each end, those that go to the whole HAL and the whole robot; the others go to their process images.
+#: Share of the frames that the complete HAL and the emulated robot receive. Single process images receive all other frames.
 ROBOT_SHARE = 0.1
-SHARES = (0.2, 0.2, 0.45, 0.15)  # sweep, anything, damaged, sealed again
+SHARES = (0.2, 0.2, 0.45, 0.15)  # shares of the four kinds: sweep, random, damaged, resealed
 
 
 class Fuzzer:
-    """Makes frames; one seed, one sequence."""
+    """Generator of fuzzed frames. Equal seeds give equal frames."""
 
     def __init__(self, seed: int, messages: Sequence[Message]) -> None:
         self._rng = np.random.default_rng(seed)
@@ -54,7 +59,7 @@ class Fuzzer:
         self._swept = int(self._rng.integers(SWEEP))
 
     def frames(self, count: int, genuine: Frames) -> Frames:
-        """Frames of every kind in random order; what is mutated comes from `genuine`. Shape (count,)."""
+        """Return frames of every kind in random order; mutated frames are made from `genuine`. Shape (count,)."""
         rng = self._rng
         sweep, anything, damaged, sealed = rng.multinomial(count, SHARES).tolist()
         made = new_frames(count)
@@ -73,13 +78,13 @@ class Fuzzer:
         return made[rng.permutation(count)]
 
     def _sweep(self, frames: Frames, count: int) -> None:
-        place = np.arange(self._swept, self._swept + count) % SWEEP
+        index = np.arange(self._swept, self._swept + count) % SWEEP
         self._swept += count
-        frames["can_id"], rest = place % 2048, place // 2048
+        frames["can_id"], rest = index % 2048, index // 2048
         frames["len"], frames["flags"] = rest % 65, rest // 65
 
     def _damage(self, frames: Frames) -> None:
-        """One to three bits of the payload, or a byte of the header."""
+        """Change one to three bits of the payload, or a byte of the header."""
         rng, rows = self._rng, np.arange(len(frames))
         octets = frames.view(np.uint8).reshape(-1, FRAME_BYTES)
         for _ in range(int(rng.integers(1, 4))):
@@ -89,7 +94,7 @@ class Fuzzer:
         octets[rows[header], rng.integers(0, 6, header.sum())] = rng.integers(0, 256, header.sum())
 
     def _seal_again(self, frames: Frames) -> None:
-        """Other content behind the counter, a counter that may be the next, and the CRC of it."""
+        """Replace the content after the counter, set a counter that may be the next, and reseal the frame."""
         rng = self._rng
         steps = rng.integers(-2, 8, len(frames)).tolist()
         for frame, step in zip(frames, steps, strict=True):
@@ -103,35 +108,35 @@ class Fuzzer:
 
 
 class Oracle:
-    """Which frames are intact, by header and CRC, as autosar-e2e sees it."""
+    """Reference that decides which frames are intact. It computes the CRC with autosar-e2e, not with the code under test."""
 
     def __init__(self, messages: Sequence[Message]) -> None:
         flags = FLAG_FDF | 1
         self._messages = {header_word(m.frame_id, m.length, flags): m for m in messages}
 
     def intact(self, frames: Frames) -> dict[int, set[bytes]]:
-        """Identifier -> payloads of the frames whose header and CRC are right."""
+        """Return, by identifier, the payloads of the frames with a valid header and CRC."""
         found: dict[int, set[bytes]] = {}
-        for place, header in enumerate(as_words(frames)[:, 0].tolist()):
+        for index, header in enumerate(as_words(frames)[:, 0].tolist()):
             message = self._messages.get(header & 0xFFFF_FFFF_FFFF)
             if message is None or header >> 48:
                 continue
-            payload = frames["data"][place, : message.length].tobytes()
+            payload = frames["data"][index, : message.length].tobytes()
             if e2e.p05.e2e_p05_check(payload, message.data_id):
                 found.setdefault(message.frame_id, set()).add(payload)
         return found
 
 
 class Finding(AssertionError):  # noqa: N818
-    """The fuzzer found a defect."""
+    """Error that reports a defect that the fuzzer found."""
 
 
 @dataclass
 class Tally:
-    """What was done."""
+    """Counts of a fuzz run."""
 
-    frames: int = 0  # fuzzed
-    intact: int = 0  # of those, how many were right by chance or sealed again
+    frames: int = 0  # number of fuzzed frames
+    intact: int = 0  # fuzzed frames that are intact, by chance or because they were resealed
     cycles: int = 0
 
 
@@ -139,12 +144,12 @@ class Tally:
 
 
 def fuzz_image(messages: Sequence[Message], frames: int, seed: int, per_cycle: int = 100) -> Iterator[Tally]:
-    """A process image of these messages: what it commits came in an intact frame of this cycle, and lies in its range.
+    """Fuzz a process image, and check that each committed value is in range and from an intact frame of this cycle.
 
-    Yields the tally now and then.
+    Yield the tally every 200 cycles and at the end.
 
     Raises:
-        Finding: the image took something else.
+        Finding: If the process image committed a value that is out of range, or not from an intact frame of this cycle.
     """
     fuzzer, oracle, tally = Fuzzer(seed, messages), Oracle(messages), Tally()
     tx, rx = TransmitImage(messages), ReceiveImage(messages)
@@ -153,11 +158,11 @@ def fuzz_image(messages: Sequence[Message], frames: int, seed: int, per_cycle: i
     signals = [signal for _, signal in tx.codec.signals]
     low, high = np.array([s.minimum for s in signals]), np.array([s.maximum for s in signals])
     slack = 1e-6 * (high - low)
-    said = rng.uniform(low, high, (64, len(signals)))
+    drawn = rng.uniform(low, high, (64, len(signals)))
     before = rx.frames["data"].copy()
-    # The image's signals are those of the transmit image: one order for both.
+    # The receive image and the transmit image have the same signals in the same order.
     while tally.frames < frames:
-        tx.values[:] = said[tally.cycles % len(said)]
+        tx.values[:] = drawn[tally.cycles % len(drawn)]
         genuine = tx.seal()
         count = min(per_cycle, RECEIVE_BUDGET - len(genuine), frames - tally.frames)
         fuzzed = fuzzer.frames(count, genuine)
@@ -187,7 +192,7 @@ def _check_committed(
     for row in np.flatnonzero(~same).tolist():
         message = rx.codec.messages[row]
         payload = committed[row, : message.length].tobytes()
-        # Behind the payload lies whatever the receiver parks there.
+        # The bytes after the payload are undefined.
         known = {genuine["data"][row, : message.length].tobytes(), before[row, : message.length].tobytes()}
         if payload not in known | intact.get(message.frame_id, set()):
             raise Finding(f"cycle {tally.cycles}: {message.name} took a frame that is not intact: {payload.hex()}")
@@ -197,20 +202,20 @@ def _check_committed(
 
 
 class FuzzedBus(WrappedBus):
-    """A bus that hands over fuzzed frames among those that came; first come, first served, none is lost."""
+    """Bus that mixes fuzzed frames into a received batch. The batches keep their order, and no frame is lost."""
 
     def __init__(self, bus: Bus, fuzzer: Fuzzer) -> None:
         super().__init__(bus)
         self._fuzzer = fuzzer
-        self.per_receive = 0  # frames to put into the next receive, then 0 again
+        self.per_receive = 0  # number of frames to add in the next `receive`, which resets it to 0
         self.fuzzed = 0
-        self.most = 0  # frames handed over in one call
+        self.most = 0  # largest number of frames that one call returned
         self._waiting: deque[Frames] = deque()
         self._scratch = new_frames(1024)
         self._shuffle = np.random.default_rng(0)
 
     def receive(self, frames: Frames, timeout: float = 0.0) -> int:
-        """As `Bus.receive`."""
+        """Receive a batch and mix in the fuzzed frames, see `Bus.receive`."""
         count = self.bus.receive(self._scratch, timeout)
         if self.per_receive:
             genuine = self._scratch[:count].copy()
@@ -234,10 +239,12 @@ class FuzzedBus(WrappedBus):
 
 
 class FuzzedRobot:
-    """HAL and emulated robot in lock-step, both with fuzz on their end of the line."""
+    """HAL and emulated robot in lock-step, both with fuzzed frames at their end of the bus."""
 
-    #: Cycles without fuzz, in which the operator acknowledges and starts the robot, then with it.
+    #: In the first `QUIET` cycles, there are no fuzzed frames, and the operator starts the robot.
+    #: In the next `FUZZED` cycles, fuzzed frames are added. Then the sequence is repeated.
     QUIET, FUZZED = 1150, 60
+    #: Cycles of the sequence in which the operator presses START.
     PRESSES = (150, 1050, 1080, 1110)
 
     def __init__(self, network: Network, robot: Robot, body: PyBulletBody, seed: int) -> None:
@@ -254,17 +261,17 @@ class FuzzedRobot:
         self.states_seen: set[SupervisorState] = set()
 
     def run(self, frames: int) -> None:
-        """Cycles until that many frames have been put on each end."""
+        """Run cycles until `frames` fuzzed frames were added at each end."""
         while self.tally.frames < frames:
             self.cycle(100)
 
     def cycle(self, per_end: int) -> None:
-        """One cycle, with that many fuzzed frames on each end while it is time for fuzz."""
+        """Run one cycle. In the cycles with fuzzing, add `per_end` or more fuzzed frames at each end."""
         phase = self.tally.cycles % (self.QUIET + self.FUZZED)
         self.tally.cycles += 1
         if phase >= self.QUIET:
             for end in self.ends:
-                # Now and then a flood, which the budget has to hold off.
+                # In 2 % of the cases, send a flood of frames, which the receive budget must limit.
                 end.per_receive = per_end if self._rng.random() < 0.98 else 8 * RECEIVE_BUDGET
         elif phase in self.PRESSES:
             self.operator.start()
@@ -296,7 +303,7 @@ class FuzzedRobot:
 
 @contextmanager
 def fuzzed_robot(seed: int) -> Iterator[FuzzedRobot]:
-    """A robot to fuzz."""
+    """Yield a robot with fuzzed frames at both ends of its bus."""
     robot = load_robot()
     body = PyBulletBody(urdf(ExoskeletonParameters(), robot))
     try:
@@ -306,20 +313,22 @@ def fuzzed_robot(seed: int) -> Iterator[FuzzedRobot]:
 
 
 def images(network: Network) -> dict[str, tuple[list[Message], float]]:
-    """Every process image of the stack: its messages, and its share of the frames of its end."""
-    heard = network.received_by("HAL")
+    """Return the messages of each process image of the stack, and the share of all fuzzed frames that the image receives."""
+    received = network.received_by("HAL")
     whole = 1.0 - ROBOT_SHARE
     return {
-        "HAL, every cycle": ([m for m in heard if m.cycle_ms == 1], 0.5 * whole),
-        "HAL, slow": ([m for m in heard if m.cycle_ms != 1], 0.5 * whole),
+        "HAL, every cycle": ([m for m in received if m.cycle_ms == 1], 0.5 * whole),
+        "HAL, slow": ([m for m in received if m.cycle_ms != 1], 0.5 * whole),
         "nodes": ([m for m in network.sent_by("HAL") if m.cycle_ms == 1], whole),
     }
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Fuzz everything with that many frames each; the exit code is 1 after a finding."""
+    """Fuzz the process images, then the HAL with the emulated robot. The exit code is 1 after a finding."""
     parser = argparse.ArgumentParser(description=main.__doc__)
-    parser.add_argument("--frames", type=int, default=10_000_000, help="at HAL and nodes each [default: 10 million]")
+    parser.add_argument(
+        "--frames", type=int, default=10_000_000, help="frames for each of HAL and nodes [default: 10 million]"
+    )
     parser.add_argument("--seed", type=int, default=0)
     wanted = parser.parse_args(arguments)
     progress = Progress()
@@ -329,25 +338,27 @@ def main(arguments: Sequence[str] | None = None) -> int:
         if progress.due():
             progress.show(f"{what}: {tally.frames:,} of {frames:,} frames, {time.monotonic() - begun:.0f} s")
 
-    def tell(what: str, tally: Tally, more: str = "") -> None:
+    def report(what: str, tally: Tally, more: str = "") -> None:
         progress.clear()
-        say(f"{what}: {tally.frames:,} frames in {tally.cycles:,} cycles, {time.monotonic() - begun:.0f} s{more}")
+        print_message(
+            f"{what}: {tally.frames:,} frames in {tally.cycles:,} cycles, {time.monotonic() - begun:.0f} s{more}"
+        )
 
     try:
         for name, (messages, share) in images(atalante_dbc.load()).items():
             frames = round(share * wanted.frames)
             for tally in fuzz_image(messages, frames, wanted.seed, min(100, RECEIVE_BUDGET - len(messages))):
                 show(f"image {name}", tally, frames)
-            tell(f"image {name}", tally, f", {tally.intact:,} of them intact")
+            report(f"image {name}", tally, f", {tally.intact:,} of them intact")
         with fuzzed_robot(wanted.seed) as robot:
             while robot.tally.frames < ROBOT_SHARE * wanted.frames:
                 robot.cycle(100)
                 show("HAL and nodes", robot.tally, round(ROBOT_SHARE * wanted.frames))
             seen = ", ".join(state.name for state in sorted(robot.states_seen))
-            tell("HAL and nodes, at each end", robot.tally, f"; the HAL was in {seen}")
+            report("HAL and nodes, at each end", robot.tally, f"; the HAL was in {seen}")
     except Finding as finding:
         progress.clear()
-        say(str(finding))
+        print_message(str(finding))
         return 1
     return 0
 

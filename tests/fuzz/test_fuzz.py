@@ -1,4 +1,4 @@
-"""A slice of the fuzz of `make fuzz` (10 million frames at each end), and that the fuzzer finds what is broken."""
+"""Run a small part of `make fuzz` (10 million frames at each end), and check that the fuzzer finds injected defects."""
 
 from __future__ import annotations
 
@@ -22,21 +22,21 @@ IMAGES = {name: messages for name, (messages, _) in images(NETWORK).items()}
 
 
 @pytest.mark.parametrize("name", IMAGES)
-def test_an_image_takes_nothing_that_is_not_intact(name: str) -> None:
+def test_receive_image_accepts_only_intact_frames(name: str) -> None:
     messages = IMAGES[name]
     *_, tally = fuzz_image(messages, 20_000, seed=3, per_cycle=min(100, RECEIVE_BUDGET - len(messages)))
     assert tally.frames == 20_000
     assert 0.1 < tally.intact / tally.frames < 0.2
 
 
-def test_hal_and_nodes_live_through_it() -> None:
+def test_hal_and_nodes_survive_fuzzed_frames() -> None:
     with fuzzed_robot(seed=5) as robot:
         robot.run(20_000)
         assert max(end.most for end in robot.ends) == RECEIVE_BUDGET
         assert {SupervisorState.READY, SupervisorState.ACTIVE, SupervisorState.HOLD} <= robot.states_seen
 
 
-def test_every_identifier_length_and_flag_comes() -> None:
+def test_fuzzer_covers_every_identifier_length_and_flag() -> None:
     fuzzer, seen = Fuzzer(1, NETWORK.messages), set()
     nothing = new_frames(0)
     fuzzer._swept = 0
@@ -49,7 +49,7 @@ def test_every_identifier_length_and_flag_comes() -> None:
     assert anything["len"].max() == 255
 
 
-def test_frames_sealed_again_are_intact_and_damaged_ones_are_not() -> None:
+def test_resealed_frames_are_intact_and_damaged_ones_are_not() -> None:
     messages = IMAGES["HAL, every cycle"]
     genuine = TransmitImage(messages).seal()
     fuzzer, oracle = Fuzzer(1, messages), Oracle(messages)
@@ -67,7 +67,7 @@ def run_image(name: str) -> None:
 
 
 @pytest.mark.parametrize("name", ["HAL, every cycle", "nodes"])
-def test_an_image_without_its_crc_check_is_found(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_fuzzer_finds_a_receive_image_without_crc_check(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
     accept_each = ReceiveImage.accept_each
 
     def accept_damaged(image: ReceiveImage, frames: Frames, count: int, tag: int | None = None) -> list[int]:
@@ -87,22 +87,22 @@ def test_an_image_without_its_crc_check_is_found(name: str, monkeypatch: pytest.
         run_image(name)
 
 
-def test_an_image_without_its_range_check_is_found(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_fuzzer_finds_a_receive_image_without_range_check(monkeypatch: pytest.MonkeyPatch) -> None:
     accept_each = ReceiveImage.accept_each
 
     def accept_anything(image: ReceiveImage, frames: Frames, count: int, tag: int | None = None) -> list[int]:
-        foreign = accept_each(image, frames, count, tag)
-        for row, why in image.refused:
-            if why is Check.RANGE:
+        unknown = accept_each(image, frames, count, tag)
+        for row, reason in image.refused:
+            if reason is Check.RANGE:
                 image.values[image.codec.row_of == row] = 1e9
-        return foreign
+        return unknown
 
     monkeypatch.setattr(ReceiveImage, "accept_each", accept_anything)
     with pytest.raises(Finding, match="left its range"):
         run_image("HAL, every cycle")
 
 
-def test_a_drive_without_its_own_limit_is_found(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_fuzzer_finds_a_drive_without_torque_limit(monkeypatch: pytest.MonkeyPatch) -> None:
     command = Drives.command
 
     def command_without_limit(drives: Drives, *arguments: Any) -> None:

@@ -5,7 +5,7 @@ import pytest
 from atalante_hal.closing import Closing
 
 
-class Door(Closing):
+class Resource(Closing):
     closed = 0
 
     def close(self) -> None:
@@ -13,21 +13,21 @@ class Door(Closing):
 
 
 def test_with_block_returns_the_object_and_closes_it_once() -> None:
-    with Door() as door:
-        assert door.closed == 0
-    assert door.closed == 1
+    with Resource() as resource:
+        assert resource.closed == 0
+    assert resource.closed == 1
 
 
 def test_error_in_the_block_closes_the_object_and_is_raised() -> None:
-    door = Door()
-    with pytest.raises(KeyError), door:
+    resource = Resource()
+    with pytest.raises(KeyError), resource:
         raise KeyError
-    assert door.closed == 1
+    assert resource.closed == 1
 
 
 def test_subclass_without_close_cannot_be_constructed() -> None:
-    class Hole(Closing):
+    class Unclosable(Closing):
         pass
 
     with pytest.raises(TypeError, match="close"):
-        Hole()  # type: ignore[abstract]
+        Unclosable()  # type: ignore[abstract]

@@ -1,4 +1,4 @@
-"""Compiled functions: same results and errors as Python, and no outdated code from the cache."""
+"""Compiled functions have the same results and errors as in Python, and the cache never returns outdated machine code."""
 
 from __future__ import annotations
 
@@ -30,8 +30,8 @@ def total(values: Any, limit: float) -> float:
     return sum_
 
 
-def beyond(values: Any, place: int) -> float:
-    return float(values[place])
+def element(values: Any, index: int) -> float:
+    return float(values[index])
 
 
 def test_compiled_function_returns_the_same_as_python() -> None:
@@ -43,7 +43,7 @@ def test_specialised_function_gives_the_same_result_and_checks_bounds(monkeypatc
     values = np.random.default_rng(0).standard_normal(100)
     assert specialised(total, values, 0.0)(values, 1.5) == total(values, 1.5)
     with pytest.raises(IndexError):
-        specialised(beyond, values, 0)(values, 100)
+        specialised(element, values, 0)(values, 100)
     monkeypatch.setenv("NUMBA_DISABLE_JIT", "1")
     assert specialised(total, values, 1.5) is total
 
@@ -55,7 +55,7 @@ def test_function_is_compiled_only_once() -> None:
 
 def test_index_out_of_bounds_raises_index_error() -> None:
     with pytest.raises(IndexError):
-        compiled(beyond)(np.zeros(3), 3)
+        compiled(element)(np.zeros(3), 3)
 
 
 def test_division_by_zero_raises_zero_division_error() -> None:
@@ -76,10 +76,10 @@ def test_function_is_compiled_without_a_writable_cache(monkeypatch: pytest.Monke
     (tmp_path / "atalante").write_text("a file where the folder should be")
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     assert module._folder(total) is None  # type: ignore[arg-type]
-    assert compiled(_kept_nowhere)(2.0) == 4.0
+    assert compiled(_squared)(2.0) == 4.0
 
 
-def _kept_nowhere(x: float) -> float:
+def _squared(x: float) -> float:
     return x * x
 
 
@@ -144,11 +144,11 @@ def test_compilation_is_logged_once(
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     caplog.set_level("INFO", logger=module.__name__)
     for _ in range(2):
-        assert compiled(_changed(_told))(2.0) == 8.0
-    assert [record.getMessage() for record in caplog.records] == [f"compiling {__name__}._told"]
+        assert compiled(_changed(_cubed))(2.0) == 8.0
+    assert [record.getMessage() for record in caplog.records] == [f"compiling {__name__}._cubed"]
 
 
-def _told(x: float) -> float:
+def _cubed(x: float) -> float:
     return x * x * x
 
 

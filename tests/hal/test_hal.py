@@ -23,7 +23,7 @@ def torques(rig) -> np.ndarray:
     return np.array([commands[j.split("_")[0]][f"{j.split('_')[1]}_TargetTorque"] for j in JOINTS])
 
 
-def test_start_up_goes_from_off_to_ready_to_active(rig):
+def test_start_passes_off_ready_and_active(rig):
     assert rig.cycle().supervisor is S.OFF
     rig.until(S.READY)
     assert rig.controlwords() == {Controlword.QUICK_STOP}
@@ -75,7 +75,7 @@ def test_joint_position_is_motor_position_over_gear(rig):
     state = rig.until(S.ACTIVE)
     record, layout = rig.hal.record, rig.hal.layout
     assert np.allclose(record[layout["motor_position"]] / 100.0, state.position, rtol=1e-12)
-    assert np.allclose(rig.emulator.body.position, state.position, atol=5e-3)  # one millisecond later
+    assert np.allclose(rig.emulator.body.position, state.position, atol=5e-3)  # the body has moved for another 1 ms
     assert np.allclose(np.linalg.norm(state.imu_quaternion, axis=1), 1.0, atol=1e-3)
     assert state.imu_accel[1] == pytest.approx([0, 0, 9.81], abs=0.5)
 
@@ -141,6 +141,22 @@ def test_failing_bus_leads_to_hold_and_raises_nothing(make_rig, monkeypatch, err
     assert rig.run(50).supervisor is S.HOLD
 
 
+def test_reason_in_hold_follows_the_error_of_the_bus(rig):
+    rig.until(S.ACTIVE)
+
+    def refuse(frames):
+        raise error
+
+    rig.bus.to_nodes = refuse
+    for text in ("can0 is down", "can0 was removed"):
+        error = BusDown(text)
+        assert rig.run(3).supervisor is S.HOLD
+        assert rig.hal.reason.endswith(text)
+    rig.bus.to_nodes = lambda frames: frames
+    rig.run(50)
+    assert rig.hal.reason.endswith("can0 was removed")
+
+
 def test_stop_leaves_every_drive_holding(rig):
     rig.until(S.ACTIVE)
     rig.hal.stop()
@@ -179,9 +195,9 @@ def test_every_frame_sent_decodes_with_cantools(rig):
 def test_state_contains_the_limited_torque_of_the_last_command(rig):
     rig.until(S.ACTIVE)
     state = rig.hal.read()
-    asked = state.torque_sent + 1e3
-    rig.hal.write(Command(asked, np.zeros(8)))
-    assert (rig.hal.read().torque_sent < asked).all()
+    requested = state.torque_sent + 1e3
+    rig.hal.write(Command(requested, np.zeros(8)))
+    assert (rig.hal.read().torque_sent < requested).all()
     before = state.torque_sent.copy()
     little = before - 0.1
     sent = rig.hal.write(Command(little, np.zeros(8)))
@@ -190,10 +206,18 @@ def test_state_contains_the_limited_torque_of_the_last_command(rig):
     assert rig.hal.read().torque_sent.tobytes() == little.tobytes()
 
 
-def test_joint_outside_the_guide_is_only_reported(rig):
+def test_joint_outside_the_guide_is_pending_and_outside_for_long_leads_to_full_assist(rig):
     rig.until(S.ACTIVE)
     assert rig.walk(5, outside=True).supervisor is S.ACTIVE
-    assert rig.seen("GUIDE_OUTSIDE") == [("GUIDE_OUTSIDE", "info")]
+    assert rig.events_of("GUIDE_OUTSIDE") == [("GUIDE_OUTSIDE", "warning")]
+    assert rig.walk(5, outside=True, guide_left=True).supervisor is S.FULL_ASSIST
+    assert rig.events_of("GUIDE_OUTSIDE")[-1] == ("GUIDE_OUTSIDE", "warning")
+
+
+def test_step_start_outside_the_hand_over_box_is_pending(rig):
+    rig.until(S.ACTIVE)
+    assert rig.walk(5, hand_over_exceeded=True).supervisor is S.ACTIVE
+    assert rig.events_of("GUIDE_OUTSIDE") == [("GUIDE_OUTSIDE", "warning")]
 
 
 def test_record_lists_diagnostics_and_status_the_most_severe(rig):
@@ -205,10 +229,10 @@ def test_record_lists_diagnostics_and_status_the_most_severe(rig):
     assert Dtc.NODE_TIMEOUT in dtcs_of(int(rig.hal.record[diagnostics][0]))
     rig.run(100)
     status = next(f for f in reversed(rig.sent) if f["can_id"][0] == 0x700)
-    said = database().decode_message(0x700, status["data"][0, :24].tobytes(), decode_choices=False)
-    assert said["DiagnosticCode"] == number_of(Dtc.NODE_TIMEOUT.bit)
-    assert said["HalState"] == S.HOLD
-    assert (said["DbcHash"], said["ConfigHash"]) == (rig.hal.network.hash32, rig.hal.robot.hash32)
+    status_values = database().decode_message(0x700, status["data"][0, :24].tobytes(), decode_choices=False)
+    assert status_values["DiagnosticCode"] == number_of(Dtc.NODE_TIMEOUT.bit)
+    assert status_values["HalState"] == S.HOLD
+    assert (status_values["DbcHash"], status_values["ConfigHash"]) == (rig.hal.network.hash32, rig.hal.robot.hash32)
 
 
 def test_status_contains_gait_hash_and_step(make_rig):
@@ -216,8 +240,8 @@ def test_status_contains_gait_hash_and_step(make_rig):
     rig.until(S.ACTIVE)
     rig.walk(120, step=70000)
     status = next(f for f in reversed(rig.sent) if f["can_id"][0] == 0x700)
-    said = database().decode_message(0x700, status["data"][0, :24].tobytes(), decode_choices=False)
-    assert (said["GaitHash"], said["Step"]) == (0xCAFE, 70000 & 0xFFFF)
+    status_values = database().decode_message(0x700, status["data"][0, :24].tobytes(), decode_choices=False)
+    assert (status_values["GaitHash"], status_values["Step"]) == (0xCAFE, 70000 & 0xFFFF)
 
 
 def test_exception_sends_the_prepared_hold_frame(rig):
@@ -259,11 +283,11 @@ def test_short_cycle_gap_is_reported_as_warning(rig):
     rig.until(S.ACTIVE)
     rig.hal.report(Dtc.CYCLE_GAP, "no cycle began for 4 ms", confirmed=False, value=0.004)
     assert rig.cycle().supervisor is S.ACTIVE
-    assert rig.seen("CYCLE_GAP") == [("CYCLE_GAP", "warning")]
+    assert rig.events_of("CYCLE_GAP") == [("CYCLE_GAP", "warning")]
 
 
 def test_stop_on_a_dead_bus_takes_a_bounded_time(network, robot, monkeypatch):
-    """No node answers, and simulated time passes only while the HAL waits."""
+    """No node answers. Simulated time passes only while the HAL waits."""
     import atalante_hal.hal as module
     import atalante_hal.transceiver as transceiver
 

@@ -24,7 +24,7 @@ S = SupervisorState
 
 
 class Recorder:
-    """Controller that counts its calls, and fails at call `fail_at`."""
+    """Controller that counts its calls, and raises an exception at call `fail_at`."""
 
     telemetry_fields = (("calls", 1),)
 
@@ -44,7 +44,7 @@ class Recorder:
 
 
 class Late:
-    """Clock that is late in the given cycles."""
+    """Clock that is late in given cycles: `lateness` has the lateness [s] by cycle number."""
 
     def __init__(self, lateness: dict[int, float]) -> None:
         self.lateness, self.cycle = lateness, 0
@@ -142,7 +142,7 @@ def test_loop_slower_than_the_monotonic_clock_leads_to_hold(make_rig, busy, expe
     assert bool(overruns) is (expected is S.HOLD)
     if overruns:
         assert overruns[0].value > DRIFT_TO_HOLD
-        # 5 ms are lost after 5 ms / (busy - 1 ms) cycles. The next cycle detects it, and the cycle after that is in HOLD.
+        # The loop is 5 ms behind after 5 ms / (busy - 1 ms) cycles. The next cycle detects this, and one cycle later HOLD begins.
         assert states.count(S.ACTIVE) <= DRIFT_TO_HOLD / (busy - 1e-3) + 3
 
 
@@ -246,7 +246,7 @@ def test_cycles_missed_by_a_late_wake_up_are_skipped():
     for cycle in range(3):
         assert clock.wait() == pytest.approx(0.0, abs=1e-12), cycle
     assert now[0] == pytest.approx(24e-3)
-    oversleeps[0] = 0.5e-3  # less than a period: the deadlines stay where they are
+    oversleeps[0] = 0.5e-3  # less than a period, so the deadlines are not moved
     assert clock.wait() == pytest.approx(0.5e-3)
     oversleeps[0] = 0.0
     assert clock.wait() == pytest.approx(0.0, abs=1e-12)

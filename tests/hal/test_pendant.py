@@ -13,7 +13,7 @@ from atalante_hal.wire.codec import Codec
 from atalante_hal.wire.process_image import ReceiveImage
 
 NETWORK = load()
-#: The values of other messages surround those of the pendant.
+#: Codec in which the values of other messages are before and after those of the pendant.
 CODEC = Codec([NETWORK.message(name) for name in ("LEFT_SK_STATE", "PENDANT_STATE", "IMU_TORSO_STATE")])
 START, STOP, HOLD = 1, 2, 3
 
@@ -27,7 +27,7 @@ def send(
     pendant: Pendant, dead_man: int = 1, request: int = 0, press: int = 0, factor: float = 0.0, factor_set: int = 0
 ):
     pendant.signals[:] = dead_man, request, press, factor, factor_set
-    pendant.hear(True)
+    pendant.evaluate(True)
 
 
 def test_pendant_finds_its_row_in_the_process_image(pendant: Pendant):
@@ -38,13 +38,14 @@ def test_nothing_is_pressed_before_the_first_frame(pendant: Pendant):
     assert (pendant.dead_man, pendant.stop_requested, pendant.started, pendant.assistance_factor) == (False,) * 3 + (
         None,
     )
-    assert pendant.heard == b""
+    assert pendant.hold_requested is False
+    assert pendant.evaluated == b""
 
 
 def test_dead_man_follows_its_signal(pendant: Pendant):
     send(pendant, dead_man=1)
     assert pendant.dead_man
-    assert pendant.heard == pendant.signals.tobytes()
+    assert pendant.evaluated == pendant.signals.tobytes()
     send(pendant, dead_man=0)
     assert not pendant.dead_man
 
@@ -76,15 +77,15 @@ def test_each_start_press_counts_once(pendant: Pendant):
 
 def test_presses_while_the_pendant_is_lost_do_not_count(pendant: Pendant):
     send(pendant, request=STOP, press=1)
-    pendant.hear(False)
+    pendant.evaluate(False)
     assert [pendant.dead_man, pendant.stop_requested, pendant.started] == [False] * 3
-    assert pendant.heard == b""
+    assert pendant.evaluated == b""
     send(pendant, request=START, press=2)
     assert pendant.dead_man
     assert not pendant.started
     send(pendant, request=START, press=3)
     assert pendant.started
-    pendant.hear(False)
+    pendant.evaluate(False)
     assert not pendant.started
 
 
@@ -96,56 +97,79 @@ def test_assistance_factor_follows_the_dial_only_while_it_is_set(pendant: Pendan
 
 
 def others(*frames: tuple[int, int, int]) -> list[np.ndarray]:
-    """Return the decoded values of further frames of a cycle, given dead-man, request and press counter of each."""
+    """Return the decoded values of further frames of a cycle. Arguments: (dead-man, request, press counter) of each frame."""
     values = np.zeros((len(frames), CODEC.size))
     columns = [CODEC.index("PENDANT_STATE", name) for name in ("DeadMan", "Request", "RequestCounter")]
     values[:, columns] = frames
     return list(values)
 
 
-@given(st.lists(st.tuples(st.booleans(), st.booleans()), min_size=1, max_size=4))
-def test_safest_demand_contains_every_stop_and_dead_man_release(demands: list[tuple[bool, bool]]):
+@given(st.lists(st.tuples(st.booleans(), st.booleans(), st.booleans()), min_size=1, max_size=4))
+def test_safest_demand_contains_every_stop_and_dead_man_release(demands: list[tuple[bool, bool, bool]]):
     found = safest([Demand(*demand) for demand in demands])
-    assert found.dead_man is all(dead_man for dead_man, _ in demands)
-    assert found.stop is any(stop for _, stop in demands)
+    assert found.dead_man is all(dead_man for dead_man, _, _ in demands)
+    assert found.stop is any(stop for _, stop, _ in demands)
+    assert found.hold is any(hold for _, _, hold in demands)
 
 
 @pytest.mark.parametrize(
-    ("request_", "stop"), [(0, False), (START, False), (STOP, True), (HOLD, True), (4, True), (7, True)]
+    ("request_", "stop", "hold"),
+    [
+        (0, False, False),
+        (START, False, False),
+        (STOP, True, False),
+        (HOLD, True, True),
+        (4, True, True),
+        (7, True, True),
+    ],
 )
-def test_unknown_request_counts_as_stop(request_: int, stop: bool):
-    assert demand_of([1.0, request_, 0.0, 0.0, 0.0]) == (True, stop)
-    assert demand_of([0.0, request_, 0.0, 0.0, 0.0]) == (False, stop)
+def test_unknown_request_counts_as_hold(request_: int, stop: bool, hold: bool):
+    assert demand_of([1.0, request_, 0.0, 0.0, 0.0]) == (True, stop, hold)
+    assert demand_of([0.0, request_, 0.0, 0.0, 0.0]) == (False, stop, hold)
+
+
+def test_hold_request_is_not_hidden_by_a_stop_of_another_frame(pendant: Pendant):
+    send(pendant, request=STOP)
+    assert not pendant.hold_requested
+    pendant.evaluate(True, further_frames=others((1, HOLD, 0)))
+    assert pendant.hold_requested
+    send(pendant, request=HOLD)
+    assert pendant.hold_requested
+    pendant.evaluate(False, qualifying=True)
+    assert not pendant.hold_requested
+    send(pendant, request=HOLD)
+    pendant.evaluate(False)
+    assert not pendant.hold_requested
 
 
 def test_safest_of_several_frames_counts_in_its_cycle(pendant: Pendant):
     pendant.signals[:] = 1, 0, 0, 0.5, 1
-    pendant.hear(True, beside=others((1, STOP, 0)))
+    pendant.evaluate(True, further_frames=others((1, STOP, 0)))
     assert (pendant.dead_man, pendant.stop_requested) == (True, True)
-    pendant.hear(True, beside=others((1, 0, 0), (0, 0, 0)))
+    pendant.evaluate(True, further_frames=others((1, 0, 0), (0, 0, 0)))
     assert (pendant.dead_man, pendant.stop_requested) == (False, False)
-    pendant.hear(True)
+    pendant.evaluate(True)
     assert (pendant.dead_man, pendant.stop_requested, pendant.assistance_factor) == (True, False, 0.5)
     pendant.signals[:2] = 0, STOP
-    pendant.hear(True, beside=others((1, 0, 0)))
+    pendant.evaluate(True, further_frames=others((1, 0, 0)))
     assert (pendant.dead_man, pendant.stop_requested) == (False, True)
 
 
 def test_press_in_a_cycle_with_different_frames_counts_one_cycle_later(pendant: Pendant):
     send(pendant, press=3)
     pendant.signals[:3] = 1, START, 4
-    pendant.hear(True, beside=others((1, 0, 3)))
+    pendant.evaluate(True, further_frames=others((1, 0, 3)))
     assert not pendant.started
-    pendant.hear(True)
+    pendant.evaluate(True)
     assert pendant.started
-    pendant.hear(True)
+    pendant.evaluate(True)
     assert not pendant.started
 
 
 def test_press_of_a_second_sender_does_not_count(pendant: Pendant):
     send(pendant, request=START, press=3)
     pendant.signals[:3] = 1, START, 9
-    pendant.hear(True, beside=others((1, START, 3)))
+    pendant.evaluate(True, further_frames=others((1, START, 3)))
     assert not pendant.started
     send(pendant, request=START, press=3)
     assert not pendant.started
@@ -153,11 +177,11 @@ def test_press_of_a_second_sender_does_not_count(pendant: Pendant):
 
 def qualify(pendant: Pendant, dead_man: int = 1, request: int = 0, press: int = 0):
     pendant.signals[:] = dead_man, request, press, 0.5, 1
-    pendant.hear(False, qualifying=True)
+    pendant.evaluate(False, qualifying=True)
     assert (pendant.dead_man, pendant.stop_requested, pendant.started, pendant.assistance_factor) == (False,) * 3 + (
         None,
     )
-    assert pendant.heard == pendant.signals.tobytes()
+    assert pendant.evaluated == pendant.signals.tobytes()
 
 
 def test_press_before_qualification_counts_once_after_it(pendant: Pendant):
@@ -195,22 +219,35 @@ def test_press_without_dead_man_is_not_kept(pendant: Pendant):
     assert not pendant.started
 
 
-@pytest.mark.parametrize("beside", [(0, 0, 0), (1, STOP, 0)])
-def test_stop_of_a_second_sender_clears_a_kept_press(pendant: Pendant, beside: tuple[int, int, int]):
+def test_start_is_evaluated_only_in_a_cycle_with_a_new_frame(pendant: Pendant):
+    send(pendant, request=START, press=3)
+    pendant.signals[:] = 1, START, 4, 0.0, 0  # of a second sender, in a cycle with further frames
+    pendant.evaluate(True, further_frames=others((1, START, 3)))
+    pendant.evaluate(True, new=False)  # no frame arrives
+    assert pendant.dead_man
+    assert not pendant.started
+    send(pendant, request=START, press=3)
+    assert not pendant.started
+    send(pendant, request=START, press=4)
+    assert pendant.started
+
+
+@pytest.mark.parametrize("further", [(0, 0, 0), (1, STOP, 0)])
+def test_stop_of_a_second_sender_clears_a_kept_press(pendant: Pendant, further: tuple[int, int, int]):
     qualify(pendant, press=6)
     qualify(pendant, request=START, press=7)
-    pendant.hear(False, qualifying=True, beside=others(beside))
+    pendant.evaluate(False, qualifying=True, further_frames=others(further))
     qualify(pendant, request=START, press=7)
     send(pendant, request=START, press=7)
     assert not pendant.started
 
 
 def test_kept_press_is_cleared_by_state_change_or_pendant_loss(pendant: Pendant):
-    for drop in (pendant.forget_press, lambda: pendant.hear(False)):
+    for drop in (pendant.clear_press, lambda: pendant.evaluate(False)):
         qualify(pendant, press=6)
         qualify(pendant, request=START, press=7)
         drop()
         qualify(pendant, request=START, press=7)
-        pendant.hear(True)
+        pendant.evaluate(True)
         assert not pendant.started
         pendant.assistance_factor = None

@@ -18,8 +18,8 @@ FIELDS = st.lists(
 @given(FIELDS)
 def test_slices_cover_the_vector_in_order_without_gaps(fields: list[tuple[str, int]]) -> None:
     layout = Layout(fields)
-    places = list(range(layout.size))
-    assert [place for name in layout for place in places[layout[name]]] == places
+    indices = list(range(layout.size))
+    assert [index for name in layout for index in indices[layout[name]]] == indices
     assert [(name, layout[name].stop - layout[name].start) for name in layout] == fields
 
 

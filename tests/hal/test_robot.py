@@ -14,14 +14,14 @@ from atalante_hal.robot import JOINTS, MIRROR_SIGN, MOTORS, ROBOT_FILE, RobotErr
 TEXT = ROBOT_FILE.read_text()
 
 
-def test_twelve_joints_and_eight_motors():
+def test_robot_has_twelve_joints_and_eight_motors():
     assert len(JOINTS) == 12
     assert JOINTS[2] == "left_SH"
     assert JOINTS[9] == "right_SK"
     assert len(MOTORS) == len(set(MOTORS)) == 8
 
 
-def test_the_right_leg_mirrors_the_left():
+def test_right_leg_mirrors_the_left_leg():
     robot = load_robot()
     sign = np.array(MIRROR_SIGN)
     low, high = robot.position_min, robot.position_max

@@ -21,7 +21,7 @@ CYCLIC = [NETWORK.message(name) for name in ("LEFT_SK_STATE", "RIGHT_SK_STATE")]
 
 
 class Clock:
-    """Simulated clock: time passes only while the bus waits; an endless loop fails."""
+    """Simulated clock: time passes only while the bus waits. An endless loop fails the test."""
 
     def __init__(self) -> None:
         self.now, self.looks = 64.0, 0
@@ -36,7 +36,7 @@ class Clock:
 
 
 class Bus:
-    """Bus of lists: the sent frames, and the frames that each `receive` delivers."""
+    """Bus that stores sent frames in the list `sent`. Each `receive` returns the next frames of the list `arrivals`."""
 
     name, dropped, stamps = "bench", 0, np.zeros(256, np.int64)
 
@@ -87,7 +87,7 @@ class Desk:
         self.transceiver = Transceiver(NETWORK, "HAL", self.bus, self.tap, cyclic=len(CYCLIC), surplus=SURPLUS)
         self.cycle = 0
 
-    def judge(self) -> dict[str, bool]:
+    def evaluate(self) -> dict[str, bool]:
         self.cycle += 1
         for finding in self.transceiver.faults():
             self.memory.raise_finding(self.cycle, finding)
@@ -104,7 +104,7 @@ def desk(monkeypatch: pytest.MonkeyPatch) -> Desk:
 
 def test_new_transceiver_has_no_diagnostics(desk: Desk):
     assert desk.transceiver.quiet is True
-    assert desk.judge() == {}
+    assert desk.evaluate() == {}
     assert desk.transceiver.quiet is True
 
 
@@ -160,27 +160,27 @@ def test_full_queue_is_confirmed_after_five_cycles_in_a_row(desk: Desk):
         desk.transceiver.send(batch)
         desk.transceiver.send(batch)
         assert not desk.transceiver.quiet
-        assert desk.judge() == {"BUS_TX_FULL": cycle >= 5}
+        assert desk.evaluate() == {"BUS_TX_FULL": cycle >= 5}
         assert not desk.transceiver.quiet
     assert desk.memory.events[0].text == "no room"
     assert desk.memory.events[0].value == 3
     desk.bus.refuses = None
     desk.transceiver.send(batch)
-    assert desk.judge() == {}
+    assert desk.evaluate() == {}
     assert desk.transceiver.quiet
     desk.bus.refuses = BusFull("no room", 3)
     desk.transceiver.send(batch)
-    assert desk.judge() == {"BUS_TX_FULL": False}
+    assert desk.evaluate() == {"BUS_TX_FULL": False}
 
 
 def test_bus_down_while_sending_is_confirmed_immediately(desk: Desk):
     desk.bus.refuses = BusDown("gone")
     desk.transceiver.send(sync(desk))
-    assert desk.judge() == {"BUS_DOWN": True}
+    assert desk.evaluate() == {"BUS_DOWN": True}
     event = desk.memory.events[0]
     assert (event.text, event.value, event.node) == ("the bus bench cannot send: gone", 0.0, "HAL")
     assert desk.tap.sent_ids == []
-    assert desk.judge() == {}
+    assert desk.evaluate() == {}
 
 
 # -- receiving ---------------------------------------------------------------------------------------------------------
@@ -195,9 +195,9 @@ def test_received_frames_are_appended(desk: Desk):
     assert desk.bus.timeouts == [0.0, 0.0]
 
 
-def image(*heard: int) -> ReceiveImage:
+def image(*received: int) -> ReceiveImage:
     made = ReceiveImage(CYCLIC)
-    made.age[list(heard)] = 0
+    made.age[list(received)] = 0
     return made
 
 
@@ -207,7 +207,7 @@ def test_complete_cycle_is_returned_without_waiting(desk: Desk):
     assert desk.bus.timeouts == [0.0]
 
 
-def test_receive_waits_for_nodes_that_are_alive(desk: Desk):
+def test_receive_waits_for_nodes_that_have_not_timed_out(desk: Desk):
     first, second = (m.frame_id for m in CYCLIC)
     desk.bus.arrivals = [ids(first), ids(7), ids(second), ids(8)]
     assert desk.transceiver.receive(0, image(0, 1), 60.0) == 3
@@ -232,13 +232,13 @@ def test_frames_of_the_last_cycle_do_not_complete_this_cycle(desk: Desk):
     assert desk.transceiver.receive(2, image(0, 1), 60.0) == 4
 
 
-def test_receive_does_not_wait_for_silent_nodes(desk: Desk):
+def test_receive_does_not_wait_for_nodes_that_timed_out(desk: Desk):
     desk.bus.arrivals = [ids(CYCLIC[0].frame_id), ids(9)]
     assert desk.transceiver.receive(0, image(0), 60.0) == 1
     assert len(desk.bus.timeouts) == 1
 
 
-def test_without_known_nodes_receive_waits_until_no_frame_arrives(desk: Desk):
+def test_receive_waits_until_no_frame_arrives_if_no_node_has_answered_yet(desk: Desk):
     desk.bus.arrivals = [ids(1), ids(2), ids(3)]
     assert desk.transceiver.receive(0, image(), 60.0) == 3
     assert desk.bus.timeouts == pytest.approx([0.0, 0.1, 0.1, 0.1])
@@ -259,6 +259,34 @@ def test_wait_is_short_after_a_failed_sync(desk: Desk, refusal: BusError):
     assert desk.bus.timeouts == [0.0, 60.0]
 
 
+def test_wait_is_halved_for_each_sync_that_a_node_did_not_answer(desk: Desk):
+    first, second = (m.frame_id for m in CYCLIC)
+    alive = image(0, 1)
+    for age, arrivals, patience, timeouts in (
+        (1, [ids(first)], 2.0, [0.0, 1.0]),
+        (2, [ids(first)], 2.0, [0.0, 0.5]),
+        (5, [ids(first)], 2.0, [0.0, 0.1]),
+        (2, [ids(first)], 0.03, [0.0, 0.03]),
+        (2, [ids(7), ids(first), ids(second)], 2.0, [0.0, 2.0, 0.5]),
+    ):
+        alive.age[1] = age
+        desk.bus.timeouts.clear()
+        desk.bus.arrivals = arrivals
+        desk.transceiver.receive(0, alive, patience)
+        assert desk.bus.timeouts == pytest.approx(timeouts)
+
+
+def test_dead_node_costs_less_than_twice_the_patience_until_it_times_out(desk: Desk):
+    first = CYCLIC[0].frame_id
+    alive = image(0, 1)
+    begun = desk.clock.now
+    for _ in range(2 * CYCLIC[1].timeout_ms):
+        desk.bus.arrivals = [ids(first)]
+        desk.transceiver.receive(0, alive, 2.0)
+        alive.age[1] += 1
+    assert desk.clock.now - begun == pytest.approx(2.0 + 1.0 + 0.5 + 0.25 + 0.125 + 0.1)
+
+
 def test_receive_does_not_wait_without_patience(desk: Desk):
     desk.bus.arrivals = [ids(1), ids(2)]
     assert desk.transceiver.receive(0, image(0, 1), 0.0) == 1
@@ -276,23 +304,23 @@ def test_flood_is_confirmed_after_five_cycles_in_a_row(desk: Desk):
     for cycle in range(1, 8):
         desk.bus.arrivals = [ids(*range(usual + 1))]
         desk.transceiver.receive()
-        assert desk.judge() == {"BUS_FLOOD": cycle >= 5}
+        assert desk.evaluate() == {"BUS_FLOOD": cycle >= 5}
         assert not desk.transceiver.quiet
     event = desk.memory.events[0]
     assert (event.value, event.text) == (usual + 1, f"HAL: {Dtc.BUS_FLOOD.meaning}")
     desk.bus.arrivals = [ids(*range(usual))]
     desk.transceiver.receive()
-    assert desk.judge() == {}
+    assert desk.evaluate() == {}
     assert desk.transceiver.quiet
     desk.bus.arrivals = [ids(*range(usual + 1))]
     desk.transceiver.receive()
-    assert desk.judge() == {"BUS_FLOOD": False}
+    assert desk.evaluate() == {"BUS_FLOOD": False}
 
 
 def test_bus_down_while_receiving_is_reported_and_not_raised(desk: Desk):
     desk.bus.arrivals = [BusDown("gone")]
     assert desk.transceiver.receive(1) == 1
-    assert desk.judge() == {"BUS_DOWN": True}
+    assert desk.evaluate() == {"BUS_DOWN": True}
     event = desk.memory.events[0]
     assert (event.text, event.value, event.node) == ("the bus bench cannot receive: gone", 0.0, "HAL")
     desk.bus.arrivals = [ids(1), BusDown("gone")]
@@ -315,16 +343,15 @@ def test_bus_down_while_receiving_is_reported_and_not_raised(desk: Desk):
         (0x700, "HAL_DUPLICATE", 0x700),
         (ID_ERROR | 0x40, "BUS_OFF", 0x40),
         (ID_ERROR | 0x44, "BUS_OFF", 0x44),
-        (ID_ERROR | 0x04, None, 0),
     ],
 )
-def test_foreign_frames_raise_their_diagnostic(desk: Desk, can_id: int, code: str | None, value: int):
+def test_foreign_frames_raise_their_diagnostic(desk: Desk, can_id: int, code: str, value: int):
     desk.transceiver.foreign(ids(can_id))
-    assert desk.transceiver.quiet is (code is None)
-    assert desk.judge() == ({code: True} if code else {})
-    assert [e.value for e in desk.memory.events] == ([value] if code else [])
+    assert desk.transceiver.quiet is False
+    assert desk.evaluate() == {code: True}
+    assert [e.value for e in desk.memory.events] == [value]
     desk.transceiver.acknowledge()
-    assert desk.judge() == {}
+    assert desk.evaluate() == {}
     assert desk.transceiver.quiet
 
 
@@ -332,16 +359,16 @@ def test_bus_off_lasts_until_it_is_acknowledged(desk: Desk):
     desk.transceiver.foreign(ids(ID_ERROR | 0x40))
     assert desk.transceiver.faults() == [Finding(Dtc.BUS_OFF, "HAL", 0x40, True, "")]
     for _ in range(3):
-        assert desk.judge() == {"BUS_OFF": True}
+        assert desk.evaluate() == {"BUS_OFF": True}
         assert not desk.transceiver.quiet
     desk.transceiver.acknowledge()
-    assert desk.judge() == {}
+    assert desk.evaluate() == {}
     assert desk.transceiver.quiet
 
 
 def test_several_foreign_frames_raise_all_diagnostics(desk: Desk):
     desk.transceiver.foreign(ids(0x7FF, ID_ERROR | 0x40, 0x100))
-    assert desk.judge() == {"FRAME_UNKNOWN": True, "BUS_OFF": True, "HAL_DUPLICATE": True}
+    assert desk.evaluate() == {"FRAME_UNKNOWN": True, "BUS_OFF": True, "HAL_DUPLICATE": True}
     assert {e.text for e in desk.memory.events} == {
         "id 0x7FF is not a message to this HAL",
         "HAL: the CAN controller is bus-off",
@@ -364,7 +391,7 @@ def test_listen_accepts_frames_of_nodes(desk: Desk):
     desk.transceiver.listen(0.25)
     assert desk.bus.arrivals == []
     assert desk.bus.timeouts == [0.25] * 3
-    assert desk.judge() == {}
+    assert desk.evaluate() == {}
 
 
 def test_listen_ignores_old_frames_in_the_buffer(desk: Desk):
@@ -384,7 +411,7 @@ def test_discard_drops_all_queued_frames(desk: Desk):
     desk.bus.arrivals = [ids(*range(RECEIVE_BUDGET)), ids(*range(RECEIVE_BUDGET)), ids(1), ids(2)]
     desk.transceiver.discard()
     assert len(desk.bus.arrivals) == 1
-    assert desk.judge() == {}
+    assert desk.evaluate() == {}
 
 
 def test_discard_is_bounded_under_a_flood(desk: Desk):
@@ -396,7 +423,7 @@ def test_discard_is_bounded_under_a_flood(desk: Desk):
 def test_bus_down_during_discard_is_reported_and_not_raised(desk: Desk):
     desk.bus.arrivals = [BusDown("gone")]
     desk.transceiver.discard()
-    assert desk.judge() == {"BUS_DOWN": True}
+    assert desk.evaluate() == {"BUS_DOWN": True}
     event = desk.memory.events[0]
     assert (event.text, event.value) == ("the bus bench cannot receive: gone", 0.0)
 
@@ -406,3 +433,37 @@ def test_transceiver_works_without_a_tap(desk: Desk):
     desk.bus.arrivals = [ids(1)]
     desk.transceiver.send(sync(desk))
     assert desk.transceiver.receive() == 1
+
+
+def test_error_frames_are_counted_and_confirmed_after_16_cycles(desk: Desk):
+    for cycle in range(1, 19):
+        desk.transceiver.foreign(ids(ID_ERROR | 0x88, ID_ERROR | 0x04))
+        assert not desk.transceiver.quiet
+        assert desk.evaluate() == {"BUS_ERROR": cycle >= 16}
+        assert desk.transceiver.error_frames == 2 * cycle
+    entry = desk.memory.active[Dtc.BUS_ERROR, "HAL"]
+    assert entry.value == 36
+    assert entry.text == "36 error frames on bench so far: check wiring, termination and bit timing"
+    for _ in range(15):
+        assert not desk.transceiver.quiet
+        assert desk.evaluate() == {"BUS_ERROR": True}
+    assert desk.evaluate() == {}
+
+
+def test_error_frames_in_a_fifth_of_the_cycles_are_never_confirmed(desk: Desk):
+    for _ in range(100):
+        desk.transceiver.foreign(ids(ID_ERROR | 0x08))
+        assert desk.evaluate() == {"BUS_ERROR": False}
+        for _ in range(4):
+            assert not desk.transceiver.quiet
+            assert desk.evaluate() == {}
+    for _ in range(12):
+        assert not desk.transceiver.quiet
+        assert desk.evaluate() == {}
+    assert desk.transceiver.quiet
+
+
+def test_bus_off_is_not_counted_as_an_error_frame(desk: Desk):
+    desk.transceiver.foreign(ids(ID_ERROR | 0x40))
+    assert desk.evaluate() == {"BUS_OFF": True}
+    assert desk.transceiver.error_frames == 0

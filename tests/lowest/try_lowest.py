@@ -2,8 +2,8 @@
 
     python tests/lowest/try_lowest.py
 
-or `make lowest`, which installs them first. The script ends with 1 when the version of a direct dependency is not its lower
-bound in pyproject.toml, when a command fails, or when a command does without a library that it should have used.
+or `make lowest`, which first installs these versions. The exit code is 1 if the version of a direct dependency is not its lower
+bound in pyproject.toml, if a command fails, or if a command skips a part of its work because a library is missing.
 """
 
 from __future__ import annotations
@@ -23,8 +23,8 @@ from packaging.version import Version
 
 ROOT = Path(__file__).resolve().parents[2]
 ATALANTE = Path(sys.executable).with_name("atalante")
-EXTRAS = ("emulator", "telemetry", "plot", "decode", "gaits", "campaign", "dask")
-#: Words of a message with which a command does without a library.
+EXTRAS = ("emulator", "mujoco", "telemetry", "plot", "decode", "gaits", "campaign", "dask")
+#: Texts in the output of a command that skips a part of its work because a library is missing.
 WITHOUT = ("no figure", "nothing is published", "is missing", "not compared")
 
 
@@ -43,7 +43,7 @@ def bound(requirement: Requirement) -> str:
 
 
 def run(*arguments: str | Path) -> None:
-    """Run an `atalante` command and end the script when it fails or does without a library."""
+    """Run an `atalante` command. End the script if the command fails, or skips work because a library is missing."""
     line = " ".join(["atalante", *map(str, arguments)])
     print(line, flush=True)
     done = subprocess.run(
@@ -68,6 +68,7 @@ def main() -> None:
         out = Path(name)
         run("demo", "--steps", "2", "--shape", "constant", "--out", out / "demo", "--can-log", out / "demo.log")
         run("validate", out / "demo.log")
+        run("demo", "--steps", "1", "--shape", "constant", "--engine", "mujoco", "--out", out / "mujoco")
         for suffix in ("mcap", "parquet"):
             run("decode", out / "demo.log", "-o", out / f"signals.{suffix}")
         patient = "--mass", "75", "--height", "175"

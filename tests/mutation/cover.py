@@ -15,7 +15,8 @@ from pathlib import Path
 
 from core import CORE
 
-ROOT = Path(__file__).resolve().parents[2]
+HERE = Path(__file__).resolve().parent
+ROOT = HERE.parents[1]
 #: Root folders of the packages.
 ROOTS = (".", "control", "emulator")
 
@@ -29,14 +30,15 @@ def main() -> int:
     include = ",".join(map(str, files))
     coverage = [sys.executable, "-m", "coverage"]
     with tempfile.TemporaryDirectory() as folder:
-        # Coverage cannot measure compiled functions, so compilation is off.
-        environment = {**os.environ, "COVERAGE_FILE": str(Path(folder) / "coverage"), "NUMBA_DISABLE_JIT": "1"}
+        environment = {**os.environ, "COVERAGE_FILE": str(Path(folder) / "coverage"), "PYTHONPATH": str(HERE)}
         run = [
             "run",
             "--branch",
             f"--include={include}",
             "-m",
             "pytest",
+            "-p",
+            "interpret_core",
             "--hypothesis-profile=coverage",
             "-m",
             "not exhaustive",

@@ -1,8 +1,8 @@
 """Pytest plugin that shortens the test runs of mutants.
 
-A test fails if it takes much longer than without a mutant; mutmut alone would wait for minutes. The plugin also sorts the tests:
-first one parameter set of every test, then the second parameter set of every test, and so on. Most mutants fail with any
-parameters.
+A test fails if it takes much longer than without a mutant. Without this plugin, mutmut would wait for minutes. The plugin also
+sorts the tests: first one parameter set of every test, then the second parameter set of every test, and so on. Most mutants fail
+with any parameters.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from mutmut.state import state
 #: Part of the name of every mutant.
 MUTANT = "__mutmut_"
 
-#: The time limit of a test is the constant part plus a multiple of its usual duration [s of processor time].
+#: The time limit of a test is `CONSTANT` plus `MULTIPLE` times its usual duration [s of processor time].
 CONSTANT, MULTIPLE = 2.0, 4.0
 
 

@@ -43,7 +43,10 @@ SURVIVED = (0, 33)
 NOT_TESTED = (None, 2, 37)
 
 #: Options of pytest. Each mutant runs pytest once, so unnecessary plugins would take most of the time.
-PLUGINS = "-p mutant_time_limit -p _hypothesis_pytestplugin -p no:cacheprovider -p no:unraisableexception -p no:threadexception"
+PLUGINS = (
+    "-p mutant_time_limit -p interpret_core -p _hypothesis_pytestplugin "
+    "-p no:cacheprovider -p no:unraisableexception -p no:threadexception"
+)
 PYPROJECT = """
 [tool.pytest.ini_options]
 testpaths = ["tests"]
@@ -75,7 +78,7 @@ class Mutant:
 
 
 class PartTest:
-    """Mutation test of one part of the safety core, in a directory of its own."""
+    """Mutation test of one part of the safety core. It works in its own directory."""
 
     def __init__(self, part: str) -> None:
         self._part, (self._files, self._tests) = part, CORE[part]
@@ -98,7 +101,7 @@ class PartTest:
                 shutil.rmtree(target)
             shutil.copytree(ROOT / package, target, ignore=shutil.ignore_patterns("__pycache__", ".*", "mutation"))
         if self._sources() != before:
-            # The statistics are out of date: they list the tests that reach each function.
+            # The statistics list the tests that reach each function, so they are out of date after a change of these files.
             (mutants / "mutmut-stats.json").unlink(missing_ok=True)
         text = PYPROJECT.format(
             packages=json.dumps([Path(package).name for package in PACKAGES]),
@@ -130,7 +133,6 @@ class PartTest:
             **os.environ,
             "PYTHONPATH": str(HERE),
             "PYTEST_DISABLE_PLUGIN_AUTOLOAD": "1",
-            "NUMBA_DISABLE_JIT": "1",  # compiled functions have no mutants
             "HYPOTHESIS_STORAGE_DIRECTORY": str(self._work / ".hypothesis"),
         }
         command = [sys.executable, "-m", "mutmut", "run", "--max-children", str(children)]

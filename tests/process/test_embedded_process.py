@@ -1,4 +1,4 @@
-"""The embedded robot in a process of its own: it is there, it dies with its HAL, and its death is one sentence."""
+"""Tests of the embedded robot in a subprocess: it runs, ends with its HAL, and its failure is reported in one sentence."""
 
 from __future__ import annotations
 
@@ -27,8 +27,8 @@ EMBEDDED = Target("embedded", "", lockstep=True)
 LONG = 60.0
 
 
-def gone(pid: int) -> bool:
-    """Whether a process has ended, and been seen off or is nobody's any more."""
+def wait_for_end(pid: int) -> bool:
+    """Wait until a process has ended, reaped or not; return whether it did."""
     give_up = time.monotonic() + LONG
     while time.monotonic() < give_up:
         stat = Path(f"/proc/{pid}/stat")
@@ -38,34 +38,34 @@ def gone(pid: int) -> bool:
     return False
 
 
-def gone_now(pid: int) -> bool:
+def is_reaped(pid: int) -> bool:
     return not Path(f"/proc/{pid}").exists()
 
 
-def test_a_robot_apart_becomes_active_and_is_gone_afterwards(network: Network, robot: Robot) -> None:
+def test_robot_subprocess_becomes_active_and_ends_with_the_session(network: Network, robot: Robot) -> None:
     robot_process = EmbeddedRobot()
     fields = PoseHold.telemetry_fields
     with open_hal(EMBEDDED, network=network, robot=robot, controller_fields=fields, robot_process=robot_process) as rig:
         assert rig.emulator is None
         assert rig.operator is None
-        assert not gone_now(robot_process.pid)
+        assert not is_reaped(robot_process.pid)
         controller = PoseHold(robot)
         watch = Watch(rig, StopRequest(), lambda state: controller.elapsed >= 0.02, lambda state: "")
         rig.run(controller, until=watch)
         watch.conclude()
         assert rig.hal.state.supervisor is SupervisorState.HOLD
-    assert gone_now(robot_process.pid)
+    assert is_reaped(robot_process.pid)
 
 
-def test_robot_and_hal_share_no_core_while_one_is_there() -> None:
+def test_robot_subprocess_and_hal_use_disjoint_cores_until_closed() -> None:
     before = os.sched_getaffinity(0)
     kept, given = halves(before)
     first = EmbeddedRobot()
-    second = EmbeddedRobot()  # loads while the first one walks
+    second = EmbeddedRobot()  # imports its modules while the first robot runs
     assert os.sched_getaffinity(0) == kept
     assert os.sched_getaffinity(first.pid) == os.sched_getaffinity(second.pid) == given
     first.close()
-    first.close()  # a second time, and changes nothing
+    first.close()  # a second close has no effect
     assert os.sched_getaffinity(0) == kept
     second.close()
     assert os.sched_getaffinity(0) == before
@@ -75,11 +75,11 @@ def test_robot_and_hal_share_no_core_while_one_is_there() -> None:
     ("cores", "kept", "given"),
     [({3}, {3}, {3}), ({0, 1}, {0}, {1}), ({5, 1, 2}, {1, 2}, {5}), ({0, 1, 2, 3}, {0, 1}, {2, 3})],
 )
-def test_the_cores_are_halved(cores: set[int], kept: set[int], given: set[int]) -> None:
+def test_cores_are_split_into_halves(cores: set[int], kept: set[int], given: set[int]) -> None:
     assert halves(cores) == (kept, given)
 
 
-def test_a_killed_robot_ends_the_run_in_one_sentence(network: Network, robot: Robot) -> None:
+def test_killed_robot_subprocess_fails_the_run_with_one_sentence(network: Network, robot: Robot) -> None:
     robot_process = EmbeddedRobot()
     fields = PoseHold.telemetry_fields
     with open_hal(EMBEDDED, network=network, robot=robot, controller_fields=fields, robot_process=robot_process) as rig:
@@ -96,7 +96,7 @@ def test_a_killed_robot_ends_the_run_in_one_sentence(network: Network, robot: Ro
             watch.conclude()
 
 
-def test_a_robot_that_cannot_be_made_says_why(network: Network, robot: Robot) -> None:
+def test_failed_robot_subprocess_reports_its_exception(network: Network, robot: Robot) -> None:
     wrong = [0.0] * 11
     with (
         pytest.raises(Failed, match=r"^embedded: the robot's process failed with ValueError: "),
@@ -105,17 +105,17 @@ def test_a_robot_that_cannot_be_made_says_why(network: Network, robot: Robot) ->
         raise AssertionError("made")
 
 
-def test_an_operator_of_this_process_is_refused(network: Network, robot: Robot) -> None:
+def test_operator_object_is_rejected_for_a_robot_subprocess(network: Network, robot: Robot) -> None:
     robot_process = EmbeddedRobot()
     with (
         pytest.raises(ValueError, match="operator must be None for a robot in a subprocess"),
         open_hal(EMBEDDED, network=network, robot=robot, operator=Operator(), robot_process=robot_process),
     ):
         raise AssertionError("made")
-    assert gone_now(robot_process.pid)
+    assert is_reaped(robot_process.pid)
 
 
-def test_faults_reach_it(network: Network, robot: Robot) -> None:
+def test_faults_act_in_the_robot_subprocess(network: Network, robot: Robot) -> None:
     lost = Fault("drop", "LEFT_SK_STATE", start=150, cycles=3)
     with open_hal(EMBEDDED, network=network, robot=robot, faults=[lost], robot_process=EmbeddedRobot()) as rig:
         row = rig.hal.messages.index("LEFT_SK_STATE")
@@ -127,15 +127,15 @@ def test_faults_reach_it(network: Network, robot: Robot) -> None:
     assert ages[149:156] == [0, 1, 2, 3, 0, 0, 0]
 
 
-@pytest.mark.parametrize("begun", [True, False])
-def test_it_ends_when_its_hal_is_killed(begun: bool) -> None:
+@pytest.mark.parametrize("connected", [True, False])
+def test_robot_subprocess_ends_when_its_hal_is_killed(connected: bool) -> None:
     program = (
         "from atalante_tools.session.embedded import EmbeddedRobot\n"
         "from atalante_tools.console.options import Target\n"
         "from atalante_tools.session.rig import open_hal\n"
         "robot_process = EmbeddedRobot()\n"
         "print(robot_process.pid, flush=True)\n"
-        f"if not {begun}: import time; time.sleep(3600)\n"
+        f"if not {connected}: import time; time.sleep(3600)\n"
         "with open_hal(Target('embedded', '', lockstep=True), robot_process=robot_process) as rig:\n"
         "    rig.hal.read()\n"
         "    print('walking', flush=True)\n"
@@ -144,7 +144,7 @@ def test_it_ends_when_its_hal_is_killed(begun: bool) -> None:
     with subprocess.Popen([sys.executable, "-c", program], stdout=subprocess.PIPE, text=True) as hal:
         assert hal.stdout is not None
         pid = int(hal.stdout.readline())
-        if begun:
+        if connected:
             assert hal.stdout.readline() == "walking\n"
         hal.kill()
-    assert gone(pid)
+    assert wait_for_end(pid)

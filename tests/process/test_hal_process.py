@@ -1,8 +1,9 @@
-"""The HAL as a process that is killed, stopped or paused: F41, F42, F43. The robot is emulated in the test, at the other end of
-a bus in shared memory, and its drives own the last line.
+"""HAL in a subprocess that is killed, stopped or paused (F41, F42, F43).
 
-What the HAL takes for the wall clock is a number in shared memory that the test moves on: a stopped process misses exactly the
-milliseconds it is meant to miss, however busy the machine is.
+The test emulates the robot at the other end of a bus in shared memory. Without the HAL, the drives hold their position.
+
+The wall clock of the HAL is a number in shared memory that the test advances: a stopped process misses exactly the given
+milliseconds, independent of the load of the machine.
 """
 
 from __future__ import annotations
@@ -24,7 +25,7 @@ import numpy as np
 import pytest
 
 import atalante_dbc
-from atalante_emulator.body import PyBulletBody
+from atalante_emulator.bodies.pybullet_body import PyBulletBody
 from atalante_emulator.drive import WATCHDOG
 from atalante_emulator.emulator import Emulator
 from atalante_emulator.pendant import Operator
@@ -36,7 +37,7 @@ from atalante_hal.robot import Robot
 from atalante_hal.types import Command, State, SupervisorState
 from atalante_hal.wire.cia402 import DriveState
 
-#: Loads everything once; for each line `memory bell`, a child drives that bus until it is told to end, and says how it went.
+#: Program that loads all modules once. For each line `memory bell`, a child drives the robot on this bus until SIGTERM.
 DRIVER = """
 import json, mmap, os, signal, sys, time
 import atalante_dbc
@@ -58,9 +59,9 @@ class Time:
         self.last = wall[0]
         return self.last
 
-    def sleep(self, seconds):  # from when the clock was read: it may have moved on since
+    def sleep(self, seconds):  # counted from the last read of the clock, which may have advanced since
         while wall[0] < self.last + seconds - 1e-9:
-            if os.getppid() == 1:  # the test was killed, and nobody moves the clock on
+            if os.getppid() == 1:  # the test was killed, and the clock stands still
                 os._exit(1)
             time.sleep(1e-4)
 
@@ -69,8 +70,8 @@ def drive(memory, bell):
     signal.signal(signal.SIGTERM, lambda *_: over.append(1))
     bus = SharedBus("shared", memory, bell, 0)
     bus.patience = 30.0 if wall is None else 0.0
-    told = Time()
-    clock = LockStep() if wall is None else WallClock(now=told.now, sleep=told.sleep)
+    time_source = Time()
+    clock = LockStep() if wall is None else WallClock(now=time_source.now, sleep=time_source.sleep)
     hal = Hal(network, robot, bus, patience=2.0, controller_fields=controller.telemetry_fields)
     at_end = []
     def until(state):
@@ -92,7 +93,7 @@ for line in sys.stdin:
 
 
 class Driver:
-    """The process that starts HALs, one for each of so many buses made beforehand."""
+    """The process that starts HALs, one for each of the given number of buses."""
 
     def __init__(self, buses: int, wall: int) -> None:
         self._pairs = [descriptors() for _ in range(buses)]
@@ -105,19 +106,19 @@ class Driver:
             bufsize=1,
             pass_fds=[*fds, wall][: len(fds) + (wall >= 0)],
         )
-        assert self.said() == "ready"
+        assert self.read_line() == "ready"
 
-    def said(self) -> str:
+    def read_line(self) -> str:
         assert self._process.stdout is not None
         return self._process.stdout.readline().strip()
 
     def start(self) -> tuple[int, SharedBus]:
-        """A HAL that drives; its process and the robot's end of its bus."""
+        """Start a HAL that drives the robot; return the process id of the HAL, and the robot's end of the bus."""
         memory, ours, theirs = self._pairs.pop(0)
         bus = SharedBus("the robot's bus", os.dup(memory), theirs, 1)
         assert self._process.stdin is not None
         self._process.stdin.write(f"{memory} {ours}\n")
-        pid = int(self.said())
+        pid = int(self.read_line())
         os.close(memory)
         os.close(ours)
         return pid, bus
@@ -135,7 +136,7 @@ class Driver:
 
 @contextmanager
 def driver(buses: int = 1, wall: int = -1) -> Iterator[Driver]:
-    """HALs in lock-step, or on the clock in the memory of the descriptor `wall`."""
+    """Yield a driver of HALs in lock-step, or on the clock in the memory of the descriptor `wall`."""
     made = Driver(buses, wall)
     try:
         yield made
@@ -168,9 +169,7 @@ def enabled(emulator: Emulator) -> bool:
     return set(emulator.drives.state) == {DriveState.OPERATION_ENABLED}
 
 
-def test_f41_killed_at_twenty_phases_of_the_gait_every_drive_holds_within_five_cycles(
-    robot: Robot, urdf_text: str
-) -> None:
+def test_f41_every_drive_holds_within_five_cycles_of_a_killed_hal(robot: Robot, urdf_text: str) -> None:
     with driver(buses=20) as hals:
         for phase in range(20):
             pid, bus = hals.start()
@@ -186,13 +185,13 @@ def test_f41_killed_at_twenty_phases_of_the_gait_every_drive_holds_within_five_c
                 for _ in range(300):
                     emulator.idle()
                 assert set(emulator.drives.state) == {DriveState.QUICK_STOP_ACTIVE}, phase
-                # No joint sags: it stops where it was, but for the way it needs to stop.
+                # No joint sags: it moves only by its stopping distance.
                 assert (abs(emulator.body.position - held) < 0.02 + 0.05 * abs(moving_at)).all(), phase
                 assert abs(emulator.body.velocity).max() < 0.1, phase
 
 
 def _kill_in_the_air(emulator: Emulator, bus: SharedBus, pid: int, cycles: int) -> None:
-    """Drive until that many cycles after the drives are enabled, then SIGKILL."""
+    """Drive for a number of cycles after the drives are enabled, then send SIGKILL to the HAL."""
     counted = 0
 
     def step() -> None:
@@ -207,34 +206,34 @@ def _kill_in_the_air(emulator: Emulator, bus: SharedBus, pid: int, cycles: int) 
     assert counted >= cycles
 
 
-class World:
-    """The robot and the HAL's clock: time goes by when the test says so."""
+class SteppedTime:
+    """The robot and the clock of the HAL, advanced by the test."""
 
     def __init__(self, emulator: Emulator, clock: memoryview) -> None:
         self.emulator, self._clock = emulator, clock
 
     def millisecond(self) -> None:
-        """One cycle of HAL and robot."""
+        """Run one cycle of HAL and robot."""
         self._clock[0] += 1e-3
         assert self.synced(60.0), "the HAL sent no SYNC"
 
     def synced(self, timeout: float) -> bool:
-        """Answer the next SYNC; before it come the commands of the cycle before."""
+        """Process the commands of the previous cycle and answer the next SYNC; return whether the SYNC was received."""
         give_up = time.monotonic() + timeout
         while time.monotonic() < give_up:
             if self.emulator.poll(give_up - time.monotonic()):
                 return True
         return False
 
-    def alone(self, milliseconds: int) -> None:
-        """Time goes by and the HAL does nothing."""
+    def without_hal(self, milliseconds: int) -> None:
+        """Advance the time while the HAL is stopped."""
         self._clock[0] += milliseconds * 1e-3
         for _ in range(milliseconds):
             self.emulator.run_without_sync()
 
 
 @pytest.mark.parametrize("milliseconds", [3, 20, 2000])
-def test_f42_stopped_and_continued_there_is_no_burst_and_a_gap_over_five_milliseconds_ends_in_hold(
+def test_f42_stopped_hal_sends_no_burst_and_holds_after_five_milliseconds(
     milliseconds: int, robot: Robot, urdf_text: str
 ) -> None:
     wall = anonymous_file("clock", 8)
@@ -242,34 +241,35 @@ def test_f42_stopped_and_continued_there_is_no_burst_and_a_gap_over_five_millise
     with driver(wall=wall) as hals:
         pid, bus = hals.start()
         with robot_on(bus, robot, urdf_text) as emulator:
-            operator, world = emulator.operator, World(emulator, clock)
+            operator, time_ = emulator.operator, SteppedTime(emulator, clock)
             assert isinstance(operator, Listener)
             while operator.hal_state is not SupervisorState.ACTIVE:
-                world.millisecond()
+                time_.millisecond()
             for _ in range(50):
-                world.millisecond()
+                time_.millisecond()
             os.kill(pid, signal.SIGSTOP)
             _wait_until_stopped(pid)
-            world.alone(milliseconds)
+            time_.without_hal(milliseconds)
             holds = milliseconds >= WATCHDOG
             assert set(emulator.drives.state) == {
                 DriveState.QUICK_STOP_ACTIVE if holds else DriveState.OPERATION_ENABLED
             }
             os.kill(pid, signal.SIGCONT)
-            # It wakes, makes the cycle it owes, and waits for the next: none of the others is made up for.
-            assert world.synced(60.0)
-            assert not world.synced(0.2)
+            # The HAL runs the cycle that is due and waits for the next one; missed cycles are not repeated.
+            assert time_.synced(60.0)
+            assert not time_.synced(0.2)
             for _ in range(50):
-                world.millisecond()
+                time_.millisecond()
             assert operator.hal_state is (SupervisorState.HOLD if holds else SupervisorState.ACTIVE)
             assert enabled(emulator) is not holds
             os.kill(pid, signal.SIGTERM)
             with suppress(BusDown):
                 while True:
-                    world.millisecond()
-        told = json.loads(hals.said())
-    gaps = [value for code, _, value in told["events"] if code == "CYCLE_GAP"]
-    assert gaps == [pytest.approx((milliseconds - 1) * 1e-3)]  # the deadline was a millisecond ahead
+                    time_.millisecond()
+        result = json.loads(hals.read_line())
+    gaps = [value for code, _, value in result["events"] if code == "CYCLE_GAP"]
+    # The HAL was stopped a millisecond before its next deadline.
+    assert gaps == [pytest.approx((milliseconds - 1) * 1e-3)]
     os.close(wall)
 
 
@@ -278,8 +278,8 @@ def _wait_until_stopped(pid: int) -> None:
         time.sleep(0.001)
 
 
-class Pausing:
-    """Holds the pose; once it does something else first."""
+class PausingController:
+    """Hold the pose; call `pause` once, in the twentieth update."""
 
     telemetry, telemetry_fields = np.zeros(0), ()
 
@@ -301,12 +301,12 @@ class Pausing:
 
     @property
     def quiet_for(self) -> int:
-        """Updates since it did something else."""
+        """Return the number of updates since the pause."""
         return self._updates - 20
 
 
 def collect_garbage() -> None:
-    """A collection that takes long: many objects that live."""
+    """Collect garbage for 10 ms, with many live objects."""
     many = [[number] for number in range(400_000)]
     begun = time.perf_counter()
     while time.perf_counter() < begun + 0.01:
@@ -317,20 +317,20 @@ def collect_garbage() -> None:
 @pytest.mark.parametrize(
     ("pause", "ends_in_hold"),
     [(lambda: time.sleep(0.004), False), (lambda: time.sleep(0.0075), True), (collect_garbage, True)],
-    ids=["4 ms", "6.5 ms late", "garbage collection"],
+    ids=["4 ms", "7.5 ms", "garbage collection"],
 )
-def test_f43_a_pause_of_over_five_milliseconds_ends_in_hold_a_shorter_one_is_noted(
+def test_f43_pause_over_five_milliseconds_ends_in_hold_and_shorter_is_reported(
     make_rig: Callable[..., Any], pause: Callable[[], Any], ends_in_hold: bool
 ) -> None:
     rig = make_rig()
     rig.until(SupervisorState.READY)
-    controller, seen = Pausing(pause), []
+    controller, seen = PausingController(pause), []
     rig.operator.start()
 
     def until(state: State) -> bool:
         seen.append(state.supervisor)
         if not controller.done and state.supervisor is SupervisorState.HOLD:
-            rig.operator.start()  # a busy machine
+            rig.operator.start()  # a busy machine caused HOLD before the pause
         return controller.done and (seen[-1] is SupervisorState.HOLD or controller.quiet_for > 50)
 
     statistics = run(rig.hal, controller, WallClock(), until=until)
@@ -340,6 +340,6 @@ def test_f43_a_pause_of_over_five_milliseconds_ends_in_hold_a_shorter_one_is_not
     if ends_in_hold:
         assert max(gaps) > GAP_TO_HOLD
         assert seen[-1] is SupervisorState.HOLD
-    elif seen[-1] is SupervisorState.HOLD:  # the machine made it longer, there were three in a row, or more was lost
+    elif seen[-1] is SupervisorState.HOLD:  # the machine was slower, or there were three overruns in a row
         overruns = {event.severity for event in rig.hal.events if event.code == "OVERRUN"}
         assert max(gaps) > GAP_TO_HOLD or "error" in overruns

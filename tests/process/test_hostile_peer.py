@@ -1,4 +1,4 @@
-"""F50: nothing from the network reaches control. 100,000 forged puts on every key while the robot walks change no byte."""
+"""F50: no network message affects the control. 100,000 forged puts while the robot moves change no byte on the bus."""
 
 from __future__ import annotations
 
@@ -13,10 +13,10 @@ from atalante_hal.types import SupervisorState
 from atalante_hal.wire.frame import Frames
 
 PUTS = 100_000
-CYCLES = 3000  # at least; more while the stranger is still at it
+CYCLES = 3000  # smallest number of cycles; the run continues while the attacker runs
 
-#: Connects, says so, and puts, deletes and asks on every key there is and on some that are not, whatever comes into its mind.
-STRANGER = """
+#: Program that connects, prints "in", and then puts, deletes and queries all existing keys and some unknown keys.
+ATTACKER = """
 import json, random, sys, zenoh
 rng = random.Random(1)
 keys = [f"atalante/exo/{name}" for name in json.loads(sys.argv[2])]
@@ -41,8 +41,8 @@ with zenoh.open(zenoh.Config.from_json5(sys.argv[1])) as session:
 """
 
 
-class Line:
-    """Every byte that passes between HAL and nodes, both ways."""
+class Recorder:
+    """Tap that keeps every byte between HAL and nodes, in both directions."""
 
     def __init__(self) -> None:
         self.bytes: list[bytes] = []
@@ -51,14 +51,14 @@ class Line:
         self.bytes.append(frames.tobytes())
 
     def received(self, frames: Frames, count: int) -> None:
-        # Behind the payload lies whatever the memory held before.
+        # The bytes after the payload are undefined.
         for frame in frames[:count]:
             self.bytes.append(frame["can_id"].tobytes() + frame["data"][: frame["len"]].tobytes())
 
 
-def test_f50_forged_puts_on_every_key_change_no_byte_on_the_bus(make_rig: Callable[..., Any]) -> None:
+def test_f50_forged_puts_on_every_key_do_not_change_any_byte(make_rig: Callable[..., Any]) -> None:
     rig = make_rig(seed=4)
-    rig.hal.tap = attacked = Line()
+    rig.hal.tap = attacked = Recorder()
     rig.until(SupervisorState.ACTIVE)
     streams = ["joint_states", "imu", "foot_forces", "haptics", "guide", "controller", "system", "loop", "events"]
     with TelemetryProcess(TelemetryConfig(slots=64), rig.hal.layout) as telemetry:
@@ -68,23 +68,23 @@ def test_f50_forged_puts_on_every_key_change_no_byte_on_the_bus(make_rig: Callab
             "scouting": {"multicast": {"enabled": False}},
             "transport": {"shared_memory": {"enabled": False}},
         }
-        command = [sys.executable, "-c", STRANGER, json.dumps(config), json.dumps(streams), str(PUTS)]
-        with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as stranger:
-            assert stranger.stdout is not None
+        command = [sys.executable, "-c", ATTACKER, json.dumps(config), json.dumps(streams), str(PUTS)]
+        with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as attacker:
+            assert attacker.stdout is not None
             begun = rig.hal.state.cycle
-            # It has to be let in first: it waits for telemetry.
-            while stranger.poll() is None or rig.hal.state.cycle - begun < CYCLES:
+            # The attacker starts after its first telemetry sample.
+            while attacker.poll() is None or rig.hal.state.cycle - begun < CYCLES:
                 rig.cycle()
                 telemetry.write(rig.hal.record)
-            assert stranger.stdout.read() == "in\ndone\n"
+            assert attacker.stdout.read() == "in\ndone\n"
         assert telemetry.alive
         assert telemetry.close().published > 0
     cycles = rig.hal.state.cycle
     assert rig.hal.state.supervisor is SupervisorState.ACTIVE
 
     golden = make_rig(seed=4)
-    golden.hal.tap = left_alone = Line()
+    golden.hal.tap = undisturbed = Recorder()
     golden.run(cycles)
     assert golden.hal.state.supervisor is SupervisorState.ACTIVE
-    assert attacked.bytes == left_alone.bytes
+    assert attacked.bytes == undisturbed.bytes
     assert rig.hal.record.tobytes() == golden.hal.record.tobytes()

@@ -1,4 +1,4 @@
-"""SIGINT and SIGTERM before the robot moves: whenever one arrives, no joint moves and the exit code is that of the signal."""
+"""SIGINT and SIGTERM before the robot moves: at any time, no joint moves and the exit code is that of the signal."""
 
 from __future__ import annotations
 
@@ -13,8 +13,8 @@ from pathlib import Path
 
 import pytest
 
-#: Runs a command and writes a line for each HAL cycle: its number, whether a signal had arrived when it began, supervisor, knee.
-#: Sends itself a signal at a point of the program: "callback" and "except" are places where an exception is lost.
+#: Program that runs a command and writes a line per HAL cycle: number, whether a signal had arrived, state, knee angle.
+#: The program sends itself a signal at a given point. At the points "callback" and "except", an exception is discarded.
 DRIVER = """
 import ctypes, json, os, signal, sys
 log, point, number, *arguments = sys.argv[1:]
@@ -76,10 +76,10 @@ if kind in acts:
 sys.argv[1:] = arguments
 main()
 """
-#: Would go on for 100 s of robot time.
+#: Command that takes 100 s of robot time.
 JOG = ("jog", "left_SK", "--to", "100", "--speed", "1", "--json")
 SIGNALS = (signal.SIGINT, signal.SIGTERM)
-#: No joint of a robot that is not driven gets so far from where it was [rad].
+#: Largest motion of a joint of a robot that is not driven [rad].
 STILL = 0.02
 
 
@@ -92,7 +92,7 @@ class Cycle:
 
 
 class Run:
-    """A command in a process of its own."""
+    """A command in a subprocess."""
 
     def __init__(self, folder: Path, *command: str, point: str = "", number: int = 0) -> None:
         self._log = folder / "cycles"
@@ -105,7 +105,7 @@ class Run:
         )
 
     def wait_for_handler(self) -> None:
-        """Return when SIGTERM is handled, which the interpreter does not do by itself."""
+        """Wait until the program has installed its SIGTERM handler."""
         status = Path(f"/proc/{self._process.pid}/status")
         while True:
             caught = next(line for line in status.read_text().splitlines() if line.startswith("SigCgt:"))
@@ -118,17 +118,17 @@ class Run:
         self._process.send_signal(number)
 
     def end(self) -> tuple[int, str, str, list[Cycle]]:
-        """Exit code, stdout, stderr, cycles."""
+        """Wait for the end; return exit code, stdout, stderr and cycles."""
         try:
             out, err = self._process.communicate(timeout=120)
         finally:
-            self._process.kill()  # nothing if it has ended
+            self._process.kill()  # no effect if the process has ended
         lines = self._log.read_text().splitlines() if self._log.exists() else []
         return self._process.returncode, out, err, [Cycle(*json.loads(line)) for line in lines]
 
 
 def assert_never_started(run: Run, number: int) -> list[Cycle]:
-    """The process was ended by the signal with its code and the robot was never ACTIVE; the cycles it had."""
+    """Assert the exit code of the signal and that the robot was never ACTIVE; return the cycles."""
     code, out, err, cycles = run.end()
     assert code == 128 + number, err
     assert out == ""
@@ -151,12 +151,12 @@ def assert_never_started(run: Run, number: int) -> list[Cycle]:
         ("except atalante_tools.session.rig", signal.SIGTERM),
     ],
 )
-def test_a_signal_before_the_first_cycle_ends_the_command(point: str, number: int, tmp_path: Path) -> None:
+def test_signal_before_the_first_cycle_ends_the_command(point: str, number: int, tmp_path: Path) -> None:
     assert assert_never_started(Run(tmp_path, *JOG, point=point, number=number), number) == []
 
 
 @pytest.mark.parametrize("number", SIGNALS)
-def test_a_signal_in_the_cycle_in_which_the_last_drive_is_enabled_refuses_the_start(
+def test_signal_in_the_cycle_before_active_prevents_the_start(
     number: signal.Signals, first_active: int, tmp_path: Path
 ) -> None:
     run = Run(tmp_path, *JOG, point=f"cycle {first_active}", number=number)
@@ -166,14 +166,14 @@ def test_a_signal_in_the_cycle_in_which_the_last_drive_is_enabled_refuses_the_st
 
 @pytest.fixture(scope="module")
 def first_active(tmp_path_factory: pytest.TempPathFactory) -> int:
-    """Number of the first ACTIVE cycle when no signal comes."""
+    """Return the number of the first ACTIVE cycle of a run without a signal."""
     code, _, err, cycles = Run(tmp_path_factory.mktemp("jog"), "jog", "left_SK", "--to", "1", "--json").end()
     assert code == 0, err
     return next(cycle.number for cycle in cycles if cycle.supervisor == "ACTIVE")
 
 
 @pytest.mark.parametrize("number", SIGNALS)
-def test_a_signal_before_ready_ends_the_command(number: signal.Signals, tmp_path: Path) -> None:
+def test_signal_before_ready_ends_the_command(number: signal.Signals, tmp_path: Path) -> None:
     cycles = assert_never_started(Run(tmp_path, *JOG, point="cycle 5", number=number), number)
     assert {cycle.supervisor for cycle in cycles} == {"OFF"}
 
@@ -187,7 +187,7 @@ def test_a_signal_before_ready_ends_the_command(number: signal.Signals, tmp_path
     ],
     ids=lambda command: command[0],
 )
-def test_every_command_that_drives_looks_at_a_lost_signal(
+def test_signal_lost_in_a_callback_ends_every_driving_command(
     command: tuple[str, ...], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
@@ -197,9 +197,9 @@ def test_every_command_that_drives_looks_at_a_lost_signal(
 
 
 @pytest.mark.parametrize("seed", range(10))
-def test_no_cycle_after_a_signal_is_active_whenever_it_arrives(seed: int, tmp_path: Path) -> None:
-    drawn = random.Random(seed)
-    number, delay = drawn.choice(SIGNALS), drawn.uniform(0.0, 3.0)
+def test_no_cycle_is_active_after_a_signal_at_a_random_time(seed: int, tmp_path: Path) -> None:
+    rng = random.Random(seed)
+    number, delay = rng.choice(SIGNALS), rng.uniform(0.0, 3.0)
     run = Run(tmp_path, *JOG)
     run.wait_for_handler()
     time.sleep(delay)  # the assertions hold whatever the program has reached by then

@@ -1,6 +1,6 @@
-"""Telemetry that fails while the robot is driven: F46 to F49. What passes on the bus is, to the byte, what passes without it.
+"""Telemetry that fails while the robot is driven (F46 to F49). The bytes on the bus are the same as without telemetry.
 
-The small disk of F46 is a limit on the size of files (RLIMIT_FSIZE): a mounted one needs rights that a test does not have.
+The full disk of F46 is simulated by a limit on the file size (RLIMIT_FSIZE), because a test may not mount a small disk.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ CYCLES = 1500
 
 
 class Sent:
-    """Every byte the HAL sent."""
+    """Tap that records every byte that the HAL sent."""
 
     def __init__(self) -> None:
         self.bytes = bytearray()
@@ -42,8 +42,8 @@ class Sent:
         pass
 
 
-class Drive:
-    """A robot that is driven with telemetry beside it, and at the end another without, for comparison."""
+class DrivenRobot:
+    """Robot that is driven with a telemetry process. At the end it is compared with a robot without telemetry."""
 
     def __init__(self, make_rig: Callable[..., Any]) -> None:
         self._make_rig = make_rig
@@ -75,13 +75,13 @@ class Drive:
                 self.telemetry.tend()
 
     def until(self, wanted: Callable[[], Any]) -> Any:
-        """Drive on until it is so; half of real time at most, for another process has to do something."""
+        """Drive until the condition holds, at most at half the real-time speed, because another process has to act."""
         for _ in range(3000):
             if found := wanted():
                 return found
             self.run(10)
             time.sleep(0.02)
-        raise AssertionError("it did not happen")
+        raise AssertionError("the expected condition did not occur")
 
     def compare(self) -> None:
         state = self.rig.hal.state
@@ -92,14 +92,14 @@ class Drive:
 
 
 class Subscriber:
-    """Another process that subscribes to everything, for the length of a block."""
+    """A subprocess that subscribes to every key within a `with` block."""
 
     def __init__(self, telemetry: TelemetryProcess) -> None:
         self.process = subscribe(telemetry)
         os.set_blocking(self.process.stdout.fileno(), False)
 
-    def heard(self) -> str:
-        """What it has got since the last time, a line a message."""
+    def received_lines(self) -> str:
+        """Return the messages received since the last call, one message per line."""
         try:
             return os.read(self.process.stdout.fileno(), 1 << 16).decode()
         except BlockingIOError:
@@ -115,14 +115,14 @@ class Subscriber:
 
 
 @pytest.fixture
-def drive(make_rig: Callable[..., Any]) -> Any:
-    made = Drive(make_rig)
+def driven(make_rig: Callable[..., Any]) -> Any:
+    made = DrivenRobot(make_rig)
     yield made
     if made.telemetry is not None:
         made.telemetry.close()
 
 
-def test_f46_a_full_disk_ends_the_recording_alone(drive: Drive, tmp_path: Path) -> None:
+def test_f46_full_disk_stops_only_the_recording(driven: DrivenRobot, tmp_path: Path) -> None:
     config = TelemetryConfig(
         recording=tmp_path / "r.mcap",
         can_log=tmp_path / "r.log",
@@ -130,11 +130,11 @@ def test_f46_a_full_disk_ends_the_recording_alone(drive: Drive, tmp_path: Path) 
         lock_step=True,
         listen=free_endpoint(),
     )
-    telemetry = drive.start(config, largest_file=50_000)
+    telemetry = driven.start(config, largest_file=50_000)
     with Subscriber(telemetry) as subscriber:
-        drive.until(subscriber.heard)
-        drive.run(CYCLES)
-        drive.until(lambda: "events" in subscriber.heard())  # RECORD_STOPPED goes out where it still can
+        driven.until(subscriber.received_lines)
+        driven.run(CYCLES)
+        driven.until(lambda: "events" in subscriber.received_lines())  # RECORD_STOPPED is still published
     written = telemetry.records.written
     summary = telemetry.close()
     assert summary.complete
@@ -142,66 +142,66 @@ def test_f46_a_full_disk_ends_the_recording_alone(drive: Drive, tmp_path: Path) 
     assert summary.recording is not None
     assert not summary.recording.complete
     assert summary.recording.missing_cycles == written - len(cycles_without_index(tmp_path / "r.mcap"))
-    drive.compare()
+    driven.compare()
 
 
-def test_f47_an_endpoint_that_cannot_be_had_is_told_and_changes_nothing(
-    drive: Drive, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+def test_f47_unavailable_endpoint_is_reported_and_does_not_affect_the_loop(
+    driven: DrivenRobot, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """There is no router to lose: who publishes listens, and who cannot says so where it still can."""
+    """The publisher listens itself, without a router. If it cannot listen, the recording contains an event."""
     program = "import atalante_hal.telemetry.publisher as p; p.DEFAULT_HOST = '203.0.113.1'\n"
     (tmp_path / "sitecustomize.py").write_text(program)  # an address this machine does not have
     monkeypatch.setenv("PYTHONPATH", str(tmp_path))
-    telemetry = drive.start(TelemetryConfig(recording=tmp_path / "r.mcap", lock_step=True))
+    telemetry = driven.start(TelemetryConfig(recording=tmp_path / "r.mcap", lock_step=True))
     assert telemetry.endpoint is None
     assert telemetry.notices[0].startswith("nothing is published")
-    drive.run(CYCLES)
+    driven.run(CYCLES)
     assert telemetry.close().complete
     (event,) = recorded(tmp_path / "r.mcap", "/events")
     assert event.code == "TELEMETRY_DOWN"
-    drive.compare()
+    driven.compare()
 
 
-def test_f47_a_subscriber_that_dies_is_followed_by_the_next(drive: Drive) -> None:
-    telemetry = drive.start(TelemetryConfig(listen=free_endpoint(), lock_step=True))
+def test_f47_next_subscriber_receives_after_one_is_killed(driven: DrivenRobot) -> None:
+    telemetry = driven.start(TelemetryConfig(listen=free_endpoint(), lock_step=True))
     for _ in range(2):
         with Subscriber(telemetry) as subscriber:
-            drive.until(subscriber.heard)
+            driven.until(subscriber.received_lines)
     assert telemetry.alive
-    drive.compare()
+    driven.compare()
 
 
-def test_f48_a_stopped_subscriber_costs_the_loop_nothing(drive: Drive, tmp_path: Path) -> None:
+def test_f48_stopped_subscriber_does_not_affect_the_loop(driven: DrivenRobot, tmp_path: Path) -> None:
     path = tmp_path / "r.mcap"
     config = TelemetryConfig(listen=free_endpoint(), stream_rate=1000, recording=path, record_rate=1000, slots=64)
-    telemetry = drive.start(config)
+    telemetry = driven.start(config)
     with Subscriber(telemetry) as subscriber:
-        drive.until(subscriber.heard)
+        driven.until(subscriber.received_lines)
         subscriber.process.send_signal(signal.SIGSTOP)
-        drive.run(CYCLES)
+        driven.run(CYCLES)
         assert telemetry.alive
-        # Telemetry itself cannot follow: the oldest is overwritten, and how much is known.
+        # Telemetry is too slow: the oldest records are overwritten and counted.
         os.kill(pid_of(telemetry), signal.SIGSTOP)
-        drive.run(CYCLES)
+        driven.run(CYCLES)
         os.kill(pid_of(telemetry), signal.SIGCONT)
         summary = telemetry.close()
     assert summary.complete
     assert summary.lost >= CYCLES - 2 * 64
     assert "TELEMETRY_DROPPED" in {event.code for event in recorded(path, "/events")}
-    drive.compare()
+    driven.compare()
 
 
 @pytest.mark.parametrize("how", [signal.SIGKILL, signal.SIGSTOP])
-def test_f49_telemetry_that_dies_or_hangs_is_started_again(drive: Drive, how: signal.Signals, tmp_path: Path) -> None:
+def test_f49_killed_or_stopped_telemetry_is_restarted(driven: DrivenRobot, how: signal.Signals, tmp_path: Path) -> None:
     path = tmp_path / "run.mcap"
     config = TelemetryConfig(listen=free_endpoint(), recording=path, record_rate=1000, lock_step=True, patience=0.1)
-    telemetry = drive.start(config)
-    endpoint, first, begin = telemetry.endpoint, pid_of(telemetry), drive.rig.hal.state.cycle + 1
-    drive.run(500)
+    telemetry = driven.start(config)
+    endpoint, first, begin = telemetry.endpoint, pid_of(telemetry), driven.rig.hal.state.cycle + 1
+    driven.run(500)
     os.kill(first, how)
-    drive.until(lambda: (tmp_path / "run-1.mcap").exists() and pid_of(telemetry) != first and telemetry.alive)
-    with Subscriber(telemetry) as subscriber:  # where the other one was
-        drive.until(subscriber.heard)
+    driven.until(lambda: (tmp_path / "run-1.mcap").exists() and pid_of(telemetry) != first and telemetry.alive)
+    with Subscriber(telemetry) as subscriber:  # the same endpoint as before
+        driven.until(subscriber.received_lines)
     assert telemetry.endpoint == endpoint
     summary = telemetry.close()
     assert not summary.complete
@@ -210,33 +210,31 @@ def test_f49_telemetry_that_dies_or_hangs_is_started_again(drive: Drive, how: si
     codes = [event.code for event in recorded(tmp_path / "run-1.mcap", "/events")]
     assert "TELEMETRY_DOWN" in codes
     again = recorded(tmp_path / "run-1.mcap")
-    assert [message.cycle for message in again] == list(range(again[0].cycle, drive.rig.hal.state.cycle + 1))
-    # What the first child had written is there, without an index: it was not asked.
+    assert [message.cycle for message in again] == list(range(again[0].cycle, driven.rig.hal.state.cycle + 1))
+    # The first recording is kept without an index, because it was not finished.
     kept = cycles_without_index(path)
     assert kept[:100] == list(range(begin, begin + 100))
     assert summary.recording is not None
     assert summary.recording.files == ("run.mcap", "run-1.mcap")
     assert not summary.recording.complete
-    if how is signal.SIGKILL:  # a stopped one may be stopped anywhere
+    if how is signal.SIGKILL:  # a process can be stopped at any point
         assert summary.recording.missing_cycles == again[0].cycle - 1 - kept[-1]
-    drive.compare()
+    driven.compare()
 
 
-def squat(endpoint: str) -> socket.socket:
-    """A program that is not ours, listening where telemetry did."""
+def listen_at(endpoint: str) -> socket.socket:
+    """Return a socket that listens at the endpoint of telemetry."""
     host, port = endpoint.partition("/")[2].split(":")
-    squatter = socket.socket()
-    squatter.setsockopt(
-        socket.SOL_SOCKET, socket.SO_REUSEADDR, 1
-    )  # what was connected may still be waiting for its end
-    squatter.bind((host, int(port)))
-    squatter.listen()
-    return squatter
+    listener = socket.socket()
+    listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)  # old connections may still be closing
+    listener.bind((host, int(port)))
+    listener.listen()
+    return listener
 
 
-@pytest.mark.parametrize("asked", [False, True], ids=["default endpoint", "endpoint asked for"])
-def test_f49_a_restart_whose_port_is_taken_records_on(
-    drive: Drive, asked: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+@pytest.mark.parametrize("configured", [False, True], ids=["default endpoint", "configured endpoint"])
+def test_f49_restart_with_a_taken_port_continues_the_recording(
+    driven: DrivenRobot, configured: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     port = int(free_endpoint().rsplit(":", 1)[1])
     (tmp_path / "sitecustomize.py").write_text(
@@ -245,36 +243,36 @@ def test_f49_a_restart_whose_port_is_taken_records_on(
     monkeypatch.setenv("PYTHONPATH", str(tmp_path))
     listen = f"tcp/127.0.0.1:{port}"
     path = tmp_path / "run.mcap"
-    config = TelemetryConfig(listen=listen if asked else None, recording=path, record_rate=1000, lock_step=True)
-    telemetry = drive.start(config)
+    config = TelemetryConfig(listen=listen if configured else None, recording=path, record_rate=1000, lock_step=True)
+    telemetry = driven.start(config)
     assert telemetry.endpoint == listen
     first = pid_of(telemetry)
     os.kill(first, signal.SIGKILL)
     assert telemetry._child is not None
     telemetry._child.wait()
-    with squat(listen):
-        drive.until(lambda: telemetry._restarting is not None and not telemetry._restarting.is_alive())
+    with listen_at(listen):
+        driven.until(lambda: telemetry._restarting is not None and not telemetry._restarting.is_alive())
         assert telemetry.alive
         assert pid_of(telemetry) != first
-        if asked:
+        if configured:
             assert telemetry.endpoint is None
         else:
             assert telemetry.endpoint not in (None, listen)
             with Subscriber(telemetry) as subscriber:
-                drive.until(subscriber.heard)
-        drive.run(100)
+                driven.until(subscriber.received_lines)
+        driven.run(100)
         summary = telemetry.close()
     assert summary.restarts == 1
     assert summary.recording is not None
     assert not summary.recording.complete
     again = [message.cycle for message in recorded(tmp_path / "run-1.mcap")]
-    assert again == list(range(again[0], drive.rig.hal.state.cycle + 1))
-    assert bool([notice for notice in summary.notices if f"cannot listen on {listen}" in notice]) is asked
-    drive.compare()
+    assert again == list(range(again[0], driven.rig.hal.state.cycle + 1))
+    assert bool([notice for notice in summary.notices if f"cannot listen on {listen}" in notice]) is configured
+    driven.compare()
 
 
 def cycles_without_index(path: Path) -> list[int]:
-    """Cycles that have all their messages in a recording, which may end anywhere."""
+    """Return the cycles with all their messages in a recording, which may end anywhere."""
     topics: dict[int, str] = {}
     streams: dict[str, set[int]] = {}
     with path.open("rb") as file, suppress(EndOfFile):
@@ -287,17 +285,17 @@ def cycles_without_index(path: Path) -> list[int]:
     return sorted(set.intersection(*streams.values())) if streams else []
 
 
-def test_f49_a_child_that_never_lives_is_given_up(drive: Drive) -> None:
-    telemetry = drive.start(TelemetryConfig(publish=False, lock_step=True))
+def test_f49_telemetry_is_not_restarted_after_three_failed_restarts(driven: DrivenRobot) -> None:
+    telemetry = driven.start(TelemetryConfig(publish=False, lock_step=True))
     killed = set()
 
-    def given_up() -> bool:
+    def kill_each_process() -> bool:
         if telemetry.alive and pid_of(telemetry) not in killed:
             killed.add(pid_of(telemetry))
             os.kill(pid_of(telemetry), signal.SIGKILL)
         return telemetry._restarts > process_module.RESTARTS
 
-    drive.until(given_up)
+    driven.until(kill_each_process)
     assert len(killed) == process_module.RESTARTS + 1
     assert "not restarted after 3 restarts" in telemetry.close().notices[-1]
-    drive.compare()
+    driven.compare()

@@ -1,4 +1,4 @@
-"""The telemetry process, alive, stopped, killed: the loop's process never notices, and what was recorded is there."""
+"""Tests of the telemetry process, running, stopped or killed: the loop is not affected and the recorded data is kept."""
 
 from __future__ import annotations
 
@@ -26,11 +26,13 @@ from atalante_hal.bus.pair import lockstep_pair
 from atalante_hal.hal import Hal
 from atalante_hal.record_layout import Layout
 from atalante_hal.robot import Robot
+from atalante_hal.safety.events import Event
+from atalante_hal.telemetry.child import TelemetryChild
 from atalante_hal.telemetry.process import Recording, TelemetryConfig, TelemetryError, TelemetryProcess
 from atalante_hal.telemetry.schema import DESCRIPTORS
 
-FOREVER = 3600.0  # s of patience: a writer that waits hangs the test
-TRIES = 600  # of 50 ms, for what another process has to do
+FOREVER = 3600.0  # patience [s]: a writer that waits blocks the test
+TRIES = 600  # number of waits of 50 ms each, for an action of another process
 
 
 @pytest.fixture(scope="module")
@@ -53,7 +55,7 @@ def write(telemetry: TelemetryProcess, cycles: range) -> None:
 
 
 def recorded(path: Path, topic: str = "/joint_states") -> list[Any]:
-    """Decoded messages; needs the index that only a finished recording has."""
+    """Return the decoded messages of a finished recording. Only a finished recording has the required index."""
     with path.open("rb") as file:
         reader = make_reader(file, decoder_factories=[DecoderFactory()])
         assert reader.get_summary() is not None
@@ -70,7 +72,7 @@ def until(wanted: Callable[[], Any]) -> Any:
         if found := wanted():
             return found
         time.sleep(0.05)
-    raise AssertionError("it did not happen")
+    raise AssertionError("the expected condition did not occur")
 
 
 class TestSession:
@@ -80,7 +82,7 @@ class TestSession:
         with TelemetryProcess(config, layout, about={"seed": 3}, diagnostics=["NODES_WELL"]) as telemetry:
             for number, shape in enumerate(("constant", "pinched")):
                 telemetry.begin_run(shape, {"xi": 0.5})
-                telemetry.event(0, "READY", "OFF -> READY", node="HAL")
+                telemetry.event(Event(0, "READY", "OFF -> READY", node="HAL"))
                 write(telemetry, range(1, 501))
                 assert telemetry.alive
                 assert telemetry.records.lossless, number
@@ -94,7 +96,7 @@ class TestSession:
         assert [message.run_name for message in system] == ["constant"] * 500 + ["pinched"] * 500
         times = [message.timestamp.ToNanoseconds() for message in states]
         assert times[:500] == [cycle * 1_000_000 for cycle in range(1, 501)]
-        assert times[500] == times[499] + 1_001_000_000  # a second's gap, then cycle 1
+        assert times[500] == times[499] + 1_001_000_000  # a gap of 1 s, then cycle 1
         assert [message.code for message in recorded(path, "/events")] == ["READY"] * 2
         assert summary.recorded == 1000 * 5 + 10 + 2
         with path.open("rb") as file:
@@ -103,7 +105,7 @@ class TestSession:
         assert about["run/1"] == {"name": "pinched", "start_ns": "1500000000", "xi": "0.5"}
 
     @pytest.mark.parametrize("cycles", [5, 1999])
-    def test_in_lock_step_no_cycle_is_lost_at_any_rate(self, layout: Layout, tmp_path: Path, cycles: int) -> None:
+    def test_lock_step_recording_loses_no_cycle(self, layout: Layout, tmp_path: Path, cycles: int) -> None:
         config = TelemetryConfig(
             recording=tmp_path / "r.mcap", record_rate=100, lock_step=True, publish=False, slots=16, patience=FOREVER
         )
@@ -113,7 +115,7 @@ class TestSession:
         assert summary.recording == Recording(("r.mcap",), True, 0)
         assert [message.cycle for message in recorded(tmp_path / "r.mcap")] == list(range(10, cycles + 1, 10))
 
-    def test_two_sessions_in_lock_step_make_the_same_recording(self, layout: Layout, tmp_path: Path) -> None:
+    def test_two_lock_step_sessions_make_identical_recordings(self, layout: Layout, tmp_path: Path) -> None:
         for name in ("one", "two"):
             path = tmp_path / f"{name}.mcap"
             config = TelemetryConfig(recording=path, record_rate=1000, lock_step=True, publish=False)
@@ -126,7 +128,7 @@ class TestSession:
         assert one == two
         assert len(one) == 300
 
-    def test_on_the_wall_clock_log_time_is_the_time_of_day(self, layout: Layout, tmp_path: Path) -> None:
+    def test_wall_clock_recording_has_the_time_of_day(self, layout: Layout, tmp_path: Path) -> None:
         path = tmp_path / "recording.mcap"
         before = time.time_ns()
         with TelemetryProcess(TelemetryConfig(recording=path, publish=False), layout) as telemetry:
@@ -134,7 +136,7 @@ class TestSession:
             write(telemetry, range(10, 11))
         assert before + 10_000_000 <= recorded(path)[0].timestamp.ToNanoseconds() <= time.time_ns() + 10_000_000
 
-    def test_close_twice_and_close_without_start(self, layout: Layout) -> None:
+    def test_close_without_start_or_twice_reports_an_incomplete_session(self, layout: Layout) -> None:
         telemetry = TelemetryProcess(TelemetryConfig(publish=False), layout)
         assert not telemetry.close().complete
         assert not telemetry.close().complete
@@ -148,7 +150,7 @@ for file in descriptor_pb2.FileDescriptorSet.FromString(open(sys.argv[2], "rb").
     pool.Add(file)
 config = zenoh.Config.from_json5('{mode: "client", connect: {endpoints: ["%s"]}}' % sys.argv[1])
 config.insert_json5("scouting/multicast/enabled", "false")
-config.insert_json5("transport/shared_memory/enabled", "false")  # it will be killed
+config.insert_json5("transport/shared_memory/enabled", "false")  # the process will be killed
 with zenoh.open(config) as session, session.declare_subscriber("atalante/*/*") as subscriber:
     for sample in subscriber:
         name = str(sample.encoding).split(";")[1]
@@ -164,30 +166,30 @@ def subscribe(telemetry: TelemetryProcess) -> subprocess.Popen[str]:
     )
 
 
-def heard(child: subprocess.Popen[str]) -> tuple[str, int]:
+def read_sample(child: subprocess.Popen[str]) -> tuple[str, int]:
     assert child.stdout is not None
     key, cycle = child.stdout.readline().split()
     return key, int(cycle)
 
 
 class TestSubscriber:
-    def test_gets_typed_messages_at_the_documented_rate(self, layout: Layout) -> None:
-        """Counted in cycles of the robot: 100 Hz is every tenth, 10 Hz every hundredth."""
+    def test_subscriber_receives_typed_messages_at_the_documented_rates(self, layout: Layout) -> None:
+        """Rates are counted in robot cycles: 100 Hz is every tenth, 10 Hz every hundredth."""
         with (
             TelemetryProcess(TelemetryConfig(listen=free_endpoint()), layout) as telemetry,
             subscribe(telemetry) as child,
         ):
             try:
-                cycle = write_until_heard(telemetry, child, 0)
-                got: list[tuple[str, int]] = []
+                cycle = write_until_received(telemetry, child, 0)
+                samples: list[tuple[str, int]] = []
                 for _ in range(200):
                     write(telemetry, range(cycle, cycle + 10))
                     cycle += 10
-                    time.sleep(0.005)  # 2 ms a cycle at most: about as fast as a lock-step run
+                    time.sleep(0.005)  # at most 2 ms per cycle: about as fast as a lock-step run
                 last = cycle
-                while not got or got[-1][1] < last:
-                    cycle = write_until_heard(telemetry, child, cycle)
-                    got.append(heard(child))
+                while not samples or samples[-1][1] < last:
+                    cycle = write_until_received(telemetry, child, cycle)
+                    samples.append(read_sample(child))
             finally:
                 child.kill()
         first = last - 2000
@@ -199,13 +201,11 @@ class TestSubscriber:
             "system": 10,
             "loop": 100,
         }.items():
-            cycles = [at for found, at in got if found == key and first <= at < last]
+            cycles = [at for sample_key, at in samples if sample_key == key and first <= at < last]
             assert all(at % every == 0 for at in cycles), key
             assert 0.5 * 2000 / every <= len(cycles) <= 2000 / every, key
 
-    def test_a_stopped_one_costs_the_loop_nothing_and_the_recording_nothing(
-        self, layout: Layout, tmp_path: Path
-    ) -> None:
+    def test_stopped_subscriber_does_not_affect_loop_or_recording(self, layout: Layout, tmp_path: Path) -> None:
         path = tmp_path / "recording.mcap"
         config = TelemetryConfig(
             recording=path,
@@ -218,7 +218,7 @@ class TestSubscriber:
         )
         with TelemetryProcess(config, layout) as telemetry, subscribe(telemetry) as child:
             try:
-                cycle = write_until_heard(telemetry, child, 0)
+                cycle = write_until_received(telemetry, child, 0)
                 child.send_signal(signal.SIGSTOP)
                 write(telemetry, range(cycle, cycle + 4000))
                 summary = telemetry.close()
@@ -229,18 +229,18 @@ class TestSubscriber:
         assert [message.cycle for message in recorded(path)] == list(range(cycle + 4000))
 
 
-def write_until_heard(telemetry: TelemetryProcess, child: subprocess.Popen[str], cycle: int) -> int:
-    """Write from `cycle` on until the subscriber says something; the cycle that comes next."""
+def write_until_received(telemetry: TelemetryProcess, child: subprocess.Popen[str], cycle: int) -> int:
+    """Write from `cycle` on until the subscriber prints a message; return the next cycle."""
     for _ in range(TRIES):
         if select.select([child.stdout], [], [], 0.02)[0]:
             return cycle
         write(telemetry, range(cycle, cycle + 10))
         cycle += 10
-    raise AssertionError("the subscriber heard nothing")
+    raise AssertionError("the subscriber received nothing")
 
 
-class TestDeath:
-    def test_of_telemetry_changes_nothing_for_the_writer(self, layout: Layout, tmp_path: Path) -> None:
+class TestEndOfTelemetry:
+    def test_killed_telemetry_does_not_affect_the_writer(self, layout: Layout, tmp_path: Path) -> None:
         config = TelemetryConfig(
             recording=tmp_path / "r.mcap", record_rate=1000, lock_step=True, publish=False, slots=64, patience=FOREVER
         )
@@ -249,11 +249,11 @@ class TestDeath:
             os.kill(pid_of(telemetry), signal.SIGKILL)
             write(telemetry, range(200, 2000))
             until(lambda: not telemetry.alive)
-            telemetry.event(2000, "READY", "still no exception")
+            telemetry.event(Event(2000, "READY", "still no exception"))
             assert not telemetry.records.lossless
             assert not telemetry.close().complete
 
-    def test_stopped_telemetry_is_not_waited_for_in_overwrite_mode(self, layout: Layout, tmp_path: Path) -> None:
+    def test_writer_overwrites_records_while_telemetry_is_stopped(self, layout: Layout, tmp_path: Path) -> None:
         path = tmp_path / "recording.mcap"
         config = TelemetryConfig(recording=path, record_rate=1000, publish=False, slots=64, patience=FOREVER)
         with TelemetryProcess(config, layout) as telemetry:
@@ -269,7 +269,7 @@ class TestDeath:
         assert summary.lost >= 2000 - 2 * 64
         assert [event.code for event in recorded(path, "/events")] == ["TELEMETRY_DROPPED"]
 
-    def test_telemetry_that_stays_stopped_is_ended_by_force(self, layout: Layout) -> None:
+    def test_close_kills_telemetry_that_stays_stopped(self, layout: Layout) -> None:
         with TelemetryProcess(TelemetryConfig(publish=False), layout) as telemetry:
             pid = pid_of(telemetry)
             os.kill(pid, signal.SIGSTOP)
@@ -277,7 +277,7 @@ class TestDeath:
             assert not telemetry.close(timeout=0.1).complete
         assert not Path(f"/proc/{pid}").exists()
 
-    def test_sigterm_finishes_the_recording_and_frees_a_waiting_writer(self, layout: Layout, tmp_path: Path) -> None:
+    def test_sigterm_finishes_the_recording_and_releases_a_waiting_writer(self, layout: Layout, tmp_path: Path) -> None:
         path = tmp_path / "recording.mcap"
         config = TelemetryConfig(
             recording=path, record_rate=1000, lock_step=True, listen=free_endpoint(), slots=64, patience=FOREVER
@@ -291,7 +291,7 @@ class TestDeath:
         assert cycles == list(range(len(cycles)))
         assert len(cycles) >= 500 - 64
 
-    def test_ctrl_c_is_for_the_loop(self, layout: Layout, tmp_path: Path) -> None:
+    def test_sigint_does_not_end_telemetry(self, layout: Layout, tmp_path: Path) -> None:
         path = tmp_path / "recording.mcap"
         config = TelemetryConfig(recording=path, record_rate=1000, lock_step=True, publish=False, slots=64)
         with TelemetryProcess(config, layout) as telemetry:
@@ -301,7 +301,7 @@ class TestDeath:
             assert telemetry.close().complete
         assert len(recorded(path)) == 500
 
-    def test_of_the_loop_finishes_the_recording(self, layout: Layout, tmp_path: Path) -> None:
+    def test_recording_is_finished_when_the_loop_is_killed(self, layout: Layout, tmp_path: Path) -> None:
         path = tmp_path / "recording.mcap"
         program = (
             "import json, os, signal, sys\n"
@@ -331,7 +331,7 @@ class TestDeath:
         assert [message.cycle for message in recorded(path)] == list(range(300))
 
 
-def test_a_full_disk_stops_the_recording_and_nothing_else(layout: Layout, tmp_path: Path) -> None:
+def test_full_disk_stops_only_the_recording(layout: Layout, tmp_path: Path) -> None:
     config = TelemetryConfig(
         recording=tmp_path / "r.mcap", record_rate=1000, lock_step=True, publish=False, slots=64, patience=FOREVER
     )
@@ -359,31 +359,31 @@ def test_a_full_disk_stops_the_recording_and_nothing_else(layout: Layout, tmp_pa
     assert 0 < summary.recording.missing_cycles <= 2000
 
 
-class TestRefusals:
+class TestRejectedConfigurations:
     @pytest.mark.parametrize("rate", [0, -1, 3, 300, 2000])
-    def test_a_rate_that_does_not_divide_the_loop_rate(self, rate: int) -> None:
+    def test_rate_that_is_no_divisor_of_the_loop_rate_is_rejected(self, rate: int) -> None:
         with pytest.raises(TelemetryError, match="must be a divisor of 1000 Hz"):
             TelemetryConfig(record_rate=rate)
 
     @pytest.mark.parametrize("robot", ["", "a/b", "**", "a b", "@x"])
-    def test_a_name_that_is_no_chunk_of_a_key(self, robot: str) -> None:
+    def test_robot_name_that_is_no_key_chunk_is_rejected(self, robot: str) -> None:
         with pytest.raises(TelemetryError, match="must be a name of letters, digits"):
             TelemetryConfig(robot=robot)
 
-    def test_a_log_format_that_loses_frames(self, layout: Layout, tmp_path: Path) -> None:
+    def test_log_format_that_loses_frames_is_rejected(self, layout: Layout, tmp_path: Path) -> None:
         with (
             pytest.raises(TelemetryError, match=r"\.log, \.asc, \.blf"),
             TelemetryProcess(TelemetryConfig(can_log=tmp_path / "run.db", publish=False), layout),
         ):
             pass
 
-    def test_a_recording_that_cannot_be_made(self, layout: Layout, tmp_path: Path) -> None:
+    def test_recording_path_that_cannot_be_created_is_rejected(self, layout: Layout, tmp_path: Path) -> None:
         (tmp_path / "file").touch()
         config = TelemetryConfig(recording=tmp_path / "file" / "r.mcap", publish=False)
         with pytest.raises(TelemetryError, match="cannot be created"), TelemetryProcess(config, layout):
             pass
 
-    def test_an_endpoint_that_was_asked_for_and_is_taken(self, layout: Layout) -> None:
+    def test_configured_endpoint_with_a_taken_port_is_rejected(self, layout: Layout) -> None:
         with socket.socket() as taken:
             taken.bind(("127.0.0.1", 0))
             taken.listen()
@@ -391,7 +391,7 @@ class TestRefusals:
             with pytest.raises(TelemetryError, match="the port is taken"), TelemetryProcess(config, layout):
                 pass
 
-    def test_a_tap_without_a_log(self, layout: Layout) -> None:
+    def test_tap_without_a_can_log_is_rejected(self, layout: Layout) -> None:
         telemetry = TelemetryProcess(TelemetryConfig(publish=False), layout)
         with pytest.raises(TelemetryError, match="set can_log"):
             telemetry.tap()
@@ -410,7 +410,7 @@ class TestLateStart:
 
         return config
 
-    def test_the_recording_begins_when_the_process_joins_and_the_gap_is_counted(
+    def test_recording_starts_when_the_process_is_ready_and_counts_the_gap(
         self, layout: Layout, late: Callable[[float], TelemetryConfig], tmp_path: Path
     ) -> None:
         telemetry = TelemetryProcess(late(1.0), layout)
@@ -425,7 +425,7 @@ class TestLateStart:
         assert summary.recording == Recording(("r.mcap",), False, 437)
         assert [message.cycle for message in recorded(tmp_path / "r.mcap")] == list(range(438, 521))
 
-    def test_a_run_that_ends_before_the_process_joins_is_recorded(
+    def test_run_that_ends_before_the_process_is_ready_is_recorded(
         self, layout: Layout, late: Callable[[float], TelemetryConfig], tmp_path: Path
     ) -> None:
         telemetry = TelemetryProcess(late(1.0), layout)
@@ -435,7 +435,7 @@ class TestLateStart:
         assert telemetry.close(60.0).recording == Recording(("r.mcap",), True, 0)
         assert [message.cycle for message in recorded(tmp_path / "r.mcap")] == list(range(1, 51))
 
-    def test_a_process_that_never_joins_is_killed_at_the_end(
+    def test_process_that_is_never_ready_is_killed_at_the_end(
         self, layout: Layout, late: Callable[[float], TelemetryConfig]
     ) -> None:
         telemetry = TelemetryProcess(late(3600.0), layout)
@@ -447,7 +447,7 @@ class TestLateStart:
         assert summary.notices == ("the telemetry process was not ready at the end of the run",)
         assert summary.recording == Recording((), False, 50)
 
-    def test_in_lock_step_the_start_waits_for_the_process(
+    def test_lock_step_start_fails_when_the_process_is_not_ready_in_time(
         self, layout: Layout, late: Callable[[float], TelemetryConfig]
     ) -> None:
         telemetry = TelemetryProcess(replace(late(3600.0), lock_step=True), layout)
@@ -455,7 +455,51 @@ class TestLateStart:
             telemetry.start(1.0)
 
 
-def test_without_zenoh_the_recording_goes_on(layout: Layout, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+class TestEarlyChild:
+    """A telemetry process that is started before its session is known."""
+
+    def test_session_uses_the_process_that_was_started_early(self, layout: Layout, tmp_path: Path) -> None:
+        config = TelemetryConfig(recording=tmp_path / "r.mcap", record_rate=1000, publish=False, lock_step=True)
+        with TelemetryChild() as child:
+            telemetry = TelemetryProcess(config, layout, child=child)
+            telemetry.start()
+            assert pid_of(telemetry) == child.pid
+            write(telemetry, range(1, 51))
+            assert telemetry.close().recording == Recording(("r.mcap",), True, 0)
+            assert not child.alive
+
+    def test_process_without_a_session_ends_with_its_block(self) -> None:
+        with TelemetryChild() as child:
+            assert child.alive
+        assert not child.alive
+
+    def test_session_that_does_not_start_ends_its_process(self, layout: Layout) -> None:
+        child = TelemetryChild()
+        TelemetryProcess(TelemetryConfig(publish=False), layout, child=child).close()
+        assert not child.alive
+
+    def test_process_without_a_session_ends_when_its_parent_is_killed(self) -> None:
+        program = (
+            "import os, signal\n"
+            "from atalante_hal.telemetry.child import TelemetryChild\n"
+            "print(TelemetryChild().pid, flush=True)\n"
+            "os.kill(os.getpid(), signal.SIGKILL)\n"
+        )
+        done = subprocess.run([sys.executable, "-c", program], stdout=subprocess.PIPE, check=False)
+        assert done.returncode == -signal.SIGKILL
+        pid = int(done.stdout)
+        until(lambda: not Path(f"/proc/{pid}/exe").exists())
+
+    def test_process_that_ended_before_its_session_is_an_error(self, layout: Layout) -> None:
+        child = TelemetryChild()
+        child.kill()
+        child.wait()
+        telemetry = TelemetryProcess(TelemetryConfig(publish=False, lock_step=True), layout, child=child)
+        with pytest.raises(TelemetryError, match="was not ready"):
+            telemetry.start()
+
+
+def test_recording_is_complete_without_zenoh(layout: Layout, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "zenoh.py").write_text("raise ImportError('no zenoh here', name='zenoh')\n")
     monkeypatch.setenv("PYTHONPATH", str(tmp_path))
     path = tmp_path / "recording.mcap"
@@ -491,7 +535,7 @@ class TestCanLog:
         assert summary.frames_logged == len(path.read_text().splitlines())
         return path
 
-    def test_one_seed_one_log_to_the_byte_another_seed_another(
+    def test_can_log_is_identical_for_one_seed_and_differs_for_another(
         self, make_rig: Callable[..., Any], tmp_path: Path
     ) -> None:
         one, again, other = (
@@ -501,7 +545,7 @@ class TestCanLog:
         assert one == again
         assert one != other
 
-    def test_every_bus_is_a_channel_and_time_goes_on_over_the_runs(
+    def test_can_log_has_one_channel_per_bus_and_monotonic_time(
         self, make_rig: Callable[..., Any], tmp_path: Path
     ) -> None:
         messages = list(can.LogReader(self.log(make_rig, tmp_path / "run.log", 1)))

@@ -1,4 +1,4 @@
-"""README and documentation are true: their commands run, their Python compiles, their links and paths exist."""
+"""Check README and documentation: their commands run, their Python compiles, their links and paths exist."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ PAGES = {str(page.relative_to(ROOT)): page.read_text() for page in (ROOT / "READ
 MAKEFILE = (ROOT / "Makefile").read_text()
 BLOCK = re.compile(r"^( *)```(\w*)[^\n]*\n(.*?)^\1```$", re.MULTILINE | re.DOTALL)
 INCLUDE = re.compile(r"--8<-- \"([^\"]+)\"")
-#: Lines of ```sh blocks that are not run here, by the first pattern that is found in them, and why.
+#: Pattern of command lines that are not run here -> reason. The first pattern that matches a line applies.
 NOT_RUN = {
     r"-i socketcan|--can-interface": "needs a CAN interface",
     r"^make ": "builds, installs or runs the whole suite; continuous integration runs it",
@@ -32,6 +32,7 @@ NOT_RUN = {
     r"^atalante airwalk --steps 100": "runs until it is stopped; tests/project/test_examples.py runs it with the subscriber",
     r"^atalante gait (library|fit|check)": "takes minutes",
     r"^atalante faults campaign": "takes an hour",
+    r"^atalante guide check --patients": "takes hours",
 }
 
 
@@ -47,13 +48,13 @@ def commands(page: str) -> list[str]:
 
 
 def reason_not_to_run(line: str) -> str | None:
-    """Return why a line is not run; None: it is."""
+    """Return why a line is not run, or None if it is run."""
     return next((reason for pattern, reason in NOT_RUN.items() if re.search(pattern, line)), None)
 
 
 def runnable(page: str) -> list[str]:
-    """Return the lines of a page that are run, in their order. What the README shares with the quickstart runs there."""
-    shared = commands("docs/quickstart.md") if page == "README.md" else []
+    """Return the lines of a page that are run, in their order. A command of README and another page runs for the other page."""
+    shared = {line for other in PAGES if other != page for line in commands(other)} if page == "README.md" else set()
     return [line for line in commands(page) if line not in shared and reason_not_to_run(line) is None]
 
 
@@ -63,20 +64,20 @@ MAKE = sorted(
 )
 
 
-def test_there_are_commands_to_check():
+def test_documentation_contains_commands_and_make_targets():
     assert sum(line.startswith("atalante ") for _, line in ALL) >= 20
     assert {"demo", "test", "docs"} <= set(MAKE)
 
 
-def test_every_reason_not_to_run_a_command_is_needed():
+def test_every_exclusion_pattern_matches_a_command():
     for pattern in NOT_RUN:
         assert any(re.search(pattern, line) for _, line in ALL), f"no command matches {pattern}"
 
 
 @pytest.mark.parametrize("line", sorted({line for _, line in ALL if line.startswith("atalante ")}))
-def test_a_command_is_accepted_by_the_parser(line: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
-    """The program's own parser, down to the subcommand; nothing is run."""
-    (tmp_path / "runs").mkdir()  # as the commands before it leave it
+def test_documented_command_is_accepted_by_the_parser(line: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    """Parse the line with the parser of the program, down to the subcommand, without running it."""
+    (tmp_path / "runs").mkdir()  # folder and file that earlier commands of the page create
     (tmp_path / "runs" / "old.dbc").touch()
     (tmp_path / "dbc").symlink_to(ROOT / "dbc")
     monkeypatch.chdir(tmp_path)
@@ -92,9 +93,9 @@ def test_a_command_is_accepted_by_the_parser(line: str, tmp_path: Path, monkeypa
 
 
 @pytest.mark.parametrize("page", [page for page in PAGES if runnable(page)])
-def test_the_commands_of_a_page_succeed_in_their_order(page: str, tmp_path: Path):
-    """In a folder that looks like the root of the project and keeps what the commands write."""
-    for name in ("atalante_hal", "dbc", "tests"):
+def test_commands_of_a_page_succeed_in_order(page: str, tmp_path: Path):
+    """Run the commands in a temporary copy of the project root, to which they write their output."""
+    for name in ("atalante_hal", "dbc", "examples", "tests"):
         (tmp_path / name).symlink_to(ROOT / name)
     environment = {**os.environ, "PATH": f"{Path(sys.executable).parent}:{os.environ['PATH']}"}
     for line in runnable(page):
@@ -105,7 +106,7 @@ def test_the_commands_of_a_page_succeed_in_their_order(page: str, tmp_path: Path
 
 
 @pytest.mark.parametrize("page", PAGES)
-def test_python_blocks_compile_and_includes_exist(page: str):
+def test_python_blocks_compile_and_included_files_exist(page: str):
     for path in INCLUDE.findall(PAGES[page]):
         assert (ROOT / path).is_file(), path
     for block in blocks(page, "python"):
@@ -114,11 +115,11 @@ def test_python_blocks_compile_and_includes_exist(page: str):
 
 
 @pytest.mark.parametrize("target", MAKE)
-def test_a_make_target_exists(target: str):
+def test_documented_make_target_exists(target: str):
     assert re.search(rf"^{target}:", MAKEFILE, re.MULTILINE)
 
 
-def test_make_alone_lists_every_target():
+def test_make_without_a_target_lists_every_target():
     done = subprocess.run(["make", "--no-print-directory"], cwd=ROOT, capture_output=True, text=True, check=True)
     (phony,) = re.findall(r"^\.PHONY: (.*)$", MAKEFILE, re.MULTILINE)
     assert [line.split()[0] for line in done.stdout.splitlines()] == phony.split()
@@ -127,7 +128,7 @@ def test_make_alone_lists_every_target():
 @pytest.mark.parametrize("page", PAGES)
 def test_paths_in_backticks_exist(page: str):
     paths = re.findall(r"`((?:[\w.-]+/)+[\w.-]*)`", PAGES[page])
-    made = ("runs/", "site/", "failed/")  # by commands
+    made = ("runs/", "site/", "failed/")  # written by commands
     missing = [path for path in paths if not path.startswith(made) and not (ROOT / path).exists()]
     assert missing == []
 
@@ -144,12 +145,12 @@ def test_every_page_is_in_the_navigation_once():
     assert sorted(navigation) == sorted(str(page.relative_to(DOCS)) for page in DOCS.rglob("*.md"))
 
 
-def test_the_command_line_page_has_every_command():
+def test_cli_page_lists_every_command():
     page = PAGES["docs/reference/cli.md"]
     assert re.findall(r"^\| `atalante (\w+)` \|", page, re.MULTILINE) == list(COMMANDS)
 
 
-def test_the_page_on_adapters_agrees_with_the_table_of_the_bus():
+def test_adapter_page_agrees_with_the_adapter_table():
     page = PAGES["docs/howto/real-bus.md"]
     rows = re.findall(r"^\| `(\w+)` \| `([^`]+)` \| (.+) \|$", page, re.MULTILINE)
     usable = {name: adapter for name, adapter in ADAPTERS.items() if adapter.can_fd and not adapter.unusable}
@@ -163,5 +164,5 @@ def test_the_page_on_adapters_agrees_with_the_table_of_the_bus():
     assert f"{ADAPTERS['socketcan'].setup}\n" in blocks("docs/howto/real-bus.md", "console")[0]
 
 
-def test_the_picture_is_small():
+def test_guide_shapes_image_is_at_most_120_kb():
     assert (DOCS / "img" / "guide_shapes.png").stat().st_size <= 120_000

@@ -1,4 +1,4 @@
-"""The programs in examples/ run to success and print what their docstrings say."""
+"""Check that the programs in examples/ succeed and print what their docstrings describe."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ def run(name: str) -> str:
 
 
 @pytest.mark.parametrize("path", EXAMPLES, ids=lambda path: path.name)
-def test_an_example_is_short_and_explains_itself(path: Path):
+def test_example_has_at_most_sixty_lines_and_a_complete_docstring(path: Path):
     text = path.read_text()
     assert len(text.splitlines()) <= 60
     docstring = ast.get_docstring(ast.parse(text)) or ""
@@ -32,31 +32,31 @@ def test_an_example_is_short_and_explains_itself(path: Path):
     assert "Prints" in docstring
 
 
-def test_the_controller_holds_the_pose_until_the_program_ends():
+def test_hold_pose_example_holds_until_the_program_ends():
     assert run("hold_pose.py").startswith("the program is ending [")  # not another reason for HOLD
     body = (ROOT / "examples" / "hold_pose.py").read_text().split('"""', 2)[2]
     assert sum(bool(line.strip()) for line in body.splitlines()) <= 20
 
 
-def test_the_own_bus_counts_frames_of_both_directions():
+def test_own_bus_example_counts_frames_in_both_directions():
     (line,) = (line for line in run("own_bus.py").splitlines() if line.startswith("HOLD "))
     assert "SYNC_LEFT_LEG" in line
 
 
-def test_the_own_guide_shape_is_certified_and_kept():
+def test_own_guide_shape_example_is_certified_and_stays_in_its_guide():
     certificate, walk = run("own_guide_shape.py").splitlines()
     assert certificate.startswith("certified - ")
     assert walk.startswith("the program is ending")
     assert float(walk.split()[-1]) < 1.0
 
 
-def test_the_fault_test_passes(tmp_path: Path):
+def test_lost_frames_example_passes(tmp_path: Path):
     test = ["-m", "pytest", "-n", "0", "-p", "no:cacheprovider", "examples/test_lost_frames.py"]
     done = subprocess.run([sys.executable, *test], capture_output=True, text=True, cwd=ROOT, timeout=300)
     assert "1 passed" in done.stdout, done.stdout
 
 
-def test_the_subscriber_receives_joint_states_without_our_modules(tmp_path: Path):
+def test_subscriber_example_receives_joint_states_without_atalante_packages(tmp_path: Path):
     text = (ROOT / "examples" / "subscribe.py").read_text()
     assert not re.search(r"^\s*(import|from) atalante", text, re.MULTILINE)
     walk = [

@@ -1,4 +1,4 @@
-"""What installs: all packages with their data, the robot side without PyBullet, and python-control keeps its name."""
+"""Check the installed files: all packages with their data, no need of PyBullet on the robot, no package named control."""
 
 from __future__ import annotations
 
@@ -39,16 +39,16 @@ def wheel(tmp_path_factory: pytest.TempPathFactory) -> list[str]:
         *(f"atalante_{package}/py.typed" for package in ("dbc", "hal", "control", "emulator", "tools")),
     ],
 )
-def test_the_wheel_has(wheel: list[str], path: str):
+def test_wheel_contains_the_file(wheel: list[str], path: str):
     assert path in wheel
 
 
-def test_the_wheel_has_nothing_else_at_the_top(wheel: list[str]):
+def test_wheel_has_only_atalante_packages_at_the_top(wheel: list[str]):
     top = {path.split("/")[0] for path in wheel}
     assert {name for name in top if not name.startswith("atalante_")} == set()
 
 
-def test_the_emulator_is_installed_on_the_python_versions_that_its_message_names():
+def test_emulator_extra_supports_the_python_versions_of_its_error_message():
     (engine,) = PROJECT["optional-dependencies"]["emulator"]
     marker = re.fullmatch(r"pybullet>=[\d.]+; python_version < '3\.(\d+)'", engine)
     assert marker, engine
@@ -57,7 +57,7 @@ def test_the_emulator_is_installed_on_the_python_versions_that_its_message_names
 
 @pytest.mark.parametrize("extra", sorted({"", *PROJECT["optional-dependencies"]}))
 def test_each_requirement_has_a_lower_bound(extra: str):
-    """A requirement without one is not tried by `make lowest`."""
+    """`make lowest` does not test a requirement without a lower bound."""
     requirements = PROJECT["optional-dependencies"][extra] if extra else PROJECT["dependencies"]
     assert requirements
     for requirement in requirements:
@@ -74,7 +74,7 @@ def run(program: str, *path: Path) -> str:
     return done.stdout
 
 
-def test_hal_and_controller_run_without_pybullet_and_without_a_telemetry_library():
+def test_hal_and_controller_import_without_pybullet_and_telemetry_libraries():
     run(
         "import sys\n"
         "for name in ('pybullet', 'zenoh', 'mcap', 'google', 'matplotlib'): sys.modules[name] = None\n"
@@ -83,8 +83,8 @@ def test_hal_and_controller_run_without_pybullet_and_without_a_telemetry_library
     )
 
 
-def test_importing_control_gives_another_package_of_that_name(tmp_path: Path):
-    """The component roots are no packages: python-control, installed later on the path, keeps its name."""
+def test_import_control_gives_python_control(tmp_path: Path):
+    """The folders of the components are no packages, so that `import control` imports python-control."""
     package = tmp_path / "control"
     package.mkdir()
     (package / "__init__.py").write_text("owner = 'python-control'\n")
@@ -92,8 +92,8 @@ def test_importing_control_gives_another_package_of_that_name(tmp_path: Path):
     assert run(program, ROOT).strip() == "python-control"
 
 
-def test_the_loops_process_opens_no_network_socket():
-    """The whole embedded stack but the telemetry process: no socket is made (audited by the interpreter), none is open."""
+def test_loop_process_opens_no_network_socket():
+    """Run the embedded stack without telemetry: no socket is created (audit hook of the interpreter) and none is open."""
     run(
         "import os, sys\n"
         "made = []\n"

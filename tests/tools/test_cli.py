@@ -30,7 +30,7 @@ from atalante_tools import cli as cli_module
 from atalante_tools.cli import COMMANDS, Commands, cli
 from atalante_tools.console.outcome import KNOWN, Failed, FaultLatched
 
-#: What a command loads that takes long, and --help must not.
+#: Modules that load slowly; `--help` must not import them.
 SLOW = {"numpy", "can", "cantools", "pybullet", "pinocchio", "zenoh", "mcap", "matplotlib", "atalante_dbc"}
 
 
@@ -45,7 +45,7 @@ def run(*arguments: str) -> subprocess.CompletedProcess[str]:
 # -- help ------------------------------------------------------------------------------------------------------------
 
 
-def helps(command: click.Command, path: list[str]) -> Iterator[str]:
+def help_texts(command: click.Command, path: list[str]) -> Iterator[str]:
     """Yield the help of a command and of all its subcommands."""
     result = CliRunner().invoke(cli, [*path, "--help"])
     assert (result.exit_code, result.stderr) == (0, "")
@@ -55,14 +55,14 @@ def helps(command: click.Command, path: list[str]) -> Iterator[str]:
         for name in command.list_commands(context):
             child = command.get_command(context, name)
             assert child is not None
-            yield from helps(child, [*path, name])
+            yield from help_texts(child, [*path, name])
 
 
 @pytest.mark.parametrize("name", COMMANDS)
 def test_every_command_has_help_with_an_example(name: str) -> None:
     command = cli.get_command(click.Context(cli), name)
     assert command is not None
-    first, *others = helps(command, [name])
+    first, *others = help_texts(command, [name])
     assert "Example: atalante " in first
     assert all(len(text.split("Options:")[0].splitlines()) > 2 for text in others)
 
@@ -75,7 +75,7 @@ def test_the_list_of_commands_is_complete_and_in_order() -> None:
     assert "0 ok, 1 failed, 2 usage error, 3 no device, 4 fault latched, 130" in result.stdout
 
 
-def test_help_and_version_load_nothing_slow() -> None:
+def test_help_and_version_import_no_slow_module() -> None:
     program = """
 import sys
 from atalante_tools.cli import cli
@@ -156,7 +156,7 @@ def failing(monkeypatch: pytest.MonkeyPatch) -> Any:
         (SystemExit(143), 143),
     ],
 )
-def test_a_known_error_is_one_sentence_and_its_code(failing: Any, error: BaseException, code: int) -> None:
+def test_known_error_prints_one_sentence_and_sets_its_exit_code(failing: Any, error: BaseException, code: int) -> None:
     result = failing(error)
     assert result.exit_code == code
     assert result.stdout == ""
@@ -186,7 +186,7 @@ def test_a_list_of_problems_is_shortened_to_the_first_and_a_count(failing: Any) 
         (OSError(28, "No space left on device"), "the output file cannot be read or written: No space left on device"),
     ],
 )
-def test_an_operating_system_error_of_a_file_is_one_sentence(failing: Any, error: OSError, sentence: str) -> None:
+def test_operating_system_error_of_a_file_prints_one_sentence(failing: Any, error: OSError, sentence: str) -> None:
     result = failing(error)
     assert (result.exit_code, result.stderr) == (1, f"atalante: {sentence}\n")
 
@@ -202,12 +202,12 @@ def test_a_group_without_subcommand_prints_its_help(group: str) -> None:
     assert (alone.exit_code, alone.stdout, alone.stderr) == (2, "", asked.stdout)
 
 
-def test_a_defect_keeps_its_traceback(failing: Any) -> None:
+def test_unexpected_error_keeps_its_traceback(failing: Any) -> None:
     error = ZeroDivisionError("a defect")
     assert failing(error).exception is error
 
 
-def test_every_known_error_exists() -> None:
+def test_every_known_error_is_an_exception_class() -> None:
     import importlib
 
     for module, name, _ in KNOWN:
@@ -236,7 +236,9 @@ def test_every_known_error_exists() -> None:
         (["pendant", "stop", "-i", "socketcan", "-c", "nocan7"], 3, "atalante doctor"),
     ],
 )
-def test_bad_input_is_one_sentence_and_its_code(arguments: list[str], code: int, sentence: str) -> None:
+def test_invalid_input_prints_one_sentence_and_sets_its_exit_code(
+    arguments: list[str], code: int, sentence: str
+) -> None:
     result = CliRunner().invoke(cli, arguments)
     assert (result.exit_code, result.stdout) == (code, "")
     assert sentence in result.stderr
@@ -246,7 +248,7 @@ def test_bad_input_is_one_sentence_and_its_code(arguments: list[str], code: int,
 # -- processes -------------------------------------------------------------------------------------------------------
 
 
-def test_version_and_codes_reach_the_shell() -> None:
+def test_process_prints_the_version_and_returns_the_exit_code() -> None:
     version, unknown = run("--version"), run("status", "-i", "pigeon", "-c", "x")
     assert (version.returncode, version.stdout.split()[0]) == (0, "atalante")
     assert unknown.returncode == 3
@@ -298,12 +300,12 @@ entry.main()
     "command",
     [
         "send({0}); print('not ended')",
-        "ctypes.CFUNCTYPE(None)(lambda: send({0}))()",  # where the exception is lost
+        "ctypes.CFUNCTYPE(None)(lambda: send({0}))()",  # the callback discards the exception
         "ctypes.CFUNCTYPE(None)(lambda: send({0}))(); sys.exit(1)",
-        "ctypes.CFUNCTYPE(None)(lambda: send({0}))(); send(signal.SIGTERM)",  # the first one counts
+        "ctypes.CFUNCTYPE(None)(lambda: send({0}))(); send(signal.SIGTERM)",  # the first signal sets the code
     ],
 )
-def test_a_signal_outside_a_run_decides_the_exit_code(number: signal.Signals, code: int, command: str) -> None:
+def test_signal_outside_a_run_sets_the_exit_code(number: signal.Signals, code: int, command: str) -> None:
     done = main_with(command.format(int(number)))
     assert (done.returncode, done.stdout, done.stderr) == (code, "", "")
 
@@ -314,13 +316,13 @@ def test_a_library_error_caused_by_a_signal_is_not_reported() -> None:
     assert (done.returncode, done.stderr) == (130, "")
 
 
-def test_an_error_after_a_signal_is_one_sentence() -> None:
+def test_error_after_a_signal_prints_one_sentence() -> None:
     done = main_with("ctypes.CFUNCTYPE(None)(lambda: send(2))(); 1 / 0")
     assert done.returncode == 130
     assert done.stderr == "atalante: stopped by a signal, then ZeroDivisionError: division by zero\n"
 
 
-def test_a_defect_without_a_signal_keeps_its_traceback_and_others_stay_reported() -> None:
+def test_unexpected_error_without_a_signal_prints_every_traceback() -> None:
     done = main_with("ctypes.CFUNCTYPE(None)(lambda: [][1])(); 1 / 0")
     assert done.returncode == 1
     assert "IndexError" in done.stderr
@@ -332,7 +334,7 @@ def test_a_signal_after_the_command_ends_the_process_without_a_traceback() -> No
     assert (done.returncode, done.stderr) == (-signal.SIGINT, "")
 
 
-def test_signals_are_handled_before_anything_is_imported() -> None:
+def test_signal_handlers_are_installed_before_the_imports() -> None:
     program = """
 import signal, sys
 there = set(sys.modules)
@@ -355,7 +357,7 @@ main()
     assert first == "atalante_tools.cli True True"
 
 
-def test_a_closed_pipe_ends_without_a_traceback() -> None:
+def test_command_with_closed_stdout_ends_without_a_traceback() -> None:
     reading, writing = os.pipe()
     os.close(reading)
     done = subprocess.run(

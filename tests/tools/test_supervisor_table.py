@@ -1,4 +1,4 @@
-"""The generated page of the supervisor is up to date and complete."""
+"""Generated page SUPERVISOR.md: it is complete, and agrees with the state machine."""
 
 from __future__ import annotations
 
@@ -16,11 +16,11 @@ from atalante_tools.supervisor_table import FACTS, a_diagnostic, page
 PAGE = Path(__file__).parents[2] / "SUPERVISOR.md"
 
 
-def test_the_page_matches_the_state_machine():
+def test_supervisor_page_matches_the_state_machine():
     assert PAGE.read_text() == page(), "SUPERVISOR.md is stale: type `make supervisor-table`"
 
 
-def test_every_reaction_has_a_row_in_both_tables_and_every_code_one_in_the_list():
+def test_page_has_a_row_for_every_reaction_and_diagnostic_code():
     lines = page().splitlines()
     for reaction in Reaction:
         rows = [line for line in lines if line.startswith(f"| {reaction.name} |")]

@@ -1,7 +1,6 @@
-"""Real SocketCAN for the tests in this folder: `make test-vcan`, or `pytest tests/vcan` where vcan0 is up.
+"""Fixtures for the tests in this folder, which need SocketCAN: `make test-vcan`, or `pytest tests/vcan` if vcan0 is up.
 
-Nothing here skips: these tests are run where SocketCAN was promised, so a missing interface is a failure that says what
-to type.
+No test is skipped. If an interface is missing, the tests fail, and the message contains the command to type.
 """
 
 from __future__ import annotations
@@ -19,34 +18,77 @@ from typing import Self
 
 import pytest
 
+from atalante_dbc import Network
 from atalante_hal.bus import BusAbsent
 from atalante_hal.bus.socketcan import SocketCanBus, require_channel
 from atalante_hal.hal import Hal
+from atalante_hal.robot import Robot
 from atalante_hal.types import SupervisorState
 from atalante_hal.wire.frame import FLAG_BRS, FLAG_FDF, new_frames
 from atalante_tools.session.pose_hold import PoseHold
+from tests.vcan.commands import load_commands
 
-#: Ends a candump log: an identifier the robot's network does not use.
+#: Identifier of the frame that marks the end of a candump log. The network of the robot does not use this identifier.
 END_ID = 0x7FF
-#: Longest wait for another process or thread [s]; a guest without KVM needs more.
-PATIENCE = float(os.environ.get("ATALANTE_VCAN_PATIENCE", "20"))
+#: Receive buffer of candump [bytes]: a minute of frames, because a loaded machine may run candump late.
+RECEIVE_BUFFER = 256 << 20
+#: Longest wait for another process, thread or message [s]. Only a failing test waits this long.
+PATIENCE = float(os.environ.get("ATALANTE_VCAN_PATIENCE", "60"))
+#: Folder in which each guest kernel marks the tests that it runs (see run.sh); empty means that this process runs all tests.
+CLAIMS = os.environ.get("ATALANTE_VCAN_CLAIMS", "")
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Run the longest tests first, so that no guest kernel waits for another guest at the end."""
+    items.sort(key=lambda item: "terminals" not in item.path.name)
+
+
+def pytest_runtestloop(session: pytest.Session) -> bool | None:
+    """Run the tests that no other guest kernel has claimed. A guest claims its next test before its present test ends."""
+    if not CLAIMS or session.testsfailed or session.config.option.collectonly:
+        return None
+
+    def claimed(number: int) -> bool:
+        try:
+            Path(CLAIMS, str(number)).mkdir()
+        except FileExistsError:
+            return False
+        return True
+
+    mine = (item for number, item in enumerate(session.items) if claimed(number))
+    item = next(mine, None)
+    while item is not None:
+        following = next(mine, None)
+        item.config.hook.pytest_runtest_protocol(item=item, nextitem=following)
+        if session.shouldfail:
+            raise session.Failed(session.shouldfail)
+        if session.shouldstop:
+            raise session.Interrupted(session.shouldstop)
+        item = following
+    return True
 
 
 @pytest.fixture(scope="session")
 def vcan() -> str:
-    """Name of a virtual CAN FD interface that is up."""
+    """Return the name of a virtual CAN FD interface that is up."""
     channel = os.environ.get("ATALANTE_VCAN", "vcan0")
     try:
         require_channel(channel)
     except BusAbsent as error:
         pytest.fail(
-            f"these tests need SocketCAN: {error}; or type `make test-vcan`, which does all of it", pytrace=False
+            f"these tests need SocketCAN: {error}; or type `make test-vcan`, which creates the interface", pytrace=False
         )
     return channel
 
 
+@pytest.fixture(scope="session")
+def loaded_commands(vcan: str, network: Network, robot: Robot) -> None:
+    """Load modules and machine code of the commands into this process, from which the terminals are forked."""
+    load_commands(network, robot)
+
+
 def as_root(*command: str) -> None:
-    """Run a command that needs root; fails the test with what to type."""
+    """Run a command as root. If it fails, the test fails with a message that contains the command."""
     line = command if os.geteuid() == 0 else ("sudo", "-n", *command)
     try:
         subprocess.run(line, check=True, capture_output=True, text=True)
@@ -57,8 +99,7 @@ def as_root(*command: str) -> None:
 
 def create(channel: str) -> None:
     """Create a virtual CAN FD interface and set it up."""
-    as_root("ip", "link", "add", channel, "type", "vcan")
-    as_root("ip", "link", "set", channel, "mtu", "72", "txqueuelen", "1000", "up")
+    as_root("ip", "link", "add", channel, "mtu", "72", "txqueuelen", "1000", "up", "type", "vcan")
 
 
 def remove(channel: str) -> None:
@@ -73,7 +114,7 @@ def present(channel: str) -> bool:
 
 @pytest.fixture
 def spare_vcan(vcan: str) -> Iterator[str]:
-    """Name of a second interface, up, that the test may take down, clog, remove or reconfigure."""
+    """Return the name of an interface that is up, and that the test may set down, disturb, remove or reconfigure."""
     channel = "vcanspare"
     create(channel)
     yield channel
@@ -81,9 +122,30 @@ def spare_vcan(vcan: str) -> Iterator[str]:
         remove(channel)
 
 
+@pytest.fixture
+def four_vcans(vcan: str) -> Iterator[list[str]]:
+    """Return the names of four interfaces that are up, one for each bus. The test may remove an interface and create it again."""
+    channels = [f"vcanbus{number}" for number in range(4)]
+    for channel in channels:
+        create(channel)
+    yield channels
+    for channel in channels:
+        if present(channel):
+            remove(channel)
+
+
+@pytest.fixture(scope="session")
+def second_vcan(vcan: str) -> Iterator[str]:
+    """Return the name of a second interface that stays up."""
+    channel = "vcansecond"
+    create(channel)
+    yield channel
+    remove(channel)
+
+
 @contextmanager
 def repeated(work: Callable[[], object]) -> Iterator[None]:
-    """`work` again and again in a thread of its own."""
+    """Call `work` repeatedly in another thread until the block ends."""
     over = threading.Event()
 
     def run() -> None:
@@ -100,7 +162,7 @@ def repeated(work: Callable[[], object]) -> Iterator[None]:
 
 
 class Loop:
-    """A HAL and the pose it found, one cycle after the other; `each` is called at the end of every cycle."""
+    """Loop of a HAL that holds its pose, run in steps by a test. `each` is called at the end of every cycle."""
 
     def __init__(self, hal: Hal, each: Callable[[], object] = lambda: None) -> None:
         self._hal, self._each = hal, each
@@ -108,7 +170,7 @@ class Loop:
         self._moved = False
 
     def cycles(self, count: int, wanted: SupervisorState | None = None) -> SupervisorState:
-        """So many cycles, or up to the first one in a state."""
+        """Run `count` cycles, or fewer if the HAL reaches the state `wanted` earlier. Return the last state."""
         hal = self._hal
         for _ in range(count):
             state = hal.read()
@@ -126,54 +188,58 @@ class Loop:
 
 
 class Candump:
-    """`candump -L` of can-utils writing every frame of a channel to a log: the second witness of what is on the wire.
+    """Log of all frames on a channel, written by `candump -L` of can-utils, which is independent of this project.
 
-    A context: entered, it listens; left, the log is complete. Leaving sends one frame with `END_ID`, which is not in the
-    log.
+    Inside the `with` block, candump records. After the block, the log is complete. At the end of the block, a frame with `END_ID`
+    is sent, which is then removed from the log.
     """
 
     def __init__(self, channel: str, log: Path) -> None:
-        self.log = log
-        self._channel = channel
+        self.log, self.channel = log, channel
 
     def __enter__(self) -> Self:
         if shutil.which("candump") is None:
             pytest.fail("candump is missing: type `apt-get install can-utils`", pytrace=False)
-        listening = self._listeners()
+        listening = self.listeners()
         with self.log.open("wb") as output:
-            command = ["candump", "-L", "-d", "-r", str(8 << 20), self._channel]
+            command = ["candump", "-L", "-d", "-r", str(RECEIVE_BUFFER), self.channel]
             self._process = subprocess.Popen(command, stdout=output, stderr=subprocess.STDOUT)
-        self._wait(lambda: self._listeners() > listening)
+        self._wait(lambda: self.listeners() > listening)
         return self
 
     def __exit__(self, *_: object) -> None:
         try:
             end = new_frames(1)
             end["can_id"], end["flags"] = END_ID, FLAG_FDF | FLAG_BRS
-            bus = SocketCanBus(self._channel)
+            bus = SocketCanBus(self.channel)
             bus.send(end)
             bus.close()
-            self._wait(lambda: f" {END_ID:03X}##" in self.log.read_text()[-200:])
+            self._wait(lambda: f" {END_ID:03X}##" in self._tail())
         finally:
             self._process.send_signal(signal.SIGTERM)
             self._process.wait(PATIENCE)
         lines = self.log.read_text().splitlines(keepends=True)
         self.log.write_text("".join(line for line in lines if f" {END_ID:03X}##" not in line))
 
-    def _listeners(self) -> int:
-        """Sockets that receive everything from the channel."""
+    def _tail(self) -> str:
+        with self.log.open("rb") as log:
+            log.seek(max(0, self.log.stat().st_size - 200))
+            return log.read().decode()
+
+    def listeners(self) -> int:
+        """Return the number of sockets that receive every frame of the channel."""
         table = Path("/proc/net/can/rcvlist_all").read_text()
-        return sum(line.split()[:1] == [self._channel] for line in table.splitlines())
+        return sum(line.split()[:1] == [self.channel] for line in table.splitlines())
 
     def _wait(self, ready: Callable[[], bool]) -> None:
         deadline = time.monotonic() + PATIENCE
         while not ready():
             assert self._process.poll() is None, f"candump ended: {self.log.read_text()}"
-            assert time.monotonic() < deadline, "candump is silent"
+            assert time.monotonic() < deadline, f"candump is silent after {self._tail()}"
             time.sleep(0.01)
 
 
 @pytest.fixture
 def candump(vcan: str, tmp_path: Path) -> Candump:
-    """`with candump: ...` records `vcan` to `candump.log`."""
+    """Return a recorder of the interface `vcan`, which writes `candump.log`."""
     return Candump(vcan, tmp_path / "candump.log")

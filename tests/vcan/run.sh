@@ -1,9 +1,10 @@
 #!/usr/bin/env bash
-# The vcan lane: tests/vcan on real SocketCAN, on this kernel if it has SocketCAN, otherwise in a guest kernel.
+# Run the tests in tests/vcan on real SocketCAN: on this kernel if it has SocketCAN, otherwise in a guest kernel.
 #
 #   tests/vcan/run.sh [PYTEST ARGUMENTS]     PYTHON=.venv/bin/python chooses the interpreter
-#   GUEST=uml|qemu tests/vcan/run.sh ...     chooses the guest: uml is User-Mode Linux (native speed, one CPU),
-#                                            qemu is a Debian kernel in QEMU without KVM (two CPUs, about 20 times slower)
+#   GUEST=uml|qemu tests/vcan/run.sh ...     chooses the guest: uml is User-Mode Linux (native speed, one CPU; two guests share
+#                                            the tests if this machine has two CPUs), qemu is a Debian kernel in QEMU without
+#                                            KVM (two CPUs, about 20 times slower)
 #
 # Without GUEST, uml is used if it boots here, otherwise qemu. The script succeeds only if pytest ran on a working vcan0 and
 # ended with 0: no SocketCAN, no boot or no result is a failure.
@@ -17,6 +18,7 @@ uml_boot_limit=60
 uml_limit=${VCAN_LANE_SECONDS:-1500}
 qemu_limit=${VCAN_LANE_SECONDS:-2100}
 memory_mb=4096
+uml_guests=$(($(nproc) > 1 ? 2 : 1)) # a guest has one CPU
 
 say() { printf 'vcan lane: %s\n' "$*" >&2; }
 fail() {
@@ -73,7 +75,7 @@ run_tests() {
     "$python" -m pytest tests/vcan -vv -n 0 -p no:cacheprovider -o faulthandler_timeout=300 "$@"
 }
 
-# The newest kernel of this machine that brings the vcan module.
+# Print the newest kernel of this machine that has the vcan module.
 bootable_kernel() {
     local version
     for version in $(ls /lib/modules | sort -rV); do
@@ -84,7 +86,7 @@ bootable_kernel() {
     done
 }
 
-# What a guest runs. The exit code comes back in a file, because neither guest passes it on.
+# Run the tests inside a guest. The exit code is written to a file, because a guest cannot return an exit code.
 inside() {
     local result=$1 code=0
     shift
@@ -100,91 +102,117 @@ inside() {
     return "$code"
 }
 
-stop_guest() {
-    kill "$guest" 2>/dev/null # timeout passes the signal on to the guest's processes
-    wait "$guest" || true
+stop_guests() {
+    kill "${guests[@]}" 2>/dev/null # timeout passes the signal on to the processes of the guest
+    wait "${guests[@]}" || true
 }
 
-# Run a guest in the background until it ends or the operator interrupts it; `guest` is its process.
-await_guest() {
-    local code=0
-    trap 'stop_guest; exit 130' INT
-    trap 'stop_guest; exit 143' TERM
-    wait "$guest" || code=$?
+# Run guests in the background until all have ended or the operator interrupts them; `guests` are their processes.
+await_guests() {
+    local guest code=0
+    trap 'stop_guests; exit 130' INT
+    trap 'stop_guests; exit 143' TERM
+    for guest in "${guests[@]}"; do
+        wait "$guest" || code=$?
+    done
     trap - INT TERM
     return "$code"
 }
 
-# Print the exit code that pytest left in the result folder; fail if there is none.
+# Return the exit code that pytest left in the folder of a guest; fail if there is none.
 result_of_guest() {
-    [ -s "$result/exit-code" ] || fail "the guest ended without a result ($1; 124 means longer than its time limit)"
-    say "pytest in the guest ended with exit code $(cat "$result/exit-code")"
-    return "$(cat "$result/exit-code")"
+    local folder=$1 code
+    [ -s "$folder/exit-code" ] || fail "the guest ended without a result ($2; 124 means longer than its time limit)"
+    code=$(cat "$folder/exit-code")
+    say "pytest in the guest ended with exit code $code"
+    return "$code"
 }
 
-# The init process of User-Mode Linux. Its root is the root of this machine (hostfs); /run is its own, with the tests' files.
+# Print the init script of User-Mode Linux. The guest has the root folder of this machine (hostfs), and its own /run for the
+# files of the tests.
 uml_init() {
+    # A page fault takes 0.1 ms in the guest, and each body of PyBullet needs 28 MB. Therefore malloc keeps freed memory.
     cat <<EOF
 #!/bin/bash
-export PATH='$PATH' HOME='$HOME' PYTHON='$python' TMPDIR=/run/tmp
+export PATH='$PATH' HOME='$HOME' PYTHON='$python' TMPDIR=/run/tmp ATALANTE_VCAN_CLAIMS='$result/claims'
+export MALLOC_MMAP_THRESHOLD_=$((1 << 30)) MALLOC_TRIM_THRESHOLD_=$((1 << 30))
 mount -t proc proc /proc && mount -t sysfs sys /sys
 mountpoint -q /dev || mount -t devtmpfs dev /dev
 mkdir -p /dev/shm /dev/pts && mount -t devpts pts /dev/pts
 mount -t tmpfs run /run && mount -t tmpfs shm /dev/shm && mkdir /run/tmp
 mount --bind /usr/lib/uml/modules /lib/modules
 ip link set lo up
-cd '$PWD' && bash tests/vcan/run.sh --inside '$result' $1
+cd '$PWD' && bash tests/vcan/run.sh --inside '$1' $2
 sync
 halt -f
 EOF
 }
 
-# Return 3 if this machine cannot boot User-Mode Linux, otherwise the exit code of pytest.
-in_uml() {
-    local code=0 arguments="" watcher memory=/dev/shm
-    install_missing "${uml_packages[@]}"
-    [ $# = 0 ] || printf -v arguments '%q ' "$@"
-    uml_init "$arguments" >"$result/init"
-    chmod +x "$result/init"
-    # Its memory is a file: on the disk if the shared memory of this machine is too small.
-    [ "$(df --output=avail -m $memory 2>/dev/null | tail -1 || echo 0)" -gt $((memory_mb + 512)) ] || memory=$result
-    say "this kernel has no usable SocketCAN; booting User-Mode Linux $(linux.uml --version)"
+# Boot one User-Mode Linux in the background. $1: folder for its results. $2: arguments of pytest, quoted for the shell.
+boot_uml() {
+    local folder=$1 memory=/dev/shm
+    mkdir -p "$folder"
+    uml_init "$folder" "$2" >"$folder/init"
+    chmod +x "$folder/init"
+    # The memory of the guest is a file in /dev/shm, or on the disk if /dev/shm is too small.
+    [ "$(df --output=avail -m $memory 2>/dev/null | tail -1 || echo 0)" -gt $((uml_guests * memory_mb + 512)) ] ||
+        memory=$folder
     TMPDIR=$memory timeout -k 10 "$uml_limit" linux.uml mem=${memory_mb}M rootfstype=hostfs rootflags=/ rw \
-        init="$result/init" con=null con0=fd:0,fd:1 quiet </dev/null > >(cat) 2>"$result/kernel.log" &
-    guest=$!
-    { sleep $uml_boot_limit && [ ! -e "$result/booted" ] && kill $guest; } 2>/dev/null &
-    watcher=$!
-    await_guest || code=$?
-    kill $watcher 2>/dev/null || true
-    if [ ! -e "$result/booted" ]; then
-        say "User-Mode Linux does not boot on this machine (exit code $code):"
-        tail -5 "$result/kernel.log" >&2
-        return 3
-    fi
-    result_of_guest "linux.uml: exit code $code"
+        init="$folder/init" con=null con0=fd:0,fd:1 quiet </dev/null > >(exec sed -u "s/^/$(basename "$folder"): /") \
+        2>"$folder/kernel.log" &
+    guests+=($!)
+    { sleep $uml_boot_limit && [ ! -e "$folder/booted" ] && kill "${guests[-1]}"; } >/dev/null 2>&1 &
+    watchers+=($!)
+}
+
+# Return 3 if this machine cannot boot User-Mode Linux, otherwise the first exit code of pytest that is not 0.
+# The guests have one CPU each and share the tests: each guest claims its next test in `claims`.
+in_uml() {
+    local code=0 worst=0 arguments="" number folder guests=() watchers=()
+    install_missing "${uml_packages[@]}"
+    [ -d /lib/modules ] || as_root mkdir -p /lib/modules # the guest mounts its own modules there
+    [ $# = 0 ] || printf -v arguments '%q ' "$@"
+    mkdir "$result/claims"
+    say "this kernel has no usable SocketCAN; booting $uml_guests times User-Mode Linux $(linux.uml --version)"
+    for number in $(seq "$uml_guests"); do
+        boot_uml "$result/guest$number" "$arguments"
+    done
+    await_guests || code=$?
+    kill "${watchers[@]}" 2>/dev/null || true
+    for folder in "$result"/guest*; do
+        if [ ! -e "$folder/booted" ]; then
+            say "User-Mode Linux does not boot on this machine (exit code $code):"
+            tail -5 "$folder/kernel.log" >&2
+            return 3
+        fi
+    done
+    for folder in "$result"/guest*; do
+        (result_of_guest "$folder" "linux.uml: exit code $code") || worst=$((worst ? worst : $?))
+    done
+    return $worst
 }
 
 in_qemu() {
-    local kernel code=0 command show reader
+    local kernel code=0 command show reader guests
     install_missing "${qemu_packages[@]}"
     kernel=$(bootable_kernel)
     [ -n "$kernel" ] || fail "no kernel with vcan under /boot; type: apt-get install --reinstall linux-image-amd64"
     PATH=$(dirname "$python"):$PATH
     command -v vng >/dev/null || fail "virtme-ng is missing; type: $python -m pip install virtme-ng"
-    # Without the compiler's library: loading it there takes longer than all loops as plain Python.
-    printf -v command '%q ' env "PYTHON=$python" NUMBA_DISABLE_JIT=1 ATALANTE_VCAN_PATIENCE=60 \
+    # Without compilation, because loading the library of the compiler takes longer in QEMU than all loops as plain Python.
+    printf -v command '%q ' env "PYTHON=$python" NUMBA_DISABLE_JIT=1 ATALANTE_VCAN_PATIENCE=180 \
         bash tests/vcan/run.sh --inside "$result" "$@"
     say "this kernel has no usable SocketCAN; booting ${kernel#/boot/} in QEMU without KVM (half a minute, then slowly)"
-    # Through a pipe: vng opens its standard output anew, and a file would be written over from its start.
+    # The output goes through a pipe, because vng opens its standard output again and would overwrite a file from its start.
     exec {show}> >(exec cat)
     reader=$!
     timeout -k 10 "$qemu_limit" vng --disable-kvm -r "$kernel" --cpus 2 --memory ${memory_mb}M --user root --rw \
         --rwdir="$result" --cwd "$PWD" -- "$command" </dev/null >&"$show" 2>&1 &
-    guest=$!
-    await_guest || code=$?
+    guests=($!)
+    await_guests || code=$?
     exec {show}>&-
     wait "$reader"
-    result_of_guest "vng: exit code $code"
+    result_of_guest "$result" "vng: exit code $code"
 }
 
 in_guest() {

@@ -1,4 +1,4 @@
-"""Commands typed in terminals: processes forked from the test, which has the slow imports behind it."""
+"""`atalante` commands as processes, as if typed in terminals. They are forked from the test, which has done the slow imports."""
 
 from __future__ import annotations
 
@@ -11,16 +11,14 @@ from pathlib import Path
 from typing import NoReturn
 
 from atalante_tools.entry import main
-
-#: Longest wait for a process or a message [s].
-PATIENCE = float(os.environ.get("ATALANTE_VCAN_PATIENCE", "60"))
+from tests.vcan.conftest import PATIENCE
 
 
 class Terminal:
-    """One `atalante` command in a process of its own, with a keyboard and a log of its output.
+    """Process of one `atalante` command, with a keyboard and a log of its output.
 
     Args:
-        log: File that takes stdout and stderr.
+        log: File for stdout and stderr.
         arguments: Command line after `atalante`.
     """
 
@@ -43,7 +41,7 @@ class Terminal:
         return self.log.read_text() if self.log.exists() else ""
 
     def wait_for(self, text: str, since: int = 0, *others: str) -> None:
-        """Wait until the output after position `since` contains a text or one of some others."""
+        """Wait until the output after the position `since` contains `text` or one of the texts in `others`."""
         wanted = (text, *others)
         wait_until(
             lambda: any(each in self.text()[since:] for each in wanted),
@@ -51,7 +49,7 @@ class Terminal:
         )
 
     def end(self, number: int = signal.SIGTERM) -> int:
-        """Send a signal, wait for the end, and return the exit code; the negative signal number if the signal killed it."""
+        """Send a signal, wait for the end, and return the exit code, or the negative signal number if the signal killed it."""
         if self.exit_code is None:
             os.kill(self.pid, number)
             _, status = os.waitpid(self.pid, 0)
@@ -69,9 +67,9 @@ class Terminal:
         return self.exit_code is None
 
 
-def wait_until(condition: Callable[[], bool], failure: Callable[[], str]) -> None:
-    """Wait until a condition holds; fail the test with a message after `PATIENCE`."""
-    deadline = time.monotonic() + PATIENCE
+def wait_until(condition: Callable[[], bool], failure: Callable[[], str], patience: float = PATIENCE) -> None:
+    """Wait until a condition holds; fail the test with a message after `patience` [s]."""
+    deadline = time.monotonic() + patience
     while not condition():
         assert time.monotonic() < deadline, failure()
         time.sleep(0.02)

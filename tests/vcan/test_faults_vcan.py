@@ -1,11 +1,10 @@
-"""Faults of the wire on real SocketCAN: a flood by another process, a second HAL, an interface that goes down."""
+"""Communication faults on real SocketCAN: a flood by another process, a second HAL, an interface that goes down."""
 
 from __future__ import annotations
 
 import subprocess
-import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from itertools import pairwise
@@ -14,9 +13,11 @@ from pathlib import Path
 import pytest
 
 from atalante_dbc import Network
-from atalante_emulator.body import PyBulletBody
+from atalante_emulator.bodies.pybullet_body import PyBulletBody
 from atalante_emulator.emulator import Emulator
 from atalante_emulator.pendant import Operator
+from atalante_hal.bus import Bus
+from atalante_hal.bus.joined import JoinedBus
 from atalante_hal.bus.resilient import ResilientBus
 from atalante_hal.bus.socketcan import SocketCanBus
 from atalante_hal.hal import Hal
@@ -26,23 +27,38 @@ from atalante_hal.types import SupervisorState
 from atalante_hal.wire.cia402 import DriveState
 from atalante_hal.wire.frame import new_frames
 from tests.vcan.conftest import PATIENCE, Loop, as_root, create, remove, repeated
+from tests.vcan.terminal import Terminal
 
 S = SupervisorState
-ATALANTE = str(Path(sys.executable).with_name("atalante"))
+
+#: Disturbance of the interface -> arguments of `tc qdisc ... netem`, and states of the HAL that the disturbance may cause.
+NETEM = {
+    "loss": (("loss", "1%"), {S.ACTIVE, S.HOLD}),
+    "delay": (("delay", "2ms", "1ms"), {S.ACTIVE}),
+    "reorder": (("delay", "1ms", "reorder", "75%", "50%"), {S.ACTIVE, S.HOLD}),
+    "duplicate": (("duplicate", "5%"), {S.ACTIVE}),
+}
+
+
+def opened(network: Network, channels: Sequence[str]) -> Bus:
+    """Open one channel for all buses of the robot, or one channel for each bus."""
+    if len(channels) == 1:
+        return SocketCanBus(channels[0])
+    return JoinedBus(network, dict(zip(network.buses, map(SocketCanBus, channels), strict=True)))
 
 
 @dataclass
 class Line:
-    """A HAL and a robot, each on a socket of its own, the robot in a thread of its own."""
+    """HAL and emulated robot, each with its own socket. The robot runs in another thread."""
 
     hal: Hal
     loop: Loop
     emulator: Emulator
     operator: Operator
-    stack: ExitStack  # ends what belongs to it
+    stack: ExitStack  # closes sockets, body and thread at the end
 
     def socket(self) -> SocketCanBus:
-        """One more socket on the same wire."""
+        """Open one more socket on the same interface."""
         bus = SocketCanBus(self.hal.bus.name)
         self.stack.callback(bus.close)
         return bus
@@ -59,7 +75,7 @@ class Line:
             assert time.monotonic() < deadline, self.hal.missing()
 
     def start(self) -> None:
-        """To ACTIVE, on the operator's word."""
+        """Press START, and check that the HAL becomes ACTIVE."""
         self.operator.start()
         assert self.loop.cycles(100, S.ACTIVE) is S.ACTIVE, self.hal.reason
 
@@ -69,12 +85,15 @@ class Line:
 
 @pytest.fixture
 def walking(network: Network, robot: Robot, urdf_text: str) -> Iterator[type]:
-    """`with walking(channel) as line`: ACTIVE."""
+    """Return a context manager `walking(channel, ...)`, which yields a `Line` whose HAL is ACTIVE.
+
+    With four channels, each bus of the robot has its own channel.
+    """
 
     @contextmanager
-    def on(channel: str) -> Iterator[Line]:
+    def on(*channels: str, patience: float = PATIENCE) -> Iterator[Line]:
         with ExitStack() as stack:
-            buses = [SocketCanBus(channel) for _ in range(2)]
+            buses = [opened(network, channels) for _ in range(2)]
             for bus in buses:
                 stack.callback(bus.close)
             body = PyBulletBody(urdf_text)
@@ -87,7 +106,7 @@ def walking(network: Network, robot: Robot, urdf_text: str) -> Iterator[type]:
                 if not emulator.poll(0.02 if wire.down else 0.05) and wire.down:
                     emulator.idle()  # a millisecond without SYNC
 
-            hal = Hal(network, robot, buses[1], patience=PATIENCE)
+            hal = Hal(network, robot, buses[1], patience=patience)
             line = Line(hal, Loop(hal), emulator, operator, stack)
             stack.enter_context(repeated(answer))
             assert line.loop.cycles(400, S.READY) is S.READY, hal.missing()
@@ -103,7 +122,7 @@ def test_f13_a_flood_of_another_process_ends_in_hold_within_five_cycles(vcan: st
         flood = subprocess.Popen(["cangen", vcan, "-g", "0", "-i", "-I", "000", "-L", "8", "-D", "00", "-f"])
         try:
             heard = 0
-            while heard < 10 * RECEIVE_BUDGET:  # so much waits for the HAL, too
+            while heard < 10 * RECEIVE_BUDGET:  # the HAL has the same number of frames in its receive buffer
                 heard += listening.receive(block, PATIENCE)
                 assert flood.poll() is None
             before, frames = line.hal.state.cycle, line.hal.layout["frames"]
@@ -117,32 +136,35 @@ def test_f13_a_flood_of_another_process_ends_in_hold_within_five_cycles(vcan: st
         finally:
             flood.kill()
             flood.wait()
-        # What a cycle reads is bounded, so it ends: no cycle was lost to the flood.
+        # The number of frames that a cycle reads is limited, so the flood delays no cycle.
         assert line.hal.state.cycle == before + 35
         assert max(after - before for before, after in pairwise(received)) <= RECEIVE_BUDGET
-        assert line.loop.cycles(200) is S.HOLD  # and stays there when the wire is quiet again
+        assert line.loop.cycles(200) is S.HOLD  # the HAL stays in HOLD after the flood
         assert line.drives_hold
         line.start()
 
 
-def test_f14_a_second_hal_refuses_to_start_and_leaves_the_first_alone(vcan: str, walking) -> None:
+@pytest.mark.usefixtures("loaded_commands")
+def test_f14_a_second_hal_refuses_to_start_and_does_not_disturb_the_first(vcan: str, walking, tmp_path: Path) -> None:
     with walking(vcan) as line:
-        command = [ATALANTE, "jog", "left_SK", "--to", "3", "-i", "socketcan", "-c", vcan, "--lockstep"]
-        with subprocess.Popen(command, stderr=subprocess.PIPE, text=True) as second:
-            while second.poll() is None:
+        arguments = ("jog", "left_SK", "--to", "3", "-i", "socketcan", "-c", vcan, "--lockstep")
+        second = Terminal(tmp_path / "jog.log", *arguments)
+        try:
+            while second.running:
                 assert line.loop.cycles(1) is S.ACTIVE, line.hal.reason
-            assert second.stderr is not None
-            assert "another HAL is active on vcan0" in second.stderr.read()
-        assert second.returncode == 1
+        finally:
+            second.end()
+        assert "another HAL is active on vcan0" in second.text()
+        assert second.exit_code == 1
 
 
-def test_f14_a_running_hal_holds_in_the_cycle_in_which_it_hears_another(
+def test_f14_a_running_hal_holds_in_the_cycle_in_which_it_receives_another(
     vcan: str, walking, network: Network, robot: Robot
 ) -> None:
     with walking(vcan) as line:
         line.loop.cycles(20)
         heard = line.hal.state.cycle + 1
-        Hal(network, robot, line.socket(), patience=0.0).read()  # one that did not listen
+        Hal(network, robot, line.socket(), patience=0.0).read()  # a HAL that did not listen before its first SYNC
         assert line.loop.cycles(1) is S.HOLD
         assert [(e.cycle, e.code) for e in line.hal.events if e.code == "HAL_DUPLICATE"] == [(heard, "HAL_DUPLICATE")]
         assert line.loop.cycles(100) is S.HOLD
@@ -158,13 +180,13 @@ def test_f16_an_interface_that_goes_down_ends_in_hold_until_the_operator_starts_
         assert line.loop.cycles(5) is S.HOLD
         assert "BUS_DOWN" in line.codes()
         assert f"type `ip link set {spare_vcan} up`" in line.hal.reason
-        line.operator.start()  # which nobody hears
+        line.operator.start()  # the HAL does not receive this START
         assert line.loop.cycles(30) is S.HOLD
         assert line.hal.state.cycle == before + 35
-        assert line.drives_hold  # by themselves
+        assert line.drives_hold  # without a command of the HAL
 
         as_root("ip", "link", "set", spare_vcan, "up")
-        assert line.loop.cycles(60) is S.HOLD  # what was pressed meanwhile does not count
+        assert line.loop.cycles(60) is S.HOLD  # the START that was pressed without a link has no effect
         assert line.hal.missing() == []
         assert line.drives_hold
         line.start()
@@ -186,3 +208,57 @@ def test_f16_a_removed_interface_ends_in_hold_and_is_used_again_when_it_is_back(
             assert line.loop.cycles(60) is S.HOLD
             line.start()
         assert line.loop.cycles(20) is S.ACTIVE, line.hal.reason
+
+
+def test_f16_one_of_four_interfaces_is_removed_and_comes_back(four_vcans: list[str], walking) -> None:
+    with walking(*four_vcans) as line:
+        line.loop.cycles(20)
+        lost = four_vcans[1]
+        remove(lost)
+        assert line.loop.cycles(2) is S.HOLD
+        line.loop.cycles(30)
+        assert f"{lost} was removed" in line.hal.reason
+        bus = line.hal.network.buses[1]
+        assert set(line.hal.missing()) == {m.sender for m in line.hal.network.messages if m.bus == bus} - {"HAL"}
+        assert line.drives_hold
+        create(lost)
+        line.reconnect()
+        line.start()
+        assert line.loop.cycles(20) is S.ACTIVE, line.hal.reason
+
+
+def test_a_second_robot_on_the_bus_ends_in_hold_and_refuses_start(
+    vcan: str, walking, network: Network, robot: Robot, urdf_text: str
+) -> None:
+    with walking(vcan) as line:
+        body = PyBulletBody(urdf_text)
+        line.stack.callback(body.close)
+        second = Emulator(network, robot, body, line.socket(), seed=1)
+        with repeated(lambda: second.poll(0.05)):
+            assert line.loop.cycles(20, S.HOLD) is S.HOLD
+            assert "NODE_DUPLICATE" in line.codes()
+            line.operator.start()
+            assert line.loop.cycles(60) is S.HOLD
+        line.reconnect()
+        line.loop.cycles(300)  # the plausibility checks replace the values of the second robot
+        line.start()
+
+
+@pytest.mark.parametrize("disturbance", NETEM)
+def test_a_disturbed_wire_ends_in_a_safe_state_and_the_robot_starts_again(
+    spare_vcan: str, walking, disturbance: str
+) -> None:
+    arguments, allowed = NETEM[disturbance]
+    netem = ("tc", "qdisc", "replace", "dev", spare_vcan, "root", "netem", *arguments)
+    with walking(spare_vcan, patience=0.05) as line:
+        line.loop.cycles(20)
+        as_root(*netem, "limit", "10000")
+        for _ in range(10):
+            assert line.loop.cycles(30) in allowed, line.hal.reason
+        assert line.hal.crc_errors == 0
+        as_root("tc", "qdisc", "del", "dev", spare_vcan, "root")
+        line.loop.cycles(30)
+        line.reconnect()
+        if line.hal.state.supervisor is not S.ACTIVE:
+            line.start()
+        assert line.loop.cycles(50) is S.ACTIVE, line.hal.reason

@@ -1,4 +1,4 @@
-"""Two SocketCAN interfaces joined to one bus: the behaviour of every bus, and one wait for both."""
+"""Two SocketCAN interfaces joined to one bus: the same behaviour as every bus, and one wait for both interfaces."""
 
 from __future__ import annotations
 
@@ -17,25 +17,25 @@ from tests.vcan.conftest import as_root
 
 
 def joined(network: Network, legs: str, senses: str) -> JoinedBus:
-    """The legs' buses on one interface, the senses' on another."""
+    """Join two interfaces: one for the two leg buses, and one for the two sensor buses."""
     one, other = SocketCanBus(legs), SocketCanBus(senses)
     return JoinedBus(network, dict(zip(BUSES, (one, one, other, other), strict=True)))
 
 
 class TestJoinedSocketCan(FrameSender, FrameReceiver, FrameWaiter):
     @pytest.fixture
-    def ends(self, vcan: str, spare_vcan: str) -> Iterator[tuple[Bus, Bus]]:
+    def ends(self, vcan: str, second_vcan: str) -> Iterator[tuple[Bus, Bus]]:
         network = network_of(dict.fromkeys([*range(0x800), *other_frames()["can_id"].tolist()], "right_sense"))
-        one, other = joined(network, vcan, spare_vcan), joined(network, vcan, spare_vcan)
+        one, other = joined(network, vcan, second_vcan), joined(network, vcan, second_vcan)
         yield one, other
         one.close()
         other.close()
 
 
-def test_one_wait_hears_either_interface(vcan: str, spare_vcan: str, network: Network) -> None:
-    bus = joined(network, vcan, spare_vcan)
+def test_one_wait_receives_from_either_interface(vcan: str, second_vcan: str, network: Network) -> None:
+    bus = joined(network, vcan, second_vcan)
     block = new_frames(4)
-    for channel, message in ((vcan, "LEFT_SK_STATE"), (spare_vcan, "FOOT_LEFT_STATE")):
+    for channel, message in ((vcan, "LEFT_SK_STATE"), (second_vcan, "FOOT_LEFT_STATE")):
         frame = new_frames(1)
         frame["can_id"], frame["flags"] = network.message(message).frame_id, FLAG_FDF | FLAG_BRS
         frame["len"] = network.message(message).length

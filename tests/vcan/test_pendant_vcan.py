@@ -1,4 +1,4 @@
-"""Robot, HAL, two pendants and a listener on real SocketCAN, each on a socket of its own, in lock-step."""
+"""Robot, HAL, two pendants and a listener on real SocketCAN in lock-step. Each has its own socket."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import time
 from contextlib import ExitStack
 
 from atalante_dbc import Network
-from atalante_emulator.body import PyBulletBody
+from atalante_emulator.bodies.pybullet_body import PyBulletBody
 from atalante_emulator.emulator import Emulator
 from atalante_hal.bus.socketcan import SocketCanBus
 from atalante_hal.hal import Hal

@@ -1,13 +1,13 @@
-"""An independent judge of what a HAL sent: cantools and the limits file say what is allowed, no line of the stack does.
+"""Check the frames that a HAL sent, with cantools and the limits file but without any code of the stack.
 
-`frames of a HAL, or a CAN log -> CommandLimits -> violations`. What holds of any frame a HAL ever sends:
+`frames of a HAL, or a CAN log -> CommandLimits -> violations`. The rules for every frame that a HAL sends:
 
 - its identifier, length and format are those of a message whose sender is the HAL in the DBC;
-- no target torque and no torque limit in it is beyond the joint's `torque_max`, whatever the controlword;
-- from one frame that enables operation to the next the target moves by `torque_rate_max` times a cycle at most. The first
-  such frame takes over what the drive holds with, and may be anything within the limit.
+- the magnitude of each target torque and torque limit is at most the `torque_max` of the joint, for every controlword;
+- between two consecutive frames that enable operation, the target torque changes by at most `torque_rate_max` times 1 ms. The
+  first such frame may have any torque within the limit, because it takes over the torque of the position hold.
 
-    python tests/witness/command_limits.py LOG...      judges CAN logs of any format python-can reads
+    python tests/witness/command_limits.py LOG...      checks CAN logs of any format python-can reads
 """
 
 from __future__ import annotations
@@ -27,67 +27,67 @@ ROOT = Path(__file__).resolve().parents[2]
 DBC_FILE = ROOT / "dbc" / "atalante_dbc" / "atalante.dbc"
 LIMITS_FILE = ROOT / "atalante_hal" / "robot.toml"
 
-#: `struct canfd_frame` of linux/can.h, written down again on purpose.
+#: `struct canfd_frame` of linux/can.h, defined again to be independent of the stack.
 RECORD = np.dtype([("id", "<u4"), ("length", "u1"), ("flags", "u1"), ("pad", "u1", 2), ("payload", "u1", 64)])
 FD = 0x04
 PERIOD = 1e-3  # s
 ENABLE_OPERATION = 0x0F  # CiA 402
-#: Violations told in full; a run that breaks a limit breaks it often.
-TOLD = 5
+#: Largest number of violations in a summary. A run that violates a limit usually does so in many frames.
+LISTED = 5
 
 Records = npt.NDArray[Any]
 
 
 @cache
 def database() -> Any:
-    """The network as cantools reads it."""
+    """Return the DBC as parsed by cantools."""
     return cantools.database.load_file(DBC_FILE)
 
 
 class CommandLimits:
-    """Judges the frames of one HAL in the order in which it sent them, in as many pieces as one likes."""
+    """Check the frames of one HAL in the order in which it sent them, in any number of batches."""
 
     def __init__(self) -> None:
         self.joints = tomllib.loads(LIMITS_FILE.read_text())["joints"]
         self.messages = {m.frame_id: m for m in database().messages if m.senders == ["HAL"]}
         self.commands = {m.frame_id: m for m in self.messages.values() if m.name.startswith("COMMAND_")}
-        self.frames = 0  # judged so far
+        self.frames = 0  # checked so far
         self.command_frames = 0
         self.violations: list[str] = []
-        self._last: dict[str, tuple[bool, float]] = {}  # signal -> (enabled, target) of the frame before
+        self._last: dict[str, tuple[bool, float]] = {}  # joint -> (enabled, target) of the last frame
 
-    def judge(self, records: Records) -> list[str]:
-        """Judge frames, shape (n,) of `RECORD`; the violations found in them."""
+    def check(self, records: Records) -> list[str]:
+        """Check frames, shape (n,) of `RECORD`; return the violations found in them."""
         known = len(self.violations)
-        self._judge_table(records)
+        self._check_table(records)
         for frame_id, message in self.commands.items():
             rows = records[(records["id"] == frame_id) & (records["length"] == message.length)]
             if len(rows):
-                self._judge_leg(message, rows)
+                self._check_leg(message, rows)
                 self.command_frames += len(rows)
         self.frames += len(records)
         return self.violations[known:]
 
-    def _judge_table(self, records: Records) -> None:
+    def _check_table(self, records: Records) -> None:
         for frame_id, length, flags in {*zip(*(records[n].tolist() for n in ("id", "length", "flags")), strict=True)}:
             message = self.messages.get(frame_id)
             if message is None:
-                self._tell(f"the HAL sent the identifier {frame_id:#x}, which is none of its messages")
+                self._report(f"the HAL sent the identifier {frame_id:#x}, which is none of its messages")
             elif length != message.length or not flags & FD:
-                self._tell(f"the HAL sent {message.name} with {length} bytes and flags {flags:#x}")
+                self._report(f"the HAL sent {message.name} with {length} bytes and flags {flags:#x}")
 
-    def _judge_leg(self, message: Any, rows: Records) -> None:
+    def _check_leg(self, message: Any, rows: Records) -> None:
         signals = {signal.name: values(signal, rows["payload"]) for signal in message.signals}
         self._confirm(message, rows, signals)
         for joint, limits in self.joints.items():
             target, largest = signals[f"{joint}_TargetTorque"], signals[f"{joint}_MaxTorque"]
             enabled = signals[f"{joint}_Controlword"] == ENABLE_OPERATION
-            # Half a step of the wire: a limit need not be a whole number of steps.
+            # Half a resolution step is tolerated, because a limit need not be a multiple of the resolution.
             step = float(message.get_signal_by_name(f"{joint}_TargetTorque").scale)
             allowed = limits["torque_max"] + 0.5 * step
             name = f"{message.name}.{joint}"
             for row in np.flatnonzero((np.abs(target) > allowed) | (largest > allowed)).tolist():
-                self._tell(
+                self._report(
                     f"{name}: target {target[row]:.4f} Nm with limit {largest[row]:.4f} Nm, "
                     f"allowed is {limits['torque_max']} Nm (command frame {self.command_frames + row})"
                 )
@@ -96,7 +96,7 @@ class CommandLimits:
             both = enabled & np.concatenate([[before_enabled], enabled[:-1]])
             most = limits["torque_rate_max"] * PERIOD + 1.01 * step  # each of the two targets is rounded
             for row in np.flatnonzero(both & (change > most)).tolist():
-                self._tell(
+                self._report(
                     f"{name}: target moves by {change[row]:.4f} Nm in a cycle, allowed is "
                     f"{limits['torque_rate_max'] * PERIOD} Nm (command frame {self.command_frames + row})"
                 )
@@ -104,24 +104,24 @@ class CommandLimits:
 
     @staticmethod
     def _confirm(message: Any, rows: Records, signals: dict[str, npt.NDArray[np.float64]]) -> None:
-        """What was decoded in bulk is what cantools decodes, in the first and in the last frame."""
+        """Raise AssertionError if cantools decodes the first or the last frame to other values."""
         for row in (0, -1):
             oracle = message.decode(rows["payload"][row, : message.length].tobytes(), decode_choices=False)
             for name, column in signals.items():
                 if abs(float(oracle[name]) - column[row]) > 1e-9:
                     raise AssertionError(f"{message.name}.{name}: cantools reads {oracle[name]}, this {column[row]}")
 
-    def _tell(self, violation: str) -> None:
+    def _report(self, violation: str) -> None:
         self.violations.append(violation)
 
-    def told(self) -> str:
-        """The first violations, one a line, and how many there are."""
-        more = f"\n... {len(self.violations)} in all" if len(self.violations) > TOLD else ""
-        return "\n".join(self.violations[:TOLD]) + more
+    def summary(self) -> str:
+        """Return the first violations, one per line, and the total number of violations if more were found."""
+        more = f"\n... {len(self.violations)} in all" if len(self.violations) > LISTED else ""
+        return "\n".join(self.violations[:LISTED]) + more
 
 
 def values(signal: Any, payloads: npt.NDArray[np.uint8]) -> npt.NDArray[np.float64]:
-    """Physical values of a little-endian signal, bit by bit. Shapes (n, 64) -> (n,)."""
+    """Return the physical values of a little-endian signal, bit by bit. Shapes (n, 64) -> (n,)."""
     first, last = signal.start // 8, (signal.start + signal.length - 1) // 8
     bits = np.unpackbits(payloads[:, first : last + 1], axis=1, bitorder="little")
     bits = bits[:, signal.start - 8 * first :][:, : signal.length]
@@ -132,7 +132,7 @@ def values(signal: Any, payloads: npt.NDArray[np.uint8]) -> npt.NDArray[np.float
 
 
 def read_log(path: Path, of: CommandLimits) -> Records:
-    """The HAL's frames of a CAN log: those with the identifiers of its messages. Shape (n,)."""
+    """Return the frames of a CAN log with the identifiers of the HAL. Shape (n,)."""
     found = [m for m in can.LogReader(path) if m.arbitration_id in of.messages and not m.is_extended_id]
     records = np.zeros(len(found), RECORD)
     for record, message in zip(records, found, strict=True):
@@ -142,13 +142,13 @@ def read_log(path: Path, of: CommandLimits) -> Records:
 
 
 def main(paths: list[str]) -> int:
-    """Judge CAN logs; 1 when a frame is outside the limits, or when there was none to judge."""
+    """Check CAN logs; return 1 if a frame is outside the limits or a log has no command frame."""
     worst = 0
     for path in paths:
-        judge = CommandLimits()
-        judge.judge(read_log(Path(path), judge))
-        verdict = "ok" if judge.command_frames and not judge.violations else judge.told() or "no command frame in it"
-        print(f"{path}: {judge.command_frames} command frames: {verdict}")
+        check = CommandLimits()
+        check.check(read_log(Path(path), check))
+        verdict = "ok" if check.command_frames and not check.violations else check.summary() or "no command frame in it"
+        print(f"{path}: {check.command_frames} command frames: {verdict}")
         worst |= verdict != "ok"
     return worst
 

@@ -1,7 +1,8 @@
-"""Every HAL that runs in a test has a witness: it writes the frames it sends into a file of its own, for `command_limits`.
+"""Recorder of the frames that the HALs in a test send. Each HAL has its own file, which `command_limits` checks.
 
-It writes as soon as they are sent, so that a killed process leaves what it sent. `start` watches the HALs of this process and
-names the folder in the environment; every Python that a test starts finds `sitecustomize` beside this file and does the same.
+Frames are written as soon as they are sent, so the frames of a killed process are kept. `start` records the HALs of this
+process, and stores the path of the files in an environment variable. Every Python subprocess imports `sitecustomize`, which
+is in the folder of this module and records the HALs of the subprocess.
 """
 
 from __future__ import annotations
@@ -15,12 +16,12 @@ from typing import Any
 
 MODULE = "atalante_hal.transceiver"
 FOLDER = "ATALANTE_WITNESS"
-#: HALs of this process so far.
+#: Numbers for the HALs of this process.
 _numbers = itertools.count()
 
 
 def watch(transceiver_type: type[Any]) -> None:
-    """Let every transceiver of this class write what it sends. Raises AttributeError when it sends in another way."""
+    """Make every transceiver of this class record what it sends. Raises AttributeError if the class has no `send`."""
     make, send = transceiver_type.__init__, transceiver_type.send
 
     def init(transceiver: Any, *arguments: Any, **options: Any) -> None:
@@ -35,7 +36,7 @@ def watch(transceiver_type: type[Any]) -> None:
                 path, os.O_WRONLY | os.O_CREAT | os.O_APPEND | os.O_EXCL | os.O_CLOEXEC, 0o600
             )
             _close_with(transceiver)
-        sent = send(transceiver, batch)  # what the transmit table denies is not sent
+        sent = send(transceiver, batch)  # raises if the transmit table denies a frame
         os.write(transceiver.witness, batch.frames.tobytes())
         return sent
 
@@ -49,7 +50,7 @@ def _close_with(transceiver: Any) -> None:
 
 
 class _Finder(importlib.abc.MetaPathFinder):
-    """Watches the HAL as soon as somebody imports it."""
+    """Import hook that records the HALs as soon as their module is imported."""
 
     def find_spec(self, name: str, path: Any, target: Any = None) -> Any:
         if name != MODULE:
@@ -69,7 +70,7 @@ class _Finder(importlib.abc.MetaPathFinder):
 
 
 def install() -> None:
-    """Watch the HAL of this process, now or when it is imported; once."""
+    """Record the HALs of this process, even if their module is imported later; a second call has no effect."""
     if getattr(sys, "_atalante_witness", False):
         return
     sys._atalante_witness = True  # type: ignore[attr-defined]
@@ -80,7 +81,7 @@ def install() -> None:
 
 
 def start(folder: str) -> None:
-    """Watch the HALs of this process and of every process it starts from now on."""
+    """Record the HALs of this process and of every process that it starts later."""
     here = os.path.dirname(__file__)
     known = [path for path in os.environ.get("PYTHONPATH", "").split(os.pathsep) if path and path != here]
     os.environ["PYTHONPATH"] = os.pathsep.join([here, *known])

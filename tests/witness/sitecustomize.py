@@ -1,4 +1,4 @@
-"""What Python imports as it starts: in a process that a test started, the witness of its HALs."""
+"""Python imports this module at its start: in a subprocess of a test, it installs the recorder of the HALs."""
 
 import os
 import sys
@@ -7,5 +7,5 @@ if "ATALANTE_WITNESS" in os.environ:
     import hal_witness
 
     hal_witness.install()
-    # As in an installation without `dev`: python-can imports it if it is there, which takes longer than all the rest.
+    # Hide asammdf, as in an installation without `dev`, because python-can would import it, which is slow.
     sys.modules["asammdf"] = None  # type: ignore[assignment]

@@ -1,4 +1,4 @@
-"""The independent judge of commands: it sees every HAL of a test, here and in other processes, and it finds what is wrong."""
+"""Tests of the independent command check: it covers every HAL of a test, in all processes, and reports each violation."""
 
 from __future__ import annotations
 
@@ -26,57 +26,59 @@ LIMIT = ROBOT.torque_max.copy()
 
 @pytest.fixture
 def transmit() -> TransmitImage:
-    """The two command frames, enabled, without torque."""
+    """Return the two command frames with enabled drives and zero torque."""
     image = TransmitImage([NETWORK.message("COMMAND_LEFT_LEG"), NETWORK.message("COMMAND_RIGHT_LEG")])
     image.values[image.codec.slice("Controlword")] = Controlword.ENABLE_OPERATION
     image.values[image.codec.slice("MaxTorque")] = LIMIT
     return image
 
 
-def judged(image: TransmitImage, *torques: Any) -> list[str]:
-    judge = CommandLimits()
+def violations_of(image: TransmitImage, *torques: Any) -> list[str]:
+    check = CommandLimits()
     for torque in torques:
         image.values[image.codec.slice("TargetTorque")] = torque
-        judge.judge(image.seal().view(np.uint8).view(RECORD))
-    assert judge.command_frames == 2 * len(torques)
-    return judge.violations
+        check.check(image.seal().view(np.uint8).view(RECORD))
+    assert check.command_frames == 2 * len(torques)
+    return check.violations
 
 
-def test_what_is_allowed_is_allowed(transmit: TransmitImage) -> None:
+def test_commands_within_the_limits_have_no_violations(transmit: TransmitImage) -> None:
     step = ROBOT.torque_rate_max * 1e-3
-    assert judged(transmit, np.zeros(12), step, 2 * step, step) == []
-    assert judged(transmit, LIMIT, LIMIT - step, LIMIT) == []
-    assert judged(transmit, -LIMIT) == []
+    assert violations_of(transmit, np.zeros(12), step, 2 * step, step) == []
+    assert violations_of(transmit, LIMIT, LIMIT - step, LIMIT) == []
+    assert violations_of(transmit, -LIMIT) == []
 
 
 @pytest.mark.parametrize("joint", range(12))
 @pytest.mark.parametrize("sign", [1.0, -1.0])
-def test_a_torque_or_a_limit_beyond_the_joints_is_found(transmit: TransmitImage, joint: int, sign: float) -> None:
+def test_torque_or_torque_limit_above_the_joint_limit_is_reported(
+    transmit: TransmitImage, joint: int, sign: float
+) -> None:
     torque = np.zeros(12)
     torque[joint] = sign * (LIMIT[joint] + 0.02)
-    (told,) = judged(transmit, torque)
-    assert f"allowed is {LIMIT[joint]} Nm" in told
+    (violation,) = violations_of(transmit, torque)
+    assert f"allowed is {LIMIT[joint]} Nm" in violation
     transmit.values[transmit.codec.slice("MaxTorque").start + joint] = LIMIT[joint] + 0.02
-    (told,) = judged(transmit, np.zeros(12))
-    assert f"with limit {LIMIT[joint] + 0.02:.2f}" in told.replace("00 Nm", " Nm")
+    (violation,) = violations_of(transmit, np.zeros(12))
+    assert f"with limit {LIMIT[joint] + 0.02:.2f}" in violation.replace("00 Nm", " Nm")
 
 
 @pytest.mark.parametrize("joint", range(12))
-def test_a_step_above_the_rate_is_found_between_two_enabled_frames_only(transmit: TransmitImage, joint: int) -> None:
+def test_step_above_the_rate_is_reported_only_between_enabled_frames(transmit: TransmitImage, joint: int) -> None:
     torque = np.zeros(12)
     torque[joint] = ROBOT.torque_rate_max[joint] * 1e-3 + 0.03
-    (told,) = judged(transmit, np.zeros(12), torque)
-    assert "moves by 20.0250 Nm in a cycle" in told
-    assert len(judged(transmit, -torque, 0.0 * torque, torque)) == 2
+    (violation,) = violations_of(transmit, np.zeros(12), torque)
+    assert "moves by 20.0250 Nm in a cycle" in violation
+    assert len(violations_of(transmit, -torque, 0.0 * torque, torque)) == 2
     words = transmit.values[transmit.codec.slice("Controlword")]
     words[joint] = Controlword.QUICK_STOP
-    assert judged(transmit, np.zeros(12), torque) == []
+    assert violations_of(transmit, np.zeros(12), torque) == []
     words[joint] = Controlword.ENABLE_OPERATION
 
 
-def test_a_frame_of_somebody_else_or_of_another_shape_is_found(transmit: TransmitImage) -> None:
+def test_frame_of_another_sender_length_or_format_is_reported(transmit: TransmitImage) -> None:
     frame = transmit.seal()[:1].view(np.uint8).view(RECORD).copy()
-    for field, value, said in (
+    for field, value, expected in (
         ("id", NETWORK.message("LEFT_SK_STATE").frame_id, "0x184, which is none of its messages"),
         ("id", 0x100 | 1 << 31, "which is none of its messages"),
         ("length", 32, "COMMAND_LEFT_LEG with 32 bytes"),
@@ -84,13 +86,13 @@ def test_a_frame_of_somebody_else_or_of_another_shape_is_found(transmit: Transmi
     ):
         wrong = frame.copy()
         wrong[field] = value
-        judge = CommandLimits()
-        (told,) = judge.judge(wrong)
-        assert said in told
+        check = CommandLimits()
+        (violation,) = check.check(wrong)
+        assert expected in violation
     assert frame["flags"][0] & FD
 
 
-def test_a_log_is_judged_on_the_command_line(
+def test_command_line_checks_a_can_log(
     make_rig: Callable[..., Any], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     rig = make_rig()
@@ -111,38 +113,38 @@ def test_a_log_is_judged_on_the_command_line(
     assert "no command frame in it" in capsys.readouterr().out
 
 
-def test_the_witness_sees_what_a_hal_in_this_process_sends(make_rig: Callable[..., Any], witness: Any) -> None:
-    witness.judge()
+def test_witness_counts_frames_of_a_hal_in_this_process(make_rig: Callable[..., Any], witness: Any) -> None:
+    witness.check()
     hals, frames = witness.counts
     rig = make_rig()
     rig.run(40)
-    assert witness.judge() == []
+    assert witness.check() == []
     assert witness.counts == (hals + 1, frames + 2 * 40)
 
 
-def test_the_witness_finds_a_limiter_that_lets_everything_through(
+def test_witness_reports_a_limiter_without_limits(
     make_rig: Callable[..., Any], witness: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     rig = make_rig()
     rig.until(SupervisorState.ACTIVE)
 
-    def let_through(limiter: Limiter, torque: np.ndarray, *others: Any) -> Any:
+    def bypass_limits(limiter: Limiter, torque: np.ndarray, *others: Any) -> Any:
         found = apply(limiter, np.zeros(12), *others)
         limiter.last[:] = torque
         return found
 
     apply = Limiter.apply
-    monkeypatch.setattr(Limiter, "apply", let_through)
-    assert witness.judge() == []
+    monkeypatch.setattr(Limiter, "apply", bypass_limits)
+    assert witness.check() == []
     rig.hal.read()
     rig.hal.write(Command(LIMIT + 1.0, np.zeros(8)))
-    (told,) = witness.judge()
-    assert "allowed is 350.0 Nm" in told
-    assert "in a cycle" in told
+    (violation,) = witness.check()
+    assert "allowed is 350.0 Nm" in violation
+    assert "in a cycle" in violation
 
 
 @pytest.mark.parametrize("killed", [False, True])
-def test_the_witness_sees_what_a_hal_in_another_process_sent(witness: Any, killed: bool) -> None:
+def test_witness_counts_frames_of_a_hal_in_a_subprocess(witness: Any, killed: bool) -> None:
     program = (
         "import os, sys\n"
         "from atalante_dbc import load\n"
@@ -159,5 +161,5 @@ def test_the_witness_sees_what_a_hal_in_another_process_sent(witness: Any, kille
     hals, frames = witness.counts
     done = subprocess.run([sys.executable, "-c", program, str(killed)], check=False, env=os.environ)
     assert done.returncode == (-9 if killed else 0)
-    assert witness.judge() == []
+    assert witness.check() == []
     assert witness.counts == (hals + 1, frames + 2 * 25)

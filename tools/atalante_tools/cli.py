@@ -1,6 +1,7 @@
 """The command group `atalante`: imports only the called subcommand, and reports an error as one sentence.
 
-entry.main -> cli -> commands.<name>.command -> exit code (see console/outcome.py)
+`entry.main` runs this group. The group runs the function `command` of the subcommand's module. See console/outcome.py for the
+exit codes.
 """
 
 from __future__ import annotations
@@ -13,10 +14,11 @@ import click
 from atalante_tools.console.outcome import INTERRUPTED, InvalidUsage, failure_of
 from atalante_tools.entry import main as main
 
-#: Command name -> module in `atalante_tools` that defines the command, and its line in `atalante --help`.
+#: Command name -> module in `atalante_tools` that defines the command, and line of the command in `atalante --help`.
 COMMANDS = {
     "demo": ("commands.demo", "Run all parts in one command: an emulated robot walks in virtual guides."),
     "airwalk": ("commands.airwalk", "Walk in the air inside one virtual guide, on any bus."),
+    "walk": ("commands.walk", "Walk on the ground with a patient, from standing to standing, on any bus."),
     "emulator": ("commands.emulator", "Emulate the robot on a bus, for a HAL in another process."),
     "jog": ("commands.jog", "Move one joint to an angle."),
     "vibrate": ("commands.vibrate", "Run one vibration motor."),
@@ -27,6 +29,7 @@ COMMANDS = {
     "decode": ("canlog.decode", "Write the signals of CAN logs as Parquet or MCAP."),
     "conform": ("conform", "Test one node for acceptance, with this computer as the HAL."),
     "faults": ("faults", "List the fault matrix and run its faults on a walking robot."),
+    "guide": ("guide", "Search for pushes that move a joint out of a virtual guide."),
     "dbc": ("dbc", "Check, print and compare DBC files, and generate C code."),
     "model": ("model", "Print, check, export and draw the patient-exoskeleton model."),
     "gait": ("gait", "Solve gaits, build a gait library, fit and check the gait network."),

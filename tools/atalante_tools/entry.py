@@ -18,7 +18,7 @@ def main() -> NoReturn:
     """Run the command line and end the process with its exit code.
 
     Raises:
-        SystemExit: Always. Its code is the exit code of the stop signal, or of the command without a stop signal.
+        SystemExit: Always. After a stop signal, its code is that of the signal, otherwise that of the command.
     """
     code: object = 0
     with interruptible() as stop:

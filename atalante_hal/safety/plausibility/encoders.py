@@ -1,23 +1,26 @@
 """Encoder checks, which compare each position with the previous position, its limits and the reported velocity.
 
-*Jump.* Between two good values, n cycles apart, a joint moves at most n * velocity_max * period, plus 3 sigma of the noise. A
-value that changed by more is not used. After `JUMPS_TO_CONFIRM` such values in a row the encoder counts as having lost its
-reference. It is used again when it jumps back to the expected position, which includes the motion since the jump, or when its
-drive has restarted, see `reference`.
+*Jump.* Between two good values that are n cycles apart, a position changes by at most n * top_speed * period plus 3 sigma of
+the encoder noise. `Robot.top_speed` is the speed from which the limiter permits no accelerating torque, so every motion that
+the limiter permits is accepted. A value that changed by more is not used. After `JUMPS_TO_CONFIRM` such values in a row it is
+confirmed that the encoder has lost its reference. The encoder is used again when its value jumps back to the expected
+position, or when its drive has restarted (see `reference`). The expected position includes the motion since the jump.
 
 *Range.* A joint must be within its position limits, extended by `position_tolerance`.
 
-*Velocity.* The mean reported velocity between two samples, by the trapezoidal rule, must match the change of the encoder
-position. Because of the low-pass filter of the drive they may differ for a few cycles, but not for `VELOCITY_SAMPLES` samples in
-a row. The time of a sample is the cycle in which it was measured. So a late or lost frame changes the interval between two
-samples, but not the result of the comparison.
+*Velocity.* The drive reports the encoder velocity after a low-pass with the cut-off frequency `velocity_bandwidth`. The check
+applies the same low-pass to the encoder positions. So the delay of the filter causes no difference, also in fast motions. The
+mean difference of two consecutive samples may exceed `velocity_error` for a few cycles, but not for `VELOCITY_SAMPLES` samples
+in a row. A late or lost frame changes the time between two positions, which the low-pass takes into account.
 """
 
 from __future__ import annotations
 
+import math
 from typing import NamedTuple
 
 import numpy as np
+import numpy.typing as npt
 
 from atalante_hal.compiled import specialised
 from atalante_hal.robot import JOINTS, Robot
@@ -36,9 +39,17 @@ _ALL = b"\1" * len(JOINTS)
 class Lost(NamedTuple):
     """Record of an encoder that jumped. Positions are on the motor side."""
 
-    last: float  # last received position [rad]
-    cycles: int  # time from the last good position to `last` [cycles]
-    expected: float  # expected position without the jump [rad]
+    last: float  # newest received position [rad]
+    cycles: int  # time from the encoder's last good position until `last` was received [cycles]
+    expected: float  # position that the encoder would have without the jump [rad]
+
+
+class Motion(NamedTuple):
+    """Arrays of the motor side that the low-pass reads, shape (12,) each."""
+
+    position: Vector  # new positions [rad]
+    before: Vector  # positions of the cycle before [rad]
+    velocity: Vector  # reported velocities [rad/s]
 
 
 class EncoderChecks:
@@ -49,17 +60,17 @@ class EncoderChecks:
         now: signals decoded in this cycle.
         before: last good signals before this cycle.
         period: cycle time [s].
-        every: interval between two calls of `judge_velocity` [cycles].
+        every: interval between two calls of `check_velocity` [cycles].
     """
 
     def __init__(self, robot: Robot, now: Signals, before: Signals, period: float, every: int) -> None:
         self._now, self._before = now, before
-        self._travel = robot.velocity_max * robot.gear * period
+        self._travel = robot.top_speed * robot.gear * period
         self._noise = 3.0 * robot.encoder_noise * robot.gear
         self.jumps = [0] * len(JOINTS)
-        self._jump_of: dict[int, float] = {}  # joint index -> size of the last jump of its encoder [rad]
+        self._jump_of: dict[int, float] = {}  # size of the last jump of the encoder, by joint index [rad]
         self._lost: dict[int, Lost] = {}
-        #: Joint index -> position [rad] of each joint outside its range.
+        #: Position of each joint that is outside its range, by joint index [rad].
         self.outside: dict[int, float] = {}
         self._range = np.array([robot.position_min, robot.position_max])
         tolerance = robot.thresholds.position_tolerance
@@ -69,10 +80,10 @@ class EncoderChecks:
         )
         self._polarity = robot.polarity.tolist()
         self._period, self._every = period, every
-        # Coefficients of twice the velocity deviation, which is a linear function of two consecutive samples.
-        time = every * period
-        self._of_later, self._of_earlier = np.array([[-2.0 / time, 1.0], [2.0 / time, 1.0]])
-        self._earlier = np.zeros((2, len(JOINTS)))  # position [rad] and velocity [rad/s] of the last sample
+        self._keep = math.exp(-2.0 * math.pi * robot.sensors.velocity_bandwidth * period)
+        #: Encoder velocities after the low-pass, and reported velocities minus these encoder velocities [rad/s].
+        self._filtered, self._deviation = np.zeros((2, len(JOINTS)))
+        self._earlier = np.zeros(len(JOINTS))  # deviation of the last sample [rad/s]
         self._no_age = np.zeros(len(JOINTS), np.int64)
         self._earlier_age: Cycles = np.full(len(JOINTS), NEVER)  # age of the values of each joint at the last sample
         self._twice_allowed = 2.0 * robot.sensors.velocity_error * robot.gear
@@ -82,23 +93,34 @@ class EncoderChecks:
         #: Arguments of the function `within_reach`. The array objects are the same in every call.
         self._positions = now.position, before.position, self._travel + self._noise, self._low, self._high
         self._within_reach = specialised(within_reach, *self._positions)
+        #: Arguments of the function `low_pass`. The array objects are the same in every call.
+        self._motion = (
+            Motion(now.position, before.position, now.velocity),
+            self._filtered, self._deviation, self._keep, period,
+        )  # fmt: skip
+        self._low_pass = specialised(low_pass, *self._motion)
 
     def within_reach(self) -> bool:
         """Return whether every joint is in its range and moved by no more than is possible in one cycle."""
         return not self.outside and self._within_reach(*self._positions)
+
+    def follow(self) -> None:
+        """Advance the low-pass of all joints by one cycle. All joints must have good positions of this and the last cycle."""
+        self._low_pass(*self._motion)
 
     def accept(self, joint: int, cycles: int) -> bool:
         """Check the new position of one joint for a jump, and return whether the position may be used.
 
         Args:
             joint: index of the joint in JOINTS.
-            cycles: time from its last good position to the new one [cycles].
+            cycles: time from the joint's last good position to the new position [cycles].
         """
         now, before = float(self._now.position[joint]), float(self._before.position[joint])
         travel, noise = float(self._travel[joint]), float(self._noise[joint])
         confirmed = self.jumps[joint] >= JUMPS_TO_CONFIRM
         moved = abs(now - before)
-        good = not confirmed and not moved > cycles * travel + noise  # NaN passes: there is no previous value yet
+        # without a previous value `moved` is NaN, and the new value is accepted
+        good = not confirmed and not moved > cycles * travel + noise
         if not good:
             lost = self._lost[joint] = followed(
                 self._lost.get(joint, Lost(before, 0, before)), now, cycles, travel, noise
@@ -107,15 +129,35 @@ class EncoderChecks:
                 moved = abs(now - lost.expected)
                 good = moved <= JUMPS_TO_CONFIRM * travel + noise
         if good:
+            self._follow(joint, cycles)
             self.reference(joint)
-            self._judge_range(joint, now)
+            self._check_range(joint, now)
             return True
         self.jumps[joint] += 1
         self._jump_of[joint] = moved / self._gear[joint]
         return False
 
+    def _follow(self, joint: int, cycles: int) -> None:
+        """Advance the low-pass of one joint.
+
+        Args:
+            joint: index of the joint in JOINTS.
+            cycles: time from the joint's last good position to the new position [cycles].
+        """
+        if cycles < 1:  # the position is not newer than the last one, because frames became late
+            return
+        velocity = float(self._now.velocity[joint])
+        moved = float(self._now.position[joint] - self._before.position[joint])
+        if cycles >= NEVER or math.isnan(moved):  # the previous position is unknown
+            self._filtered[joint] = velocity
+        else:
+            keep = self._keep**cycles
+            mean = moved / (cycles * self._period)
+            self._filtered[joint] = keep * self._filtered[joint] + (1.0 - keep) * mean
+        self._deviation[joint] = velocity - self._filtered[joint]
+
     def reference(self, joint: int) -> None:
-        """Reset the jump count of a joint, so that its encoder is used again from the next value on.
+        """Reset the jump count of a joint, so that its encoder is used again, starting with the next value.
 
         Args:
             joint: index of the joint in JOINTS.
@@ -123,59 +165,51 @@ class EncoderChecks:
         self.jumps[joint] = 0
         self._lost.pop(joint, None)
 
-    def _judge_range(self, joint: int, position: float) -> None:
+    def _check_range(self, joint: int, position: float) -> None:
         if self._low[joint] <= position <= self._high[joint]:
             self.outside.pop(joint, None)
         else:
             self.outside[joint] = position * self._polarity[joint] / self._gear[joint]
 
-    def judge_velocity(self, age: Cycles | None) -> bool:
-        """Compare the reported velocity with the encoder motion since the last call.
+    def check_velocity(self, age: Cycles | None) -> bool:
+        """Compare the reported velocities with the encoder velocities after the same low-pass.
 
         Args:
-            age: age of the values of each joint [cycles], shape (12,). A joint with an age of `NEVER` or more is not compared.
-                None if all values are of this cycle.
+            age: age of the values of each joint [cycles], shape (12,). A joint with an age of `NEVER` or more is not
+                compared. Pass None if all values are of this cycle.
 
         Returns:
             Whether a wrong velocity is confirmed for any joint.
         """
-        motion, earlier, earlier_age = self._now.motion, self._earlier, self._earlier_age
-        if age is None and earlier_age is self._no_age:
-            error = self._of_later.dot(motion) + self._of_earlier.dot(earlier)
-            compared = None
-        else:
-            error, compared = self._error_between(self._no_age if age is None else age)
+        error = self._deviation + self._earlier
+        compared = None
+        if age is not None or self._earlier_age is not self._no_age:
+            compared = self._compared(self._no_age if age is None else age)
+            error = np.where(compared, error, 0.0)
         right = np.abs(error) <= self._twice_allowed
         if right.tobytes() != _ALL or any(self._wrong):
-            self._count_wrong(error.tolist(), right.tolist(), compared)
-        earlier[:] = motion
+            self._count_wrong(error.tolist(), right.tolist(), None if compared is None else compared.tolist())
+        self._earlier[:] = self._deviation
         self._earlier_age = self._no_age if age is None else age
         return bool(self._wrong_findings)
 
-    def _error_between(self, age: Cycles) -> tuple[Vector, list[bool]]:
-        """Return twice the deviation of each velocity from the encoder motion, and for each joint whether it is compared.
+    def _compared(self, age: Cycles) -> npt.NDArray[np.bool_]:
+        """Return for each joint whether it has a sample that is newer than the last one, shape (12,).
 
         Args:
             age: age of the values of each joint [cycles], shape (12,).
-
-        Returns:
-            Twice the deviation [rad/s, motor side], 0 for a joint that is not compared, shape (12,); and whether each joint is
-            compared, length 12.
         """
-        motion, earlier = self._now.motion, self._earlier
         cycles = self._every + self._earlier_age - age
-        compared = (age < NEVER) & (self._earlier_age < NEVER) & (cycles > 0)
-        time = np.where(compared, cycles, 1) * self._period
-        error = motion[1] + earlier[1] - 2.0 * (motion[0] - earlier[0]) / time
-        return np.where(compared, error, 0.0), compared.tolist()
+        return (age < NEVER) & (self._earlier_age < NEVER) & (cycles > 0)
 
     def _count_wrong(self, error: list[float], right: list[bool], compared: list[bool] | None) -> None:
         """Count the consecutive wrong velocities of each joint, and update the findings.
 
         Args:
-            error: twice the deviation of the velocity of each joint [rad/s, motor side].
+            error: sum of the last two velocity deviations of each joint, which is twice their mean [rad/s, motor side].
             right: whether the deviation of each joint is within its limit.
-            compared: whether each joint was compared; None if all were. A joint that was not compared keeps its count.
+            compared: whether each joint was compared; None if all joints were. A joint that was not compared keeps its
+                count.
         """
         self._wrong = [
             wrong if compared is not None and not compared[joint] else 0 if right[joint] else wrong + 1
@@ -191,7 +225,7 @@ class EncoderChecks:
         )
 
     def findings(self) -> tuple[Finding, ...]:
-        """Return the present findings."""
+        """Return the current findings."""
         if not (self.outside or any(self.jumps)):
             return self._wrong_findings
         jumps = (self._jump(joint) for joint, jumps in enumerate(self.jumps) if jumps)
@@ -222,12 +256,12 @@ class EncoderChecks:
 def followed(lost: Lost, now: float, cycles: int, travel: float, noise: float) -> Lost:
     """Return the updated record of an encoder that jumped.
 
-    A change without a jump counts as motion of the joint and is added to its expected position.
+    A change that is small enough to be motion of the joint is added to the expected position.
 
     Args:
-        lost: record before this position.
+        lost: record before the position `now` was received.
         now: received position [rad].
-        cycles: time from the last good position to the received one [cycles].
+        cycles: time from the last good position to the position `now` [cycles].
         travel: largest motion of the joint in one cycle [rad].
         noise: largest change of the position due to encoder noise [rad].
     """
@@ -237,7 +271,7 @@ def followed(lost: Lost, now: float, cycles: int, travel: float, noise: float) -
 
 
 def within_reach(position: Vector, before: Vector, reach: Vector, low: Vector, high: Vector) -> bool:
-    """Return whether every joint is within its limits and moved by at most its reach.
+    """Return whether every joint is within its position limits and moved by no more than `reach`.
 
     Args:
         position: new positions, shape (12,) [rad, motor side].
@@ -251,3 +285,19 @@ def within_reach(position: Vector, before: Vector, reach: Vector, low: Vector, h
         if moved > reach[joint] or position[joint] < low[joint] or position[joint] > high[joint]:
             return False
     return True
+
+
+def low_pass(motion: Motion, filtered: Vector, deviation: Vector, keep: float, period: float) -> None:
+    """Advance the low-pass of the encoder velocities by one cycle, as the drives do.
+
+    Args:
+        motion: new and previous positions, and reported velocities.
+        filtered: velocities after the low-pass, shape (12,) [rad/s]; updated.
+        deviation: receives the reported velocities minus `filtered`, shape (12,) [rad/s].
+        keep: share of the last velocity that the low-pass keeps.
+        period: cycle time [s].
+    """
+    for joint in range(len(filtered)):
+        mean = (motion.position[joint] - motion.before[joint]) / period
+        filtered[joint] = keep * filtered[joint] + (1.0 - keep) * mean
+        deviation[joint] = motion.velocity[joint] - filtered[joint]

@@ -1,26 +1,31 @@
-"""Foot checks, which compare the force cells of a foot with each other, and the ground contact of both feet.
+"""Foot checks, which detect faulty force cells and an impossible loss of ground contact.
 
-*Cell.* A foot is a rigid plate on four cells. A cell is stuck or dead if it carries load while the other three are free, or if it
-is free while the other three carry load, for longer than the foot can rock. A cell without noise is detected sooner by
-`stillness`.
+*Cell.* A sole is a rigid plate on four equal cells. Its load has three degrees of freedom: the force and two moments. So the two
+diagonals of the cells carry equal vertical forces: FL + RR = FR + RL, also where a cell is pulled. A fault of one cell changes
+the difference by the error of the cell. A difference above `cell_twist` for `CELL_CYCLES` is a fault. The faulty cell is known
+if it is the only cell with load, or the only cell without load. A cell without noise is detected sooner by `stillness`.
 
-*Contact.* Walking has no flight phase. So a robot that stood on the ground cannot swing both feet. Both feet may swing if the
-robot has been suspended since the program began, or after it has been lifted for `LIFTED_CYCLES`. A robot that was lifted is in
-HOLD and requires a new START.
+*Contact.* Walking has no flight phase. So a robot that stood on the ground cannot swing both feet. The check is armed after both
+feet have carried load together for `STANDING_CYCLES`, which does not happen while a crane sets the robot down. It is disarmed if
+the robot has been lifted for `LIFTED_CYCLES`. A robot that was lifted is in HOLD and requires a new START.
 """
 
 from __future__ import annotations
+
+from collections.abc import Iterator
 
 from atalante_hal.robot import CELLS, FEET, Robot
 from atalante_hal.safety.diagnostics import Dtc, Finding
 from atalante_hal.safety.plausibility.finding import FOOT_NODES, Signals
 
-#: Time after which a cell that contradicts the other cells counts as faulty [cycles].
+#: Time after which a cell that contradicts the other cells is reported as faulty [cycles].
 CELL_CYCLES = 256
-#: Time after which a swing of both feet counts as implausible [cycles].
-SWING_CYCLES = 20
-#: Time without ground contact after which the robot counts as lifted on purpose [cycles].
-LIFTED_CYCLES = 100
+#: After both feet have carried load together for this time [cycles], a swing of both feet is implausible.
+STANDING_CYCLES = 500
+#: Longest plausible swing of both feet [cycles]. If a foot touches down late in a walk, both feet swing for 30 cycles.
+SWING_CYCLES = 60
+#: After this time without ground contact [cycles], the robot is regarded as lifted on purpose.
+LIFTED_CYCLES = 140
 
 
 class FootChecks:
@@ -29,70 +34,94 @@ class FootChecks:
     Args:
         robot: sensor thresholds of the robot.
         now: signals decoded in this cycle.
-        every: interval between two calls of `judge` [cycles].
+        every: interval between two calls of `evaluate` [cycles].
     """
 
     def __init__(self, robot: Robot, now: Signals, every: int) -> None:
         self._force, self._forces = now.force, now.forces
-        self._free, self._loaded = robot.sensors.cell_free, robot.sensors.cell_loaded
+        self._free, self._twist = robot.sensors.cell_free, robot.sensors.cell_twist
         self._every = every
         # No cell carries load if the sum of the squares of all force components is at most this value [N^2].
-        self._surely_free = self._free**2
+        self._free_squared = self._free**2
         #: Index of the swing leg in FEET; None unless exactly one foot is on the ground.
         self.swing: int | None = None
         self._swinging = LIFTED_CYCLES  # time since a foot was last on the ground [cycles]
-        # Time for which each cell has contradicted the other cells of its foot [cycles].
-        self._contradicts = [[0] * len(CELLS) for _ in FEET]
-        #: (foot, cell) -> vertical force [N] of each cell that contradicts the other cells.
-        self.cells: dict[tuple[int, int], float] = {}
+        self._standing = 0  # time for which both feet have been on the ground [cycles]
+        self._armed = False  # True while a swing of both feet would be implausible
+        # Time for which the cells of each foot have contradicted each other [cycles].
+        self._contradicts = [0] * len(FEET)
+        #: Foot -> difference of the forces on its two diagonals [N], and index of the faulty cell (None if it is unknown).
+        self._twisted: dict[int, tuple[float, int | None]] = {}
 
-    def judge(self, updated: tuple[bool, bool]) -> bool:
+    def evaluate(self, updated: tuple[bool, bool]) -> bool:
         """Check the vertical forces of both feet.
 
         Args:
-            updated: whether the left and the right foot have new values since the last call. The cells of a foot are checked
-                only if it has new values.
+            updated: whether each foot (left, right) has new values since the last call. The cells of a foot are checked
+                only if the foot has new values.
 
         Returns:
             Whether a cell or the ground contact is implausible.
         """
         lifted = self._swinging >= LIFTED_CYCLES
-        if lifted and self._forces.dot(self._forces) <= self._surely_free and not any(map(any, self._contradicts)):
+        if lifted and self._forces.dot(self._forces) <= self._free_squared and not any(self._contradicts):
             return False
         on_ground = []
         for foot, cells in enumerate(self._force[:, :, 2].tolist()):
             carries = [abs(force) > self._free for force in cells]
             on_ground.append(sum(carries) >= 2)
             if updated[foot]:
-                self._judge_cells(foot, cells, carries)
+                self._check_cells(foot, cells, carries)
         self.swing = None if on_ground[0] == on_ground[1] else on_ground.index(False)
         self._swinging = 0 if any(on_ground) else self._swinging + self._every
-        return bool(self.cells) or self._both_swing()
+        self._standing = self._standing + self._every if all(on_ground) else 0
+        if self._standing >= STANDING_CYCLES:
+            self._armed = True
+        elif self._swinging >= LIFTED_CYCLES:
+            self._armed = False
+        return bool(self._twisted) or self._both_swing()
+
+    @property
+    def cells(self) -> Iterator[tuple[int, int]]:
+        """Yield (foot, cell) of each faulty cell that is known."""
+        return ((foot, cell) for foot, (_, cell) in self._twisted.items() if cell is not None)
 
     def _both_swing(self) -> bool:
-        return SWING_CYCLES <= self._swinging < LIFTED_CYCLES
+        return self._armed and self._swinging >= SWING_CYCLES
 
-    def _judge_cells(self, foot: int, cells: list[float], carries: list[bool]) -> None:
-        for cell, force in enumerate(cells):
-            others = sum(carries) - carries[cell]
-            alone = carries[cell] and others == 0
-            missing = not carries[cell] and others == len(CELLS) - 1 and sum(cells) - force > self._loaded
-            counts = self._contradicts[foot]
-            counts[cell] = counts[cell] + self._every if alone or missing else 0
-            if counts[cell] >= CELL_CYCLES:
-                self.cells.setdefault((foot, cell), force)
-            else:
-                self.cells.pop((foot, cell), None)
+    def _check_cells(self, foot: int, cells: list[float], carries: list[bool]) -> None:
+        front_left, front_right, rear_left, rear_right = cells
+        twist = front_left + rear_right - front_right - rear_left
+        self._contradicts[foot] = self._contradicts[foot] + self._every if abs(twist) > self._twist else 0
+        if self._contradicts[foot] >= CELL_CYCLES:
+            if foot not in self._twisted or self._twisted[foot][1] is None:
+                self._twisted[foot] = twist, _deviating_cell(carries)
+        else:
+            self._twisted.pop(foot, None)
 
     def findings(self) -> tuple[Finding, ...]:
-        """Return the present findings."""
-        cells = tuple(_contradicting(foot, cell, force) for (foot, cell), force in self.cells.items())
+        """Return the current findings."""
+        cells = tuple(_contradicting(foot, *twisted) for foot, twisted in self._twisted.items())
         return (*cells, _BOTH_SWING) if self._both_swing() else cells
 
 
-def _contradicting(foot: int, cell: int, force: float) -> Finding:
-    text = f"force cell {CELLS[cell]} of the {FEET[foot]} foot reports {force:.0f} N, which contradicts the other three cells"
-    return Finding(Dtc.FOOT_CELL, FOOT_NODES[foot], force, True, text)
+def _deviating_cell(carries: list[bool]) -> int | None:
+    """Return the index of the only loaded cell or of the only unloaded cell. Return None if there is no such cell.
+
+    Args:
+        carries: whether each cell of a foot carries load.
+    """
+    for odd in (True, False):
+        if carries.count(odd) == 1:
+            return carries.index(odd)
+    return None
+
+
+def _contradicting(foot: int, twist: float, cell: int | None) -> Finding:
+    which = "the force cells" if cell is None else f"force cell {CELLS[cell]}"
+    contradict = "contradict each other" if cell is None else "contradicts the other three cells"
+    text = f"{which} of the {FEET[foot]} foot {contradict}: the diagonals of the cells differ by {abs(twist):.0f} N"
+    return Finding(Dtc.FOOT_CELL, FOOT_NODES[foot], twist, True, text)
 
 
 _BOTH_SWING = Finding(

@@ -18,7 +18,7 @@ Cycles = npt.NDArray[np.int64]
 JOINT_MESSAGES = tuple(f"{joint.upper()}_STATE" for joint in JOINTS)
 IMU_MESSAGES = tuple(f"IMU_{imu.upper()}_STATE" for imu in IMUS)
 FOOT_MESSAGES = tuple(f"FOOT_{foot.upper()}_STATE" for foot in FEET)
-#: DBC names of the nodes that send these messages.
+#: DBC names of the nodes that send the sensor messages.
 JOINT_NODES, IMU_NODES, FOOT_NODES = (
     tuple(message.removesuffix("_STATE") for message in messages)
     for messages in (JOINT_MESSAGES, IMU_MESSAGES, FOOT_MESSAGES)
@@ -35,8 +35,8 @@ class Signals(NamedTuple):
     gyro: Vector  # (4, 3) rad/s
     accel: Vector  # (4, 3) m/s2
     force: Vector  # (2, 4, 3) N
-    motion: Vector  # (2, 12) `position` and `velocity` in one view
-    forces: Vector  # (24,) all components of `force` in one view
+    motion: Vector  # (2, 12) `position` and `velocity` as one array
+    forces: Vector  # (24,) all components of `force` as one array
 
 
 class Ages(NamedTuple):
@@ -57,7 +57,7 @@ class Rows:
     """
 
     def __init__(self, codec: Codec) -> None:
-        #: Rows of the joint, IMU and foot messages, shapes (12,), (4,) and (2,).
+        #: Rows of the joint messages, shape (12,), the IMU messages, shape (4,), and the foot messages, shape (2,).
         self.joint, self.imu, self.foot = (
             np.array(rows_of(codec, messages)) for messages in (JOINT_MESSAGES, IMU_MESSAGES, FOOT_MESSAGES)
         )
@@ -88,7 +88,7 @@ def signals_of(codec: Codec, values: Vector) -> Signals:
 
     Args:
         codec: codec of the process image.
-        values: decoded values, shape (codec.size,), or the slice `measured` of them.
+        values: decoded values, shape (codec.size,). An array with only the slice `measured(codec)` is accepted, too.
     """
     position, velocity, torque, quaternion, gyro, accel, force = (
         codec.slice(quantity) for quantity in ("Position", "Velocity", "Torque", "Quaternion", "Gyro", "Accel", "Force")

@@ -14,7 +14,7 @@ from atalante_hal.safety.plausibility.finding import IMU_NODES, Signals
 from atalante_hal.types import Vector
 from atalante_hal.wire.codec import Codec
 
-#: Time without good values after which the diagnostic of an IMU is confirmed [cycles].
+#: Time without good values after which the diagnostic of the IMU is confirmed [cycles].
 IMU_CYCLES = 10
 
 
@@ -31,9 +31,9 @@ class Imus:
         self._now = now
         self._gyro_end, self._accel_end = (_end_of_range(codec, signal) for signal in ("GyroX", "AccelX"))
         self._norm_error = robot.sensors.quaternion_error
-        #: IMU index -> norm of its quaternion, for each IMU whose quaternion does not have unit norm.
+        #: Norm of the quaternion of each IMU that does not have unit norm, by IMU index.
         self.no_attitude: dict[int, float] = {}
-        #: IMU index -> largest reading [rad/s or m/s2], for each saturated IMU.
+        #: Largest reading of each saturated IMU, by IMU index [rad/s or m/s2].
         self.saturated: dict[int, float] = {}
         self._confirmed: dict[int, bool] = {}
         #: Arguments of the function `usable`. The array objects are the same in every call.
@@ -49,7 +49,7 @@ class Imus:
 
         Args:
             imu: index of the IMU in IMUS.
-            cycles: time from its last good values to the new ones [cycles].
+            cycles: time from the last good values of the IMU to the new values [cycles].
             frozen: True if the readings of the IMU do not change.
         """
         saturation, norm = self._saturation(imu), self._wrong_norm(imu)
@@ -75,7 +75,7 @@ class Imus:
         return None if abs(squared - 1.0) <= self._norm_error else math.sqrt(squared)
 
     def findings(self) -> tuple[Finding, ...]:
-        """Return the present findings."""
+        """Return the current findings."""
         return (
             *(_no_attitude(imu, norm, self._confirmed[imu]) for imu, norm in self.no_attitude.items()),
             *(_saturated(imu, value, self._confirmed[imu]) for imu, value in self.saturated.items()),
@@ -92,8 +92,8 @@ def usable(
         gyro: angular velocity of each IMU, shape (4, 3) [rad/s].
         accel: specific force at each IMU, shape (4, 3) [m/s2].
         norm_error: largest deviation of the squared norm of a quaternion from 1.
-        gyro_end: angular velocity from which a gyro counts as saturated [rad/s].
-        accel_end: specific force from which an accelerometer counts as saturated [m/s2].
+        gyro_end: smallest angular velocity at which a gyro is saturated [rad/s].
+        accel_end: smallest specific force at which an accelerometer is saturated [m/s2].
     """
     for imu in range(len(quaternion)):
         if not abs(squared_norm(quaternion[imu]) - 1.0) <= norm_error:
@@ -115,7 +115,7 @@ def largest(readings: Vector) -> float:
 
 
 def _end_of_range(codec: Codec, name: str) -> float:
-    """Return the reading from which an IMU signal counts as saturated: its maximum minus half its resolution."""
+    """Return the reading at and above which an IMU signal is saturated: maximum of the signal minus half its resolution."""
     signal = next(signal for _, signal in codec.signals if signal.name == name)
     return signal.maximum - 0.5 * signal.factor
 

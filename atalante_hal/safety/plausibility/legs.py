@@ -1,23 +1,26 @@
 """Leg checks, which compare the encoders of a leg with its IMUs to detect drifting and stuck encoders.
 
-The joints FH, TH, SH and SK of a leg lie between the pelvis IMU and the tibia IMU. Their axes are x, z, y, y of parallel frames.
-So the attitude of the tibia relative to the pelvis is Rx(FH) Rz(TH) Ry(SH + SK). The two IMUs give these three angles, and the
-four encoders must agree with them.
+Four joints of a leg lie between the pelvis IMU and the tibia IMU: frontal, transverse and sagittal hip and sagittal
+knee (FH, TH, SH, SK). At zero angles their axes are x, z, y and y. So the attitude of the tibia relative to the pelvis
+is Rx(FH) Rz(TH) Ry(SH + SK). The two IMUs give these three angles, and the four encoders must agree with them.
 
-*Drift.* An encoder that drifts at rate d is detected after the time attitude_error / d plus `DRIFT_SAMPLES` samples. A drift of
-more than 0.035 rad/s is detected within 1000 cycles, and a slower drift takes longer. Some drifts cannot be detected or
-separated. The foot has no IMU, so a drift of SA or HA is not detected. Opposite drifts of SH and SK cancel and are not detected,
-and a drift of SH cannot be separated from a drift of SK. A drift of an IMU has the same effect as a drift of an encoder. The
-heading of an IMU without a fault also drifts, but this affects only TH.
+*Drift.* An encoder that drifts at rate d is detected after the time attitude_error / d plus `DRIFT_SAMPLES` samples. A
+drift of more than 0.035 rad/s is detected within 1000 cycles, and a slower drift takes longer. Some drifts cannot be
+detected, and some drifting encoders cannot be distinguished. The foot has no IMU, so a drift of SA or HA is not
+detected. Opposite drifts of SH and SK cancel and are not detected, and a drift of SH cannot be distinguished from a
+drift of SK. A drift of an IMU has the same effect as a drift of an encoder. The heading of an IMU without a fault also
+drifts, without a limit, but this affects only TH. The check of TH therefore subtracts the drift of the headings, which it
+follows at `_HEADING_DRIFT` at most. A slower drift of the encoder of TH is not detected.
 
-*Standstill.* While the reading of an encoder is constant, the difference between encoders and IMUs about its axis is also
-constant if the joint is at rest. If the joint moves, the difference changes by its motion. The check uses this change, so that a
-stuck encoder is detected long before the difference reaches `attitude_error`. The threshold also covers the effect
-of a misaligned IMU (`misalignment`) while the leg turns about another axis. If the readings of SH and SK are both constant, both
-are reported. Unlike `stillness`, this check needs no torque, so it also covers a joint that is moved by its neighbours.
+*Standstill.* While the reading of an encoder is constant and its joint is at rest, the difference between encoders and
+IMUs about the axis of the joint is also constant. If the joint moves, this difference changes by the motion of the
+joint. The check uses this change, so that a stuck encoder is detected long before the difference reaches
+`attitude_error`. The threshold also covers the effect of a misaligned IMU (`misalignment`) while the leg turns about
+another axis. If the readings of SH and SK are both constant, both are reported. Unlike the module `stillness`, this
+check needs no torque, so it also covers a joint that other joints move.
 
-*Age.* Values from earlier cycles are extrapolated to this cycle with the velocity of the same message. The thresholds are
-extended by `velocity_error` times the age of the values.
+*Age.* Values from earlier cycles are extrapolated to this cycle with the velocity that the same message contains. The
+thresholds are extended by `velocity_error` times the age of the values.
 """
 
 from __future__ import annotations
@@ -40,9 +43,14 @@ DRIFT_SAMPLES = 4
 STANDSTILL_SAMPLES = 2
 #: Drift of the IMUs that the standstill check tolerates per sample [rad]. IMUs without a fault drift less than a tenth of this.
 _IMU_DRIFT = 2e-5
+#: Largest change of the heading between pelvis and tibia IMU that the drift check follows per sample [rad]. A leg has a sample
+#: every 32 cycles, so this is 3e-4 rad/s.
+_HEADING_DRIFT = 1e-5
 _PELVIS = IMUS.index("pelvis")
 _TIBIAE = tuple(IMUS.index(f"{side}_tibia") for side in SIDES)
 _AXES = (("FH",), ("TH",), ("SH", "SK"))
+#: Axis that the headings of the IMUs affect.
+_HEADING = _AXES.index(("TH",))
 #: For each of the first four joints of a leg: index of its axis in `_AXES`.
 _AXIS_OF = (0, 1, 2, 2)
 _HIPS = tuple(JOINTS.index(f"{side}_FH") for side in SIDES)
@@ -51,9 +59,9 @@ _HIPS = tuple(JOINTS.index(f"{side}_FH") for side in SIDES)
 class _Comparison(NamedTuple):
     """Comparison of the encoders and IMUs of a leg in one sample."""
 
-    angles: tuple[float, float, float]  # angles FH, TH, SH + SK from the IMUs [rad]
+    angles: tuple[float, float, float]  # the three angles FH, TH and SH + SK from the IMUs [rad]
     errors: tuple[float, float, float]  # encoder angles minus `angles` [rad]
-    doubt: float = 0.0  # uncertainty of `errors` if the values are from different cycles [rad]
+    uncertainty: float = 0.0  # uncertainty of `errors` if the values are from different cycles [rad]
 
 
 class Legs:
@@ -72,16 +80,18 @@ class Legs:
         self._to_joint: Vector = robot.polarity / robot.gear
         self._attitude_error = robot.sensors.attitude_error
         self._attitude_change, self._misalignment = robot.sensors.attitude_change, robot.sensors.misalignment
+        #: For each leg: drift of the headings since the start, as an error of TH [rad].
+        self._heading = [0.0 for _ in SIDES]
         self._contradicts = [[0] * len(_AXES) for _ in SIDES]
         self._constant_samples = [constant_samples[hip : hip + len(_AXIS_OF)] for hip in _HIPS]
-        #: For each joint: comparison of its leg that was made when the encoder reading of the joint last changed.
+        #: For each joint: comparison of its leg in the newest sample in which the encoder reading of the joint changed.
         self._moved: list[_Comparison | None] = [None] * len(JOINTS)
-        #: Joint index -> number of consecutive samples in which the leg turned but the encoder reading was constant.
+        #: Number of consecutive samples in which the leg turned but the encoder reading was constant, by joint index.
         self._turned: dict[int, int] = {}
         self._drifts: list[tuple[Finding, ...]] = [() for _ in SIDES]
         self._stuck: list[tuple[Finding, ...]] = [() for _ in SIDES]
 
-    def judge_left(self, ages: Ages | None) -> bool:
+    def check_left(self, ages: Ages | None) -> bool:
         """Check the left leg. Also check the right leg if one of the right encoders has a constant reading.
 
         Args:
@@ -91,9 +101,9 @@ class Legs:
         Returns:
             Whether there is a finding for any leg.
         """
-        return self._judge(0, ages)
+        return self._check(0, ages)
 
-    def judge_right(self, ages: Ages | None) -> bool:
+    def check_right(self, ages: Ages | None) -> bool:
         """Check the right leg. Also check the left leg if one of the left encoders has a constant reading.
 
         Args:
@@ -103,30 +113,30 @@ class Legs:
         Returns:
             Whether there is a finding for any leg.
         """
-        return self._judge(1, ages)
+        return self._check(1, ages)
 
-    def _judge(self, leg: int, ages: Ages | None) -> bool:
+    def _check(self, leg: int, ages: Ages | None) -> bool:
         comparison = self._compare(leg, ages)
         if comparison is not None:
-            self._judge_drift(leg, comparison)
-            self._judge_standstill(leg, comparison)
+            self._check_drift(leg, comparison)
+            self._check_standstill(leg, comparison)
         other = 1 - leg
         if self._stuck[other] or self._constant_samples[other].any():
             comparison = self._compare(other, ages)
             if comparison is not None:
-                self._judge_standstill(other, comparison)
+                self._check_standstill(other, comparison)
         return any(self._drifts) or any(self._stuck)
 
     def _compare(self, leg: int, ages: Ages | None) -> _Comparison | None:
         """Compare the encoders and IMUs of a leg in this cycle; return None if a value is too old."""
-        now, four, doubt = self._now, slice(_HIPS[leg], _HIPS[leg] + len(_AXIS_OF)), 0.0
+        now, four, uncertainty = self._now, slice(_HIPS[leg], _HIPS[leg] + len(_AXIS_OF)), 0.0
         angles = now.position[four] * self._to_joint[four]
         pelvis, tibia = now.quaternion[_PELVIS].tolist(), now.quaternion[_TIBIAE[leg]].tolist()
         if ages is not None:
             cycles = [*ages.joint[four].tolist(), *ages.imu[[_PELVIS, _TIBIAE[leg]]].tolist()]
             if max(cycles) >= NEVER:
                 return None
-            doubt = self._velocity_error * self._period * sum(cycles)
+            uncertainty = self._velocity_error * self._period * sum(cycles)
             angles += now.velocity[four] * self._to_joint[four] * (self._period * ages.joint[four])
             pelvis = extrapolated(pelvis, now.gyro[_PELVIS].tolist(), self._period * cycles[-2])
             tibia = extrapolated(tibia, now.gyro[_TIBIAE[leg]].tolist(), self._period * cycles[-1])
@@ -134,18 +144,22 @@ class Legs:
         x, z, y = hip_angles(pelvis, tibia)
         turn = 2.0 * math.pi
         errors = math.remainder(fh - x, turn), math.remainder(th - z, turn), math.remainder(sh + sk - y, turn)
-        return _Comparison((x, z, y), errors, doubt)
+        return _Comparison((x, z, y), errors, uncertainty)
 
-    def _judge_drift(self, leg: int, comparison: _Comparison) -> None:
+    def _check_drift(self, leg: int, comparison: _Comparison) -> None:
         drifts = []
         counts = self._contradicts[leg]
-        for axis, error in enumerate(comparison.errors):
-            counts[axis] = counts[axis] + 1 if abs(error) > self._attitude_error + comparison.doubt else 0
+        errors, allowed = list(comparison.errors), self._attitude_error + comparison.uncertainty
+        errors[_HEADING] -= self._heading[leg]
+        for axis, error in enumerate(errors):
+            counts[axis] = counts[axis] + 1 if abs(error) > allowed else 0
             if counts[axis] >= DRIFT_SAMPLES:
                 drifts.append(_drift(SIDES[leg], _AXES[axis], error))
+        if not counts[_HEADING]:
+            self._heading[leg] += max(-_HEADING_DRIFT, min(_HEADING_DRIFT, errors[_HEADING]))
         self._drifts[leg] = tuple(drifts)
 
-    def _judge_standstill(self, leg: int, comparison: _Comparison) -> None:
+    def _check_standstill(self, leg: int, comparison: _Comparison) -> None:
         stuck = []
         for index, constant in enumerate(self._constant_samples[leg].tolist()):
             joint, axis = _HIPS[leg] + index, _AXIS_OF[index]
@@ -155,8 +169,8 @@ class Legs:
                 continue
             change = comparison.errors[axis] - moved.errors[axis]
             turned = max(abs(angle - moved.angles[i]) for i, angle in enumerate(comparison.angles))
-            # If the leg has not turned, a changed deviation is no evidence of a stuck encoder. It results from a jump or a drift.
-            allowed = self._attitude_change + self._misalignment * turned + comparison.doubt + moved.doubt
+            # If the deviation changes while the leg does not turn, the encoder is not stuck: it jumped or drifts.
+            allowed = self._attitude_change + self._misalignment * turned + comparison.uncertainty + moved.uncertainty
             if min(abs(change), turned) <= allowed:
                 self._turned[joint] = 0
                 self._moved[joint] = _follow_imu_drift(moved, axis, change)
@@ -167,7 +181,7 @@ class Legs:
         self._stuck[leg] = tuple(stuck)
 
     def findings(self) -> tuple[Finding, ...]:
-        """Return the present findings."""
+        """Return the current findings."""
         return (*self._drifts[0], *self._drifts[1], *self._stuck[0], *self._stuck[1])
 
 
@@ -185,7 +199,7 @@ def hip_angles(pelvis: list[float], tibia: list[float]) -> tuple[float, float, f
     x = a * f - b * e - c * h + d * g
     y = a * g + b * h - c * e - d * f
     z = a * h - b * g + c * f - d * e
-    sine = 2.0 * (w * z - x * y)  # sine of TH: minus the entry (0, 1) of the rotation matrix
+    sine = 2.0 * (w * z - x * y)  # sine of TH: minus element (0, 1) of the rotation matrix
     th = math.asin(max(-1.0, min(1.0, sine)))
     sagittal = math.atan2(2.0 * (x * z + w * y), 1.0 - 2.0 * (y * y + z * z))
     fh = math.atan2(2.0 * (y * z + w * x), 1.0 - 2.0 * (x * x + z * z))
@@ -196,7 +210,7 @@ def extrapolated(quaternion: list[float], gyro: list[float], time: float) -> lis
     """Extrapolate an attitude in time to first order, at constant angular velocity.
 
     Args:
-        quaternion: present attitude, wxyz, sensor to world.
+        quaternion: attitude before the extrapolation, wxyz, sensor to world.
         gyro: angular velocity in the sensor frame [rad/s], three axes.
         time: extrapolation time [s].
 
@@ -214,7 +228,7 @@ def extrapolated(quaternion: list[float], gyro: list[float], time: float) -> lis
 
 
 def _follow_imu_drift(moved: _Comparison, axis: int, change: float) -> _Comparison:
-    """Return a copy of `moved` with `change`, limited to +-`_IMU_DRIFT`, added to the deviation of one axis."""
+    """Limit `change` to +-`_IMU_DRIFT`, add it to one error in a copy of `moved`, and return the copy."""
     errors = list(moved.errors)
     errors[axis] += max(-_IMU_DRIFT, min(_IMU_DRIFT, change))
     return moved._replace(errors=(errors[0], errors[1], errors[2]))

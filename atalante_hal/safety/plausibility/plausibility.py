@@ -3,9 +3,10 @@
     process image -> one slow check in turn (standstill, velocity, feet, legs, monitor of checks that lack data) -> jump, range,
     IMUs -> state
 
-Each cycle checks the encoders and the IMUs, and runs at most one slow check. If the new values of a joint or an IMU fail their
-check, they are rejected: the message keeps its previous values, and their age grows. Each check uses only the messages it
-needs, with the ages of their values. So a fault of one message does not disable a check of another message.
+Each cycle checks the encoders and the IMUs, and runs at most one slow check. If the new values of a joint or an IMU
+fail a check, they are rejected: the process image keeps the previous values, and the age of these values grows. Each
+check uses only the messages that it needs, and the ages of their values. So a fault of one message does not disable the
+checks of other messages.
 """
 
 from __future__ import annotations
@@ -27,7 +28,7 @@ from atalante_hal.wire.process_image import NEVER, ReceiveImage
 
 #: Interval of the foot checks [cycles].
 FEET = 4
-#: Interval of the other slow checks [cycles]: standstill, velocity, monitor of checks without data.
+#: Interval of the standstill check, of the velocity check, and of the monitor of checks that lack data [cycles].
 SLOW = 16
 #: Period of the schedule of all slow checks [cycles]. Each leg is checked once per period.
 _PERIOD = 32
@@ -43,54 +44,54 @@ class Plausibility:
         period: cycle time [s].
 
     Attributes:
-        findings: present findings; the tuple is replaced only when they change.
+        findings: current findings; the tuple is replaced only when the findings change.
     """
 
     def __init__(self, robot: Robot, image: ReceiveImage, period: float) -> None:
         self._image = image
         codec = image.codec
-        now = signals_of(codec, image.values)
+        now, before = signals_of(codec, image.values), signals_of(codec, image.values_before)
         self._force = now.force
-        self._encoders = EncoderChecks(robot, now, signals_of(codec, image.values_before), period, SLOW)
+        self._encoders = EncoderChecks(robot, now, before, period, SLOW)
         self._imus = Imus(robot, codec, now)
-        self._stillness = Stillness(robot, image, now, SLOW)
+        self._stillness = Stillness(robot, image, now, before, SLOW, period)
         self._legs = Legs(robot, now, self._stillness.constant_samples, period)
         self._feet = FootChecks(robot, now, FEET)
         self._rows = Rows(codec)
         self._unchecked = Unchecked(self._rows, image.check, SLOW)
         self._joint_rows, self._imu_rows = self._rows.joint.tolist(), self._rows.imu.tolist()
         self._foot_ages = [NEVER] * len(self._rows.foot)  # age of the values of each foot at its last check [cycles]
-        #: Row -> cycle in which its last good values were measured. It is updated only while `_settled` is False.
+        #: Cycle in which the last good values of each row were measured. Updated only while `_settled` is False.
         self._measured = dict.fromkeys((*self._joint_rows, *self._imu_rows), -NEVER)
-        #: (foot, cell) -> measured force of each faulty cell, shape (3,) [N]. Its force in the process image is replaced by 0.
+        #: Measured force of each faulty cell, by (foot, cell), shape (3,) [N]. The process image has 0 instead.
         self._measured_forces: dict[tuple[int, int], Vector] = {}
         self._settled = False  # True if the last values of all rows were good and new
         self._turns = self._build_turns()
         self._cycle = 0
         self.findings: tuple[Finding, ...]
-        #: Findings when all rows were last checked. If `findings` differs, all rows are checked again.
-        self._judged: tuple[Finding, ...]
-        self.findings = self._judged = ()
+        #: Findings at the last check of all rows. If `findings` differs from these findings, all rows are checked.
+        self._evaluated: tuple[Finding, ...]
+        self.findings = self._evaluated = ()
 
     def _build_turns(self) -> list[Callable[[Ages | None], bool] | None]:
         """Return the slow check for each cycle of the schedule period; None for a cycle without a slow check.
 
-        Each check is called with the ages of the sensor values, or with None if all values are of this cycle. It returns whether
-        it has findings.
+        Each check is called with the ages of the sensor values, or with None if all values are of this cycle. The
+        return value states whether the check has findings.
         """
         turns: list[Callable[[Ages | None], bool] | None] = [None] * _PERIOD
         turns[0::SLOW] = [self._sample] * (_PERIOD // SLOW)
-        turns[2::SLOW] = [self._judge_velocity] * (_PERIOD // SLOW)
-        turns[4::SLOW] = [self._judge_unchecked] * (_PERIOD // SLOW)
-        turns[1::FEET] = [self._judge_feet] * (_PERIOD // FEET)
-        turns[8], turns[24] = self._legs.judge_left, self._legs.judge_right
+        turns[2::SLOW] = [self._check_velocity] * (_PERIOD // SLOW)
+        turns[4::SLOW] = [self._check_unchecked] * (_PERIOD // SLOW)
+        turns[1::FEET] = [self._check_feet] * (_PERIOD // FEET)
+        turns[8], turns[24] = self._legs.check_left, self._legs.check_right
         return turns
 
     def check(self) -> tuple[Finding, ...]:
         """Run the checks of one cycle. Call this after the process image has accepted the frames of the cycle.
 
         Returns:
-            The present findings.
+            The current findings.
         """
         fresh = self._image.all_fresh
         if self._measured_forces:
@@ -98,10 +99,14 @@ class Plausibility:
         turn = self._turns[self._cycle % _PERIOD]
         if turn is not None and (turn(None if fresh else self._rows.ages(self._image.age)) or self.findings):
             self._collect()
-        settled = fresh and self._settled and self.findings is self._judged
-        if not (settled and self._encoders.within_reach() and self._imus.usable()):
-            self._judged = self.findings
-            self._judge_rows()
+        settled = fresh and self._settled and self.findings is self._evaluated
+        if settled and self._encoders.within_reach() and self._imus.usable():
+            self._encoders.follow()
+            if self._stillness.follow():
+                self._collect()
+        else:
+            self._evaluated = self.findings
+            self._check_rows()
             self._collect()
         if self.findings:
             self._set_faulty_cells_to_zero()
@@ -109,7 +114,7 @@ class Plausibility:
         return self.findings
 
     def reference(self, node: str) -> None:
-        """Skip the jump check of a joint's next position, because its drive has referenced the encoder.
+        """Skip the jump check for the next position of a joint whose drive has referenced its encoder.
 
         Args:
             node: DBC name of the drive; the name of any other node has no effect.
@@ -131,20 +136,20 @@ class Plausibility:
     def _sample(self, ages: Ages | None) -> bool:
         return self._stillness.sample(ages is None)
 
-    def _judge_velocity(self, ages: Ages | None) -> bool:
-        return self._encoders.judge_velocity(None if ages is None else ages.joint)
+    def _check_velocity(self, ages: Ages | None) -> bool:
+        return self._encoders.check_velocity(None if ages is None else ages.joint)
 
-    def _judge_unchecked(self, ages: Ages | None) -> bool:
-        return self._unchecked.judge(None if ages is None else self._image.age)
+    def _check_unchecked(self, ages: Ages | None) -> bool:
+        return self._unchecked.evaluate(None if ages is None else self._image.age)
 
-    def _judge_feet(self, ages: Ages | None) -> bool:
+    def _check_feet(self, ages: Ages | None) -> bool:
         now = [0] * len(self._foot_ages) if ages is None else ages.foot.tolist()
         # A foot is checked only if it has new values since its last check.
         left, right = (age < before + FEET for age, before in zip(now, self._foot_ages, strict=True))
         self._foot_ages = now
-        return self._feet.judge((left, right))
+        return self._feet.evaluate((left, right))
 
-    def _judge_rows(self) -> None:
+    def _check_rows(self) -> None:
         """Check the new values of each joint and each IMU, and reject implausible values."""
         measured, cycle, image = self._measured, self._cycle, self._image
         if self._settled:
@@ -158,6 +163,7 @@ class Plausibility:
                 measured[row] = at
             else:
                 image.refuse(row)
+        self._stillness.check_driven()
         self._settled = all(at == cycle for at in measured.values())
 
     def _accept(self, sensor: int, cycles: int) -> bool:
@@ -165,11 +171,14 @@ class Plausibility:
 
         Args:
             sensor: index of a joint, or number of joints plus index of an IMU.
-            cycles: time from its last good values to the new ones [cycles].
+            cycles: time from the sensor's last good values to the new values [cycles].
         """
         imu = sensor - len(self._joint_rows)
         if imu < 0:
-            return self._encoders.accept(sensor, cycles)
+            accepted = self._encoders.accept(sensor, cycles)
+            if accepted:
+                self._stillness.follow_joint(sensor, cycles)
+            return accepted
         return self._imus.accept(imu, cycles, frozen=imu in self._stillness.imus)
 
     def _collect(self) -> None:
@@ -191,7 +200,7 @@ class Plausibility:
             self._force[cell] = 0.0
 
     def _restore_cells(self) -> None:
-        """Restore the measured forces of the faulty cells of each foot without new values, because its checks need them."""
+        """Restore the measured forces of faulty cells in feet without new values, because the foot checks need them."""
         for (foot, cell), force in self._measured_forces.items():
             if self._image.check[self._rows.foot[foot]] > _FRESH:
                 self._force[foot, cell] = force

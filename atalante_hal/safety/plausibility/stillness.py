@@ -1,20 +1,35 @@
-"""Standstill checks, which detect stuck encoders, frozen gyros and frozen force cells: their readings stay exactly constant.
+"""Standstill checks, which detect stuck encoders, frozen gyros and frozen force cells by exactly constant readings.
 
-All signals are sampled every few cycles, and consecutive samples with exactly the same value are counted. A signal is
-skipped if its value is not newer than its value in the last sample.
+All signals are sampled every few cycles, and consecutive samples with exactly the same value are counted. A sample
+skips each signal that has no new value since the last sample. In addition, each cycle updates a record of each joint
+(`Drive`): the range of its torque since its encoder reading last changed, and the motion that this torque would cause.
+
+*Ankles.* The ankles of a foot on the ground move the whole robot, whose inertia is some thousand times that of the foot. A torque
+that varies fast then does not move them. But the sole is at rest, so an ankle moves when its shank turns. An encoder of an ankle
+with a loaded foot is therefore stuck if its reading is constant while the shank turns by `_TURN`.
 
 The reading of an encoder may be constant because the joint is at rest. An encoder is stuck only under two conditions. First, the
-torque of the drive has varied by at least `breakaway` since the reading last changed; this is more than twice the dry friction of
-the joint. Second, the joint is not at its end stop, which holds it against any torque. A stuck encoder of a joint without torque
-is not detected here until the joint is driven. The module `legs` detects some of these encoders with the IMUs.
+torque of the drive has varied by at least `breakaway` since the reading last changed. `breakaway` is more than twice the dry
+friction of the joint. Second, the joint is not at its end stop, because an end stop holds a joint against any torque. A stuck
+encoder of a joint without torque is not detected here until the joint is driven. The module `legs` detects some of
+these encoders with the IMUs.
+
+*Large torque.* A controller that drives a joint with a stuck encoder accelerates the joint by a large torque within a few
+cycles. The accepted time of a constant reading is therefore shorter, the larger the torque. A joint whose reading has been
+constant for `_AT_REST` cycles is at rest, so its torque is in balance. From then on, each cycle computes how far the
+torque change beyond `breakaway` would have turned a joint with the inertia `_INERTIA`, which is larger than that of any
+joint. The encoder is stuck if this angle is at least `_DRIVEN`.
 """
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 import numpy.typing as npt
 
-from atalante_hal.robot import CELLS, FEET, IMUS, JOINTS, Robot
+from atalante_hal.compiled import specialised
+from atalante_hal.robot import CELLS, FEET, IMUS, JOINTS, SIDES, Robot
 from atalante_hal.safety.diagnostics import Dtc, Finding
 from atalante_hal.safety.plausibility.finding import (
     FOOT_NODES,
@@ -31,9 +46,46 @@ from atalante_hal.wire.process_image import NEVER, ReceiveImage
 STUCK_CYCLES = 50
 #: Longest time from the first repeated reading of a gyro or force cell to its detection as frozen [cycles].
 FROZEN_CYCLES = 100
-#: A joint counts as being at its end stop if it is closer than this distance to a position limit [rad].
+#: Turn of a shank above a loaded foot that must change the readings of the ankle encoders [rad].
+_TURN = 0.01
+#: Inertia above that of any joint, also of the knee of a leg that carries robot and patient [kg m2].
+_INERTIA = 100.0
+#: Cycles with a constant reading after which a joint is at rest. In this time, an unbalanced torque would move it.
+_AT_REST = 3
+#: Turn of a joint with the inertia `_INERTIA` that must change the reading of its encoder [rad]; 20 counts of a motor encoder.
+_DRIVEN = 1e-5
+#: A joint closer to a position limit than this distance is regarded as being at its end stop [rad].
 _AT_STOP = 0.005
 _NEVER = 1 << 30
+#: Indices of the ankles in JOINTS, and for each ankle the index of its foot in FEET and of its shank IMU in IMUS.
+_ANKLES = [JOINTS.index(f"{side}_{joint}") for side in SIDES for joint in ("SA", "HA")]
+_FOOT_OF = [0, 0, 1, 1]
+#: For each joint: index of the foot that holds it on the ground, -1 for a joint above the ankles.
+_HELD_BY = tuple(_FOOT_OF[_ANKLES.index(joint)] if joint in _ANKLES else -1 for joint in range(len(JOINTS)))
+_SHANK_OF = [IMUS.index(f"{side}_tibia") for side in SIDES for _ in ("SA", "HA")]
+
+
+class Readings(NamedTuple):
+    """Signals that update the `Drive` record in each cycle. Positions are on the motor side."""
+
+    position: Vector  # (12,) rad
+    before: Vector  # (12,) rad, positions of the cycle before
+    torque: Vector  # (12,) Nm
+    force: Vector  # (2, 4, 3) N
+
+
+class Drive(NamedTuple):
+    """Torque of each joint since its encoder reading last changed, and the motion that this torque would cause. Shape (12,) each.
+
+    The motion is computed for a joint with the inertia `_INERTIA` that breaks away at `breakaway`.
+    """
+
+    cycles: Vector  # cycles with a constant reading
+    rest: Vector  # torque at rest [Nm]
+    low: Vector  # lowest torque [Nm]
+    high: Vector  # highest torque [Nm]
+    momentum: Vector  # angular momentum [Nm s]
+    turn: Vector  # angle [rad]
 
 
 class Stillness:
@@ -43,41 +95,58 @@ class Stillness:
         robot: limits and friction of the robot.
         image: process image whose decoded values are sampled.
         now: views of the measured signals in these values.
+        before: views of the last good signals before this cycle.
         every: interval between two calls of `sample` [cycles].
+        period: cycle time [s].
     """
 
-    def __init__(self, robot: Robot, image: ReceiveImage, now: Signals, every: int) -> None:
+    def __init__(
+        self, robot: Robot, image: ReceiveImage, now: Signals, before: Signals, every: int, period: float
+    ) -> None:
         codec = image.codec
         where = measured(codec)
         self._values, self._now, self._age = image.values[where], now, image.age
         self._every = every
-        #: Age of the values that were last sampled, for each row [cycles], shape (rows,).
+        #: Age of the last sample of each row [cycles], shape (rows,).
         self._sampled_age: Cycles = np.full(len(image.age), 2 * NEVER)
         self._row_of = codec.row_of[where]
         size = len(self._values)
         self._sampled = np.full(size, np.nan)
         self._same = np.empty(size, np.bool_)
         self._repeats = np.full(size, 0)
-        # Round the limits down, because the first sample of a standstill may be up to `every` - 1 cycles late.
+        # Limits [samples]. `every` - 1 is subtracted, because the first sample of a standstill may be this many cycles late.
         limit = np.full(size, _NEVER)
         limit[codec.slice("Position")] = self._to_stuck = (STUCK_CYCLES - every + 1) // every
         limit[codec.slice("Gyro")] = limit[codec.slice("Force")] = to_freeze = (FROZEN_CYCLES - every + 1) // every
         self._to_freeze = to_freeze
         self._limit = limit
         self._none_over = bytes(size)
-        #: Number of consecutive samples with a constant reading, for each encoder, shape (12,).
+        #: Number of consecutive samples in which the reading of each encoder was constant, shape (12,).
         self.constant_samples: npt.NDArray[np.int64]
         self.constant_samples, self._gyros, self._cells = (
             self._repeats[codec.slice(quantity)] for quantity in ("Position", "Gyro", "Force")
         )
         self._encoders_same, self._no_encoder = self._same[codec.slice("Position")], bytes(len(JOINTS))
-        self._sampled_torque = self._sampled[codec.slice("Torque")]
-        self._torque_low, self._torque_high = np.zeros((2, len(JOINTS)))
         self._breakaway = robot.breakaway
+        self._loaded = 2.0 * robot.sensors.cell_free  # vertical force on a foot on the ground [N]
+        self._interval = every * period
+        self._drive = Drive(*np.zeros((6, len(JOINTS))))
+        #: Joints with a constant encoder reading despite a large torque, see the module docstring.
+        self._driven: list[int] = []
+        #: Arguments of the function `follow`. The array objects are the same in every call.
+        self._readings = (
+            Readings(now.position, before.position, now.torque, now.force),
+            self._drive, self._breakaway, self._loaded, period,
+        )  # fmt: skip
+        self._follow = specialised(follow, *self._readings)
+        for joint in range(len(JOINTS)):
+            release(self._drive, joint)
+        #: Turn of the shank since the reading of each ankle encoder last changed, while its foot is loaded, shape (4, 3) [rad].
+        self._turn = np.zeros((len(_ANKLES), 3))
         self._to_joint: Vector = robot.polarity / robot.gear
         self._low_stop, self._high_stop = robot.position_min + _AT_STOP, robot.position_max - _AT_STOP
-        #: Indices of the joints with a stuck encoder.
-        self.encoders: list[int] = []
+        #: Finding of each stuck encoder at its last check, by joint index.
+        self.encoders: dict[int, Finding] = {}
         #: Indices of the IMUs with a frozen gyro.
         self.imus: list[int] = []
         #: (foot, cell) of each frozen force cell.
@@ -90,7 +159,8 @@ class Stillness:
             whole: True if the values of all rows are of this cycle. If False, the ages in the process image are used.
 
         Returns:
-            Whether any signal has been constant for too long. For an encoder this alone is not a finding yet.
+            Whether any signal has been constant for too long. A constant encoder alone is not a finding, see the module
+            docstring.
         """
         same, repeats = self._same, self._repeats
         np.equal(self._values, self._sampled, same)
@@ -102,54 +172,154 @@ class Stillness:
         else:
             np.copyto(repeats, (repeats + 1) * same, where=newer)
         if self._encoders_same.tobytes() != self._no_encoder:
-            self._follow_torque()
+            self._follow_shanks()
         if newer is None:
             self._sampled[:] = self._values
         else:
             np.copyto(self._sampled, self._values, where=newer)
         over: bool = (repeats >= self._limit).tobytes() != self._none_over
         if over or self.encoders or self.imus or self.cells:
-            self._judge()
+            self._check()
         return over
 
     def _newer(self) -> npt.NDArray[np.bool_]:
-        """Return for each signal whether its value is newer than the sampled value, and update the ages of the sampled values."""
+        """Return which signals have a newer value than their last sample, and update the ages of the samples."""
         self._sampled_age += self._every
         newer = self._age < self._sampled_age
         np.copyto(self._sampled_age, self._age, where=newer)
         return newer[self._row_of]
 
-    def _follow_torque(self) -> None:
-        """Update the torque range of each joint since the last change of its encoder reading."""
-        first = self.constant_samples == 1
-        torque = self._now.torque
-        low = np.where(first, self._sampled_torque, self._torque_low)
-        high = np.where(first, self._sampled_torque, self._torque_high)
-        np.minimum(low, torque, out=self._torque_low)
-        np.maximum(high, torque, out=self._torque_high)
+    def _follow_shanks(self) -> None:
+        """Update the turn of each shank since the encoder reading of its ankle last changed."""
+        on_ground = (self._now.force[:, :, 2].sum(axis=1) > self._loaded)[_FOOT_OF]
+        self._turn += self._now.gyro[_SHANK_OF] * self._interval
+        self._turn[~on_ground | (self.constant_samples[_ANKLES] <= 1)] = 0.0
 
-    def _judge(self) -> None:
+    def follow(self) -> bool:
+        """Update the `Drive` record of all joints. All joints must have good values of this and the last cycle.
+
+        Returns:
+            Whether the list of encoders that are stuck under a large torque has changed.
+        """
+        return (self._follow(*self._readings) or bool(self._driven)) and self.check_driven()
+
+    def follow_joint(self, joint: int, cycles: int) -> None:
+        """Update the `Drive` record of one joint, see `follow_one`.
+
+        Args:
+            joint: index of the joint in JOINTS.
+            cycles: time from the joint's last good values to the new values [cycles].
+        """
+        if cycles > 0:
+            readings, drive, breakaway, loaded, period = self._readings
+            follow_one(joint, readings, drive, float(breakaway[joint]), (loaded, cycles * period))
+
+    def check_driven(self) -> bool:
+        """Update the list of encoders that are stuck under a large torque, and return whether it has changed."""
+        driven = np.flatnonzero((self._drive.turn >= _DRIVEN) & self._free()).tolist()
+        if driven == self._driven:
+            return False
+        self._driven = driven
+        self.encoders.update((joint, self._stuck(joint)) for joint in driven)
+        return True
+
+    def _free(self) -> npt.NDArray[np.bool_]:
+        """Return whether each joint is away from its end stops, shape (12,)."""
         angle = self._now.position * self._to_joint
-        pushed = self._torque_high - self._torque_low >= self._breakaway
-        free = (angle > self._low_stop) & (angle < self._high_stop)
-        self.encoders = np.flatnonzero((self.constant_samples >= self._to_stuck) & pushed & free).tolist()
+        return (angle > self._low_stop) & (angle < self._high_stop)
+
+    def _check(self) -> None:
+        pushed = self._drive.high - self._drive.low >= self._breakaway
+        pushed[_ANKLES] |= np.linalg.norm(self._turn, axis=1) >= _TURN
+        stuck = (self.constant_samples >= self._to_stuck) & pushed & self._free()
+        stuck[self._driven] = True
+        self.encoders = {joint: self._stuck(joint) for joint in np.flatnonzero(stuck).tolist()}
         frozen = (self._gyros.reshape(len(IMUS), 3) >= self._to_freeze).all(axis=1)
         self.imus = np.flatnonzero(frozen).tolist()
         dead = (self._cells.reshape(len(FEET), len(CELLS), 3) >= self._to_freeze).any(axis=2)
         self.cells = [(foot, cell) for foot, cell in np.argwhere(dead).tolist()]
 
     def findings(self) -> tuple[Finding, ...]:
-        """Return the present findings."""
+        """Return the current findings."""
         return (
-            *map(self._stuck, self.encoders),
+            *self.encoders.values(),
             *map(_frozen_imu, self.imus),
             *(_frozen_cell(foot, cell, float(self._now.force[foot, cell, 2])) for foot, cell in self.cells),
         )
 
     def _stuck(self, joint: int) -> Finding:
-        swing = float(self._torque_high[joint] - self._torque_low[joint])
+        swing = float(self._drive.high[joint] - self._drive.low[joint])
+        if swing < self._breakaway[joint]:
+            turn = float(np.linalg.norm(self._turn[_ANKLES.index(joint)]))
+            text = (
+                f"the encoder of {JOINTS[joint]} has a constant reading while the shank turns by {np.degrees(turn):.1f} "
+                "degrees over the foot on the ground"
+            )
+            return Finding(Dtc.ENC_STUCK, JOINT_NODES[joint], turn, True, text)
         text = f"the encoder of {JOINTS[joint]} has a constant reading while the torque varies by {swing:.0f} Nm"
         return Finding(Dtc.ENC_STUCK, JOINT_NODES[joint], swing, True, text)
+
+
+def follow(readings: Readings, drive: Drive, breakaway: Vector, loaded: float, period: float) -> bool:
+    """Update the `Drive` record of all joints by one cycle, see `follow_one`.
+
+    Args:
+        readings: signals of the cycle.
+        drive: record of all joints. Updated here.
+        breakaway: change of torque that moves each joint, shape (12,) [Nm].
+        loaded: vertical force on a foot that is on the ground [N].
+        period: cycle time [s].
+
+    Returns:
+        Whether a large torque should have changed a constant reading.
+    """
+    driven = False
+    for joint in range(len(breakaway)):
+        follow_one(joint, readings, drive, breakaway[joint], (loaded, period))
+        driven = driven or drive.turn[joint] >= _DRIVEN
+    return driven
+
+
+def follow_one(joint: int, readings: Readings, drive: Drive, breakaway: float, limits: tuple[float, float]) -> None:
+    """Update the `Drive` record of one joint.
+
+    If the encoder reading has changed, or if the ground holds the joint, the record is cleared. Otherwise the torque of this
+    cycle extends the torque range, and the motion is integrated over the time since the last values.
+
+    Args:
+        joint: index of the joint in JOINTS.
+        readings: signals of the cycle.
+        drive: record of all joints. Updated here.
+        breakaway: change of torque that moves the joint [Nm].
+        limits: vertical force on a foot that is on the ground [N], and time since the last values of the joint [s].
+    """
+    loaded, time = limits
+    foot, held = _HELD_BY[joint], False
+    if foot >= 0:
+        force = readings.force[foot]
+        held = force[0, 2] + force[1, 2] + force[2, 2] + force[3, 2] > loaded
+    if held or readings.position[joint] != readings.before[joint]:
+        release(drive, joint)
+        return
+    torque = readings.torque[joint]
+    drive.low[joint], drive.high[joint] = min(drive.low[joint], torque), max(drive.high[joint], torque)
+    drive.cycles[joint] += 1.0
+    if drive.cycles[joint] <= _AT_REST:
+        drive.rest[joint] = torque
+    beyond = abs(torque - drive.rest[joint]) - breakaway
+    drive.momentum[joint] = max(0.0, drive.momentum[joint] + beyond * time)
+    drive.turn[joint] += drive.momentum[joint] / _INERTIA * time
+
+
+def release(drive: Drive, joint: int) -> None:
+    """Clear the `Drive` record of a joint whose encoder reading has changed, or which the ground holds.
+
+    Args:
+        drive: record of all joints. Updated here.
+        joint: index of the joint in JOINTS.
+    """
+    drive.low[joint], drive.high[joint] = np.inf, -np.inf
+    drive.cycles[joint] = drive.momentum[joint] = drive.turn[joint] = 0.0
 
 
 def _frozen_imu(imu: int) -> Finding:

@@ -1,9 +1,9 @@
 """Monitor of the checks that cannot run because their messages contain no usable values.
 
-A check uses values that are younger than the timeout of their message, see `finding.Rows`. If a node sends nothing for longer,
-the message monitor brings the robot to HOLD within 10 cycles. If a node keeps sending messages without values, the robot may keep
-moving. For example, an IMU that permanently sends its invalid code leaves the robot in FULL_ASSIST. Then the encoders of its leg
-are not checked against the IMUs, and this module reports it.
+A check uses values that are younger than the timeout of their message, see `finding.Rows`. If a node sends no message,
+the message monitor brings the robot to HOLD within 10 cycles. If a node sends messages without usable values, the robot
+may keep moving. For example, the robot stays in FULL_ASSIST if an IMU permanently sends the code for invalid values.
+Then the encoders of the leg are not checked against the IMUs, and this module reports the missing check.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from atalante_hal.safety.plausibility.finding import FOOT_NODES, JOINT_NODES, Cy
 from atalante_hal.wire.e2e import Check
 from atalante_hal.wire.process_image import NEVER
 
-#: Time without a check after which its diagnostic is confirmed [cycles]. It is the detection time of the slowest check.
+#: If a check cannot run for this time [cycles], its diagnostic is confirmed. The slowest check detects a fault in this time.
 UNCHECKED_CYCLES = 128
 #: Number of encoders per leg that are compared with the IMUs.
 _COMPARED = 4
@@ -30,7 +30,7 @@ class _SensorCheck(NamedTuple):
     dtc: Dtc
     node: str
     rows: list[int]  # rows of the process image that the check needs
-    quantity: str  # checked quantity, for the text of the finding
+    quantity: str  # quantity that the check covers, for the text of the finding
 
 
 class Unchecked:
@@ -38,8 +38,8 @@ class Unchecked:
 
     Args:
         rows: rows and timeouts of the sensor messages.
-        check: `Check` of each row of the process image, shape (rows,); read in each `judge`.
-        every: interval between two calls of `judge` [cycles].
+        check: `Check` of each row of the process image, shape (rows,); read in each `evaluate`.
+        every: interval between two calls of `evaluate` [cycles].
     """
 
     def __init__(self, rows: Rows, check: npt.NDArray[np.uint8], every: int) -> None:
@@ -48,15 +48,16 @@ class Unchecked:
         self._cycles = [0] * len(self._checks)
         self._findings: tuple[Finding, ...] = ()
 
-    def judge(self, age: Cycles | None) -> bool:
+    def evaluate(self, age: Cycles | None) -> bool:
         """Update the time for which each check could not run.
 
-        The time of a check grows if one of its messages arrives, but without usable values. If one of its messages timed out for
-        another reason, the time does not change. Otherwise it is reset.
+        The time of a check grows while one of the required messages arrives without usable values. The time does not
+        change while one of these messages has timed out for another reason. In all other cycles the time is reset to 0.
 
         Args:
-            age: age of each row of the process image [cycles], shape (rows,). A row with an age of `NEVER` or more never had
-                values and is not counted, because the robot cannot be READY without it. None if all values are of this cycle.
+            age: age of each row of the process image [cycles], shape (rows,). A row with an age of `NEVER` or more has
+                had no values yet and is ignored, because without this message the robot cannot be READY. Pass None if
+                all values are of this cycle.
 
         Returns:
             Whether any check could not run.
@@ -81,7 +82,7 @@ class Unchecked:
         return bool(self._findings)
 
     def findings(self) -> tuple[Finding, ...]:
-        """Return the present findings."""
+        """Return the current findings."""
         return self._findings
 
 

@@ -1,6 +1,6 @@
-"""Carry-over of the torque at a step change: the torque jump is compensated, and the compensation fades out.
+"""Carry-over of the torque at a stance change: the torque jump is compensated, and the compensation fades out.
 
-`torque before the change, torque of the new control law -> continuous torque`
+`torque before the stance change, torque of the new control law -> continuous torque`
 """
 
 from __future__ import annotations
@@ -17,41 +17,43 @@ from atalante_hal.types import Vector
 
 
 class Carry:
-    """State of the carry-over: torque before the step change, and torque jump to compensate."""
+    """State of the carry-over: torque before the stance change, and torque jump to compensate."""
 
-    pending: bool  # true until the first torque after the change is computed
-    before: Annotated[Vector, len(JOINTS)]  # Nm, torque before the change
-    carried: Annotated[Vector, len(JOINTS)]  # Nm, torque before the change minus first torque after it
+    pending: bool  # true until the first torque after the stance change is computed
+    before: Annotated[Vector, len(JOINTS)]  # Nm, torque before the stance change
+    #: Nm, torque before the stance change minus first torque after the stance change
+    carried: Annotated[Vector, len(JOINTS)]
 
 
 class CarryOver:
-    """Carry-over of the torque, which keeps the command continuous at a step change.
+    """Carry-over of the torque, which keeps the command continuous at a stance change.
 
     Attributes:
         records: record of `add_carried`, shape (1,).
-        blend: factor of the carried torque for each cycle since the change, from 1 to 0, shape (n,).
+        blend: fraction of the torque jump that is still compensated in each cycle since the stance change. It falls from 1
+            towards 0, shape (n,).
     """
 
     def __init__(self, duration: float) -> None:
         """Compute the factors of the fade-out.
 
         Args:
-            duration: time in which the compensation of the torque jump fades out [s].
+            duration: time in which the compensation of the torque jump fades out [s]. With 0, the jump is not compensated.
         """
-        ramp = np.arange(round(duration / PERIOD)) * (PERIOD / duration)
-        self.blend: Vector = 0.5 + 0.5 * np.cos(math.pi * ramp)
+        cycles = round(duration / PERIOD)
+        self.blend: Vector = 0.5 + 0.5 * np.cos(math.pi * np.arange(cycles) / max(1, cycles))
         self.records: Records[Carry] = zeros(Carry, 1)
 
     @property
     def pending(self) -> bool:
-        """Return whether a carry-over has started, but the first torque after the change is not computed yet."""
+        """Return whether a carry-over has started, but the first torque after the stance change is still to be computed."""
         return bool(self.records[0].pending)
 
     def start(self, before: Vector) -> None:
-        """Start the carry-over at a step change or at the start of the motion.
+        """Start the carry-over at a stance change or at the start of the motion.
 
         Args:
-            before: torque before the change, shape (12,) [Nm]; copied.
+            before: torque before the stance change, shape (12,) [Nm]; copied.
         """
         carry = self.records[0]
         carry.before[:], carry.pending = before, True
@@ -62,12 +64,12 @@ class CarryOver:
 
 
 def add_carried(carries: Records[Carry], blend: Vector, cycle: int, torque: Vector) -> None:
-    """Add the fading compensation of the torque jump to the torque command. The first call after a change computes the jump.
+    """Add the fading compensation of the torque jump to the command. The first call after a stance change computes the jump.
 
     Args:
-        carries: `CarryOver.records`; `pending` is cleared.
+        carries: `CarryOver.records`; `pending` is set to False.
         blend: `CarryOver.blend`.
-        cycle: cycles since the change.
+        cycle: cycles since the stance change.
         torque: torque command, shape (12,) [Nm], updated.
     """
     carry = carries[0]

@@ -1,44 +1,48 @@
-"""Controller of the paper for an exoskeleton suspended by its pelvis: `State -> Command`, once a cycle.
+"""Controller of the paper for an exoskeleton suspended by its pelvis: `State -> Command`, once per cycle.
 
     step switch -> q_des = q_nom + s -> PID, gravity, flat foot -> u_t --------------------------.
                                      -> idealization u_i, feedforward u_f, virtual guide u_v ->  merge -> u
                                      -> haptics
 
-Steps alternate between right and left stance. They change by time, because no foot touches the ground in the air. SH and SK of
-the swing leg get the assistive torque; every other joint gets the baseline torque. The paper leaves four points open. They are
-decided as follows:
+Steps alternate between right and left stance. They change by time, because no foot touches the ground in the air. The sagittal
+hip and knee (SH, SK) of the swing leg get the assistive torque; every other joint gets the baseline torque. The paper leaves five
+points open. This controller decides them as follows:
 
-- *Assistance factor.* Xi changes only at a step change, where the reference is re-centred and the torque is carried over.
-  The guide therefore never moves during a step, and the certificate of each step stays valid for any input of the operator.
-- *Xi towards 1.* The assisted joints get w u_t + (1 - w) (u_i + u_f + u_v). The weight w is a smoothstep from 0 at Xi = 0.9 to
-  exactly 1 at Xi = 1, where the torque is bitwise equal to the baseline torque. Their integral gains are scaled by the same w.
-  No guide is certified for Xi between 0.9 and 1.
-- *Gains.* A stiff backup policy is needed in a narrow guide, but exceeds the available torque in a wide one. There are a few sets
-  of gains. Each step uses the lowest set for which the guide is certified with a margin at the Xi of the step. The command is
-  continuous in Xi except where the set of gains changes.
-- *Carry-over.* At a step change the re-centring sets the tracking error to zero, a leg changes from one control law to the
-  other, and the horizon returns to its full length. The resulting torque jump is compensated, and the compensation fades out
-  within `blend`, so the command is continuous. This is part of the baseline and is the same with and without assistance.
+- *Assistance factor.* Xi changes only at a stance change, where the reference is re-centred and the torque is carried over.
+  The width of the guide therefore does not depend on the operator during a step, and the certificate of the step stays valid.
+- *Xi towards 1.* Below Xi = 1 the assisted joints get the torque of the guide filter alone. At Xi = 1 they get exactly the torque
+  of the baseline controller. Xi changes only at a stance change, so the carry-over makes the command continuous.
+- *Gains.* A narrow guide requires a stiff backup policy, but a stiff policy reaches the torque limit in a wide guide. There are
+  a few sets of gains. Each step uses the softest set whose certificate includes the chosen promise at the Xi of the step. The
+  promise is a disturbance torque that does not move the joints out of the guide.
+- *Leaving the guide.* A counter rises in each cycle with h below 0 (outside the safe backward image) and falls in each other
+  cycle. If the counter exceeds `outside_cycles` although the guide has a promise, the disturbance is larger than promised. The
+  HAL then moves Xi to 1.
+- *Carry-over.* At a stance change the torque jumps for three reasons: the re-centring sets the tracking error to zero, the
+  control law of each leg changes, and the prediction of the guide filter, which is shorter near the end of a step, returns to
+  its full length. The torque jump is compensated, and the compensation fades out within `blend`, so the command is continuous.
+  The carry-over is the same with and without assistance.
 """
 
 from __future__ import annotations
 
 import numpy as np
 
-from atalante_control.airwalk.assistance import Assistance
 from atalante_control.airwalk.carry_over import CarryOver, add_carried
-from atalante_control.airwalk.config import AirwalkConfig, baseline_share
+from atalante_control.airwalk.config import AirwalkConfig
 from atalante_control.airwalk.kernel import Measured, Outputs, Parts, run
 from atalante_control.airwalk.reference import Deviation, GaitReference, StartMotion
-from atalante_control.airwalk.step_guides import StepGuides, backup_torque_limits
+from atalante_control.airwalk.swing_leg import OVERLAP, swing_leg
 from atalante_control.airwalk.telemetry import TELEMETRY_FIELDS, AirwalkStatistics, Step, Telemetry
 from atalante_control.dynamics.gravity import Gravity
-from atalante_control.dynamics.suspended import check_hung
+from atalante_control.dynamics.suspended import check_suspended, suspended_gait
 from atalante_control.gait.gait import Gait, step_over
 from atalante_control.gait.recentering import Deadbeat
 from atalante_control.guide.certificate import Certificate
 from atalante_control.guide.filter import GuideFilter
+from atalante_control.guide.literal import LiteralConfig, LiteralGuide, no_promise
 from atalante_control.guide.shapes import GuideShape
+from atalante_control.guide.step_guides import Choice, StepGuides
 from atalante_control.joint.flat_foot import LevelFeet
 from atalante_control.joint.haptics import intensity
 from atalante_control.joint.idealization import AssistedInertia
@@ -49,7 +53,7 @@ from atalante_hal.compiled import specialised
 from atalante_hal.robot import IMUS, JOINTS, LEG_JOINTS, Robot
 from atalante_hal.types import Command, State, Vector
 
-__all__ = ["AirwalkConfig", "AirwalkController", "baseline_share"]
+__all__ = ["AirwalkConfig", "AirwalkController"]
 
 _N, _LEG = len(JOINTS), len(LEG_JOINTS)
 _SH, _SK = LEG_JOINTS.index("SH"), LEG_JOINTS.index("SK")
@@ -62,7 +66,7 @@ class AirwalkController:
     Attributes:
         reference: desired trajectories of both steps.
         pid: PIDs of the baseline controller.
-        guide: virtual guide filter of this step, one of `guides`.
+        guide: virtual guide filter of the current step, one of `guides`.
         statistics: statistics of the guide since `reset`.
         telemetry: telemetry of the last cycle, for the recording.
         telemetry_fields: name and width of each field of `telemetry`, see `telemetry.Telemetry`.
@@ -84,17 +88,17 @@ class AirwalkController:
             robot: limits of the joints.
             gait: right-stance step that repeats.
             shape: shape of the virtual guide.
-            config: parameters of the controller; None: the defaults.
-            exoskeleton: geometry and masses of the empty exoskeleton; None: the defaults.
+            config: parameters of the controller. If None, the defaults are used.
+            exoskeleton: geometry and masses of the empty exoskeleton. If None, the defaults are used.
 
         Raises:
-            GaitError: If the gait exceeds a limit of the robot or is not periodic, see `suspended.check_hung`.
+            GaitError: If the gait exceeds a limit of the robot or is not periodic, see `suspended.check_suspended`.
         """
         self.config = config = config or AirwalkConfig()
         exoskeleton = exoskeleton or ExoskeletonParameters()
         articulated = pinocchio_model(urdf(exoskeleton, robot))
         self._gravity = Gravity(articulated)
-        check_hung(gait, robot, articulated, self._gravity, config.ankle_offset)
+        check_suspended(gait, robot, articulated, self._gravity, config.ankle_offset)
         deadbeat, poses = Deadbeat(gait.duration, config.alpha), gait.tables().q
 
         self.reference = GaitReference(gait, deadbeat, config.ankle_offset)
@@ -103,17 +107,18 @@ class AirwalkController:
         swinging = [nominal[RIGHT], nominal[LEFT]]  # left leg, right leg
         self._feet = LevelFeet(robot, exoskeleton, articulated, deadbeat, swinging, config.ankle_offset)
         self.pid = Pid(config.gains)
-        self._assistance = Assistance(
-            AssistedInertia(articulated, poses),
-            gait,
-            config.friction,
-            decoupled=config.decoupled,
-            feedforward=config.feedforward,
-        )
-        torque_limits = backup_torque_limits(robot, config, self._gravity, poses)
-        self._guides = StepGuides(config, shape, gait, deadbeat, self._assistance, torque_limits)
-        self.guide = self._guides.filters[-1]
         self._carry = CarryOver(config.blend)
+        inertia = AssistedInertia(articulated, poses)
+        leg = swing_leg(config, gait, inertia, self._gravity)
+        self._guides = StepGuides(config, robot, shape, leg, self._carry.blend, OVERLAP)
+        self.guide = self._guides.filters[-1]
+        of_gait = gait if gait.feedforward is not None else suspended_gait(gait, exoskeleton, robot)
+        self._literal = LiteralGuide(
+            LiteralConfig(config.gains.swing, config.promise, config.zeta, config.idealization, config.feedforward),
+            shape,
+            leg,
+            of_gait.tables().uf[:, [_SH, _SK]],
+        )
 
         self._cycles, self._share = gait.cycles, np.ones(_N)
         steps: Records[Step] = zeros(Step, 1)
@@ -121,7 +126,7 @@ class AirwalkController:
         telemetry = zeros(Telemetry, 1)
         self.telemetry: Vector = telemetry.view(np.float64)
         self._step, self._outputs = steps[0], outputs[0]
-        self._step.cycles, self._step.active = gait.cycles, config.active
+        self._step.cycles, self._step.active, self._step.literal = gait.cycles, config.active, config.literal_law
         self._command = Command(self._outputs.torque, self._outputs.vibration)
         self._measured = Measured(
             np.zeros(_N), np.zeros(_N), np.zeros((len(IMUS), 4)), np.zeros((len(IMUS), 3)), np.zeros(_N)
@@ -132,8 +137,7 @@ class AirwalkController:
             pids=self.pid.records,
             ankles=self._feet.ankles,
             cubics=self._feet.cubics,
-            laws=self._assistance.laws,
-            feedforward=self._assistance.rows,
+            literal=self._literal.tables,
             carries=self._carry.records,
             blend=self._carry.blend,
             outputs=outputs,
@@ -143,7 +147,7 @@ class AirwalkController:
         self._forget()
 
     def _compile(self) -> None:
-        """Compile the kernel by one call, and discard its results."""
+        """Compile the kernel by one call, and discard the results of the call."""
         inputs = 0, False, np.zeros(2 * _N), self._measured, self.guide.tables, self._parts
         self._run = specialised(run, *inputs)
 
@@ -163,7 +167,25 @@ class AirwalkController:
         Args:
             xi: assistance factor in [0, 1].
         """
-        return self._guides.at(xi)
+        return self.choice(xi).guide
+
+    def prepare(self) -> None:
+        """Compute the guides of all assistance factors before a walk on the wall clock, see `StepGuides.prepare`."""
+        if not self.config.literal_law:
+            self._guides.prepare()
+
+    def choice(self, xi: float) -> Choice:
+        """Return the guide filter that is used at an assistance factor, and the promise for which it is built.
+
+        Args:
+            xi: assistance factor in [0, 1].
+        """
+        return Choice(self._guides.filters[0], 0.0) if self.config.literal_law else self._guides.at(xi)
+
+    @property
+    def blend(self) -> Vector:
+        """Return the fraction of the torque jump that is still compensated in each cycle since the stance change, shape (n,)."""
+        return self._carry.blend
 
     def certificate(self, xi: float) -> Certificate:
         """Return the certificate of the guide used at an assistance factor, see `StepGuides.certificate`.
@@ -171,6 +193,8 @@ class AirwalkController:
         Args:
             xi: assistance factor in [0, 1].
         """
+        if self.config.literal_law and xi < 1.0:
+            return no_promise(self.guide.shape.name, xi)
         return self._guides.certificate(xi)
 
     def reset(self, state: State) -> None:
@@ -194,14 +218,15 @@ class AirwalkController:
         self._share.fill(1.0)
         self.pid.start_step(RIGHT, self._share)
         self._command.vibration.fill(0.0)
-        self._command.outside = False
+        self._command.outside = self._command.guide_left = self._command.hand_over_exceeded = False
+        self._outside, self._promised, self._exceeded = 0, False, False
         self.telemetry.fill(0.0)
         self.statistics = AirwalkStatistics()
 
     # -- one cycle ---------------------------------------------------------------------------------------------------
 
     def update(self, state: State) -> Command:
-        """Compute the command of one cycle. If the present step is over, start the next step first.
+        """Compute the command of one cycle. If the current step is over, start the next step first.
 
         Args:
             state: measured state of the robot.
@@ -233,14 +258,20 @@ class AirwalkController:
         ratio, h, active = self._run(cycle, level, row, measured, self.guide.tables, self._parts)
         self.statistics.count(cycle, ratio, h, active)
         self._command.outside = self._assisting and h < 0.0
+        self._outside = self._outside + 1 if self._command.outside else max(0, self._outside - 1)
+        self._command.guide_left = self._promised and self._outside > self.config.outside_cycles
+        self._command.hand_over_exceeded = cycle == 0 and self._exceeded
         return self._command
 
     def _move_to_start(self, state: State, cycle: int) -> Command:
         """Follow the start motion with the baseline controller only."""
         row, torque = self._start_motion.row(cycle), self._command.torque
         tracking = self.pid.update(row, state.position, state.velocity, state.torque_sent)
-        holding = self._gravity.torque(state.position, state.imu_quaternion[_PELVIS].tolist())
-        np.add(tracking, holding, out=torque)
+        if self.config.literal_law:
+            torque[:] = tracking
+        else:
+            holding = self._gravity.torque(state.position, state.imu_quaternion[_PELVIS].tolist())
+            np.add(tracking, holding, out=torque)
         add_carried(self._carry.records, self._carry.blend, cycle, torque)
         self.pid.store_request(torque)
         self.telemetry[:_N] = row[:_N]
@@ -251,13 +282,12 @@ class AirwalkController:
         self._changed_at, self._stance = state.cycle, stance
         self._command.step = (self._command.step or 0) + 1
         xi = min(1.0, max(0.0, state.assistance_factor))
-        share = baseline_share(xi, self.config.fade)
-        self._assisting = share < 1.0
+        self._assisting = xi < 1.0
         self.statistics.factors.add(xi)
         leg = _LEG * (1 - stance)
         hip, knee = leg + _SH, leg + _SK
         self._share.fill(1.0)
-        self._share[[hip, knee]] = share
+        self._share[[hip, knee]] = 0.0 if self._assisting else 1.0
         self.pid.start_step(stance, self._share)
         self._start_guide(xi, self.reference.start_step(stance, state.position, state.velocity), (hip, knee))
         if self.config.flat_foot:
@@ -266,16 +296,18 @@ class AirwalkController:
             self._carry.start(self.pid.requested)
         step = self._step
         step.stance, step.completed = stance, self.statistics.steps
-        step.xi, step.share, step.intensity = xi, share, intensity(xi)
+        step.xi, step.assisted, step.intensity = xi, self._assisting, intensity(xi)
 
     def _start_guide(self, xi: float, deviation: Deviation, joints: tuple[int, int]) -> None:
-        """Start the guide of a step. Count step changes with a deviation larger than the certificate assumes."""
+        """Start the guide of a step. Count the stance change if its deviation is larger than the certificate assumes."""
         hip, knee = joints
         angles = float(deviation.angle[hip]), float(deviation.angle[knee])
         rates = float(deviation.rate[hip]), float(deviation.rate[knee])
-        self.guide = self._guides.at(xi)
-        self.guide.start_step(xi, angles, rates)
+        self.guide, promise = self.choice(xi)
+        self.guide.start_step(xi, angles, rates, promise)
+        if self.config.literal_law:
+            self._literal.start_step(xi, angles, rates)
         largest = self.config.hand_over
         exceeded = max(map(abs, angles)) > largest.deviation or max(map(abs, rates)) > largest.rate
-        if exceeded and self.statistics.steps:
-            self.statistics.hand_overs_exceeded += 1
+        self._promised, self._exceeded = promise > 0.0, exceeded and self.statistics.steps > 0
+        self.statistics.hand_overs_exceeded += self._exceeded

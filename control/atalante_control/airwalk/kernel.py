@@ -1,6 +1,6 @@
 """Compiled control cycle within a step: `q_des, measurements -> torque command u, vibration levels, telemetry`.
 
-    flat foot -> PID, gravity -> u_t, virtual guide -> u_v, merge with u_i and u_f -> carry-over -> u, haptics, telemetry
+    flat foot -> PID, gravity -> u_t, virtual guide -> torques of SH and SK -> carry-over -> u, haptics, telemetry
 
 This module defines the order of the parts and the data between them. Each part is documented in its own module.
 """
@@ -12,10 +12,10 @@ from typing import Annotated, NamedTuple
 from atalante_control.airwalk.carry_over import Carry, add_carried
 from atalante_control.airwalk.telemetry import Step, Telemetry, write_telemetry
 from atalante_control.dynamics.gravity import LinkRecord, hold
-from atalante_control.guide.kernel import GuideTables, tick
+from atalante_control.guide.kernel import GuideTables, leg_state, tick
+from atalante_control.guide.literal import LiteralTables, assistive_torque
 from atalante_control.joint.flat_foot import Ankle, write_level_ankle
 from atalante_control.joint.haptics import levels
-from atalante_control.joint.idealization import Law, merge
 from atalante_control.joint.pid import PidRecord, control
 from atalante_control.structured import Records
 from atalante_hal.robot import IMUS, JOINTS, LEG_JOINTS, MOTORS, SIDES
@@ -32,20 +32,19 @@ class Measured(NamedTuple):
     q: Vector  # (12,) rad
     qd: Vector  # (12,) rad/s
     attitudes: Vector  # (4, 4) attitude of each IMU, unit quaternion wxyz, sensor frame to world
-    gyros: Vector  # (4, 3) rad/s, angular velocity of each IMU in its own frame
+    gyros: Vector  # (4, 3) rad/s, angular velocity of each IMU in the frame of the same IMU
     sent: Vector  # (12,) Nm, torque command of the previous cycle after the limiter
 
 
 class Parts(NamedTuple):
-    """Arrays of the controller parts, which `run` reads and updates. Each part allocates its own arrays."""
+    """Arrays of the controller parts. `run` reads and updates them. Each part allocates the arrays that it owns."""
 
     steps: Records[Step]  # (1,) values of the step
     links: Records[LinkRecord]  # (n,) `Gravity.links`
     pids: Records[PidRecord]  # (1,) `Pid.records`
     ankles: Records[Ankle]  # (2,) `LevelFeet.ankles`
     cubics: Vector  # (n, 4) `LevelFeet.cubics`
-    laws: Records[Law]  # (1,) `Assistance.laws`
-    feedforward: Vector  # (n, 2) Nm, `Assistance.rows`
+    literal: LiteralTables  # `LiteralGuide.tables`
     carries: Records[Carry]  # (1,) `CarryOver.records`
     blend: Vector  # (n,) `CarryOver.blend`
     outputs: Records[Outputs]  # (1,) results
@@ -67,20 +66,20 @@ def run(
     """Compute torque, vibration and telemetry of one cycle.
 
     Args:
-        cycle: cycles since the step change.
-        level: whether the targets of the swing ankle come from the tibia IMU; False: they are those of `row`.
+        cycle: cycles since the stance change.
+        level: whether the targets of the swing ankle come from the tibia IMU. If not, the targets come from `row`.
         row: q_des [rad], then q_des' [rad/s], shape (24,).
         measured: measurements of the cycle.
         guide: tables of the guide filter of this step.
         parts: arrays of the other parts; updated, and the results are written to `outputs` and `telemetry`.
 
     Returns:
-        The larger |e| / q_bound of SH and SK, the smaller h of the two, and whether the filter is active on either.
+        The larger |e| / q_bound of SH and SK, h, and whether the filter is active.
     """
     step, outputs = parts.steps[0], parts.outputs[0]
     q, qd, attitudes, gyros, sent = measured
     desired, gravity, torque = outputs.desired, outputs.gravity, outputs.torque
-    swing, w, n = 1 - step.stance, step.share, len(q)
+    swing, n = 1 - step.stance, len(q)
     leg = swing * len(LEG_JOINTS)
     hip, knee = leg + _SH, leg + _SK
 
@@ -91,18 +90,22 @@ def run(
     pelvis = attitudes[_PELVIS]
     hold(parts.links, q, (pelvis[0], pelvis[1], pelvis[2], pelvis[3]), gravity)
     control(parts.pids, desired, q, qd, sent, torque)
-    for joint in range(n):
-        torque[joint] += gravity[joint]
 
-    e_hip, e_knee = q[hip] - desired[hip], q[knee] - desired[knee]
-    u_v = tick(guide, cycle, e_hip, qd[hip] - desired[n + hip], e_knee, qd[knee] - desired[n + knee])
-    if w < 1.0:
-        u = u_v[0] + parts.feedforward[cycle, 0], u_v[1] + parts.feedforward[cycle, 1]
-        merge(parts.laws, leg, w, u, q, qd, gravity, torque)
+    motion = leg_state(hip, q, qd, desired, sent, (gravity[hip], gravity[knee]))
+    if step.literal:
+        assisted = assistive_torque(
+            parts.literal, guide.guards[0], cycle, motion, (desired[n + hip], desired[n + knee])
+        )
+    else:
+        assisted = tick(guide, cycle, motion)
+        for joint in range(n):
+            torque[joint] += gravity[joint]
+    if step.assisted:
+        torque[hip], torque[knee] = assisted
     add_carried(parts.carries, parts.blend, cycle, torque)
     parts.pids[0].requested[:] = torque
 
-    errors = e_hip, e_knee
-    bounds, ratio, h, active = write_telemetry(parts.telemetry, step, guide.joints, cycle, desired, errors)
+    errors = q[hip] - desired[hip], q[knee] - desired[knee]
+    bounds, ratio, active = write_telemetry(parts.telemetry, step, guide.guards[0], cycle, desired, errors)
     levels(swing, errors, bounds, step.intensity, outputs.vibration)
-    return ratio, h, active
+    return ratio, guide.guards[0].h, active

@@ -1,6 +1,6 @@
-"""Desired trajectories of the airwalk controller: start motion, then q_des = q_nom + s of every step.
+"""Desired trajectories of the airwalk controller: start motion, then q_des = q_nom + s (nominal plus re-centring) in every step.
 
-`gait, measured pose at the step change -> row (q_des, q_des') of each cycle`
+`gait, measured pose at the stance change -> row (q_des, q_des') of each cycle`
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ _N, _LEG, _SA = len(JOINTS), len(LEG_JOINTS), LEG_JOINTS.index("SA")
 
 
 class Deviation(NamedTuple):
-    """Deviation of the measured angles and speeds from their nominal values at the start of a step."""
+    """Deviation of the measured angles and speeds from the nominal values at the start of a step."""
 
     angle: Vector  # (12,) rad, s(0) = q - q_nom
     rate: Vector  # (12,) rad/s, s'(0) = q' - q_nom'
@@ -54,18 +54,16 @@ class GaitReference:
         self._basis[0, :, :_N], self._basis[0, :, _N:] = c0[:end, None], c0d[:end, None]
         self._basis[1, :, :_N], self._basis[1, :, _N:] = c1[:end, None], c1d[:end, None]
         self._added = np.zeros_like(self._basis)
-        self._angles, self._rates = (
-            np.zeros(2 * _N),
-            np.zeros(2 * _N),
-        )  # s(0) and s'(0), each stored twice, because both the added angles and the added speeds depend on them
+        # s(0) and s'(0) are stored twice: once for the added angles and once for the added speeds.
+        self._angles, self._rates = np.zeros(2 * _N), np.zeros(2 * _N)
 
     def start_step(self, stance: int, position: Vector, velocity: Vector) -> Deviation:
         """Re-centre the step on the measured motion.
 
         Args:
             stance: stance leg of the new step, LEFT or RIGHT.
-            position: measured angles at the step change, shape (12,) [rad].
-            velocity: measured speeds at the step change, shape (12,) [rad/s].
+            position: measured angles at the stance change, shape (12,) [rad].
+            velocity: measured speeds at the stance change, shape (12,) [rad/s].
 
         Returns:
             Deviation from the nominal start, overwritten by the next call.
@@ -85,7 +83,7 @@ class GaitReference:
 
         Args:
             stance: stance leg, LEFT or RIGHT.
-            cycle: cycles since the step change.
+            cycle: cycles since the stance change.
         """
         row: Vector = self._rows[stance][cycle]
         return row

@@ -1,9 +1,10 @@
 """Neural network that computes a gait from patient and step parameters: `Subject -> 12 x 8 control points -> Gait`.
 
-`gait library -> fit (scikit-learn) -> file of weights -> this module (numpy) -> controller`. The network is a perceptron with
-tanh layers. The rows of its last layer satisfy the linear equation c_7 = S c_0, where S swaps and mirrors the legs. The angles
-are therefore continuous at the step change for every input, even if the fit is poor. The speeds jump at the step change by the
-residual of the fit, less than 0.02 rad/s.
+`gait_optimization.fit` computes the weights of the network and writes them to a file. This module reads the file and
+needs only numpy. The network is a perceptron with tanh layers. The weights of the last layer are constrained so that
+every gait satisfies c_7 = S c_0. Here c_0 and c_7 are the first and the last control points, and S swaps and mirrors
+the legs. The angles are therefore continuous at the stance change for every input, even if the fit is poor. The speeds
+are not exactly continuous: the error of the fit causes a jump of less than 0.02 rad/s at the stance change.
 """
 
 from __future__ import annotations
@@ -31,7 +32,7 @@ INPUTS = {"mass": "kg", "height": "m", "step_length": "m", "step_duration": "s"}
 OUTPUTS = len(JOINTS) * (DEGREE + 1)
 LAYERS_MAX = 4
 WIDTH_MAX = 128  # largest number of neurons of a layer
-#: Largest accepted angle jump at the step change [rad]. It allows for rounding errors in the weights of the last layer.
+#: Largest accepted angle jump at the stance change [rad]. It allows for rounding errors in the weights of the last layer.
 _PERIODICITY_DEFECT = 1e-9
 _ANGLE_MAX = 2.0 * np.pi  # rad, largest accepted absolute value of a control point
 #: Largest accepted deviation of thigh and shank length from Winter's table [m]. The network was fitted with Winter's lengths.
@@ -51,7 +52,7 @@ class Layer(NamedTuple):
 
 @dataclass(frozen=True)
 class GaitNetwork:
-    """Gait network: its weights, and the range of inputs for which they were fitted."""
+    """Gait network: weights of the layers, and range of the inputs for which the weights were fitted."""
 
     low: Vector  # smallest valid values of INPUTS, shape (4,)
     high: Vector  # largest valid values of INPUTS, shape (4,)
@@ -76,7 +77,7 @@ class GaitNetwork:
         return np.asarray((x @ last.weights + last.bias).reshape(len(JOINTS), DEGREE + 1))
 
     def gait(self, subject: Subject, robot: Robot) -> Gait:
-        """Return the gait of a subject. Its feedforward is computed from its trajectories by inverse dynamics.
+        """Return the gait of a subject. The feedforward is computed from the trajectories by inverse dynamics.
 
         The limits of the robot are not checked here, see `check_gait`.
 
@@ -85,8 +86,8 @@ class GaitNetwork:
             robot: robot description for the dynamics.
 
         Raises:
-            NetworkError: If a parameter is outside the range of the network, if the leg lengths are not those of Winter, or if
-                the angles are too large to compute torques.
+            NetworkError: If a parameter is outside the range of the network, if the leg lengths are not those of Winter's table,
+                or if the angles are too large to compute torques.
         """
         self.check(subject)
         with np.errstate(over="ignore", invalid="ignore"):
@@ -109,7 +110,7 @@ class GaitNetwork:
             subject: patient and step parameters.
 
         Raises:
-            NetworkError: If a parameter is out of range. The message states the parameter and its range.
+            NetworkError: If a parameter is out of range. The message states the parameter and the valid range.
         """
         for name, value, low, high in zip(INPUTS, _inputs(subject), self.low, self.high, strict=True):
             if not low <= value <= high:
@@ -128,9 +129,10 @@ class GaitNetwork:
 
 
 def periodicity() -> Vector:
-    """Return the matrix A for which A c = 0 means that a gait is continuous at the step change, shape (24, 96).
+    """Return the matrix A for which A c = 0 means that a gait is continuous at the stance change, shape (24, 96).
 
-    c contains the control points of all joints, shape (96,). The first 12 rows are for the angles, the last 12 for the slopes.
+    c is the vector of the control points of all joints, shape (96,). The first 12 rows of A are the conditions on the angles, the
+    last 12 rows are the conditions on the slopes.
     """
     points = np.arange(OUTPUTS).reshape(len(JOINTS), DEGREE + 1)
     rows = np.zeros((2, len(JOINTS), OUTPUTS))
@@ -169,7 +171,7 @@ def load_network(path: Path | None = None) -> GaitNetwork:
     """Read a network file and check its content.
 
     Args:
-        path: path of a file written by `save_network`; None: the network file of this package.
+        path: path of a file written by `save_network`, or None for the network file of this package.
 
     Raises:
         NetworkError: If the file cannot be read or is damaged, if an array is unknown, missing or of the wrong shape, if a number
@@ -226,7 +228,9 @@ def _network(arrays: Mapping[str, npt.NDArray[Any]]) -> GaitNetwork:
     low, high = arrays["low"], arrays["high"]
     width = len(INPUTS)
     if low.shape != (width,) or high.shape != (width,) or not (low < high).all():
-        raise ArrayFileError(f"low and high must be {width} numbers each, low below high, got {low} and {high}")
+        raise ArrayFileError(
+            f"the arrays 'low' and 'high' must be {width} numbers each, low below high, got {low} and {high}"
+        )
     if depth > LAYERS_MAX:
         raise ArrayFileError(f"the network must have at most {LAYERS_MAX} layers, got {depth}")
     for i, (weights, bias) in enumerate(layers):
@@ -242,7 +246,7 @@ def _network(arrays: Mapping[str, npt.NDArray[Any]]) -> GaitNetwork:
     defect = np.abs(periodicity()[: len(JOINTS)] @ np.vstack([layers[-1].weights, layers[-1].bias]).T).max()
     if not defect <= _PERIODICITY_DEFECT:
         raise ArrayFileError(
-            f"the angles of a gait must be continuous at the step change, got weights with a jump of {defect:.2g} rad"
+            f"the angles of a gait must be continuous at the stance change, got weights with a jump of {defect:.2g} rad"
         )
     return GaitNetwork(low, high, layers, str(about["version"]))
 

@@ -1,8 +1,8 @@
-"""Gravity torques u_g of the empty exoskeleton, suspended at its pelvis: `joint angles, pelvis attitude -> u_g`.
+"""Gravity torques u_g of the empty exoskeleton, suspended at the pelvis: `joint angles, pelvis attitude -> u_g`.
 
 Statics of a tree of links, as in the recursive Newton-Euler algorithm (Featherstone, Rigid Body Dynamics Algorithms, 5.3). The
-outward pass computes the direction of gravity in each link. The inward pass adds the force and moment that hold each link to
-those of its parent. The joint torque is the component of the moment about the joint axis. The tree of links comes from the
+outward pass computes the direction of gravity in each link. The inward pass starts at the feet and sums the forces and moments
+that hold the links. The joint torque is the component of this moment about the joint axis. The tree of links comes from the
 Pinocchio model, which is also the reference in the tests.
 """
 
@@ -26,7 +26,7 @@ Attitude = tuple[float, float, float, float]  # unit quaternion wxyz
 
 
 class LinkRecord:
-    """Data of one link, in the frame of its joint. The last four fields depend on the pose, the others are constant."""
+    """Data of one link, in the frame of its joint. The last four fields depend on the pose. All other fields are constant."""
 
     joint: int  # index in JOINTS
     parent: int  # index of the parent link
@@ -43,10 +43,10 @@ class LinkRecord:
 
 
 class Gravity:
-    """Gravity torques u_g of the empty exoskeleton, suspended at its pelvis.
+    """Gravity torques u_g of the empty exoskeleton, suspended at the pelvis.
 
     Attributes:
-        links: data of the pelvis and the links for `hold`, parents first.
+        links: records of the pelvis and all links for `hold`, each parent before its children.
     """
 
     def __init__(self, articulated: ArticulatedModel) -> None:
@@ -75,7 +75,7 @@ class Gravity:
 
 
 def _links(articulated: ArticulatedModel) -> Records[LinkRecord]:
-    """Return the data of the links of a model, parents first. Record 0 is the pelvis."""
+    """Return the records of the links of a model, each parent before its children. Record 0 is the pelvis."""
     model, into, _ = articulated
     data, neutral = model.createData(), pinocchio.neutral(model)
     joint_of = {int(q): joint for joint, q in enumerate(into)}

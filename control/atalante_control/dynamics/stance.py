@@ -5,11 +5,11 @@ at rest.
 
 The model has a floating pelvis. Its motion follows from the joint motion, because the stance foot does not move: if V is the
 twist of the foot in the pelvis frame, the twist of the pelvis is -V. One recursive Newton-Euler pass gives the wrench f on the
-floating pelvis. Only the ground can apply this wrench, so the ground wrench is f. The joint torques are those of the pass minus
-J^T f, where J is the Jacobian of the foot in the pelvis frame. This solves the equation of motion of the pelvis exactly.
+floating pelvis. Only the ground can apply this wrench, so the ground wrench is f. The joint torques are the torques of this pass
+minus J^T f, where J is the Jacobian of the foot in the pelvis frame. This solves the equation of motion of the pelvis exactly.
 
 The torque of a gait is the sum u_g + u_f. The gravity torque u_g is that of the *empty* exoskeleton suspended at its pelvis. The
-controller adds it in every cycle (joint idealization). The feedforward u_f in the gait file is the remainder: the weight of the
+controller adds u_g in every cycle (joint idealization). The feedforward u_f in the gait file is the remainder: the weight of the
 patient, the load of standing on one leg, and the inertia.
 """
 
@@ -147,7 +147,7 @@ def stance_dynamics(robot: Robot, patient: Patient | None = None) -> StanceDynam
 
     Args:
         robot: limits of the joints.
-        patient: patient in the exoskeleton; None: empty.
+        patient: patient in the exoskeleton, or None for an empty exoskeleton.
     """
     exoskeleton = ExoskeletonParameters()
     fitted = exoskeleton if patient is None else exoskeleton.fitted(patient)

@@ -1,7 +1,8 @@
-"""Gait for the exoskeleton suspended in the air: the trajectories of a gait on the ground with another feedforward.
+"""Gait for the exoskeleton suspended in the air: it has the trajectories of a gait on the ground, but another feedforward.
 
-`gait (solver or network), exoskeleton -> gait with u_f for the air -> AirwalkController`. The feedforward of a gait on the ground
-includes the load of the patient on the stance leg. In the air the exoskeleton is empty and suspended at its pelvis.
+`gait (solver or network), exoskeleton -> gait with u_f for the air`. `AirwalkController` uses this gait. The
+feedforward of a gait on the ground includes the load of the patient on the stance leg. In the air the exoskeleton is
+empty and suspended at the pelvis.
 """
 
 from __future__ import annotations
@@ -25,7 +26,7 @@ _LEVEL = (1.0, 0.0, 0.0, 0.0)  # attitude of a level pelvis, unit quaternion wxy
 def suspended_gait(gait: Gait, exoskeleton: ExoskeletonParameters, robot: Robot) -> Gait:
     """Return a gait with the feedforward u_f of the empty exoskeleton suspended in the air.
 
-    This u_f contains only the inertia torques, because the controller adds the gravity torque u_g.
+    This u_f consists of the inertia torques alone, because the controller adds the gravity torque u_g.
 
     Args:
         gait: gait of any source.
@@ -35,8 +36,10 @@ def suspended_gait(gait: Gait, exoskeleton: ExoskeletonParameters, robot: Robot)
     return replace(gait, feedforward=_feedforward(gait, pinocchio_model(urdf(exoskeleton, robot))))
 
 
-def check_hung(gait: Gait, robot: Robot, articulated: ArticulatedModel, gravity: Gravity, ankle_offset: float) -> None:
-    """Raise `GaitError` if the suspended exoskeleton would exceed a limit in a gait.
+def check_suspended(
+    gait: Gait, robot: Robot, articulated: ArticulatedModel, gravity: Gravity, ankle_offset: float
+) -> None:
+    """Raise `GaitError` if the suspended exoskeleton would exceed a limit while it follows a gait.
 
     The torque limits apply to the sum of feedforward u_f and gravity torque u_g with a level pelvis. A gait without u_f gets the
     u_f of `suspended_gait`.

@@ -2,7 +2,7 @@
 
 A damaged or hostile file cannot cause a large memory allocation. Before a member is read, the directory of the zip archive is
 checked against the names and the size that the caller expects. Decompression stops at the declared size. The CRC-32 of the zip
-format covers the bytes of each member but not its name. An additional member therefore contains a SHA-256 over all names, types,
+format covers the bytes of each member but not the name. An additional member therefore contains a SHA-256 over all names, types,
 shapes and bytes.
 """
 
@@ -26,7 +26,7 @@ _FLOAT: Final = np.dtype("<f8")
 
 
 class ArrayFileError(ValueError):
-    """Invalid content of an array file. The message does not contain the path; the caller adds it."""
+    """Invalid content of an array file. The message does not state the path, because the caller adds it."""
 
 
 def write_arrays(path: Path, arrays: Mapping[str, Array]) -> None:
@@ -34,7 +34,7 @@ def write_arrays(path: Path, arrays: Mapping[str, Array]) -> None:
 
     Args:
         path: path of the file, replaced if it exists.
-        arrays: 64-bit floats and texts by name.
+        arrays: name -> array of 64-bit floats or text.
     """
     content = {**arrays, CHECKSUM: np.array(_checksum(arrays))}
     packed = io.BytesIO()
@@ -138,7 +138,7 @@ def _array(name: str, content: bytes) -> Array:
 
 
 def _checksum(arrays: Mapping[str, Array | None]) -> str:
-    """Return the SHA-256 of names, types, shapes and bytes of the arrays as hexadecimal digits. Entries of None are skipped."""
+    """Return the hexadecimal SHA-256 of names, types, shapes and bytes of all arrays. Arrays that are None are skipped."""
     digest = hashlib.sha256()
     for name, array in sorted(arrays.items()):
         if array is not None:

@@ -1,8 +1,8 @@
 """Gait: twelve joint trajectories of one right-stance step as Bezier polynomials, read from a file.
 
-`gait file -> Gait -> StepTables (1 ms) -> baseline controller, guide filter`. The left-stance step is the right-stance
-step of the mirrored robot: the legs are swapped and each joint angle is multiplied by its MIRROR_SIGN. A gait that is not
-continuous at the step change, or that exceeds the limits of the robot, is rejected when the file is read.
+`gait file -> Gait -> StepTables (one row per ms)`. The left-stance step is the right-stance step of the mirrored robot:
+the legs are swapped and each joint angle is multiplied by its MIRROR_SIGN. A gait that is not continuous at the step
+change, or that exceeds the limits of the robot, is rejected when the file is read.
 """
 
 from __future__ import annotations
@@ -31,8 +31,8 @@ AIRWALK_GAIT = Path(__file__).parents[1] / "gaits" / "airwalk.json"
 SWAP = np.r_[len(LEG_JOINTS) : len(JOINTS), 0 : len(LEG_JOINTS)]
 SIGN = np.array(MIRROR_SIGN * len(SIDES), dtype=np.float64)
 
-POSITION_JUMP = math.radians(0.1)  # rad, largest accepted jump of a joint angle at the step change
-VELOCITY_JUMP = 0.05  # rad/s, largest accepted jump of a joint speed at the step change
+POSITION_JUMP = math.radians(0.1)  # rad, largest accepted jump of a joint angle at the stance change
+VELOCITY_JUMP = 0.05  # rad/s, largest accepted jump of a joint speed at the stance change
 DURATION_RANGE = (0.3, 3.0)  # s, shortest and longest step
 ROUNDING = 1e-9  # rad, rad/s or Nm, tolerance of the limit checks for rounding errors
 
@@ -48,7 +48,7 @@ class GaitError(ValueError):
 
 @dataclass(frozen=True)
 class StepTables:
-    """Step sampled in every control cycle from 0 to T, both included. The arrays have shape (N + 1, 12) and are read-only."""
+    """Step sampled in every control cycle from 0 to T inclusive. The arrays have shape (N + 1, 12) and are read-only."""
 
     q: Vector  # rad
     qd: Vector  # rad/s
@@ -81,12 +81,12 @@ class Gait:
         return zlib.crc32(content)
 
     def mirrored(self) -> Gait:
-        """Return the step of the mirrored robot, in which the other leg is the stance leg."""
+        """Return the step of the mirrored robot. Stance leg and swing leg are exchanged."""
         feedforward = None if self.feedforward is None else _mirror(self.feedforward)
         return Gait(self.name, self.duration, _mirror(self.coefficients), feedforward, self.parameters, self.solver)
 
     def tables(self) -> StepTables:
-        """Return the step sampled in every control cycle."""
+        """Return the trajectory of the step, with one row for each control cycle."""
         phase = _cycle_phases(self)
         uf = np.zeros_like(self.coefficients) if self.feedforward is None else self.feedforward
         tables = (*motion(self.coefficients, self.duration, phase), bezier(uf, phase))
@@ -157,7 +157,7 @@ def control_points(phase: Vector, values: Vector) -> Vector:
 
 
 def power_basis(coefficients: Vector) -> Vector:
-    """Convert Bezier control points to coefficients in powers of the phase, lowest first.
+    """Convert Bezier control points to coefficients in powers of the phase, lowest power first.
 
     Args:
         coefficients: control points, shape (m, d + 1).
@@ -185,8 +185,22 @@ def load_gait(path: Path, robot: Robot) -> Gait:
         robot: limits of the joints.
 
     Raises:
-        GaitError: If a key is unknown, missing or malformed, if a value is not finite, if the discontinuity at the step change
+        GaitError: If a key is unknown, missing or malformed, if a value is not finite, if the discontinuity at the stance change
             exceeds 0.1 degrees or 0.05 rad/s, or if a position, speed or feedforward exceeds a limit of the robot.
+    """
+    gait = gait_from(read_object(path), str(path))
+    check_gait(gait, robot, str(path))
+    return gait
+
+
+def read_object(path: Path) -> dict[str, Any]:
+    """Read a JSON file that must contain an object.
+
+    Args:
+        path: path of the file.
+
+    Raises:
+        GaitError: If the file cannot be read, or if it is not a JSON object with unique keys and finite numbers.
     """
     try:
         document = json.loads(
@@ -201,29 +215,40 @@ def load_gait(path: Path, robot: Robot) -> Gait:
             f"{path}: a gait file must be a JSON object with the keys {', '.join(_REQUIRED)}, "
             f"got {type(document).__name__}"
         )
+    return document
+
+
+def gait_from(document: Mapping[str, Any], where: str) -> Gait:
+    """Return the gait of a JSON object. Limits and continuity are not checked here.
+
+    Args:
+        document: object with the keys of a gait file, see `load_gait`.
+        where: start of the error message, for example the name of the file.
+
+    Raises:
+        GaitError: If a key is unknown, missing or malformed, or if a value is not finite.
+    """
     if unknown := sorted(set(document) - {*_REQUIRED, *_OPTIONAL}):
-        raise GaitError(f"{path}: {unknown[0]} is unknown; valid keys are {', '.join(_REQUIRED + _OPTIONAL)}")
+        raise GaitError(f"{where}: {unknown[0]} is unknown; valid keys are {', '.join(_REQUIRED + _OPTIONAL)}")
     if missing := [key for key in _REQUIRED if key not in document]:
-        raise GaitError(f"{path}: {missing[0]} is missing; required keys are {', '.join(_REQUIRED)}")
+        raise GaitError(f"{where}: {missing[0]} is missing; required keys are {', '.join(_REQUIRED)}")
     if document["format"] != FORMAT:
-        raise GaitError(f"{path}: format must be {FORMAT!r}, got {document['format']!r}")
+        raise GaitError(f"{where}: format must be {FORMAT!r}, got {document['format']!r}")
     name, parameters, solver = document["name"], document.get("parameters", {}), document.get("solver", {})
     if not (isinstance(name, str) and name):
-        raise GaitError(f"{path}: name must be a text that is not empty, got {name!r}")
+        raise GaitError(f"{where}: name must be a text that is not empty, got {name!r}")
     if not isinstance(parameters, dict) or not all(_is_number(value) for value in parameters.values()):
-        raise GaitError(f"{path}: parameters must be an object of finite numbers, got {parameters!r}")
+        raise GaitError(f"{where}: parameters must be an object of finite numbers, got {parameters!r}")
     if not isinstance(solver, dict):
-        raise GaitError(f"{path}: solver must be an object, got {solver!r}")
-    gait = Gait(
+        raise GaitError(f"{where}: solver must be an object, got {solver!r}")
+    return Gait(
         name,
-        _check_duration(document["duration"], str(path)),
-        _control_points(path, "joints", document["joints"]),
-        _control_points(path, "feedforward", document["feedforward"]) if "feedforward" in document else None,
+        _check_duration(document["duration"], where),
+        _control_points(where, "joints", document["joints"]),
+        _control_points(where, "feedforward", document["feedforward"]) if "feedforward" in document else None,
         {key: float(value) for key, value in parameters.items()},
         solver,
     )
-    check_gait(gait, robot, str(path))
-    return gait
 
 
 def write_gait(gait: Gait, path: Path) -> None:
@@ -233,11 +258,29 @@ def write_gait(gait: Gait, path: Path) -> None:
         gait: gait to write.
         path: path of the file, replaced if it exists.
     """
+    write_object(gait_object(gait), path)
+
+
+def gait_object(gait: Gait) -> dict[str, Any]:
+    """Return a gait as a JSON object for `gait_from`.
+
+    Args:
+        gait: gait to convert.
+    """
     document: dict[str, Any] = {"format": FORMAT, "name": gait.name, "duration": gait.duration}
     document["joints"] = dict(zip(JOINTS, gait.coefficients.tolist(), strict=True))
     if gait.feedforward is not None:
         document["feedforward"] = dict(zip(JOINTS, gait.feedforward.tolist(), strict=True))
-    document |= {"parameters": dict(gait.parameters), "solver": dict(gait.solver)}
+    return document | {"parameters": dict(gait.parameters), "solver": dict(gait.solver)}
+
+
+def write_object(document: Mapping[str, Any], path: Path) -> None:
+    """Write a JSON file atomically.
+
+    Args:
+        document: object to write; its numbers must be finite.
+        path: path of the file, replaced if it exists.
+    """
     unfinished = path.with_name(f"{path.name}.new")
     unfinished.write_text(json.dumps(document, indent=1, allow_nan=False) + "\n", encoding="utf-8")
     unfinished.replace(path)
@@ -246,7 +289,7 @@ def write_gait(gait: Gait, path: Path) -> None:
 def check_gait(
     gait: Gait, robot: Robot, where: str = "gait", gravity: Callable[[Vector], Vector] | None = None
 ) -> None:
-    """Raise `GaitError` if a gait is malformed, discontinuous at the step change or beyond a limit of the robot.
+    """Raise `GaitError` if a gait is malformed, discontinuous at the stance change or beyond a limit of the robot.
 
     Angles, speeds and torques are compared with their limits in every cycle and at every extremum between cycles.
 
@@ -255,14 +298,13 @@ def check_gait(
         robot: limits of the joints.
         where: start of the error message, for example the name of the file.
         gravity: function from a pose (12,) [rad] to the torque (12,) [Nm] that the controller adds to the feedforward. The torque
-            limits apply to the sum. None: they apply to the feedforward.
+            limits apply to the sum of both torques. If None, the torque limits apply to the feedforward alone.
 
     Raises:
         GaitError: If the gait is rejected. The message states the joint, the limit, the value and the phase.
     """
     _check_form(gait, where)
-    steps = {"right": gait, "left": gait.mirrored()}
-    right, left = (step.tables() for step in steps.values())
+    right, left = gait.tables(), gait.mirrored().tables()
     for end, start, limit, unit in (
         (right.q[-1], left.q[0], POSITION_JUMP, "rad"),
         (right.qd[-1], left.qd[0], VELOCITY_JUMP, "rad/s"),
@@ -271,11 +313,29 @@ def check_gait(
         worst = int(jump.argmax())
         if not jump[worst] <= limit:
             raise GaitError(
-                f"{where}: jump of joints.{JOINTS[worst]} at the step change must be at most {limit:.4g} {unit}, "
+                f"{where}: jump of joints.{JOINTS[worst]} at the stance change must be at most {limit:.4g} {unit}, "
                 f"got {jump[worst]:.4g} {unit}"
             )
+    check_step(gait, robot, where, gravity)
+
+
+def check_step(
+    gait: Gait, robot: Robot, where: str = "gait", gravity: Callable[[Vector], Vector] | None = None
+) -> None:
+    """Raise `GaitError` if a step is malformed or beyond a limit of the robot. Continuity is not checked.
+
+    Args:
+        gait: step to check; its left-stance step is checked too.
+        robot: limits of the joints.
+        where: start of the error message, as in `check_gait`.
+        gravity: gravity torques, as in `check_gait`.
+
+    Raises:
+        GaitError: If the step is rejected, as in `check_gait`.
+    """
+    _check_form(gait, where)
     # The limits of left and right joints can differ, so both steps are checked.
-    for stance, step in steps.items():
+    for stance, step in (("right", gait), ("left", gait.mirrored())):
         for phases in (_cycle_phases, _turning_points):
             _check_limits(step, phases(step), robot, gravity, where, stance)
 
@@ -332,8 +392,8 @@ def _cycle_phases(gait: Gait) -> Vector:
 def _turning_points(gait: Gait) -> Vector:
     """Return the phases in [0, 1] at which the angle, speed or feedforward of a joint has an extremum, shape (n,).
 
-    Rounding can turn a double root into a complex pair, so the real part of every root is used. This can add phases without an
-    extremum, which are harmless.
+    Rounding can turn a double root into a complex pair, so the real part of every root is used. The result can therefore contain
+    phases without an extremum. These phases do no harm.
     """
     slope = derivative(gait.coefficients)
     slopes = [slope, derivative(slope)]
@@ -355,22 +415,22 @@ def _check_duration(value: Any, where: str) -> float:
     return float(value)
 
 
-def _control_points(path: Path, key: str, table: Any) -> Vector:
+def _control_points(where: str, key: str, table: Any) -> Vector:
     if not isinstance(table, dict):
         raise GaitError(
-            f"{path}: {key} must be an object with one list for each of {', '.join(JOINTS)}, got {type(table).__name__}"
+            f"{where}: {key} must be an object with one list for each of {', '.join(JOINTS)}, got {type(table).__name__}"
         )
     if unknown := sorted(set(table) - set(JOINTS)):
-        raise GaitError(f"{path}: {key}.{unknown[0]} is unknown; valid joints are {', '.join(JOINTS)}")
+        raise GaitError(f"{where}: {key}.{unknown[0]} is unknown; valid joints are {', '.join(JOINTS)}")
     for joint in JOINTS:
         points = table.get(joint)
         if not isinstance(points, list) or len(points) != DEGREE + 1 or not all(_is_number(p) for p in points):
-            raise GaitError(f"{path}: {key}.{joint} must be a list of {DEGREE + 1} finite numbers, got {points!r}")
+            raise GaitError(f"{where}: {key}.{joint} must be a list of {DEGREE + 1} finite numbers, got {points!r}")
     return _read_only(np.array([table[joint] for joint in JOINTS], dtype=np.float64))
 
 
 def _is_number(value: Any) -> bool:
-    # math.isfinite raises an exception for very large integers. This comparison is false for them, for NaN and for infinity.
+    # math.isfinite raises an exception for a very large integer. The comparison with the largest float does not.
     return type(value) in (int, float) and abs(value) <= sys.float_info.max
 
 
@@ -400,7 +460,7 @@ def step_over(cycle: int, cycles: int) -> bool:
     """Return whether a step is over because its nominal duration has passed.
 
     Args:
-        cycle: cycles since the step change.
+        cycle: cycles since the stance change.
         cycles: nominal duration of the step in cycles.
     """
     return cycle >= cycles

@@ -1,8 +1,8 @@
-"""Re-centring ("deadbeat" in the paper): a cubic that leads from the pose at a step change to the nominal trajectory.
+"""Re-centring ("deadbeat" in the paper): a cubic that leads from the pose at a stance change to the nominal trajectory.
 
-`step change -> (q - q_nom, q' - q_nom') -> s(t) -> q_des(t) = q_nom(t) + s(t)`. The tracking error is exactly zero at the step
-change. After the time alpha T the desired trajectory is the nominal trajectory. s is linear in the two deviations:
-s(t) = s(0) c0(t) + s'(0) c1(t). The guide filter therefore computes its responses to the basis cubics c0 and c1 in advance.
+`stance change -> (q - q_nom, q' - q_nom') -> s(t) -> q_des(t) = q_nom(t) + s(t)`. The tracking error is exactly zero at the step
+change. After the fraction alpha of the step duration T, the desired trajectory is the nominal trajectory. s is linear:
+s(t) = s(0) c0(t) + s'(0) c1(t). The guide filter can therefore compute the responses to the basis cubics c0 and c1 in advance.
 
 The paper calls this polynomial a deadbeat. It is a reference trajectory, not a finite-time (deadbeat) control law.
 """
@@ -19,7 +19,7 @@ from atalante_hal.types import Vector
 
 @dataclass(frozen=True)
 class Deadbeat:
-    """Re-centring ("deadbeat" in the paper) of one gait: an offset s(t) added to q_nom after a step change.
+    """Re-centring ("deadbeat" in the paper) of one gait: an offset s(t) added to q_nom after a stance change.
 
     Raises:
         ValueError: If alpha is outside (0, 1], or the duration is not positive.
@@ -36,7 +36,7 @@ class Deadbeat:
 
     @property
     def end(self) -> float:
-        """Return the time alpha T after the step change at which the re-centring ends [s]."""
+        """Return the time alpha T after the stance change at which the re-centring ends [s]."""
         return self.alpha * self.duration
 
     def polynomials(self) -> Vector:
@@ -50,7 +50,7 @@ class Deadbeat:
         """Return c0 and c1 with their first and second time derivatives. All of them are zero after the time alpha T.
 
         Args:
-            time: time since the step change, shape (n,) [s], at least 0.
+            time: time since the stance change, shape (n,) [s], at least 0.
 
         Returns:
             Three arrays of shape (2, n), rows c0 and c1. Units of c0 are 1, 1/s, 1/s2; units of c1 are s, 1, 1/s.
@@ -62,12 +62,12 @@ class Deadbeat:
         return tuple(np.where(inside, _values(p, x), 0.0) for p in (c, first, second))  # type: ignore[return-value]
 
     def s(self, time: Vector, deviation: Vector, rate: Vector) -> Vector:
-        """Return the offset s of the re-centring for given deviations at the step change.
+        """Return the offset s of the re-centring for given deviations at the stance change.
 
         Args:
-            time: time since the step change, shape (n,) [s].
-            deviation: q(t_i) - q_nom(0), shape (m,) [rad].
-            rate: q'(t_i) - q_nom'(0), shape (m,) [rad/s].
+            time: time since the stance change, shape (n,) [s].
+            deviation: deviation of the joint angles at the stance change, q(t_i) - q_nom(0), shape (m,) [rad].
+            rate: deviation of the joint speeds at the stance change, q'(t_i) - q_nom'(0), shape (m,) [rad/s].
 
         Returns:
             Values of s, shape (n, m) [rad].

@@ -1,4 +1,4 @@
-"""Input of the gait computation: patient, step length and step duration. `Subject -> gait solver, library, network`."""
+"""Subject: patient, step length and step duration. Gait solver, gait library and gait network compute the gait of a subject."""
 
 from __future__ import annotations
 
@@ -9,6 +9,15 @@ from atalante_control.model import Patient
 
 STEP_LENGTH_RANGE = (0.05, 0.40)  # m, accepted step lengths; some of them have no feasible gait
 STEP_DURATION_RANGE = (0.4, 2.0)  # s, accepted step durations; some of them have no feasible gait
+
+#: Eight patients of the walks in the documentation. They span the range of the subjects of the paper, 58 to 91 kg and 1.62 to
+#: 1.93 m. The paper gives only the range.
+STUDY_PATIENTS = tuple(
+    Patient(mass, height)
+    for mass, height in (
+        (58.0, 1.62), (62.0, 1.68), (66.0, 1.65), (70.0, 1.74), (75.0, 1.75), (80.0, 1.80), (85.0, 1.86), (91.0, 1.93),
+    )
+)  # fmt: skip
 
 
 @dataclass(frozen=True)

@@ -1,7 +1,7 @@
 """Compiler of the functions of the nonlinear program: `CasADi functions -> C -> gcc -> shared library in a cache`.
 
-Interpreted and compiled functions execute the same operations in the same order, without fused multiply-add. Both therefore give
-the same gait. If there is no compiler, or if the compilation fails, the interpreted functions are used.
+Interpreted and compiled functions execute the same operations in the same order, without fused multiply-add. The gaits
+are therefore the same. If there is no compiler, or if the compilation fails, the interpreted functions are used.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from atalante_control.gait_optimization.nlp import Functions
 
 COMPILER = "gcc"
 #: Compiler options. With -O0 the 60,000 statements compile in 13 s and run 4 times as fast as in the interpreter.
-#: With -O1 they compile in 95 s and run twice as fast as with -O0, but the solver then needs only 10 % less time.
+#: With -O1 the statements compile in 95 s and run twice as fast as with -O0, but the solver needs only 10 % less time.
 #: Fused multiply-adds are disabled, because they round differently than the interpreter.
 OPTIONS = ("-O0", "-fPIC", "-shared", "-ffp-contract=off")
 CACHE_VARIABLE = "ATALANTE_CACHE"

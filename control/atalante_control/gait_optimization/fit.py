@@ -1,15 +1,15 @@
 """Fit of the gait network to a library of gaits: `gaits -> principal directions -> perceptron -> GaitNetwork`.
 
 The 96 control points depend on each other, so the perceptron does not learn them directly. It learns the coordinates along the
-few directions in which the library varies. The linear map back to the control points is multiplied into the last layer.
+few directions in which the library varies. The last layer includes the linear map from these coordinates to the control points.
 
-1. *Periodic gaits.* The angles are exactly continuous at the step change, which leaves 84 dimensions. The speeds jump slightly
+1. *Periodic gaits.* The angles are exactly continuous at the stance change, which leaves 84 dimensions. The speeds jump slightly
    at the impact. The fit keeps the fraction `JUMP_KEPT` of this jump, as a compromise between a smooth walk and the accelerations
    of the solved gait.
-2. *Weighted errors.* The distance of two gaits is the deviation of their angles and accelerations along the step. The
+2. *Weighted errors.* The distance between two gaits is the deviation of their angles and accelerations along the step. The
    accelerations determine the feedforward. The ends of the step have a larger weight, because the foot lands there. The
-   perceptron learns the principal directions of the library in this metric. The last directions are omitted if all of them
-   together cause an rms error below `RESOLUTION`.
+   perceptron learns the principal directions of the library in this metric. The least important directions are omitted: as many
+   as together cause an rms error of at most `RESOLUTION`.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ HIDDEN = (64, 64)
 ITERATIONS = 3000  # largest number of L-BFGS iterations in one run of the optimiser
 ROUNDS = 2  # number of runs of the optimiser; the second run starts from the result of the first run
 RESOLUTION = math.radians(0.003)  # rad, largest rms error caused by the principal directions that are left out
-JUMP_KEPT = 0.45  # the speed jump of each gait at the step change is multiplied by this factor before the fit
+JUMP_KEPT = 0.45  # the speed jump of each gait at the stance change is multiplied by this factor before the fit
 END_WEIGHT = 20.0  # weight of the samples at start and end of a step; the other samples have weight 1
 ACCELERATION_WEIGHT = 5e-2  # s2, weight of an acceleration error [rad/s2] relative to an angle error [rad]
 ALPHA = 1e-7  # penalty on the squared weights of the network; it smooths the gaits between the grid points
@@ -108,7 +108,8 @@ def inputs(gait: Gait) -> Vector:
 def _metric(duration: float) -> Vector:
     """Return the matrix M of the squared distance d' M d between two gaits, shape (96, 96).
 
-    d is the difference of their control points. The squared distance is the weighted mean of squared errors along the step.
+    d is the difference of the control points of the two gaits. The squared distance is the weighted mean of squared
+    errors along the step.
 
     Args:
         duration: duration of the step [s].

@@ -19,7 +19,7 @@ _BEND = 0.96  # height of the pelvis above the ankle, as a fraction of the lengt
 _WIDTH = 0.20  # m, lateral distance of the ankles
 _SWAY = 0.03  # m, largest lateral displacement of the pelvis towards the stance foot
 _LIFT = 0.06  # m, largest height of the swing foot
-_CROUCH = {"SH": -0.25, "SK": 0.5, "SA": -0.2}  # rad, start pose of the inverse kinematics; other joints are at 0
+_CROUCH = {"SH": -0.25, "SK": 0.5, "SA": -0.2}  # rad, start pose of the inverse kinematics; all other joints are at 0
 _ITERATIONS = 50  # largest number of iterations of the inverse kinematics for a pose
 _TOLERANCE = 1e-6  # m or rad, largest accepted error of the inverse kinematics
 _LARGEST = 0.2  # rad, largest change of a joint angle in one iteration
@@ -49,7 +49,7 @@ def guess(problem: StepProblem, parameters: Vector, subject: Subject) -> Vector:
 
 
 def _reach(errors: Any, pose: Vector, target: Vector, parameters: Vector) -> Vector:
-    """Return joint angles that move pelvis and swing ankle to the target and level them (damped Gauss-Newton)."""
+    """Return the joint angles at which pelvis and swing foot are level and at the target positions (damped Gauss-Newton)."""
     for _ in range(_ITERATIONS):
         error, jacobian = (np.array(value) for value in errors(pose, target, parameters))
         if np.abs(error).max() < _TOLERANCE:

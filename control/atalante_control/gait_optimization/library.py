@@ -1,8 +1,9 @@
 """Library of gaits for a grid of subjects, solved in parallel. An interrupted computation can be resumed.
 
-`Grid, solve -> one file for each gait -> fit`. Every gait is solved without a warm start, so it depends only on its own
-parameters. Other gaits, the number of processes and interruptions have no effect. The small error of the fit shows that similar
-subjects converge to similar local minima. Failures are recorded in files.
+`Grid, solve -> one file for each gait`. `atalante_control.gait_optimization.fit` reads the files. Every gait is solved without
+a warm start, so a gait depends only on the parameters of its own subject. Other gaits, the number of processes and
+interruptions have no effect. The small error of the fit shows that the optimiser finds similar local minima for similar
+subjects. Failures are recorded in files.
 """
 
 from __future__ import annotations
@@ -25,7 +26,7 @@ from atalante_control.model import Patient
 from atalante_hal.robot import Robot, load_robot
 
 FORMAT = "atalante-library/1"
-LEVELS_MIN = 3  # smallest number of levels of a parameter; with 2 levels, the network error between them is 10 degrees
+LEVELS_MIN = 3  # smallest number of levels of a parameter; a network fitted to only 2 levels has an error of 10 degrees
 
 Index = tuple[int, ...]
 #: Function that solves one gait. It must be defined at module level, because other processes import it.
@@ -33,14 +34,14 @@ Solve = Callable[[Subject], SolvedGait]
 
 
 class LibraryError(ValueError):
-    """Missing or invalid library, or a library with another grid. The message states the path or the folder."""
+    """Missing or invalid library, or library with a grid that is not the required one. The message states the file or folder."""
 
 
 @dataclass(frozen=True)
 class Grid:
     """Grid of subjects. The default covers the subjects of the paper (58 to 91 kg, 1.62 to 1.93 m).
 
-    Each attribute contains the levels of one parameter in ascending order.
+    Each attribute is the list of levels of one parameter, in ascending order.
 
     Raises:
         ValueError: If there are fewer than three levels, levels are not ascending, or a subject is out of range.
@@ -94,10 +95,10 @@ class Library:
 
         Args:
             folder: folder of the library.
-            grid: required grid; None: the grid of the folder.
+            grid: required grid, or None to accept the grid that is stored in the folder.
 
         Raises:
-            LibraryError: If the folder has no library and no grid is given, or if the grid of the library is not `grid`.
+            LibraryError: If the folder has no library and no grid is given, or if the library has another grid.
         """
         self.folder = folder
         path = folder / "grid.json"
@@ -167,7 +168,7 @@ class Library:
         Args:
             solve: function that solves one gait, defined at module level.
             jobs: number of processes on this computer.
-            cluster: address of a dask scheduler whose workers are used instead of processes.
+            cluster: address of a dask scheduler; its workers are used instead of processes on this computer.
 
         Raises:
             FanOutError: If the calls cannot be distributed, see `fan_out`.
@@ -207,7 +208,7 @@ def solve_subject(subject: Subject) -> SolvedGait:
 def solve_compiled(subject: Subject) -> SolvedGait:
     """Solve and verify the gait of a subject with compiled functions. The result is the same as that of `solve_subject`.
 
-    The functions are compiled once per computer. A gait then takes half the time.
+    The functions are compiled once per computer. The computation of a gait then takes half the time.
 
     Args:
         subject: patient and step parameters.

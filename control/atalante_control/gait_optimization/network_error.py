@@ -1,7 +1,7 @@
-"""Error of the gait network: deviation of its gaits from solved gaits of the same subjects, compared with limits.
+"""Error of the gait network: deviations from solved gaits of the same subjects, and the limits of these deviations.
 
-`GaitNetwork, newly solved gaits -> Deviation of each -> findings against the limits`. The subjects are not on the grid of the
-library, because the fit is always good there.
+`GaitNetwork, newly solved gaits -> one Deviation per subject -> findings against the limits`. The subjects are not on the grid
+of the library, because the fit is always good on the grid.
 """
 
 from __future__ import annotations
@@ -27,10 +27,10 @@ class Deviation(NamedTuple):
     angles: Vector  # (n, 12) rad, absolute deviation of the joint angles along the step
     landing_position: float  # m, deviation of the position of the swing foot in the stance foot frame, at the landing
     landing_attitude: float  # rad, deviation of the attitude of the swing foot in the stance foot frame, at the landing
-    position_defect: float  # rad, largest jump of a joint angle at the step change
-    speed_defect: float  # rad/s, largest jump of a joint speed at the step change
+    position_defect: float  # rad, largest jump of a joint angle at the stance change
+    speed_defect: float  # rad/s, largest jump of a joint speed at the stance change
     feedforward: float  # rms of the feedforward difference, relative to the rms of the solved feedforward
-    within_limits: bool  # True: the gait of the network is valid and within the limits of the robot, see `check_gait`
+    within_limits: bool  # whether the gait of the network is valid and within the limits of the robot, see `check_gait`
 
 
 class Finding(NamedTuple):

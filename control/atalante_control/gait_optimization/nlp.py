@@ -2,7 +2,7 @@
 
 `Rows (SX expressions of a few unknowns) -> NonlinearProgram.add -> f, g and their exact sparse derivatives as five functions`.
 The model of walking is in `step_problem`. Every repeated function is differentiated only once. For each repetition, the program
-stores where the derivatives belong in the sparse matrices.
+stores the positions of the derivatives in the sparse matrices.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ class Rows(NamedTuple):
 
     name: str  # readable name of the group, for example "swing clearance"
     unit: str  # SI unit
-    size: float  # [unit] scale; the program divides values and bounds by it
+    size: float  # [unit] scale; the program divides values and bounds by this scale
     values: Symbol  # SX, shape (m,) [unit]
     lower: Vector  # [unit] lower bounds, shape (m,), or (repetitions, m) if they differ between repetitions
     upper: Vector  # [unit] upper bounds, same shapes as `lower`
@@ -41,7 +41,7 @@ class Group(NamedTuple):
 
 
 class Functions(NamedTuple):
-    """Functions of the unknowns x and the parameters p for the solver, in the order of `NAMES`."""
+    """Functions that the solver calls, in the order of `NAMES`. Arguments are the unknowns x and the parameters p."""
 
     objective: Any  # x, p -> f
     constraints: Any  # x, p -> g
@@ -54,21 +54,21 @@ NAMES = ("nlp_f", "nlp_g", "nlp_grad_f", "nlp_jac_g", "nlp_hess_l")
 
 
 class _Block(NamedTuple):
-    """Expression repeated for several groups of unknowns. It is part of g, or of the objective if it has weights."""
+    """Expression that is repeated for several groups of unknowns. It is a cost if it has weights, else a constraint."""
 
     expression: Symbol  # SX
     x: Symbol  # SX symbols of the unknowns of one repetition, shape (n,)
     at: Indices  # indices of the unknowns of each repetition, shape (repetitions, n)
-    weights: Vector | None  # weight of each repetition in the objective; None: the expression is part of g
+    weights: Vector | None  # weight of each repetition in the objective, or None if the expression is a constraint
 
 
 class NonlinearProgram:
     """Nonlinear program: minimise f(x, p) subject to lower <= g(x, p) <= upper.
 
     Attributes:
-        lower: lower bounds of g, each row divided by the size of its group.
-        upper: upper bounds of g, each row divided by the size of its group.
-        groups: groups of rows by name.
+        lower: lower bounds of g, each divided by the scale (`size`) of its group.
+        upper: upper bounds of g, each divided by the scale (`size`) of its group.
+        groups: named groups of constraints, with the rows of g that belong to each group.
     """
 
     def __init__(self, unknowns: int, parameters: Symbol) -> None:
@@ -177,7 +177,7 @@ class NonlinearProgram:
 
 
 class _Entries(NamedTuple):
-    """Function that returns the entries of a sparse matrix, with their row and column indices."""
+    """Function that returns the nonzero entries of a sparse matrix, and the row and column of each entry."""
 
     function: Any  # casadi.Function
     rows: Indices  # row index of each entry
@@ -185,7 +185,7 @@ class _Entries(NamedTuple):
 
 
 def _derivatives(block: _Block, p: Symbol) -> tuple[Any, _Entries, _Entries]:
-    """Return three functions: the expression, its Jacobian, and the upper triangle of its multiplier-weighted Hessian."""
+    """Return functions for the expression, its Jacobian, and the upper triangle of its Hessian weighted with multipliers."""
     lam = casadi.SX.sym("lam", block.expression.shape[0])
     slopes = casadi.jacobian(block.expression, block.x)
     curvature = casadi.triu(casadi.hessian(casadi.dot(lam, block.expression), block.x)[0])
@@ -195,7 +195,7 @@ def _derivatives(block: _Block, p: Symbol) -> tuple[Any, _Entries, _Entries]:
         ("hessian", curvature, [block.x, p, lam]),
     ):
         rows, columns = matrix.sparsity().get_triplet()
-        # Common subexpressions are not eliminated: this would save only 3 % of the operations but take most of the build time.
+        # Elimination of common subexpressions would save only 3 % of the operations, but take most of the build time.
         function = casadi.Function(name, arguments, [casadi.vertcat(*matrix.nonzeros())])
         entries.append(_Entries(function, np.array(rows, np.intp), np.array(columns, np.intp)))
     return casadi.Function("values", [block.x, p], [block.expression]), entries[0], entries[1]

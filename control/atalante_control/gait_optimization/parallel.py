@@ -34,18 +34,18 @@ def fan_out(
 ) -> Generator[_Result, None, None]:
     """Call a function for many tasks in parallel, and yield the results in the order of completion.
 
-    Only the caller handles Ctrl-C. The processes ignore it. They end when the iteration ends or is closed.
+    Only the calling process handles Ctrl-C. All other processes ignore Ctrl-C, and end when the iteration ends or is closed.
 
     Args:
         call: function to call, defined at module level, because other processes import it.
         tasks: argument of each call.
-        jobs: number of processes on this computer; 1: this process.
+        jobs: number of processes on this computer. With 1, the calls run in this process.
         cluster: address of a dask scheduler such as tcp://127.0.0.1:8786. The project must be installed on its workers.
-        patience: longest time without a result of the processes [s]; None: unlimited. It has no effect on a cluster.
+        patience: longest time between two results [s], or None for no limit. On a cluster there is no limit.
 
     Raises:
         FanOutError: If joblib or dask is missing, or the scheduler does not respond.
-        TimeoutError: If there is no result for `patience`.
+        TimeoutError: If no result arrives within `patience`.
     """
     if jobs == 1 and not cluster:
         yield from map(call, tasks)
@@ -78,9 +78,9 @@ def fan_out(
 
 @contextmanager
 def _without_ctrl_c() -> Iterator[None]:
-    """Ignore Ctrl-C in this context. Processes started in this context also ignore Ctrl-C, and their parent ends them.
+    """Ignore Ctrl-C inside the `with` block. Child processes started inside the block also ignore Ctrl-C; the parent ends them.
 
-    The signal is ignored instead of blocked, because the resource tracker of joblib unblocks it for processes started later.
+    The signal is ignored and not blocked, because the resource tracker of joblib unblocks the signal for later processes.
     """
     before = signal.signal(signal.SIGINT, signal.SIG_IGN)
     try:
@@ -93,8 +93,8 @@ def _without_ctrl_c() -> Iterator[None]:
 def _without_loky_errors() -> Iterator[None]:
     """Suppress the report of a KeyError in the executor thread of loky.
 
-    Before loky ends its processes, it clears the table of pending calls. If the thread queues a call at that moment, it does not
-    find the call in the table (`add_call_item_to_queue` in loky 3.6). The error has no effect, because all calls are cancelled.
+    Before loky ends its processes, it clears the table of pending calls. If the executor thread queues a call at that moment, the
+    call is missing in the table (`add_call_item_to_queue` in loky 3.6). The error has no effect, because all calls are cancelled.
     """
     before = threading.excepthook
 

@@ -30,7 +30,7 @@ class Watch(casadi.Callback):
         self.construct("watch", {})
 
     def get_n_in(self) -> int:
-        """Return the number of inputs of the callback. Its inputs are the outputs of the solver."""
+        """Return the number of inputs of the callback, which are the outputs of the solver."""
         return int(casadi.nlpsol_n_out())
 
     def get_n_out(self) -> int:
@@ -48,7 +48,7 @@ class Watch(casadi.Callback):
         return casadi.Sparsity.dense(length, 1 if length else 0)
 
     def eval(self, arguments: Sequence[Any]) -> list[int]:
-        """Report the iteration and its largest constraint violation, and let the solver continue."""
+        """Report the iteration number and the largest constraint violation, and let the solver continue."""
         rows = np.array(arguments[casadi.nlpsol_out().index("g")]).ravel()
         outside = np.maximum(self._bounds[0] - rows, rows - self._bounds[1])
         self._progress(self._iteration, max(0.0, float(outside.max())))

@@ -1,4 +1,4 @@
-"""Check before the optimisation that a landing pose exists: `problem, subject -> None, or reason why there is none`.
+"""Check before the optimisation that a landing pose exists: `problem, subject -> None, or reason why no pose exists`.
 
 The search finds a pose with both feet flat on the ground, one step length apart, with soft joint limits. If a joint must leave
 its range, the joint with the largest violation is reported as the reason why there is no gait.
@@ -16,13 +16,14 @@ from atalante_control.gait_optimization.step_problem import StepProblem
 from atalante_hal.robot import JOINTS
 from atalante_hal.types import Vector
 
-_TOLERANCE = math.radians(0.5)  # rad, accepted violation of a joint range; the optimiser may still find a valid pose
-_CENTRE_WEIGHT = 1e-6  # weight of the distance from the middle of the joint ranges; a violation has weight 1
+#: Accepted violation of a joint range [rad]. The optimiser can find a valid pose near a pose with a smaller violation.
+_TOLERANCE = math.radians(0.5)
+_CENTRE_WEIGHT = 1e-6  # weight of the distance from the middle of a joint range; violations of the range have weight 1
 _OPTIONS: dict[str, Any] = {"ipopt.print_level": 0, "ipopt.sb": "yes", "print_time": False, "error_on_fail": False}
 
 
 class Reach:
-    """Search for a landing pose. Its solver is built once per nonlinear program."""
+    """Search for a landing pose, with a solver that is built once per nonlinear program."""
 
     def __init__(self, problem: StepProblem) -> None:
         """Build the solver of the search.

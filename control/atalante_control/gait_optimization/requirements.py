@@ -22,20 +22,22 @@ class Requirements:
     sole_share: float = 0.6  # fraction of the sole in which the centre of pressure must be
     cell_share: float = 0.8  # fraction of the rectangle between the force cells in which the centre of pressure must be
     yaw_lever: float = 0.03  # m, largest ratio of yaw moment about the sole centre to vertical ground force
-    #: Required height of the swing sole at mid-swing [m]. At other times it is multiplied by sin(pi t / T)^2.
-    #: For start and stop steps this factor is sin(pi t / T)^4.
+    #: Required height of the swing sole at mid-swing [m]. At other times this height is multiplied by sin(pi t / T)^2.
+    #: In start and stop steps the required height is multiplied by sin(pi t / T)^4.
     clearance: float = 0.05
     corridor: tuple[float, float] = (0.17, 0.28)  # m, smallest and largest lateral distance of the ankles
     roll: float = math.radians(5.0)  # rad, largest roll of the pelvis
     pitch: float = math.radians(6.0)  # rad, largest pitch of the pelvis
     yaw: float = math.radians(6.0)  # rad, largest yaw of the pelvis
-    landing_speed: tuple[float, float] = (-0.03, -0.003)  # m/s, vertical speed of the landing foot, upwards positive
+    #: m/s, range of the vertical speed of the landing foot, upwards positive
+    landing_speed: tuple[float, float] = -0.03, -0.003
     landing_slide: float = 0.035  # m/s, largest forward speed and largest lateral speed of the landing foot
     landing_turn: float = 0.2  # rad/s, largest angular velocity of the landing foot about each axis
-    #: Largest jump of a joint speed at the impact [rad/s]. The rest of VELOCITY_JUMP is a reserve for errors of the gait network.
+    #: Largest jump of a joint speed at the impact [rad/s].
+    #: The fit error of the gait network increases the speed jump. The increased jump must stay below VELOCITY_JUMP.
     impact_jump: float = 0.6 * VELOCITY_JUMP
     sinking: float = 0.01  # m/s, largest downward speed of the rear foot after the impact
-    # The cost is the sum of squared torques [(100 Nm)^2] and of the terms with the weights below.
+    # The cost is the sum of squared torques [(100 Nm)^2] plus the weighted sums of the squares below.
     # Without the weights of tilt and pressure, similar subjects get very different swing motions.
     acceleration_weight: float = 3e-3  # weight of the squared joint accelerations [(rad/s2)^2]
     tilt_weight: float = 5.0  # weight of the squared tilt of the swing sole [rad^2]

@@ -1,4 +1,4 @@
-"""Result of the gait solver: `solve -> SolvedGait -> library, command line`."""
+"""Result of the gait solver, for the gait library and the command line: `solve -> SolvedGait`."""
 
 from __future__ import annotations
 

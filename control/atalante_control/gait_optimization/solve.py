@@ -32,7 +32,7 @@ from atalante_hal.robot import ROBOT_FILE, load_robot
 
 RESIDUAL = 1e-6  # largest accepted violation of each constraint in a solved gait, in the SI unit of this constraint
 _OPTIONS: dict[str, Any] = {
-    "ipopt.nlp_scaling_method": "none",  # IPOPT does not scale, because the program scales constraints and unknowns
+    "ipopt.nlp_scaling_method": "none",  # no scaling by IPOPT, because constraints and unknowns are already scaled
     "ipopt.max_iter": 150,
     "ipopt.tol": 1e-8,
     "ipopt.constr_viol_tol": 1e-10,
@@ -42,10 +42,10 @@ _OPTIONS: dict[str, Any] = {
     "print_time": False,
     "error_on_fail": False,
     "calc_lam_p": False,
-    "no_nlp_grad": True,  # the gradient is used only for sensitivities, which compiled functions do not provide
+    "no_nlp_grad": True,  # only sensitivities need the gradient; compiled functions provide no sensitivities
 }
 #: IPOPT options of a warm start: a small initial barrier parameter mu, and bound multipliers computed from mu.
-#: With these options a warm start takes 17 to 21 iterations. With the default options it takes 34 to 36.
+#: A warm start takes 17 to 21 iterations with these options, and 34 to 36 iterations with the default options.
 _WARM: dict[str, Any] = {"ipopt.mu_init": 1e-3, "ipopt.bound_mult_init_method": "mu-based"}
 #: Patterns of the source files that determine a gait; `code_version` hashes these files.
 _SOURCES = (
@@ -63,31 +63,36 @@ def solve(
     kind: Kind = "periodic",
     progress: Progress | None = None,
     machine_code: bool = False,
+    around: Gait | None = None,
 ) -> SolvedGait:
     """Optimise the gait of one step.
 
-    A start step leads from rest on both feet to the end of the periodic step of the subject. A stop step leads from the start of
-    the periodic step to rest. Both last `step_problem.TRANSITION` seconds, whatever the step duration is.
+    A start step leads from rest on both feet to the end of the periodic step of the subject. A stop step leads from the
+    start of the periodic step to rest. Start and stop step last `step_problem.TRANSITION` seconds. The step duration of
+    the subject has no effect on them.
 
     Args:
         subject: patient and step parameters.
-        warm_start: gait of a similar subject as the initial guess; None: the result of `guess`.
+        warm_start: gait of a similar subject as the initial guess. If None, the initial guess is the result of `guess`.
         kind: kind of step, `periodic`, `start` or `stop`.
-        progress: function to call at each iteration; None: no progress report.
-        machine_code: True: use compiled functions. The first use on a computer compiles them in about 15 s, which is worth it
-            for a library.
+        progress: function to call at each iteration, or None for no progress report.
+        machine_code: whether compiled functions are used. The first use on a computer takes about 15 s for the compilation, which
+            saves time only if many gaits are solved.
+        around: periodic gait before a stop step or after a start step. If None, the gait of the subject is solved first.
 
     Returns:
         The gait. If the solver failed, the gait is the last iterate and the status names the violated constraint.
     """
-    around = None if kind == "periodic" else solve(subject, machine_code=machine_code)
-    if around is not None and not around.solved:
-        return around
+    if kind != "periodic" and around is None:
+        periodic = solve(subject, machine_code=machine_code)
+        if not periodic.solved:
+            return periodic
+        around = periodic.gait
     problem, functions = _built(kind, machine_code)
     duration = subject.step_duration if around is None else TRANSITION
     parameters = problem.parameters(subject.patient, duration, subject.step_length)
     lower, upper = problem.bounds(duration)
-    low, high = problem.constraint_bounds(None if around is None else around.gait)
+    low, high = problem.constraint_bounds(around)
     coefficients = guess(problem, parameters, subject) if warm_start is None else warm_start.coefficients
     refusal = _reach().refusal(parameters, subject.step_length) if kind == "periodic" else None
     ending, iterations = "not started", 0

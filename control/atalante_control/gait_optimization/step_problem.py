@@ -1,13 +1,14 @@
 """Walking step as a nonlinear program: unknowns, constraints in named groups, and cost.
 
-`Chain, Requirements -> constraints of one node, of both ends, of the impact -> NonlinearProgram`, built once per kind of step.
+`Chain, Requirements -> constraints of nodes, ends of the step and impact -> NonlinearProgram`, built once per kind of step.
 Subject, step length and duration are parameters. Bezier control points determine the motion. The unknowns of a node are the
 joint angles, their first and second derivatives with respect to the phase, the torques and the ground wrench. Linear equations
-connect the unknowns of a node to the control points. The equations of motion connect the unknowns of a node to each other. The
-unknowns are redundant, which keeps the equations short and the matrix sparse.
+connect the unknowns of a node to the control points. The equations of motion connect the unknowns of the same node. The unknowns
+are redundant, which keeps the equations short and the matrix sparse.
 
-Stance foot and swing foot are flat rigid bodies on flat ground. The stance foot does not move. Every step is fully actuated, so
-the partial hybrid zero dynamics has no zero dynamics. The impact map connects the end of a step with the start of the next step.
+Stance foot and swing foot are flat rigid bodies on flat ground. The stance foot does not move. Every step is fully
+actuated, so no zero dynamics remain in the partial hybrid zero dynamics. The impact map connects the end of a step with
+the start of the next step.
 """
 
 from __future__ import annotations
@@ -33,7 +34,7 @@ KINDS: tuple[Kind, ...] = ("periodic", "start", "stop")
 TRANSITION = 1.2  # s, duration of start and stop steps
 
 _N = len(JOINTS)
-_POINTS = _N * (DEGREE + 1)  # number of control points, which are the first unknowns, joint after joint
+_POINTS = _N * (DEGREE + 1)  # number of control points; they are the first unknowns, sorted by joint
 _NODE = 4 * _N + 6  # number of unknowns of a node: q, dq/ds, d2q/ds2, torque, ground force, ground moment
 _TORQUE, _FORCE, _MOMENT = 100.0, 1500.0, 1500.0  # scales of joint torque [Nm], ground force [N], ground moment [Nm]
 _BOUND_UNITS = {
@@ -143,7 +144,7 @@ class StepProblem:
 
     @property
     def basis(self) -> Vector:
-        """Return the matrix from control points to angles at the nodes, shape (nodes, 8)."""
+        """Return the matrix that maps control points to angles at the nodes, shape (nodes, 8)."""
         return self._bases[0]
 
     def residuals(
@@ -152,7 +153,7 @@ class StepProblem:
         """Return the largest violation of each group of constraints, in the SI unit of the group.
 
         Args:
-            unknowns: result of `unknowns`; its torques and ground forces follow from the motion.
+            unknowns: result of `self.unknowns()`, so torques and ground forces follow from the motion.
             rows: values of g at these unknowns.
             bounds: lower and upper bounds of g.
             duration: duration of the step [s].
@@ -230,7 +231,7 @@ class StepProblem:
         return casadi.Function("reach", [q, target, self.symbols], [error, casadi.jacobian(error, q)])
 
     def _trajectory_rows(self) -> Vector:
-        """Return A of the constraints A x = 0, by which the control points determine q, dq/ds and d2q/ds2 at the nodes."""
+        """Return the matrix A of the constraints A x = 0, which connect control points with q, dq/ds and d2q/ds2 at the nodes."""
         rows = np.zeros((self.requirements.nodes, 3, _N, self.program.unknowns))
         for node in range(self.requirements.nodes):
             for order, basis in enumerate(self._bases):
@@ -241,7 +242,7 @@ class StepProblem:
         return rows.reshape(-1, self.program.unknowns)
 
     def _control_point(self, index: int) -> Vector:
-        """Return the matrix that selects the control point `index` of every joint from x, shape (12, unknowns)."""
+        """Return the matrix that selects the control point `index` of every joint from the unknowns, shape (12, unknowns)."""
         rows = np.zeros((_N, self.program.unknowns))
         rows[np.arange(_N), np.arange(_N) * (DEGREE + 1) + index % (DEGREE + 1)] = 1.0
         return rows
@@ -252,7 +253,7 @@ class StepProblem:
             rows = point(0) - SIGN[:, None] * point(-1)[SWAP]
             program.add_linear("periodicity", "rad", rows, np.zeros(_N))
             return
-        # A start step begins at rest and ends in the gait. A stop step begins in the gait and ends at rest.
+        # A start step begins at rest and ends in the periodic gait. A stop step begins in the periodic gait and ends at rest.
         given, rest = ((-1, -2), (0, 1, 2)) if self.kind == "start" else ((0, 1), (-1, -2, -3))
         for name, index in zip(("gait pose", "gait speed"), given, strict=True):
             program.add_linear(name, "rad", point(index), np.zeros(_N))
@@ -269,7 +270,7 @@ class StepProblem:
         if around is not None:
             end, next_one = (-1, -2) if self.kind == "start" else (0, 1)
             pose, other = around.coefficients[:, end], around.coefficients[:, next_one]
-            # At their common pose both steps have the same q', so dq/ds = q' T is proportional to the duration T of a step.
+            # Where two steps meet, the joint speed q' is the same in both steps. Hence dq/ds = q' T is proportional to T.
             points = {"gait pose": pose, "gait speed": pose + (other - pose) * TRANSITION / around.duration}
             for group in self.program.groups:
                 if group.name in points:
@@ -290,7 +291,7 @@ class StepProblem:
         return wrench[3:] * _MOMENT - casadi.cross(casadi.DM([x, 0.0, z]), wrench[:3] * _FORCE)
 
     def _ground(self, wrench: Symbol) -> list[Rows]:
-        """Return the constraints of friction cone, centre of pressure and yaw moment, each as a force that must be positive."""
+        """Return the constraints of friction cone, centre of pressure and yaw moment, each as a force of at least 0."""
         requirements, exo = self.requirements, self.exoskeleton
         force, moment = wrench[:3] * _FORCE, self._pressure_moment(wrench)
         length, width = exo.sole_size
@@ -348,7 +349,7 @@ class StepProblem:
         ]
 
     def landing(self, q: Symbol) -> list[Rows]:
-        """Return the constraints of the landing pose: swing foot flat on the ground, one step length ahead, toe-out mirrored.
+        """Return the constraints of the landing pose: swing foot flat on the ground, one step length ahead, mirrored toe-out.
 
         Args:
             q: joint angles, SX of shape (12,) [rad].
@@ -386,11 +387,11 @@ class StepProblem:
         ]
 
     def _add_impact(self) -> None:
-        """Add the impact map, which connects the speeds at the end of a step with those at the start of the next step.
+        """Add the impact map, which connects the speeds at the end of a step with the speeds at the start of the next step.
 
-        In the mirrored robot the landing foot is the stance foot. The impact changes its twist to zero and the joint speeds to
-        those of the next step. The joint impulses are zero, the ground impulse is upwards, and the sinking speed of the other
-        foot is limited.
+        In the mirrored robot the landing foot is the stance foot. The impact changes the twist of this foot to zero, and the
+        joint speeds to the speeds at the start of the next step. The joint impulses are zero. The ground impulse is upwards.
+        The downward speed of the rear foot is limited.
         """
         requirements, program, duration = self.requirements, self.program, self._duration
         q0, v0, q1, v1 = (casadi.SX.sym(name, _N) for name in ("q0", "v0", "q1", "v1"))

@@ -36,7 +36,7 @@ class Body:
     parent: str  # name of the parent link
     joint: int  # index of the joint in JOINTS; -1 for the pelvis, which has no joint
     origin: Vector3  # m, position of the joint in the frame of the parent link
-    yaw: float  # rad, rotation about z of the parent link
+    yaw: float  # rad, angle about the z axis of the parent link, from the parent frame to the link frame at joint angle 0
     axis: Vector3  # joint axis in the frame of the link
     mass: float  # kg
     moment: Vector3  # kg m, mass times position of the centre of mass
@@ -62,13 +62,13 @@ class Frame:
 
 
 def bodies(links: Sequence[Link]) -> tuple[Body, ...]:
-    """Return the pelvis and the twelve moving bodies in the order of `JOINTS`. Fixed links are fused into them.
+    """Return the pelvis and the twelve moving bodies in the order of `JOINTS`. Fixed links are fused into these bodies.
 
     Args:
         links: links of the model, parents first.
 
     Raises:
-        ValueError: If a fixed link is rotated or fixed to another fixed link; both are not supported.
+        ValueError: If a fixed link is rotated, or if it is fixed to another fixed link. Neither is supported.
     """
     carriers = {link.name: link for link in links if link.joint or link.name == BASE_LINK}
     mass = dict.fromkeys(carriers, 0.0)
@@ -105,7 +105,7 @@ def bodies(links: Sequence[Link]) -> tuple[Body, ...]:
 
 
 class Chain:
-    """Chain of bodies from stance foot to swing foot. Its masses and lengths are symbols, so it is valid for every subject.
+    """Chain of bodies from stance foot to swing foot. Masses and lengths are symbols, so the chain is valid for every subject.
 
     Axes and toe-out are constants. Numbers that are zero in the reference robot remain zero, which keeps the expressions small.
     """
@@ -114,7 +114,7 @@ class Chain:
         """Build the chain from a reference robot.
 
         Args:
-            reference: links of the reference robot. They define topology, axes, and which numbers are zero.
+            reference: links of the reference robot. They define the topology, the axes, and the masses and lengths that are zero.
         """
         self.bodies = bodies(reference)
         numbers = _numbers(self.bodies)
@@ -126,7 +126,7 @@ class Chain:
         width = numbers.shape[1]
         self._rows = [casadi.vertcat(*flat[i * width : (i + 1) * width]) for i in range(len(self.bodies))]
         by_name = {named.name: i for i, named in enumerate(self.bodies)}
-        self._route: list[tuple[int, int, bool]] = []  # (body, next body, True if the next body is its parent)
+        self._route: list[tuple[int, int, bool]] = []  # (body, next body, True if the next body is the parent)
         body = by_name[STANCE_FOOT]
         while self.bodies[body].parent:
             parent = by_name[self.bodies[body].parent]
@@ -157,7 +157,8 @@ class Chain:
         unused = np.delete(numbers, self._used)
         if not same or unused.any():
             raise ValueError(
-                "the robot must have the same bodies, joint axes and zero parameters as the reference robot, got others"
+                "the robot must have the bodies and joint axes of the reference robot, and the same parameters must be zero; "
+                "got a different robot"
             )
         return np.asarray(numbers[self._used])
 
@@ -199,8 +200,8 @@ class Chain:
             q: joint angles, SX of shape (12,) [rad].
             qd: joint speeds, SX of shape (12,) [rad/s].
             qdd: joint accelerations, SX of shape (12,) [rad/s2].
-            linear: acceleration of the origin of the stance foot in its axes, with gravity as an upward acceleration [m/s2].
-            angular: angular acceleration of the stance foot in its axes [rad/s2].
+            linear: acceleration of the stance foot origin in the axes of the foot; gravity is an upward acceleration [m/s2].
+            angular: angular acceleration of the stance foot in the axes of the foot [rad/s2].
         """
         omega, alpha, acceleration = {self.root: casadi.SX(3, 1)}, {self.root: angular}, {self.root: linear}
         turns, origins, axes = {}, {}, {}

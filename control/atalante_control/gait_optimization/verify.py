@@ -2,7 +2,7 @@
 
 The verification shares no code with the optimiser. Polynomials are evaluated by de Casteljau's algorithm, and the model is the
 URDF. The pelvis is a floating base. Its motion follows from the stance foot, which is at rest. Torques and ground wrench come
-from recursive Newton-Euler on this base. The impact is computed with the KKT system of the floating robot. The step is sampled
+from the recursive Newton-Euler algorithm. The impact is computed with the KKT system of the floating robot. The step is sampled
 every few milliseconds, which is finer than the nodes of the optimiser.
 """
 
@@ -189,7 +189,7 @@ class Verifier:
         sinking = -min(leaving[2] + np.cross(leaving[3:], corner)[2] for corner in self._corners())
         return [
             *self._landing(motion.q[-1]),
-            GaitCheck("angle jump at the step change", float(np.abs(motion.q[-1] - mirrored_q).max()), _EXACT, "rad"),
+            GaitCheck("angle jump at the stance change", float(np.abs(motion.q[-1] - mirrored_q).max()), _EXACT, "rad"),
             GaitCheck("speed error of the impact map", float(np.abs(after - mirrored_qd).max()), _EXACT, "rad/s"),
             GaitCheck("downward impact impulse", float(-impulse[2]), 0.0, "Ns"),
             GaitCheck("impact impulse beyond friction", sliding, _SLIDING, "Ns"),
@@ -236,7 +236,7 @@ class Verifier:
         return np.asarray(configuration)
 
     def _forward(self) -> Vector:
-        """Return the rotation from the walking frame to the frame of the stance foot, which has the toe-out angle."""
+        """Return the rotation from the walking frame to the frame of the stance foot. Its angle is the toe-out."""
         return np.asarray(pinocchio.utils.rotate("z", self._exo.toe_out))
 
     def _corners(self) -> Vector:

@@ -1,14 +1,9 @@
-r"""Virtual guide filter of the swing leg's SH and SK, with the exact flow of the backup policy.
+"""Virtual guide filter of the coupled sagittal hip and knee (SH, SK) of the swing leg.
 
-`e, e' of both joints -> safe backward image h -> lambda -> u_v`. Each cycle predicts the motion of the two joints under the
-backup policy over the rest of the step, for the worst disturbances. The closer the prediction comes to the guide, the larger is
-the share of the backup policy in the torque. The flow is linear (see `backup_policy`), so the prediction takes a few products
-over the horizon for each joint and both extremes, and no integration. Where the backup policy would saturate the drive, the
-prediction is piecewise (see `kernel`).
-
-The horizon is a fixed grid with at most `points` intervals up to T. It continues with the same spacing for `overlap` after T.
-After T the joint follows the nominal trajectory of the next step, and the guide keeps its last width. Without the overlap the
-prediction in the last cycles would end at T, and any speed would be admitted there (see `certificate`).
+`measured motion -> function h of the safe backward image -> gate -> torques`. In each cycle the filter predicts the motion under
+the backup policy for the next `Assumptions.horizon` cycles, and adds the largest effect of all disturbances. The closer the
+prediction comes to the guide, to the torque limit or to the speed limit, the larger is the share of the backup torque. The two
+joints share one h and one gate, because a torque at one joint accelerates both joints.
 """
 
 from __future__ import annotations
@@ -19,211 +14,276 @@ from dataclasses import dataclass
 import numpy as np
 
 from atalante_control.gait.gait import PERIOD
-from atalante_control.gait.recentering import Deadbeat
-from atalante_control.guide.backup_policy import BackupPolicy, Curve, ForcedResponse, forced_response, free_drift
-from atalante_control.guide.kernel import BOUND, GuideTables, Joint, P, errors_ahead, tick
+from atalante_control.guide.kernel import (
+    BASE,
+    COLUMNS,
+    FLOOR,
+    INVERSE,
+    MASS,
+    NEAR,
+    REFERENCE,
+    SLACK_CYCLES,
+    SPEED,
+    TAIL,
+    TAIL_CYCLES,
+    VELOCITY,
+    Block,
+    Few,
+    Guard,
+    GuideTables,
+    Lag,
+    LegState,
+    tick,
+)
+from atalante_control.guide.prediction import FEW, Prediction
 from atalante_control.guide.shapes import GuideShape
+from atalante_control.joint.idealization import law_of
 from atalante_control.structured import Records, zeros
 from atalante_hal.compiled import specialised
 from atalante_hal.types import Vector
 
 Pair = tuple[float, float]
 
+_SMOOTHED = 11  # number of cycles of the moving mean in `_smoothed`
+#: Fraction of the guide width that must remain at the last predicted cycle, so that the motion stays inside in later cycles.
+_TAIL_MARGIN = 0.03
+
 
 @dataclass(frozen=True)
 class GuideConfig:
-    """Parameters of the guide filter for the two assisted joints, SH then SK.
+    """Parameters of the guide filter that do not depend on gait and gains.
 
     Raises:
-        ValueError: If a disturbance interval does not contain zero, or if a number is out of range.
+        ValueError: If a number is out of range.
     """
 
-    policies: tuple[BackupPolicy, BackupPolicy]
-    disturbance: tuple[tuple[float, float], tuple[float, float]]  # Nm, (u_ext_min, u_ext_max) of each joint
-    points: int = 100  # grid intervals over a step
-    overlap: float = 0.1  # s, length of the prediction beyond the end of the step
+    torque_limit: float  # Nm, largest predicted torque of SH and of SK
+    rate_limit: float  # Nm, largest change of the backup torque within one cycle
+    speed_limit: float  # rad/s, largest predicted speed of SH and of SK
+    worst_speed_limit: float  # rad/s, largest predicted speed for the worst model errors
     zeta: float = 0.01  # s, gain of the derivative term lambda_d
     derivative_time: float = 0.005  # s, time constant of the low-pass filter on dh/dt
-    reserve: float = (
-        0.1  # fraction of the torque limit that the rollouts do not use; compensates for a delay of one cycle
-    )
+    release: float = 0.03  # s, shortest time in which the gate falls from 1 to 0
+    idealization: float = 1.0  # intensity of u_i in [0, 1] while the gate is 0
+    feedforward: float = 0.0  # intensity of u_f in [0, 1] while the gate is 0
 
     def __post_init__(self) -> None:
-        for low, high in self.disturbance:
-            if not (math.isfinite(low) and math.isfinite(high) and low <= 0.0 <= high):
-                raise ValueError(f"disturbance must be (min <= 0, max >= 0) in Nm for each joint, got {(low, high)!r}")
-        if self.points < 2:
-            raise ValueError(f"points must be at least 2, got {self.points!r}")
-        if not 0.0 <= self.reserve < 1.0:
-            raise ValueError(f"reserve must be a fraction of the torque limit in [0, 1), got {self.reserve!r}")
-        for name in ("overlap", "zeta", "derivative_time"):
+        for name in ("torque_limit", "rate_limit", "speed_limit", "worst_speed_limit", "release"):
+            if not (math.isfinite(getattr(self, name)) and getattr(self, name) > 0.0):
+                raise ValueError(f"{name} must be positive and finite, got {getattr(self, name)!r}")
+        for name in ("zeta", "derivative_time"):
             if not (math.isfinite(getattr(self, name)) and getattr(self, name) >= 0.0):
                 raise ValueError(f"{name} must be finite and at least 0 s, got {getattr(self, name)!r}")
+        for name in ("idealization", "feedforward"):
+            if not 0.0 <= getattr(self, name) <= 1.0:
+                raise ValueError(f"intensity of {name} must be between 0 and 1, got {getattr(self, name)!r}")
 
 
 class GuideFilter:
-    """Guide filter of SH and SK for one gait and one shape. By symmetry, the same filter serves both swing legs.
+    """Guide filter of SH and SK for one gait, one shape and one set of gains. By symmetry, it serves both swing legs.
 
-    Call `start_step` at each step change, then `tick` once a cycle.
+    Call `start_step` at each stance change, then `tick` once per cycle.
 
     Attributes:
-        tables: tables of `kernel` for SH and SK; h, gate and guide of `tables.joints` are those of the last tick.
-        nominal: Bezier control points of SH and SK, shape (2, 8) [rad].
-        cycles: cycles of a step.
-        stride: cycles of a grid interval.
-        grid: cycles of the grid points.
-        horizon: cycle at the end of the horizon.
-        time: time of every cycle to the end of the horizon [s].
-        forced: forced responses of SH and SK at `time`, from which P is computed.
+        config: parameters.
+        shape: shape of the guide.
+        prediction: gains, gait and tables of the prediction.
+        tables: tables of `kernel`; the results of the last tick are in `tables.guards`.
+        cycles: number of cycles of a step.
+        time: time since the stance change in each cycle, to the end of the prediction, shape (n,) [s].
     """
 
-    def __init__(
-        self,
-        config: GuideConfig,
-        shape: GuideShape,
-        deadbeat: Deadbeat,
-        nominal: Vector,
-        following: Vector,
-        feedforward: Vector | None = None,
-    ) -> None:
+    def __init__(self, config: GuideConfig, shape: GuideShape, prediction: Prediction, blend: Vector) -> None:
         """Compute the tables that are the same in every step.
 
         Args:
-            config: gains, disturbance bounds and horizon.
+            config: parameters.
             shape: shape of the guide.
-            deadbeat: re-centring of the gait.
-            nominal: Bezier control points of SH and SK of the swing leg, shape (2, 8) [rad].
-            following: Bezier control points of the same joints in the next step, as stance leg, shape (2, 8) [rad].
-            feedforward: Bezier control points of u_f, shape (2, 8) [Nm]; None: no feedforward.
+            prediction: gains, gait and tables of the prediction.
+            blend: smallest gate for each cycle since the stance change, shape (m,).
 
         Raises:
-            ValueError: If a bound of the shape is not finite or too small at a cycle of the step, see `GuideShape.bounds`.
+            ValueError: If a bound of the shape is invalid in a cycle of the step, see `GuideShape.bounds`.
         """
-        self.config, self.shape, self.deadbeat, self.nominal = config, shape, deadbeat, nominal
-        self.cycles = round(deadbeat.duration / PERIOD)
-        self.stride = max(1, -(-self.cycles // config.points))
-        beyond = math.ceil(round(config.overlap / PERIOD) / self.stride) * self.stride
-        self.horizon = self.cycles + beyond
-        self.grid = np.arange(self.cycles % self.stride, self.horizon + 1, self.stride)
-        self.time: Vector = np.arange(self.horizon + 1, dtype=np.float64) * PERIOD
-        shape.check(self.time / deadbeat.duration)
-
-        self.forced: list[ForcedResponse] = []
-        tables = []
-        for joint, policy in enumerate(config.policies):
-            uf = None if feedforward is None else feedforward[joint]
-            curve = Curve(deadbeat, nominal[joint], following[joint], self.time, uf)
-            self.forced.append(forced_response(policy, curve))
-            tables.append(np.concatenate([self.forced[joint], free_drift(policy, curve)], axis=2))
-        #: Terms of the columns P and DRIFT of `step`: nominal, per rad of s(0), per rad/s of s'(0). Shape (3, 2, horizon + 1, 4).
-        self._parts = np.stack(tables, axis=1)
-        first = int(self.grid[0])
-        flow = np.array([_flow(config, joint, self.time) for joint in (0, 1)])
-        self.tables = GuideTables(_joints(config, first, self.stride), flow, np.empty((2, self.horizon + 1, 6)))
+        self.config, self.shape, self.prediction = config, shape, prediction
+        leg = prediction.leg
+        self.cycles, self.time = prediction.cycles, leg.time
+        self._phase = np.minimum(np.arange(len(leg.time)) / self.cycles, 1.0)
+        shape.check(self._phase)
+        self._nominal, self._bases = _reference(prediction)
+        step = np.zeros((len(leg.time), COLUMNS))
+        step[:, MASS : MASS + 3] = prediction.mass.reshape(-1, 4)[:, [0, 1, 3]]
+        step[: len(blend), FLOOR] = blend
+        self.tables = GuideTables(
+            guards=_guards(config, prediction),
+            laws=law_of(leg.friction, leg.inertia),
+            lags=_lags(prediction),
+            blocks=_blocks(prediction),
+            few=_few(prediction),
+            reach=prediction.reach,
+            highest=np.maximum.reduceat(prediction.reach, np.arange(0, len(prediction.ahead), SLACK_CYCLES), axis=1),
+            few_reach=prediction.few_reach,
+            step=step,
+        )
         self.start_step(0.0, (0.0, 0.0), (0.0, 0.0))
-        discarded = self.tables._replace(joints=_joints(config, first, self.stride))
-        self._tick = specialised(tick, discarded, 0, 0.0, 0.0, 0.0, 0.0)
+        discarded = self.tables._replace(guards=self.tables.guards.copy())  # type: ignore[attr-defined]
+        self._tick = specialised(tick, discarded, 0, LegState(*[0.0] * 10))
 
-    def start_step(self, xi: float, deviation: Pair, rate: Pair) -> None:
-        """Start a step: compute the bounds of the guide from Xi, and the forced responses from the deviations.
+    def start_step(self, xi: float, deviation: Pair, rate: Pair, promise: float = 1.0) -> None:
+        """Start a step: compute the guide from Xi, and the reference from the deviations.
 
         Args:
             xi: assistance factor of the whole step.
-            deviation: deviations s(0) of SH and SK at the step change [rad].
-            rate: deviations s'(0) of SH and SK at the step change [rad/s].
+            deviation: deviations s(0) of SH and SK at the stance change [rad].
+            rate: deviations s'(0) of SH and SK at the stance change [rad/s].
+            promise: disturbance that the filter assumes in this step, as a fraction of `Assumptions.promise`.
         """
-        (joints, _, step), (nominal, per_deviation, per_rate) = self.tables, self._parts
-        if xi != joints[0].xi:
-            step[:, :, BOUND:] = self.shape.bounds(self.time / self.deadbeat.duration, xi)
-        moved = per_deviation * np.reshape(deviation, (2, 1, 1)) + per_rate * np.reshape(rate, (2, 1, 1))
-        np.add(moved, nominal, out=step[:, :, :BOUND])
-        for i in (0, 1):
-            joints[i].xi, joints[i].fresh = xi, True
+        guard, step = self.tables.guards[0], self.tables.step
+        if xi != guard.xi:
+            sides = self.shape.bounds(self._phase, xi)
+            inverse = 1.0 / sides.transpose(1, 0, 2).reshape(-1, 4)
+            step[:, INVERSE : INVERSE + 4], step[:, TAIL : TAIL + 4] = inverse, tail(inverse)
+            step[:, NEAR : NEAR + 4] = narrowest(inverse, SLACK_CYCLES)
+        moved = self._bases[0] * np.array(deviation) + self._bases[1] * np.array(rate)
+        for column, values in ((REFERENCE, moved[0]), (VELOCITY, moved[1]), (SPEED, moved[2])):
+            step[:, column : column + 2] = values
+        step[:, BASE : BASE + 2] = (self.prediction.mass @ moved[3, :, :, None])[:, :, 0]
+        for column, values in zip((REFERENCE, VELOCITY, SPEED, BASE), self._nominal, strict=True):
+            step[:, column : column + 2] += values
+        guard.xi, guard.promise, guard.fresh = xi, promise, True
 
-    def tick(self, cycle: int, e_hip: float, ed_hip: float, e_knee: float, ed_knee: float) -> Pair:
-        """Return the guide torques u_v of SH and SK [Nm].
+    def widths(self, xi: float) -> Vector:
+        """Return the distance from q_des to the nearer bound of the guide, for SH and SK in each cycle, shape (n, 2) [rad].
 
         Args:
-            cycle: cycles since the step change; limited to the length of the step.
-            e_hip: q - q_des of SH [rad].
-            ed_hip: q' - q_des' of SH [rad/s].
-            e_knee: q - q_des of SK [rad].
-            ed_knee: q' - q_des' of SK [rad/s].
+            xi: assistance factor in [0, 1].
         """
-        cycle = min(cycle, self.cycles)
-        return self._tick(self.tables, cycle, e_hip, ed_hip, e_knee, ed_knee)
+        return np.asarray(self.shape.bounds(self._phase, xi).min(axis=2).T)
 
-    @property
-    def h(self) -> list[float]:
-        """Return the safe backward image function h of SH and SK at the last tick; it is at least 0 inside the image."""
-        return [float(self.tables.joints[i].h) for i in (0, 1)]
-
-    @property
-    def gates(self) -> list[float]:
-        """Return the weight of the backup torque, lambda + (1 - lambda) lambda_d, of SH and SK at the last tick."""
-        return [float(self.tables.joints[i].gate) for i in (0, 1)]
-
-    @property
-    def bounds(self) -> list[float]:
-        """Return the distances from q_des to the upper and to the lower bound of the guide at the last tick [rad]."""
-        hip = self.tables.joints[0]
-        return [float(hip.upper), float(hip.lower)]
-
-    @property
-    def stepped(self) -> int:
-        """Return the number of rollouts that were computed cycle by cycle because of torque saturation."""
-        return sum(int(self.tables.joints[i].stepped) for i in (0, 1))
-
-    def rollouts(self, cycle: int, e_hip: float, ed_hip: float, e_knee: float, ed_knee: float) -> Vector:
-        """Predict the errors under the unsaturated backup policy at the remaining grid points, from the exact flow.
+    def tick(self, cycle: int, leg: LegState) -> Pair:
+        """Return the torques of SH and SK [Nm].
 
         Args:
-            cycle: cycles since the step change.
-            e_hip: q - q_des of SH [rad].
-            ed_hip: q' - q_des' of SH [rad/s].
-            e_knee: q - q_des of SK [rad].
-            ed_knee: q' - q_des' of SK [rad/s].
-
-        Returns:
-            Largest e and largest -e of SH under the disturbance bounds, then of SK, shape (4, n) [rad].
+            cycle: cycles since the stance change. A number above the length of the step is replaced by this length.
+            leg: measurements of the swing leg.
         """
-        points = self.grid[self.grid >= cycle].tolist()
-        rolled = []
-        for joint, (e, ed) in enumerate(((e_hip, ed_hip), (e_knee, ed_knee))):
-            flow, step = self.tables.flow[joint], self.tables.step[joint]
-            y, yd = e - step[cycle, P], ed - step[cycle, P + 1]
-            rolled.append([errors_ahead(flow[point - cycle], step[point], y, yd) for point in points])
-        return np.array(rolled).swapaxes(1, 2).reshape(4, len(points))
+        return self._tick(self.tables, min(cycle, self.cycles), leg)
 
-    def solution(self) -> Vector:
-        """Return the solution P of this step at every cycle: (e, e') of SH, then of SK. Shape (horizon + 1, 4) [rad, rad/s]."""
-        hip, knee = self.tables.step[:, :, P : P + 2]
-        return np.hstack([hip, knee])
+    @property
+    def state(self) -> Vector:
+        """Return a copy of the state of the sampled loop at the last tick, shape (10,), as defined in `backup_policy`."""
+        return self.tables.guards[0].state.copy()
 
+    def errors_ahead(self) -> Vector:
+        """Return the tracking errors of SH and SK predicted at the last tick without disturbance, shape (n, 2) [rad]."""
+        return np.asarray(self.prediction.ahead @ (self.prediction.compress @ self.state))
 
-def _joints(config: GuideConfig, first: int, stride: int) -> Records[Joint]:
-    """Return the initial records of SH and SK: gains, limits and grid, without the values of a step."""
-    one = np.array([PERIOD])
-    joints: Records[Joint] = zeros(Joint, 2)
-    for i, policy in enumerate(config.policies):
-        joint, (low, high) = joints[i], config.disturbance[i]
-        joint.kp, joint.kd, joint.inertia = policy.kp, policy.kd, policy.inertia
-        joint.limit, joint.counted = policy.torque_limit, (1.0 - config.reserve) * policy.torque_limit
-        joint.up, joint.down = high, low
-        (joint.phi11, joint.phi12), (joint.phi21, joint.phi22) = policy.transition(one)[0]
-        joint.s1, joint.s2 = policy.step_response(one)[0]
-        joint.monotone = all(policy.monotone for policy in config.policies)
-        joint.first, joint.stride = first, stride
-        joint.zeta, joint.smoothing = config.zeta, PERIOD / (config.derivative_time + PERIOD)
-        joint.xi, joint.h, joint.upper, joint.lower = math.nan, 1.0, math.inf, math.inf
-    return joints
+    def uncertainty(self) -> Vector:
+        """Return the largest change of `errors_ahead` by a wrong inertia or delay in the model, shape (n, 2) [rad]."""
+        x = self.state
+        size = np.abs(np.concatenate([x[:2], x[2:4] - x[4:6], x[4:]]))
+        return np.repeat(self.prediction.slack @ size, SLACK_CYCLES, axis=0)[: len(self.prediction.ahead)]
+
+    @property
+    def h(self) -> float:
+        """Return the value of h at the last tick. h is at least 0 if the state of the leg is in the safe backward image."""
+        return float(self.tables.guards[0].h)
+
+    @property
+    def gate(self) -> float:
+        """Return the weight of the backup torque at the last tick."""
+        return float(self.tables.guards[0].gate)
 
 
-def _flow(config: GuideConfig, joint: int, time: Vector) -> Vector:
-    """Return the table `flow` of `kernel` for one joint, shape (n, 9)."""
-    policy, (low, high) = config.policies[joint], config.disturbance[joint]
-    phi, (s, rate) = policy.transition(time), policy.step_response(time).T
-    largest, smallest = policy.disturbance(time, low, high)
-    kp, kd = policy.kp, policy.kd
-    added = kp * largest + kd * high * rate, -(kp * smallest + kd * low * rate)
-    return np.column_stack([phi[:, 0], largest, -smallest, kp * phi[:, 0] + kd * phi[:, 1], *added, s])
+def tail(inverse: Vector) -> Vector:
+    """Return 1 / width of the narrowest guide between each cycle and `TAIL_CYCLES` cycles later, increased by a margin.
+
+    Args:
+        inverse: 1 / distance to the guide for each cycle, shape (n, m) [1/rad].
+    """
+    return (1.0 + _TAIL_MARGIN) * narrowest(inverse, TAIL_CYCLES + 1)
+
+
+def narrowest(inverse: Vector, cycles: int) -> Vector:
+    """Return 1 / width of the narrowest guide in each cycle and the following cycles.
+
+    Args:
+        inverse: 1 / distance to the guide for each cycle, shape (n, m) [1/rad]; the last row applies to all later cycles.
+        cycles: number of cycles, including the first one.
+    """
+    padded = np.concatenate([inverse, np.repeat(inverse[-1:], cycles - 1, axis=0)])
+    windows = np.lib.stride_tricks.sliding_window_view(padded, cycles, axis=0)
+    return np.asarray(windows.max(axis=-1))
+
+
+def _lags(prediction: Prediction) -> Records[Lag]:
+    """Return the prediction for each number of cycles ahead."""
+    lags = zeros(Lag, len(prediction.ahead))
+    lags["ahead"] = prediction.ahead.swapaxes(1, 2)
+    return lags
+
+
+def _blocks(prediction: Prediction) -> Records[Block]:
+    """Return the bounds of the prediction for each block of cycles ahead."""
+    blocks, starts = zeros(Block, len(prediction.slack)), np.arange(0, len(prediction.ahead), SLACK_CYCLES)
+    high, low = (extreme.reduceat(prediction.ahead, starts).swapaxes(1, 2) for extreme in (np.maximum, np.minimum))
+    blocks["slack"] = prediction.slack.swapaxes(1, 2)
+    blocks["middle"], blocks["spread"] = 0.5 * (high + low), 0.5 * (high - low)
+    return blocks
+
+
+def _few(prediction: Prediction) -> Records[Few]:
+    """Return the prediction of torque and speed for each number of cycles in `FEW`."""
+    rows = zeros(Few, len(FEW))
+    rows["lag"], rows["slack"] = FEW, prediction.few_slack.swapaxes(1, 2)
+    rows["ahead"] = prediction.few_ahead.swapaxes(1, 2)
+    return rows
+
+
+def _guards(config: GuideConfig, prediction: Prediction) -> Records[Guard]:
+    """Return the initial record of the filter, shape (1,): gains and limits, without the values of a step."""
+    guards: Records[Guard] = zeros(Guard, 1)
+    guard, loop = guards[0], prediction.assumptions.loop
+    guard.gains[:] = np.hstack(prediction.policy.gains())
+    guard.compression[:], guard.few_slack[:] = prediction.compress, prediction.few_slack.max(axis=0).T
+    guard.torque_limit, guard.speed_limit = config.torque_limit, config.speed_limit
+    guard.worst_speed_limit = config.worst_speed_limit
+    guard.tracking, guard.keep = loop.tracking, loop.keep
+    guard.zeta, guard.smoothing = config.zeta, PERIOD / (config.derivative_time + PERIOD)
+    guard.release = PERIOD / config.release
+    guard.idealization, guard.feedforward = config.idealization, config.feedforward
+    guard.xi, guard.h, guard.bounds[:] = math.nan, 1.0, math.inf
+    return guards
+
+
+def _reference(prediction: Prediction) -> tuple[list[Vector], Vector]:
+    """Return the reference of the step without re-centring, and the change of the reference by the re-centring.
+
+    Returns:
+        The reference: acceleration (ahead by the command lag), velocity behind the low-pass of the drives, velocity, and torque;
+        each of shape (n, 2). The change for s(0) = 1 rad and for s'(0) = 1 rad/s: acceleration (ahead by the command lag),
+        velocity behind the low-pass, velocity, and acceleration; shape (2, 4, n, 1).
+    """
+    leg, loop = prediction.leg, prediction.assumptions.loop
+    time, lag = leg.time, loop.command_lag
+    values, slopes, curvatures = leg.deadbeat.basis(time)
+    # The acceleration of the re-centring ends with a jump. The moving mean prevents a jump of the torque.
+    ahead = [_smoothed(row) for row in leg.deadbeat.basis(time + lag)[2]]
+    bases = np.stack([[ahead[i], _measured(values[i], slopes[i], loop.keep), slopes[i], curvatures[i]] for i in (0, 1)])
+    acceleration = np.stack([np.interp(time + lag, time, leg.qdd[:, i]) for i in (0, 1)], axis=1)
+    velocity = np.stack([_measured(leg.q[:, i], leg.qd[:, i], loop.keep) for i in (0, 1)], axis=1)
+    return [acceleration, velocity, leg.qd, prediction.torque], bases[:, :, :, None]
+
+
+def _smoothed(row: Vector) -> Vector:
+    """Return the mean of `_SMOOTHED` values around each value, shape (n,)."""
+    padded = np.pad(row, _SMOOTHED // 2, mode="edge")
+    return np.convolve(padded, np.full(_SMOOTHED, 1.0 / _SMOOTHED), mode="valid")
+
+
+def _measured(value: Vector, slope: Vector, keep: float) -> Vector:
+    """Return the velocity that a drive would measure along a trajectory, shape (n,). The first value is the true velocity."""
+    result = slope.copy()
+    for i in range(1, len(value)):
+        result[i] = keep * result[i - 1] + (1.0 - keep) * (value[i] - value[i - 1]) / PERIOD
+    return result

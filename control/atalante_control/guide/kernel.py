@@ -1,113 +1,376 @@
-"""Compiled cycle of the virtual guide filter: compute h, then lambda, then u_v of a joint from e, e' and the step tables.
+"""Compiled cycle of the virtual guide filter: measured motion -> h -> gate -> torques of sagittal hip and knee (SH, SK).
 
-`GuideFilter` prepares the tables and runs `tick` compiled. The flow of the backup policy is linear as long as its torque is
-within the limit of the drive (`_linear`). Beyond the limit the rollout is computed cycle by cycle (`limited`): the torque is
-constant, and the error is a known drift plus a parabola. When the torque is within the limit again, the flow is linear.
-
-`GuideTables` names the tables, `Joint` the constants and results of a joint.
+`GuideFilter` prepares the tables and runs the compiled `tick`. A tick estimates the state of the sampled loop (`_estimate`),
+predicts errors, torques and speeds under the backup policy (`largest_ratio`), and blends the torque of the free motion with the
+backup torque.
 """
 
 from __future__ import annotations
 
-import math
-from typing import NamedTuple
+from typing import Annotated, NamedTuple
 
 from atalante_control.gait.gait import PERIOD
+from atalante_control.guide.backup_policy import STATES
+from atalante_control.joint.idealization import Law, idealization, mass
 from atalante_control.structured import Records
 from atalante_hal.types import Vector
 
 Pair = tuple[float, float]
 
+#: Slope of the line that maps torque / limit and speed / limit to the ratio of `largest_ratio`; 1 is mapped to 1.
+#: The gait alone needs a large part of both limits, so the gate must rise only when torque or speed is near its limit.
+STEEPNESS = 4.0
+#: Number of elements of the compressed state, from which the predicted errors are computed.
+COMPRESSED = 5
+#: Number of consecutive predicted cycles that share one bound of the model errors in `Block.slack`.
+SLACK_CYCLES = 10
+#: Predictions that start in one block of this many cycles share one bound of the disturbances in `GuideTables.reach`.
+START_CYCLES = 4
 
-class Joint:
-    """Data of one assisted joint: constants, values of the step, and results of the last tick."""
 
-    kp: float  # Nm/rad, Kp of the backup policy
-    kd: float  # Nm s/rad, Kd of the backup policy
-    inertia: float  # kg m2
-    limit: float  # Nm, torque limit of the backup policy
-    counted: float  # Nm, torque limit in the rollouts: `limit` minus the reserve
-    up: float  # Nm, u_ext_max
-    down: float  # Nm, u_ext_min
-    phi11: float  # error after one cycle per unit of e
-    phi12: float  # s, error after one cycle per unit of e'
-    phi21: float  # 1/s, rate of the error after one cycle per unit of e
-    phi22: float  # rate of the error after one cycle per unit of e'
-    s1: float  # rad/Nm, error after one cycle per unit of disturbance
-    s2: float  # rad/(Nm s), rate of the error after one cycle per unit of disturbance
-    monotone: bool  # see `BackupPolicy.monotone`
-    first: int  # cycle of the first point of the grid
-    stride: int  # cycles between two points of the grid
+class Guard:
+    """Constants and state of the filter, and results of the last tick."""
+
+    gains: Annotated[Vector, (2, 4)]  # rows SH, SK; Kv [1/s2] in columns 0 and 1, Dv [1/s] in columns 2 and 3
+    torque_limit: float  # Nm, largest predicted torque
+    speed_limit: float  # rad/s, largest predicted speed of a joint
+    worst_speed_limit: float  # rad/s, largest predicted speed of a joint for the worst model errors
+    tracking: float  # share of a commanded torque change that a motor reaches within one cycle
+    keep: float  # weight of the old value in the low-pass of the measured velocity
     zeta: float  # s, gain of the derivative term lambda_d
     smoothing: float  # weight of the new value in the low-pass filter of dh/dt
+    release: float  # largest decrease of the gate per cycle; without this limit the gate could oscillate with the leg
+    idealization: float  # intensity of u_i in [0, 1]
+    feedforward: float  # intensity of u_f in [0, 1]
+    promise: float  # disturbance that the filter assumes in this step, as a fraction of `Assumptions.promise`
     xi: float  # assistance factor of the step
-    fresh: bool  # true before the first tick of a step, when dh/dt is not defined
-    h: float  # safe backward image function
+    fresh: bool  # true before the first tick of a step
+    motor: Annotated[Vector, 2]  # Nm, estimated torques of the motors
+    lag: Annotated[Vector, 2]  # rad/s, estimated true velocity minus measured velocity
+    state: Annotated[Vector, STATES]  # state of the last tick, see `backup_policy`
+    #: absolute value of each element of `state`; for e', of the difference between true and measured e'
+    magnitude: Annotated[Vector, STATES]
+    compression: Annotated[Vector, (COMPRESSED, STATES)]  # state -> compressed state
+    compressed: Annotated[Vector, COMPRESSED]  # compressed state of the last tick
+    few_slack: Annotated[Vector, (STATES, 2)]  # largest `Few.slack` of all rows
+    h: float  # at least 0 inside the safe backward image
     rate: float  # 1/s, dh/dt
     gate: float  # weight of the backup torque, lambda + (1 - lambda) lambda_d
-    upper: float  # rad, distance from q_des to the upper bound of the guide
-    lower: float  # rad, distance from q_des to the lower bound of the guide
-    stepped: int  # number of rollouts computed cycle by cycle
+    bounds: Annotated[Vector, 4]  # rad, distances from q_des to the guide: upper and lower of SH, upper and lower of SK
+
+
+class Lag:
+    """Prediction of the errors at one number of cycles ahead. A field with a fixed shape makes the compiled loops fast."""
+
+    ahead: Annotated[Vector, (COMPRESSED, 2)]  # compressed state -> predicted errors e of SH and SK [rad]
+
+
+class Block:
+    """Bounds of the prediction for `SLACK_CYCLES` consecutive cycles ahead."""
+
+    #: largest change of the predicted errors of SH and SK by model errors, per unit of each element of `Guard.magnitude`
+    slack: Annotated[Vector, (STATES, 2)]
+    middle: Annotated[Vector, (COMPRESSED, 2)]  # middle of the range of `Lag.ahead` in the block
+    spread: Annotated[Vector, (COMPRESSED, 2)]  # largest absolute difference of `Lag.ahead` from `middle` in the block
+    ratio: float  # ratio that no cycle of the block exceeds, at the last tick
+
+
+class Few:
+    """Prediction of torque and speed at one number of cycles ahead."""
+
+    lag: int  # number of cycles ahead
+    #: state -> predicted feedback [rad/s2] of SH and SK, predicted e' [rad/s] of SH and SK
+    ahead: Annotated[Vector, (STATES, 4)]
+    #: largest change of e' ahead by model errors, per unit of each element of `Guard.magnitude`
+    slack: Annotated[Vector, (STATES, 2)]
 
 
 class GuideTables(NamedTuple):
-    """Tables of the guide filter for SH and SK of the swing leg, index 0 and 1 of the first axis."""
+    """Tables of the guide filter. `GuideFilter` owns them; `tick` writes to `guards` and to `Block.ratio` only."""
 
-    joints: Records[Joint]  # (2,) data of SH and SK; `tick` writes its results to them
-    flow: Vector  # (2, horizon + 1, 9) flow of the backup policy, a row for each cycle ahead; columns: ERROR to STEADY below
-    step: Vector  # (2, horizon + 1, 6) a row for each cycle since the step change; columns: P, DRIFT and BOUND below
-
-
-ERROR = 0  # columns 0 and 1 of `flow`: predicted error per unit of e and per unit of e'
-ERROR_ADDED = 2  # columns 2 and 3 of `flow`: largest error that the disturbance adds, up and down [rad]
-TORQUE = 4  # columns 4 and 5 of `flow`: predicted Kp e + Kd e' per unit of e and per unit of e'
-TORQUE_ADDED = 6  # columns 6 and 7 of `flow`: largest torque that the disturbance adds, up and down [Nm]
-STEADY = 8  # column 8 of `flow`: error caused by a constant disturbance of 1 Nm [rad/Nm]
-P = 0  # columns 0 and 1 of `step`: solution P of the undisturbed loop and its rate [rad, rad/s]
-DRIFT = 2  # columns 2 and 3 of `step`: error without backup torque and its rate [rad, rad/s]
-BOUND = 4  # columns 4 and 5 of `step`: distance from q_des to the guide, upper and lower [rad]
-
-#: Any limit above 1 gives the same lambda. With 2.0, h = 1 - (|e| / q_bound)^2 is still exact down to -3.
-_HOPELESS = 2.0  # a prediction ends early at this |e| / q_bound, because lambda is 1 for every value above 1
+    guards: Records[Guard]  # (1,)
+    laws: Records[Law]  # (1,) mass matrix and friction
+    lags: Records[Lag]  # (lags,)
+    blocks: Records[Block]  # (blocks,)
+    few: Records[Few]  # (rows,) in ascending order of `Few.lag`
+    reach: Vector  # (starts, lags, 4) errors [rad] of SH and SK by the budget, then of SH and SK by the chosen promise
+    highest: Vector  # (starts, blocks, 4) largest `reach` of each block
+    #: (starts, rows, 12) torques [Nm] and speeds [rad/s] of SH and SK by the budget, then the same by the chosen promise,
+    #: then worst speeds by the budget and by the chosen promise
+    few_reach: Vector
+    step: Vector  # (horizon + 1, COLUMNS) values of each cycle of the step; the constants below are the column numbers
 
 
-def tick(guide: GuideTables, cycle: int, e_hip: float, ed_hip: float, e_knee: float, ed_knee: float) -> Pair:
-    """Compute the guide torques u_v of SH and SK for one cycle.
+INVERSE = 0  # columns 0 to 3 of `step`: 1 / distance to the upper and lower bound of SH, then of SK [1/rad]
+REFERENCE = 4  # columns 4 and 5: acceleration of q_des, ahead by the command lag of the sampled loop [rad/s2]
+VELOCITY = 6  # columns 6 and 7: velocity of q_des behind the low-pass of the drives [rad/s]
+BASE = 8  # columns 8 and 9: torque that the leg needs along q_des [Nm]
+MASS = 10  # columns 10 to 12: M11, M12 and M22 along q_des [kg m2]
+SPEED = 13  # columns 13 and 14: velocity of q_des [rad/s]
+#: Column 15: smallest gate. It is 1 at the start of a step, where the filter takes over from the baseline controller.
+FLOOR = 15
+TAIL = 16  # columns 16 to 19: as columns 0 to 3, for the narrowest guide in the next `TAIL_CYCLES` cycles [1/rad]
+NEAR = 20  # columns 20 to 23: as columns 0 to 3, for the narrowest guide in this and the next `SLACK_CYCLES` - 1 cycles [1/rad]
+COLUMNS = 24
+#: Number of cycles after the last predicted cycle in which the guide may become narrower while the free motion decays.
+TAIL_CYCLES = 60
+
+
+class LegState(NamedTuple):
+    """Measurements of SH and SK of the swing leg in one cycle."""
+
+    hip: float  # rad, q of SH
+    knee: float  # rad, q of SK
+    hip_rate: float  # rad/s, measured velocity of SH
+    knee_rate: float  # rad/s, measured velocity of SK
+    hip_desired: float  # rad, q_des of SH
+    knee_desired: float  # rad, q_des of SK
+    hip_sent: float  # Nm, command of the previous cycle to SH, after the limiter
+    knee_sent: float  # Nm, command of the previous cycle to SK, after the limiter
+    hip_gravity: float  # Nm, u_g of SH
+    knee_gravity: float  # Nm, u_g of SK
+
+
+def leg_state(hip: int, q: Vector, qd: Vector, desired: Vector, sent: Vector, gravity: Pair) -> LegState:
+    """Return the measurements of the swing leg.
 
     Args:
-        guide: tables of the guide filter; the results of the tick are written to `joints`.
-        cycle: cycles since the step change, at most the length of the step.
-        e_hip: q - q_des of SH [rad].
-        ed_hip: q' - q_des' of SH [rad/s].
-        e_knee: q - q_des of SK [rad].
-        ed_knee: q' - q_des' of SK [rad/s].
-
-    Returns:
-        u_v of SH and SK [Nm].
+        hip: index of SH of the swing leg in JOINTS; SK is the next joint.
+        q: joint angles, shape (12,) [rad].
+        qd: joint speeds, shape (12,) [rad/s].
+        desired: q_des in its first 12 elements [rad].
+        sent: torques sent in the last cycle, shape (12,) [Nm].
+        gravity: gravity torques of SH and SK [Nm].
     """
-    return (
-        _act(guide.joints[0], guide.flow[0], guide.step[0], cycle, e_hip, ed_hip),
-        _act(guide.joints[1], guide.flow[1], guide.step[1], cycle, e_knee, ed_knee),
+    knee = hip + 1
+    return LegState(
+        q[hip],
+        q[knee],
+        qd[hip],
+        qd[knee],
+        desired[hip],
+        desired[knee],
+        sent[hip],
+        sent[knee],
+        gravity[0],
+        gravity[1],
     )
 
 
-def _act(joint: Joint, flow: Vector, step: Vector, cycle: int, e: float, ed: float) -> float:
-    ratio = _largest_ratio(joint, flow, step, cycle, e, ed)
+def tick(guide: GuideTables, cycle: int, leg: LegState) -> Pair:
+    """Compute the torques of SH and SK for one cycle: (1 - gate) u_free + gate u_B.
+
+    Args:
+        guide: tables of the guide filter; the results of the tick are written to `GuideTables.guards`.
+        cycle: cycles since the stance change, at most the length of the step.
+        leg: measurements of the swing leg.
+
+    Returns:
+        Torques of SH and SK [Nm].
+    """
+    guard, law, now = guide.guards[0], guide.laws[0], guide.step[cycle]
+    u_hip, u_knee = idealization(law, leg.knee, leg.hip_rate, leg.knee_rate, (leg.hip_gravity, leg.knee_gravity))
+    m11, m12, m22 = mass(law.fit, leg.knee)
+    _estimate(guard, guide.step, cycle, leg, (m11, m12, m22), (u_hip, u_knee))
+    x = guard.state
+
+    ratio = largest_ratio(guide, cycle)
     h, rate = 1.0 - ratio * ratio, 0.0
-    if not joint.fresh:
-        rate = joint.rate + joint.smoothing * ((h - joint.h) / PERIOD - joint.rate)
-    weight = damped_gate(gate(h, joint.xi), rate, joint.zeta)
-    joint.h, joint.rate, joint.gate, joint.fresh = h, rate, weight, False
-    joint.upper, joint.lower = step[cycle, BOUND], step[cycle, BOUND + 1]
-    u, limit = -joint.kp * e - joint.kd * ed, joint.limit
-    return weight * float(limit if u > limit else -limit if u < -limit else u)
+    if not guard.fresh:
+        rate = guard.rate + guard.smoothing * ((h - guard.h) / PERIOD - guard.rate)
+    weight = max(damped_gate(gate(h, guard.xi), rate, guard.zeta), now[FLOOR])
+    if not guard.fresh:
+        weight = max(weight, guard.gate - guard.release)
+    guard.h, guard.rate, guard.gate, guard.fresh = h, rate, weight, False
+    for side in range(4):
+        guard.bounds[side] = 1.0 / now[INVERSE + side]
+
+    k, free, share = (
+        guard.gains,
+        guard.feedforward * (1.0 - weight) + weight,
+        guard.idealization * (1.0 - weight) + weight,
+    )
+    hip = free * now[REFERENCE] - weight * (k[0, 0] * x[0] + k[0, 1] * x[1] + k[0, 2] * x[4] + k[0, 3] * x[5])
+    knee = free * now[REFERENCE + 1] - weight * (k[1, 0] * x[0] + k[1, 1] * x[1] + k[1, 2] * x[4] + k[1, 3] * x[5])
+    return share * u_hip + m11 * hip + m12 * knee, share * u_knee + m12 * hip + m22 * knee
+
+
+def _estimate(guard: Guard, step: Vector, cycle: int, leg: LegState, m: tuple[float, float, float], u: Pair) -> None:
+    """Estimate the state of the sampled loop and write it into `Guard.state`.
+
+    The measured velocity lags behind the true velocity. The lag caused by the sent torques is known. The lag caused by the
+    disturbance is part of `GuideTables.reach`.
+    """
+    x, now, last = guard.state, step[cycle], step[cycle - 1 if cycle else 0]
+    if guard.fresh:
+        guard.motor[0], guard.motor[1] = leg.hip_sent, leg.knee_sent
+        guard.lag[0], guard.lag[1] = 0.0, 0.0
+    x[0], x[1] = leg.hip - leg.hip_desired, leg.knee - leg.knee_desired
+    x[4], x[5] = leg.hip_rate - now[VELOCITY], leg.knee_rate - now[VELOCITY + 1]
+    x[2], x[3] = x[4] + guard.lag[0], x[5] + guard.lag[1]
+    x[6], x[7] = _acceleration(guard.motor[0] - u[0], guard.motor[1] - u[1], m, last)
+    x[8], x[9] = _acceleration(leg.hip_sent - u[0], leg.knee_sent - u[1], m, last)
+    guard.motor[0] += guard.tracking * (leg.hip_sent - guard.motor[0])
+    guard.motor[1] += guard.tracking * (leg.knee_sent - guard.motor[1])
+    hip, knee = _acceleration(guard.motor[0] - u[0], guard.motor[1] - u[1], m, last)
+    half = 0.5 * PERIOD * (1.0 + guard.keep)
+    guard.lag[0] = guard.keep * guard.lag[0] + half * hip
+    guard.lag[1] = guard.keep * guard.lag[1] + half * knee
+
+
+def _acceleration(hip: float, knee: float, m: tuple[float, float, float], row: Vector) -> Pair:
+    """Return the acceleration of the tracking error e under torques u of SH and SK, M^-1 u - q_des'' [rad/s2]."""
+    m11, m12, m22 = m
+    determinant = m11 * m22 - m12 * m12
+    return (m22 * hip - m12 * knee) / determinant - row[REFERENCE], (m11 * knee - m12 * hip) / determinant - row[
+        REFERENCE + 1
+    ]
+
+
+def largest_ratio(guide: GuideTables, cycle: int) -> float:
+    """Return the largest predicted ratio of error / width, torque / limit and speed / limit under backup policy and disturbances.
+
+    Args:
+        guide: tables of the guide filter; `Guard.state` must contain the state of the current cycle.
+        cycle: cycles since the stance change.
+    """
+    guard = guide.guards[0]
+    x, y, size = guard.state, guard.compressed, guard.magnitude
+    for column in range(STATES):
+        size[column] = abs(x[column] - x[column + 2] if 2 <= column < 4 else x[column])
+    for i in range(COMPRESSED):
+        total = 0.0
+        for column in range(STATES):
+            total += guard.compression[i, column] * x[column]
+        y[i] = total
+    ratio = _error_ratio(guide, cycle)
+    return max(ratio, _few_ratio(guide, cycle, ratio))
+
+
+def _error_ratio(guide: GuideTables, cycle: int) -> float:
+    """Return the largest predicted ratio of error / width.
+
+    Most cycles ahead need not be predicted. `bound_blocks` computes a ratio for each block that no cycle of the block exceeds.
+    The block with the largest bound is predicted first. A block whose bound is at most the largest ratio found so far cannot
+    contain a larger ratio.
+    """
+    guard, step, reach = guide.guards[0], guide.step, guide.reach[cycle // START_CYCLES]
+    promise, size, y0, y1, y2, y3, y4 = guard.promise, guard.magnitude, *_compressed(guard)
+    lags = min(len(guide.lags), len(step) - cycle)
+    blocks = (lags + SLACK_CYCLES - 1) // SLACK_CYCLES
+    first, worst = bound_blocks(guide, cycle, blocks), 0.0
+    for number in range(-1, blocks):
+        at = first if number < 0 else number
+        block, last = guide.blocks[at], at == blocks - 1
+        if number >= 0 and (number == first or (block.ratio <= worst and not last)):
+            continue
+        hip_slack = knee_slack = e_hip = e_knee = d_hip = d_knee = 0.0
+        for column in range(STATES):
+            hip_slack += block.slack[column, 0] * size[column]
+            knee_slack += block.slack[column, 1] * size[column]
+        for lag in range(at * SLACK_CYCLES, min((at + 1) * SLACK_CYCLES, lags)):
+            row, width, added = guide.lags[lag].ahead, step[cycle + lag], reach[lag]
+            e_hip = row[0, 0] * y0 + row[1, 0] * y1 + row[2, 0] * y2 + row[3, 0] * y3 + row[4, 0] * y4
+            e_knee = row[0, 1] * y0 + row[1, 1] * y1 + row[2, 1] * y2 + row[3, 1] * y3 + row[4, 1] * y4
+            d_hip = hip_slack + added[0] + promise * added[2]
+            d_knee = knee_slack + added[1] + promise * added[3]
+            worst = max(worst, (d_hip + e_hip) * width[INVERSE], (d_hip - e_hip) * width[INVERSE + 1])
+            worst = max(worst, (d_knee + e_knee) * width[INVERSE + 2], (d_knee - e_knee) * width[INVERSE + 3])
+        if last:
+            width = step[cycle + lags - 1]
+            worst = max(worst, (d_hip + e_hip) * width[TAIL], (d_hip - e_hip) * width[TAIL + 1])
+            worst = max(worst, (d_knee + e_knee) * width[TAIL + 2], (d_knee - e_knee) * width[TAIL + 3])
+    return worst
+
+
+def _compressed(guard: Guard) -> tuple[float, float, float, float, float]:
+    """Return the elements of the compressed state."""
+    y = guard.compressed
+    return y[0], y[1], y[2], y[3], y[4]
+
+
+def bound_blocks(guide: GuideTables, cycle: int, blocks: int) -> int:
+    """Compute `Block.ratio` of each block, and return the number of the block with the largest one.
+
+    In a block, a predicted error differs from `Block.middle` times the compressed state y by at most `Block.spread` times abs(y).
+    The disturbances add at most `GuideTables.highest`, and no width is below the one of the columns `NEAR`.
+
+    Args:
+        guide: tables of the guide filter; `Guard.magnitude` and `Guard.compressed` must belong to the current cycle.
+        cycle: cycles since the stance change.
+        blocks: number of blocks.
+    """
+    guard, highest, promise = guide.guards[0], guide.highest[cycle // START_CYCLES], guide.guards[0].promise
+    y, size = guard.compressed, guard.magnitude
+    first, most = 0, -1.0
+    for number in range(blocks):
+        block, added, width = guide.blocks[number], highest[number], guide.step[cycle + number * SLACK_CYCLES]
+        d_hip, d_knee = added[0] + promise * added[2], added[1] + promise * added[3]
+        e_hip = e_knee = 0.0
+        for column in range(STATES):
+            d_hip += block.slack[column, 0] * size[column]
+            d_knee += block.slack[column, 1] * size[column]
+        for i in range(COMPRESSED):
+            e_hip += block.middle[i, 0] * y[i]
+            e_knee += block.middle[i, 1] * y[i]
+            d_hip += block.spread[i, 0] * abs(y[i])
+            d_knee += block.spread[i, 1] * abs(y[i])
+        bound = max((d_hip + e_hip) * width[NEAR], (d_hip - e_hip) * width[NEAR + 1])
+        bound = max(bound, (d_knee + e_knee) * width[NEAR + 2], (d_knee - e_knee) * width[NEAR + 3])
+        block.ratio = bound
+        if bound > most:
+            first, most = number, bound
+    return first
+
+
+def _few_ratio(guide: GuideTables, cycle: int, least: float) -> float:
+    """Return the larger of the predicted torque / limit and speed / limit, mapped by the slope `STEEPNESS` (1 is mapped to 1).
+
+    Args:
+        guide: tables of the guide filter.
+        cycle: cycles since the stance change.
+        least: ratio below which the result need not be exact; the result is then below this ratio, too.
+    """
+    guard, step, reach = guide.guards[0], guide.step, guide.few_reach[cycle // START_CYCLES]
+    x, size, promise = guard.state, guard.magnitude, guard.promise
+    torque = speed = worst = hip_most = knee_most = 0.0
+    known = guard.worst_speed_limit * (1.0 - (1.0 - least) / STEEPNESS)
+    for column in range(STATES):
+        hip_most += guard.few_slack[column, 0] * size[column]
+        knee_most += guard.few_slack[column, 1] * size[column]
+    for i in range(len(guide.few)):
+        few = guide.few[i]
+        at = cycle + few.lag
+        if at >= len(step):
+            break
+        now, added = step[at], reach[i]
+        a_hip = a_knee = v_hip = v_knee = 0.0
+        for column in range(STATES):
+            a_hip += few.ahead[column, 0] * x[column]
+            a_knee += few.ahead[column, 1] * x[column]
+            v_hip += few.ahead[column, 2] * x[column]
+            v_knee += few.ahead[column, 3] * x[column]
+        hip = now[BASE] + now[MASS] * a_hip + now[MASS + 1] * a_knee
+        knee = now[BASE + 1] + now[MASS + 1] * a_hip + now[MASS + 2] * a_knee
+        torque = max(torque, abs(hip) + added[0] + promise * added[4], abs(knee) + added[1] + promise * added[5])
+        v_hip, v_knee = abs(v_hip + now[SPEED]), abs(v_knee + now[SPEED + 1])
+        speed = max(speed, v_hip + added[2] + promise * added[6], v_knee + added[3] + promise * added[7])
+        v_hip, v_knee = v_hip + added[8] + promise * added[10], v_knee + added[9] + promise * added[11]
+        if max(v_hip + hip_most, v_knee + knee_most) > max(worst, known):
+            hip_slack = knee_slack = 0.0
+            for column in range(STATES):
+                hip_slack += few.slack[column, 0] * size[column]
+                knee_slack += few.slack[column, 1] * size[column]
+            worst = max(worst, v_hip + hip_slack, v_knee + knee_slack)
+    largest = max(torque / guard.torque_limit, speed / guard.speed_limit, worst / guard.worst_speed_limit)
+    return 1.0 - STEEPNESS * (1.0 - largest)
 
 
 def gate(h: float, xi: float) -> float:
-    """Return lambda of the paper, (1 + (Xi^10 - 1) h)^3, clamped to [0, 1]; 1 outside the safe backward image.
+    """Return the gate lambda of the paper, (1 + (Xi^10 - 1) h)^3, clamped to [0, 1]; 1 outside the safe backward image.
 
     Args:
-        h: safe backward image function, at most 1.
+        h: function that is at least 0 inside the safe backward image, at most 1.
         xi: assistance factor in [0, 1].
     """
     if h <= 0.0:
@@ -128,96 +391,3 @@ def damped_gate(gate: float, rate: float, zeta: float) -> float:
     if damping <= 0.0:
         return gate
     return gate + (1.0 - gate) * damping if damping < 1.0 else 1.0
-
-
-def _largest_ratio(joint: Joint, flow: Vector, step: Vector, cycle: int, e: float, ed: float) -> float:
-    """Return the largest |e| / q_bound of this cycle and of the predictions under both extreme disturbances.
-
-    There is a rollout for each bound of the guide. It is computed cycle by cycle only if the drive saturates while it pushes the
-    joint away from this bound. If a monotone loop saturates in the other direction, its error stays below that of the linear
-    rollout, which is then used.
-    """
-    worst = float(e / step[cycle, BOUND] if e > 0.0 else -e / step[cycle, BOUND + 1])
-    asked = (joint.kp * e + joint.kd * ed) / joint.counted
-    ratios, torques = _linear(joint, flow, step, cycle, e, ed)
-    for side in range(2):
-        against = abs(asked) if not joint.monotone else -asked if side else asked
-        if against > 1.0 or torques[side] > 1.0:
-            joint.stepped += 1
-            worst = max(worst, limited(joint, flow, step, side, cycle, e, ed))
-        else:
-            worst = max(worst, ratios[side])
-    return worst
-
-
-def _linear(joint: Joint, flow: Vector, step: Vector, cycle: int, e: float, ed: float) -> tuple[Pair, Pair]:
-    """Return the largest |e| / q_bound and the largest torque / `Joint.counted` of the linear rollouts.
-
-    Each result is a pair: the value under the upper extreme disturbance, then the value under the lower one.
-    """
-    kp, kd, monotone = joint.kp, joint.kd, joint.monotone
-    y, yd = e - step[cycle, P], ed - step[cycle, P + 1]
-    above = below = torque_above = torque_below = -math.inf
-    first = cycle + int((joint.first - cycle) % joint.stride)
-    for point in range(first, len(step), joint.stride):
-        now, ahead = step[point], flow[point - cycle]
-        e_up, e_down = errors_ahead(ahead, now, y, yd)
-        torque = ahead[TORQUE] * y + ahead[TORQUE + 1] * yd + kp * now[P] + kd * now[P + 1]
-        up, down = torque + ahead[TORQUE_ADDED], ahead[TORQUE_ADDED + 1] - torque
-        if not monotone:
-            up, down = abs(up), abs(down)
-        above, below = max(above, e_up / now[BOUND]), max(below, e_down / now[BOUND + 1])
-        torque_above, torque_below = max(torque_above, up), max(torque_below, down)
-    return (above, below), (torque_above / joint.counted, torque_below / joint.counted)
-
-
-def errors_ahead(flow: Vector, step: Vector, y: float, yd: float) -> Pair:
-    """Return the largest e and the largest -e of a linear rollout at a point ahead [rad].
-
-    Args:
-        flow: row of `flow` for the number of cycles to the point.
-        step: row of `step` of the point.
-        y: e - P at the start of the rollout [rad].
-        yd: e' - P' at the start of the rollout [rad/s].
-    """
-    error = flow[ERROR] * y + flow[ERROR + 1] * yd + step[P]
-    return error + flow[ERROR_ADDED], flow[ERROR_ADDED + 1] - error
-
-
-def limited(joint: Joint, flow: Vector, step: Vector, side: int, cycle: int, e: float, ed: float) -> float:
-    """Return the largest |e| / q_bound of a rollout in which the drive saturates.
-
-    Args:
-        joint: record of the joint.
-        flow: table `flow` of the joint.
-        step: table `step` of the joint.
-        side: 0: e under the upper extreme disturbance; 1: -e under the lower extreme disturbance.
-        cycle: cycles since the step change at the start of the rollout.
-        e: error at the start [rad].
-        ed: rate of the error at the start [rad/s].
-    """
-    sign, external = (-1.0, joint.down) if side else (1.0, joint.up)
-    limit, horizon, start, worst, linear = joint.counted, len(step) - 1, cycle, 0.0, False
-    while cycle < horizon and worst < _HOPELESS:
-        u, now, then = -joint.kp * e - joint.kd * ed, step[cycle], step[cycle + 1]
-        if -limit <= u <= limit:
-            if not linear:
-                ratios, torques = _linear(joint, flow, step, cycle, e, ed)
-                if torques[side] <= 1.0:
-                    return max(worst, ratios[side])
-            linear = True
-            y, yd = e - now[P], ed - now[P + 1]
-            e = then[P] + joint.phi11 * y + joint.phi12 * yd + joint.s1 * external
-            ed = then[P + 1] + joint.phi21 * y + joint.phi22 * yd + joint.s2 * external
-        else:
-            linear = False
-            gained = (math.copysign(limit, u) + external) / joint.inertia * PERIOD
-            y, yd = e - now[DRIFT], ed - now[DRIFT + 1]
-            e = then[DRIFT] + y + (yd + 0.5 * gained) * PERIOD
-            ed = then[DRIFT + 1] + yd + gained
-        cycle += 1
-        # `allowance` is the error under the worst disturbance minus the error under the constant extreme; zero if monotone.
-        ahead = flow[cycle - start]
-        allowance = ahead[ERROR_ADDED + side] - sign * external * ahead[STEADY]
-        worst = max(worst, (sign * e + allowance) / then[BOUND + side])
-    return worst

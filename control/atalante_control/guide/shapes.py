@@ -1,7 +1,7 @@
-"""Shapes of the virtual guide: its width along a step, above and below the desired trajectory.
+"""Shapes of the virtual guide: width of the guide along a step, above and below the desired trajectory.
 
-`shape, assistance factor -> bounds over the phase -> guide filter, certificate, plots`. The paper leaves the shape open. The full
-half-width is that of the paper, 0.5 + 7 (1 - Xi) degrees.
+`shape, assistance factor -> bounds over the phase`. The guide filter, the certificate and the plots use the bounds. The paper
+does not define the shape. The half-width without a shape is taken from the paper: 0.5 + 7 (1 - Xi) degrees.
 """
 
 from __future__ import annotations
@@ -18,13 +18,14 @@ PINCH_WIDTH = math.radians(1.0)  # rad, smallest half-width of the shape `pinche
 SNAP_WIDTH = math.radians(0.1)  # rad, smallest half-width of the shape `snap`
 #: Smallest bound of a shape [rad], about two encoder counts at the joint. With a much smaller bound, h overflows in the filter.
 NARROWEST = 1e-6
+JOINTS = ("SH", "SK")  # joints with a guide, in the order of the bounds
 #: Phases and assistance factors at which a shape is checked on construction.
 _CHECKED_PHASES = np.linspace(0.0, 1.0, 2001)
 _CHECKED_FACTORS = np.linspace(0.0, 1.0, 21).tolist()
 
 
 def half_width(xi: float) -> float:
-    """Return the half-width of the guide before its shape narrows it: 0.5 + 7 (1 - Xi) degrees, in rad.
+    """Return the half-width of the guide before a shape is applied [rad]. In degrees, this is 0.5 + 7 (1 - Xi).
 
     Args:
         xi: assistance factor in [0, 1].
@@ -41,14 +42,15 @@ def half_width(xi: float) -> float:
 class GuideShape:
     """Named shape of the guide.
 
-    A shape is checked on construction, at 2001 phases and 21 assistance factors. `GuideFilter` checks it again at every cycle of
-    its step, and `bounds` checks every result.
+    A shape is checked on construction, at 2001 phases and 21 assistance factors. `GuideFilter` checks the shape again at every
+    cycle of the step, and `bounds` checks every result.
 
     Attributes:
         name: name of the shape, for options and messages.
         summary: one line that describes the shape.
-        fractions: function of phases (n,) and the half-width [rad]. It returns the fractions of the half-width above and below
-            the desired trajectory, each of shape (n,).
+        fractions: function of phases (n,) and the half-width [rad]. It returns two arrays: the width above and the width below
+            the desired trajectory, as fractions of the half-width. Each array has the shape (2, n) for SH and SK, or (n,) if
+            SH and SK have the same fractions.
 
     Raises:
         ValueError: If a bound is not finite or is below `NARROWEST`, or if `fractions` returns other array shapes.
@@ -68,7 +70,7 @@ class GuideShape:
             phase: (t - t_i) / T, shape (n,).
 
         Raises:
-            ValueError: If a bound is not valid, as for `bounds`.
+            ValueError: If a bound is invalid, as for `bounds`.
         """
         for xi in _CHECKED_FACTORS:
             self.bounds(phase, xi)
@@ -77,30 +79,32 @@ class GuideShape:
         """Return the distances from the desired trajectory to the guide.
 
         Args:
-            phase: (t - t_i) / T, shape (n,); a phase above 1 gets the width at 1.
+            phase: (t - t_i) / T, shape (n,); a phase above 1 gets the width at phase 1.
             xi: assistance factor in [0, 1].
 
         Returns:
-            Upper and lower distance, shape (n, 2) [rad], finite and at least `NARROWEST`.
+            Upper and lower distance of SH and SK, shape (2, n, 2) [rad], finite and at least `NARROWEST`.
 
         Raises:
-            ValueError: If a bound is not finite or too small, if `fractions` does not return two arrays of shape (n,), or if Xi
-                is outside [0, 1].
+            ValueError: If a bound is not finite or too small, if `fractions` does not return two arrays of shape (n,) or (2, n),
+                or if Xi is outside [0, 1].
         """
         width, phase = half_width(xi), np.clip(phase, 0.0, 1.0)
         sides = [np.asarray(side, dtype=np.float64) for side in self.fractions(phase, width)]
-        if [side.shape for side in sides] != [phase.shape] * 2:
+        of_both, of_each = phase.shape, (len(JOINTS), *phase.shape)
+        if len(sides) != 2 or any(side.shape not in (of_both, of_each) for side in sides):
             raise ValueError(
-                f"fractions of the guide shape {self.name!r} must return 2 arrays of shape {phase.shape}, "
+                f"fractions of the guide shape {self.name!r} must return 2 arrays of shape {of_both} or {of_each}, "
                 f"got {[side.shape for side in sides]}"
             )
-        bounds: Vector = width * np.stack(sides, axis=1)
+        bounds: Vector = width * np.stack([np.broadcast_to(side, of_each) for side in sides], axis=2)
         valid = (bounds >= NARROWEST) & (bounds < math.inf)
         if not valid.all():
-            at, side = divmod(int(valid.argmin()), 2)
+            joint, at, side = np.unravel_index(int(valid.argmin()), valid.shape)
             raise ValueError(
                 f"bounds of the guide shape {self.name!r} must be finite and at least {NARROWEST:g} rad, got "
-                f"{bounds[at, side]:g} rad ({('upper', 'lower')[side]}) at phase {phase[at]:.4g} and Xi {xi:g}"
+                f"{bounds[joint, at, side]:g} rad ({JOINTS[joint]}, {('upper', 'lower')[side]}) at phase {phase[at]:.4g} "
+                f"and Xi {xi:g}"
             )
         return bounds
 

@@ -1,10 +1,10 @@
-r"""Flat foot: angles of the swing ankle that hold the sole level. `tibia attitude -> SA, HA targets`.
+r"""Flat foot: angles that hold the sole of the swing leg level. `tibia attitude -> targets of sagittal and henke ankle (SA, HA)`.
 
 The attitude comes from the tibia IMU. If this IMU is lost, the attitude is computed from the joints and the pelvis IMU. The
 targets replace the nominal angles in the reference of the PID. The attitude of the foot in the world is
 :math:`R_{tibia} R_z(\text{toe}) R_y(q_{SA}) R_a(q_{HA})`. The sole is level when this rotation maps the normal of the sole to the
 vertical. Let :math:`g` be the vertical in the ankle frame and :math:`a = (a_x, 0, a_z)` the henke axis. The y component of
-:math:`R_a e_z` is :math:`-a_x \sin q_{HA}` and does not depend on SA, which gives HA. SA then rotates in the x-z plane.
+:math:`R_a e_z` is :math:`-a_x \sin q_{HA}` and does not depend on SA. This gives HA. Then SA follows in the x-z plane.
 """
 
 from __future__ import annotations
@@ -31,22 +31,23 @@ Vector3 = tuple[float, float, float]
 
 _SA, _HA = LEG_JOINTS.index("SA"), LEG_JOINTS.index("HA")
 _STOP_MARGIN = math.radians(1.0)  # rad, smallest distance between a target and the joint limit
-_STOP_FADE = math.radians(3.0)  # rad, the target rate is reduced within this distance of a limit of the target
+_STOP_FADE = math.radians(3.0)  # rad, the target rate is reduced if the target is closer to its limit than this angle
 _PELVIS = IMUS.index("pelvis")
 _TIBIAE = tuple(IMUS.index(f"{side}_tibia") for side in SIDES)
-_IMU_AGE = 10  # cycles, largest valid age of an IMU message; the same as its timeout in the DBC
+_IMU_AGE = 10  # cycles, largest valid age of an IMU message, equal to the timeout of the message in the DBC
 
 
 class Ankle:
-    """Data of one ankle: constants, and the deviations at the step change, from which the re-centring starts."""
+    """Data of one ankle: its constants, and its deviation from the target at the stance change. The re-centring removes it."""
 
     geometry: Annotated[Vector, 4]  # `FlatFoot.geometry`
     offset: float  # rad, added to SA
-    joints: Annotated[npt.NDArray[np.int64], 2]  # indices of SA and HA of this leg in JOINTS
-    low: Annotated[Vector, 2]  # rad, smallest targets of SA and HA
-    high: Annotated[Vector, 2]  # rad, largest targets of SA and HA
-    deviation: Annotated[Vector, 2]  # rad, deviation of SA and HA from the target at the step change
-    rate: Annotated[Vector, 2]  # rad/s, deviation of the rates of SA and HA at the step change
+    joints: Annotated[npt.NDArray[np.int64], 2]  # indices of sagittal and henke ankle (SA, HA) of this leg in JOINTS
+    low: Annotated[Vector, 2]  # rad, smallest targets of sagittal and henke ankle
+    high: Annotated[Vector, 2]  # rad, largest targets of sagittal and henke ankle
+    #: rad, deviation of sagittal and henke ankle from their targets at the stance change
+    deviation: Annotated[Vector, 2]
+    rate: Annotated[Vector, 2]  # rad/s, deviation of both joint speeds from the target rates at the stance change
 
 
 @dataclass(frozen=True)
@@ -73,7 +74,7 @@ class FlatFoot:
 
 
 class Tibiae:
-    """Substitute for a lost tibia IMU: attitude and angular velocity from the joints and the pelvis IMU."""
+    """Substitute for a lost tibia IMU: computes attitude and angular velocity of the tibia from the joints and the pelvis IMU."""
 
     def __init__(self, articulated: ArticulatedModel) -> None:
         """Prepare the forward kinematics.
@@ -90,14 +91,14 @@ class Tibiae:
     def attitude(
         self, side: int, position: Vector, velocity: Vector, pelvis: Sequence[float], gyro: Sequence[float]
     ) -> tuple[Quaternion, Vector3]:
-        """Compute attitude and angular velocity of a tibia, as its IMU would measure them.
+        """Compute the attitude and the angular velocity that the IMU of a tibia would measure.
 
         Args:
             side: 0 left, 1 right.
             position: joint angles, shape (12,) [rad].
             velocity: joint speeds, shape (12,) [rad/s].
             pelvis: attitude of the pelvis IMU, unit quaternion wxyz, pelvis to world.
-            gyro: angular velocity of the pelvis IMU in its own frame [rad/s].
+            gyro: angular velocity of the pelvis IMU in the frame of this IMU [rad/s].
 
         Returns:
             Unit quaternion wxyz, tibia to world, and angular velocity in the frame of the tibia [rad/s].
@@ -119,15 +120,44 @@ def flat_feet(parameters: ExoskeletonParameters) -> tuple[FlatFoot, FlatFoot]:
     return FlatFoot(parameters.toe_out, parameters.ha_axis), FlatFoot(-parameters.toe_out, parameters.ha_axis)
 
 
-class LevelFeet:
-    """Flat-foot targets of the swing ankle, which replace its nominal trajectory.
+def ankle_records(robot: Robot, exoskeleton: ExoskeletonParameters, offset: float) -> Records[Ankle]:
+    """Return the records of the left and the right ankle. Only the constants are set.
 
-    Call `start_step` at each step change. Then call `write_level_ankle` once a cycle, or `without_imu` while the tibia IMU is
+    Args:
+        robot: limits of the joints.
+        exoskeleton: geometry of the feet.
+        offset: angle added to SA [rad].
+    """
+    ankles: Records[Ankle] = zeros(Ankle, len(SIDES))
+    for side, foot in enumerate(flat_feet(exoskeleton)):
+        ankle, joints = ankles[side], [side * len(LEG_JOINTS) + joint for joint in (_SA, _HA)]
+        ankle.geometry[:], ankle.offset, ankle.joints[:] = foot.geometry, offset, joints
+        ankle.low[:] = robot.position_min[joints] + _STOP_MARGIN
+        ankle.high[:] = robot.position_max[joints] - _STOP_MARGIN
+    return ankles
+
+
+def recentring_rows(deadbeat: Deadbeat, count: int) -> Vector:
+    """Return the basis cubics c0, c1 of the re-centring and the derivatives c0', c1', one row per cycle, shape (n, 4).
+
+    Args:
+        deadbeat: re-centring of the gait.
+        count: largest number of rows.
+    """
+    time: Vector = np.arange(count, dtype=np.float64) * PERIOD
+    (c0, c1), (c0d, c1d), _ = deadbeat.basis(time[: np.searchsorted(time, deadbeat.end)])
+    return np.column_stack([c0, c1, c0d, c1d])
+
+
+class LevelFeet:
+    """Flat-foot targets of the swing ankle. They replace the nominal angles of this ankle.
+
+    Call `start_step` at each stance change. Then call `write_level_ankle` once per cycle, or `without_imu` while the tibia IMU is
     lost.
 
     Attributes:
         ankles: records of the left and the right ankle.
-        cubics: c0 and c1 of the re-centring, then their derivatives, a row for each cycle of the re-centring, shape (n, 4).
+        cubics: basis cubics c0 and c1 of the re-centring and their time derivatives c0' and c1', one row per cycle, shape (n, 4).
     """
 
     def __init__(
@@ -146,30 +176,22 @@ class LevelFeet:
             exoskeleton: geometry of the feet.
             articulated: model with the pelvis fixed.
             deadbeat: re-centring of the gait.
-            nominal: rows (q_nom, q_nom') of both steps, each of shape (n, 24): first the left leg swings, then the right leg.
+            nominal: two arrays of shape (n, 24) with rows (q_nom, q_nom'): the step in which the left leg swings, then the
+                step in which the right leg swings.
             offset: angle added to SA [rad].
         """
         self._nominal, self._tibiae = nominal, Tibiae(articulated)
-        self.ankles: Records[Ankle] = zeros(Ankle, len(SIDES))
-        for side, foot in enumerate(flat_feet(exoskeleton)):
-            ankle, joints = self.ankles[side], [side * len(LEG_JOINTS) + joint for joint in (_SA, _HA)]
-            ankle.geometry[:], ankle.offset, ankle.joints[:] = foot.geometry, offset, joints
-            ankle.low[:] = robot.position_min[joints] + _STOP_MARGIN
-            ankle.high[:] = robot.position_max[joints] - _STOP_MARGIN
-        time: Vector = np.arange(len(nominal[0]), dtype=np.float64) * PERIOD
-        (c0, c1), (c0d, c1d), _ = deadbeat.basis(time[: np.searchsorted(time, deadbeat.end)])
-        self.cubics: Vector = np.column_stack([c0, c1, c0d, c1d])
+        self.ankles = ankle_records(robot, exoskeleton, offset)
+        self.cubics = recentring_rows(deadbeat, len(nominal[0]))
 
     def start_step(self, state: State, side: int) -> None:
-        """Store the deviation of the swing ankle from its target. The re-centring of the step starts from it.
+        """Store the deviation of the swing ankle from the target. The re-centring then reduces this deviation to zero.
 
         Args:
-            state: measured state of the robot at the step change.
+            state: measured state of the robot at the stance change.
             side: leg that swings now, 0 left, 1 right.
         """
-        ankle, (angles, rates) = self.ankles[side], self._target(state, side, 0)
-        ankle.deviation[:] = state.position[ankle.joints] - angles
-        ankle.rate[:] = state.velocity[ankle.joints] - rates
+        _store_deviation(self.ankles[side], self._target(state, side, 0), state.position, state.velocity)
 
     def imu_valid(self, state: State, side: int) -> bool:
         """Return whether the last message of a tibia IMU is recent enough for `write_level_ankle`.
@@ -181,7 +203,7 @@ class LevelFeet:
         return not state.imu_rows or bool(state.age[state.imu_rows[_TIBIAE[side]]] <= _IMU_AGE)
 
     def without_imu(self, state: State, side: int, cycle: int, row: Vector) -> Vector:
-        """Return a copy of q_des and q_des' with the targets of the swing ankle, computed without the tibia IMU.
+        """Return a copy of q_des and q_des' in which the swing ankle has flat-foot targets. The tibia IMU is not used.
 
         The attitude of the tibia is computed from the joints and the pelvis IMU. If the pelvis IMU is lost too, the targets are
         the nominal angles.
@@ -189,7 +211,7 @@ class LevelFeet:
         Args:
             state: measured state of the robot.
             side: swing leg, 0 left, 1 right.
-            cycle: cycles since the step change.
+            cycle: cycles since the stance change.
             row: q_des [rad], then q_des' [rad/s], shape (24,); not changed.
         """
         desired = row.copy()
@@ -207,22 +229,49 @@ class LevelFeet:
         return (row[sa], row[ha]), (row[n + sa], row[n + ha])
 
 
-def write_level_ankle(ankle: Ankle, cubics: Vector, cycle: int, tibia: Vector, gyro: Vector, desired: Vector) -> None:
-    """Write the targets of the swing ankle from the tibia IMU.
+def start_level_ankle(ankle: Ankle, tibia: Vector | Quaternion, gyro: Vector | Vector3, q: Vector, qd: Vector) -> None:
+    """Store the deviation of a swing ankle from its target at the stance change. The re-centring starts with this deviation.
+
+    Args:
+        ankle: record of the swing ankle.
+        tibia: attitude of the tibia, as in `level`.
+        gyro: angular velocity of the tibia, as in `level`.
+        q: measured angles, shape (12,) [rad].
+        qd: measured speeds, shape (12,) [rad/s].
+    """
+    _store_deviation(ankle, _target(ankle, tibia, gyro), q, qd)
+
+
+def _store_deviation(ankle: Ankle, target: tuple[Pair, Pair], q: Vector, qd: Vector) -> None:
+    angles, rates = target
+    for i in range(2):
+        ankle.deviation[i] = q[ankle.joints[i]] - angles[i]
+        ankle.rate[i] = qd[ankle.joints[i]] - rates[i]
+
+
+def write_level_ankle(
+    ankle: Ankle,
+    cubics: Vector,
+    cycle: int,
+    tibia: Vector | Quaternion,
+    gyro: Vector | Vector3,
+    desired: Vector,
+) -> None:
+    """Compute the targets of the swing ankle from the tibia IMU, and write them into `desired`.
 
     Args:
         ankle: record of the swing ankle.
         cubics: `LevelFeet.cubics`.
-        cycle: cycles since the step change.
-        tibia: attitude of the tibia IMU, as in `level`.
-        gyro: angular velocity of the tibia, as in `level`.
-        desired: q_des [rad], then q_des' [rad/s], shape (24,); the entries of the swing ankle are overwritten.
+        cycle: cycles since the stance change.
+        tibia: attitude of the tibia IMU, unit quaternion wxyz as in `level`.
+        gyro: angular velocity of the tibia in the frame of the tibia [rad/s].
+        desired: q_des [rad], then q_des' [rad/s], shape (24,); the elements of the swing ankle are overwritten.
     """
     _write_targets(ankle, cubics, cycle, _target(ankle, tibia, gyro), desired)
 
 
 def _write_targets(ankle: Ankle, cubics: Vector, cycle: int, target: tuple[Pair, Pair], desired: Vector) -> None:
-    """Write angles and rates of SA and HA with the re-centring added."""
+    """Add the re-centring to the target angles and rates of both ankle joints, and write the sums into `desired`."""
     (angles, rates), n = target, len(desired) // 2
     for i in range(2):
         angle, rate, joint = angles[i], rates[i], ankle.joints[i]
@@ -234,7 +283,7 @@ def _write_targets(ankle: Ankle, cubics: Vector, cycle: int, target: tuple[Pair,
 
 
 def _target(ankle: Ankle, tibia: Sequence[float] | Vector, gyro: Sequence[float] | Vector) -> tuple[Pair, Pair]:
-    """Return angles and rates of SA and HA that hold the sole level. SA has its offset; both are limited to the target range."""
+    """Return angles and rates of sagittal and henke ankle that hold the sole level, with offset and limits applied."""
     (sagittal, henke), rates = level(ankle.geometry, tibia, gyro)
     low, high = ankle.low, ankle.high
     sa, sa_rate = _within(sagittal + ankle.offset, rates[0], low[0], high[0])
@@ -243,18 +292,20 @@ def _target(ankle: Ankle, tibia: Sequence[float] | Vector, gyro: Sequence[float]
 
 
 def _within(angle: float, rate: float, low: float, high: float) -> Pair:
-    """Return the angle limited to [low, high], and the rate. The rate is reduced near the limits, and zero at a limit."""
+    """Return the angle limited to [low, high], and its rate. The rate is reduced near a limit and is zero at the limit."""
     room = max(0.0, min(angle - low, high - angle) / _STOP_FADE)
     return min(high, max(low, angle)), rate * min(1.0, room)
 
 
 def level(geometry: Vector, tibia: Sequence[float] | Vector, gyro: Sequence[float] | Vector) -> tuple[Pair, Pair]:
-    """Return the angles of SA and HA that level the sole. If the tibia leans too far sideways, HA is the nearest possible angle.
+    """Return the angles of sagittal and henke ankle (SA, HA) that level the sole.
+
+    If the tibia leans so far sideways that no angle of HA levels the sole, HA gets the nearest possible angle.
 
     Args:
         geometry: `FlatFoot.geometry`.
         tibia: attitude of the tibia IMU, unit quaternion wxyz, tibia to world; the heading has no effect.
-        gyro: angular velocity of the tibia in its own frame [rad/s].
+        gyro: angular velocity of the tibia in the frame of the tibia [rad/s].
 
     Returns:
         Angles [rad] and their rates [rad/s], SA then HA.
@@ -263,11 +314,8 @@ def level(geometry: Vector, tibia: Sequence[float] | Vector, gyro: Sequence[floa
     w, x, y, z = tibia[0], tibia[1], tibia[2], tibia[3]
     tx, ty, tz = 2.0 * (x * z - w * y), 2.0 * (y * z + w * x), 1.0 - 2.0 * (x * x + y * y)
     p, q, r = gyro[0], gyro[1], gyro[2]
-    txd, tyd, tzd = (
-        ty * r - tz * q,
-        tz * p - tx * r,
-        tx * q - ty * p,
-    )  # 1/s, rate of the vertical direction in the tibia frame
+    # 1/s, time derivative of the vertical direction in the tibia frame
+    txd, tyd, tzd = ty * r - tz * q, tz * p - tx * r, tx * q - ty * p
     gx, gy, gxd, gyd = c * tx + s * ty, c * ty - s * tx, c * txd + s * tyd, c * tyd - s * txd
 
     sine = -gy / ax

@@ -1,8 +1,8 @@
 """Haptic feedback: `tracking error, guide, assistance factor -> levels of the eight vibration motors`.
 
-Law of the paper: |e / q_bound| (1 - exp(30 (Xi - 1))). The front motor of the limb vibrates if the joint angle is above the
-desired angle, the back motor if it is below. The thigh motors belong to the hip and the shank motors to the knee of the
-swing leg. At Xi = 1 no motor vibrates.
+Law of the paper for the level: |e / q_bound| (1 - exp(30 (Xi - 1))). The front motor of a limb vibrates if the joint angle is
+above the desired angle. The back motor vibrates if the joint angle is below the desired angle. In the swing leg, the thigh
+motors show the error of the hip, and the shank motors show the error of the knee. At Xi = 1 no motor vibrates.
 """
 
 from __future__ import annotations
@@ -28,12 +28,12 @@ def intensity(xi: float) -> float:
 
 
 def levels(leg: int, errors: tuple[float, float], bounds: tuple[float, float], intensity: float, out: Vector) -> Vector:
-    """Compute the levels of all vibration motors; those of the stance leg are zero.
+    """Compute the levels of all vibration motors. The motors of the stance leg get level 0.
 
     Args:
         leg: swing leg, 0 left, 1 right.
-        errors: q - q_des of SH and SK [rad].
-        bounds: distance from q_des to the guide on the side of the error, SH and SK, positive [rad].
+        errors: tracking errors q - q_des of SH and SK [rad].
+        bounds: distance from q_des to the edge of the guide on the side of the error, for SH and SK, positive [rad].
         intensity: result of `intensity(xi)`.
         out: levels in the order of MOTORS, shape (8,), overwritten.
 

@@ -1,14 +1,14 @@
-"""Joint idealization: torques with which an assisted joint moves like a free inertia. `q, q' -> u_i`, with u_g from `gravity`.
+"""Joint idealization: torques u_i with which an assisted joint moves like a free inertia. `q, q', u_g -> u_i`.
 
-The law of the paper is u_i = k_d sign(q') + k_v q' + u_g. Three points are decided here:
+The law of the paper is u_i = k_d sign(q') + k_v q' + u_g. This module decides three points:
 
 - The paper prints sign(q) and k_v q. Friction opposes the velocity, so this module uses q'.
-- The sign is smoothed to tanh(q' / v_s). At rest the measured velocity changes sign with its noise, and a torque of +-k_d in
-  each cycle would shake the joint.
-- The guide treats the two joints as separate inertias, J q'' = u_v. In fact hip and knee share the shank (3.6 kg m2 off the
-  diagonal of the mass matrix, 1.9 on it), so a torque on one joint accelerates the other, and a moving knee loads the hip.
-  `AssistedInertia` converts torques on the separate inertias to torques that cause the same accelerations of the coupled pair.
-  It adds the velocity torques of the pair (centrifugal, Coriolis), which are part of u_i like gravity.
+- The sign is smoothed to tanh(q' / v_s). At rest, noise changes the sign of the measured velocity from cycle to cycle. Without
+  smoothing, the torque would switch between +k_d and -k_d and shake the joint.
+- The paper treats hip and knee as separate inertias. In fact both joints move the shank: the off-diagonal element of the mass
+  matrix is up to 3.6 kg m2, and the diagonal element of the knee is 1.9 kg m2. A torque at one joint therefore accelerates both
+  joints, and a moving knee loads the hip. `AssistedInertia` is the mass matrix of both joints. u_i contains the velocity torques
+  (centrifugal, Coriolis) of this mass matrix.
 """
 
 from __future__ import annotations
@@ -31,11 +31,9 @@ _ASSISTED = (LEG_JOINTS.index("SH"), LEG_JOINTS.index("SK"))
 
 
 class Law:
-    """Parameters of `merge` for the assisted joints, SH and SK."""
+    """Parameters of `idealization` for the assisted joints, SH and SK."""
 
     fit: Annotated[Vector, (3, 3)]  # kg m2, `AssistedInertia.fit`
-    inertias: Annotated[Vector, 2]  # kg m2, inertias J of SH and SK without their coupling, see `AssistedInertia`
-    decoupled: bool  # true: u_f + u_v are converted with the mass matrix of SH and SK
     coulomb: Annotated[Vector, 2]  # Nm
     viscous: Annotated[Vector, 2]  # Nm s/rad
     smoothing: float  # rad/s
@@ -43,7 +41,7 @@ class Law:
 
 @dataclass(frozen=True)
 class Friction:
-    """Joint friction as identified on the robot, for each leg joint FH to HA.
+    """Joint friction as identified on the robot, one value per joint of a leg in the order of `LEG_JOINTS`.
 
     Raises:
         ValueError: If a list does not have six values, a value is negative, or the smoothing speed is not positive.
@@ -72,10 +70,10 @@ class Friction:
 
 
 class AssistedInertia:
-    """Mass matrix of SH and SK of one leg in closed form; it depends only on the knee angle.
+    """Mass matrix of sagittal hip and knee (SH, SK) of one leg, as a function of the knee angle in closed form.
 
-    The block is M(q_SK) = A + B cos q_SK + C sin q_SK. A, B and C follow from three evaluations of the CRBA of Pinocchio, with
-    the other joints at their mean angles during the swing.
+    The block is M(q_SK) = A + B cos q_SK + C sin q_SK. A, B and C follow from three evaluations of Pinocchio's composite rigid
+    body algorithm, with all other joints at their mean angles during the swing.
 
     Attributes:
         inertias: J of SH and SK [kg m2], the largest diagonal elements of M during the swing.
@@ -83,7 +81,7 @@ class AssistedInertia:
     """
 
     def __init__(self, articulated: ArticulatedModel, swing: Vector) -> None:
-        """Compute the mass matrix of SH and SK of the left leg. By symmetry it also applies to the right leg.
+        """Compute the mass matrix of SH and SK of the left leg. By symmetry the matrix also applies to the right leg.
 
         Args:
             articulated: empty exoskeleton with the pelvis fixed.
@@ -118,82 +116,47 @@ class AssistedInertia:
         m11, m12, m22 = (self.fit[:, 0] + self.fit[:, 1] * math.cos(knee) + self.fit[:, 2] * math.sin(knee)).tolist()
         return m11, m12, m22
 
-    def torques(self, knee: float, hip_rate: float, knee_rate: float, u: Pair) -> Pair:
-        """Return the torques [Nm] that accelerate SH and SK as J q'' = u. The other joints are assumed at rest.
-
-        tau = M J^-1 u + c, with c the velocity torques of M(q_SK): c1 = M11' q1' q2' + M12' q2'^2, c2 = -M11' q1'^2 / 2.
+    def velocity_torques(self, knee: float, hip_rate: float, knee_rate: float) -> Pair:
+        """Return the velocity torques (centrifugal, Coriolis) of SH and SK [Nm], see `velocity_torques`.
 
         Args:
             knee: angle of SK [rad].
             hip_rate: speed of SH [rad/s].
             knee_rate: speed of SK [rad/s].
-            u: torques on the separate inertias `inertias`, SH and SK [Nm].
         """
-        return coupled(self.fit, self.inertias, knee, hip_rate, knee_rate, u)
-
-    def ideal(self, knee: float, hip_rate: float, knee_rate: float, tau: Pair) -> Pair:
-        """Return the torques u [Nm] in J q'' = u that are equivalent to real torques of SH and SK. Inverse of `torques`.
-
-        Args:
-            knee: angle of SK [rad].
-            hip_rate: speed of SH [rad/s].
-            knee_rate: speed of SK [rad/s].
-            tau: real torques of SH and SK without gravity [Nm].
-        """
-        c1, c2 = self.torques(knee, hip_rate, knee_rate, (0.0, 0.0))
-        on_hip, on_knee = (self.ideal_of(knee) @ (tau[0] - c1, tau[1] - c2)).tolist()
-        return on_hip, on_knee
-
-    def ideal_of(self, knee: float) -> Vector:
-        """Return A = J M^-1, shape (2, 2). It converts real torques minus velocity torques to torques u in J q'' = u.
-
-        Args:
-            knee: angle of SK [rad].
-        """
-        m11, m12, m22 = self.block(knee)
-        inverse: Vector = np.array([[m22, -m12], [-m12, m11]]) / (m11 * m22 - m12 * m12)
-        return np.reshape(self.inertias, (2, 1)) * inverse
+        return velocity_torques(self.fit, knee, hip_rate, knee_rate)
 
 
-def law_of(friction: Friction, inertia: AssistedInertia, decoupled: bool) -> Records[Law]:
-    """Return the parameters of `merge`, shape (1,).
+def law_of(friction: Friction, inertia: AssistedInertia) -> Records[Law]:
+    """Return the parameters of `idealization`, shape (1,).
 
     Args:
         friction: friction to compensate.
         inertia: mass matrix of SH and SK.
-        decoupled: whether u_f + u_v are torques on the separate inertias, which `AssistedInertia.torques` converts.
     """
     laws: Records[Law] = zeros(Law, 1)
     law = laws[0]
-    law.fit[:], law.inertias[:], law.decoupled = inertia.fit, inertia.inertias, decoupled
+    law.fit[:] = inertia.fit
     law.coulomb[:], law.viscous[:] = ([row[i] for i in _ASSISTED] for row in (friction.coulomb, friction.viscous))
     law.smoothing = friction.smoothing
     return laws
 
 
-def merge(
-    laws: Records[Law], leg: int, w: float, u: Pair, q: Vector, qd: Vector, gravity: Vector, torque: Vector
-) -> None:
-    """Set the torque of SH and SK of the swing leg to w u_t + (1 - w) (u_i + u_f + u_v).
+def idealization(law: Law, knee: float, hip_rate: float, knee_rate: float, gravity: Pair) -> Pair:
+    """Return u_i of SH and SK, the sum of friction compensation, velocity torques and u_g [Nm].
 
     Args:
-        laws: result of `law_of`.
-        leg: index in JOINTS of the first joint of the swing leg.
-        w: weight of the baseline in [0, 1).
-        u: u_f + u_v of SH and SK [Nm].
-        q: measured angles, shape (12,) [rad].
-        qd: measured speeds, shape (12,) [rad/s].
-        gravity: u_g, shape (12,) [Nm].
-        torque: u_t, shape (12,) [Nm]; the entries of SH and SK are overwritten.
+        law: result of `law_of`.
+        knee: angle of SK [rad].
+        hip_rate: speed of SH [rad/s].
+        knee_rate: speed of SK [rad/s].
+        gravity: u_g of SH and SK [Nm].
     """
-    law = laws[0]
-    hip, knee = leg + _ASSISTED[0], leg + _ASSISTED[1]
-    if law.decoupled:
-        u = coupled(law.fit, law.inertias, q[knee], qd[hip], qd[knee], u)
-    for i in range(2):
-        joint = leg + _ASSISTED[i]
-        assisted = gravity[joint] + friction(qd[joint], law.coulomb[i], law.viscous[i], law.smoothing) + u[i]
-        torque[joint] = w * torque[joint] + (1.0 - w) * assisted
+    hip_c, knee_c = velocity_torques(law.fit, knee, hip_rate, knee_rate)
+    return (
+        gravity[0] + hip_c + friction(hip_rate, law.coulomb[0], law.viscous[0], law.smoothing),
+        gravity[1] + knee_c + friction(knee_rate, law.coulomb[1], law.viscous[1], law.smoothing),
+    )
 
 
 def friction(velocity: float, coulomb: float, viscous: float, smoothing: float) -> float:
@@ -208,23 +171,33 @@ def friction(velocity: float, coulomb: float, viscous: float, smoothing: float) 
     return coulomb * math.tanh(velocity / smoothing) + viscous * velocity
 
 
-def coupled(fit: Vector, inertias: Vector | Pair, knee: float, hip_rate: float, knee_rate: float, u: Pair) -> Pair:
-    """Convert torques u in J q'' = u to real torques, as `AssistedInertia.torques` does. Compiled kernels can call it.
+def mass(fit: Vector, knee: float) -> tuple[float, float, float]:
+    """Return M11, M12 and M22 of SH and SK at a knee angle [kg m2]. Compiled kernels can call this function.
 
     Args:
         fit: `AssistedInertia.fit`.
-        inertias: `AssistedInertia.inertias`.
+        knee: angle of SK [rad].
+    """
+    c, s = math.cos(knee), math.sin(knee)
+    return (
+        fit[0, 0] + fit[0, 1] * c + fit[0, 2] * s,
+        fit[1, 0] + fit[1, 1] * c + fit[1, 2] * s,
+        fit[2, 0] + fit[2, 1] * c + fit[2, 2] * s,
+    )
+
+
+def velocity_torques(fit: Vector, knee: float, hip_rate: float, knee_rate: float) -> Pair:
+    """Return the velocity torques (centrifugal, Coriolis) of SH and SK [Nm]. Compiled kernels can call this function.
+
+    The torque of SH is M11' q1' q2' + M12' q2'^2, and the torque of SK is -M11' q1'^2 / 2. M11' and M12' are derivatives with
+    respect to the knee angle; q1' and q2' are the speeds of SH and SK.
+
+    Args:
+        fit: `AssistedInertia.fit`.
         knee: angle of SK [rad].
         hip_rate: speed of SH [rad/s].
         knee_rate: speed of SK [rad/s].
-        u: torques on the separate inertias, SH and SK [Nm].
     """
     c, s = math.cos(knee), math.sin(knee)
-    m11, m12 = fit[0, 0] + fit[0, 1] * c + fit[0, 2] * s, fit[1, 0] + fit[1, 1] * c + fit[1, 2] * s
-    m22 = fit[2, 0] + fit[2, 1] * c + fit[2, 2] * s
     m11_slope, m12_slope = fit[0, 2] * c - fit[0, 1] * s, fit[1, 2] * c - fit[1, 1] * s
-    hip_acceleration, knee_acceleration = u[0] / inertias[0], u[1] / inertias[1]
-    return (
-        m11 * hip_acceleration + m12 * knee_acceleration + (m11_slope * hip_rate + m12_slope * knee_rate) * knee_rate,
-        m12 * hip_acceleration + m22 * knee_acceleration - 0.5 * m11_slope * hip_rate * hip_rate,
-    )
+    return (m11_slope * hip_rate + m12_slope * knee_rate) * knee_rate, -0.5 * m11_slope * hip_rate * hip_rate

@@ -1,8 +1,8 @@
 """Joint PID of the baseline controller: `q_des, q_des' and measured q, q' -> tracking torque u_t` of twelve joints.
 
-Each leg has the gains of its role, stance or swing. The integral is a torque with a separate, small limit. Anti-windup: if the
-limiter reduced the torque of a joint, its integral does not grow further in that direction. If the virtual guide assists a joint,
-its integral gain is scaled by the share of the baseline.
+The gains of a leg depend on whether the leg is in stance or in swing. The integral is a torque with a separate, small limit.
+Anti-windup: if the limiter changed the torque of a joint, the integral of this joint does not grow further towards the requested
+torque. If the virtual guide assists a joint, the integral gain of this joint is multiplied by the share of the baseline.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ LEFT, RIGHT = 0, 1
 
 @dataclass(frozen=True)
 class LegGains:
-    """PID gains of the joints of a leg, FH to HA.
+    """PID gains of the six joints of a leg, in the order of `LEG_JOINTS`.
 
     Raises:
         ValueError: If a list does not have six values, or if a value is negative or not finite.
@@ -63,8 +63,8 @@ class PidGains:
     integral_limit: float = 10.0  # Nm
 
 
-#: Gains for the suspended robot. The stance leg carries no load, so its TH, SK, SA and HA get the gains of the swing leg.
-#: With the gains for the ground, knee and ankle would oscillate, because their inertia is small (0.16 and 0.04 kg m2).
+#: Gains for the suspended robot. The stance leg carries no load, so TH, SK, SA and HA of this leg get the gains of the swing leg.
+#: With the gains for the ground, knee and ankle would oscillate, because these joints move small inertias (0.16, 0.04 kg m2).
 AIR_GAINS = PidGains(
     stance=LegGains(
         kp=(3000.0, 720.0, 3000.0, 900.0, 300.0, 180.0),
@@ -77,7 +77,7 @@ AIR_GAINS = PidGains(
 class PidRecord:
     """PID data of the twelve joints: gains, integral torque and last requested torque."""
 
-    gains: Annotated[Vector, (3, len(JOINTS))]  # Kp [Nm/rad], Kd [Nm s/rad], and Ki times the cycle [Nm/rad]
+    gains: Annotated[Vector, (3, len(JOINTS))]  # Kp [Nm/rad], Kd [Nm s/rad], and Ki times the cycle time [Nm/rad]
     limit: float  # Nm, largest absolute value of the integral torque
     integral: Annotated[Vector, len(JOINTS)]  # Nm, integral torque
     requested: Annotated[Vector, len(JOINTS)]  # Nm, torque command before the limiter, with all contributions
@@ -86,7 +86,7 @@ class PidRecord:
 class Pid:
     """PIDs of the twelve joints.
 
-    Call `start_step` at each step change. Then call `update` and `store_request` once a cycle.
+    Call `start_step` at each stance change. Then call `update` and `store_request` once per cycle.
 
     Attributes:
         records: record of `control`, shape (1,): gains, integral and the last requested torque.
@@ -117,7 +117,7 @@ class Pid:
 
         Args:
             stance: stance leg, LEFT or RIGHT.
-            share: share of the baseline in the torque of each joint, shape (12,), in [0, 1]; scales the integral gains.
+            share: share of the baseline in the torque of each joint, in [0, 1], shape (12,). It multiplies the integral gains.
         """
         gains = self.records[0].gains
         gains[:] = self._gains_of[stance]
@@ -130,7 +130,7 @@ class Pid:
             desired: q_des [rad], then q_des' [rad/s], shape (24,).
             q: measured angles, shape (12,) [rad].
             qd: measured speeds, shape (12,) [rad/s].
-            sent: torque command of the previous cycle after the limiter, shape (12,) [Nm]; None: it was not limited.
+            sent: torque command of the previous cycle after the limiter, shape (12,) [Nm]; None if the limiter changed nothing.
 
         Returns:
             u_t, shape (12,) [Nm], overwritten by the next call.
@@ -144,7 +144,7 @@ class Pid:
         return self.records[0].requested
 
     def store_request(self, torque: Vector) -> None:
-        """Store the torque command of this cycle for the anti-windup of the next one.
+        """Store the torque command of this cycle for the anti-windup of the next cycle.
 
         Args:
             torque: torque command before the limiter, with all contributions, shape (12,) [Nm]; copied.

@@ -1,8 +1,8 @@
 """Model of exoskeleton and patient, shared by gait optimization, controller, emulator and viewers.
 
-`ExoskeletonParameters, Patient -> links (left leg, right leg its mirror image) -> URDF text -> Pinocchio model`. Frames
+`ExoskeletonParameters, Patient -> links (the right leg mirrors the left leg) -> URDF text -> Pinocchio model`. Frames
 follow REP-103: x forward, y left, z up. The frame of a link is the frame of its joint. At the zero pose all frames are parallel
-except those of the feet, which are turned outwards by the toe-out angle.
+except the foot frames, which are turned outwards by the toe-out angle.
 """
 
 from atalante_control.model.articulated import GRAVITY, ArticulatedModel, pinocchio_model

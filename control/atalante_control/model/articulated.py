@@ -1,4 +1,4 @@
-"""Pinocchio model of a URDF, with the indices of the joints in its vectors: `URDF -> ArticulatedModel`."""
+"""Pinocchio model of a URDF, with the index of each joint in the vectors of Pinocchio: `URDF -> ArticulatedModel`."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ GRAVITY = 9.81  # m/s2, magnitude of the gravitational acceleration; the default
 
 
 class ArticulatedModel(NamedTuple):
-    """Pinocchio model with the indices of `JOINTS` in its vectors."""
+    """Pinocchio model with the index of each of `JOINTS` in the vectors of Pinocchio."""
 
     model: Any  # pinocchio.Model
     q: npt.NDArray[np.intp]  # (12,) index of each of JOINTS in a configuration vector
@@ -24,12 +24,12 @@ class ArticulatedModel(NamedTuple):
 def pinocchio_model(urdf_text: str, fixed_base: bool = True) -> ArticulatedModel:
     """Build the Pinocchio model of a URDF, with gravity of 9.81 m/s2 (`GRAVITY`) downwards.
 
-    The joint order of Pinocchio can differ from `JOINTS`, so index its vectors only with `ArticulatedModel.q` and `.v`.
+    The joint order of Pinocchio can differ from `JOINTS`. Index Pinocchio vectors only with `ArticulatedModel.q` and `.v`.
 
     Args:
         urdf_text: URDF with all joints of `JOINTS`.
-        fixed_base: True: the pelvis is fixed to the world at its origin. False: it floats on a `JointModelFreeFlyer`, which
-            comes first in q and v.
+        fixed_base: whether the pelvis is fixed to the world at its origin. If not, the pelvis floats on a
+            `JointModelFreeFlyer`, whose coordinates come first in q and v.
 
     Raises:
         ValueError: If a joint of `JOINTS` is missing in the URDF.

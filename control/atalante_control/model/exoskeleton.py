@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 from itertools import pairwise
 
 from atalante_control.model.patient import ANKLE_HEIGHT, Patient
-from atalante_control.model.rigid_body import ZERO, Box, Inertia, Link, Vector3
+from atalante_control.model.rigid_body import ZERO, Box, Inertia, Link, Sphere, Vector3
 from atalante_hal.robot import CELLS, LEG_JOINTS
 
 BASE_LINK = "pelvis"
@@ -44,18 +44,18 @@ class ExoskeletonParameters:
     knee_lateral: float = 0.005  # m, lateral offset of joint SK relative to SH, positive outwards
     ankle_lateral: float = -0.169  # m, lateral offset of joint SA relative to SK, positive outwards
     toe_out: float = math.radians(8.0)  # rad, outward rotation of the foot about the vertical
-    ha_axis: Vector3 = (0.788, 0.0, 0.616)  # axis of joint HA in the foot frame; the URDF contains its unit vector
+    ha_axis: Vector3 = (0.788, 0.0, 0.616)  # axis of joint HA in the foot frame; the URDF contains the unit vector
 
     sole_size: tuple[float, float] = (0.275, 0.119)  # m, length and width
     sole_centre: tuple[float, float] = (0.06, -0.165)  # m, x and z of the sole centre relative to the ankle
     cell_x: tuple[float, float] = (0.178, -0.064)  # m, x of front and rear force cells relative to the ankle
     cell_y: float = 0.027  # m, lateral distance of the force cells from the middle of the foot
-    pad_radius: float = 0.005  # m, radius of the contact sphere under each force cell; it touches the sole plane
+    pad_radius: float = 0.005  # m, radius of the contact sphere in each corner of the sole; it touches the sole plane
     pad_mass: float = 0.0015  # kg, mass of each contact sphere, subtracted from the mass of the foot
 
     torso_imu: Vector3 = (-0.14, 0.0, 0.50)  # m, position of the torso IMU in the pelvis frame
     pelvis_imu: Vector3 = (-0.164, -0.015, 0.191)  # m, position of the pelvis IMU in the pelvis frame
-    tibia_imu: Vector3 = (-0.13, -0.074, 0.018)  # m, left tibia IMU: x and y relative to SK, z relative to SA
+    tibia_imu: Vector3 = (-0.13, -0.074, 0.018)  # m, left tibia IMU: x, y relative to SK, z relative to SA
 
     def __post_init__(self) -> None:
         for name in ("thigh_length", "shank_length"):
@@ -74,15 +74,15 @@ class ExoskeletonParameters:
 
 
 def links(parameters: ExoskeletonParameters, patient: Patient | None = None) -> tuple[Link, ...]:
-    """Return all links of the exoskeleton, parents first: pelvis, its IMUs, left leg, right leg.
+    """Return all links of the exoskeleton, each parent before its children: pelvis, IMUs of the pelvis, left leg, right leg.
 
-    With a patient, thigh and shank of the exoskeleton get the lengths of the patient, and the segments of the patient are fused
-    into the links: head, arms and trunk into the pelvis; thigh, shank and foot into those of each leg. The names of the links are
-    the same as without a patient.
+    With a patient, thigh and shank of the exoskeleton get the lengths of the patient, and the segments of the patient
+    are fused into the links. Head, arms and trunk are fused into the pelvis. Thigh, shank and foot are fused into
+    thigh, shank and foot of the exoskeleton. The names of the links are the same as without a patient.
 
     Args:
         parameters: geometry and masses of the exoskeleton.
-        patient: patient in the exoskeleton; None: empty.
+        patient: patient in the exoskeleton, or None for an empty exoskeleton.
     """
     p = parameters if patient is None else parameters.fitted(patient)
     pelvis = Box(p.pelvis_mass, (-0.13, 0.0, 0.12), (0.18, 0.36, 0.40))
@@ -105,9 +105,9 @@ def imu_link(imu: str) -> str:
 
 
 def pad_link(foot: str, cell: str) -> str:
-    """Return the name of the link that represents the contact pad under a force cell.
+    """Return the name of the link at a force cell. This link carries the contact sphere of the nearest sole corner.
 
-    The axes of the link are parallel to those of the foot.
+    The axes of the link are parallel to the axes of the foot.
 
     Args:
         foot: left or right.
@@ -163,12 +163,16 @@ def _left_leg(p: ExoskeletonParameters) -> list[Link]:
     pad = 0.4 * p.pad_mass * p.pad_radius**2
     pad_inertia = Inertia(p.pad_mass, ZERO, (pad, 0.0, 0.0, pad, 0.0, pad))
     for cell in CELLS:
-        origin = (
-            p.cell_x[0] if cell[0] == "F" else p.cell_x[1],
-            p.cell_y if cell[1] == "L" else -p.cell_y,
-            sole_z + p.pad_radius,
+        forward, left = 1 if cell[0] == "F" else -1, 1 if cell[1] == "L" else -1
+        x, y = p.cell_x[0] if forward > 0 else p.cell_x[1], left * p.cell_y
+        corner = (
+            sole_x + forward * (0.5 * length - p.pad_radius) - x,
+            left * (0.5 * width - p.pad_radius) - y,
+            0.0,
         )
-        legs.append(Link(pad_link("left", cell), "left_foot", None, origin, 0.0, ZERO, pad_inertia, pad=p.pad_radius))
+        origin = (x, y, sole_z + p.pad_radius)
+        sphere = Sphere(p.pad_radius, corner)
+        legs.append(Link(pad_link("left", cell), "left_foot", None, origin, 0.0, ZERO, pad_inertia, pad=sphere))
     return legs
 
 

@@ -31,7 +31,7 @@ class Segment:
 
 #: Body segments from D. A. Winter, Biomechanics and Motor Control of Human Movement, 4th ed. 2009.
 #: Mass, centre, gyration and density are from table 4.1, length is from figure 4.1 (after Drillis and Contini).
-#: HAT is head, arms and trunk. Its length is that from hips to shoulders. Its density is the mean density of its parts.
+#: HAT is head, arms and trunk, with the length from hips to shoulders and the mean density of all its parts.
 #: Thigh, shank and foot are the segments of one side of the body.
 SEGMENTS = {
     "HAT": Segment(0.678, 0.626, 0.496, 0.288, 1050.0),
@@ -43,7 +43,7 @@ SEGMENTS = {
 
 @dataclass(frozen=True)
 class Patient:
-    """Patient in the exoskeleton. If a length is None, it follows from the height and Winter's table.
+    """Patient in the exoskeleton. A length that is None is computed from the height with Winter's table.
 
     Raises:
         ValueError: If a number is outside its range; the message states the range.
@@ -76,8 +76,9 @@ class Patient:
     def body(self, segment: str, proximal: Vector3, axis: int, direction: int) -> tuple[Box, Inertia]:
         """Return the box (for viewers) and the mass properties of a segment, in the frame of the link that carries it.
 
-        The moment of inertia about the transverse axes is m (gyration length)^2. The table has no moment about the axis of the
-        segment. It is computed for a square prism with the length and density of the segment. The same prism is the box.
+        The moment of inertia about the transverse axes is m (gyration length)^2. The table has no moment about the long
+        axis of the segment. For this axis, the moment of a square prism with the length and density of the segment is
+        used. The box is this prism.
 
         Args:
             segment: one of `SEGMENTS`.

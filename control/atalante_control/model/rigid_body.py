@@ -1,6 +1,6 @@
 """Rigid bodies and the links of a tree, with fusion of bodies and reflection in the sagittal plane.
 
-`Box` (shape for viewers) -> `Inertia` (mass properties) -> `Link` (body with the joint that moves it).
+`Box` (shape for viewers) -> `Inertia` (mass properties) -> `Link` (body, and the joint that moves this body).
 """
 
 from __future__ import annotations
@@ -31,6 +31,14 @@ class Box:
 
 
 @dataclass(frozen=True)
+class Sphere:
+    """Sphere that touches the floor."""
+
+    radius: float  # m
+    centre: Vector3  # m, in the link frame
+
+
+@dataclass(frozen=True)
 class Inertia:
     """Mass properties of a rigid body in a link frame."""
 
@@ -50,7 +58,7 @@ class Inertia:
         return Inertia(self.mass, mirrored(self.centre), (xx, -xy, xz, yy, -yz, zz))
 
     def fused(self, other: Inertia) -> Inertia:
-        """Return the combined mass properties of this body and another body fixed to it (parallel axis theorem).
+        """Return the mass properties of this body and a second body that are fixed to each other (parallel axis theorem).
 
         Args:
             other: mass properties of the second body in the same link frame.
@@ -68,17 +76,17 @@ class Inertia:
 
 @dataclass(frozen=True)
 class Link:
-    """Link of a tree of links, with the joint that connects it to its parent link."""
+    """Link of a tree of links, with the joint between the link and the parent link."""
 
     name: str
-    parent: str  # name of the parent link; "": the link is the root
-    joint: str | None  # one of `JOINTS`; None: the link is fixed to its parent
+    parent: str  # name of the parent link, or "" for the root
+    joint: str | None  # one of `JOINTS`, or None if the link is fixed to its parent
     origin: Vector3  # m, position of the joint in the frame of the parent link
-    yaw: float  # rad, rotation about z of the parent link
+    yaw: float  # rad, angle about the z axis of the parent link, from the parent frame to the link frame at joint angle 0
     axis: Vector3  # joint axis in the frame of the link; unused for a fixed link
     inertia: Inertia
     boxes: tuple[Box, ...] = ()  # shapes for viewers
-    pad: float = 0.0  # m, radius of a contact sphere at the origin of the link; 0: no contact
+    pad: Sphere | None = None  # contact sphere
 
     def fused(self, box: Box, inertia: Inertia) -> Link:
         """Return a copy of the link that is fused with a second body.
@@ -92,7 +100,7 @@ class Link:
     def mirrored(self) -> Link:
         """Return the mirror image of a link of the left leg, for the right leg.
 
-        The joint axis is the same. The sign of the joint angle changes instead (MIRROR_SIGN).
+        The joint axis is not mirrored. Instead, the sign of the joint angle changes (MIRROR_SIGN).
         """
         name = _right(self.name)
         if self.pad:  # mirroring swaps the left and the right force cells of a foot
@@ -106,7 +114,7 @@ class Link:
             self.axis,
             self.inertia.mirrored(),
             tuple(Box(box.mass, mirrored(box.centre), box.size) for box in self.boxes),
-            self.pad,
+            self.pad and replace(self.pad, centre=mirrored(self.pad.centre)),
         )
 
 

@@ -13,13 +13,13 @@ from atalante_hal.robot import JOINTS, Robot
 def urdf(parameters: ExoskeletonParameters, robot: Robot, patient: Patient | None = None) -> str:
     """Return the URDF of the exoskeleton, empty or with a patient.
 
-    The joints are `JOINTS` in their order. Only the eight contact pads have collision shapes. The links of the IMUs have no mass.
-    The same parameters give the same text, with all digits of every number.
+    The joints are those of `JOINTS`, in the same order. Only the eight contact pads have collision shapes. The links of the IMUs
+    have no mass. The same parameters give the same text, with all digits of every number.
 
     Args:
         parameters: geometry and masses of the exoskeleton; each link is a homogeneous box.
         robot: limits of the joints.
-        patient: patient in the exoskeleton; None: empty.
+        patient: patient in the exoskeleton, or None for an empty exoskeleton.
     """
     return urdf_text(links(parameters, patient), robot)
 
@@ -68,7 +68,12 @@ def _link_xml(link: Link) -> list[str]:
             "    </visual>",
         ]
     if link.pad:
-        lines.append(f'    <collision><geometry><sphere radius="{_number(link.pad)}"/></geometry></collision>')
+        lines += [
+            "    <collision>",
+            f'      <origin xyz="{_numbers(link.pad.centre)}"/>',
+            f'      <geometry><sphere radius="{_number(link.pad.radius)}"/></geometry>',
+            "    </collision>",
+        ]
     return [*lines, "  </link>"]
 
 

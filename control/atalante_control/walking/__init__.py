@@ -1,1 +1,1 @@
-"""Walking on the ground: contact detection of the swing foot."""
+"""Walking on the ground: walking controller, phases of a walk, ankle stabiliser, steering, kinematics and attitude observer."""

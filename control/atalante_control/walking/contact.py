@@ -1,7 +1,7 @@
-"""Detection of the step change on the ground: `foot force, time in the step -> step change`.
+"""Detection of the stance change on the ground: `foot force, time in the step -> stance change`.
 
-On the ground a step ends when the swing foot has carried load for several consecutive cycles, but not before a given fraction
-of the step has passed. In the air a step ends by time (`gait.step_over`).
+On the ground a step ends when the swing foot has carried load for several consecutive cycles and a minimum fraction of the step
+has passed. In the air a step ends by time (`gait.step_over`).
 """
 
 from __future__ import annotations
@@ -18,10 +18,11 @@ class ImpactConfig:
         ValueError: If the release force is not below the impact force, or a number is out of range.
     """
 
-    impact_force: float = 80.0  # N, smallest vertical force on the swing foot that counts as an impact
-    release_force: float = 30.0  # N, the force must fall below this value in a step before an impact counts
-    debounce: int = 5  # number of consecutive cycles with at least impact_force that count as an impact
-    earliest: float = 0.5  # fraction of the step duration before which no impact counts
+    impact_force: float = 80.0  # N, smallest vertical force on the swing foot at an impact
+    #: N, force below which the swing foot has left the ground; an impact is accepted only afterwards
+    release_force: float = 30.0
+    debounce: int = 5  # number of consecutive cycles with at least `impact_force` that are an impact
+    earliest: float = 0.5  # fraction of the step duration before which impacts are ignored
 
     def __post_init__(self) -> None:
         if not 0.0 <= self.release_force < self.impact_force < math.inf:
@@ -43,15 +44,15 @@ class ImpactDetector:
         self.start_step()
 
     def start_step(self) -> None:
-        """Reset the detector. An impact counts only after the new swing foot has left the ground."""
+        """Reset the detector at the start of a step. Impacts are ignored until the new swing foot has left the ground."""
         self._released, self._count = False, 0
 
     def update(self, vertical_force: float, phase: float) -> bool:
-        """Return whether the step ends in this cycle. A force of NaN counts as neither contact nor release.
+        """Return whether the step ends in this cycle. A force of NaN is neither a contact nor a release.
 
         Args:
             vertical_force: force on the swing foot, sum of its cells, upwards positive [N].
-            phase: time since the step change divided by the step duration, t / T.
+            phase: time since the stance change divided by the step duration, t / T.
         """
         config = self._config
         if vertical_force < config.release_force:

@@ -1,4 +1,4 @@
-"""Torque carried over a step change: the command starts at the last torque and fades to the new one."""
+"""Torque carried over a stance change: the command starts at the last torque and fades to the new one."""
 
 from __future__ import annotations
 

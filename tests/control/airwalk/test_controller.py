@@ -1,7 +1,7 @@
-"""The hanging controller on the coupled exoskeleton: forward dynamics by Pinocchio, drives as they are.
+"""Airwalk controller on a simulated exoskeleton: forward dynamics of Pinocchio, with the dynamics of the drives.
 
-The plant knows what the controller does not: friction that is a fifth off what was identified, one cycle of delay, a
-current loop, encoder steps and an 80 Hz velocity filter.
+The simulation includes one cycle of delay, a current loop, encoder steps and a velocity filter of 80 Hz. In some tests its
+friction differs by 20 % from the friction that the controller compensates.
 """
 
 from __future__ import annotations
@@ -14,13 +14,11 @@ from functools import cache
 import numpy as np
 import pinocchio
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 
-from atalante_control.airwalk.controller import AirwalkConfig, AirwalkController, baseline_share
+from atalante_control.airwalk.controller import AirwalkConfig, AirwalkController
 from atalante_control.dynamics.gravity import Gravity
 from atalante_control.gait.gait import AIRWALK_GAIT, Gait, load_gait
-from atalante_control.guide.certificate import certify
+from atalante_control.guide.certificate import largest_promise
 from atalante_control.guide.shapes import SHAPES
 from atalante_control.joint.idealization import Friction
 from atalante_control.joint.pid import AIR_GAINS, LEFT, RIGHT, Pid
@@ -32,7 +30,7 @@ ROBOT = load_robot()
 GAIT = load_gait(AIRWALK_GAIT, ROBOT)
 MODEL = pinocchio_model(urdf(ExoskeletonParameters(), ROBOT))
 CONFIG = AirwalkConfig(startup=0.5)
-RATE = ROBOT.torque_rate_max * 1e-3  # Nm a cycle
+RATE = ROBOT.torque_rate_max * 1e-3  # Nm per cycle
 STARTUP = 500
 SH, SK = JOINTS.index("left_SH"), JOINTS.index("left_SK")
 START = np.array([0.02, 0.0, -0.1, 0.3, -0.1, 0.0, -0.02, 0.0, -0.2, 0.3, -0.05, 0.0])
@@ -47,7 +45,7 @@ def blank_state(xi: float) -> State:
 
 
 class Plant:
-    """Twelve joints under a fixed pelvis; order of JOINTS."""
+    """Simulated exoskeleton with a fixed pelvis. Its twelve joints are in the order of JOINTS."""
 
     COUNT = 2 * math.pi / 131072 / 100.0  # rad, encoder step at the joint
     KEEP = math.exp(-2 * math.pi * 80.0 * 1e-3)
@@ -64,7 +62,7 @@ class Plant:
         self._sense_tibiae()
 
     def step(self, torque: np.ndarray) -> None:
-        """One cycle with the command of the cycle before, then sense."""
+        """Advance by one cycle under the command of the previous cycle, then measure the new state."""
         for _ in range(2):
             self.motor += (self.command - self.motor) * (1.0 - math.exp(-1.0))  # 0.5 ms current loop
             friction = self.coulomb * np.tanh(self.v / 0.05) + self.viscous * self.v
@@ -103,7 +101,7 @@ def walk(
     xi: float = 0.5,
     each: Callable[[State], None] = lambda state: None,
 ) -> np.ndarray:
-    """Commands of a closed loop, shape (cycles, 12)."""
+    """Walk in a closed loop, and return the commands, shape (cycles, 12) [Nm]."""
     plant = Plant(friction, xi)
     controller.reset(plant.state)
     torques = np.empty((cycles, 12))
@@ -124,47 +122,28 @@ CERTIFIED = ["constant", "widening", "narrowing", "pinched", "asymmetric"]
 
 
 @pytest.mark.parametrize("shape", [*CERTIFIED, "snap"])
-def test_a_step_takes_the_gentlest_gains_that_are_certified_with_a_margin(shape: str):
+def test_step_uses_the_softest_gains_certified_for_the_promise(shape: str):
     controller = airwalk(shape)
-    box, margin = CONFIG.hand_over, CONFIG.guide_margin
-    kp = [guide.config.policies[0].kp for guide in controller.guides]
-    assert kp == sorted(kp)
-    for xi in (0.0, 0.25, 0.5, 0.75, 0.93):
-        certificates = [certify(guide, xi, box) for guide in controller.guides]
-        enough = [c.certified and c.margin >= margin + 0.05 for c in certificates]  # the bound in Xi is found to 0.01
-        never = [not c.certified or c.margin < margin for c in certificates]
-        taken = controller.guides.index(controller.guide_at(xi))
-        assert not any(enough[:taken])
-        assert taken == len(kp) - 1 or not never[taken]
-        if xi <= CONFIG.fade:
-            assert replace(controller.certificate(xi), joint_torque=None) == certificates[taken]
-    # What the stiffest gains keep is never lost to gentler ones.
-    stiffest = [certify(controller.guides[-1], xi, box).certified for xi in (0.5, 0.93)]
-    assert [certify(controller.guide_at(xi), xi, box).certified for xi in (0.5, 0.93)] == stiffest
+    stiffness = [guide.prediction.policy.stiffness for guide in controller.guides]
+    assert stiffness == sorted(stiffness)
+    for xi in (0.0, 0.5, 0.75, 0.93):
+        scales = [largest_promise(guide, xi) for guide in controller.guides]
+        guide, promise = controller.choice(xi)
+        enough = [scale >= 1.0 for scale in scales]
+        expected = enough.index(True) if any(enough) else int(np.argmax(scales))
+        assert guide is controller.guides[expected] is controller.guide_at(xi)
+        assert promise == pytest.approx(1.0 if any(enough) else max(0.0, 0.95 * max(scales)))
 
 
 @pytest.mark.parametrize("shape", list(SHAPES))
-@pytest.mark.parametrize("xi", [0.9 + 1e-9, 0.91, 0.95, 0.99, 1.0])
-def test_no_guide_is_certified_where_the_baseline_is_blended_in(shape: str, xi: float):
-    certificate = airwalk(shape).certificate(xi)
+def test_no_guide_has_a_promise_at_full_assistance(shape: str):
+    certificate = airwalk(shape).certificate(1.0)
     assert not certificate.certified
-    assert certificate.joint_torque is None
-    assert ("fade" if xi < 1.0 else "only the baseline controller drives the joints") in certificate.reason
+    assert certificate.promise is None
+    assert "only the baseline controller drives the joints" in certificate.reason
 
 
-def test_the_fade_is_that_of_the_configuration():
-    controller = airwalk("constant", replace(CONFIG, fade=0.4))
-    assert [controller.certificate(xi).certified for xi in (0.4, 0.5)] == [True, False]
-
-
-def test_a_guide_whose_torques_are_not_decoupled_is_not_certified():
-    certificate = airwalk("constant", replace(CONFIG, decoupled=False)).certificate(0.5)
-    assert not certificate.certified
-    assert certificate.joint_torque is None
-    assert "decoupled=False" in certificate.reason
-
-
-def test_statistics_keep_the_factors_of_the_steps():
+def test_statistics_contain_the_assistance_factors_of_the_steps():
     controller = airwalk()
 
     def operator(state: State) -> None:
@@ -174,7 +153,7 @@ def test_statistics_keep_the_factors_of_the_steps():
     assert controller.statistics.factors == {0.5, 0.95}
 
 
-def test_a_joint_whose_torque_is_cut_winds_no_integral_up():
+def test_integral_does_not_wind_up_when_the_limiter_cuts_the_torque():
     controllers = airwalk(), airwalk()
     joint, commands = JOINTS.index("right_FH"), []
     for controller, cut in zip(controllers, (0.0, 1.0), strict=True):
@@ -194,18 +173,18 @@ def test_a_joint_whose_torque_is_cut_winds_no_integral_up():
 
 
 @pytest.mark.parametrize("shape", CERTIFIED)
-def test_a_certified_guide_is_kept_by_the_coupled_leg(shape: str):
+def test_coupled_leg_stays_inside_a_certified_guide(shape: str):
     controller = airwalk(shape)
     assert controller.certificate(0.5).certified
     torques = walk(controller, TWO_STEPS + 1)
-    said = controller.statistics
-    assert said.steps == 2
-    assert said.max_ratio <= 1.0
-    assert said.inside_fraction == 1.0
-    assert said.active_fraction > 0.5  # nobody moves the leg: it is led along the guide
-    assert said.min_h_at_start > 0.0
-    assert said.hand_overs_exceeded == 0
-    # Nothing for the limiter to cut, at step changes least of all.
+    statistics = controller.statistics
+    assert statistics.steps == 2
+    assert statistics.max_ratio <= 1.0
+    assert statistics.inside_fraction == 1.0
+    assert statistics.active_fraction < 0.9  # the feedforward moves the leg, so the guide acts little
+    assert statistics.min_h_at_start > 0.0
+    assert statistics.hand_overs_exceeded == 0
+    # The torques stay within the rate limit of the limiter, also at stance changes.
     jumps = np.abs(np.diff(torques, axis=0))
     assert (jumps <= RATE).all()
     changes = STARTUP + STEP * np.arange(1, 4)
@@ -215,49 +194,35 @@ def test_a_certified_guide_is_kept_by_the_coupled_leg(shape: str):
 
 @pytest.mark.parametrize("friction", [0.8, 1.2])
 @pytest.mark.parametrize("shape", ["constant", "pinched"])
-def test_friction_a_fifth_off_does_not_break_the_guide(shape: str, friction: float):
+def test_joints_stay_inside_the_guide_with_20_percent_friction_error(shape: str, friction: float):
     controller = airwalk(shape)
     walk(controller, STARTUP + 3 * STEP, friction)
     assert controller.statistics.max_ratio <= 1.0
 
 
-@pytest.mark.parametrize("xi", [0.0, 0.8, 0.93])
-def test_the_guide_is_kept_at_other_assistance_factors(xi: float):
+@pytest.mark.parametrize("xi", [0.0, 0.8, 0.93, 0.97])
+def test_joints_stay_inside_the_guide_at_other_assistance_factors(xi: float):
     controller = airwalk()
-    assert controller.certificate(xi).certified == (xi <= CONFIG.fade)
+    assert controller.certificate(xi).certified
     walk(controller, STARTUP + 3 * STEP, xi=xi)
     assert controller.statistics.max_ratio <= 1.0
 
 
-def test_an_uncertified_guide_is_announced_and_left():
+def test_push_moves_a_joint_out_of_a_guide_without_promise():
     controller = airwalk("snap")
     certificate = controller.certificate(0.5)
     assert not certificate.certified
     assert certificate.reason
-    walk(controller, STARTUP + 3 * STEP)
+    plant = Plant(xi=0.5)
+    controller.reset(plant.state)
+    for cycle in range(STARTUP + 3 * STEP):
+        torque = controller.update(plant.state).torque.copy()
+        torque[SK] += 30.0 if cycle > STARTUP + 2 * STEP + 300 else 0.0
+        plant.step(torque)
     assert controller.statistics.max_ratio > 1.0
-    assert controller.statistics.inside_fraction < 1.0
-
-
-def test_without_the_coupling_undone_a_certified_guide_is_left():
-    """Why `decoupled` is there: as printed, each torque on its own joint, the knee throws the hip out."""
-    controller = airwalk("pinched", replace(CONFIG, decoupled=False))
-    walk(controller, STARTUP + 3 * STEP)
-    assert controller.statistics.max_ratio > 1.05
 
 
 # -- Xi --------------------------------------------------------------------------------------------------------------
-
-
-@given(st.floats(0.0, 1.0), st.floats(0.0, 0.99))
-def test_share_of_the_baseline_is_a_smooth_step_to_exactly_one(xi: float, fade: float):
-    share = baseline_share(xi, fade)
-    assert 0.0 <= share <= 1.0
-    assert baseline_share(1.0, fade) == 1.0
-    if xi <= fade:
-        assert share == 0.0
-    assert share <= baseline_share(min(1.0, xi + 1e-3), fade)
-    assert abs(baseline_share(min(1.0, xi + 1e-9), fade) - share) < 1e-6
 
 
 def test_at_full_assistance_the_command_is_the_baseline_torque_to_the_last_bit():
@@ -273,27 +238,26 @@ def test_at_full_assistance_the_command_is_the_baseline_torque_to_the_last_bit()
         state = plant.state
         torque = controller.update(state).torque.copy()
         if since < 0:
-            # The way to the start is the baseline's own; take over its integrals.
+            # The start motion is not compared, so copy the integrals of the controller.
             pid.records[0].integral[:] = controller.pid.records[0].integral
         else:
             expected = pid.update(controller.desired, state.position, state.velocity)
             expected += gravity.torque(state.position, (1.0, 0.0, 0.0, 0.0))
-            if since % STEP >= 30:  # the hand-over of the baseline itself has faded
+            if since % STEP >= 30:  # the torque that was carried over the stance change has faded
                 assert torque.tobytes() == expected.tobytes()
                 compared += 1
         plant.step(torque)
     assert compared == 3 * (STEP - 30)
 
 
-def test_at_full_assistance_the_guide_has_no_say():
-    """Whatever u_v is, and in the hand-over too."""
+def test_guide_has_no_effect_at_full_assistance():
+    """The guide torque u_v has no effect, also not directly after a stance change."""
     calm, wild = airwalk(), airwalk()
     rng = np.random.default_rng(1)
 
     def nonsense(state: State) -> None:
         for guide in wild.guides:
-            for name in ("kp", "kd", "limit"):
-                guide.tables.joints[name] = rng.uniform(0.0, 1e6, 2)
+            guide.tables.guards["gains"] = rng.uniform(0.0, 1e6, (1, 2, 4))
 
     cycles = STARTUP + 2 * STEP + 100
     assert walk(calm, cycles, xi=1.0).tobytes() == walk(wild, cycles, xi=1.0, each=nonsense).tobytes()
@@ -324,7 +288,7 @@ def replayed(xi: float, shape: str = "constant", config: AirwalkConfig = CONFIG,
     return np.array([controller.update(replace(state, assistance_factor=xi)).torque.copy() for state in states])
 
 
-@pytest.mark.parametrize("xi", [0.0, 0.5, 0.9, 0.95, 0.999, 1.0 - 1e-6])
+@pytest.mark.parametrize("xi", [0.0, 0.5, 0.9])
 def test_the_command_is_continuous_in_the_assistance_factor(xi: float):
     here = replayed(xi)
     near, nearer = (np.abs(replayed(xi + step) - here).max() for step in (1e-6, 1e-7))
@@ -337,13 +301,13 @@ def test_only_hip_and_knee_of_the_swing_leg_are_assisted():
     first = slice(STARTUP, STARTUP + STEP)
     others = [j for j in range(12) if j not in (SH, SK)]
     assert assisted[first][:, others].tobytes() == baseline[first][:, others].tobytes()
-    assert np.abs(assisted[first][:, [SH, SK]] - baseline[first][:, [SH, SK]]).max() > 10.0
+    assert np.abs(assisted[first][:, [SH, SK]] - baseline[first][:, [SH, SK]]).max() > 5.0
     faded = slice(STARTUP + STEP + 30, None)
     left = [j for j in range(6) if j not in (SH, SK)]
     np.testing.assert_allclose(assisted[faded][:, left], baseline[faded][:, left], atol=1e-9)
 
 
-def test_a_new_assistance_factor_waits_for_the_step_change():
+def test_new_assistance_factor_takes_effect_at_the_stance_change():
     controller = airwalk("widening")
     seen: list[tuple[float, float]] = []
 
@@ -359,13 +323,13 @@ def test_a_new_assistance_factor_waits_for_the_step_change():
     assert (np.abs(np.diff(torques, axis=0)) <= RATE).all()
 
 
-@pytest.mark.parametrize("asked", [-1.0, 2.0])
-def test_a_factor_out_of_range_is_brought_into_it(asked: float):
+@pytest.mark.parametrize("requested", [-1.0, 2.0])
+def test_assistance_factor_out_of_range_is_clamped(requested: float):
     controller = airwalk()
     controller.reset(walked()[0])
     for state in walked()[: STARTUP + 3]:
-        controller.update(replace(state, assistance_factor=asked))
-    assert controller.telemetry[-1] == min(1.0, max(0.0, asked))
+        controller.update(replace(state, assistance_factor=requested))
+    assert controller.telemetry[-1] == min(1.0, max(0.0, requested))
 
 
 # -- the rest --------------------------------------------------------------------------------------------------------
@@ -388,7 +352,7 @@ def test_starts_from_the_measured_pose_and_torque():
     assert (np.abs(np.diff(poses[:-1], axis=0)) / 1e-3 < ROBOT.velocity_max).all()
 
 
-def test_starts_again_after_a_reset_as_if_new():
+def test_reset_controller_behaves_like_a_new_one():
     used, fresh = airwalk(), airwalk()
     walk(used, STARTUP + 900)
     first, second = (walk(controller, STARTUP + 850) for controller in (used, fresh))
@@ -396,7 +360,7 @@ def test_starts_again_after_a_reset_as_if_new():
     assert used.statistics == fresh.statistics
 
 
-def test_telemetry_is_what_its_fields_say():
+def test_telemetry_matches_the_names_and_lengths_of_its_fields():
     controller = airwalk("asymmetric")
     fields = dict(controller.telemetry_fields)
     assert sum(fields.values()) == len(controller.telemetry)
@@ -431,20 +395,35 @@ def test_haptics_follow_the_swing_leg_and_are_silent_at_full_assistance():
         assert not vibration[4:].any()
 
 
-def test_a_joint_outside_its_safe_backward_image_is_told():
-    controller = airwalk()
+def pushed_out(config: AirwalkConfig = CONFIG, shape: str = "constant") -> list[tuple[bool, bool]]:
+    """Return `outside` and `guide_left` of each cycle. After cycle STARTUP + 200, the measured hip angle is far outside."""
+    controller = airwalk(shape, config)
     controller.reset(walked()[0])
-    told = []
+    found = []
     for cycle, state in enumerate(walked()[: STARTUP + 300]):
-        pushed = state.position.copy()
-        pushed[SH] += 0.3 * (cycle > STARTUP + 200)
-        told.append(controller.update(replace(state, assistance_factor=0.5, position=pushed)).outside)
-    assert not any(told[: STARTUP + 200])
-    assert told[-1]
+        position = state.position.copy()
+        position[SH] += 0.3 * (cycle > STARTUP + 200)
+        command = controller.update(replace(state, assistance_factor=0.5, position=position))
+        found.append((command.outside, command.guide_left))
+    return found
+
+
+def test_a_joint_outside_its_safe_backward_image_is_reported():
+    outside = [out for out, _ in pushed_out()]
+    assert not any(outside[: STARTUP + 200])
+    assert outside[-1]
+
+
+def test_leaving_the_guide_is_reported_after_outside_cycles():
+    left = [left for _, left in pushed_out(replace(CONFIG, outside_cycles=50))]
+    assert left.index(True) in range(STARTUP + 251, STARTUP + 254)
+    assert all(left[left.index(True) :])
+    # A guide without a promise is not reported.
+    assert not any(left for _, left in pushed_out(replace(CONFIG, outside_cycles=50), "snap"))
 
 
 @pytest.mark.parametrize("silent", [("left_tibia", "right_tibia"), ("left_tibia", "right_tibia", "pelvis")])
-def test_flat_foot_does_not_listen_to_an_imu_that_is_silent(silent: tuple[str, ...]):
+def test_flat_foot_ignores_imus_that_timed_out(silent: tuple[str, ...]):
     def ankles(quaternion: float, age: int) -> np.ndarray:
         controller = airwalk(config=replace(CONFIG, gentler=()))
         controller.reset(walked()[0])
@@ -466,7 +445,7 @@ def test_flat_foot_does_not_listen_to_an_imu_that_is_silent(silent: tuple[str, .
     assert np.abs(np.diff(unheard[STARTUP + 1 : STARTUP + STEP], axis=0)).max() < 0.01
 
 
-def test_missed_cycles_do_not_stretch_the_step():
+def test_missed_cycles_do_not_lengthen_the_step():
     controller = airwalk()
     controller.reset(walked()[0])
     for state in walked()[: STARTUP + STEP - 2]:
@@ -477,18 +456,30 @@ def test_missed_cycles_do_not_stretch_the_step():
     np.testing.assert_allclose(controller.telemetry[:12], late.position, atol=math.radians(5.0))
 
 
-def test_feedforward_is_off_in_the_air_and_acts_when_asked_for():
-    rng = np.random.default_rng(7)
-    points = rng.normal(size=(12, 8)) * 5.0
-    pushed = replace(GAIT, feedforward=points)
-    np.testing.assert_array_equal(replayed(0.5, gait=pushed), replayed(0.5))
-    open_guide = replace(CONFIG, feedforward=True, gentler=())  # the stiffest gains leave it alone longest
-    swing = STARTUP + 100
-    difference = replayed(0.5, config=open_guide, gait=pushed)[swing] - replayed(0.5, config=open_guide)[swing]
-    assert not difference[[j for j in range(12) if j not in (SH, SK)]].any()
-    # As a torque on the coupled pair it comes out as the gait asks for, where the guide leaves the joint alone.
-    uf = pushed.tables().uf[100, [SH, SK]]
-    np.testing.assert_allclose(difference[[SH, SK]], uf, atol=6.0)
+def test_literal_law_at_full_assistance_is_the_pid_alone():
+    config = replace(AirwalkConfig.literal(), startup=0.5)
+    controller, pid, plant = airwalk(config=config), Pid(config.gains), Plant(xi=1.0)
+    controller.reset(plant.state)
+    for k in range(STARTUP + STEP):
+        if k == STARTUP:
+            pid.start_step(RIGHT, np.ones(12))
+        state = plant.state
+        torque = controller.update(state).torque.copy()
+        if k < STARTUP:
+            pid.records[0].integral[:] = controller.pid.records[0].integral
+        else:
+            assert torque.tobytes() == pid.update(controller.desired, state.position, state.velocity).tobytes()
+        plant.step(torque)
+
+
+def test_intensities_scale_idealization_and_feedforward():
+    full, none = (replayed(0.0, config=replace(CONFIG, idealization=x, feedforward=x)) for x in (1.0, 0.0))
+    half = replayed(0.0, config=replace(CONFIG, idealization=0.5, feedforward=0.5))
+    cycle = STARTUP + 100
+    others = [j for j in range(12) if j not in (SH, SK)]
+    assert np.array_equal(full[cycle][others], none[cycle][others])
+    assert np.abs(full[cycle] - none[cycle])[[SH, SK]].max() > 5.0
+    np.testing.assert_allclose(half[cycle][[SH, SK]], 0.5 * (full + none)[cycle][[SH, SK]], atol=3.0)
 
 
 @pytest.mark.parametrize(
@@ -496,14 +487,15 @@ def test_feedforward_is_off_in_the_air_and_acts_when_asked_for():
     [
         {"startup": 0.0},
         {"blend": float("nan")},
-        {"fade": 1.0},
-        {"guide_rate": (0.0, 1.0)},
+        {"stiffness": (0.0, 1.0)},
+        {"promise": (30.0, 0.0)},
+        {"idealization": 1.5},
+        {"feedforward": -0.5},
         {"gentler": (0.7, 0.5)},
         {"gentler": (1.0,)},
         {"alpha": 2.0},
-        {"points": 1},
     ],
 )
-def test_refuses_a_configuration_that_is_none(bad: dict[str, object]):
+def test_invalid_configuration_is_rejected(bad: dict[str, object]):
     with pytest.raises(ValueError, match=r"\w"):
         airwalk(config=replace(CONFIG, **bad))

@@ -44,7 +44,7 @@ def test_step_starts_at_the_measured_motion_and_reaches_the_nominal_one(stance: 
     np.testing.assert_allclose(reference.row(stance, end), nominal[end], atol=1e-12)
 
 
-def test_new_step_forgets_the_last_deviation():
+def test_new_step_does_not_depend_on_the_last_deviation():
     used, fresh = (GaitReference(GAIT, DEADBEAT, OFFSET) for _ in range(2))
     used.start_step(RIGHT, *RNG.normal(size=(2, 12)))
     motion = RNG.normal(size=(2, 12))

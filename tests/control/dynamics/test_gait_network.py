@@ -35,7 +35,7 @@ ROBOT = load_robot()
 SHIPPED = load_network()
 
 
-def drawn(seed: int) -> GaitNetwork:
+def untrained(seed: int) -> GaitNetwork:
     """Return an untrained network whose last layer gives periodic gaits."""
     rng = np.random.default_rng(seed)
     _, _, right = np.linalg.svd(periodicity())
@@ -44,7 +44,7 @@ def drawn(seed: int) -> GaitNetwork:
         Layer(rng.normal(size=(4, 5)), rng.normal(size=5)),
         Layer(rng.normal(size=(5, len(basis))) @ basis * 0.05, rng.normal(size=len(basis)) @ basis * 0.05),
     )
-    return GaitNetwork(np.array([50.0, 1.5, 0.1, 0.6]), np.array([90.0, 1.9, 0.2, 1.2]), layers, "drawn")
+    return GaitNetwork(np.array([50.0, 1.5, 0.1, 0.6]), np.array([90.0, 1.9, 0.2, 1.2]), layers, "untrained")
 
 
 def random_inputs(network: GaitNetwork, count: int, seed: int = 0) -> np.ndarray:
@@ -56,7 +56,7 @@ def subject(inputs: np.ndarray) -> Subject:
     return Subject(Patient(mass, height), length, round(duration, 3))
 
 
-@pytest.mark.parametrize("network", [SHIPPED, drawn(1)], ids=["shipped", "untrained"])
+@pytest.mark.parametrize("network", [SHIPPED, untrained(1)], ids=["shipped", "untrained"])
 def test_angles_of_every_gait_continue_in_the_mirrored_step(network: GaitNetwork) -> None:
     for inputs in random_inputs(network, 50):
         points = network.coefficients(inputs)
@@ -83,7 +83,7 @@ def test_shipped_network_covers_the_subjects_of_the_paper() -> None:
     assert gait_network.DEFAULT_NETWORK.stat().st_size < 100_000
 
 
-def test_output_is_continuous() -> None:
+def test_network_output_is_continuous() -> None:
     """An input step of 1e-6 of its range changes every angle by less than 1e-4 degrees."""
     for inputs in random_inputs(SHIPPED, 100):
         for axis, step in enumerate(1e-6 * (SHIPPED.high - SHIPPED.low)):
@@ -137,10 +137,10 @@ def test_ends_of_the_range_are_accepted() -> None:
 
 
 def test_saved_network_is_loaded_bit_for_bit(tmp_path: Path) -> None:
-    network = drawn(2)
+    network = untrained(2)
     save_network(network, tmp_path / "network.npz")
     back = load_network(tmp_path / "network.npz")
-    assert back.version == "drawn"
+    assert back.version == "untrained"
     for inputs in random_inputs(network, 5):
         np.testing.assert_array_equal(back.coefficients(inputs), network.coefficients(inputs))
 
@@ -154,7 +154,7 @@ def test_saved_network_is_loaded_bit_for_bit(tmp_path: Path) -> None:
         ({"surprise": np.zeros(3)}, "'surprise.npy' is not a valid member"),
         ({"bias_1": None}, "bias_1 is missing"),
         ({"weights_3": np.zeros((4, 5))}, "weights_2 is missing"),
-        ({"low": np.zeros(3)}, "low and high must be 4 numbers"),
+        ({"low": np.zeros(3)}, "the arrays 'low' and 'high' must be 4 numbers"),
         ({"weights_0": np.full((4, 5), np.nan)}, "weights_0 must be an array of finite 64-bit floats"),
         ({"weights_0": np.full((4, 5), np.inf)}, "weights_0 must be an array of finite 64-bit floats"),
         ({"weights_0": np.full((4, 5), "1.0")}, "weights_0 must be an array of finite 64-bit floats"),
@@ -162,12 +162,12 @@ def test_saved_network_is_loaded_bit_for_bit(tmp_path: Path) -> None:
         ({"bias_0": np.zeros(4)}, r"weights_0 must have shape \(4, n\) and bias_0 shape \(n,\), with n from 1 to 128"),
         ({"weights_0": np.zeros((4, 129)), "bias_0": np.zeros(129)}, r"weights_0 must have shape \(4, n\)"),
         ({"weights_1": np.zeros((5, 8)), "bias_1": np.zeros(8)}, f"last layer must have {OUTPUTS} columns"),
-        ({"bias_1": np.arange(96.0)}, "the angles of a gait must be continuous at the step change"),
+        ({"bias_1": np.arange(96.0)}, "the angles of a gait must be continuous at the stance change"),
     ],
 )
 def test_invalid_network_file_is_rejected(tmp_path: Path, change: dict[str, np.ndarray | None], sentence: str) -> None:
     path = tmp_path / "network.npz"
-    save_network(drawn(3), path)
+    save_network(untrained(3), path)
     with np.load(path) as file:
         arrays = {**dict(file), **change}
     write_arrays(path, {name: array for name, array in arrays.items() if array is not None and name != CHECKSUM})
@@ -190,14 +190,14 @@ def test_damaged_network_file_is_rejected(tmp_path: Path, content: bytes) -> Non
 
 
 def test_invalid_network_is_not_saved(tmp_path: Path) -> None:
-    network = drawn(4)
-    endless = replace(
+    network = untrained(4)
+    infinite = replace(
         network, layers=(*network.layers[:-1], Layer(network.layers[-1].weights, np.full(OUTPUTS, np.inf)))
     )
     with pytest.raises(
         NetworkError, match=r"npz is not written; the network must be valid: bias_1 must be an array of finite"
     ):
-        save_network(endless, tmp_path / "network.npz")
+        save_network(infinite, tmp_path / "network.npz")
     assert not list(tmp_path.iterdir())
 
 

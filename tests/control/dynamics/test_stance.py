@@ -13,7 +13,7 @@ from atalante_hal.robot import load_robot
 ROBOT = load_robot()
 PATIENT = Patient(75.0, 1.75)
 DYNAMICS = stance_dynamics(ROBOT, PATIENT)
-SOLE = -ExoskeletonParameters().sole_centre[1]  # m, ankle over the ground
+SOLE = -ExoskeletonParameters().sole_centre[1]  # m, height of the ankle above the ground
 
 
 def random_states(count: int) -> list[tuple[np.ndarray, np.ndarray, np.ndarray]]:
@@ -78,7 +78,7 @@ def test_ground_wrench_at_rest_is_the_weight_at_the_centre_of_mass() -> None:
 
 def test_feedforward_and_suspended_gravity_give_the_walking_torque() -> None:
     gait = load_gait(AIRWALK_GAIT, ROBOT)
-    slow = 3.0  # step duration [s]; at its own duration, this gait for the air needs too large ground forces
+    slow = 3.0  # s, step duration; the airwalk gait at its own duration would need too large ground forces
     phase = np.linspace(0.0, 1.0, 41)
     q, qd, qdd = motion(gait.coefficients, slow, phase)
     fitted = pinocchio_model(urdf(ExoskeletonParameters().fitted(PATIENT), ROBOT))

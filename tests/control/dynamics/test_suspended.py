@@ -9,7 +9,7 @@ import pytest
 from atalante_control.airwalk.controller import AirwalkConfig, AirwalkController
 from atalante_control.dynamics.gait_network import load_network
 from atalante_control.dynamics.gravity import Gravity
-from atalante_control.dynamics.suspended import check_hung, suspended_gait
+from atalante_control.dynamics.suspended import check_suspended, suspended_gait
 from atalante_control.gait.gait import AIRWALK_GAIT, Gait, GaitError, bezier, check_gait, load_gait, motion
 from atalante_control.gait.subject import Subject
 from atalante_control.guide.shapes import SHAPES
@@ -22,7 +22,7 @@ EXOSKELETON = ExoskeletonParameters().fitted(Patient(80.0, 1.85))
 
 def test_gravity_and_feedforward_give_the_torque_of_the_motion() -> None:
     gait = suspended_gait(load_gait(AIRWALK_GAIT, ROBOT), EXOSKELETON, ROBOT)
-    model, into, out_of = pinocchio_model(urdf(EXOSKELETON, ROBOT))
+    model, q_index, v_index = pinocchio_model(urdf(EXOSKELETON, ROBOT))
     data = model.createData()
     phase = np.linspace(0.0, 1.0, 50)
     assert gait.feedforward is not None
@@ -30,9 +30,9 @@ def test_gravity_and_feedforward_give_the_torque_of_the_motion() -> None:
     demanded = []
     for row, state in enumerate(zip(*motion(gait.coefficients, gait.duration, phase), strict=True)):
         q, v, a = np.zeros((3, 12))
-        q[into], v[out_of], a[out_of] = state
-        demanded.append(pinocchio.rnea(model, data, q, v, a)[out_of])
-        u_f[row] += pinocchio.computeGeneralizedGravity(model, data, q)[out_of]
+        q[q_index], v[v_index], a[v_index] = state
+        demanded.append(pinocchio.rnea(model, data, q, v, a)[v_index])
+        u_f[row] += pinocchio.computeGeneralizedGravity(model, data, q)[v_index]
     assert np.abs(u_f - demanded).max() < 0.04 * np.abs(demanded).max()
 
 
@@ -50,10 +50,17 @@ def test_guides_are_certified_with_the_gaits_of_the_network(
     exoskeleton = ExoskeletonParameters().fitted(subject.patient)
     gait = suspended_gait(load_network().gait(subject, ROBOT), exoskeleton, ROBOT)
     for shape in SHAPES.values():
-        certificate = AirwalkController(ROBOT, gait, shape, AirwalkConfig(feedforward=True), exoskeleton).certificate(
-            0.5
-        )
-        assert certificate.certified == (shape.name != "snap"), certificate.reason
+        certificate = AirwalkController(ROBOT, gait, shape, AirwalkConfig(), exoskeleton).certificate(0.5)
+        if shape.name == "snap" or (mass_height[0] > 90.0 and step[1] < 0.8):
+            # The hand-over box is the range of deviations at a stance change for which a promise must hold. With the heaviest
+            # patient, the largest deviations in it need more torque at the start of the fast step than the drives have.
+            assert not certificate.certified
+            assert ("backup torque" if shape.name != "snap" else "no promise") in certificate.reason
+            continue
+        assert certificate.promise is not None, certificate.reason
+        if shape.name == "constant" and step[1] > 0.8:
+            assert certificate.promise.hip >= 12.0
+            assert certificate.promise.knee >= 8.0
 
 
 AIRWALK = load_gait(AIRWALK_GAIT, ROBOT)
@@ -75,41 +82,41 @@ def bent(points: tuple[int, ...], angle: float) -> Gait:
     return replace(AIRWALK, coefficients=moved)
 
 
-def pushed(torque: float) -> Gait:
+def with_ankle_torque(torque: float) -> Gait:
     """Return the airwalk gait with a constant feedforward of both Henke ankles [Nm]."""
     feedforward = np.zeros_like(AIRWALK.coefficients)
     feedforward[[JOINTS.index("left_HA"), JOINTS.index("right_HA")]] = torque
     return replace(AIRWALK, feedforward=feedforward)
 
 
-def endless(gait: Gait) -> Gait:
+def with_nan(gait: Gait) -> Gait:
     moved = gait.coefficients.copy()
     moved[3, 4] = np.nan
     return replace(gait, coefficients=moved)
 
 
 @pytest.mark.parametrize(
-    ("gait", "said"),
+    ("gait", "message"),
     [
         (
             shifted("SK", 2.5),
             r"gait 'airwalk': angle of joints\.\w+_SK must be 0 to 110\.01 deg, got 1\d\d\.\d+ deg at phase",
         ),
         (bent((3, 4), 2.0), r"joints\.left_SK must be"),
-        (bent((7,), 0.1), r"joints\.\w+_SK at the step change must be at most .* rad, got 0\.1 rad"),
+        (bent((7,), 0.1), r"joints\.\w+_SK at the stance change must be at most .* rad, got 0\.1 rad"),
         (
             replace(AIRWALK, coefficients=AIRWALK.coefficients[:11]),
             r"gait 'airwalk': joints must be 64-bit floats of shape \(12, 8\)",
         ),
-        (endless(AIRWALK), r"joints\.left_SK must be finite, got nan"),
-        (pushed(81.9), r"feedforward and gravity of joints\.\w+_HA must be -82 to 82 Nm"),
-        (pushed(-81.9), r"feedforward and gravity of joints\.\w+_HA must be -82 to 82 Nm"),
+        (with_nan(AIRWALK), r"joints\.left_SK must be finite, got nan"),
+        (with_ankle_torque(81.9), r"feedforward and gravity of joints\.\w+_HA must be -82 to 82 Nm"),
+        (with_ankle_torque(-81.9), r"feedforward and gravity of joints\.\w+_HA must be -82 to 82 Nm"),
         (replace(AIRWALK, duration=0.3), r"speed of joints\.left_SK must be -4 to 4 rad/s"),
     ],
-    ids=["86 degrees beyond", "between the ends", "jump", "shape", "nan", "torque", "torque backwards", "speed"],
+    ids=["angle", "angle within the step", "jump", "shape", "nan", "torque", "negative torque", "speed"],
 )  # fmt: skip
-def test_controller_rejects_a_gait_beyond_a_limit(gait: Gait, said: str) -> None:
-    with pytest.raises(GaitError, match=said):
+def test_controller_rejects_a_gait_beyond_a_limit(gait: Gait, message: str) -> None:
+    with pytest.raises(GaitError, match=message):
         AirwalkController(ROBOT, gait, SHAPES["constant"])
 
 
@@ -136,7 +143,7 @@ def test_gait_without_feedforward_is_checked_with_its_inverse_dynamics() -> None
     assert AIRWALK.feedforward is None
     check_gait(AIRWALK, weak)
     with pytest.raises(GaitError, match=r"feedforward and gravity of joints\.\w+_TH must be"):
-        check_hung(AIRWALK, weak, articulated, gravity, 0.0)
+        check_suspended(AIRWALK, weak, articulated, gravity, 0.0)
 
 
 def random_subjects(count: int) -> list[Subject]:
@@ -152,4 +159,4 @@ def test_200_gaits_of_the_network_are_accepted() -> None:
         articulated = pinocchio_model(urdf(exoskeleton, ROBOT))
         gait, gravity = network.gait(subject, ROBOT), Gravity(articulated)
         for walked in (gait, suspended_gait(gait, exoskeleton, ROBOT)):
-            check_hung(walked, ROBOT, articulated, gravity, ANKLE_OFFSET)
+            check_suspended(walked, ROBOT, articulated, gravity, ANKLE_OFFSET)

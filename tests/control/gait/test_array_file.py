@@ -21,7 +21,7 @@ from atalante_control.dynamics.gait_network import DEFAULT_NETWORK, GaitNetwork,
 from atalante_control.gait.array_file import ArrayFileError, read_arrays, write_arrays
 
 SHIPPED = DEFAULT_NETWORK.read_bytes()
-SEEDS = 400  # per kind of corruption; there are five kinds
+SEEDS = 400  # number of files for each of the five kinds of corruption
 #: Memory that a load may allocate [bytes]. The largest valid file has 0.4 MB.
 MEMORY_MAX = 4_000_000
 BOMB_SIZE = 256_000_000  # bytes after decompression
@@ -30,7 +30,7 @@ STORED, DEFLATED = 0, 8
 
 @dataclass(frozen=True)
 class Member:
-    """A member of a zip archive: the fields of its headers, true or false, and its compressed bytes."""
+    """A member of a zip archive: the fields of its headers, correct or not, and its compressed bytes."""
 
     name: str
     packed: bytes
@@ -46,7 +46,7 @@ def member(name: str, content: bytes) -> Member:
 
 
 def archive(members: list[Member]) -> bytes:
-    """Return a zip file. The module zipfile writes only true headers, so this function writes the bytes itself."""
+    """Return a zip file. The module zipfile writes only correct headers, so this function writes the bytes itself."""
     body, directory = b"", b""
     for m in members:
         name = m.name.encode()
@@ -85,7 +85,7 @@ def header(descr: object, shape: object, *, fortran: object = False) -> bytes:
 
 
 def flipped(rng: random.Random) -> bytes:
-    """Flip one to three bits; in half of the files they are in the directory at the end."""
+    """Flip one to three bits. In half of the files, the flipped bits are in the directory at the end of the file."""
     content = bytearray(SHIPPED)
     first = rng.choice((0, len(content) - 900))
     for _ in range(rng.randint(1, 3)):
@@ -94,7 +94,7 @@ def flipped(rng: random.Random) -> bytes:
 
 
 def cut(rng: random.Random) -> bytes:
-    """Remove bytes at the end or in the middle, or repeat some."""
+    """Remove bytes at the end or in the middle, or repeat some bytes."""
     a, b = sorted(rng.randrange(len(SHIPPED)) for _ in range(2))
     return rng.choice((SHIPPED[:a], SHIPPED[:a] + SHIPPED[b:], SHIPPED[:b] + SHIPPED[a:], SHIPPED[a:], bytes(a)))
 
@@ -144,15 +144,15 @@ def oversized(rng: random.Random) -> bytes:
     """Let a member expand to 256 MB or have a false size, or add thousands of members."""
     found = list(packed())
     i = rng.randrange(len(found))
-    name, honest = found[i].name, found[i]
+    name, valid = found[i].name, found[i]
     found[i] = rng.choice((
-        replace(bomb(), name=name), replace(bomb(), name=name, size=honest.size), replace(bomb(), name=name, size=300_000),
-        replace(bomb(), name=name, size=0), replace(bomb(), name=name, method=STORED), replace(honest, size=2**32 - 1),
-        replace(honest, size=honest.size - 1), replace(honest, size=honest.size + 1), replace(honest, size=0),
-        replace(honest, method=rng.choice((STORED, 12, 14, 93, 99))), replace(honest, flags=1), replace(honest, flags=32),
+        replace(bomb(), name=name), replace(bomb(), name=name, size=valid.size), replace(bomb(), name=name, size=300_000),
+        replace(bomb(), name=name, size=0), replace(bomb(), name=name, method=STORED), replace(valid, size=2**32 - 1),
+        replace(valid, size=valid.size - 1), replace(valid, size=valid.size + 1), replace(valid, size=0),
+        replace(valid, method=rng.choice((STORED, 12, 14, 93, 99))), replace(valid, flags=1), replace(valid, flags=32),
     ))  # fmt: skip
     if not rng.randrange(8):
-        found += [replace(honest, packed=b"", name=f"{n:x}") for n in range(rng.choice((100, 3_000)))]
+        found += [replace(valid, packed=b"", name=f"{n:x}") for n in range(rng.choice((100, 3_000)))]
     return archive(found)
 
 
@@ -173,7 +173,7 @@ def little_memory() -> Iterator[None]:
 
 @pytest.mark.parametrize("corrupt", [flipped, cut, swapped, misdescribed, oversized])
 def test_corrupted_network_is_rejected_or_unchanged(corrupt: Callable[[random.Random], bytes], tmp_path: Path) -> None:
-    intact, path, refused = load_network(), tmp_path / "network.npz", 0
+    intact, path, rejected = load_network(), tmp_path / "network.npz", 0
     contents = [corrupt(random.Random(seed)) for seed in range(SEEDS)]
     tracemalloc.start()
     try:
@@ -183,15 +183,15 @@ def test_corrupted_network_is_rejected_or_unchanged(corrupt: Callable[[random.Ra
                 try:
                     assert same(load_network(path), intact), seed
                 except NetworkError as error:
-                    refused += 1
-                    said = str(error)
-                    assert said.startswith(f"{path} is not a valid gait network: "), seed
-                    assert said.endswith("; make it with `atalante gait fit`"), seed
-                    assert "\n" not in said, seed
+                    rejected += 1
+                    message = str(error)
+                    assert message.startswith(f"{path} is not a valid gait network: "), seed
+                    assert message.endswith("; make it with `atalante gait fit`"), seed
+                    assert "\n" not in message, seed
     finally:
         tracemalloc.stop()
     # Flipped bits of a date or a comment have no effect; every other corruption is found.
-    assert refused > (0.7 * SEEDS if corrupt is flipped else 0.98 * SEEDS)
+    assert rejected > (0.7 * SEEDS if corrupt is flipped else 0.98 * SEEDS)
 
 
 def test_repacked_network_is_unchanged(tmp_path: Path) -> None:
@@ -209,7 +209,7 @@ def test_swapped_biases_are_found_by_the_checksum(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("method", [zipfile.ZIP_BZIP2, zipfile.ZIP_LZMA])
-def test_other_compression_methods_are_rejected(tmp_path: Path, method: int) -> None:
+def test_bzip2_and_lzma_archives_are_rejected(tmp_path: Path, method: int) -> None:
     path = tmp_path / "network.npz"
     with zipfile.ZipFile(path, "w", method) as file:
         for name, content in members():

@@ -36,7 +36,8 @@ def document() -> dict[str, Any]:
     return json.loads(AIRWALK_GAIT.read_text())
 
 
-def refused(tmp_path: Path, content: Any) -> str:
+def rejection(tmp_path: Path, content: Any) -> str:
+    """Return the error message of a gait file with this content."""
     path = tmp_path / "gait.json"
     path.write_text(content if isinstance(content, str) else json.dumps(content))
     with pytest.raises(GaitError) as error:
@@ -64,7 +65,7 @@ def test_bezier_derivative_and_power_basis_agree():
     np.testing.assert_allclose(bezier(derivative(control_points), phase), slope, atol=1e-10)
 
 
-def test_tables_match_their_numerical_derivatives():
+def test_velocity_and_acceleration_tables_match_finite_differences():
     tables = AIRWALK.tables()
     assert tables.q.shape == (AIRWALK.cycles + 1, len(JOINTS))
     np.testing.assert_allclose(np.gradient(tables.q, PERIOD, axis=0)[1:-1], tables.qd[1:-1], atol=1e-4)
@@ -80,7 +81,7 @@ def test_mirroring_swaps_legs_and_signs_and_is_its_own_inverse():
     np.testing.assert_array_equal(left.mirrored().coefficients, AIRWALK.coefficients)
 
 
-def test_airwalk_gait_is_periodic_slow_and_within_limits():
+def test_airwalk_gait_is_periodic_and_within_angle_and_speed_limits():
     right, left = AIRWALK.tables(), AIRWALK.mirrored().tables()
     assert AIRWALK.duration == 0.8
     np.testing.assert_allclose(right.q[-1], left.q[0], atol=1e-12)
@@ -117,7 +118,7 @@ def test_loader_keeps_feedforward_parameters_and_solver_record(tmp_path: Path):
 
 
 @pytest.mark.parametrize(
-    ("change", "said"),
+    ("change", "reason"),
     [
         (lambda d: d.update(speed=1), "speed is unknown; valid keys are format, name, duration, joints"),
         (lambda d: d.pop("duration"), "duration is missing"),
@@ -140,22 +141,22 @@ def test_loader_keeps_feedforward_parameters_and_solver_record(tmp_path: Path):
         ),
     ],
 )
-def test_invalid_gait_file_is_rejected_with_its_key(tmp_path: Path, change: Any, said: str):
+def test_invalid_gait_file_is_rejected_with_its_key(tmp_path: Path, change: Any, reason: str):
     raw = document()
     change(raw)
-    assert said in refused(tmp_path, raw)
+    assert reason in rejection(tmp_path, raw)
 
 
 def test_gait_file_with_nan_or_infinity_is_rejected(tmp_path: Path):
     text = AIRWALK_GAIT.read_text()
-    assert "must be finite, got NaN" in refused(tmp_path, text.replace("0.384", "NaN", 1))
-    assert "must be finite, got Infinity" in refused(tmp_path, text.replace("0.384", "Infinity", 1))
-    assert "finite" in refused(tmp_path, text.replace("0.384", "1e999", 1))
+    assert "must be finite, got NaN" in rejection(tmp_path, text.replace("0.384", "NaN", 1))
+    assert "must be finite, got Infinity" in rejection(tmp_path, text.replace("0.384", "Infinity", 1))
+    assert "finite" in rejection(tmp_path, text.replace("0.384", "1e999", 1))
 
 
 def test_file_without_a_gait_is_rejected(tmp_path: Path):
-    refused(tmp_path, "{")
-    refused(tmp_path, "[]")
+    rejection(tmp_path, "{")
+    rejection(tmp_path, "[]")
     with pytest.raises(GaitError):
         load_gait(tmp_path / "missing.json", ROBOT)
 
@@ -167,27 +168,27 @@ def shift(raw: dict[str, Any], joint: str, points: tuple[int, ...], by: float) -
 
 
 def test_gait_with_a_jump_at_the_step_change_is_rejected(tmp_path: Path):
-    said = refused(tmp_path, shift(document(), "left_SK", (6, 7), math.radians(0.11)))
-    assert "jump of joints.left_SK at the step change must be" in said
-    assert " rad, got " in said
+    reason = rejection(tmp_path, shift(document(), "left_SK", (6, 7), math.radians(0.11)))
+    assert "jump of joints.left_SK at the stance change must be" in reason
+    assert " rad, got " in reason
     path = tmp_path / "gait.json"
     path.write_text(json.dumps(shift(document(), "left_SK", (6, 7), math.radians(0.09))))
     load_gait(path, ROBOT)
-    said = refused(tmp_path, shift(document(), "left_SH", (6,), 0.01))
-    assert "jump of joints.left_SH at the step change must be" in said
-    assert " rad/s, got " in said
+    reason = rejection(tmp_path, shift(document(), "left_SH", (6,), 0.01))
+    assert "jump of joints.left_SH at the stance change must be" in reason
+    assert " rad/s, got " in reason
 
 
 def test_gait_beyond_angle_or_speed_limit_is_rejected(tmp_path: Path):
-    said = refused(tmp_path, shift(document(), "left_SA", (3, 4), -0.2))
+    reason = rejection(tmp_path, shift(document(), "left_SA", (3, 4), -0.2))
     assert re.search(
         r"angle of joints\.left_SA must be -15\.986 to 8\.9954 deg, got -1[67]\.\d+ deg "
         r"at phase 0\.\d+ of the right-stance step, [01]\.\d+ deg beyond the limit$",
-        said,
+        reason,
     )
     fast = document()
     fast["duration"] = 0.3  # the same motion in less than half the time
-    assert "speed of joints.left_SK must be -4 to 4 rad/s, got " in refused(tmp_path, fast)
+    assert "speed of joints.left_SK must be -4 to 4 rad/s, got " in rejection(tmp_path, fast)
 
 
 def knees_bent_by(angle: float) -> Gait:
@@ -212,7 +213,7 @@ def test_limit_exceeded_between_two_cycles_is_found():
 
 
 @pytest.mark.parametrize(
-    ("change", "said"),
+    ("change", "reason"),
     [
         (
             {"coefficients": AIRWALK.coefficients[:11]},
@@ -231,8 +232,8 @@ def test_limit_exceeded_between_two_cycles_is_found():
     ],
 )  # fmt: skip
 @pytest.mark.filterwarnings("ignore::RuntimeWarning")
-def test_gait_with_invalid_arrays_is_rejected(change: dict[str, Any], said: str):
-    with pytest.raises(GaitError, match=said):
+def test_gait_with_invalid_arrays_is_rejected(change: dict[str, Any], reason: str):
+    with pytest.raises(GaitError, match=reason):
         check_gait(replace(AIRWALK, **change), ROBOT)
 
 

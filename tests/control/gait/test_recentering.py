@@ -25,14 +25,14 @@ def test_re_centring_starts_at_the_deviation_and_ends_at_zero(
 
 
 @given(ALPHAS, DURATIONS)
-def test_re_centring_is_exactly_zero_from_alpha_t_on(alpha: float, duration: float):
+def test_re_centring_is_exactly_zero_after_alpha_times_the_step(alpha: float, duration: float):
     deadbeat = Deadbeat(duration, alpha)
     late = deadbeat.end + np.linspace(0.0, duration, 5)
     assert all(not part.any() for part in deadbeat.basis(late))
     assert not deadbeat.s(late, np.ones(3), np.ones(3)).any()
 
 
-def test_derivatives_match_the_cubic():
+def test_re_centring_derivatives_match_finite_differences():
     deadbeat = Deadbeat(0.8, 0.4)
     time = np.linspace(0.0, deadbeat.end, 400, endpoint=False)
     value, slope, curvature = deadbeat.basis(time)

@@ -8,7 +8,7 @@ from atalante_control.model import Patient
 PATIENT = Patient(75.0, 1.75, thigh_length=0.44)
 
 
-def test_parameters_have_the_keys_of_a_gait_file() -> None:
+def test_subject_parameters_have_the_keys_of_a_gait_file() -> None:
     assert Subject(PATIENT, 0.16, 0.8).parameters() == {
         "patient_mass": 75.0,
         "patient_height": 1.75,

@@ -94,7 +94,7 @@ def test_deviation_of_a_gait_from_itself_is_zero() -> None:
 
 
 def test_deviation_equals_the_applied_change() -> None:
-    """A change of the swing ankle turns the landing foot; a change of the knee also moves it."""
+    """A change of the swing ankle only turns the landing foot. A change of the knee turns and moves the landing foot."""
     subject = Subject(Patient(70.0, 1.7), 0.12, 0.9)
     gait = synthetic(subject).gait
     for joint, attitude, position in ((4, 0.01, 0.0), (3, 0.01, 0.01 * subject.patient.length("shank"))):
@@ -145,7 +145,7 @@ class TestCommand:
     def run(*arguments: str) -> Any:
         return CliRunner().invoke(cli, ["gait", *arguments])
 
-    def test_from_library_to_report(self, monkeypatch: pytest.MonkeyPatch, tmp_path: Any) -> None:
+    def test_library_fit_and_check_run_in_sequence(self, monkeypatch: pytest.MonkeyPatch, tmp_path: Any) -> None:
         monkeypatch.setattr(library_module, "solve_subject", synthetic)
         monkeypatch.setattr(fit_module, "fit", partial(fit, hidden=(8,), iterations=800))
         folder, file = tmp_path / "library", tmp_path / "network.npz"
@@ -163,7 +163,7 @@ class TestCommand:
         assert fitted.exit_code == 0, fitted.output
         assert load_network(file).low.tolist() == LOW.tolist()
         checked = self.run("check", "--network", str(file), "--count", "5")
-        # The synthetic gaits ignore the ground: their feedforward is scaled, and the true one exceeds the torque limits.
+        # The synthetic gaits ignore the ground: their feedforward is scaled, and the true feedforward exceeds the limits.
         assert checked.exit_code == 1
         assert [line.split()[-1] for line in checked.stdout.splitlines()[1:]] == ["ok"] * 6 + ["FAIL"] * 2
 

@@ -21,7 +21,7 @@ ROBOT = load_robot()
 AIRWALK = load_gait(AIRWALK_GAIT, ROBOT)
 GRID = Grid((60.0, 70.0, 80.0), (1.6, 1.7, 1.8, 1.9), (0.1, 0.15, 0.2), (0.7, 0.8, 1.0))
 POINTS = math.prod(GRID.shape)
-WHY = "no such gait: the speed of the swing knee cannot hold"
+REASON = "no such gait: the speed of the swing knee cannot hold"
 
 
 def synthetic(subject: Subject) -> SolvedGait:
@@ -36,7 +36,7 @@ def failing(subject: Subject) -> SolvedGait:
     """Return a failure for tall patients with a short step duration."""
     done = synthetic(subject)
     if subject.patient.height > 1.75 and subject.step_duration < 0.75:
-        return replace(done, status=WHY)
+        return replace(done, status=REASON)
     return done
 
 
@@ -83,7 +83,7 @@ def test_failures_are_listed_and_retried(tmp_path: Path) -> None:
     failed = {str(subject) for subject, solved in library.generate(failing) if not solved.solved}
     assert len(failed) == 3 * 2 * 3
     failures = Library(tmp_path).failures()
-    assert set(failures.values()) == {WHY}
+    assert set(failures.values()) == {REASON}
     assert {str(GRID.subject(index)) for index in failures} == failed
     assert set(library.missing()) == set(failures)
     assert len(list(library.generate(synthetic))) == len(failures)
@@ -100,7 +100,7 @@ def test_exception_in_the_solver_is_raised(tmp_path: Path) -> None:
     assert not Library(tmp_path).failures()
 
 
-def test_folder_keeps_its_grid(tmp_path: Path) -> None:
+def test_library_folder_rejects_another_grid(tmp_path: Path) -> None:
     Library(tmp_path, GRID)
     assert Library(tmp_path).grid == GRID
     with pytest.raises(LibraryError, match=r"grid of the library in .* must be Grid"):

@@ -10,7 +10,7 @@ from atalante_control.gait_optimization.nlp import NAMES, Functions, NonlinearPr
 
 P = np.array([1.3, 0.7])
 X = np.array([0.2, -0.4, 0.9, 1.1, -0.8])
-PLACES = [np.array([0, 2]), np.array([2, 1]), np.array([4, 3])]  # unknown 2 occurs twice
+INSTANCES = [np.array([0, 2]), np.array([2, 1]), np.array([4, 3])]  # unknown 2 occurs twice
 
 
 @pytest.fixture(scope="module")
@@ -21,8 +21,8 @@ def program() -> NonlinearProgram:
     x = casadi.SX.sym("x", 2)
     circle = Rows("circle", "m2", 4.0, casadi.sumsqr(x) * p[0], np.array([-np.inf]), np.array([[1.0], [2.0], [3.0]]))
     product = Rows("product", "N", 2.0, casadi.vertcat(x[0] * x[1] ** 2, casadi.sin(x[0])), np.zeros(2), np.ones(2))
-    built.add([circle, product], x, PLACES)
-    built.minimise(casadi.exp(x[0] * x[1]) * p[1], x, PLACES, np.array([0.5, 1.0, 2.0]))
+    built.add([circle, product], x, INSTANCES)
+    built.minimise(casadi.exp(x[0] * x[1]) * p[1], x, INSTANCES, np.array([0.5, 1.0, 2.0]))
     return built
 
 
@@ -45,10 +45,10 @@ def slopes(function: object, count: int) -> np.ndarray:
 
 def test_objective_and_constraints_have_the_expected_values(program: NonlinearProgram, functions: Functions) -> None:
     expected = [X[0] + 2.0 * X[2]]
-    for a, b in PLACES:
+    for a, b in INSTANCES:
         expected += [(X[a] ** 2 + X[b] ** 2) * P[0] / 4.0, X[a] * X[b] ** 2 / 2.0, np.sin(X[a]) / 2.0]
     np.testing.assert_allclose(np.array(functions.constraints(X, P)).ravel(), expected, rtol=1e-14)
-    objective = sum(w * np.exp(X[a] * X[b]) * P[1] for w, (a, b) in zip((0.5, 1.0, 2.0), PLACES, strict=True))
+    objective = sum(w * np.exp(X[a] * X[b]) * P[1] for w, (a, b) in zip((0.5, 1.0, 2.0), INSTANCES, strict=True))
     assert float(functions.objective(X, P)) == pytest.approx(objective, rel=1e-14)
 
 
@@ -69,7 +69,7 @@ def test_derivatives_match_finite_differences(program: NonlinearProgram, functio
     np.testing.assert_allclose(upper + np.triu(upper, 1).T, slopes(lagrangian_slope, 5), atol=1e-7)
 
 
-def test_bounds_are_scaled_and_may_differ_at_each_place(program: NonlinearProgram) -> None:
+def test_bounds_are_scaled_and_may_differ_per_instance(program: NonlinearProgram) -> None:
     circle = next(group for group in program.groups if group.name == "circle")
     assert program.upper[circle.rows].tolist() == [0.25, 0.5, 0.75]
     product = next(group for group in program.groups if group.name == "product")
@@ -82,5 +82,5 @@ def test_each_constraint_row_is_in_one_group(program: NonlinearProgram) -> None:
     assert sorted(rows.tolist()) == list(range(len(program.lower)))
 
 
-def test_functions_have_the_names_of_the_solver(functions: Functions) -> None:
+def test_functions_have_the_names_that_the_solver_expects(functions: Functions) -> None:
     assert tuple(function.name() for function in functions) == NAMES

@@ -54,27 +54,27 @@ def test_closing_the_iteration_ends_its_processes_without_a_warning() -> None:
         except ProcessLookupError:
             return
         time.sleep(0.01)
-    pytest.fail(f"process {process} still works")
+    pytest.fail(f"process {process} still runs")
 
 
-@pytest.mark.parametrize(("error", "told"), [(KeyError, []), (ValueError, [ValueError])])
+@pytest.mark.parametrize(("error", "reported"), [(KeyError, []), (ValueError, [ValueError])])
 def test_key_error_of_loky_at_shutdown_is_suppressed(
-    error: type[Exception], told: list[type[Exception]], monkeypatch: pytest.MonkeyPatch
+    error: type[Exception], reported: list[type[Exception]], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    hand_out = _ExecutorManagerThread.add_call_item_to_queue
+    original = _ExecutorManagerThread.add_call_item_to_queue
 
-    def stumble(thread: _ExecutorManagerThread) -> None:
+    def fail_at_shutdown(thread: _ExecutorManagerThread) -> None:
         if thread.executor_flags.shutdown:
             raise error
-        hand_out(thread)
+        original(thread)
 
-    said: list[type[Exception]] = []
-    monkeypatch.setattr(threading, "excepthook", lambda arguments: said.append(arguments.exc_type))
-    monkeypatch.setattr(_ExecutorManagerThread, "add_call_item_to_queue", stumble)
+    raised: list[type[Exception]] = []
+    monkeypatch.setattr(threading, "excepthook", lambda arguments: raised.append(arguments.exc_type))
+    monkeypatch.setattr(_ExecutorManagerThread, "add_call_item_to_queue", fail_at_shutdown)
     results = fan_out(slow, [0.0, 600.0, 600.0, 600.0], jobs=2)
     next(results)
     results.close()
-    assert said == told
+    assert raised == reported
 
 
 def test_missing_result_raises_timeout_error() -> None:

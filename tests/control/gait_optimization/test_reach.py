@@ -1,4 +1,4 @@
-"""Reach of the legs: the subjects and steps of the paper have a landing pose; a step out of reach names the joint."""
+"""Reach of the legs: the subjects and steps of the paper have a landing pose. For other steps, the reason names a joint."""
 
 from __future__ import annotations
 

@@ -60,13 +60,13 @@ def test_derivatives_match_finite_differences_along_random_directions(
         return np.array(functions.gradient(at, parameters)[1] + jacobian.T @ lam).ravel()
 
     for _ in range(3):
-        way = random.normal(size=len(x))
-        ahead, behind = x + step * way, x - step * way
+        direction = random.normal(size=len(x))
+        ahead, behind = x + step * direction, x - step * direction
         change = np.array(functions.constraints(ahead, parameters) - functions.constraints(behind, parameters)).ravel()
-        exact = np.array(functions.jacobian(x, parameters)[1] @ way).ravel()
+        exact = np.array(functions.jacobian(x, parameters)[1] @ direction).ravel()
         np.testing.assert_allclose(exact, change / (2 * step), atol=1e-6 * np.abs(exact).max())
         upper = np.array(functions.hessian(x, parameters, 1.0, lam))
-        curved = (upper + np.triu(upper, 1).T) @ way
+        curved = (upper + np.triu(upper, 1).T) @ direction
         np.testing.assert_allclose(
             curved, (slope(ahead) - slope(behind)) / (2 * step), atol=1e-6 * np.abs(curved).max()
         )
@@ -88,14 +88,14 @@ def test_violations_are_in_physical_units(
 ) -> None:
     before = violations(problem, functions, coefficients, parameters)
     bent = coefficients.copy()
-    bent[JOINTS.index("left_HA"), 0] += 0.5  # rad, changes exactly only the first node
+    bent[JOINTS.index("left_HA"), 0] += 0.5  # rad, changes only the first node
     after = violations(problem, functions, bent, parameters)
     assert after["periodicity"] == pytest.approx(0.5, abs=before["periodicity"] + 1e-12)
-    place = coefficients.copy()
-    place[JOINTS.index("left_SK"), -1] += 0.1
+    moved = coefficients.copy()
+    moved[JOINTS.index("left_SK"), -1] += 0.1
     assert (
-        violations(problem, functions, place, parameters)["landing position"] > 0.02
-    )  # m; 0.1 rad turn a shank of 0.43 m
+        violations(problem, functions, moved, parameters)["landing position"] > 0.02
+    )  # m; a shank of 0.43 m turns by 0.1 rad
     backwards = coefficients.copy()
     backwards[JOINTS.index("right_SK")] = -0.5
     assert violations(problem, functions, backwards, parameters)["joint limits"] == pytest.approx(

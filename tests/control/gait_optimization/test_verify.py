@@ -99,7 +99,7 @@ def test_impact_changes_momentum_only_at_the_landing_foot_and_loses_energy(verif
     ("control_point", "joint", "change", "named"),
     [
         (7, 3, 0.02, "height error of the landing foot"),
-        (0, 1, 0.01, "angle jump at the step change"),
+        (0, 1, 0.01, "angle jump at the stance change"),
         (6, 2, 0.01, "speed error of the impact map"),
         (5, 2, 0.4, "depth of the swing sole in the ground"),
         (4, 6, 0.6, "centre of pressure across the sole"),
@@ -121,5 +121,5 @@ def test_gait_with_a_short_duration_fails(verifier: Verifier, gait: Gait) -> Non
     assert expected <= set(failed)
 
 
-def test_weight_is_that_of_robot_and_patient(verifier: Verifier) -> None:
+def test_weight_is_the_sum_of_robot_and_patient(verifier: Verifier) -> None:
     assert verifier.weight == pytest.approx((82.0 + 75.0) * 9.81, rel=0.01)

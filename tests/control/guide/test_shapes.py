@@ -37,7 +37,7 @@ def test_half_width_rejects_an_invalid_factor(bad: float):
 @given(xi=st.floats(0.0, 1.0))
 def test_every_shape_is_positive_and_at_most_the_half_width(shape: GuideShape, xi: float):
     bounds = shape.bounds(PHASE, xi)
-    assert bounds.shape == (len(PHASE), 2)
+    assert bounds.shape == (2, len(PHASE), 2)
     assert (bounds > 0.0).all()
     assert (bounds <= half_width(xi) * (1 + 1e-12)).all()
 
@@ -46,20 +46,19 @@ def test_every_shape_is_positive_and_at_most_the_half_width(shape: GuideShape, x
 def test_every_shape_shrinks_with_the_assistance_factor(shape: GuideShape):
     widths = np.stack([shape.bounds(PHASE, xi) for xi in (0.0, 0.25, 0.5, 0.75, 1.0)])
     assert (np.diff(widths, axis=0) <= 1e-12).all()
-    np.testing.assert_array_equal(
-        shape.bounds(np.array([1.0, 1.2]), 0.5)[0], shape.bounds(np.array([1.0, 1.2]), 0.5)[1]
-    )
+    at_the_end = shape.bounds(np.array([1.0, 1.2]), 0.5)
+    np.testing.assert_array_equal(at_the_end[:, 0], at_the_end[:, 1])
 
 
 @pytest.mark.parametrize("name", ["constant", "widening", "narrowing", "pinched", "asymmetric"])
 def test_certifiable_shapes_are_continuous(name: str):
     bounds = SHAPES[name].bounds(PHASE, 0.5)
-    assert np.abs(np.diff(bounds, axis=0)).max() < 0.02 * half_width(0.5)
+    assert np.abs(np.diff(bounds, axis=1)).max() < 0.02 * half_width(0.5)
 
 
 def test_shapes_have_the_widths_of_their_names():
     def at(name: str, phase: float) -> np.ndarray:
-        return np.degrees(SHAPES[name].bounds(np.array([phase]), 0.5)[0])
+        return np.degrees(SHAPES[name].bounds(np.array([phase]), 0.5)[0, 0])
 
     for phase in (0.0, 0.3, 1.0):
         np.testing.assert_allclose(at("constant", phase), [4.0, 4.0])
@@ -94,7 +93,7 @@ def at(value: float, side: int = 0, where: Callable[[np.ndarray, float], np.ndar
 @pytest.mark.parametrize("side", [0, 1])
 @pytest.mark.parametrize("value", [-1.0, 0.0, -0.0, math.nan, math.inf, -math.inf, 1e-300, 1e-6])
 def test_shape_with_an_invalid_bound_is_rejected(value: float, side: int):
-    with pytest.raises(ValueError, match=rf"bounds of the guide shape 'own' must be .*{('upper', 'lower')[side]}"):
+    with pytest.raises(ValueError, match=rf"bounds of the guide shape 'own' must be .*SH, {('upper', 'lower')[side]}"):
         GuideShape("own", "", at(value, side))
     with pytest.raises(ValueError, match="'constant' must be finite"):
         replace(CONSTANT, fractions=at(value, side))
@@ -105,13 +104,13 @@ def test_error_names_shape_phase_factor_and_value():
     with pytest.raises(ValueError) as refused:  # noqa: PT011
         GuideShape("notched", "", negative)
     assert str(refused.value) == (
-        "bounds of the guide shape 'notched' must be finite and at least 1e-06 rad, got -0.0654498 rad (lower) "
+        "bounds of the guide shape 'notched' must be finite and at least 1e-06 rad, got -0.0654498 rad (SH, lower) "
         "at phase 0.43 and Xi 0"
     )
 
 
 def test_shape_that_closes_in_narrow_guides_is_rejected():
-    """Its fractions are negative only in narrow guides."""
+    """The fractions of this shape are negative only in narrow guides."""
     with pytest.raises(ValueError, match=r"'narrow' must be .* and Xi 0\.85"):
         GuideShape("narrow", "", lambda phase, width: ((width - 0.03) * np.ones_like(phase), np.ones_like(phase)))
 
@@ -132,9 +131,23 @@ def test_invalid_bound_between_the_checked_phases_is_rejected_on_use():
 )
 def test_fractions_of_another_array_shape_are_rejected(fractions):
     with pytest.raises(
-        ValueError, match=r"fractions of the guide shape 'own' must return 2 arrays of shape \(2001,\), got"
+        ValueError,
+        match=r"fractions of the guide shape 'own' must return 2 arrays of shape \(2001,\) or \(2, 2001\), got",
     ):
         GuideShape("own", "", fractions)
+
+
+def test_shape_may_have_other_bounds_at_the_knee():
+    def fractions(phase: np.ndarray, width: float) -> tuple[np.ndarray, np.ndarray]:
+        return np.ones_like(phase), np.stack([np.full_like(phase, 0.5), np.full_like(phase, 0.25)])
+
+    bounds = np.degrees(GuideShape("own", "", fractions).bounds(PHASE, 0.5))
+    np.testing.assert_allclose(bounds, np.broadcast_to([[[4.0, 2.0]], [[4.0, 1.0]]], bounds.shape))
+
+
+def test_invalid_bound_at_the_knee_is_rejected():
+    with pytest.raises(ValueError, match=r"got -0\.13\d* rad \(SK, upper\)"):
+        GuideShape("own", "", lambda phase, width: (np.stack([phase + 1.0, phase - 1.0]), phase + 1.0))
 
 
 def test_very_narrow_shape_is_accepted():

@@ -76,7 +76,7 @@ def test_ankle_compensates_the_pitch_of_the_tibia():
     )
 
 
-def test_left_and_right_are_mirror_images():
+def test_left_and_right_ankle_angles_are_mirror_images():
     left = level(LEFT.geometry, quaternion(tibia(0.0, 0.1, 0.2)), STILL)[0]
     right = level(RIGHT.geometry, quaternion(tibia(0.0, -0.1, 0.2)), STILL)[0]
     np.testing.assert_allclose(right, (left[0], -left[1]), atol=1e-12)
@@ -89,7 +89,7 @@ def test_ankle_angle_is_limited_for_a_strongly_tilted_tibia():
 
 
 @given(HEADING, ANGLES, ANGLES, *[st.floats(-3.0, 3.0)] * 3)
-def test_rates_are_the_derivatives_of_the_angles(
+def test_ankle_rates_are_the_derivatives_of_the_angles(
     heading: float, roll: float, pitch: float, p: float, q: float, r: float
 ):
     assume(abs(heading) < 3.0)
@@ -134,23 +134,25 @@ def test_tibia_attitude_from_joints_matches_its_imu(
     np.testing.assert_allclose(rotation_vector(np.array(gyro) * dt), r.T @ later, atol=1e-9)
 
 
-# -- targets instead of the nominal ones -------------------------------------------------------------------------------------
+# -- targets of the swing ankle ------------------------------------------------------------------------------------------------
 
 
 def feet() -> LevelFeet:
     return LevelFeet(ROBOT, ExoskeletonParameters(), MODEL, DEADBEAT, [np.zeros((801, 24))] * 2, OFFSET)
 
 
-def put(f: LevelFeet, side: int, cycle: int, r: np.ndarray, gyro: tuple[float, float, float] = STILL) -> np.ndarray:
+def written_row(
+    f: LevelFeet, side: int, cycle: int, r: np.ndarray, gyro: tuple[float, float, float] = STILL
+) -> np.ndarray:
     row = np.arange(24.0)
     write_level_ankle(f.ankles[side], f.cubics, cycle, np.array(quaternion(r)), np.array(gyro), row)
     return row
 
 
 @pytest.mark.parametrize(("side", "foot"), [(0, LEFT), (1, RIGHT)])
-def test_level_targets_replace_only_those_of_the_swing_ankle(side: int, foot: FlatFoot):
+def test_level_targets_replace_only_the_swing_ankle_targets(side: int, foot: FlatFoot):
     r, gyro, sa = tibia(0.4, 0.02, 0.1), (0.1, -0.2, 0.3), 6 * side + 4
-    row = put(feet(), side, 500, r, gyro)
+    row = written_row(feet(), side, 500, r, gyro)
     angles, rates = level(foot.geometry, quaternion(r), gyro)
     np.testing.assert_allclose(row[[sa, sa + 1]], (angles[0] + OFFSET, angles[1]), atol=1e-15)
     np.testing.assert_allclose(row[[sa + 12, sa + 13]], rates, atol=1e-15)
@@ -160,13 +162,13 @@ def test_level_targets_replace_only_those_of_the_swing_ankle(side: int, foot: Fl
 
 @pytest.mark.parametrize("pitch", [-1.2, 1.2])
 def test_ankle_target_slows_down_and_stops_before_its_limit(pitch: float):
-    row = put(feet(), 0, 500, tibia(0.0, 0.0, pitch), (0.0, 1.0, 0.0))
+    row = written_row(feet(), 0, 500, tibia(0.0, 0.0, pitch), (0.0, 1.0, 0.0))
     margin = math.radians(1.0)
     limit = ROBOT.position_max[4] - margin if pitch < 0.0 else ROBOT.position_min[4] + margin
     assert row[4] == pytest.approx(limit)
     assert row[16] == 0.0
-    near = -(limit - OFFSET - math.copysign(math.radians(1.5), limit))  # half the way of the fade
-    row = put(feet(), 0, 500, tibia(0.0, 0.0, near), (0.0, 1.0, 0.0))
+    near = -(limit - OFFSET - math.copysign(math.radians(1.5), limit))  # middle of the fade
+    row = written_row(feet(), 0, 500, tibia(0.0, 0.0, near), (0.0, 1.0, 0.0))
     rate = level(LEFT.geometry, quaternion(tibia(0.0, 0.0, near)), (0.0, 1.0, 0.0))[1][0]
     assert row[16] == pytest.approx(0.5 * rate, rel=0.1)
 
@@ -178,8 +180,8 @@ def test_ankle_target_moves_from_measured_to_level_during_re_centring():
         0, 0.0, SupervisorState.ACTIVE, 0.5, np.full(12, 0.05), np.full(12, 0.2), *np.zeros((3, 12)), attitudes,
         np.zeros((4, 3)), np.zeros((4, 3)), np.zeros((2, 4, 3)), np.zeros(8), np.ones(24, bool), np.zeros(24, int), True,
     )  # fmt: skip
-    target = put(f, 0, 0, r)
+    target = written_row(f, 0, 0, r)
     f.start_step(state, 0)
-    first, late = put(f, 0, 0, r), put(f, 0, 321, r)
+    first, late = written_row(f, 0, 0, r), written_row(f, 0, 321, r)
     np.testing.assert_allclose(first[[4, 5, 16, 17]], (0.05, 0.05, 0.2, 0.2), atol=1e-12)
     np.testing.assert_array_equal(late, target)

@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from atalante_control.gait.gait import AIRWALK_GAIT, load_gait
-from atalante_control.joint.idealization import AssistedInertia, Friction, law_of, merge
+from atalante_control.joint.idealization import AssistedInertia, Friction, idealization, law_of, mass
 from atalante_control.model import ExoskeletonParameters, pinocchio_model, urdf
 from atalante_hal.robot import JOINTS, load_robot
 
@@ -58,48 +58,30 @@ def test_assisted_inertia_matches_the_mass_matrix_along_the_step():
         m = mass_matrix(pose)
         m11, m12, m22 = inertia.block(float(pose[KNEE]))
         np.testing.assert_allclose([m11, m12, m22], [m[HIP, HIP], m[HIP, KNEE], m[KNEE, KNEE]], rtol=0.02)
-    diagonal = np.array([[mass_matrix(p)[HIP, HIP], mass_matrix(p)[KNEE, KNEE]] for p in SWING[::50]])
-    np.testing.assert_allclose(inertia.inertias, diagonal.max(axis=0), rtol=0.02)
+        np.testing.assert_allclose(mass(inertia.fit, float(pose[KNEE])), (m11, m12, m22))
 
 
-def test_torques_give_the_accelerations_of_separate_inertias():
+def test_velocity_torques_and_mass_give_the_inverse_dynamics():
     inertia, rng = AssistedInertia(MODEL, SWING), np.random.default_rng(9)
     for pose in SWING[::100]:
-        v = np.zeros(12)
-        v[[HIP, KNEE]] = rng.normal(size=2) * 2.0
-        u = rng.normal(size=2) * 50.0
-        tau = inertia.torques(float(pose[KNEE]), float(v[HIP]), float(v[KNEE]), (float(u[0]), float(u[1])))
+        v, a = np.zeros(12), np.zeros(12)
+        v[[HIP, KNEE]], a[[HIP, KNEE]] = rng.normal(size=2) * 2.0, rng.normal(size=2) * 10.0
+        m11, m12, m22 = mass(inertia.fit, float(pose[KNEE]))
+        tau = np.array([[m11, m12], [m12, m22]]) @ a[[HIP, KNEE]]
+        tau += inertia.velocity_torques(float(pose[KNEE]), float(v[HIP]), float(v[KNEE]))
         # With the other joints at rest, inverse dynamics must give tau for the accelerations of these two.
-        a = np.zeros(12)
-        a[[HIP, KNEE]] = u / np.array(inertia.inertias)
         pin_q, pin_v, pin_a = np.empty(12), np.empty(12), np.empty(12)
         pin_q[MODEL.q], pin_v[MODEL.v], pin_a[MODEL.v] = pose, v, a
         data = MODEL.model.createData()
         asked = pinocchio.rnea(MODEL.model, data, pin_q, pin_v, pin_a)
         asked -= pinocchio.computeGeneralizedGravity(MODEL.model, data, pin_q)
-        np.testing.assert_allclose(tau, asked[MODEL.v][[HIP, KNEE]], atol=0.02 * np.abs(u).max() + 0.2)
+        np.testing.assert_allclose(tau, asked[MODEL.v][[HIP, KNEE]], atol=0.02 * np.abs(tau).max() + 0.2)
 
 
-@given(st.floats(0.0, 1.9), *[st.floats(-3.0, 3.0)] * 2, *[st.floats(-100.0, 100.0)] * 2)
-def test_ideal_is_the_inverse_function_of_torques(knee: float, hip_rate: float, knee_rate: float, u1: float, u2: float):
-    inertia = AssistedInertia(MODEL, SWING)
-    tau = inertia.torques(knee, hip_rate, knee_rate, (u1, u2))
-    np.testing.assert_allclose(inertia.ideal(knee, hip_rate, knee_rate, tau), (u1, u2), atol=1e-8)
-
-
-@pytest.mark.parametrize("leg", [0, 6])
-@pytest.mark.parametrize("decoupled", [False, True])
-def test_merge_is_the_weighted_mean_of_baseline_and_assistance(leg: int, decoupled: bool):
-    friction, inertia, rng = Friction(), AssistedInertia(MODEL, SWING), np.random.default_rng(11)
-    law, u = law_of(friction, inertia, decoupled), (30.0, -20.0)
-    baseline, gravity, q, qd = rng.normal(size=(4, 12))
-    hip, knee = leg + HIP, leg + KNEE
-    real = inertia.torques(q[knee], qd[hip], qd[knee], u) if decoupled else u
-    for w in (0.0, 0.3, 1.0):
-        torque = baseline.copy()
-        merge(law, leg, w, u, q, qd, gravity, torque)
-        expected = baseline.copy()
-        for i, joint in enumerate((hip, knee)):
-            assisted = gravity[joint] + friction.torque(joint % 6, qd[joint]) + real[i]
-            expected[joint] = w * baseline[joint] + (1.0 - w) * assisted
-        np.testing.assert_allclose(torque, expected, atol=1e-12)
+def test_idealization_is_gravity_velocity_torque_and_friction():
+    friction, inertia = Friction(), AssistedInertia(MODEL, SWING)
+    law = law_of(friction, inertia)[0]
+    found = idealization(law, 0.7, 0.4, -1.1, (12.0, -3.0))
+    velocity = inertia.velocity_torques(0.7, 0.4, -1.1)
+    expected = 12.0 + velocity[0] + friction.torque(2, 0.4), -3.0 + velocity[1] + friction.torque(3, -1.1)
+    np.testing.assert_allclose(found, expected)

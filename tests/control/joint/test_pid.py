@@ -17,7 +17,7 @@ def desired(q: np.ndarray, qd: np.ndarray) -> np.ndarray:
 
 
 @pytest.mark.parametrize("stance", [LEFT, RIGHT])
-def test_each_leg_has_the_gains_of_its_role(stance: int):
+def test_stance_and_swing_leg_have_their_gains(stance: int):
     pid = Pid(GAINS)
     pid.start_step(stance, ALL)
     q_des, qd_des, q, qd = RNG.normal(size=(4, 12)) * 0.01
@@ -44,7 +44,7 @@ def test_integral_grows_with_the_error_and_stops_at_its_limit():
     np.testing.assert_allclose(last - (first - ki), GAINS.integral_limit, rtol=1e-9)
 
 
-def test_integral_does_not_wind_up_past_its_limit():
+def test_integral_unwinds_from_its_limit_when_the_error_reverses():
     pid = Pid(GAINS)
     pid.start_step(RIGHT, ALL)
     zero = np.zeros(12)
@@ -75,7 +75,7 @@ def test_saturated_torque_stops_its_integral(cut: float, error: float):
     assert after[3] == before[3] or cut * error < 0.0
 
 
-def test_unlimited_torque_as_sent_torque_changes_nothing():
+def test_sent_torque_equal_to_the_request_leaves_the_pid_unchanged():
     one, other = Pid(GAINS), Pid(GAINS)
     for _ in range(100):
         q_des, qd_des, q, qd = RNG.normal(size=(4, 12))

@@ -39,7 +39,7 @@ def test_total_mass_is_the_sum_of_the_published_masses() -> None:
     assert pinocchio.computeTotalMass(model) == pytest.approx(82.5, abs=1e-12)
 
 
-def test_text_is_deterministic() -> None:
+def test_urdf_text_is_deterministic_without_negative_zeros() -> None:
     text = urdf(ExoskeletonParameters(), load_robot())
     assert text == urdf(ExoskeletonParameters(), ROBOT)
     assert "-0.0 " not in text
@@ -97,8 +97,8 @@ def test_mirrored_motion_needs_mirrored_torques(patient: Patient | None, seed: i
 
     mirrored = (SIGN * values[SWAP] for values in (q, v, a))
     np.testing.assert_allclose(torque(*mirrored), SIGN * torque(q, v, a)[SWAP], rtol=0, atol=1e-12 * 400)
-    there, back = mass_matrix(q), mass_matrix(SIGN * q[SWAP])
-    np.testing.assert_allclose(back, np.outer(SIGN, SIGN) * there[np.ix_(SWAP, SWAP)], rtol=0, atol=1e-13 * 20)
+    original, mirror = mass_matrix(q), mass_matrix(SIGN * q[SWAP])
+    np.testing.assert_allclose(mirror, np.outer(SIGN, SIGN) * original[np.ix_(SWAP, SWAP)], rtol=0, atol=1e-13 * 20)
 
 
 def test_floating_exoskeleton_is_symmetric_about_the_sagittal_plane() -> None:
@@ -119,23 +119,23 @@ def test_sensor_frames_have_the_documented_positions() -> None:
     data = model.createData()
     pinocchio.framesForwardKinematics(model, data, np.zeros(12))
 
-    def place(frame: str) -> np.ndarray:
+    def position(frame: str) -> np.ndarray:
         assert model.existFrame(frame)
         return np.asarray(data.oMf[model.getFrameId(frame)].translation)
 
-    np.testing.assert_allclose(place(imu_link("pelvis")), [-0.164, -0.015, 0.191])
-    np.testing.assert_allclose(place(imu_link("torso")), [-0.14, 0.0, 0.5])
+    np.testing.assert_allclose(position(imu_link("pelvis")), [-0.164, -0.015, 0.191])
+    np.testing.assert_allclose(position(imu_link("torso")), [-0.14, 0.0, 0.5])
     ankle = np.array([0.0, 0.094, -0.788])
-    np.testing.assert_allclose(place("left_foot"), ankle, atol=1e-15)
-    np.testing.assert_allclose(place(imu_link("left_tibia")), [-0.13, 0.263 - 0.074, -0.38 - 0.39], atol=1e-15)
-    np.testing.assert_allclose(place(imu_link("right_tibia")), [-0.13, -0.263 + 0.074, -0.38 - 0.39], atol=1e-15)
+    np.testing.assert_allclose(position("left_foot"), ankle, atol=1e-15)
+    np.testing.assert_allclose(position(imu_link("left_tibia")), [-0.13, 0.263 - 0.074, -0.38 - 0.39], atol=1e-15)
+    np.testing.assert_allclose(position(imu_link("right_tibia")), [-0.13, -0.263 + 0.074, -0.38 - 0.39], atol=1e-15)
     out = np.radians(8.0)
     for foot, sign in zip(FEET, (1, -1), strict=True):
         yaw = np.array([[np.cos(out), -sign * np.sin(out), 0], [sign * np.sin(out), np.cos(out), 0], [0, 0, 1]])
         for cell in CELLS:
             local = [0.178 if cell[0] == "F" else -0.064, 0.027 if cell[1] == "L" else -0.027, -0.16]
             expected = ankle * [1, sign, 1] + yaw @ local
-            np.testing.assert_allclose(place(pad_link(foot, cell)), expected, atol=1e-15)
+            np.testing.assert_allclose(position(pad_link(foot, cell)), expected, atol=1e-15)
     assert all(model.existFrame(imu_link(imu)) for imu in IMUS)
 
 

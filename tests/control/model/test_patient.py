@@ -69,11 +69,11 @@ def test_link_with_patient_includes_the_segment_of_the_table(patient: Patient) -
         mass, centre, gyration, _ = WINTER[segment]
         added, length = only(worn[name], empty[name]), patient.length(segment)
         assert added.mass == pytest.approx(mass * patient.mass, rel=1e-12)
-        lies = 0 if segment == "foot" else 2
+        axis = 0 if segment == "foot" else 2
         start = {"HAT": 0.0, "foot": EMPTY.sole_centre[0] - 0.5 * length}.get(segment, 0.0)
         sign = 1.0 if segment in ("HAT", "foot") else -1.0
-        assert added.centre[lies] == pytest.approx(start + sign * centre * length, abs=1e-12)
-        across = np.delete(np.diag(added.matrix()), lies)
+        assert added.centre[axis] == pytest.approx(start + sign * centre * length, abs=1e-12)
+        across = np.delete(np.diag(added.matrix()), axis)
         np.testing.assert_allclose(across, mass * patient.mass * (gyration * length) ** 2, rtol=1e-9)
         assert np.abs(added.matrix() - np.diag(np.diag(added.matrix()))).max() < 1e-12
     unchanged = set(empty) - {*WORN, *(name.replace("left", "right") for name in WORN)}
@@ -102,11 +102,11 @@ def test_joints_of_patient_and_exoskeleton_coincide() -> None:
         q = np.zeros(12)
         q[q_index[joint]] = 0.2
         pinocchio.framesForwardKinematics(model, data, q)
-        place = data.oMf[model.getFrameId("left_thigh")].act(upper)
-        np.testing.assert_allclose(place, [0.0, EMPTY.fh_offset[1], 0.0], atol=1e-15)
+        position = data.oMf[model.getFrameId("left_thigh")].act(upper)
+        np.testing.assert_allclose(position, [0.0, EMPTY.fh_offset[1], 0.0], atol=1e-15)
 
 
-def test_mass_and_inertias_are_valid_over_the_whole_range() -> None:
+def test_masses_and_inertias_are_physical_over_the_whole_range() -> None:
     empty = math.fsum(link.inertia.mass for link in links(EMPTY))
     for patient in patients():
         bodies = links(EMPTY, patient)
@@ -128,7 +128,7 @@ def test_urdf_keeps_the_full_precision() -> None:
     np.testing.assert_allclose(root.lever, pelvis.centre, rtol=1e-15, atol=1e-15)
 
 
-def test_numpy_numbers_are_written_as_plain_numbers() -> None:
+def test_patient_of_numpy_numbers_gives_the_same_urdf() -> None:
     numpy = Patient(np.float64(71.3), np.float64(1.777))
     assert urdf(EMPTY, ROBOT, numpy) == urdf(EMPTY, ROBOT, Patient(71.3, 1.777))
 

@@ -1,4 +1,4 @@
-"""Facts about the interfaces of python-can, against the installed python-can; backends without hardware, on loopback."""
+"""Facts about the interfaces of python-can, compared with the installed python-can. Some backends also run on a loopback."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ CLASSIC = [name for name in ADAPTERS if not ADAPTERS[name].can_fd]
 
 
 def sources(name: str) -> str:
-    """Return the sources of the backend's module, or of its package."""
+    """Return the source code of a backend: of its module, or of all modules of its package."""
     module, _ = can.interfaces.BACKENDS[name]
     spec = importlib.util.find_spec(module)
     assert spec is not None
@@ -52,23 +52,24 @@ def test_every_built_in_interface_of_python_can_is_covered() -> None:
     assert "remote" in can.interfaces.BACKENDS
 
 
-@pytest.mark.parametrize("name", [name for name in ADAPTERS if name != "virtual"])  # passes message objects on
-def test_can_fd_claim_agrees_with_the_source(name: str) -> None:
+# The backend `virtual` passes message objects to the receiver, so its source code does not mention `is_fd`.
+@pytest.mark.parametrize("name", [name for name in ADAPTERS if name != "virtual"])
+def test_can_fd_support_agrees_with_the_source_code(name: str) -> None:
     assert ("is_fd" in sources(name)) == ADAPTERS[name].can_fd
 
 
 @pytest.mark.parametrize("name", [name for name in ADAPTERS if ADAPTERS[name].can_fd])
-def test_reported_protocol_agrees_with_the_source(name: str) -> None:
+def test_reported_protocol_agrees_with_the_source_code(name: str) -> None:
     assert bool(re.search(r"CanProtocol\.CAN_FD|= protocol\b", sources(name))) == ADAPTERS[name].reports_can_fd
 
 
 @pytest.mark.parametrize("name", [name for name in BUILT_IN if ADAPTERS[name].library])
-def test_the_backend_loads_the_library(name: str) -> None:
+def test_backend_loads_the_named_library(name: str) -> None:
     assert ADAPTERS[name].library in sources(name)
 
 
 @pytest.mark.parametrize("name", [name for name in ADAPTERS if "python-can[" in ADAPTERS[name].install])
-def test_the_extra_exists(name: str) -> None:
+def test_named_extra_of_python_can_exists(name: str) -> None:
     extras = importlib.metadata.metadata("python-can").get_all("Provides-Extra")
     (extra,) = re.findall(r"python-can\[([\w-]+)\]", ADAPTERS[name].install)
     assert extra in (extras or [])
@@ -105,7 +106,7 @@ def test_ixxat_has_presets_for_the_bit_rates() -> None:
 
 
 @pytest.mark.parametrize("name", [name for name in BUILT_IN if ADAPTERS[name].can_fd])
-def test_the_backend_accepts_the_options_of_the_bus(name: str) -> None:
+def test_backend_accepts_the_options_of_the_bus(name: str) -> None:
     module, class_name = can.interfaces.BACKENDS[name]
     if name in ("etas", "ixxat"):  # cannot be imported on Linux
         assert "receive_own_messages: bool = False" in sources(name)
@@ -116,7 +117,7 @@ def test_the_backend_accepts_the_options_of_the_bus(name: str) -> None:
 
 
 @pytest.mark.parametrize("name", CLASSIC)
-def test_a_classic_interface_is_refused_before_it_is_opened(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_classic_interface_is_rejected_before_it_is_opened(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(can, "Bus", None)
     with pytest.raises(BusAbsent) as error:
         open_bus(name, "0")
@@ -125,12 +126,12 @@ def test_a_classic_interface_is_refused_before_it_is_opened(name: str, monkeypat
 
 
 @pytest.mark.parametrize("name", ["virtual", "udp_multicast"])
-def test_an_interface_for_one_process_is_refused_only_between_processes(name: str) -> None:
+def test_interface_for_one_process_is_rejected_only_between_processes(name: str) -> None:
     assert "use a CAN FD adapter" in refusal(name)
     assert refusal(name, one_process=True) == ""
 
 
-def test_an_interface_of_a_plug_in_is_not_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_interface_of_a_plug_in_is_not_rejected(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(can, "VALID_INTERFACES", can.VALID_INTERFACES | {"candle"})
     assert refusal("candle") == ""
 
@@ -139,7 +140,7 @@ def test_an_interface_of_a_plug_in_is_not_refused(monkeypatch: pytest.MonkeyPatc
 
 
 class SerialPort:
-    """Serial port in memory, as pyserial's, with a CANable at its other end that passes frames on to the other port."""
+    """Serial port in memory, with the interface of pyserial. A CANable at its other end passes each frame to the port `peer`."""
 
     def __init__(self) -> None:
         self.peer = self
@@ -167,7 +168,7 @@ class SerialPort:
 
 
 class Expired:
-    """Timeout of pyserial that is always expired: the test never waits."""
+    """Timeout of pyserial that has always expired, so that the test never waits."""
 
     def __init__(self, seconds: float) -> None: ...
 
@@ -206,7 +207,7 @@ def test_slcan_transfers_can_fd_frames_bit_for_bit(ports: dict[str, SerialPort])
         bus.close()
 
 
-def test_a_damaged_line_of_slcan_is_dropped_and_counted(ports: dict[str, SerialPort]) -> None:
+def test_damaged_line_of_slcan_is_dropped_and_counted(ports: dict[str, SerialPort]) -> None:
     bus = open_bus("slcan", "/dev/a", sleep_after_open=0.0)
     sent, received = fd_frames(1), new_frames(4)
     ports["/dev/a"].buffer.extend(b"bXYZ8\rb\r")
@@ -251,7 +252,7 @@ def test_remote_transfers_can_fd_frames_bit_for_bit(server: RemoteServer) -> Non
         bus.close()
 
 
-def test_a_lost_server_is_a_lost_link(server: RemoteServer) -> None:
+def test_lost_server_raises_bus_down(server: RemoteServer) -> None:
     bus = open_bus("remote", f"127.0.0.1:{server.server_port}")
     while not server.clients:
         time.sleep(0.001)
@@ -262,7 +263,7 @@ def test_a_lost_server_is_a_lost_link(server: RemoteServer) -> None:
 
 
 def test_socketcand_sends_a_can_fd_frame_as_a_classic_frame() -> None:
-    """The reason of its refusal: the text that the client sends has no CAN FD flags."""
+    """This is the reason why `refusal` rejects the interface: its client sends a text without CAN FD flags."""
     lines: list[str] = []
     with socket.create_server(("127.0.0.1", 0)) as listener:
 

@@ -1,7 +1,7 @@
 """Behaviour of every bus, run on each transport, and the special behaviour of some transports.
 
-`FrameReceiver` is what receiving means, `FrameSender` what sending means; a transport subclasses them with its two ends
-and nothing else. The SocketCAN subclass is in tests/vcan, which needs a kernel that has it.
+`FrameReceiver` contains the tests of receiving, and `FrameSender` contains the tests of sending. The subclasses of a transport
+only create its two ends. The SocketCAN subclasses are in tests/vcan, because they need a kernel with SocketCAN.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ BUSES = ("left_leg", "right_leg", "left_sense", "right_sense")
 
 
 def random_frames(count: int, seed: int = 0, lengths: tuple[int, ...] = FD_LENGTHS) -> Frames:
-    """CAN FD frames with random identifiers, lengths and payloads; bytes beyond the length are 0."""
+    """Return CAN FD frames with random identifiers, lengths and payloads. Bytes after the payload are 0."""
     rng = np.random.default_rng(seed)
     frames = new_frames(count)
     frames["can_id"] = rng.integers(0, 0x800, count)
@@ -54,7 +54,7 @@ def random_frames(count: int, seed: int = 0, lengths: tuple[int, ...] = FD_LENGT
 
 
 def other_frames() -> Frames:
-    """Frame kinds that the robot does not use but a bus must transfer: classic, extended, remote, ESI."""
+    """Return frames that the robot does not use, but that a bus must transfer: classic, extended, remote, ESI."""
     frames = new_frames(5)
     frames["can_id"] = [0x123, 0x7FF, 0x12345678 | ID_EXTENDED, 0x42 | ID_REMOTE, 0x1FFFFFFF | ID_EXTENDED]
     frames["len"] = [8, 0, 5, 0, 64]
@@ -162,7 +162,7 @@ class FrameSender:
 
     @pytest.fixture
     def ends(self) -> Iterator[tuple[Bus, Bus]]:
-        """Two connected buses."""
+        """Yield two connected buses."""
         raise NotImplementedError
 
     def deliver(self, frames: Frames) -> Bus:
@@ -173,7 +173,7 @@ class FrameSender:
     def _wire(self, ends: tuple[Bus, Bus]) -> None:
         self.sender, self.receiver = ends
 
-    def test_both_directions_carry_frames(self) -> None:
+    def test_frames_are_transferred_in_both_directions(self) -> None:
         for source, sink in ((self.sender, self.receiver), (self.receiver, self.sender)):
             sent = random_frames(22, seed=4)
             source.send(sent)
@@ -243,7 +243,7 @@ class FrameSender:
 
 
 class FrameWaiter:
-    """Tests of waiting, for every bus except the lock-step pair and the replay, which never wait."""
+    """Tests of waiting, for every bus that waits. The lock-step pair and the replay never wait."""
 
     sender: Bus
     receiver: Bus
@@ -359,7 +359,7 @@ def write_log(path: Path, frames: Frames) -> Path:
     return path
 
 
-def test_pair_steps_the_peer_only_when_nothing_is_queued() -> None:
+def test_pair_steps_the_peer_only_if_no_frame_is_queued() -> None:
     hal, emulator = lockstep_pair()
     inbox, answer = new_frames(8), random_frames(3, seed=9)
     steps = []
@@ -417,10 +417,10 @@ def test_pair_transfers_frames_of_many_short_lived_arrays() -> None:
 
 
 def test_virtual_bus_drops_and_counts_invalid_frames() -> None:
-    with can.Bus(interface="virtual", channel="made-up", protocol=can.CanProtocol.CAN_FD) as stranger:
+    with can.Bus(interface="virtual", channel="made-up", protocol=can.CanProtocol.CAN_FD) as sender:
         bus = PythonCanBus("virtual", "made-up")
         for data, is_fd in ((bytes(13), True), (bytes(9), False), (bytes(12), True), (bytes(70), True)):
-            stranger.send(can.Message(arbitration_id=1, is_extended_id=False, is_fd=is_fd, data=data))
+            sender.send(can.Message(arbitration_id=1, is_extended_id=False, is_fd=is_fd, data=data))
         received = new_frames(4)
         assert bus.receive(received) == 1
         assert received["len"][0] == 12
@@ -473,7 +473,7 @@ def test_send_to_a_replay_is_rejected(tmp_path: Path) -> None:
     bus.close()
 
 
-def test_replay_counts_records_that_are_no_valid_frame(tmp_path: Path) -> None:
+def test_replay_counts_records_that_are_not_valid_frames(tmp_path: Path) -> None:
     log = tmp_path / "run.log"
     log.write_text("(1.0) can0 100##5000102030405060708090A0B0C\n(1.1) can0 101##500\n", encoding="ascii")
     bus = ReplayBus(log)
@@ -539,7 +539,7 @@ def test_valid_lengths_and_identifiers_are_those_of_iso_11898() -> None:
     assert [i for i in (0x7FF, 0x800, 0x800 | ID_EXTENDED) if is_legal(i, 8, 0)] == [0x7FF, 0x800 | ID_EXTENDED]
 
 
-def test_channel_map_of_one_channel_serves_all_buses() -> None:
+def test_channel_map_of_one_channel_assigns_it_to_all_buses() -> None:
     assert parse_channel_map("vcan0", BUSES) == dict.fromkeys(BUSES, "vcan0")
 
 
@@ -631,7 +631,7 @@ def _message_indices(network: Network, frames: Frames) -> list[int]:
 
 def test_joined_bus_receives_frames_and_time_stamps_of_every_channel(network: Network) -> None:
     joined, near, far = four_pairs(network)
-    for cycle in range(4):  # as many cycles as channels: receiving starts with another channel each cycle
+    for cycle in range(4):  # four cycles, because each call of `receive` starts with another of the four channels
         for index, bus in enumerate(BUSES):
             frames = frames_of(network, *[m.name for m in network.messages if m.bus == bus and m.cycle_ms == 1][:2])
             far[bus].send(frames)
@@ -652,7 +652,7 @@ def test_joined_bus_rejects_a_batch_with_an_unknown_frame(network: Network) -> N
     assert far["left_leg"].receive(new_frames(1)) == 0
 
 
-def test_joined_bus_serves_other_channels_if_one_is_full_or_closed(network: Network) -> None:
+def test_joined_bus_uses_the_other_channels_if_one_is_full_or_closed(network: Network) -> None:
     joined, near, far = four_pairs(network)
     syncs = frames_of(network, *(f"SYNC_{bus.upper()}" for bus in BUSES))
     for _ in range(8):

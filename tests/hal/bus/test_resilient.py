@@ -1,14 +1,16 @@
-"""`ResilientBus`: a program outlasts a link that is lost and comes back."""
+"""`ResilientBus`: a program continues while its link is lost, and after the link is back."""
 
 from __future__ import annotations
 
 import pytest
 
 from atalante_hal.bus import BusDown, BusFull, resilient
+from atalante_hal.bus.joined import JoinedBus
 from atalante_hal.bus.pair import lockstep_pair
-from atalante_hal.bus.resilient import RETRY_PERIOD, ResilientBus
+from atalante_hal.bus.resilient import RETRY_PERIOD, SETTLE_TIME, ResilientBus
 from atalante_hal.bus.wrapped import WrappedBus
 from atalante_hal.wire.frame import Frames, new_frames
+from tests.hal.bus.test_bus import BUSES, network_of
 
 
 class Link(WrappedBus):
@@ -27,48 +29,103 @@ class Link(WrappedBus):
         return super().receive(frames, timeout)
 
 
+class Clock:
+    """Simulated clock: time passes only while the bus waits."""
+
+    def __init__(self) -> None:
+        self.now = 64.0
+        self.slept: list[float] = []
+
+    def monotonic(self) -> float:
+        return self.now
+
+    def sleep(self, seconds: float) -> None:
+        self.slept.append(seconds)
+        self.now += seconds
+
+
 @pytest.fixture
-def sleeps(monkeypatch: pytest.MonkeyPatch) -> list[float]:
-    slept: list[float] = []
-    monkeypatch.setattr(resilient.time, "sleep", slept.append)
-    return slept
+def clock(monkeypatch: pytest.MonkeyPatch) -> Clock:
+    made = Clock()
+    monkeypatch.setattr(resilient, "time", made)
+    return made
 
 
-def test_a_lost_link_drops_frames_and_reports_loss_and_return_once(sleeps: list[float]) -> None:
+def test_lost_link_drops_frames_and_its_loss_and_return_are_reported_once(clock: Clock) -> None:
     near, far = lockstep_pair()
     link, notices = Link(near), []
     bus = ResilientBus(link, notices.append)
     frames = new_frames(2)
     link.error = BusDown("can0 is down")
-    for _ in range(3):
+    for _ in range(8):
         bus.send(frames)
         assert bus.receive(new_frames(4), 0.02) == 0
     assert (bus.down, bus.losses, far.receive(new_frames(4))) == ("can0 is down", 1, 0)
-    assert sleeps == [0.02] * 3
+    assert clock.slept == [0.02] * 8
     link.error = None
     assert bus.receive(new_frames(4)) == 0
     assert bus.down == "can0 is down"  # silence does not prove that the link is back
     far.send(frames)
     assert bus.receive(new_frames(4)) == 2
     assert (bus.down, bus.losses) == ("", 1)
-    assert notices == ["can0 is down; waiting for it", f"{near.name} is back"]
+    assert notices == ["can0 is down; waiting for the link", f"{near.name} is back"]
     link.error = BusDown("can0 is down")
     bus.send(frames)
     link.error = None
     bus.send(frames)
     assert (bus.down, bus.losses) == ("", 2)
+    assert notices[2:] == [f"{near.name} was lost and is back"]
     assert far.receive(new_frames(4)) == 2
 
 
-def test_a_lost_link_is_tried_again_within_the_retry_period(sleeps: list[float]) -> None:
+def test_only_an_unchanged_error_message_of_a_loss_is_reported(clock: Clock) -> None:
+    near, _ = lockstep_pair()
+    link, notices = Link(near), []
+    bus = ResilientBus(link, notices.append)
+    for reason, waits in (("is down", 1), ("was removed", 2), ("is plugged in and down", 3)):
+        link.error = BusDown(f"can0 {reason}")
+        for _ in range(waits):
+            bus.receive(new_frames(4), SETTLE_TIME / 2)
+            assert bus.down == f"can0 {reason}"
+        link.error = None
+    assert bus.receive(new_frames(4)) == 0
+    assert notices == ["can0 is plugged in and down; waiting for the link"]
+    assert bus.losses == 1
+
+
+def test_other_channels_transfer_frames_while_one_is_lost(clock: Clock) -> None:
+    pairs = {name: lockstep_pair() for name in BUSES}
+    links = {name: Link(near) for name, (near, _) in pairs.items()}
+    network, notices = network_of(dict(enumerate(BUSES))), []
+    bus = ResilientBus(JoinedBus(network, links), notices.append)
+    frames = new_frames(4)
+    frames["can_id"] = range(4)
+    links[BUSES[1]].error = BusDown("can1 is down")
+    for _ in range(3):
+        bus.send(frames)
+        for near, far in pairs.values():
+            assert far.receive(new_frames(4)) == (near is not pairs[BUSES[1]][0])
+        pairs[BUSES[0]][1].send(frames[:1])
+        assert bus.receive(new_frames(4)) == 1
+        assert (bus.down, bus.losses) == ("can1 is down", 1)
+        clock.sleep(SETTLE_TIME)
+    links[BUSES[1]].error = None
+    assert bus.receive(new_frames(4)) == 0
+    assert bus.down == "can1 is down"
+    bus.send(frames)
+    assert bus.down == ""
+    assert notices == ["can1 is down; waiting for the link", f"{bus.name} is back"]
+
+
+def test_lost_link_is_tried_again_after_the_retry_period(clock: Clock) -> None:
     near, _ = lockstep_pair()
     link = Link(near)
     link.error = BusDown("can0 is down")
     assert ResilientBus(link).receive(new_frames(4), 60.0) == 0
-    assert sleeps == [RETRY_PERIOD]
+    assert clock.slept == [RETRY_PERIOD]
 
 
-def test_other_errors_of_the_bus_reach_the_caller() -> None:
+def test_other_errors_of_the_bus_are_raised() -> None:
     near, _ = lockstep_pair()
     link = Link(near)
     link.error = BusFull("the transmit queue is full")

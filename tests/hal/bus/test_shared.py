@@ -1,6 +1,6 @@
 """Special behaviour of the shared-memory bus: lock-step of two processes, waiting, and loss of the other process.
 
-The behaviour it shares with every bus is in test_bus.
+`test_bus` tests the behaviour that is common to all buses.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from atalante_hal.bus import BusDown, BusFull
 from atalante_hal.bus.shared import SharedBus, descriptors, shared_pair
 from atalante_hal.wire.frame import FLAG_BRS, FLAG_FDF, Frames, new_frames
 
-#: A test that waits this long has failed [s].
+#: Timeout of the tests [s]. A test that reaches it fails.
 LONG = 60.0
 
 
@@ -130,7 +130,7 @@ def test_wait_for_an_end_that_never_serves_times_out(ends: tuple[SharedBus, Shar
         ours.wait_until_served(0.03)
 
 
-def test_full_ring_queue_rejects_whole_batches(ends: tuple[SharedBus, SharedBus]) -> None:
+def test_full_queue_rejects_whole_batches(ends: tuple[SharedBus, SharedBus]) -> None:
     one, other = ends
     received = []
     for batch in range(20):
@@ -156,7 +156,7 @@ def test_time_stamps_are_the_time_of_the_receive(ends: tuple[SharedBus, SharedBu
 
 def test_frames_sent_before_closing_arrive_then_the_closing_reason(ends: tuple[SharedBus, SharedBus]) -> None:
     one, other = ends
-    other.send(frames_of(1))  # makes the kernel report a broken connection first
+    other.send(frames_of(1))  # an unread wake-up, because of which the kernel reports a broken connection first
     one.send(frames_of(5))
     one.close("the simulation failed")
     block = new_frames(1)

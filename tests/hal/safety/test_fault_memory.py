@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import random
+
 import pytest
 
 from atalante_hal.safety.diagnostics import Dtc, Finding
 from atalante_hal.safety.events import Event
-from atalante_hal.safety.fault_memory import EVENTS_KEPT, QUIET_CONFIRMED, QUIET_PENDING, EventLog, FaultMemory
+from atalante_hal.safety.fault_memory import EVENTS_KEPT, FOLD_CYCLES, EventLog, FaultMemory
 
 
 @pytest.fixture
@@ -14,7 +16,7 @@ def memory() -> FaultMemory:
     return FaultMemory()
 
 
-def told(memory: FaultMemory) -> list[tuple[int, str, str, str, float]]:
+def logged(memory: FaultMemory) -> list[tuple[int, str, str, str, float]]:
     return [(e.cycle, e.code, e.node, e.severity, e.value) for e in memory.events]
 
 
@@ -31,7 +33,7 @@ def test_persistent_diagnostic_is_logged_once(memory: FaultMemory):
         assert memory.confirmed == {Dtc.NODE_TIMEOUT}
         assert memory.bits == Dtc.NODE_TIMEOUT.bit
         assert memory.active[Dtc.NODE_TIMEOUT, "LEFT_SK"].value == cycle
-    assert told(memory) == [(5, "NODE_TIMEOUT", "LEFT_SK", "error", 5)]
+    assert logged(memory) == [(5, "NODE_TIMEOUT", "LEFT_SK", "error", 5)]
     assert memory.events[0].text == "LEFT_SK: a node timed out"
 
 
@@ -40,6 +42,13 @@ def test_a_finding_is_raised_with_all_its_fields(memory: FaultMemory, confirmed:
     memory.raise_finding(7, Finding(Dtc.ENC_JUMP, "LEFT_SK", 0.25, confirmed, "the encoder jumped"))
     entry = memory.active[Dtc.ENC_JUMP, "LEFT_SK"]
     assert (entry.confirmed, entry.value, entry.text, entry.cycle) == (confirmed, 0.25, "the encoder jumped", 7)
+
+
+def test_active_diagnostic_has_the_latest_text(memory: FaultMemory):
+    for text in ("can0 is down", "can0 was removed", ""):
+        memory.raise_dtc(1, Dtc.BUS_DOWN, "HAL", text=text)
+    assert memory.text_of(frozenset({Dtc.BUS_DOWN})) == "can0 was removed"
+    assert [event.text for event in memory.events] == ["can0 is down"]
 
 
 def test_diagnostic_ends_when_it_is_not_raised_again(memory: FaultMemory):
@@ -59,7 +68,7 @@ def test_pending_is_logged_as_warning_and_confirmed_as_error(memory: FaultMemory
         memory.raise_dtc(cycle, Dtc.E2E_CRC, "LEFT_SK", confirmed=confirmed, text=f"in cycle {cycle}", value=cycle)
         memory.close_cycle(cycle)
         assert memory.confirmed == ({Dtc.E2E_CRC} if confirmed else frozenset())
-    assert told(memory) == [(1, "E2E_CRC", "LEFT_SK", "warning", 1), (3, "E2E_CRC", "LEFT_SK", "error", 3)]
+    assert logged(memory) == [(1, "E2E_CRC", "LEFT_SK", "warning", 1), (3, "E2E_CRC", "LEFT_SK", "error", 3)]
     assert [e.text for e in memory.events] == ["in cycle 1", "in cycle 3"]
 
 
@@ -86,13 +95,77 @@ def test_pending_information_keeps_its_severity(memory: FaultMemory):
     assert [e.severity for e in memory.events] == ["info", "warning", "info"]
 
 
-@pytest.mark.parametrize(("confirmed", "quiet"), [(False, QUIET_PENDING), (True, QUIET_CONFIRMED)])
-def test_intermittent_diagnostic_is_logged_again_after_the_quiet_time(memory: FaultMemory, confirmed: bool, quiet: int):
-    for cycle in range(0, 2 * quiet + 1, 2):
-        memory.raise_dtc(cycle, Dtc.E2E_CRC, "LEFT_SK", confirmed=confirmed)
+@pytest.mark.parametrize("confirmed", [False, True])
+def test_toggling_diagnostic_logs_one_event_with_a_count_per_window(memory: FaultMemory, confirmed: bool):
+    for cycle in range(0, 2 * FOLD_CYCLES + 1, 2):
+        memory.raise_dtc(cycle, Dtc.E2E_CRC, "LEFT_SK", confirmed=confirmed, value=cycle, text="the CRC is wrong")
         memory.close_cycle(cycle)
         memory.close_cycle(cycle + 1)
-    assert [e.cycle for e in memory.events] == [0, quiet, 2 * quiet]
+    half = FOLD_CYCLES // 2
+    assert [(e.cycle, e.count) for e in memory.events] == [(0, 1), (FOLD_CYCLES, half), (2 * FOLD_CYCLES, half)]
+    assert [e.value for e in memory.events] == [0, FOLD_CYCLES, 2 * FOLD_CYCLES]
+    assert memory.events[1].text == f"the CRC is wrong ({half} times since the last such event)"
+    severity = "error" if confirmed else "warning"
+    assert {(e.code, e.node, e.severity) for e in memory.events} == {("E2E_CRC", "LEFT_SK", severity)}
+
+
+def test_no_occurrence_is_lost_in_the_counts(memory: FaultMemory):
+    rng, raised = random.Random(3), 0
+    for cycle in range(1, 20 * FOLD_CYCLES, 2):
+        if rng.random() < 0.002 if cycle // FOLD_CYCLES % 2 else rng.random() < 0.3:
+            memory.raise_dtc(cycle, Dtc.BUS_FLOOD, "HAL")
+            raised += 1
+        memory.close_cycle(cycle)
+        memory.close_cycle(cycle + 1)
+    memory.log_repeats(20 * FOLD_CYCLES, final=True)
+    assert sum(event.count for event in memory.events) == raised
+    assert len(memory.events) <= 21
+
+
+def test_window_without_repeats_logs_nothing_and_ends(memory: FaultMemory):
+    for cycle in (5, 5 + FOLD_CYCLES):
+        memory.raise_dtc(cycle, Dtc.E2E_CRC, "LEFT_SK")
+        memory.close_cycle(cycle)
+        assert not memory.window_over(cycle + FOLD_CYCLES - 1)
+        assert memory.window_over(cycle + FOLD_CYCLES)
+        memory.close_cycle(cycle + FOLD_CYCLES)
+        assert not memory.window_over(10 * FOLD_CYCLES)
+    assert [(e.cycle, e.count) for e in memory.events] == [(5, 1), (5 + FOLD_CYCLES, 1)]
+
+
+def test_end_of_one_window_leaves_a_later_window_open(memory: FaultMemory):
+    first, second = ("LEFT_SK", 0), ("RIGHT_SK", FOLD_CYCLES // 2)
+    for node, start in (first, second):
+        for cycle in (start, start + 2):
+            memory.raise_dtc(cycle, Dtc.E2E_CRC, node)
+            memory.close_cycle(cycle)
+            memory.close_cycle(cycle + 1)
+    memory.close_cycle(FOLD_CYCLES)
+    assert [(e.cycle, e.node, e.count) for e in memory.events][2:] == [(FOLD_CYCLES, "LEFT_SK", 1)]
+    memory.close_cycle(FOLD_CYCLES + FOLD_CYCLES // 2)
+    assert [(e.cycle, e.node, e.count) for e in memory.events][3:] == [(FOLD_CYCLES * 3 // 2, "RIGHT_SK", 1)]
+
+
+def test_repeats_are_logged_at_the_end_of_a_run(memory: FaultMemory):
+    for cycle in (5, 7, 9):
+        memory.raise_dtc(cycle, Dtc.E2E_CRC, "LEFT_SK")
+        memory.close_cycle(cycle)
+        memory.close_cycle(cycle + 1)
+    for _ in range(2):
+        memory.log_repeats(12, final=True)
+        assert [(e.cycle, e.count) for e in memory.events] == [(5, 1), (12, 2)]
+
+
+def test_codes_nodes_pending_and_confirmed_are_counted_separately(memory: FaultMemory):
+    for cycle in (0, 2):
+        for node in ("LEFT_SK", "RIGHT_SK"):
+            for error in (0x2310, 0x4310):
+                memory.raise_dtc(cycle, Dtc.EMCY_CURRENT, node, value=error, confirmed=cycle == 2)
+                memory.close_cycle(cycle)
+                memory.close_cycle(cycle + 1)
+    memory.raise_dtc(4, Dtc.TORQUE_SATURATED, "HAL", confirmed=False)
+    memory.raise_dtc(4, Dtc.TORQUE_SATURATED, "HAL")  # with the same severity
+    assert len(memory.events) == 10
 
 
 def test_each_pair_of_node_and_code_is_logged(memory: FaultMemory):
@@ -121,15 +194,15 @@ def test_nodes_and_texts_of_confirmed_codes_are_returned(memory: FaultMemory):
 
 def test_diagnostic_without_a_value_has_value_zero(memory: FaultMemory):
     memory.raise_dtc(3, Dtc.NODE_RESET, "LEFT_SK")
-    assert told(memory) == [(3, "NODE_RESET", "LEFT_SK", "error", 0.0)]
+    assert logged(memory) == [(3, "NODE_RESET", "LEFT_SK", "error", 0.0)]
 
 
 def test_event_log_is_bounded_and_counts_dropped_events(memory: FaultMemory):
     total = EVENTS_KEPT + 100
     for number in range(total):
-        memory.raise_dtc(number * QUIET_CONFIRMED, Dtc.OVER_TEMP, "LEFT_SK", value=number)
-        memory.close_cycle(number * QUIET_CONFIRMED)
-        memory.close_cycle(number * QUIET_CONFIRMED + 1)
+        memory.raise_dtc(number * FOLD_CYCLES, Dtc.OVER_TEMP, "LEFT_SK", value=number)
+        memory.close_cycle(number * FOLD_CYCLES)
+        memory.close_cycle(number * FOLD_CYCLES + 1)
     events = memory.events
     assert (len(events), events.count, events.dropped) == (EVENTS_KEPT, total, 100)
     assert [event.value for event in events] == list(range(100, total))

@@ -11,7 +11,7 @@ from atalante_hal.safety.diagnostics import Dtc
 from atalante_hal.safety.fault_memory import FaultMemory
 from atalante_hal.safety.heartbeats import BOOT_UP, Heartbeats
 from atalante_hal.wire.e2e import FULL
-from atalante_hal.wire.frame import Frames, new_frames
+from atalante_hal.wire.frame import FLAG_ESI, Frames, new_frames
 from atalante_hal.wire.process_image import TransmitImage
 
 NETWORK, THRESHOLDS = load(), load_robot().thresholds
@@ -29,27 +29,27 @@ class Nodes:
         self.vibration = np.zeros(8)
         self.now = 0
         for node in [*NODES, "PENDANT"]:
-            self.say(node, "STATUS", NodeState=5, DbcHash=NETWORK.hash32, SupplyVoltage=48.0)
+            self.set_signals(node, "STATUS", NodeState=5, DbcHash=NETWORK.hash32, SupplyVoltage=48.0)
 
-    def say(self, node: str, kind: str, **signals: float) -> None:
+    def set_signals(self, node: str, kind: str, **signals: float) -> None:
         for signal, value in signals.items():
             self.tx.values[self.tx.codec.index(f"{node}_{kind}", signal)] = value
 
     def frame(self, node: str, kind: str = "STATUS", **signals: float) -> Frames:
-        self.say(node, kind, **signals)
+        self.set_signals(node, kind, **signals)
         return self.tx.seal_row(self.tx.codec.rows[f"{node}_{kind}"]).copy()
 
-    def hear(self, *frames: Frames, cycle: int | None = None) -> list[int]:
+    def receive(self, *frames: Frames, cycle: int | None = None) -> list[int]:
         self.now = self.now + 1 if cycle is None else cycle
         return self.heartbeats.accept(np.concatenate(frames), self.now, self.vibration)
 
-    def judge(self) -> dict[tuple[str, str], bool]:
-        self.heartbeats.judge(self.now, self.memory)
+    def evaluate(self) -> dict[tuple[str, str], bool]:
+        self.heartbeats.evaluate(self.now, self.memory)
         self.memory.close_cycle(self.now)
         return {(dtc.value, node): entry.confirmed for (dtc, node), entry in self.memory.active.items()}
 
-    def all_well(self) -> None:
-        self.hear(*[self.frame(node) for node in [*NODES, "PENDANT"]])
+    def send_every_status(self) -> None:
+        self.receive(*[self.frame(node) for node in [*NODES, "PENDANT"]])
 
 
 @pytest.fixture
@@ -58,75 +58,75 @@ def nodes() -> Nodes:
 
 
 @pytest.fixture
-def well(nodes: Nodes) -> Nodes:
-    nodes.all_well()
-    assert nodes.judge() == {}
+def running(nodes: Nodes) -> Nodes:
+    nodes.send_every_status()
+    assert nodes.evaluate() == {}
     return nodes
 
 
 def test_nodes_are_known_after_a_status_of_each_except_the_pendant(nodes: Nodes):
     *first, last = NODES
     for node in first:
-        nodes.hear(nodes.frame(node))
-        assert not nodes.heartbeats.known
+        nodes.receive(nodes.frame(node))
+        assert not nodes.heartbeats.all_reported
     assert nodes.heartbeats.missing() == {last}
-    nodes.hear(nodes.frame(last))
-    assert nodes.heartbeats.known
+    nodes.receive(nodes.frame(last))
+    assert nodes.heartbeats.all_reported
     assert nodes.heartbeats.missing() == set()
     assert nodes.heartbeats.quiet is False, "the state machine has to be run: the robot may become READY"
-    assert nodes.judge() == {}
+    assert nodes.evaluate() == {}
     assert nodes.heartbeats.quiet
     assert nodes.heartbeats.quiet
 
 
 def test_second_boot_up_is_reported_as_reset(nodes: Nodes):
-    nodes.hear(nodes.frame("LEFT_SK", NodeState=0))
-    assert nodes.judge() == {}
+    nodes.receive(nodes.frame("LEFT_SK", NodeState=0))
+    assert nodes.evaluate() == {}
     assert nodes.heartbeats.quiet
-    nodes.hear(nodes.frame("LEFT_SK", NodeState=0))
+    nodes.receive(nodes.frame("LEFT_SK", NodeState=0))
     assert nodes.heartbeats.quiet is False
-    assert nodes.judge() == {("NODE_RESET", "LEFT_SK"): True}
-    nodes.hear(nodes.frame("LEFT_SK", NodeState=5))
-    assert nodes.judge() == {}
+    assert nodes.evaluate() == {("NODE_RESET", "LEFT_SK"): True}
+    nodes.receive(nodes.frame("LEFT_SK", NodeState=5))
+    assert nodes.evaluate() == {}
 
 
-def test_boot_up_with_any_counter_is_reported_as_reset(well: Nodes):
-    well.tx.resume(well.tx.codec.rows["LEFT_SK_STATUS"], 100)
-    well.hear(well.frame("LEFT_SK", NodeState=0))
-    assert well.judge() == {("NODE_RESET", "LEFT_SK"): True}
+def test_boot_up_with_any_counter_is_reported_as_reset(running: Nodes):
+    running.tx.resume(running.tx.codec.rows["LEFT_SK_STATUS"], 100)
+    running.receive(running.frame("LEFT_SK", NodeState=0))
+    assert running.evaluate() == {("NODE_RESET", "LEFT_SK"): True}
 
 
 def test_other_dbc_hash_is_reported_until_it_changes(nodes: Nodes):
-    nodes.hear(nodes.frame("IMU_TORSO", DbcHash=NETWORK.hash32 ^ 1))
+    nodes.receive(nodes.frame("IMU_TORSO", DbcHash=NETWORK.hash32 ^ 1))
     assert nodes.heartbeats.quiet is False
-    assert nodes.judge() == {("DBC_MISMATCH", "IMU_TORSO"): True}
+    assert nodes.evaluate() == {("DBC_MISMATCH", "IMU_TORSO"): True}
     assert nodes.heartbeats.missing() == set(NODES)
     assert nodes.memory.events[0].value == NETWORK.hash32 ^ 1
     nodes.now += 1
-    assert nodes.judge() == {("DBC_MISMATCH", "IMU_TORSO"): True}  # until the node sends another status
+    assert nodes.evaluate() == {("DBC_MISMATCH", "IMU_TORSO"): True}  # until the node sends another status
     assert nodes.heartbeats.quiet is False
 
 
 @pytest.mark.parametrize("node", ["LEFT_SK", "HAPTICS", "PENDANT"])
-def test_heartbeat_is_lost_exactly_at_its_timeout(well: Nodes, node: str):
+def test_heartbeat_is_lost_exactly_at_its_timeout(running: Nodes, node: str):
     others = [n for n in [*NODES, "PENDANT"] if n != node]
-    well.hear(*[well.frame(n) for n in others], cycle=150)
-    well.now = 1 + 249
-    assert not well.heartbeats.overdue(well.now)
-    assert well.judge() == {}
-    well.now = 1 + 250
-    assert well.heartbeats.overdue(well.now)
-    assert well.judge() == {("HEARTBEAT_LOST", node): True}
-    assert well.heartbeats.quiet is False
-    assert well.memory.events[0].value == 250
-    well.hear(well.frame(node))
-    assert not well.heartbeats.overdue(well.now)
-    assert well.judge() == {}
-    assert well.heartbeats.quiet
+    running.receive(*[running.frame(n) for n in others], cycle=150)
+    running.now = 1 + 249
+    assert not running.heartbeats.overdue(running.now)
+    assert running.evaluate() == {}
+    running.now = 1 + 250
+    assert running.heartbeats.overdue(running.now)
+    assert running.evaluate() == {("HEARTBEAT_LOST", node): True}
+    assert running.heartbeats.quiet is False
+    assert running.memory.events[0].value == 250
+    running.receive(running.frame(node))
+    assert not running.heartbeats.overdue(running.now)
+    assert running.evaluate() == {}
+    assert running.heartbeats.quiet
 
 
 def test_no_node_is_known_before_the_first_frame(nodes: Nodes):
-    assert nodes.heartbeats.known is False
+    assert nodes.heartbeats.all_reported is False
     assert nodes.heartbeats.quiet is True
     assert nodes.heartbeats.missing() == set(NODES)
 
@@ -134,7 +134,7 @@ def test_no_node_is_known_before_the_first_frame(nodes: Nodes):
 @pytest.mark.parametrize("cycle", [0, 1, 10_000])
 def test_node_without_any_frame_is_not_overdue(nodes: Nodes, cycle: int):
     assert not nodes.heartbeats.overdue(cycle)
-    assert nodes.judge() == {}
+    assert nodes.evaluate() == {}
 
 
 @pytest.mark.parametrize(
@@ -148,83 +148,83 @@ def test_node_without_any_frame_is_not_overdue(nodes: Nodes, cycle: int):
         (0.0, "UNDER_VOLTAGE"),
     ],
 )
-def test_low_supply_of_a_drive_is_reported(well: Nodes, volts: float, code: str | None):
-    well.hear(well.frame("LEFT_SK", SupplyVoltage=volts))
-    assert well.heartbeats.quiet is (code is None)
-    assert well.judge() == ({(code, "LEFT_SK"): True} if code else {})
-    assert well.heartbeats.quiet is (code is None)
-    assert not code or well.memory.events[0].value == pytest.approx(volts)
+def test_low_supply_of_a_drive_is_reported(running: Nodes, volts: float, code: str | None):
+    running.receive(running.frame("LEFT_SK", SupplyVoltage=volts))
+    assert running.heartbeats.quiet is (code is None)
+    assert running.evaluate() == ({(code, "LEFT_SK"): True} if code else {})
+    assert running.heartbeats.quiet is (code is None)
+    assert not code or running.memory.events[0].value == pytest.approx(volts)
 
 
 @pytest.mark.parametrize("node", ["PENDANT", "IMU_TORSO", "FOOT_LEFT", "HAPTICS"])
-def test_low_supply_of_another_node_is_ignored(well: Nodes, node: str):
-    well.hear(well.frame(node, SupplyVoltage=0.0))
-    assert well.heartbeats.quiet
-    assert well.judge() == {}
+def test_low_supply_of_another_node_is_ignored(running: Nodes, node: str):
+    running.receive(running.frame(node, SupplyVoltage=0.0))
+    assert running.heartbeats.quiet
+    assert running.evaluate() == {}
 
 
-def test_emergency_lasts_until_the_node_clears_it(well: Nodes):
-    well.hear(well.frame("LEFT_SK", "EMCY", ErrorCode=0x4310))
-    assert well.heartbeats.quiet is False
+def test_emergency_lasts_until_the_node_clears_it(running: Nodes):
+    running.receive(running.frame("LEFT_SK", "EMCY", ErrorCode=0x4310))
+    assert running.heartbeats.quiet is False
     for _ in range(3):
-        assert well.judge() == {("OVER_TEMP", "LEFT_SK"): True}
-        assert well.heartbeats.quiet is False
-        well.now += 1
-    assert well.memory.events[0].text == "LEFT_SK: a drive is too hot to hold its position (emergency 0x4310)"
-    assert well.memory.events[0].value == 0x4310
-    well.hear(well.frame("LEFT_SK", "EMCY", ErrorCode=0))
-    assert well.judge() == {}
-    assert well.heartbeats.quiet
-    well.hear(well.frame("LEFT_SA", "EMCY", ErrorCode=0))
-    assert well.judge() == {}
+        assert running.evaluate() == {("OVER_TEMP", "LEFT_SK"): True}
+        assert running.heartbeats.quiet is False
+        running.now += 1
+    assert running.memory.events[0].text == "LEFT_SK: a drive is too hot to hold its position (emergency 0x4310)"
+    assert running.memory.events[0].value == 0x4310
+    running.receive(running.frame("LEFT_SK", "EMCY", ErrorCode=0))
+    assert running.evaluate() == {}
+    assert running.heartbeats.quiet
+    running.receive(running.frame("LEFT_SA", "EMCY", ErrorCode=0))
+    assert running.evaluate() == {}
 
 
-def test_several_emergencies_in_one_cycle_are_all_reported(well: Nodes):
-    well.hear(
-        well.frame("LEFT_SK", "EMCY", ErrorCode=0x8110),
-        well.frame("LEFT_SA", "EMCY", ErrorCode=0x2310),
-        well.frame("LEFT_SK", "EMCY", ErrorCode=0x8250),
+def test_several_emergencies_in_one_cycle_are_all_reported(running: Nodes):
+    running.receive(
+        running.frame("LEFT_SK", "EMCY", ErrorCode=0x8110),
+        running.frame("LEFT_SA", "EMCY", ErrorCode=0x2310),
+        running.frame("LEFT_SK", "EMCY", ErrorCode=0x8250),
     )
-    assert well.judge() == {
+    assert running.evaluate() == {
         ("CMD_SOME_LOST", "LEFT_SK"): False,
         ("CMD_TIMEOUT", "LEFT_SK"): True,
         ("EMCY_2xxx", "LEFT_SA"): True,
     }
-    well.now += 1
-    assert well.judge() == {("CMD_TIMEOUT", "LEFT_SK"): True, ("EMCY_2xxx", "LEFT_SA"): True}
-    assert [(e.code, e.value) for e in well.memory.events] == [
+    running.now += 1
+    assert running.evaluate() == {("CMD_TIMEOUT", "LEFT_SK"): True, ("EMCY_2xxx", "LEFT_SA"): True}
+    assert [(e.code, e.value) for e in running.memory.events] == [
         ("CMD_SOME_LOST", 0x8110),
         ("EMCY_2310", 0x2310),
         ("CMD_TIMEOUT", 0x8250),
     ]
 
 
-def test_acknowledge_keeps_emergencies_of_faulty_drives(well: Nodes):
+def test_acknowledge_keeps_emergencies_of_faulty_drives(running: Nodes):
     for node in ("LEFT_SK", "LEFT_SA"):
-        well.hear(well.frame(node, "EMCY", ErrorCode=0x4310))
-    well.heartbeats.acknowledge({"LEFT_SA"})
-    assert well.heartbeats.emergencies == {"LEFT_SA": (Dtc.OVER_TEMP, 0x4310)}
-    assert well.judge() == {("OVER_TEMP", "LEFT_SA"): True}
+        running.receive(running.frame(node, "EMCY", ErrorCode=0x4310))
+    running.heartbeats.acknowledge({"LEFT_SA"})
+    assert running.heartbeats.emergencies == {"LEFT_SA": (Dtc.OVER_TEMP, 0x4310)}
+    assert running.evaluate() == {("OVER_TEMP", "LEFT_SA"): True}
 
 
-def test_received_amplitudes_are_written_to_the_state(well: Nodes):
-    level = well.tx.codec.slice("Amplitude")
-    well.tx.values[level] = 0.5
-    well.hear(well.frame("LEFT_SK"))
-    assert not well.vibration.any()
-    row = well.tx.codec.rows["HAPTICS_STATE"]
-    assert well.hear(well.tx.seal_row(row).copy()) == []
-    assert (well.vibration == 0.5).all()
-    well.tx.values[level] = 0.75
-    well.tx.seal_row(row)  # is lost
-    assert well.hear(well.tx.seal_row(row).copy()) == []
-    assert (well.vibration == 0.75).all()
-    well.tx.values[level] = 1.0
-    damaged = well.tx.seal_row(row).copy()
+def test_received_amplitudes_are_written_to_the_state(running: Nodes):
+    level = running.tx.codec.slice("Amplitude")
+    running.tx.values[level] = 0.5
+    running.receive(running.frame("LEFT_SK"))
+    assert not running.vibration.any()
+    row = running.tx.codec.rows["HAPTICS_STATE"]
+    assert running.receive(running.tx.seal_row(row).copy()) == []
+    assert (running.vibration == 0.5).all()
+    running.tx.values[level] = 0.75
+    running.tx.seal_row(row)  # is lost
+    assert running.receive(running.tx.seal_row(row).copy()) == []
+    assert (running.vibration == 0.75).all()
+    running.tx.values[level] = 1.0
+    damaged = running.tx.seal_row(row).copy()
     damaged["data"][0, 9] ^= 1
-    well.hear(damaged)
-    assert (well.vibration == 0.75).all()
-    assert well.heartbeats.quiet is False
+    running.receive(damaged)
+    assert (running.vibration == 0.75).all()
+    assert running.heartbeats.quiet is False
 
 
 def damaged(frame: Frames) -> Frames:
@@ -237,106 +237,133 @@ def shortened(frame: Frames) -> Frames:
     return frame
 
 
-def test_rejected_frames_are_reported_and_not_used(well: Nodes):
-    repeated = well.frame("FOOT_LEFT")
-    out_of_range = well.frame("IMU_TORSO", SupplyVoltage=np.nan)
-    well.hear(
-        damaged(well.frame("LEFT_SK", NodeState=0)),
-        shortened(well.frame("LEFT_SA", NodeState=0)),
+def test_rejected_frames_are_reported_and_not_used(running: Nodes):
+    repeated = running.frame("FOOT_LEFT")
+    out_of_range = running.frame("IMU_TORSO", SupplyVoltage=np.nan)
+    running.receive(
+        damaged(running.frame("LEFT_SK", NodeState=0)),
+        shortened(running.frame("LEFT_SA", NodeState=0)),
         repeated,
         repeated,
         out_of_range,
     )
-    assert well.heartbeats.quiet is False
-    assert well.judge() == {
+    assert running.heartbeats.quiet is False
+    assert running.evaluate() == {
         ("E2E_CRC", "LEFT_SK"): False,
         ("FRAME_LENGTH", "LEFT_SA"): False,
         ("E2E_REPEATED", "FOOT_LEFT"): False,
         ("SIGNAL_RANGE", "IMU_TORSO"): False,
     }
-    well.now += 1
-    assert well.judge() == {}
+    running.now += 1
+    assert running.evaluate() == {}
 
 
-def test_unknown_frames_are_returned(well: Nodes):
-    stranger = new_frames(1)
-    stranger["can_id"] = 0x7FF
-    assert well.hear(stranger, well.frame("LEFT_SK"), stranger) == [0, 2]
-    assert well.heartbeats.quiet
+def test_unknown_frames_are_returned(running: Nodes):
+    unknown = new_frames(1)
+    unknown["can_id"] = 0x7FF
+    assert running.receive(unknown, running.frame("LEFT_SK"), unknown) == [0, 2]
+    assert running.heartbeats.quiet
     cyclic = TransmitImage([NETWORK.message("LEFT_SK_STATE")]).seal()
-    assert well.hear(cyclic) == [0]  # that is the fast image's
+    assert running.receive(cyclic) == [0]  # a cyclic message, which another process image receives
 
 
-def test_restarted_sender_with_the_last_counter_is_accepted_and_reported(well: Nodes):
-    row = well.tx.codec.rows["LEFT_SK_STATUS"]
-    well.tx.resume(row, int(well.tx.frames["data"][row, 2]) - 1 & 0xFF)
-    well.hear(well.frame("LEFT_SK", Uptime=9.0))
-    assert well.heartbeats.quiet is False
-    assert well.heartbeats.image.values[well.heartbeats.image.codec.index("LEFT_SK_STATUS", "Uptime")] == 9.0
-    assert well.judge() == {("NODE_DUPLICATE", "LEFT_SK"): False}
-    assert well.heartbeats.quiet
+def test_restarted_sender_with_the_last_counter_is_accepted_and_reported(running: Nodes):
+    row = running.tx.codec.rows["LEFT_SK_STATUS"]
+    running.tx.resume(row, int(running.tx.frames["data"][row, 2]) - 1 & 0xFF)
+    running.receive(running.frame("LEFT_SK", Uptime=9.0))
+    assert running.heartbeats.quiet is False
+    assert running.heartbeats.image.values[running.heartbeats.image.codec.index("LEFT_SK_STATUS", "Uptime")] == 9.0
+    assert running.evaluate() == {("NODE_DUPLICATE", "LEFT_SK"): False}
+    assert running.heartbeats.quiet
 
 
-def test_emergency_with_the_last_counter_is_accepted(well: Nodes):
-    row = well.tx.codec.rows["LEFT_SK_EMCY"]
-    well.hear(well.frame("LEFT_SK", "EMCY", ErrorCode=0x7305))
-    well.tx.resume(row, int(well.tx.frames["data"][row, 2]) - 1 & 0xFF)
-    well.hear(well.frame("LEFT_SK", "EMCY", ErrorCode=0x4310))
-    assert well.heartbeats.emergencies == {"LEFT_SK": (Dtc.OVER_TEMP, 0x4310)}
+def test_emergency_with_the_last_counter_is_accepted(running: Nodes):
+    row = running.tx.codec.rows["LEFT_SK_EMCY"]
+    running.receive(running.frame("LEFT_SK", "EMCY", ErrorCode=0x7305))
+    running.tx.resume(row, int(running.tx.frames["data"][row, 2]) - 1 & 0xFF)
+    running.receive(running.frame("LEFT_SK", "EMCY", ErrorCode=0x4310))
+    assert running.heartbeats.emergencies == {"LEFT_SK": (Dtc.OVER_TEMP, 0x4310)}
 
 
-def test_two_senders_are_confirmed_at_the_fifth_conflict(well: Nodes):
-    row = well.tx.codec.rows["HAPTICS_STATE"]
+def test_two_senders_are_confirmed_at_the_fifth_conflict(running: Nodes):
+    row = running.tx.codec.rows["HAPTICS_STATE"]
     for pair in range(1, 7):
-        true = well.frame("HAPTICS", "STATE", LeftThighFront_Amplitude=0.25)
-        well.tx.resume(row, int(true["data"][0, 2]) - 1 & 0xFF)
-        well.hear(true, well.frame("HAPTICS", "STATE", LeftThighFront_Amplitude=0.5))
-        assert not well.heartbeats.quiet
-        assert well.judge() == {("NODE_DUPLICATE", "HAPTICS"): pair > 4}
-        assert well.heartbeats.quiet is (pair <= 4)
-    entry = well.memory.active[Dtc.NODE_DUPLICATE, "HAPTICS"]
+        true = running.frame("HAPTICS", "STATE", LeftThighFront_Amplitude=0.25)
+        running.tx.resume(row, int(true["data"][0, 2]) - 1 & 0xFF)
+        running.receive(true, running.frame("HAPTICS", "STATE", LeftThighFront_Amplitude=0.5))
+        assert not running.heartbeats.quiet
+        assert running.evaluate() == {("NODE_DUPLICATE", "HAPTICS"): pair > 4}
+        assert running.heartbeats.quiet is (pair <= 4)
+    entry = running.memory.active[Dtc.NODE_DUPLICATE, "HAPTICS"]
     assert entry.value == FULL
     assert entry.text == "HAPTICS: two senders of one message, HAPTICS_STATE: switch one of them off"
-    well.hear(well.frame("HAPTICS", "STATE"))
-    assert well.judge() == {}
-    assert well.heartbeats.quiet
+    running.receive(running.frame("HAPTICS", "STATE"))
+    assert running.evaluate() == {}
+    assert running.heartbeats.quiet
 
 
-def test_two_senders_are_confirmed_beside_damaged_frames_of_another_node(well: Nodes):
-    row = well.tx.codec.rows["HAPTICS_STATE"]
+def test_two_senders_are_confirmed_although_frames_of_another_node_are_damaged(running: Nodes):
+    row = running.tx.codec.rows["HAPTICS_STATE"]
     for pair in range(1, 6):
-        damaged = well.frame("LEFT_SK")
+        damaged = running.frame("LEFT_SK")
         damaged["data"][0, 5] ^= 1
-        true = well.frame("HAPTICS", "STATE", LeftThighFront_Amplitude=0.25)
-        well.tx.resume(row, int(true["data"][0, 2]) - 1 & 0xFF)
-        well.hear(damaged, true, well.frame("HAPTICS", "STATE", LeftThighFront_Amplitude=0.5))
-        assert well.judge()["NODE_DUPLICATE", "HAPTICS"] is (pair > 4)
+        true = running.frame("HAPTICS", "STATE", LeftThighFront_Amplitude=0.25)
+        running.tx.resume(row, int(true["data"][0, 2]) - 1 & 0xFF)
+        running.receive(damaged, true, running.frame("HAPTICS", "STATE", LeftThighFront_Amplitude=0.5))
+        assert running.evaluate()["NODE_DUPLICATE", "HAPTICS"] is (pair > 4)
 
 
-def test_one_sender_leaves_no_evidence_of_a_second(well: Nodes):
-    well.hear(well.frame("LEFT_SK"), well.frame("HAPTICS", "STATE"))  # the first frame of HAPTICS_STATE
-    assert well.heartbeats.quiet is True
+def test_frames_of_one_sender_are_no_evidence_of_two_senders(running: Nodes):
+    running.receive(running.frame("LEFT_SK"), running.frame("HAPTICS", "STATE"))  # the first frame of HAPTICS_STATE
+    assert running.heartbeats.quiet is True
 
 
-def test_booted_node_is_listed(well: Nodes):
-    well.hear(well.frame("LEFT_SK"))
-    assert well.heartbeats.booted == set()
-    well.hear(well.frame("LEFT_SK", NodeState=BOOT_UP))
-    well.judge()
-    assert well.heartbeats.booted == {"LEFT_SK"}
+def test_booted_node_is_listed(running: Nodes):
+    running.receive(running.frame("LEFT_SK"))
+    assert running.heartbeats.booted == set()
+    running.receive(running.frame("LEFT_SK", NodeState=BOOT_UP))
+    running.evaluate()
+    assert running.heartbeats.booted == {"LEFT_SK"}
 
 
-def test_emergency_explains_a_fault_until_it_is_cleared(well: Nodes):
-    assert not well.heartbeats.explains_fault("LEFT_SK")
-    well.hear(well.frame("LEFT_SK", "EMCY", ErrorCode=0x7305))
-    well.judge()
-    assert well.heartbeats.explains_fault("LEFT_SK")
-    assert not well.heartbeats.explains_fault("LEFT_SA")
-    well.hear(well.frame("LEFT_SK", "EMCY", ErrorCode=0))
-    well.judge()
-    assert well.heartbeats.explains_fault("LEFT_SK")
-    well.now += 1
-    well.judge()
-    assert not well.heartbeats.explains_fault("LEFT_SK")
-    well.hear(well.frame("LEFT_SK", "EMCY", ErrorCode=0))
-    assert not well.heartbeats.explains_fault("LEFT_SK"), "no emergency was active"
+def test_emergency_explains_a_fault_until_it_is_cleared(running: Nodes):
+    assert not running.heartbeats.has_emergency("LEFT_SK")
+    running.receive(running.frame("LEFT_SK", "EMCY", ErrorCode=0x7305))
+    running.evaluate()
+    assert running.heartbeats.has_emergency("LEFT_SK")
+    assert not running.heartbeats.has_emergency("LEFT_SA")
+    running.receive(running.frame("LEFT_SK", "EMCY", ErrorCode=0))
+    running.evaluate()
+    assert running.heartbeats.has_emergency("LEFT_SK")
+    running.now += 1
+    running.evaluate()
+    assert not running.heartbeats.has_emergency("LEFT_SK")
+    running.receive(running.frame("LEFT_SK", "EMCY", ErrorCode=0))
+    assert not running.heartbeats.has_emergency("LEFT_SK"), "no emergency was active"
+
+
+def test_status_of_an_error_passive_node_is_reported(running: Nodes):
+    status = running.frame("LEFT_SK")
+    status["flags"] |= FLAG_ESI
+    running.receive(status)
+    assert running.heartbeats.quiet is False
+    assert running.evaluate() == {("NODE_ERROR_PASSIVE", "LEFT_SK"): False}
+
+
+def test_status_of_an_error_passive_node_is_used(running: Nodes):
+    status = running.frame("LEFT_SK", SupplyVoltage=UNDER - 1.0)
+    status["flags"] |= FLAG_ESI
+    assert running.receive(status) == []
+    assert running.heartbeats.quiet is False
+    assert running.evaluate() == {("NODE_ERROR_PASSIVE", "LEFT_SK"): False, ("UNDER_VOLTAGE", "LEFT_SK"): True}
+    assert running.memory.active[Dtc.NODE_ERROR_PASSIVE, "LEFT_SK"].value == 0
+    running.receive(running.frame("LEFT_SK", SupplyVoltage=48.0))
+    assert running.evaluate() == {}
+
+
+def test_status_that_is_received_twice_in_a_cycle_is_reported(running: Nodes):
+    status = running.frame("LEFT_SK")
+    running.receive(status, status)
+    assert running.heartbeats.quiet is False
+    assert running.evaluate() == {("E2E_REPEATED", "LEFT_SK"): False}
+    assert running.heartbeats.quiet

@@ -80,7 +80,7 @@ def test_every_command_is_limited_as_documented(cycles: list[tuple[np.ndarray, n
         assert (np.abs(u - before) <= STEP + tiny).all()
         assert (u <= np.maximum(up, before - STEP) + tiny).all()
         assert (-u <= np.maximum(down, -before - STEP) + tiny).all()
-        # The torque is cut no further than that.
+        # The torque is not reduced by more than these limits require.
         low = np.clip(-down, before - STEP, before + STEP)
         high = np.clip(up, before - STEP, before + STEP)
         assert np.allclose(u, np.minimum(np.maximum(command, low), high), rtol=0.0, atol=tiny)
@@ -111,16 +111,16 @@ shares = arrays(np.float64, 12, elements=st.floats(-1.0, 1.0))
 def test_command_within_every_limit_is_sent_unchanged(
     torque: np.ndarray, step: np.ndarray, velocity: np.ndarray, position: np.ndarray, derated: np.ndarray
 ):
-    """Torque up to its derated limit, position, velocity and rate up to at least 99 % of their limits."""
+    """The torque reaches its derated limit. Position, velocity and torque rate reach at least 99 % of their limits."""
     limiter = Limiter(ROBOT, PERIOD)
     limiter.derate(derated * ROBOT.torque_max)
-    asked = torque * limiter.limit
-    limiter.restart(asked + 0.99 * step * STEP)
+    requested = torque * limiter.limit
+    limiter.restart(requested + 0.99 * step * STEP)
     speed = velocity * ROBOT.velocity_max
     half = (ROBOT.position_max - ROBOT.position_min) / 2.0
     ahead = MIDDLE + 0.99 * position * half
-    assert limiter.apply(asked, np.array([ahead - LOOK * speed, speed])) == FREE
-    assert limiter.last.tobytes() == asked.tobytes()
+    assert limiter.apply(requested, np.array([ahead - LOOK * speed, speed])) == FREE
+    assert limiter.last.tobytes() == requested.tobytes()
     assert limiter.cut.tolist() == [False] * 12
     assert limiter.saturated == 0
 
@@ -138,7 +138,7 @@ def test_command_within_the_limits_is_unchanged_for_1000_cycles():
 @joints
 @pytest.mark.parametrize("sign", [1.0, -1.0])
 class TestTightThresholds:
-    """A torque just inside its limit is unchanged; just outside, only that joint is cut."""
+    """A torque just inside its limit is unchanged. If it is just outside, only the torque of this joint is reduced."""
 
     def expect(self, limiter: Limiter, torque: np.ndarray, motion: np.ndarray, cut: int | None) -> None:
         assert limiter.apply(torque, motion) == (FREE if cut is None else CUT)

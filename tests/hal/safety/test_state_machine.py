@@ -13,10 +13,18 @@ from atalante_hal.safety.state_machine import MOVING, Conditions, next_state
 from atalante_hal.types import SupervisorState
 
 S, R = SupervisorState, Reaction
-FACTS = ("nodes_well", "drives_enabled", "dead_man", "stop_requested", "start_wanted", "step_finished")
-#: One code per reaction. The next state depends only on the most severe reaction, so these represent all codes.
+FACTS = (
+    "nodes_ready",
+    "drives_enabled",
+    "dead_man",
+    "stop_requested",
+    "start_wanted",
+    "step_finished",
+    "walk_end_requested",
+)
+#: One code per reaction. These codes represent all codes, because the next state depends only on the most severe reaction.
 ONE_OF = {reaction: next(d for d in Dtc if d.reaction is reaction) for reaction in Reaction}
-RUN = {"nodes_well": True, "drives_enabled": True, "dead_man": True}
+RUN = {"nodes_ready": True, "drives_enabled": True, "dead_man": True}
 GO = RUN | {"start_wanted": True}
 EVERYTHING = [
     (state, reaction, Conditions(frozenset({ONE_OF[reaction]}), *facts))
@@ -30,10 +38,10 @@ def after(state: S, *dtcs: Dtc, **facts: bool) -> S:
 
 TABLE = [
     (S.OFF, {}, S.OFF),
-    (S.OFF, {"nodes_well": True}, S.READY),
+    (S.OFF, {"nodes_ready": True}, S.READY),
     (S.OFF, GO, S.READY),
     (S.READY, {}, S.OFF),
-    (S.READY, {"nodes_well": True}, S.READY),
+    (S.READY, {"nodes_ready": True}, S.READY),
     (S.READY, GO | {"drives_enabled": False}, S.READY),
     (S.READY, GO | {"dead_man": False}, S.READY),
     (S.READY, GO | {"stop_requested": True}, S.READY),
@@ -44,13 +52,21 @@ TABLE = [
     (S.FULL_ASSIST, RUN, S.FULL_ASSIST),
     (S.FULL_ASSIST, GO, S.ACTIVE),
     (S.FULL_ASSIST, RUN | {"dead_man": False}, S.HOLD),
+    (S.ACTIVE, RUN | {"walk_end_requested": True}, S.FINISH_STEP),
+    (S.ACTIVE, GO | {"walk_end_requested": True}, S.FINISH_STEP),
+    (S.ACTIVE, RUN | {"walk_end_requested": True, "dead_man": False}, S.HOLD),
+    (S.FULL_ASSIST, RUN | {"walk_end_requested": True}, S.FINISH_STEP),
+    (S.FINISH_STEP, RUN | {"walk_end_requested": True}, S.FINISH_STEP),
+    (S.FINISH_STEP, RUN | {"walk_end_requested": True, "step_finished": True}, S.HOLD),
+    (S.HOLD, GO | {"walk_end_requested": True}, S.HOLD),
+    (S.READY, GO | {"walk_end_requested": True}, S.READY),
     (S.FINISH_STEP, RUN, S.FINISH_STEP),
     (S.FINISH_STEP, GO, S.FINISH_STEP),
     (S.FINISH_STEP, RUN | {"step_finished": True}, S.HOLD),
     (S.FINISH_STEP, RUN | {"stop_requested": True}, S.HOLD),
     (S.HOLD, RUN, S.HOLD),
     (S.HOLD, GO, S.ACTIVE),
-    (S.HOLD, GO | {"nodes_well": False}, S.HOLD),
+    (S.HOLD, GO | {"nodes_ready": False}, S.HOLD),
     (S.HOLD, {}, S.HOLD),
     (S.LOWER, RUN, S.LOWER),
     (S.LOWER, GO, S.HOLD),
@@ -94,11 +110,11 @@ def test_every_code_except_information_prevents_the_start(dtc: Dtc):
 @pytest.mark.parametrize(
     ("before", "facts", "then"), [(S.FAULT, RUN, S.FAULT), (S.FAULT, GO, S.LOWER), (S.LOWER, GO, S.LOWER)]
 )
-def test_start_keeps_lowering_while_the_cause_lasts(before: S, facts: dict[str, bool], then: S):
+def test_start_does_not_end_lower_while_its_cause_lasts(before: S, facts: dict[str, bool], then: S):
     assert after(before, Dtc.OVER_TEMP, **facts) is then
 
 
-def test_start_keeps_fault_while_its_cause_lasts():
+def test_start_does_not_end_fault_while_its_cause_lasts():
     assert after(S.FAULT, Dtc.DRIVE_FAULT, **GO) is S.FAULT
 
 
@@ -112,12 +128,13 @@ def test_invariants_hold_for_all_states_reactions_and_facts():
         check_laws(before, reaction, conditions)
 
 
-#: Transitions that no diagnostic causes. Each has a reason of its own, see `test_safety_monitor.py`.
+#: Transitions for which `next_state` returns no diagnostic. `test_safety_monitor.py` tests the texts of their reasons.
 WITHOUT_REASON = {
     (S.OFF, S.READY),
     (S.READY, S.OFF),
     *((before, S.ACTIVE) for before in (S.READY, S.FULL_ASSIST, S.HOLD)),
     *((before, S.HOLD) for before in (S.FINISH_STEP, S.LOWER, S.FAULT)),
+    *((before, S.FINISH_STEP) for before in (S.ACTIVE, S.FULL_ASSIST)),
 }
 
 
@@ -141,27 +158,40 @@ def check_laws(before: S, reaction: R, c: Conditions):
     if then in MOVING and before not in MOVING:
         assert then is S.ACTIVE
         assert c.start_wanted
-        assert c.nodes_well
+        assert not c.walk_end_requested
+        assert c.nodes_ready
         assert c.drives_enabled
         assert reaction is R.INFO
-    # Only START of the operator leads to a less safe state; OFF to READY is excepted, because it moves nothing.
+    # Only START of the operator leads to a less safe state. Exception: OFF to READY, in which nothing moves.
     if not (c.start_wanted and c.dead_man and not c.stop_requested) and (before, then) != (S.OFF, S.READY):
         assert then >= before or (before, then) == (S.READY, S.OFF)
-    # After a movement the drives stay enabled.
+    # STOP ends the walk with the current step or earlier.
+    if before in MOVING and c.walk_end_requested:
+        assert then >= S.FINISH_STEP
+    # After a motion, the state machine does not return to OFF or READY, in which the drives are not enabled.
     if before not in (S.OFF, S.READY):
         assert then not in (S.OFF, S.READY)
-    # A moving robot reaches at least the safety of the demanded reaction.
+    # The next state of a moving robot is at least as safe as the reaction demands.
     if before in MOVING and reaction > R.NOT_READY:
         assert then >= S[reaction.name]
 
 
+@pytest.mark.parametrize("reaction", R)
+def test_end_of_walk_hides_only_less_severe_codes(reaction: R):
+    code = ONE_OF[reaction]
+    _, reasons = next_state(S.ACTIVE, Conditions(frozenset({code}), **RUN, walk_end_requested=True))
+    assert reasons == (frozenset({code}) if reaction >= R.FINISH_STEP else frozenset())
+
+
 @given(st.sampled_from(S), st.frozensets(st.sampled_from(Dtc), max_size=6), st.tuples(*[st.booleans()] * len(FACTS)))
-def test_most_severe_code_of_a_set_determines_state_and_reasons(before, dtcs, facts):
+def test_most_severe_code_determines_the_next_state_and_its_reasons(before, dtcs, facts):
     then, reasons = next_state(before, Conditions(dtcs, *facts))
-    alone, _ = next_state(before, Conditions(frozenset({ONE_OF[worst(dtcs)]}), *facts))
-    assert then is alone
+    representative, _ = next_state(before, Conditions(frozenset({ONE_OF[worst(dtcs)]}), *facts))
+    assert then is representative
     stopped = before in MOVING and (not facts[2] or facts[3])
     expected = worst([*dtcs, *([Dtc.OPERATOR_STOP] if stopped else [])])
+    if before in MOVING and facts[6] and expected < R.FINISH_STEP:
+        expected = R.INFO  # the end of the walk that the operator requested is more severe than the diagnostics
     assert {d.reaction for d in reasons} == ({expected} if expected is not R.INFO else set())
     assert reasons == {d for d in dtcs | ({Dtc.OPERATOR_STOP} if stopped else set()) if d.reaction is expected} or not (
         reasons or expected is not R.INFO

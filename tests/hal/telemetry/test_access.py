@@ -27,12 +27,12 @@ from atalante_hal.telemetry.process import TelemetryConfig, TelemetryError, Tele
 from atalante_hal.telemetry.publisher import Publisher
 from atalante_tools.cli import cli
 
-TRIES = 100  # of 50 ms
+TRIES = 100  # largest number of polls, one every 50 ms
 STREAMS = [("imu", "ImuStates")]
 
 
 class Authority:
-    """Signs certificates for 127.0.0.1."""
+    """Certificate authority that signs certificates for 127.0.0.1."""
 
     def __init__(self, folder: Path, name: str) -> None:
         self._folder, self._name = folder, name
@@ -40,7 +40,7 @@ class Authority:
         self.certificate = self._write(name, self._key, self._sign(name, self._key, of_authority=True))[0]
 
     def issue(self, name: str) -> tuple[Path, Path]:
-        """Issue a certificate and private key, for server or client."""
+        """Issue a certificate and its private key, for a server or a client. Return the paths of both files."""
         key = ec.generate_private_key(ec.SECP256R1())
         return self._write(name, key, self._sign(name, key, of_authority=False))
 
@@ -110,7 +110,10 @@ def receives(publisher: Publisher, transport: dict[str, Any], where: str | None 
 
 
 def any_receives(publisher: Publisher, *clients: tuple[dict[str, Any], str | None]) -> bool:
-    """Return whether any client receives telemetry. They run in parallel, because a rejected client retries until its timeout."""
+    """Return whether any of the clients receives telemetry.
+
+    The clients run in parallel, because a rejected client retries until its timeout.
+    """
     with ThreadPoolExecutor() as pool:
         return any(pool.map(lambda one: receives(publisher, *one), clients))
 
@@ -130,7 +133,7 @@ def trusting(authority: Authority, certificate: tuple[Path, Path] | None = None)
 class TestLoopback:
     def test_tls_with_users_accepts_only_clients_with_both(self, authority: Authority, users: Path) -> None:
         access = Access(*authority.issue("robot"), users=users)
-        stranger = Authority(users.parent, "stranger")
+        other_authority = Authority(users.parent, "other")
         with Publisher("exo", STREAMS, endpoint("tls"), access) as publisher:
             assert receives(publisher, trusting(authority) | user("lab", "secret"))
             assert not any_receives(
@@ -138,18 +141,18 @@ class TestLoopback:
                 (trusting(authority) | user("lab", "guess"), None),
                 (trusting(authority), None),
                 (
-                    trusting(stranger) | user("lab", "secret"),
+                    trusting(other_authority) | user("lab", "secret"),
                     None,
                 ),  # the client does not trust the authority of the publisher
                 (user("lab", "secret"), publisher.endpoint.replace("tls/", "tcp/")),
             )
 
     def test_client_authority_requires_a_client_certificate(self, authority: Authority) -> None:
-        stranger = Authority(authority.certificate.parent, "stranger")
+        other_authority = Authority(authority.certificate.parent, "other")
         access = Access(*authority.issue("robot"), client_ca=authority.certificate)
         with Publisher("exo", STREAMS, endpoint("tls"), access) as publisher:
             assert receives(publisher, trusting(authority, authority.issue("desk")))
-            spy = trusting(authority, stranger.issue("spy"))
+            spy = trusting(authority, other_authority.issue("spy"))
             assert not any_receives(publisher, (spy, None), (trusting(authority), None))
 
     def test_quic_accepts_only_clients_with_certificate_and_password(self, authority: Authority, users: Path) -> None:
@@ -204,7 +207,7 @@ class TestTelemetryFile:
         assert self.read(folder, "") == {}
 
     @pytest.mark.parametrize(
-        ("text", "said"),
+        ("text", "message"),
         [
             ('lisen = "tcp/127.0.0.1:1"', "lisen is unknown; valid keys are robot, listen, certificate"),
             ("listen = 7447", "listen must be a text that is not empty, got 7447"),
@@ -220,12 +223,12 @@ class TestTelemetryFile:
             ("listen", "telemetry.toml: "),
         ],
     )
-    def test_invalid_telemetry_file_is_rejected_with_its_key(self, folder: Path, text: str, said: str) -> None:
+    def test_invalid_telemetry_file_is_rejected_with_its_key(self, folder: Path, text: str, message: str) -> None:
         (folder / "open.key").touch(0o644)
         (folder / "empty").touch(0o600)
         with pytest.raises(AccessError) as refused:
             self.read(folder, text)
-        assert said in str(refused.value)
+        assert message in str(refused.value)
         assert "\n" not in str(refused.value)
 
     @pytest.mark.parametrize(
@@ -306,7 +309,7 @@ class TestTelemetryFile:
 
 
 class TestCommand:
-    """The command `atalante airwalk --telemetry FILE`, with each kind of telemetry file in the README."""
+    """The command `atalante airwalk --telemetry FILE`, with each combination of keys that the README shows."""
 
     @pytest.mark.parametrize(
         "keys",

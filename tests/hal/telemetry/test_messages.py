@@ -30,16 +30,17 @@ NANOSECONDS = 1_000_000_000
 
 @pytest.fixture
 def layout(network: atalante_dbc.Network, robot: Robot) -> Layout:
-    """Layout of the records of the HAL with the airwalk controller."""
+    """Return the layout of the records of the HAL with the airwalk controller."""
     return Hal(network, robot, lockstep_pair()[0], controller_fields=AirwalkController.telemetry_fields).layout
 
 
 @pytest.fixture
 def record(layout: Layout) -> np.ndarray:
-    """A record with a different value at each index; float32 represents each value exactly."""
+    """Return a record with a different value at each index. float32 represents each value exactly."""
     values = np.arange(layout.size) / 8 + 1.0
     values[layout["cycle"]], values[layout["time"]] = 1234, 1.234
-    values[layout["supervisor"]], values[layout["diagnostics"]] = SupervisorState.ACTIVE, 0b101
+    values[layout["supervisor"]] = SupervisorState.ACTIVE
+    values[layout["diagnostics"]], values[layout["diagnostics_high"]] = 0b101, 0b10
     values[layout["drive_state"]] = DriveState.OPERATION_ENABLED
     values[layout["controller.filter_active"]] = 0.0, 1.0
     values[layout["controller.stance"]], values[layout["controller.step"]] = 1.0, 7.0
@@ -54,7 +55,7 @@ def decoded(encoder: Encoder, key: str, record: np.ndarray, start_ns: int = 0) -
 
 class TestSchema:
     def test_committed_descriptor_set_matches_the_proto_file(self, tmp_path: Path) -> None:
-        """Regenerate with the command given in the .proto file."""
+        """If this test fails, regenerate the descriptor set with the command in the .proto file."""
         folder, made = schema.DESCRIPTORS.parent, tmp_path / "messages.binpb"
         text = (folder / "messages.proto").read_text()
         command = next(line for line in text.splitlines() if "-m grpc_tools.protoc" in line).strip("/ ").split()
@@ -73,14 +74,14 @@ class TestSchema:
             seen.add(file.name)
 
     @pytest.mark.parametrize(
-        ("name", "ours"),
+        ("name", "hal_enum"),
         [("SupervisorState", SupervisorState), ("DriveState", DriveState)],
         ids=["supervisor", "drive"],
     )
-    def test_enums_have_the_names_and_values_of_the_hal(self, name: str, ours: type[enum.IntEnum]) -> None:
-        theirs = {value.name: value.number for value in _enum(name)}
+    def test_enums_have_the_names_and_values_of_the_hal(self, name: str, hal_enum: type[enum.IntEnum]) -> None:
+        proto_values = {value.name: value.number for value in _enum(name)}
         prefix = "".join(f"_{letter}" if letter.isupper() else letter for letter in name).upper().strip("_")
-        assert theirs == {f"{prefix}_{value.name}": value.value for value in ours}
+        assert proto_values == {f"{prefix}_{value.name}": value.value for value in hal_enum}
 
     def test_severities_are_in_the_order_of_the_enum(self) -> None:
         assert [value.name for value in _enum("Severity")] == [f"SEVERITY_{name.upper()}" for name in SEVERITIES]
@@ -126,11 +127,11 @@ class TestStreams:
     def test_imu_states_contain_the_recorded_values(self, layout: Layout, record: np.ndarray) -> None:
         message = decoded(Encoder(layout), "imu", record)
         assert [imu.name for imu in message.imu] == list(IMUS)
-        for place, imu in enumerate(message.imu):
+        for index, imu in enumerate(message.imu):
             turn, rate, force = imu.orientation, imu.angular_velocity, imu.linear_acceleration
-            assert [turn.w, turn.x, turn.y, turn.z] == record[layout["imu_quaternion"]].reshape(4, 4)[place].tolist()
-            assert [rate.x, rate.y, rate.z] == record[layout["imu_gyro"]].reshape(4, 3)[place].tolist()
-            assert [force.x, force.y, force.z] == record[layout["imu_accel"]].reshape(4, 3)[place].tolist()
+            assert [turn.w, turn.x, turn.y, turn.z] == record[layout["imu_quaternion"]].reshape(4, 4)[index].tolist()
+            assert [rate.x, rate.y, rate.z] == record[layout["imu_gyro"]].reshape(4, 3)[index].tolist()
+            assert [force.x, force.y, force.z] == record[layout["imu_accel"]].reshape(4, 3)[index].tolist()
 
     def test_foot_forces_contain_the_recorded_values(self, layout: Layout, record: np.ndarray) -> None:
         message = decoded(Encoder(layout), "foot_forces", record)
@@ -182,7 +183,7 @@ class TestStreams:
         assert (message.run, message.run_name) == (2, "pinched")
         assert message.supervisor == SupervisorState.ACTIVE
         assert message.assistance_factor == record[layout["assistance_factor"]][0]
-        assert message.diagnostics == 5
+        assert message.diagnostics == 5 | 1 << 49
         assert list(message.diagnostic) == ["NODES_WELL", "DEAD_MAN"]
 
     def test_encoder_keeps_no_values_of_the_last_message(self, layout: Layout, record: np.ndarray) -> None:
@@ -223,13 +224,13 @@ class TestLoop:
 
 
 class TestEvents:
-    EVENT = Event(42, "NODE_TIMEOUT", "IMU_TORSO was not heard for 5 cycles", "error", "IMU_TORSO", 5.0)
+    EVENT = Event(42, "NODE_TIMEOUT", "IMU_TORSO timed out for 5 cycles", "error", "IMU_TORSO", 5.0, 7)
 
     def test_event_message_contains_every_field(self, layout: Layout) -> None:
         message = schema.message_class("Event").FromString(Encoder(layout).event(self.EVENT, 3 * NANOSECONDS + 7))
         assert (message.timestamp.seconds, message.timestamp.nanos, message.cycle) == (3, 7, 42)
         assert (message.severity, message.code, message.node) == (2, "NODE_TIMEOUT", "IMU_TORSO")
-        assert (message.value, message.text) == (5.0, self.EVENT.text)
+        assert (message.value, message.text, message.count) == (5.0, self.EVENT.text, 7)
 
     def test_event_is_unchanged_by_pack_and_unpack(self) -> None:
         assert unpack(pack(self.EVENT, 77)) == (self.EVENT, 77)
@@ -238,7 +239,7 @@ class TestEvents:
         event, _ = unpack(pack(Event(1, "C" * 60, "é" * 300), 0))
         assert set(event.code) == {"C"}
         assert set(event.text) == {"é"}
-        assert len(event.text) == 108
+        assert len(event.text) == 110
 
     def test_unknown_severity_is_rejected_with_the_valid_ones(self) -> None:
         with pytest.raises(ValueError, match="info, warning, error"):

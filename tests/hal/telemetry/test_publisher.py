@@ -24,7 +24,7 @@ from atalante_hal.telemetry.schema import message_class
 from atalante_hal.telemetry.sink import SinkError
 
 STREAMS = [("joint_states", "JointStates"), ("imu", "ImuStates")]
-TRIES = 400  # polls of another thread or process, every 50 ms
+TRIES = 400  # largest number of polls of another thread or process, one every 50 ms
 
 
 def free_port() -> int:
@@ -117,26 +117,26 @@ class TestSubscribers:
             "mode": "client",
             "connect": {"endpoints": [publisher.endpoint]},
             "scouting": {"multicast": {"enabled": False}},
-            "transport": {"shared_memory": {"enabled": False}},  # it will be killed
+            "transport": {"shared_memory": {"enabled": False}},  # the killed process would leave it in /dev/shm
         }
         with subprocess.Popen([sys.executable, "-c", program, json.dumps(config)], stdout=subprocess.PIPE) as child:
             assert child.stdout is not None
             os.set_blocking(child.stdout.fileno(), False)
 
-            def hears(payload: bytes) -> Callable[[], bool]:
-                def said() -> bool:
+            def has_received(payload: bytes) -> Callable[[], bool]:
+                def is_received() -> bool:
                     publisher.put("imu", payload, 0, 0)
                     return payload in (child.stdout.read() or b"")
 
-                return said
+                return is_received
 
             try:
-                until(hears(b"first"))
+                until(has_received(b"first"))
                 child.send_signal(signal.SIGSTOP)
-                for _ in range(5000):  # 20 MB: more than every buffer on the way holds
+                for _ in range(5000):  # 20 MB, more than all buffers between publisher and subscriber can store
                     publisher.put("joint_states", b"+" * 4000, 0, 0)
                 child.send_signal(signal.SIGCONT)
-                until(hears(b"again"))
+                until(has_received(b"again"))
             finally:
                 child.kill()
 
@@ -145,12 +145,16 @@ class TestAccessControl:
     KEYS = ("joint_states", "imu", "events", "command", "anything/else")
 
     def forge(self, publisher: Publisher, count: int) -> tuple[list[bytes], list[bytes]]:
-        """Let a foreign client put on every key; return what the telemetry process and another subscriber received."""
+        """Let a foreign client put and delete on every key.
+
+        Returns:
+            Payloads that the telemetry process received, and payloads that another subscriber received.
+        """
         with (
             publisher._session.declare_subscriber("**", zenoh.handlers.FifoChannel(10_000)) as inside,
             client(publisher) as other,
             other.declare_subscriber("**", zenoh.handlers.FifoChannel(10_000)) as watching,
-            client(publisher) as stranger,
+            client(publisher) as attacker,
         ):
             seen: list[bytes] = []
 
@@ -161,10 +165,10 @@ class TestAccessControl:
 
             until(watched)
             for number in range(count):
-                stranger.put(f"atalante/exo/{self.KEYS[number % len(self.KEYS)]}", b"forged")
-                stranger.delete(f"atalante/exo/{self.KEYS[number % len(self.KEYS)]}")
+                attacker.put(f"atalante/exo/{self.KEYS[number % len(self.KEYS)]}", b"forged")
+                attacker.delete(f"atalante/exo/{self.KEYS[number % len(self.KEYS)]}")
             # The reply to this query follows all earlier puts of the client.
-            list(stranger.get("atalante/exo/none", timeout=1.0))
+            list(attacker.get("atalante/exo/none", timeout=1.0))
             publisher.put("imu", b"end", 0, 0)
 
             def ended() -> bool:
@@ -180,10 +184,10 @@ class TestAccessControl:
         assert set(seen) == {b"ours", b"end"}
 
     def test_foreign_puts_arrive_without_access_control(self, monkeypatch: pytest.MonkeyPatch) -> None:
-        def open_door(robot: str, listen: str) -> dict[str, Any]:
+        def without_access_control(robot: str, listen: str) -> dict[str, Any]:
             return {**configuration(robot, listen), "access_control": {"enabled": False}}
 
-        monkeypatch.setattr(publisher_module, "configuration", open_door)
+        monkeypatch.setattr(publisher_module, "configuration", without_access_control)
         with Publisher("exo", STREAMS, f"tcp/127.0.0.1:{free_port()}") as publisher:
             inside, _ = self.forge(publisher, 200)
             assert inside.count(b"forged") > 0
@@ -202,7 +206,7 @@ def sockets(*kinds: str) -> list[tuple[str, str]]:
     for fd in Path("/proc/self/fd").iterdir():
         try:
             links.append(str(fd.readlink()))
-        except FileNotFoundError:  # the folder's own
+        except FileNotFoundError:  # the descriptor with which the folder itself was read
             continue
     rows = [line.split() for kind in kinds for line in Path(f"/proc/self/net/{kind}").read_text().splitlines()[1:]]
     return [(row[1], row[3]) for row in rows if f"socket:[{row[9]}]" in links]

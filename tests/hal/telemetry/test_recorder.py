@@ -54,7 +54,7 @@ def test_messages_are_read_back_by_a_generic_mcap_decoder(tmp_path: Path) -> Non
         assert event.code == "NODE_TIMEOUT"
 
 
-def test_session_and_runs_are_metadata(tmp_path: Path) -> None:
+def test_session_and_runs_are_recorded_as_metadata(tmp_path: Path) -> None:
     path = tmp_path / "recording.mcap"
     with Recorder(path, STREAMS, {"dbc_hash": 0xABC, "seed": 3}) as recorder:
         recorder.begin_run(0, {"name": "constant", "xi": 0.5})
@@ -77,7 +77,7 @@ def test_file_of_a_killed_recorder_contains_the_flushed_messages(tmp_path: Path)
         payload = message_class("JointStates")(cycle=cycle, position=rng.random(12)).SerializeToString()
         recorder.put("joint_states", payload, cycle, cycle)
     torn = tmp_path / "torn.mcap"
-    torn.write_bytes(path.read_bytes())  # the content of the file at this moment
+    torn.write_bytes(path.read_bytes())  # the file as it would be if the recorder were killed now
     recorder.close()
     cycles = []
     with torn.open("rb") as file:
@@ -116,7 +116,7 @@ def test_file_that_cannot_be_created_gives_an_error_message(tmp_path: Path) -> N
         Recorder(Path("/dev/full"), STREAMS, {})
 
 
-def test_second_close_changes_nothing(tmp_path: Path) -> None:
+def test_second_close_does_not_change_the_file(tmp_path: Path) -> None:
     recorder = Recorder(tmp_path / "recording.mcap", STREAMS, {})
     recorder.close()
     size = recorder.path.stat().st_size

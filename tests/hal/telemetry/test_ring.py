@@ -1,4 +1,4 @@
-"""Ring buffer: written records are read in order, overwritten records are counted, and no end waits for a dead process."""
+"""Ring buffer: records are read in order, overwritten records are counted, and no end waits for a process that has ended."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ class TestOrder:
         assert got == list(range(100))
 
     @pytest.mark.parametrize("size", [1, 7, 8, 20, 4096])
-    def test_any_record_size_comes_back_byte_for_byte(self, size: int) -> None:
+    def test_record_of_any_size_is_read_unchanged(self, size: int) -> None:
         rng = np.random.default_rng(size)
         sent = [rng.integers(0, 256, size, np.uint8) for _ in range(5)]
         with ends(size=size) as (writer, reader):
@@ -74,7 +74,7 @@ class TestOrder:
                 writer.write(record(1, SIZE + 8))
             assert len(reader.read()) == 0
 
-    def test_last_is_the_record_written_last(self) -> None:
+    def test_last_returns_the_newest_record(self) -> None:
         with ends(2) as (writer, _):
             assert writer.last() == b""
             for number in range(5):
@@ -131,7 +131,7 @@ class TestOverwriting:
 
 
 class _Overtaken:
-    """Records of a ring; a writer overwrites them between the copy and the check of the reader."""
+    """Records of a ring that a writer overwrites after the reader has copied them, and before it checks the counter again."""
 
     def __init__(self, array: np.ndarray, between: object) -> None:
         self.array, self._between = array, between
@@ -139,15 +139,15 @@ class _Overtaken:
     def __len__(self) -> int:
         return len(self.array)
 
-    def __getitem__(self, place: slice) -> np.ndarray:
-        found = self.array[place].copy()
+    def __getitem__(self, rows: slice) -> np.ndarray:
+        found = self.array[rows].copy()
         between, self._between = self._between, lambda: None
         between()
         return found
 
 
 def _write_half(writer: RingWriter) -> None:
-    """Write the first bytes of a record that is not yet announced, as a writer that is stopped in the middle."""
+    """Write the first bytes of a record without storing the counter, like a writer that is stopped during `write`."""
     writer._map[writer._offset : writer._offset + 8] = b"\xff" * 8
 
 
@@ -198,22 +198,22 @@ class TestLossless:
 class TestNotes:
     def test_note_contains_the_number_of_the_next_record(self) -> None:
         with ends() as (writer, reader):
-            writer.note({"run": 0})
+            writer.add_note({"run": 0})
             writer.write(record(0))
             writer.write(record(1))
-            writer.note({"run": 1})
+            writer.add_note({"run": 1})
             reader.read()
             assert reader.notes() == [{"run": 0, "from": 0}, {"run": 1, "from": 2}]
             assert reader.notes() == []
-            writer.note({"run": 2})
+            writer.add_note({"run": 2})
             assert reader.notes() == [{"run": 2, "from": 2}]
 
     def test_note_beyond_the_limit_is_rejected(self) -> None:
         with ends() as (writer, reader):
             for _ in range(60):
-                writer.note({"text": "x" * 1000})
+                writer.add_note({"text": "x" * 1000})
             with pytest.raises(RingError, match=str(NOTES_BYTES)):
-                writer.note({"text": "x" * 8000})
+                writer.add_note({"text": "x" * 8000})
             writer.write(record(7))
             assert len(reader.notes()) == 60
             assert numbers(reader.read()) == [7]
@@ -226,7 +226,7 @@ class TestNotes:
 
 
 class TestEnds:
-    def test_reader_sees_the_finish(self) -> None:
+    def test_reader_detects_that_the_writer_finished(self) -> None:
         with ends() as (writer, reader):
             assert not reader.closed
             writer.finish()
@@ -338,7 +338,7 @@ class TestAcrossProcesses:
         with RingWriter(SIZE, 4, lossless=True, patience=3600.0) as writer, reader_process(writer) as child:
             assert writer.reader_alive
             child.send_signal(signal.SIGKILL)
-            _wait_for_the_end(child)  # a zombie: its process id still exists, but its lock does not
+            _wait_for_the_end(child)  # the process is a zombie: its process id still exists, but its lock is released
             assert not writer.reader_alive
             for number in range(100):
                 writer.write(record(number))

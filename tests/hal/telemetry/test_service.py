@@ -1,4 +1,4 @@
-"""Telemetry service: each record and event in the rings reaches the sinks; it runs in the process of the test."""
+"""Telemetry service, run in the process of the test: the records and events in the rings reach the sinks."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ TYPES = {"joint_states": "JointStates", "system": "SystemState", "loop": "LoopSt
 
 @dataclass
 class Sink:
-    """Sink that keeps its messages, and fails at message number `fails_at`."""
+    """Sink that stores its messages, and fails after `fails_at` messages."""
 
     fails_at: int | None = None
     got: list[tuple[str, bytes, int, int]] = field(default_factory=list)
@@ -54,7 +54,7 @@ class Sink:
 
 @dataclass
 class ServiceBench:
-    """The writers of both rings, and the service that reads them."""
+    """The writers of the rings of records and events, and the service that reads both rings."""
 
     layout: Layout
     records: RingWriter
@@ -69,7 +69,7 @@ class ServiceBench:
             self.records.write(record)
 
     def begin_run(self, number: int, name: str, start_ns: int) -> None:
-        self.records.note({"run": number, "name": name, "start_ns": start_ns, "about": {"shape": name}})
+        self.records.add_note({"run": number, "name": name, "start_ns": start_ns, "about": {"shape": name}})
 
     def event(self, run: int, cycle: int, code: str) -> None:
         self.events.write(pack(Event(cycle, code, "it happened"), run))
@@ -203,13 +203,13 @@ class TestLosses:
 
     @pytest.mark.parametrize("fails_at", [0, 3, 7])
     def test_failed_sink_is_removed_and_reported_to_the_others(self, layout: Layout, fails_at: int) -> None:
-        broken, well = Sink(fails_at), Sink()
-        with bench(layout, (broken, 10), (well, 10)) as at:
+        broken, working = Sink(fails_at), Sink()
+        with bench(layout, (broken, 10), (working, 10)) as at:
             at.write(range(1, 301))
             at.service.step()
         assert len(broken.got) == fails_at
-        assert well.cycles("joint_states") == list(range(10, 301, 10))
-        (event,) = well.messages("events")
+        assert working.cycles("joint_states") == list(range(10, 301, 10))
+        (event,) = working.messages("events")
         assert (event.code, event.text, event.severity) == ("RECORD_STOPPED", "the disk is full", 2)
         assert at.service.notices == ["the disk is full"]
 

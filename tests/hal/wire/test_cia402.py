@@ -10,7 +10,7 @@ from atalante_hal.wire.cia402 import Controlword, DriveState, controlword_toward
 
 S, C = DriveState, Controlword
 
-#: Transition numbers of IEC 61800-7-201 for each command; the drive itself makes 0, 1, 13 and 14.
+#: Transitions of IEC 61800-7-201 that a controlword causes, by number. The drive makes transitions 0, 1, 13 and 14 itself.
 STANDARD = {
     2: (S.SWITCH_ON_DISABLED, C.SHUTDOWN, S.READY_TO_SWITCH_ON),
     3: (S.READY_TO_SWITCH_ON, C.SWITCH_ON, S.SWITCHED_ON),
@@ -26,7 +26,7 @@ STANDARD = {
     15: (S.FAULT, C.FAULT_RESET, S.SWITCH_ON_DISABLED),
     16: (S.QUICK_STOP_ACTIVE, C.ENABLE_OPERATION, S.OPERATION_ENABLED),
 }
-#: Quick stop also makes transitions 7 and 10.
+#: Quick stop also causes transitions 7 and 10.
 BY_QUICK_STOP = {S.READY_TO_SWITCH_ON: S.SWITCH_ON_DISABLED, S.SWITCHED_ON: S.SWITCH_ON_DISABLED}
 
 

@@ -8,7 +8,7 @@ import pytest
 
 from atalante_dbc import DBC_FILE, load
 from atalante_hal.robot import JOINTS
-from atalante_hal.wire.codec import INSIDE, OUTSIDE, SAYS_INVALID, Codec, group_of, read_row, scale_row
+from atalante_hal.wire.codec import INSIDE, MARKED_INVALID, OUTSIDE, Codec, group_of, read_row, scale_row
 from atalante_hal.wire.frame import WORDS
 
 NETWORK = load()
@@ -22,7 +22,7 @@ def limits(codec: Codec) -> tuple[np.ndarray, np.ndarray]:
 
 
 def layouts() -> list[list[int]]:
-    """Return the rows of the messages, grouped by equal signals: ten layouts for 68 messages."""
+    """Return the rows of the messages, grouped by layout: 68 messages have ten different layouts."""
     rows: dict[object, list[int]] = {}
     for row, message in enumerate(MESSAGES):
         signals = tuple((s.start, s.length, s.signed, s.factor, s.offset) for s in message.signals)
@@ -30,8 +30,8 @@ def layouts() -> list[list[int]]:
     return list(rows.values())
 
 
-def asked(image: int) -> list[int]:
-    """Return the rows to compare with cantools, which is slow: one message of every layout, in turn."""
+def compared_rows(image: int) -> list[int]:
+    """Return one row of every layout, in turn. Only these rows are compared with cantools, because cantools is slow."""
     return [rows[image % len(rows)] for rows in LAYOUTS]
 
 
@@ -44,17 +44,17 @@ def test_decode_agrees_with_cantools_on_random_images():
     rng = np.random.default_rng(1)
     decoders = [ORACLE.get_message_by_name(m.name) for m in MESSAGES]
     out = np.empty(codec.size)
-    places = [[codec.index(m.name, s.name) for s in m.signals] for m in MESSAGES]
+    positions = [[codec.index(m.name, s.name) for s in m.signals] for m in MESSAGES]
     worst = 0.0
     for image in range(IMAGES):
         frames["data"] = rng.integers(0, 256, (len(MESSAGES), 64), dtype=np.uint8)
         codec.decode(frames, out)
-        for row in asked(image):
+        for row in compared_rows(image):
             message = MESSAGES[row]
             decoded = decoders[row].decode(frames["data"][row, : message.length].tobytes(), decode_choices=False)
-            for place, signal in zip(places[row], message.signals, strict=True):
+            for position, signal in zip(positions[row], message.signals, strict=True):
                 expected = float(decoded[signal.name])
-                worst = max(worst, abs(out.item(place) - expected) / max(abs(expected), 1e-6))
+                worst = max(worst, abs(out.item(position) - expected) / max(abs(expected), 1e-6))
     assert worst <= 1e-9
 
 
@@ -69,7 +69,7 @@ def test_encode_agrees_with_cantools_bit_for_bit_on_random_images():
         values = rng.uniform(low, high)
         codec.encode(values, frames)
         numbers = values.tolist()
-        for row in asked(image):
+        for row in compared_rows(image):
             expected = encoders[row].encode({name: numbers[i] for name, i in names[row]}, strict=False)
             assert frames["data"][row, : MESSAGES[row].length].tobytes() == expected
 
@@ -159,7 +159,7 @@ def test_quantity_of_all_joints_is_one_slice_in_order():
     assert force[12][0].sender == "FOOT_RIGHT"
 
 
-def test_group_names():
+def test_group_of_a_signal_is_its_quantity():
     assert [group_of(n) for n in ("FH_TargetTorque", "QuaternionW", "FL_ForceX", "Velocity")] == [
         "TargetTorque", "Quaternion", "Force", "Velocity",
     ]  # fmt: skip
@@ -187,7 +187,7 @@ def test_invalid_code_and_value_out_of_range_are_distinguished():
         invalid = 0 if signal.invalid_raw is None else signal.invalid_raw << signal.start
         for payload in (invalid, invalid if signal is drive_state else invalid | outside):
             frames["data"][0] = np.frombuffer(payload.to_bytes(64, "little"), np.uint8)
-            expected = SAYS_INVALID if invalid else OUTSIDE if payload else INSIDE
+            expected = MARKED_INVALID if invalid else OUTSIDE if payload else INSIDE
             assert read_one(codec, 0, frames) == expected, signal.name
 
 
@@ -200,14 +200,14 @@ def test_single_row_is_decoded_without_changing_other_rows():
     assert codec.decode(frames, whole)
     codes = codec.table.codes.copy()
     shuffled = rng.permutation(len(MESSAGES))
-    alone = frames[shuffled].copy()
-    for place, row in enumerate(shuffled.tolist()):
+    single = frames[shuffled].copy()
+    for position, row in enumerate(shuffled.tolist()):
         codec.table.codes.fill(-7)
         values = np.full(codec.size, np.nan)
-        assert read_one(codec, row, alone, (place - row) * WORDS) == INSIDE
+        assert read_one(codec, row, single, (position - row) * WORDS) == INSIDE
         scale_row(row, codec.table, values)
-        mine = codec.row_of == row
-        assert np.array_equal(values[mine], whole[mine])
-        assert np.array_equal(codec.table.codes[mine], codes[mine])
-        assert np.isnan(values[~mine]).all()
-        assert (codec.table.codes[~mine] == -7).all()
+        own = codec.row_of == row
+        assert np.array_equal(values[own], whole[own])
+        assert np.array_equal(codec.table.codes[own], codes[own])
+        assert np.isnan(values[~own]).all()
+        assert (codec.table.codes[~own] == -7).all()

@@ -52,7 +52,7 @@ def test_crc_and_counter_bytes_equal_the_reference(message):
 
 @pytest.mark.exhaustive
 @pytest.mark.parametrize("messages", [CYCLIC, SENT], ids=["to the HAL", "from the HAL"])
-def test_a_whole_sealed_cycle_equals_the_reference(messages):
+def test_sealed_cycle_of_all_messages_equals_the_reference(messages):
     image = TransmitImage(messages)
     rng = np.random.default_rng(4)
     low = np.array([s.minimum for _, s in image.codec.signals])
@@ -66,13 +66,13 @@ def test_a_whole_sealed_cycle_equals_the_reference(messages):
             assert oracle.p05.e2e_p05_check(payload, message.data_id)
 
 
-# -- the same for whole cycles of frames, byte by byte -----------------------------------------------------------------
+# -- functions for several frames at once ------------------------------------------------------------------------------
 
 SHORT, LONG = NETWORK.message("LEFT_SK_STATE"), NETWORK.message("FOOT_LEFT_STATE")
 
 
 def rows_of_frames() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Two frames of random bytes: octets, spans, and their counters 7 and 250."""
+    """Return two frames of random bytes, their spans, and the counters 7 and 250."""
     octets = np.random.default_rng(3).integers(0, 256, 2 * FRAME_BYTES).astype(np.uint8)
     return octets, protected_spans([SHORT, LONG]), np.array([7, 250])
 
@@ -112,11 +112,11 @@ def test_every_changed_byte_makes_its_row_damaged():
     assert not intact(octets, spans, counters)
     protect(octets, spans, counters)
     assert intact(octets, spans, counters) is True
-    payloads = {place for begin, end, _ in spans.tolist() for place in range(begin, end)}
-    for place in range(len(octets)):
-        octets[place] ^= 0x10
-        assert intact(octets, spans, counters) is (place not in payloads)
-        octets[place] ^= 0x10
+    payloads = {index for begin, end, _ in spans.tolist() for index in range(begin, end)}
+    for index in range(len(octets)):
+        octets[index] ^= 0x10
+        assert intact(octets, spans, counters) is (index not in payloads)
+        octets[index] ^= 0x10
     for other in ([8, 250], [7, 249]):
         assert intact(octets, spans, np.array(other)) is False
 
@@ -124,20 +124,20 @@ def test_every_changed_byte_makes_its_row_damaged():
 def test_every_counter_step_has_a_check_result():
     for last in (0, 1, 200, 255):
         for delta in range(256):
-            judged = check_counter(last, (last + delta) & 0xFF)
+            result = check_counter(last, (last + delta) & 0xFF)
             expected = (
                 Check.REPEATED if delta == 0
                 else Check.OK if delta == 1
                 else Check.SOME_LOST if delta <= MAX_DELTA
                 else Check.WRONG_SEQUENCE
             )  # fmt: skip
-            assert judged is expected
+            assert result is expected
     assert check_counter(None, 77) is Check.OK
     assert [c for c in Check if c.fresh] == [Check.OK, Check.SOME_LOST]
 
 
 def _received(messages):
-    """A transmit and a receive process image after one exchanged cycle."""
+    """Return a transmit and a receive process image after one cycle, and the frames of this cycle."""
     tx, rx = TransmitImage(messages), ReceiveImage(messages)
     buffer = tx.seal().copy()
     assert list(rx.accept(buffer, len(buffer))) == []
@@ -145,7 +145,7 @@ def _received(messages):
 
 
 def flips(chance: random.Random, kind: int, bits: int) -> int:
-    """Positions of flipped bits in a frame: one, two or any odd number of bits."""
+    """Return a mask of flipped bits: one bit for kind 0, two bits for kind 1, else any odd number of bits."""
     if kind < 2:
         return sum(1 << bit for bit in chance.sample(range(bits), kind + 1))
     pattern = chance.getrandbits(bits)
@@ -154,21 +154,21 @@ def flips(chance: random.Random, kind: int, bits: int) -> int:
 
 @pytest.mark.exhaustive
 def test_one_two_or_odd_numbers_of_flipped_bits_are_rejected():
-    """100,000 damaged frames of all messages that the HAL receives."""
+    """The test checks 100,000 damaged frames of the cyclic messages that the HAL receives."""
     tx, _, _ = _received(CYCLIC)
     good = tx.seal().copy()
     payloads = [
         int.from_bytes(good["data"][row, : message.length].tobytes(), "little") for row, message in enumerate(CYCLIC)
     ]
     chance = random.Random(5)
-    refused = 0
+    rejected = 0
     for i in range(100_000):
         row = i % len(CYCLIC)
         message = CYCLIC[row]
         payload = payloads[row] ^ flips(chance, i % 3, 8 * message.length)
         damaged = payload.to_bytes(message.length, "little")
-        refused += crc(damaged[2:], data_id_bytes(message.data_id)) != int.from_bytes(damaged[:2], "little")
-    assert refused == 100_000
+        rejected += crc(damaged[2:], data_id_bytes(message.data_id)) != int.from_bytes(damaged[:2], "little")
+    assert rejected == 100_000
 
 
 @pytest.mark.exhaustive
@@ -205,9 +205,9 @@ def test_rejected_frames_leave_the_values_unchanged(row):
         elif kind == "classic":
             buffer["flags"][row] = 0
         rx.accept(buffer, len(buffer))
-        mine = rx.codec.row_of == row
+        own = rx.codec.row_of == row
         assert rx.check[row] == expected, kind
-        assert np.array_equal(rx.values[mine], values[mine]), kind
+        assert np.array_equal(rx.values[own], values[own]), kind
         assert rx.age[row] == age + 1
         others = np.delete(np.arange(len(CYCLIC)), row)
         assert (rx.check[others] == Check.OK).all()
@@ -227,29 +227,39 @@ def test_frame_with_the_identifier_of_another_message_is_rejected():
 
 
 def evidence_after(history: str, evidence: int = 0) -> int:
-    """Return the evidence after cycles: r with a frame of a second sender, c without."""
+    """Return the counter that detects two senders, after a sequence of cycles.
+
+    Args:
+        history: one letter per cycle: r if there is a frame of a second sender, c if not.
+        evidence: counter before the first cycle.
+    """
     for cycle in history:
         evidence = suspect(evidence, rival=cycle == "r")
     return evidence
 
 
-def test_four_cycles_with_two_senders_are_full_evidence():
+def test_four_cycles_with_two_senders_confirm_two_senders():
     assert [evidence_after("r" * n) for n in range(6)] == [0, 16, 32, 48, 64, 64]
     assert [evidence_after("c" * n, 64) for n in (1, 63, 64, 65)] == [63, 1, 0, 0]
     assert evidence_after("r" + "c" * 16) == 0
 
 
-def test_second_sender_in_every_other_cycle_is_full_evidence():
+def test_second_sender_in_every_other_cycle_is_confirmed():
     assert evidence_after("rc" * 4) == 60
     assert evidence_after("rc" * 4 + "r") == FULL
     assert evidence_after(("r" + "c" * 16) * 50) == 0
 
 
-# -- how far a sender is trusted ---------------------------------------------------------------------------------------
+# -- trust in a sender -------------------------------------------------------------------------------------------------
 
 
 def after(history: str, start: Qualification | None = None) -> Qualification:
-    """Return the qualification after cycles: g good, b bad, t bad and timed out, T good and timed out."""
+    """Return the qualification after a sequence of cycles.
+
+    Args:
+        history: one letter per cycle: g good, b bad, t bad and timed out, T good and timed out.
+        start: qualification before the first cycle.
+    """
     now = start or Qualification()
     for cycle in history:
         now = qualify(now, good=cycle in "gT", timed_out=cycle in "tT")
@@ -278,13 +288,13 @@ def test_bad_cycle_fills_the_bucket_by_4_good_cycle_empties_by_1():
     assert after("g" * 16, now) is SETTLED
 
 
-def test_bucket_trips_exactly_when_it_is_full():
+def test_trust_ends_exactly_when_the_bucket_is_full():
     assert after("b" * 15, SETTLED) == (60, 0, True)
     assert after("b" * 16, SETTLED) == (64, 0, False)
     assert after("b" * 40, SETTLED) == (64, 0, False)
 
 
-def test_tripped_sender_is_trusted_again_after_16_good_cycles():
+def test_sender_with_a_full_bucket_is_trusted_again_after_16_good_cycles():
     assert after("b" * 16 + "g" * 15, SETTLED) == (49, 15, False)
     assert after("b" * 16 + "g" * 16, SETTLED) == (48, 16, True)
     assert after("b" * 16 + "g" * 16 + "b" * 3, SETTLED).trusted
@@ -298,7 +308,7 @@ def test_timeout_clears_the_trust_and_keeps_the_bucket(cycle: str):
     assert after(cycle + "g" * 16, SETTLED) is SETTLED
 
 
-def test_steady_loss_trips_only_above_20_percent():
+def test_steady_loss_ends_the_trust_only_above_20_percent():
     assert after("bgggg" * 500, SETTLED).trusted
     assert not after("bggg" * 500, SETTLED).trusted
 
@@ -306,17 +316,17 @@ def test_steady_loss_trips_only_above_20_percent():
 @given(st.text("gbtT", max_size=80))
 def test_qualification_keeps_its_invariants_for_any_history(history: str):
     now = Qualification()
-    for place, cycle in enumerate(history):
+    for index, cycle in enumerate(history):
         before, now = now, after(cycle, now)
         assert 0 <= now.bucket <= FULL
         assert 0 <= now.good <= REQUALIFY
         if now.trusted and not before.trusted:
-            assert history[place - REQUALIFY + 1 : place + 1] == "g" * REQUALIFY
+            assert history[index - REQUALIFY + 1 : index + 1] == "g" * REQUALIFY
         if before.trusted and not now.trusted:
             assert cycle in "tT" or now.bucket == FULL
 
 
-def test_cycle_counts_as_in_time_by_default():
+def test_message_has_not_timed_out_by_default():
     before = Qualification(8, 3, True)
     assert qualify(before, good=True) == Qualification(7, 4, True)
     assert qualify(before, good=True, timed_out=True) == Qualification(8, 0, False)

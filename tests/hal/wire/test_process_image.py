@@ -1,4 +1,4 @@
-"""Process image: committed values, ages and check results, equal on the fast and the slow path."""
+"""Process image: committed values, ages and results of the checks, which are equal on the fast and the slow path."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ from hypothesis import strategies as st
 from atalante_dbc import Message, load
 from atalante_hal.wire import process_image
 from atalante_hal.wire.e2e import Check
-from atalante_hal.wire.frame import new_frames
+from atalante_hal.wire.frame import FLAG_BRS, FLAG_ESI, FLAG_FDF, new_frames
 from atalante_hal.wire.process_image import NEVER, ReceiveImage, TransmitImage
 
 NETWORK = load()
-#: Some cyclic messages of every kind; test_e2e tests all of them.
+#: Cyclic messages of several kinds of nodes. `test_e2e` tests all cyclic messages.
 NAMES = ("LEFT_FH", "LEFT_SK", "RIGHT_FH", "FOOT_LEFT", "RIGHT_SK", "IMU_TORSO", "IMU_PELVIS", "PENDANT")
 CYCLIC = [NETWORK.message(f"{name}_STATE") for name in NAMES]
 ROWS = len(CYCLIC)
@@ -131,8 +131,8 @@ def test_invalid_code_keeps_the_last_good_values():
     row = rx.codec.rows["IMU_PELVIS_STATE"]
     assert rx.check[row] == Check.INVALID
     assert rx.age[row] == 1
-    mine = rx.codec.row_of == row
-    assert np.array_equal(rx.values[mine], before[mine])
+    own = rx.codec.row_of == row
+    assert np.array_equal(rx.values[own], before[own])
     assert (np.delete(rx.check, row) == Check.OK).all()
 
 
@@ -177,10 +177,10 @@ CHANGES = ("none", "flip", "drop", "twice", "rival", "rival first", "old", "rang
 
 
 def rival(frame: np.ndarray, message: Message, byte: int = 0) -> np.ndarray:
-    """Return the frame of a second sender: the same counter, one changed bit and the right CRC."""
+    """Return the frame of a second sender: the same counter, one changed bit, and a correct CRC."""
     other = frame.copy()
-    place = 3 + byte % (message.length - 3)
-    other["data"][place] ^= 1
+    index = 3 + byte % (message.length - 3)
+    other["data"][index] ^= 1
     checksum = protection(other["data"][2 : message.length].tobytes(), message.data_id)
     other["data"][:2] = list(checksum.to_bytes(2, "little"))
     return other
@@ -204,7 +204,7 @@ def test_same_counter_with_other_bytes_is_a_conflict(row: int):
         rx.accept(buffer, ROWS + 1)
         assert rx.refused == [(row, Check.CONFLICT)]
         assert (rx.check[row], rx.age[row]) == (Check.OK, 0)
-        # The second frame arrives alone: the counter is constant.
+        # The second frame arrives alone, with the counter of the last accepted frame.
         deliver_frames(rx, buffer, [rival(following[row], CYCLIC[row], byte)])
         assert rx.check[row] == Check.CONFLICT
         assert rx.age[row] == 1
@@ -213,8 +213,8 @@ def test_same_counter_with_other_bytes_is_a_conflict(row: int):
 
 
 def deliver_frames(rx: ReceiveImage, buffer: np.ndarray, frames: list[np.ndarray]) -> None:
-    for place, frame in enumerate(frames):
-        buffer[place] = frame
+    for index, frame in enumerate(frames):
+        buffer[index] = frame
     rx.accept(buffer, len(frames))
 
 
@@ -250,23 +250,23 @@ def test_restarted_sender_with_the_last_counter_is_accepted_and_listed():
     assert rx.refused == [(0, Check.REPEATED)]
 
 
-def test_accepted_frame_after_a_loss_is_not_listed_beside():
+def test_committed_frame_after_a_loss_is_not_a_further_frame():
     tx, rx, buffer = pair()
     deliver(tx, rx, buffer)
     tx.seal()  # lost
     true = tx.seal()[0].copy()
     deliver_frames(rx, buffer, [true, rival(true, CYCLIC[0])])
     assert rx.check[0] == Check.SOME_LOST
-    assert len(rx.beside(0)) == 1
+    assert len(rx.decode_further_frames(0)) == 1
 
 
-def test_other_frames_of_a_row_are_decoded_in_order_of_arrival():
+def test_further_frames_of_a_row_are_decoded_in_order_of_arrival():
     tx, rx, buffer = pair()
-    row, mine = rx.codec.rows["PENDANT_STATE"], slice(None)
+    row, own = rx.codec.rows["PENDANT_STATE"], slice(None)
     dead_man = rx.codec.index("PENDANT_STATE", "DeadMan")
     deliver(tx, rx, buffer)
     deliver(tx, rx, buffer)
-    assert rx.beside(row) == []
+    assert rx.decode_further_frames(row) == []
     tx.values[dead_man] = 1.0
     released, true = tx.seal()[row].copy(), tx.frames[row].copy()
     released["data"][3] ^= 1
@@ -274,15 +274,15 @@ def test_other_frames_of_a_row_are_decoded_in_order_of_arrival():
     damaged = true.copy()
     damaged["data"][5] ^= 1
     deliver_frames(rx, buffer, [damaged, true, true, released])
-    assert [values[dead_man] for values in rx.beside(row)] == [0.0]
+    assert [values[dead_man] for values in rx.decode_further_frames(row)] == [0.0]
     assert rx.values[dead_man] == 1.0
-    assert rx.beside(0) == []
+    assert rx.decode_further_frames(0) == []
     late, now = tx.seal()[row].copy(), tx.seal()[row].copy()
     deliver_frames(rx, buffer, [released, late, now])
-    assert [values[dead_man] for values in rx.beside(row)] == [0.0, 1.0]
-    assert rx.values[mine][dead_man] == 1.0
+    assert [values[dead_man] for values in rx.decode_further_frames(row)] == [0.0, 1.0]
+    assert rx.values[own][dead_man] == 1.0
     deliver(tx, rx, buffer)
-    assert rx.beside(row) == []
+    assert rx.decode_further_frames(row) == []
 
 
 @given(
@@ -292,7 +292,7 @@ def test_other_frames_of_a_row_are_decoded_in_order_of_arrival():
     st.randoms(use_true_random=False),
 )
 def test_fast_and_slow_path_agree_for_any_history(history, shuffler):
-    """One process image may use its fast path, the other checks frame by frame; all results must be equal."""
+    """One process image may use its fast path, the other checks frame by frame. All results must be equal."""
     tx, fast, buffer = pair()
     slow = ReceiveImage(CYCLIC)
     old = tx.seal().copy()
@@ -315,8 +315,8 @@ def test_fast_and_slow_path_agree_for_any_history(history, shuffler):
             frames[row]["len"] = byte
         elif change == "swap":
             shuffler.shuffle(frames)
-        for place, frame in enumerate(frames):
-            buffer[place] = frame
+        for index, frame in enumerate(frames):
+            buffer[index] = frame
         foreign_fast = list(fast.accept(buffer, len(frames)))
         slow.new_cycle()
         foreign_slow = slow.accept_each(buffer, len(frames))
@@ -329,7 +329,7 @@ def test_fast_and_slow_path_agree_for_any_history(history, shuffler):
         assert slow.refused == fast.refused
         assert fast.frames.tobytes() == slow.frames.tobytes()
         for each in range(ROWS):
-            assert np.array_equal(fast.beside(each), slow.beside(each), equal_nan=True)
+            assert np.array_equal(fast.decode_further_frames(each), slow.decode_further_frames(each), equal_nan=True)
 
 
 @pytest.mark.parametrize("byte", [0, 1, 2, 11])
@@ -359,7 +359,15 @@ def test_single_row_has_its_own_counter():
 
 
 def answer(tx: TransmitImage, rx: ReceiveImage, buffer: np.ndarray, cycle: int, delays: dict[int, int]) -> None:
-    """Let all rows answer SYNC `cycle`; `delays` gives rows that answer an earlier SYNC, or none (-1)."""
+    """Receive the answers of all rows to the SYNC of a cycle.
+
+    Args:
+        tx: process image of the nodes.
+        rx: process image of the HAL.
+        buffer: receive buffer.
+        cycle: number of the cycle.
+        delays: row -> delay of its answer [cycles]; -1 if the row does not answer. All other rows answer without delay.
+    """
     count = 0
     for row in range(ROWS):
         delay = delays.get(row, 0)
@@ -427,7 +435,7 @@ class TestCycleTag:
             answer(tx, rx, buffer, cycle, {})
             assert rx.check[7] == check
         assert rx.all_fresh
-        # The same for all rows at once, with the fast path before and after.
+        # The same happens to all rows at once. Before and after it, the fast path is used.
         for cycle in range(back + 2, back + 2 + cycles):
             answer(tx, rx, buffer, cycle, dict.fromkeys(range(ROWS), -1))
         back += 2 + cycles
@@ -476,20 +484,20 @@ def test_any_counter_is_accepted_if_senders_may_restart():
 
 def test_rejected_row_keeps_its_values_and_ages():
     tx, rx, buffer = pair()
-    mine = rx.codec.row_of == 3
-    tx.values[mine[: tx.codec.size]] = 1.0
+    own = rx.codec.row_of == 3
+    tx.values[own[: tx.codec.size]] = 1.0
     deliver(tx, rx, buffer)
     deliver(tx, rx, buffer)
     assert rx.all_fresh
     kept = rx.values.copy()
     for age in range(1, 4):
-        tx.values[mine] = 2.0
+        tx.values[own] = 2.0
         deliver(tx, rx, buffer)
-        assert not np.array_equal(rx.values[mine], kept[mine])
+        assert not np.array_equal(rx.values[own], kept[own])
         rx.refuse(3)
         assert not rx.all_fresh
         assert (rx.check[3], rx.age[3]) == (Check.IMPLAUSIBLE, age)
-        assert np.array_equal(rx.values[mine], kept[mine])
+        assert np.array_equal(rx.values[own], kept[own])
         assert (np.delete(rx.check, 3) == Check.OK).all()
     deliver(tx, rx, buffer, [r for r in range(ROWS) if r != 3])
     assert (rx.check[3], rx.age[3]) == (Check.NO_DATA, 4)
@@ -516,7 +524,7 @@ def test_rejected_frames_are_listed_with_their_reason():
     pelvis = rx.codec.rows["IMU_PELVIS_STATE"]
     expected = [(0, Check.LENGTH), (1, Check.CRC), (2, Check.LENGTH), (pelvis, Check.INVALID), (4, Check.REPEATED)]
     assert rx.refused == expected
-    assert rx.check[4] == Check.OK  # it came once as it should
+    assert rx.check[4] == Check.OK  # its first frame was accepted
     assert rx.crc_errors == 1
     tx.values[tx.codec.index("IMU_PELVIS_STATE", "GyroX")] = 0.0
     deliver(tx, rx, buffer)
@@ -570,16 +578,17 @@ def test_cycle_is_complete_if_all_messages_are_first_and_in_order():
 
 def test_identifiers_are_expected_until_their_timeout():
     tx, rx, buffer = pair()
-    assert rx.expected_ids() == set()
+    assert rx.expected_ages() == {}
     deliver(tx, rx, buffer)
-    everybody = {m.frame_id for m in CYCLIC}
-    assert rx.expected_ids() == everybody
-    timeout = CYCLIC[3].timeout_ms
-    for _ in range(timeout):
+    everybody = {m.frame_id: 0 for m in CYCLIC}
+    assert rx.expected_ages() == everybody
+    silent = CYCLIC[3]
+    for age in range(1, silent.timeout_ms + 1):
         deliver(tx, rx, buffer, [r for r in range(ROWS) if r != 3])
-    assert rx.expected_ids() == everybody
+        assert rx.expected_ages() == everybody | {silent.frame_id: age}
     deliver(tx, rx, buffer, [r for r in range(ROWS) if r != 3])
-    assert rx.expected_ids() == everybody - {CYCLIC[3].frame_id}
+    del everybody[silent.frame_id]
+    assert rx.expected_ages() == everybody
 
 
 def test_resume_continues_after_the_given_counter():
@@ -620,9 +629,9 @@ def test_refuse_affects_only_its_row():
     new = rx.values.copy()
     rx.refuse(3)
     assert (rx.age[3], rx.all_fresh) == (1, False)
-    mine = rx.codec.row_of == 3
-    assert np.array_equal(rx.values[~mine], new[~mine])
-    assert not np.array_equal(rx.values[mine], new[mine])
+    own = rx.codec.row_of == 3
+    assert np.array_equal(rx.values[~own], new[~own])
+    assert not np.array_equal(rx.values[own], new[own])
 
 
 def test_complete_cycle_in_any_order_is_fresh():
@@ -733,3 +742,57 @@ def test_nan_without_an_invalid_code_cannot_be_sealed():
     ):
         tx.seal()
     assert tx.frames.tobytes() == before.tobytes()
+
+
+class TestErrorPassiveSender:
+    """A sender that is error passive sets the flag ESI in its frames."""
+
+    def test_error_passive_sender_is_listed_and_its_frame_used(self):
+        tx, rx, buffer = pair()
+        assert rx.error_passive == []
+        deliver(tx, rx, buffer)
+        assert rx.error_passive == []
+        tx.values[tx.codec.index("LEFT_SK_STATE", "Temperature")] = 41.0
+        buffer[:ROWS] = tx.seal()
+        buffer["flags"][1] |= FLAG_ESI
+        buffer["flags"][4] |= FLAG_ESI
+        assert list(rx.accept(buffer, ROWS)) == []
+        assert rx.error_passive == [1, 4]
+        assert rx.refused == []
+        assert rx.values[rx.codec.index("LEFT_SK_STATE", "Temperature")] == 41.0
+        assert (rx.check == Check.OK).all()
+        assert not rx.all_fresh
+        deliver(tx, rx, buffer)
+        assert rx.error_passive == []
+        assert rx.all_fresh
+
+    def test_error_passive_sender_is_not_listed_after_a_cycle_without_frames(self):
+        tx, rx, buffer = pair()
+        buffer[:ROWS] = tx.seal()
+        buffer["flags"][1] |= FLAG_ESI
+        rx.accept(buffer, ROWS)
+        rx.new_cycle()
+        assert rx.error_passive == []
+
+    def test_error_passive_sender_of_an_unknown_frame_is_not_listed(self):
+        _, rx, buffer = pair()
+        buffer["can_id"][0], buffer["flags"][0] = 0x7FF, FLAG_FDF | FLAG_BRS | FLAG_ESI
+        assert list(rx.accept(buffer, 1)) == [0]
+        assert rx.error_passive == []
+
+    def test_error_passive_flag_outside_the_received_frames_is_ignored(self):
+        tx, rx, buffer = pair()
+        buffer[:ROWS] = tx.seal()
+        buffer["flags"][1] |= FLAG_ESI
+        rx.accept(buffer, 1)
+        assert rx.error_passive == []
+        assert buffer["flags"][1] & FLAG_ESI
+
+    @pytest.mark.parametrize("flags", [0, FLAG_FDF, FLAG_FDF | FLAG_ESI, FLAG_ESI, FLAG_BRS | FLAG_ESI])
+    def test_frame_with_another_wrong_flag_is_rejected(self, flags: int):
+        tx, rx, buffer = pair()
+        buffer[:ROWS] = tx.seal()
+        buffer["flags"][1] = flags
+        rx.accept(buffer, ROWS)
+        assert rx.check[1] == Check.LENGTH
+        assert rx.error_passive == ([1] if flags == FLAG_FDF | FLAG_ESI else [])

@@ -25,8 +25,8 @@ TARGETS = {
     "filter_tick": 1 / 20,
     "emulator_tick": 2.3,
     "lockstep": 1 / 6,
-    "judge_log": 1 / 20,
-    "judge_against_mdf": 1.0,
+    "validate_log": 1 / 20,
+    "validate_against_mdf": 1.0,
     "network_evaluation": 1.0,
     "gait_solve_cold": 1.0,
     "gait_solve_warm": 1.0,
@@ -106,7 +106,7 @@ def idle(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.mark.usefixtures("idle")
-def test_benchmark_without_work_exits_with_1() -> None:
+def test_invalid_benchmark_exits_with_1() -> None:
     result = CliRunner().invoke(cli, ["bench", "hal_cycle"])
     assert result.exit_code == 1
     assert "the benchmark hal_cycle is invalid: nothing was done" in result.stderr
@@ -132,7 +132,7 @@ def test_timed_block_runs_the_given_number_of_times() -> None:
     assert len(ran) == 7
 
 
-def test_require_raises_its_message() -> None:
+def test_failed_requirement_raises_its_message() -> None:
     require(True, "fine")
     with pytest.raises(BenchmarkError, match="the robot fell"):
         require(False, "the robot fell")

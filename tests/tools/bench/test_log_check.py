@@ -1,4 +1,4 @@
-"""Benchmarks of the validator: the work is complete; no time is checked."""
+"""Tests of the validator benchmarks: each benchmark checks the whole log. No time is asserted."""
 
 from __future__ import annotations
 
@@ -10,8 +10,8 @@ from atalante_tools.bench import log_check
 from atalante_tools.bench.measure import BenchmarkError, Effort, Measurement
 
 
-@pytest.mark.parametrize("run", [log_check.judge_log, log_check.judge_against_mdf])
-def test_both_sides_are_measured(run: Callable[[Effort], Measurement]) -> None:
+@pytest.mark.parametrize("run", [log_check.validate_log, log_check.validate_against_mdf])
+def test_benchmark_measures_value_and_baseline(run: Callable[[Effort], Measurement]) -> None:
     measured = run(Effort(quick=True))
     assert measured.remarks == ()
     assert measured.value is not None
@@ -21,14 +21,14 @@ def test_both_sides_are_measured(run: Callable[[Effort], Measurement]) -> None:
 
 
 def test_benchmark_rejects_a_log_with_findings(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Repetitions without continuous alive counters give findings, so the time would not be that of a valid log."""
+    """If the alive counters are not continuous, the log has findings, so the time would not be that of a valid log."""
     monkeypatch.setattr(log_check, "COUNTER_BYTE", 4)
     with pytest.raises(BenchmarkError, match="must have no findings"):
-        log_check.judge_log(Effort(quick=True))
+        log_check.validate_log(Effort(quick=True))
 
 
 def test_full_recording_repeats_without_findings(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A joint that sags during the recording would jump at the repetition."""
+    """If a joint sagged during the recording, its position would jump at each repetition of the recording."""
     monkeypatch.setattr(log_check, "_REPEATED", 2)
     with log_check._log(Effort()) as (path, frames):
         assert len(frames) > 2 * log_check._CYCLES

@@ -1,4 +1,4 @@
-"""Bulk codec against cantools on every kind of layout, and CRCs of columns against CRCs of single frames."""
+"""Column codec compared with cantools for every kind of layout, and CRCs of many frames compared with CRCs of single frames."""
 
 from __future__ import annotations
 
@@ -270,7 +270,7 @@ def test_index_finds_a_signal_or_lists_the_valid_names() -> None:
 
 @pytest.mark.parametrize("length", [2, 3, 4, 5, 6, 7, 8, 12, 16, 20, 24, 32, 48, 64])
 def test_crc_differences_are_equal_to_single_crcs(length: int) -> None:
-    """The affine map gives the CRC of `e2e.crc` for each frame."""
+    """`crc_differences` and `crc_of_zeros` together give the CRC of `e2e.crc` for each frame."""
     generator = np.random.default_rng(length)
     frames = new_frames(300)
     frames["len"] = length

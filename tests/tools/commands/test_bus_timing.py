@@ -20,23 +20,11 @@ from atalante_tools.console.options import Target
 from atalante_tools.console.stop_request import StopRequest
 from atalante_tools.session import rig as rig_module
 from atalante_tools.session.rig import open_hal
+from tests.tools.commands.recorder import Tap
 
 EMBEDDED = Target("embedded", "", lockstep=True)
 #: Synthetic time of the first SYNC [ns].
 START = 1_700_000_000_000_000_000
-
-
-class Tap:
-    """Recorder of all frames of the embedded bus, in their order."""
-
-    def __init__(self) -> None:
-        self.batches: list[Frames] = []
-
-    def sent(self, frames: Frames) -> None:
-        self.batches.append(frames.copy())
-
-    def received(self, frames: Frames, count: int) -> None:
-        self.batches.append(frames[:count].copy())
 
 
 @pytest.fixture(scope="module")
@@ -51,9 +39,10 @@ def traffic() -> Frames:
 
 
 def stamped(network: Network, frames: Frames, state_us: float = 100.0, command_us: float = 600.0) -> Stamps:
-    """Return a timestamp [ns] for each frame: cycles 1 ms apart, states and commands at these times after their SYNC.
+    """Return a timestamp [ns] for each frame. A cycle takes 1 ms.
 
-    The six states of a cycle and bus are 10 us apart.
+    The first state of a bus is `state_us` after its SYNC, and each further state of this bus is 10 us later. Commands are
+    `command_us` after their SYNC.
     """
     first = network.message("SYNC_LEFT_LEG").frame_id
     messages = {m.frame_id: m for m in network.messages}
@@ -85,7 +74,7 @@ def latency(timing: BusTiming, bus: str, kind: str) -> Latency:
     return next(x for x in timing.report() if (x.bus, x.kind) == (bus, kind))
 
 
-def test_latencies_of_lockstep_traffic_are_the_synthetic_ones(network: Network, traffic: Frames) -> None:
+def test_latencies_of_lockstep_traffic_equal_the_synthetic_delays(network: Network, traffic: Frames) -> None:
     timing = timed(network, traffic, stamped(network, traffic))
     assert {(x.bus, x.kind) for x in timing.report()} >= {
         (bus, "state") for bus in ("left_leg", "right_leg", "left_sense", "right_sense")
@@ -125,7 +114,7 @@ def test_percentile_and_maximum_show_single_late_frames(network: Network) -> Non
     assert not timed(network, frames, stamps).report()[0].fits
 
 
-def test_a_bus_is_compared_with_its_own_sync_only(network: Network) -> None:
+def test_latency_of_a_bus_is_measured_from_its_own_sync(network: Network) -> None:
     frames = frames_of(network, "SYNC_LEFT_LEG", "SYNC_RIGHT_LEG", "LEFT_SK_STATE", "RIGHT_SK_STATE")
     other_clock = 5_000_000_000
     stamps = np.array([0, other_clock, 90_000, other_clock + 110_000])
@@ -139,7 +128,7 @@ def test_frames_without_an_earlier_sync_are_skipped_and_counted(network: Network
     assert (timing.report(), timing.skipped) == ([], 3)
 
 
-def test_status_messages_and_the_pendant_are_no_answers(network: Network) -> None:
+def test_status_and_pendant_frames_are_not_timed(network: Network) -> None:
     frames = frames_of(network, "SYNC_RIGHT_SENSE", "PENDANT_STATE", "SYNC_LEFT_LEG", "LEFT_SK_STATUS")
     assert timed(network, frames, np.arange(4)).report() == []
 
@@ -211,7 +200,10 @@ def test_late_states_are_named_and_end_with_code_1(
     some = traffic[:1000]
     result = invoke(monkeypatch, network, some, stamped(network, some, state_us=480.0))
     assert result.exit_code == 1
-    assert "99 % of the frames must be within the budget, but these are later: state on left_leg" in result.stderr
+    assert (
+        "99 % of the frames must arrive within the time budget, got too many late frames: state on left_leg"
+        in result.stderr
+    )
 
 
 def test_a_bus_without_sync_fails_with_code_1(monkeypatch: pytest.MonkeyPatch, network: Network) -> None:
@@ -220,7 +212,7 @@ def test_a_bus_without_sync_fails_with_code_1(monkeypatch: pytest.MonkeyPatch, n
     assert "no answer to a SYNC on pcan test" in result.stderr
 
 
-def test_the_embedded_robot_has_no_bus_to_measure() -> None:
+def test_bus_timing_of_the_embedded_robot_is_a_usage_error() -> None:
     result = CliRunner().invoke(cli, ["doctor", "--bus"])
     assert result.exit_code == 2
     assert "--bus requires an interface and a channel" in result.stderr
@@ -237,5 +229,5 @@ def test_a_stop_request_ends_the_measurement(network: Network) -> None:
     ("interface", "clock"),
     [("socketcan", "kernel"), ("kvaser", "hardware"), ("slcan", "software"), ("candle", "unknown")],
 )
-def test_clock_of_the_timestamps(interface: str, clock: str) -> None:
+def test_timestamp_clock_depends_on_the_interface(interface: str, clock: str) -> None:
     assert doctor.stamp_clock(interface) == clock

@@ -26,7 +26,7 @@ class AnyMachine:
 
     refusal: str | None = None
     has_vcan: bool = True
-    there: list[Interface] = field(default_factory=lambda: [GOOD])
+    present: list[Interface] = field(default_factory=lambda: [GOOD])
     priority: int = 99
     memory: int | None = None
     lacks: tuple[str, ...] = ()
@@ -39,7 +39,7 @@ class AnyMachine:
         return self.has_vcan
 
     def interfaces(self) -> list[Interface]:
-        return self.there
+        return self.present
 
     def open_channel(self, interface: str, channel: str) -> str | None:
         return self.opening
@@ -71,7 +71,7 @@ def test_all_checks_pass_on_a_complete_machine(interface: str, channels: tuple[s
 
 
 def test_a_kernel_without_can_fails_only_for_socketcan() -> None:
-    bare = AnyMachine(refusal="Address family not supported by protocol", there=[])
+    bare = AnyMachine(refusal="Address family not supported by protocol", present=[])
     assert needed(bare, "embedded") == []
     assert needed(bare, "pcan", "x") == []
     assert needed(bare, "socketcan", "vcan0") == ["AF_CAN", "vcan", "vcan0"]
@@ -91,14 +91,14 @@ def test_a_kernel_without_can_fails_only_for_socketcan() -> None:
     ],
 )
 def test_an_unusable_interface_fails_with_the_command_that_repairs_it(interface: Interface, fix: str) -> None:
-    found = missing(AnyMachine(there=[interface]), "socketcan", interface.name)
+    found = missing(AnyMachine(present=[interface]), "socketcan", interface.name)
     assert list(found) == [interface.name]
     assert found[interface.name].needed
     assert found[interface.name].fix == fix
 
 
 def test_a_short_transmit_queue_is_reported_but_not_required() -> None:
-    found = missing(AnyMachine(there=[Interface("can0", False, True, 72, 10)]), "socketcan", "can0")
+    found = missing(AnyMachine(present=[Interface("can0", False, True, 72, 10)]), "socketcan", "can0")
     assert not found["can0"].needed
     assert found["can0"].fix == "ip link set can0 txqueuelen 1000"
 
@@ -110,14 +110,15 @@ def test_a_missing_channel_fails_with_the_command_that_creates_it() -> None:
 
 
 def test_without_a_channel_all_interfaces_are_listed_and_none_is_required() -> None:
-    machine = AnyMachine(there=[GOOD, Interface("can7", False, False, 72, 1000)])
+    machine = AnyMachine(present=[GOOD, Interface("can7", False, False, 72, 1000)])
     assert needed(machine, "socketcan") == []
     assert list(missing(machine, "socketcan")) == ["can7"]
 
 
 def test_pybullet_is_required_for_embedded_and_pinocchio_always() -> None:
-    machine = AnyMachine(lacks=("pybullet", "pinocchio", "zenoh", "mcap", "matplotlib", "gcc", "candump"))
+    machine = AnyMachine(lacks=("pybullet", "mujoco", "pinocchio", "zenoh", "mcap", "matplotlib", "gcc", "candump"))
     assert needed(machine, "embedded") == ["pinocchio", "pybullet"]
+    assert needed(AnyMachine(lacks=("pybullet",)), "embedded") == []
     assert needed(machine, "socketcan", "vcan0") == ["pinocchio"]
     assert set(missing(machine, "embedded")) == set(machine.lacks)
     assert missing(machine, "embedded")["zenoh"].fix == "pip install 'atalante-hal[telemetry]'"
@@ -149,7 +150,12 @@ def test_missing_realtime_limits_are_reported_but_not_required() -> None:
 
 def test_every_failed_check_has_a_command_that_repairs_it() -> None:
     worst = AnyMachine(
-        "no such family", False, [], 0, 0, ("pybullet", "pinocchio", "zenoh", "mcap", "matplotlib", "gcc", "candump")
+        "no such family",
+        False,
+        [],
+        0,
+        0,
+        ("pybullet", "mujoco", "pinocchio", "zenoh", "mcap", "matplotlib", "gcc", "candump"),
     )
     for interface in ("embedded", "socketcan", "pigeon"):
         for check in missing(worst, interface).values():
@@ -206,7 +212,7 @@ def test_this_machine_returns_a_value_for_every_query() -> None:
 
 @pytest.fixture
 def bare(monkeypatch: pytest.MonkeyPatch) -> AnyMachine:
-    machine = AnyMachine(refusal="Address family not supported by protocol", there=[])
+    machine = AnyMachine(refusal="Address family not supported by protocol", present=[])
     monkeypatch.setattr(machine_module, "ThisMachine", lambda: machine)
     return machine
 
@@ -239,7 +245,7 @@ def test_json_prints_one_check_per_line(bare: AnyMachine) -> None:
     assert all(bool(c["fix"]) is not c["ok"] for c in checks)
 
 
-def test_the_embedded_robot_has_no_channel() -> None:
+def test_channel_of_the_embedded_robot_is_a_usage_error() -> None:
     result = CliRunner().invoke(cli, ["doctor", "-c", "vcan0"])
     assert result.exit_code == 2
     assert "the embedded robot has no channel; to check vcan0, type -i socketcan -c vcan0" in result.stderr
@@ -254,7 +260,7 @@ def opens(arguments: list[str]) -> bool:
 
 @pytest.mark.parametrize("interface", [*ADAPTERS, "pigeon"])
 def test_doctor_and_the_commands_agree_on_every_interface(interface: str) -> None:
-    """On this machine, without adapters; slcan and remote that open: see below."""
+    """This machine has no adapters; the next test checks a channel that opens."""
     arguments = ["-i", interface, "-c", "0"]
     result = CliRunner().invoke(cli, ["doctor", *arguments, "--json"])
     *checks, last = map(json.loads, result.stdout.splitlines())
@@ -265,7 +271,7 @@ def test_doctor_and_the_commands_agree_on_every_interface(interface: str) -> Non
 
 
 @pytest.mark.parametrize("reason", ["", "the driver is missing"])
-def test_doctor_and_the_commands_agree_on_a_channel(reason: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_doctor_and_the_commands_agree_whether_a_channel_opens(reason: str, monkeypatch: pytest.MonkeyPatch) -> None:
     def bus(**options: object) -> object:
         if reason:
             raise can.CanInitializationError(reason)
@@ -279,7 +285,7 @@ def test_doctor_and_the_commands_agree_on_a_channel(reason: str, monkeypatch: py
 
 
 @pytest.mark.parametrize("interface", ADAPTERS)
-def test_the_facts_of_an_interface_are_printed(interface: str) -> None:
+def test_properties_of_an_interface_are_printed(interface: str) -> None:
     adapter, result = ADAPTERS[interface], CliRunner().invoke(cli, ["doctor", "-i", interface])
     assert f"interface {interface}\n  CAN FD:     {'yes' if adapter.can_fd else 'no'}" in result.stdout
     for text in (adapter.channel, adapter.install, adapter.note, adapter.tried, adapter.source):

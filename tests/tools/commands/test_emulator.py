@@ -90,9 +90,9 @@ def test_the_legs_are_adjusted_to_the_given_patient(
     network: Network, robot: Robot, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     bodies: list[str] = []
-    open_described = body_module.open_described
+    opened = body_module.open_mechanics
     monkeypatch.setattr(
-        body_module, "open_described", lambda text, pose: (bodies.append(text), open_described(text))[1]
+        body_module, "open_mechanics", lambda mechanics: (bodies.append(mechanics.urdf), opened(mechanics))[1]
     )
     for arguments in ((), ("--mass", "75", "--height", "175")):
         result = OtherProcess(network, robot, 5, monkeypatch).run(*arguments)
@@ -118,14 +118,17 @@ def test_the_status_line_counts_cycles_frames_and_drives(
     monkeypatch.setattr(emulator_module, "STATUS_PERIOD", 1e-9)
     result = OtherProcess(network, robot, 20, monkeypatch).run()
     lines = [line for line in result.stderr.splitlines() if "cycles" in line]
-    assert lines[0] == "0 cycles, 0 frames in, 0 out; drives: 12 SWITCH_ON_DISABLED"
+    assert lines[0] == (
+        "0 cycles, 0 frames in, 0 out; drives: 12 SWITCH_ON_DISABLED; no SYNC received: waiting for a HAL"
+    )
+    assert "no SYNC" not in lines[-1]
     # Every cycle the emulator receives 7 frames and sends 19, plus slower messages.
-    cycles, came, went = (int(word) for word in lines[-1].split() if word.isdigit() and word != "12")
-    assert came == 7 * cycles
-    assert 19 * cycles < went < 21 * cycles
+    cycles, frames_in, frames_out = (int(word) for word in lines[-1].split() if word.isdigit() and word != "12")
+    assert frames_in == 7 * cycles
+    assert 19 * cycles < frames_out < 21 * cycles
 
 
-def test_it_does_not_start_while_another_robot_answers(
+def test_emulator_does_not_start_while_another_robot_answers(
     network: Network, robot: Robot, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     other = OtherProcess(network, robot, 400, monkeypatch)
@@ -138,7 +141,7 @@ def test_it_does_not_start_while_another_robot_answers(
     assert other.hal_bus.receive(new_frames(1)) == 0
 
 
-def test_a_robot_that_comes_later_is_reported_once(
+def test_another_robot_that_starts_later_is_reported_once(
     network: Network, robot: Robot, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(emulator_module, "STATUS_PERIOD", 1e-9)
@@ -153,12 +156,12 @@ def test_a_robot_that_comes_later_is_reported_once(
     other.bus.step = with_another_robot
     result = other.run()
     assert result.exit_code == 130, result.stderr
-    said = result.stderr.splitlines()
+    printed = result.stderr.splitlines()
     notice = "another robot answers, too (received IMU_TORSO_STATE): stop one of them; the HAL refuses START"
-    assert said.count(notice) == 1
-    after = [line for line in said[said.index(notice) :] if "cycles" in line]
+    assert printed.count(notice) == 1
+    after = [line for line in printed[printed.index(notice) :] if "cycles" in line]
     assert after[-1].endswith("drives: 12 SWITCH_ON_DISABLED; another robot answers, too")
-    assert not any("another robot" in line for line in said[: said.index(notice)])
+    assert not any("another robot" in line for line in printed[: printed.index(notice)])
 
 
 @pytest.mark.parametrize(
@@ -171,7 +174,7 @@ def test_a_robot_that_comes_later_is_reported_once(
         ([], "socketcan requires a channel: -c vcan0"),
     ],
 )
-def test_an_invalid_command_line_is_one_sentence_and_code_2(arguments: list[str], sentence: str) -> None:
+def test_invalid_command_line_prints_one_sentence_and_exits_with_2(arguments: list[str], sentence: str) -> None:
     result = CliRunner().invoke(cli, ["emulator", *arguments])
     assert result.exit_code == 2
     assert sentence in result.stderr

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from atalante_dbc import Network
-from atalante_emulator.body import PyBulletBody
+from atalante_emulator.bodies.pybullet_body import PyBulletBody
 from atalante_emulator.emulator import Emulator
 from atalante_emulator.pendant import Operator
 from atalante_hal.bus import BusDown, resilient
@@ -50,7 +50,7 @@ class Sender:
         return self._image.seal(counter & 0xFF).copy()
 
 
-def test_the_line_counts_frames_and_drops_its_pendant_after_another_sends(network: Network) -> None:
+def test_line_counts_frames_and_drops_its_pendant_once_another_sends(network: Network) -> None:
     near, far = lockstep_pair()
     line = Line(near, network)
     sync, state = Sender(network, "SYNC_RIGHT_SENSE"), Sender(network, "PENDANT_STATE")
@@ -69,7 +69,7 @@ def test_the_line_counts_frames_and_drops_its_pendant_after_another_sends(networ
     assert (line.sent, line.received) == (10, 20)
 
 
-def test_a_frame_without_a_fresh_counter_and_a_valid_crc_is_no_other_pendant(network: Network) -> None:
+def test_stale_or_unprotected_frame_is_not_another_pendant(network: Network) -> None:
     near, far = lockstep_pair()
     line = Line(near, network)
     sync, state = Sender(network, "SYNC_RIGHT_SENSE"), Sender(network, "PENDANT_STATE")
@@ -133,13 +133,13 @@ def test_listening_returns_the_message_of_another_robot(network: Network, messag
 
 
 class Interface(WrappedBus):
-    """SocketCAN interface that goes down and up again: receiving fails once, sending as long as it is down."""
+    """SocketCAN interface that goes down and up again: `receive` fails once, and `send` fails while it is down."""
 
     _up = True
-    _told = True
+    _reported = True
 
     def set(self, *, up: bool) -> None:
-        self._up = self._told = up
+        self._up = self._reported = up
 
     def send(self, frames: Frames) -> None:
         if not self._up:
@@ -147,8 +147,8 @@ class Interface(WrappedBus):
         super().send(frames)
 
     def receive(self, frames: Frames, timeout: float = 0.0) -> int:
-        if not self._told:
-            self._told = True
+        if not self._reported:
+            self._reported = True
             raise BusDown("can0 is down (Network is down): type `ip link set can0 up`")
         return super().receive(frames, timeout) if self._up else 0
 
@@ -181,9 +181,11 @@ def test_the_robot_restarts_after_the_interface_was_down(network: Network, robot
     cycles(200)
     assert set(emulator.drives.state) == {DriveState.QUICK_STOP_ACTIVE}
     assert line.sent == sent
-    assert status_line(emulator, line).endswith("; can0 is down (Network is down): type `ip link set can0 up`")
+    assert status_line(emulator, line, silent=True).endswith(
+        "; can0 is down (Network is down): type `ip link set can0 up`"
+    )
     while ours.receive(new_frames(64)) or theirs.receive(new_frames(64)):
-        """What was said to an interface that is down has gone."""
+        pass  # frames sent while the interface was down are lost
     interface.set(up=True)
     cycles(200)
     assert line.sent > sent

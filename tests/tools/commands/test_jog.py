@@ -59,7 +59,7 @@ def test_the_profile_is_monotonic_and_starts_and_ends_at_rest() -> None:
     assert minimum_jerk(2.0) == (1.0, 0.0)
 
 
-# -- the refusals ----------------------------------------------------------------------------------------------------
+# -- rejected arguments ----------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("index", range(len(JOINTS)))
@@ -85,7 +85,7 @@ def test_a_target_outside_the_limits_is_rejected_with_the_range(robot: Robot, in
         (["left_SK", "--to", "5", "-c", "vcan0"], "to use vcan0, type -i socketcan -c vcan0"),
     ],
 )
-def test_an_invalid_command_line_is_one_sentence_and_code_2(arguments: list[str], sentence: str) -> None:
+def test_invalid_command_line_prints_one_sentence_and_exits_with_2(arguments: list[str], sentence: str) -> None:
     result = jog(*arguments)
     assert result.exit_code == 2
     assert sentence in result.stderr
@@ -106,11 +106,11 @@ def test_one_joint_moves_and_all_others_hold_their_pose(prepared: Callable[[Call
     rigs = prepared(follow)
     result = jog("LEFT_sk", "--to", "20", "--speed", "60", "--json")
     assert result.exit_code == 0, result.stderr
-    said = json.loads(result.stdout)
-    assert said["joint"] == "left_SK"
-    assert said["to_deg"] == 20.0
-    assert abs(said["error_deg"]) < 0.1
-    assert said["reached_deg"] == pytest.approx(20.0, abs=0.1)
+    printed = json.loads(result.stdout)
+    assert printed["joint"] == "left_SK"
+    assert printed["to_deg"] == 20.0
+    assert abs(printed["error_deg"]) < 0.1
+    assert printed["reached_deg"] == pytest.approx(20.0, abs=0.1)
     assert rigs[0].hal.state.supervisor.name == "HOLD"
     positions = np.degrees(track[-1000:])
     speed = np.abs(np.diff(positions[:, JOINTS.index("left_SK")])).max() * 1e3
@@ -128,11 +128,11 @@ def test_the_output_contains_the_reached_angle() -> None:
 
 
 def test_a_joint_that_misses_its_target_fails(prepared: Callable[[Callable[[Rig], None]], list[Rig]]) -> None:
-    def stand_in_its_way(rig: Rig) -> None:
+    def push_against_the_motion(rig: Rig) -> None:
         assert rig.emulator is not None
         rig.emulator.drives.motors.push(JOINTS.index("left_SK"), -150.0)
 
-    prepared(stand_in_its_way)
+    prepared(push_against_the_motion)
     result = jog("left_SK", "--to", "20", "--speed", "60", "--json")
     assert result.exit_code == 1
     assert "left_SK must reach 20 degrees, got 1" in result.stderr
@@ -142,11 +142,11 @@ def test_a_joint_that_misses_its_target_fails(prepared: Callable[[Callable[[Rig]
 def test_a_drive_fault_ends_jog_with_code_4(prepared: Callable[[Callable[[Rig], None]], list[Rig]]) -> None:
     def fail(rig: Rig) -> None:
         assert rig.emulator is not None
-        place = rig.emulator.signals.index("RIGHT_HA_STATE", "DriveState")
+        column = rig.emulator.signals.index("RIGHT_HA_STATE", "DriveState")
 
         def rewrite(now: int, values: Any) -> None:
             if now > 500:
-                values[place] = DriveState.FAULT
+                values[column] = DriveState.FAULT
 
         rig.emulator.before_send.append(rewrite)
 

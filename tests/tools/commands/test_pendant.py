@@ -11,7 +11,7 @@ import pytest
 from click.testing import CliRunner, Result
 
 from atalante_dbc import Network
-from atalante_emulator.body import PyBulletBody
+from atalante_emulator.bodies.pybullet_body import PyBulletBody
 from atalante_emulator.emulator import Emulator
 from atalante_emulator.pendant import Operator
 from atalante_hal.bus import BusDown
@@ -32,7 +32,7 @@ from atalante_tools.session.pendant_session import Keyboard, Session
 from atalante_tools.session.takeover import DRAW_CYCLES, PRESENT_FRAMES, QUIET_CYCLES, TAKEOVER_CYCLES
 
 OFF, READY, ACTIVE, HOLD = (SupervisorState[name] for name in ("OFF", "READY", "ACTIVE", "HOLD"))
-#: Longest time from the start of the newest pendant until exactly one is left [cycles].
+#: Longest time from the start of the newest pendant until only one pendant sends [cycles].
 TAKEOVER_SETTLED = 300
 TARGET = Target("pcan", "test", lockstep=False)
 
@@ -96,7 +96,7 @@ class World:
         self.anchor = np.zeros(12)
 
     def cycle(self) -> None:
-        """One millisecond."""
+        """Advance the time by 1 ms."""
         self.now += 1e-3
         if self.running:
             self._hal_cycle()
@@ -163,7 +163,7 @@ def world(make_world: Callable[..., World]) -> World:
 # -- the node --------------------------------------------------------------------------------------------------------
 
 
-def test_it_answers_every_sync_with_a_protected_frame(world: World) -> None:
+def test_pendant_answers_every_sync_with_a_protected_frame(world: World) -> None:
     world.sending()
     ids = {m.name: m.frame_id for m in world.network.messages}
     tap = world.wire.end()
@@ -246,7 +246,7 @@ def test_a_takeover_by_a_new_pendant_does_not_disturb_the_hal(world: World) -> N
     assert world.hal.crc_errors == 0
 
 
-def test_a_press_of_the_new_pendant_counts_once(world: World) -> None:
+def test_press_of_a_new_pendant_takes_effect_once(world: World) -> None:
     world.active()
     new = world.node()
     world.run(50)
@@ -257,17 +257,33 @@ def test_a_press_of_the_new_pendant_counts_once(world: World) -> None:
     assert world.run(30) is ACTIVE
 
 
-def test_a_pendant_that_keeps_sending_prevents_the_takeover(world: World) -> None:
-    hardware = world.active()
+def test_a_pendant_that_keeps_sending_prevents_the_takeover_and_the_repeated_frames_lead_to_hold(world: World) -> None:
+    hardware, events = world.active(), world.hal.events.count
     hardware._takeover.answer = lambda counter: False  # type: ignore[method-assign]
     new = world.node()
     world.run(50)
     new.start_sending()
-    assert world.run(200) is ACTIVE
+    assert world.run(200) is HOLD
+    assert "E2E_REPEAT_RATE" in {event.code for event in world.hal.events.since(events)}
     assert new.takeover_failed
     assert TAKEOVER_CYCLES <= new.answered < TAKEOVER_CYCLES + DRAW_CYCLES
     assert not hardware.displaced
     assert hardware.answered == world.hal.state.cycle
+
+
+@pytest.mark.parametrize("request_", [Request.STOP, Request.HOLD])
+def test_stop_and_hold_work_against_a_replay_that_displaced_the_pendant(world: World, request_: Request) -> None:
+    pendant, replay = world.active(), world.node()
+    replay._takeover.answer = lambda counter: False  # type: ignore[method-assign]
+    replay.dead_man = True
+    replay.start_sending()
+    assert world.run(200) is ACTIVE
+    assert pendant.displaced
+    new = world.node()
+    world.run(50)
+    new.start_sending()
+    new.press(request_)
+    assert world.run(5) is HOLD
 
 
 def test_the_emulated_pendant_yields_to_a_pendant_process(make_world: Callable[..., World]) -> None:
@@ -347,7 +363,7 @@ def test_garbage_in_every_cycle_does_not_stop_a_pendant(world: World) -> None:
 
 @pytest.mark.parametrize("older", [False, True])
 @pytest.mark.parametrize("offset", [0, 1, 2, 5, 30, 49, 77, 120])
-def test_one_pendant_is_left_and_nothing_moves_without_its_dead_man(world: World, offset: int, older: bool) -> None:
+def test_one_pendant_is_left_and_motion_requires_its_dead_man(world: World, offset: int, older: bool) -> None:
     if older:
         world.active()
         allowed = {ACTIVE, HOLD}
@@ -388,7 +404,7 @@ def test_a_short_silence_does_not_end_the_motion(world: World) -> None:
     assert node.answered == world.hal.state.cycle - QUIET_CYCLES
 
 
-def test_a_start_pressed_before_a_silence_does_not_count_again(world: World) -> None:
+def test_start_pressed_before_a_silence_has_no_effect_again(world: World) -> None:
     node, send = world.active(), replayed(world, lambda cycle: cycle, Request.HOLD)
     for _ in range(PRESENT_FRAMES + 1):
         send()
@@ -433,8 +449,8 @@ def test_start_is_pressed_when_the_hal_is_ready_and_printed(world: World, capsys
     operator.take_over()
     operator.start_wanted = True
     operator.run(0.6)
-    said = capsys.readouterr().err
-    assert said.splitlines() == [
+    printed = capsys.readouterr().err
+    assert printed.splitlines() == [
         "the pendant is active",
         "the HAL is OFF",
         "the HAL is READY",
@@ -455,9 +471,9 @@ def started_once(world: World, capsys: pytest.CaptureFixture[str]) -> None:
     operator.run(0.35)
     assert ACTIVE in world.states[-250:]
     assert world.hal.state.supervisor is HOLD
-    said = capsys.readouterr().err.splitlines()
-    assert said[-3:] == ["START pressed", "the HAL is ACTIVE", "STOP: the HAL is HOLD"]
-    assert said.count("START pressed") == 1
+    printed = capsys.readouterr().err.splitlines()
+    assert printed[-3:] == ["START pressed", "the HAL is ACTIVE", "STOP: the HAL is HOLD"]
+    assert printed.count("START pressed") == 1
 
 
 @pytest.mark.parametrize("cycles", HEAD_STARTS)
@@ -500,13 +516,15 @@ def test_a_start_of_a_late_pendant_makes_the_hal_active(
 
 @pytest.mark.parametrize("frames", HEAD_STARTS)
 @pytest.mark.parametrize("state", [READY, HOLD])
-def test_a_late_pendant_may_press_from_its_second_frame_on(world: World, state: SupervisorState, frames: int) -> None:
+def test_press_of_a_late_pendant_is_accepted_from_its_second_frame(
+    world: World, state: SupervisorState, frames: int
+) -> None:
     assert world.run(200) is READY
     if state is HOLD:
         world.active()
         world.nodes.clear()
         assert world.run(10) is HOLD
-        frames += 1  # the first one after a loss is refused
+        frames += 1  # the first frame after a loss is rejected
     node = world.sending()
     assert world.run(frames) is state
     node.press(Request.START)
@@ -556,8 +574,8 @@ def test_a_refused_start_is_printed_and_its_reason_logged(world: World, capsys: 
     operator.take_over()
     operator.start_wanted = True
     operator.run(0.6)
-    said = capsys.readouterr().err
-    assert "the HAL did not become ACTIVE, see its event log; type start to press START again" in said
+    printed = capsys.readouterr().err
+    assert "the HAL did not become ACTIVE, see its event log; type start to press START again" in printed
     assert [event.text for event in world.hal.events if event.code == "START_REFUSED"] == [world.hal.reason]
     assert world.hal.reason.startswith("START refused: LEFT_FH: its torque limit is")
 
@@ -582,7 +600,7 @@ def test_typed_commands_are_executed(world: World, capsys: pytest.CaptureFixture
     assert capsys.readouterr().err.count("a command must be start, stop, hold or xi X") == 5
 
 
-def test_ctrl_c_is_a_stop_with_the_dead_man_released_last(world: World) -> None:
+def test_ctrl_c_sends_stop_before_the_dead_man_is_released(world: World) -> None:
     stop = StopRequest()
     operator = world.session(stop)
     operator.take_over()
@@ -603,7 +621,7 @@ def test_ctrl_c_is_a_stop_with_the_dead_man_released_last(world: World) -> None:
     assert stop.exit_code == 130
 
 
-def test_the_older_session_ends_with_a_sentence(world: World, capsys: pytest.CaptureFixture[str]) -> None:
+def test_displaced_session_ends_with_a_message(world: World, capsys: pytest.CaptureFixture[str]) -> None:
     older = world.session()
     older.take_over()
     older.start_wanted = True
@@ -621,7 +639,7 @@ def test_the_older_session_ends_with_a_sentence(world: World, capsys: pytest.Cap
     assert world.hal.state.supervisor is ACTIVE
 
 
-def test_a_missing_hal_is_reported_once_and_waited_for(world: World, capsys: pytest.CaptureFixture[str]) -> None:
+def test_missing_hal_is_reported_once_while_the_pendant_waits(world: World, capsys: pytest.CaptureFixture[str]) -> None:
     world.running = False
     operator = world.session()
     operator.take_over()
@@ -716,7 +734,7 @@ def test_xi_takes_over_without_a_conflict_and_sets_the_factor(world: World, monk
         (["stop", "-c", "left_leg=a,b"], "must be BUS=CHANNEL, got 'b'"),
     ],
 )
-def test_an_invalid_command_line_is_one_sentence_and_code_2(arguments: list[str], sentence: str) -> None:
+def test_invalid_command_line_prints_one_sentence_and_exits_with_2(arguments: list[str], sentence: str) -> None:
     result = CliRunner().invoke(cli, ["pendant", *arguments])
     assert result.exit_code == 2
     assert sentence in result.stderr
@@ -758,7 +776,7 @@ def test_a_lost_link_releases_the_dead_man_until_start_is_typed(
     ]
 
 
-def test_a_start_typed_after_a_gap_is_pressed_when_the_hal_trusts_the_pendant_again(
+def test_start_typed_after_lost_syncs_is_pressed_once_and_accepted(
     world: World, capsys: pytest.CaptureFixture[str]
 ) -> None:
     end = world.wire.end(world.cycle)

@@ -19,33 +19,17 @@ from atalante_tools.commands import status
 from atalante_tools.commands.observer import NodeReport, Observer, Report, as_json
 from atalante_tools.commands.status import render
 from atalante_tools.console.options import Target
+from atalante_tools.session import listening
 from atalante_tools.session import rig as rig_module
+from tests.tools.commands.recorder import Tap
 
 TARGET = Target("pcan", "test", lockstep=False)
-
-
-class Tap:
-    """Recorder of all frames of the embedded bus, in their order."""
-
-    def __init__(self) -> None:
-        self.batches: list[Frames] = []
-
-    def sent(self, frames: Frames) -> None:
-        self.batches.append(frames.copy())
-
-    def received(self, frames: Frames, count: int) -> None:
-        self.batches.append(frames[:count].copy())
-
-    def cycles(self, sync: int) -> list[Frames]:
-        """A block a cycle, each beginning with this identifier."""
-        frames = np.concatenate(self.batches)
-        return np.split(frames, np.flatnonzero(frames["can_id"] == sync))[1:]
 
 
 @pytest.fixture(scope="module")
 def traffic(network: Network, robot: Robot, urdf_text: str) -> list[Frames]:
     """Return all frames of half a second from power-on to ACTIVE, one block per cycle."""
-    from atalante_emulator.body import PyBulletBody
+    from atalante_emulator.bodies.pybullet_body import PyBulletBody
     from atalante_emulator.emulator import Emulator
     from atalante_emulator.pendant import Operator
     from atalante_hal.bus.pair import lockstep_pair
@@ -201,7 +185,7 @@ def test_foreign_frames_are_counted(network: Network, robot: Robot) -> None:
     assert "3 with an identifier that is not in the DBC" in render(report, TARGET)
 
 
-def test_an_emergency_is_reported(network: Network, robot: Robot) -> None:
+def test_emergency_is_reported_with_code_and_register(network: Network, robot: Robot) -> None:
     from atalante_hal.wire.process_image import TransmitImage
 
     image = TransmitImage([network.message("LEFT_SK_EMCY")])
@@ -258,14 +242,15 @@ def invoke(monkeypatch: pytest.MonkeyPatch, cycles: list[Frames], *arguments: st
         monotonic = staticmethod(lambda: now[0])
 
     bus = Recorded(cycles, tick)
-    monkeypatch.setattr(status, "time", Clock)
+    for module in (status, listening):
+        monkeypatch.setattr(module, "time", Clock)
     monkeypatch.setattr(rig_module, "open_buses", lambda network, target: dict.fromkeys(network.buses, bus))
     result = CliRunner().invoke(cli, ["status", "-i", "pcan", "-c", "test", *arguments])
     assert bus.closed
     return result
 
 
-def test_the_table_is_printed(monkeypatch: pytest.MonkeyPatch, traffic: list[Frames]) -> None:
+def test_table_shows_hal_state_joints_and_bus_load(monkeypatch: pytest.MonkeyPatch, traffic: list[Frames]) -> None:
     result = invoke(monkeypatch, traffic, "--for", "0.5")
     assert result.exit_code == 0, result.stderr
     assert result.stdout.startswith("pcan test: HAL ACTIVE, cycle ")
@@ -277,7 +262,7 @@ def test_the_table_is_printed(monkeypatch: pytest.MonkeyPatch, traffic: list[Fra
     assert result.stderr == ""
 
 
-def test_json_is_one_object(monkeypatch: pytest.MonkeyPatch, traffic: list[Frames]) -> None:
+def test_json_output_is_one_object(monkeypatch: pytest.MonkeyPatch, traffic: list[Frames]) -> None:
     result = invoke(monkeypatch, traffic, "--for", "0.5", "--json")
     assert result.exit_code == 0
     (line,) = result.stdout.splitlines()
@@ -293,7 +278,7 @@ def test_a_bus_without_frames_fails_with_code_1(monkeypatch: pytest.MonkeyPatch)
     assert json.loads(result.stdout)["frames"] == 0
 
 
-def test_a_latched_fault_is_code_4(
+def test_latched_fault_exits_with_code_4(
     monkeypatch: pytest.MonkeyPatch, network: Network, robot: Robot, traffic: list[Any]
 ) -> None:
     from atalante_hal.wire.process_image import TransmitImage

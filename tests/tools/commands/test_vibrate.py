@@ -23,14 +23,14 @@ def vibrate(*arguments: str) -> Result:
 
 @pytest.mark.parametrize("index", [0, 5])
 def test_only_the_chosen_motor_runs_and_it_stops_afterwards(monkeypatch: pytest.MonkeyPatch, index: int) -> None:
-    felt: list[np.ndarray] = []
+    levels: list[np.ndarray] = []
     original = rig_module.open_hal
 
     @contextmanager
     def open_hal(*arguments: Any, **options: Any) -> Iterator[Rig]:
         with original(*arguments, **options) as rig:
             assert rig.emulator is not None
-            rig.emulator.before_send.append(lambda now, values: felt.append(rig.hal.state.vibration.copy()))
+            rig.emulator.before_send.append(lambda now, values: levels.append(rig.hal.state.vibration.copy()))
             yield rig
             for _ in range(300):
                 rig.hal.read()
@@ -39,13 +39,13 @@ def test_only_the_chosen_motor_runs_and_it_stops_afterwards(monkeypatch: pytest.
     monkeypatch.setattr(rig_module, "open_hal", open_hal)
     result = vibrate(MOTORS[index].upper(), "0.6", "--for", "0.4", "--json")
     assert result.exit_code == 0, result.stderr
-    said = json.loads(result.stdout)
-    assert said["motor"] == MOTORS[index]
-    assert said["measured"] == pytest.approx(0.6, abs=0.02)
-    strongest = np.max(felt, axis=0)
+    printed = json.loads(result.stdout)
+    assert printed["motor"] == MOTORS[index]
+    assert printed["measured"] == pytest.approx(0.6, abs=0.02)
+    strongest = np.max(levels, axis=0)
     assert strongest[index] == pytest.approx(0.6, abs=0.02)
     assert np.delete(strongest, index).max() == 0.0
-    assert felt[-1].max() < 0.02
+    assert levels[-1].max() < 0.02
 
 
 def test_the_output_contains_commanded_and_measured_level() -> None:
@@ -65,7 +65,7 @@ def test_the_output_contains_commanded_and_measured_level() -> None:
         (["left_thigh_front"], "Missing argument 'LEVEL'"),
     ],
 )
-def test_an_invalid_command_line_is_one_sentence_and_code_2(arguments: list[str], sentence: str) -> None:
+def test_invalid_command_line_prints_one_sentence_and_exits_with_2(arguments: list[str], sentence: str) -> None:
     result = vibrate(*arguments)
     assert result.exit_code == 2
     assert sentence in result.stderr

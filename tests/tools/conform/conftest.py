@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 
 from atalante_dbc import Message, Network
-from atalante_emulator.body import PyBulletBody
+from atalante_emulator.bodies.pybullet_body import PyBulletBody
 from atalante_emulator.emulator import Emulator
 from atalante_emulator.pendant import Operator
 from atalante_hal.bus.pair import lockstep_pair

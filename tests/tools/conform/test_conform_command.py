@@ -68,7 +68,7 @@ def test_json_is_one_object_per_requirement():
 
 
 def test_failed_requirement_is_named_and_exit_code_is_1(monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr("atalante_emulator.drive.WATCHDOG", 6)
+    monkeypatch.setattr("atalante_emulator.drive.WATCHDOG", 7)
     result = run("LEFT_SK", "--only", "NODE-01", "--only", "DRIVE-13")
     assert result.exit_code == 1
     assert "DRIVE-13   FAIL" in result.stdout
@@ -110,8 +110,8 @@ def test_empty_bus_passes_nothing_and_exits_with_1(monkeypatch: pytest.MonkeyPat
     monkeypatch.setattr("atalante_emulator.emulator.Emulator.poll", lambda emulator: None)
     result = run("LEFT_SH")
     assert result.exit_code == 1
-    assert "LEFT_SH: 0 of 38 requirements passed; not passed: NODE-01, " in result.stderr
-    assert " ".join(result.stdout.split()).count("measured: no frame of LEFT_SH received; ") == 38
+    assert "LEFT_SH: 0 of 39 requirements passed; not passed: NODE-01, " in result.stderr
+    assert " ".join(result.stdout.split()).count("measured: no frame of LEFT_SH received; ") == 39
 
 
 # -- requirements in general -------------------------------------------------------------------------------------------
@@ -188,7 +188,7 @@ def test_missed_deadline_is_recorded_and_skipped():
     assert clock._deadline >= begun
 
 
-def test_request_to_a_person_without_effect_is_not_tested(
+def test_request_that_a_person_does_not_follow_is_not_tested(
     make_setup: MakeSetup, network: Network, robot: Robot, capsys: pytest.CaptureFixture
 ):
     setup = make_setup("IMU_TORSO")

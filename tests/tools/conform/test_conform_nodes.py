@@ -59,7 +59,7 @@ def test_silence_between_two_syncs_passes_only_if_syncs_are_answered(make_setup:
 
 
 def _sends(kind: str, change: Callable[[Frames, Message, int], Frames | None], node: str = IMU) -> Break:
-    """Return a node whose frames of one kind are replaced by `change(frame, message, number)`; None: unchanged."""
+    """Return a node whose frames of one kind are replaced by `change(frame, message, number)`; None means unchanged."""
 
     def broken(make_setup: MakeSetup, monkeypatch: Patch) -> NodeSetup:
         del monkeypatch
@@ -123,12 +123,12 @@ def other_network(make_setup: MakeSetup, monkeypatch: Patch) -> NodeSetup:
 def raises_an_emergency(make_setup: MakeSetup, monkeypatch: Patch) -> NodeSetup:
     del monkeypatch
     setup = make_setup(IMU)
-    message, asked = setup.message("EMCY"), 0
+    message, calls = setup.message("EMCY"), 0
 
     def once() -> Frames:
-        nonlocal asked
-        asked += 1
-        if asked != 150:
+        nonlocal calls
+        calls += 1
+        if calls != 150:
             return wire.NO_FRAME
         frame = np.zeros(1, wire.NO_FRAME.dtype)
         frame["can_id"] = message.frame_id
@@ -270,7 +270,7 @@ def _never_stop(motors: Haptics, level: np.ndarray, _silence: int, cycles: int) 
     Haptics.advance(motors, level, 0, cycles)
 
 
-def _hum(motors: Haptics, level: np.ndarray, silence: int, cycles: int) -> None:
+def _vibrate_at_rest(motors: Haptics, level: np.ndarray, silence: int, cycles: int) -> None:
     """Vibrate slightly until the first command."""
     if not hasattr(motors, "commanded"):
         motors.commanded = False
@@ -326,7 +326,7 @@ class Unplugged(Operator):
         pass
 
 
-class Ghost(Operator):
+class SpuriousPress(Operator):
     """Operator with a START button that triggers once without a press."""
 
     def __init__(self) -> None:
@@ -344,37 +344,37 @@ class Ghost(Operator):
 
 BROKEN: dict[str, tuple[Break, str]] = {
     "no boot-up": (_sends("STATUS", _never_booting), "NODE-01"),
-    "other network": (other_network, "NODE-02"),
-    "half the heartbeat": (_sends("STATUS", _every_other), "NODE-03"),
+    "DBC hash of another network": (other_network, "NODE-02"),
+    "heartbeat at half the rate": (_sends("STATUS", _every_other), "NODE-03"),
     "misses a SYNC": (_sends("STATE", _one_missing), "NODE-04"),
     "emergency at rest": (raises_an_emergency, "NODE-05"),
     "sends without SYNC": (sends_without_sync, "NODE-06"),
-    "no CRC of SYNC": (_receives("SYNC", wire.no_crc), "NODE-07"),
+    "checks no CRC of SYNC": (_receives("SYNC", wire.no_crc), "NODE-07"),
     "answers a repeated SYNC": (_receives("SYNC", wire.no_repetition), "NODE-08"),
     "answers any length of SYNC": (_receives("SYNC", wire.no_length), "NODE-09"),
     "receive queue overflows": (overflows_its_queue, "NODE-10"),
     "counter slips": (_sends("STATE", _counter_slips), "NODE-11"),
     "wrong Data ID sometimes": (_sends("STATE", _other_data_id), "NODE-12"),
     "no bit rate switch": (_sends("STATUS", _no_bit_rate_switch), "NODE-13"),
-    "an invalid code": (_measures(_no_temperature_once), "NODE-14"),
-    "reserved bits": (_sends("STATE", _reserved_bits), "NODE-15"),
+    "sends an invalid code": (_measures(_no_temperature_once), "NODE-14"),
+    "sets reserved bits": (_sends("STATE", _reserved_bits), "NODE-15"),
     "quaternion not of unit length": (_measures(_shrunk_quaternion), "IMU-01"),
-    "accelerometer scale": (_measures(_scaled_accel), "IMU-02"),
-    "axes swapped": (_measures(_swapped_accel), "IMU-03"),
+    "wrong accelerometer scale": (_measures(_scaled_accel), "IMU-02"),
+    "accelerometer axes swapped": (_measures(_swapped_accel), "IMU-03"),
     "gyro bias": (_measures(_biased_gyro), "IMU-04"),
     "gyro axis stuck": (_set("GyroX", 0.01), "IMU-05"),
     "IMU error": (_set("ImuState", 1.0), "IMU-06"),
     "tare lost": (_measures(_tare_lost, "FOOT_LEFT"), "FOOT-01"),
-    "cell stuck": (_set("FR_ForceX", 0.0, "FOOT_RIGHT"), "FOOT-02"),
+    "load cell stuck": (_set("FR_ForceX", 0.0, "FOOT_RIGHT"), "FOOT-02"),
     "foot error": (_set("FootState", 1.0, "FOOT_LEFT"), "FOOT-03"),
-    "hums": (_with_motors(_hum), "HAPTICS-01"),
-    "ramps": (_with_motors(_ramp), "HAPTICS-02"),
+    "vibrates without a command": (_with_motors(_vibrate_at_rest), "HAPTICS-01"),
+    "level rises slowly": (_with_motors(_ramp), "HAPTICS-02"),
     "never full amplitude": (_with_motors(_weak), "HAPTICS-03"),
     "two motors swapped": (
         _receives("COMMAND", _levels(lambda codes: [codes[1], codes[0], *codes[2:]]), "HAPTICS"),
         "HAPTICS-04",
     ),
-    "wraps around": (
+    "level above full wraps around": (
         _receives("COMMAND", _levels(lambda codes: [c - 201 if 200 < c < 255 else c for c in codes]), "HAPTICS"),
         "HAPTICS-05",
     ),
@@ -382,20 +382,20 @@ BROKEN: dict[str, tuple[Break, str]] = {
         _receives("COMMAND", _levels(lambda codes: [200 if c == 255 else c for c in codes]), "HAPTICS"),
         "HAPTICS-06",
     ),
-    "never stops": (_with_motors(_never_stop), "HAPTICS-07"),
-    "no CRC": (_receives("COMMAND", wire.no_crc, "HAPTICS"), "HAPTICS-08"),
-    "no Data ID": (_receives("COMMAND", wire.no_data_id, "HAPTICS"), "HAPTICS-09"),
+    "keeps the level without commands": (_with_motors(_never_stop), "HAPTICS-07"),
+    "checks no CRC": (_receives("COMMAND", wire.no_crc, "HAPTICS"), "HAPTICS-08"),
+    "checks no Data ID": (_receives("COMMAND", wire.no_data_id, "HAPTICS"), "HAPTICS-09"),
     "accepts repeated levels": (_receives("COMMAND", wire.no_repetition, "HAPTICS"), "HAPTICS-10"),
     "accepts any length": (_receives("COMMAND", wire.no_length, "HAPTICS"), "HAPTICS-11"),
-    "request without a press": (_pendant(Ghost), "PENDANT-01"),
+    "request without a press": (_pendant(SpuriousPress), "PENDANT-01"),
     "dead-man stuck": (_set("DeadMan", 1.0, "PENDANT"), "PENDANT-02"),
     "START bounces": (_pendant(lambda: Bouncing(starts=False)), "PENDANT-03"),
-    "no STOP": (_pendant(lambda: Unplugged(starts=False)), "PENDANT-04"),
-    "HOLD is STOP": (_pendant(lambda: Swapped(starts=False)), "PENDANT-05"),
-    "dial dead": (_set("AssistanceSet", 0.0, "PENDANT"), "PENDANT-06"),
+    "STOP button disconnected": (_pendant(lambda: Unplugged(starts=False)), "PENDANT-04"),
+    "HOLD button sends STOP": (_pendant(lambda: Swapped(starts=False)), "PENDANT-05"),
+    "assistance dial without effect": (_set("AssistanceSet", 0.0, "PENDANT"), "PENDANT-06"),
 }
 
-#: Requirements at rest, which take long; skipped for nodes with another defect.
+#: Requirements at rest. Their tests take long, so they are skipped for nodes with another defect.
 _REST = ("NODE-03", "NODE-04", "NODE-07", "NODE-08", "NODE-09", "NODE-10")
 
 
@@ -476,7 +476,7 @@ def _slow_motors(rise_time: float) -> Break:
     return broken
 
 
-#: Requirement and the quantity of its bound -> node with a defect of the given multiple of the bound.
+#: (requirement, bounded quantity) -> function that returns a node whose defect is the given multiple of the bound.
 BOUNDS: dict[tuple[str, str], Callable[[float], Break]] = {
     ("NODE-03", "mean period"): lambda share: _late_heartbeats(lambda number: round(10 * share) * number),
     ("NODE-03", "single period"): lambda share: _late_heartbeats(lambda number: round(50 * share) * (number == 3)),

@@ -93,24 +93,25 @@ def put(frame: Frames, message: Message, signal: str, code: int) -> None:
     frame["data"][0] = np.frombuffer(payload.to_bytes(64, "little"), np.uint8)
 
 
-#: Function `(frame, message, memory)` that replaces a frame of the HAL; None: unchanged. `memory["other"]`: another Data ID.
+#: Function `(frame, message, memory)` that replaces a frame of the HAL. It returns None for an unchanged frame.
+#: `memory["other"]` is the Data ID of another message.
 Reading = Callable[[Frames, Message, dict], Frames | None]
 
 
 def no_crc(frame: Frames, message: Message, memory: dict) -> Frames | None:
-    """Accept frames with a wrong CRC."""
+    """Repair a wrong CRC, so that the node accepts the frame."""
     if crc_holds(frame, message.data_id) or crc_holds(frame, memory["other"]):
         return None
     return protect(frame, message)
 
 
 def no_data_id(frame: Frames, message: Message, memory: dict) -> Frames | None:
-    """Accept frames with the Data ID of another message."""
+    """Replace the Data ID of another message, so that the node accepts the frame."""
     return protect(frame, message) if crc_holds(frame, memory["other"]) else None
 
 
 def no_repetition(frame: Frames, message: Message, memory: dict) -> Frames | None:
-    """Accept frames with a repeated counter."""
+    """Replace a repeated counter by the next counter, so that the node accepts the frame."""
     if not is_good(frame, message):
         return None
     counter = int(frame["data"][0][2])
@@ -120,6 +121,6 @@ def no_repetition(frame: Frames, message: Message, memory: dict) -> Frames | Non
 
 
 def no_length(frame: Frames, message: Message, _: dict) -> Frames | None:
-    """Accept frames of another length or format."""
+    """Replace a wrong length or format, so that the node accepts the frame."""
     shape = int(frame["len"][0]), int(frame["flags"][0]) & FLAG_FDF
     return None if shape == (message.length, FLAG_FDF) else protect(frame, message)

@@ -49,16 +49,16 @@ finally:
 
 
 def test_in_another_thread_no_handler_is_installed_and_no_error_raised() -> None:
-    seen = []
+    wanted = []
 
     def work() -> None:
         with stop_requested() as stop:
-            seen.append(stop.wanted)
+            wanted.append(stop.wanted)
 
     thread = threading.Thread(target=work)
     thread.start()
     thread.join()
-    assert seen == [False]
+    assert wanted == [False]
 
 
 def test_a_nested_block_shares_the_stop_request_of_the_outer_block() -> None:
@@ -89,4 +89,4 @@ def test_a_block_with_an_end_callback_is_not_interrupted_by_signals() -> None:
                 signal.raise_signal(number)
         assert stop.exit_code == 130
     assert ends == [True, True, True]
-    check_stop()  # nothing is left of it
+    check_stop()  # no stop request is pending

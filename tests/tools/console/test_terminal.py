@@ -10,7 +10,7 @@ import math
 import pytest
 
 from atalante_hal import compiled
-from atalante_tools.console.terminal import LIVE, LOGGED, CompilationNotice, Progress, say, show_json, table
+from atalante_tools.console.terminal import LIVE, LOGGED, CompilationNotice, Progress, print_message, show_json, table
 
 
 class Terminal(io.StringIO):
@@ -19,7 +19,7 @@ class Terminal(io.StringIO):
 
 
 def test_log_lines_go_to_stderr_and_objects_to_stdout(capsys: pytest.CaptureFixture[str]) -> None:
-    say("hello")
+    print_message("hello")
     show_json({"a": 1.5, "b": math.nan, "c": [math.inf, {"d": -math.inf}], "e": None})
     captured = capsys.readouterr()
     assert captured.err == "hello\n"
@@ -67,7 +67,7 @@ def test_a_given_period_replaces_both_default_periods() -> None:
     assert progress.due()
 
 
-def test_compiling_is_announced_once(capsys: pytest.CaptureFixture[str]) -> None:
+def test_compilation_notice_is_printed_once(capsys: pytest.CaptureFixture[str]) -> None:
     logger = logging.getLogger(compiled.__name__)
     before = list(logger.handlers), logger.level
     try:

@@ -47,7 +47,7 @@ def test_c_and_python_agree_on_random_images_of_the_whole_network(whole):
     assert run_host_test(build, program, IMAGES, seed=1) == 2 * IMAGES * len(build.messages)
 
 
-def test_host_test_runs_on_the_vector_file(whole):
+def test_host_test_passes_on_the_vector_file(whole):
     _, folder, program = whole
     done = subprocess.run([program, folder / "vectors.bin"], capture_output=True, text=True, check=False)
     assert (done.returncode, done.stdout) == (0, f"{2 * 100 * len(load().messages)} frames compared\n")
@@ -76,7 +76,7 @@ def test_vectors_of_another_network_are_rejected(whole, tmp_path: Path):
 
 
 def test_wrong_factor_in_c_fails_the_comparison(tmp_path: Path):
-    """The smallest mistake an engineer could make by hand: one factor, in its ninth digit."""
+    """One factor in the C code differs from the DBC in its ninth digit."""
     build = Build.of(DBC_FILE, "LEFT_SK")
     write(build, tmp_path, 0)
     code = tmp_path / "atalante.c"
@@ -155,7 +155,7 @@ def test_crc_table_equals_binascii():
     assert crc_table() == [crc_hqx(bytes([byte]), 0) for byte in range(256)]
 
 
-def test_random_payloads_have_codes_out_of_range(whole):
+def test_random_payloads_have_codes_inside_and_outside_their_range(whole):
     """The comparison of the range checks needs payloads of both kinds."""
     from atalante_tools.dbc.vectors import Vectors
 

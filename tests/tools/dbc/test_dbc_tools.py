@@ -16,7 +16,7 @@ from atalante_tools.dbc.lint import findings
 
 TEXT = DBC_FILE.read_text("cp1252")
 NETWORK = load()
-#: A signal line of LEFT_FH_STATE (frame 385), the message the mutations touch.
+#: Lines of two signals of LEFT_FH_STATE (identifier 385). The tests change this message.
 TORQUE = ' SG_ Torque : 80|16@1- (0.0125,0) [-409.58750000000003|409.58750000000003] "Nm" HAL'
 TEMPERATURE = ' SG_ Temperature : 56|8@1+ (1,-40) [-40|214] "degC" HAL'
 
@@ -31,7 +31,10 @@ def rows(result: Result) -> list[dict]:
 
 @pytest.fixture
 def mutated(tmp_path: Path):
-    """Write the network with texts replaced once, from LEFT_FH_STATE on."""
+    """Return a function that writes the DBC with replaced texts.
+
+    For each text, only the first occurrence after the start of LEFT_FH_STATE is replaced.
+    """
 
     def write(*replacements: tuple[str, str]) -> Path:
         start = TEXT.index("BO_ 385 LEFT_FH_STATE")
@@ -185,7 +188,7 @@ def test_diff_reports_the_change_and_its_consequences(name: str, mutated):
     replacements, subject, where, breaking = CHANGES[name]
     found = [c for c in changes(NETWORK, load(mutated(*replacements))) if c.subject != "hash" or subject == "hash"]
     assert (subject, where, breaking) in {(c.subject, c.where, c.breaking) for c in found}
-    # No change besides the consequences of this one.
+    # All other changes are consequences of this change.
     follows = {"layout": {"range", "invalid code"}, "sign": {"range"}, "offset": {"range"}}.get(name, set())
     assert {c.subject for c in found} - {subject} <= follows
 
@@ -236,7 +239,7 @@ def test_renamed_message_is_compatible(mutated):
 
 
 def test_new_signal_is_compatible_only_in_reserved_bits(mutated):
-    # The first message with reserved bits after LEFT_FH_STATE is an IMU: bits 40 to 63.
+    # The first message after LEFT_FH_STATE with reserved bits is IMU_TORSO_STATE. Its bits 40 to 63 are reserved.
     accel = ' SG_ AccelX : 192|16@1- (0.005,0) [-163.835|163.835] "m/s2" HAL'
     for line, breaking in (
         (' SG_ Extra : 40|8@1+ (1,0) [0|254] "1" HAL', False),

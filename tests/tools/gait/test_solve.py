@@ -48,15 +48,17 @@ def test_json_is_one_object_with_the_documented_keys(result: tuple[Result, Path]
 
 
 @pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
-def test_signal_during_optimisation_gives_no_result(monkeypatch: pytest.MonkeyPatch, number: int, code: int) -> None:
-    class GivenUp:
+def test_signal_during_optimisation_exits_with_its_code(
+    monkeypatch: pytest.MonkeyPatch, number: int, code: int
+) -> None:
+    class Unsolved:
         solved, status = False, "no such gait: the impact map cannot hold"
 
-    def optimise(*_: object, **__: object) -> GivenUp:
-        """Swallow an exception and give up, as CasADi does."""
+    def optimise(*_: object, **__: object) -> Unsolved:
+        """Discard the exception that the signal raises and return no solution, as CasADi does."""
         with suppress(KeyboardInterrupt, SystemExit):
             os.kill(os.getpid(), number)
-        return GivenUp()
+        return Unsolved()
 
     monkeypatch.setattr("atalante_control.gait_optimization.solve.solve", optimise)
     outcome = run(*PATIENT)
@@ -79,7 +81,7 @@ def test_plot_and_animation_are_written(result: tuple[Result, Path], tmp_path: P
     gait = load_gait(result[1] / "gait.json", load_robot())
     draw_animation(gait, Patient(75.0, 1.75), tmp_path / "gait.gif")
     with Image.open(tmp_path / "gait.gif") as animation:
-        assert animation.n_frames == 21  # 25 a second over 0.8 s, both ends included
+        assert animation.n_frames == 21  # 25 frames per second over 0.8 s, with the first and the last frame
 
 
 def test_text_output_has_torques_residuals_and_verification() -> None:

@@ -35,14 +35,14 @@ def test_link_masses_add_up_and_every_check_passes() -> None:
     }  # fmt: skip
 
 
-def test_lengths_in_metres_and_centimetres_are_equal() -> None:
+def test_lengths_in_metres_and_centimetres_give_the_same_model() -> None:
     metres = model("--mass", "75", "--height", "1.75", "--thigh", "0.44", "--shank", "0.41")
     assert metres.exit_code == 0
     assert metres.stdout == model("--mass", "75", "--height", "175", "--thigh", "44", "--shank", "41").stdout
     assert "157.5 kg: exoskeleton 82.5, patient 75" in metres.stdout
 
 
-def test_model_without_patient_is_the_exoskeleton() -> None:
+def test_model_without_patient_has_the_mass_of_the_exoskeleton() -> None:
     assert "82.5 kg: exoskeleton 82.5, patient 0" in model().stdout
 
 
@@ -76,7 +76,7 @@ def test_patient_out_of_range_is_rejected_with_the_range(arguments: list[str], s
     assert sentence in result.stderr
 
 
-def test_asymmetric_model_fails(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_asymmetric_model_fails_the_mirror_check(monkeypatch: pytest.MonkeyPatch) -> None:
     def asymmetric(parameters: ExoskeletonParameters, patient: Patient | None = None) -> tuple[Link, ...]:
         bodies = exoskeleton.links(parameters, patient)
         heavier = replace(bodies[3].inertia, mass=bodies[3].inertia.mass + 1.0)
@@ -89,6 +89,6 @@ def test_asymmetric_model_fails(monkeypatch: pytest.MonkeyPatch) -> None:
     assert "the model is inconsistent: mirror" in result.stderr
 
 
-def test_disagreement_of_the_engines_fails(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_disagreeing_dynamics_engines_fail_the_check(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(checks_module, "AGREEMENT", 1e-20)
     assert "FAIL  engines" in model().stdout

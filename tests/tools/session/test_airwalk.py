@@ -25,7 +25,7 @@ from atalante_control.dynamics import gait_network
 from atalante_control.dynamics.gait_network import load_network, save_network
 from atalante_control.gait.gait import AIRWALK_GAIT, load_gait
 from atalante_control.guide.shapes import SHAPES
-from atalante_emulator.body import PyBulletBody
+from atalante_emulator.bodies.pybullet_body import PyBulletBody
 from atalante_emulator.emulator import Emulator
 from atalante_emulator.pendant import Operator
 from atalante_hal.bus.pair import lockstep_pair
@@ -33,6 +33,7 @@ from atalante_hal.hal import Hal
 from atalante_hal.loop import LockStep, run
 from atalante_hal.robot import JOINTS, load_robot
 from atalante_hal.safety import fault_memory
+from atalante_hal.safety.events import Event
 from atalante_hal.telemetry.process import Recording, TelemetryProcess, TelemetrySummary
 from atalante_hal.telemetry.schema import message_class
 from atalante_hal.types import State, SupervisorState
@@ -44,8 +45,8 @@ from tests.process.test_telemetry_faults import cycles_without_index
 
 ATALANTE = str(Path(sys.executable).with_name("atalante"))
 KEYS = [
-    "shape", "certified", "bound_hip_nm", "bound_knee_nm", "steps", "max_ratio", "inside", "filter_active", "cycles",
-    "real_time_factor", "frames", "crc_errors",
+    "shape", "certified", "promise_hip_nm", "promise_knee_nm", "steps", "max_ratio", "inside", "filter_active", "cycles",
+    "real_time_factor", "frames", "crc_errors", "hand_overs_exceeded",
 ]  # fmt: skip
 
 
@@ -54,13 +55,27 @@ def atalante(*arguments: str) -> subprocess.CompletedProcess[str]:
 
 
 def test_the_table_shows_no_tracking_error_for_a_single_step() -> None:
-    walked = Result("pinched", True, 1.97, 1.18, 2, 0.934, 0.99876, 0.5, 4697, 6.25, 90000, 0)
+    walked = Result("pinched", True, 1.97, 1.18, 2, 0.934, 0.99876, 0.5, 4697, 6.25, 90000, 0, 0)
     head, two, one = results_table(
         [walked, replace(walked, steps=1, max_ratio=None, inside=None, filter_active=None)]
     ).splitlines()
     assert head.split("  ")[0].strip() == "shape"
-    assert two.split() == ["pinched", "yes", "1.97", "1.18", "2", "0.93", "99.9", "50.0", "4697", "6.2", "90000", "0"]
-    assert one.split() == ["pinched", "yes", "1.97", "1.18", "1", "-", "-", "-", "4697", "6.2", "90000", "0"]
+    assert two.split() == [
+        "pinched",
+        "yes",
+        "1.97",
+        "1.18",
+        "2",
+        "0.93",
+        "99.9",
+        "50.0",
+        "4697",
+        "6.2",
+        "90000",
+        "0",
+        "0",
+    ]
+    assert one.split() == ["pinched", "yes", "1.97", "1.18", "1", "-", "-", "-", "4697", "6.2", "90000", "0", "0"]
 
 
 @pytest.fixture(scope="module")
@@ -68,7 +83,7 @@ def demo(tmp_path_factory: pytest.TempPathFactory) -> tuple[subprocess.Completed
     out = tmp_path_factory.mktemp("demo")
     done = atalante(
         "demo", "--steps", "2", "--shape", "pinched", "--shape", "snap", "--out", str(out), "--json",
-        "--can-log", str(out / "frames.log"), "--seed", "3",
+        "--can-log", str(out / "frames.log"), "--seed", "3", "--feedforward", "0.5",
     )  # fmt: skip
     assert done.returncode == 0, done.stderr
     return done, out
@@ -94,14 +109,13 @@ def test_stdout_has_one_object_per_shape_and_one_of_the_recording(demo):
     bound = (
         AirwalkController(load_robot(), load_gait(AIRWALK_GAIT, load_robot()), SHAPES["pinched"])
         .certificate(0.5)
-        .joint_torque
+        .promise
     )
     assert bound is not None
-    assert (pinched["bound_hip_nm"], pinched["bound_knee_nm"]) == (bound.hip, bound.knee)
-    assert (snap["bound_hip_nm"], snap["bound_knee_nm"]) == (None, None)
+    assert (pinched["promise_hip_nm"], pinched["promise_knee_nm"]) == (bound.hip, bound.knee)
+    assert (snap["promise_hip_nm"], snap["promise_knee_nm"]) == (None, None)
     assert pinched["max_ratio"] <= 1.0
     assert pinched["inside"] == 1.0
-    assert snap["max_ratio"] > 1.0
 
 
 def test_certificates_are_printed_before_the_run(demo):
@@ -110,31 +124,32 @@ def test_certificates_are_printed_before_the_run(demo):
     assert announced < stderr.index("ACTIVE on")
     (promise,) = (line for line in stderr.splitlines() if line.startswith("pinched: "))
     pinched = json.loads(demo[0].stdout.splitlines()[0])
-    hip, knee = pinched["bound_hip_nm"], pinched["bound_knee_nm"]
+    hip, knee = pinched["promise_hip_nm"], pinched["promise_knee_nm"]
     assert promise.startswith(
-        f"pinched: certified on the model at Xi 0.5 for disturbances of {hip:.2f} Nm at the hip and "
-        f"{knee:.2f} Nm at the knee together"
+        f"pinched: promise at Xi 0.5: disturbances up to {hip:.2f} Nm at the hip and {knee:.2f} Nm at the knee together"
     )
-    assert "no guarantee: joint torque and rate limits, delay" in stderr
+    assert "the promise includes joint torque and rate limits, delay" in stderr
 
 
-@pytest.mark.parametrize(("factors", "certified"), [({0.5}, True), ({0.5, 0.9}, True), ({0.5, 0.95}, False)])
+@pytest.mark.parametrize(("factors", "certified"), [({0.5}, True), ({0.5, 0.9}, True), ({0.5, 1.0}, False)])
 def test_the_result_has_the_weakest_certificate_of_all_assistance_factors(factors: set[float], certified: bool):
     robot = load_robot()
     controller = AirwalkController(robot, load_gait(AIRWALK_GAIT, robot), SHAPES["constant"])
-    promise = trial._bounds(trial._weakest(controller, factors))
+    promise = trial._promise(trial._weakest(controller, factors))
     assert promise["certified"] == certified
-    bound = controller.certificate(0.5).joint_torque  # the wider the guide, the worse the worst pose
-    assert bound is not None
-    assert promise["bound_hip_nm"] == (bound.hip if certified else None)
+    bound = min(
+        (controller.certificate(xi) for xi in factors), key=lambda c: c.promise.hip if c.promise else 0.0
+    ).promise
+    assert promise["promise_hip_nm"] == (bound.hip if certified and bound else None)
 
 
-def test_the_run_folder(demo):
+def test_the_run_folder_contains_recording_summary_and_figure(demo):
     _, out = demo
     assert {"recording.mcap", "summary.json", "guide_shapes.png"} <= {path.name for path in out.iterdir()}
     summary = json.loads((out / "summary.json").read_text())
     assert [list(shape) for shape in summary["shapes"]] == [KEYS, KEYS]
     assert (summary["steps"], summary["xi"], summary["seed"]) == (2, 0.5, 3)
+    assert (summary["idealization"], summary["feedforward"]) == (1.0, 0.5)
     assert summary["recording"] == {"files": ["recording.mcap"], "complete": True, "missing_cycles": 0}
     assert (out / "guide_shapes.png").read_bytes().startswith(b"\x89PNG")
     cycles = sum(shape["cycles"] for shape in summary["shapes"])
@@ -156,11 +171,11 @@ def test_the_recording_holds_every_joint_at_its_rate(demo):
     assert max(knee) - min(knee) > 0.5
 
 
-def test_the_can_log_is_the_same_to_the_byte_for_the_same_seed_and_another_for_another(demo, tmp_path: Path):
+def test_equal_seeds_give_equal_can_logs_and_other_seeds_give_other_logs(demo, tmp_path: Path):
     _, out = demo
     again, other = tmp_path / "again.log", tmp_path / "other.log"
     for log, seed, *walk in (
-        (again, "3", "2", "--shape", "pinched", "--shape", "snap"),
+        (again, "3", "2", "--shape", "pinched", "--shape", "snap", "--feedforward", "0.5"),
         (other, "4", "1", "--shape", "pinched"),
     ):
         done = atalante(
@@ -169,7 +184,7 @@ def test_the_can_log_is_the_same_to_the_byte_for_the_same_seed_and_another_for_a
         assert done.returncode == 0, done.stderr
     first = (out / "frames.log").read_bytes()
     assert again.read_bytes() == first
-    # One step of another seed, beside the same cycles; `startswith` would hold for the same one.
+    # A run of one step with another seed begins with other frames than the first run.
     begun = other.read_bytes()[:4_000_000]
     assert len(begun) == 4_000_000
     assert not first.startswith(begun)
@@ -196,11 +211,11 @@ class Baseline(AirwalkController):
 
     def _change_step(self, state: State, stance: int) -> None:
         super()._change_step(state, stance)
-        self._step.share, self.guide.tables.joints["kp"] = 1.0, np.nan
+        self._step.assisted, self.guide.tables.guards["gains"] = False, np.nan
 
 
 @pytest.mark.parametrize(("xi", "equal"), [(1.0, True), (0.99, False)])
-def test_at_full_assistance_the_command_frames_are_the_baselines_to_the_last_bit(network, robot, urdf_text, xi, equal):
+def test_command_frames_at_full_assistance_are_equal_to_those_without_assistance(network, robot, urdf_text, xi, equal):
     sent = []
     for kind in (AirwalkController, Baseline):
         ours, theirs = lockstep_pair()
@@ -217,7 +232,7 @@ def test_at_full_assistance_the_command_frames_are_the_baselines_to_the_last_bit
 
 
 @pytest.mark.parametrize(
-    ("arguments", "code", "says"),
+    ("arguments", "code", "message"),
     [
         (["--shape", "round"], 2, "constant"),
         (["--steps", "0"], 2, "steps"),
@@ -233,14 +248,14 @@ def test_at_full_assistance_the_command_frames_are_the_baselines_to_the_last_bit
         (["--telemetry", "nofile.toml"], 1, "nofile.toml cannot be read"),
     ],
 )
-def test_bad_input_gets_one_sentence_that_says_what_is_valid(arguments, code, says, tmp_path: Path):
+def test_bad_input_gets_one_sentence_that_says_what_is_valid(arguments, code, message, tmp_path: Path):
     out = tmp_path / "run"
     done = CliRunner().invoke(cli, ["airwalk", "--out", str(out), *arguments])
     assert done.exit_code == code, done.stderr
     # No certificate is printed before the error, because no robot runs.
     assert done.stderr.startswith("atalante: ")
     assert done.stderr.count("\n") == 1
-    assert says in done.stderr
+    assert message in done.stderr
     assert not out.exists()
 
 
@@ -260,7 +275,7 @@ class Child:
 
 
 @pytest.mark.parametrize(
-    ("notices", "complete", "said"),
+    ("notices", "complete", "printed"),
     [
         ((*Child.notices, "the recording stopped: disk full"), True, "the recording stopped: disk full\n"),
         (("telemetry hangs; it is restarted",), False, "telemetry hangs; it is restarted\n"),
@@ -268,11 +283,11 @@ class Child:
         ((), True, ""),
     ],
 )
-def test_notices_about_lost_records_are_printed_once(notices, complete, said, capsys):
+def test_notices_about_lost_records_are_printed_once(notices, complete, printed, capsys):
     walked = trial.Walked()
     trial._close(Child(*notices, complete=complete), walked)
     assert walked.recording is RECORDING
-    assert capsys.readouterr().err == said
+    assert capsys.readouterr().err == printed
 
 
 def kill_and_take_the_port(telemetry: TelemetryProcess) -> socket.socket:
@@ -281,7 +296,7 @@ def kill_and_take_the_port(telemetry: TelemetryProcess) -> socket.socket:
     assert child is not None
     while telemetry.records.taken != telemetry.records.written:
         time.sleep(0.001)
-    telemetry.event(0, "MARK", "it is taken when the records before it are handled")
+    telemetry.event(Event(0, "MARK", "it is taken when the records before it are handled"))
     while telemetry.events.taken != telemetry.events.written:
         time.sleep(0.001)
     child.kill()
@@ -324,8 +339,8 @@ def test_a_recording_with_a_gap_fails_the_run_and_is_counted(tmp_path: Path, mon
     old, new = endpoints
     assert old != new
     assert done.stderr.index(f"telemetry on Zenoh at {old}") < done.stderr.index(f"telemetry on Zenoh at {new}")
-    said = f"one file with every cycle, got recording.mcap, recording-1.mcap with {missing} cycles missing"
-    assert done.stderr.splitlines()[-1] == f"atalante: the recording must be {said}"
+    problem = f"one file with every cycle, got recording.mcap, recording-1.mcap with {missing} cycles missing"
+    assert done.stderr.splitlines()[-1] == f"atalante: the recording must be {problem}"
 
 
 def test_a_run_of_one_step_reports_no_tracking_error(tmp_path: Path):
@@ -341,8 +356,8 @@ def test_a_can_log_on_a_full_disk_fails_the_run(tmp_path: Path):
     done = CliRunner().invoke(cli, ["airwalk", "--steps", "1", "--out", str(tmp_path), "--can-log", str(log)])
     assert done.exit_code == 1
     assert f"the CAN log {log} stopped: No space left on device" in done.stderr
-    said = f"atalante: the CAN log {log} must contain every frame, but frames are missing"
-    assert done.stderr.splitlines()[-1] == said
+    problem = f"atalante: the CAN log {log} must contain every frame, but frames are missing"
+    assert done.stderr.splitlines()[-1] == problem
 
 
 def test_a_run_starts_without_the_telemetry_process(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
@@ -384,9 +399,9 @@ def test_a_signal_ends_in_hold_and_keeps_recording_and_summary(number, code, tmp
             if "ACTIVE" in line:
                 break
         airwalk.send_signal(number)
-        _, said = airwalk.communicate(timeout=60)
-    assert airwalk.returncode == code, said
-    assert "HOLD" in said
+        _, errors = airwalk.communicate(timeout=60)
+    assert airwalk.returncode == code, errors
+    assert "HOLD" in errors
     with (tmp_path / "recording.mcap").open("rb") as file:
         states = [
             message_class("Event").FromString(message.data).code
@@ -409,7 +424,7 @@ def test_a_patient_s_gait_of_the_network_is_walked_inside_a_certified_guide(tmp_
 
 
 @pytest.mark.parametrize(
-    ("arguments", "code", "says"),
+    ("arguments", "code", "message"),
     [
         (["--mass", "110", "--height", "175"], 1, "mass for the gait network must be 58 to 91 kg, got 110 kg"),
         (
@@ -422,16 +437,16 @@ def test_a_patient_s_gait_of_the_network_is_walked_inside_a_certified_guide(tmp_
         (["--mass", "75", "--height", "175", "--step-duration", "0.85123"], 2, "a whole number of milliseconds"),
     ],
 )
-def test_a_subject_out_of_range_is_rejected_with_the_range(arguments, code, says, tmp_path: Path):
+def test_a_subject_out_of_range_is_rejected_with_the_range(arguments, code, message, tmp_path: Path):
     done = CliRunner().invoke(cli, ["airwalk", "--out", str(tmp_path), *arguments])
     assert done.exit_code == code, done.stderr
-    assert says in done.stderr
+    assert message in done.stderr
     assert done.stderr.count("\n") == 1
 
 
 @pytest.mark.parametrize("command", ["airwalk", "demo"])
 @pytest.mark.parametrize(
-    ("change", "says"),
+    ("change", "message"),
     [
         (
             lambda points: points + 2.84,
@@ -443,7 +458,7 @@ def test_a_subject_out_of_range_is_rejected_with_the_range(arguments, code, says
     ids=["86 degrees", "no angle"],
 )
 def test_a_network_of_wrong_weights_is_not_walked(
-    command: str, change: Any, says: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    command: str, change: Any, message: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ):
     network = load_network()
     bias = network.layers[-1].bias.copy().reshape(len(JOINTS), -1)
@@ -453,8 +468,8 @@ def test_a_network_of_wrong_weights_is_not_walked(
     path, out = tmp_path / "network.npz", tmp_path / "run"
     save_network(replace(network, layers=(*network.layers[:-1], last)), path)
     monkeypatch.setattr(gait_network, "DEFAULT_NETWORK", path)
-    who = ["--mass", "75", "--height", "1.75", "--step-length", "0.15", "--step-duration", "0.9"]
-    done = CliRunner().invoke(cli, [command, "--steps", "1", "--out", str(out), *who])
+    subject = ["--mass", "75", "--height", "1.75", "--step-length", "0.15", "--step-duration", "0.9"]
+    done = CliRunner().invoke(cli, [command, "--steps", "1", "--out", str(out), *subject])
     assert done.exit_code == 1, done.stderr
-    assert re.fullmatch(f"atalante: {says}.*\n", done.stderr)
+    assert re.fullmatch(f"atalante: {message}.*\n", done.stderr)
     assert not out.exists()

@@ -33,7 +33,7 @@ def samples(*steps: tuple[int, int, float]) -> Iterator[tuple[str, Any, float, f
 
 @pytest.fixture
 def drawn(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Any:
-    """Draw a run, and return the title and, per line, its label and final phase."""
+    """Return a function that draws a run. It returns the title of the figure, and label and final phase of each line."""
     kept: list[Any] = []
     monkeypatch.setattr(figures.plt, "close", kept.append)
 
@@ -51,14 +51,14 @@ WHOLE = pytest.approx(0.99, abs=0.011)
 GUIDE = [("measu", WHOLE), ("desir", WHOLE), ("guide", WHOLE), ("child", WHOLE)]
 
 
-def test_a_run_stopped_in_the_middle_of_a_step_shows_the_whole_guide_of_the_step_before(drawn: Any) -> None:
+def test_run_stopped_within_a_step_draws_the_last_complete_guide(drawn: Any) -> None:
     title, lines = drawn((0, RIGHT, 1.0), (1, LEFT, 1.0), (1, RIGHT, 1.0), (2, LEFT, 1.0), (2, RIGHT, 0.3))
     assert title == "pinched: 2 right-stance steps"
     assert lines[0][1] == WHOLE
     assert lines[1:] == GUIDE
 
 
-def test_a_run_that_ended_after_its_steps_or_while_the_left_foot_stands_shows_them_all(drawn: Any) -> None:
+def test_run_ended_outside_a_right_stance_step_draws_all_steps(drawn: Any) -> None:
     for ends in ([], [(2, LEFT, 0.4)]):
         title, lines = drawn((0, RIGHT, 1.0), (1, LEFT, 1.0), (1, RIGHT, 0.95), *ends)
         assert title == "pinched: 2 right-stance steps"

@@ -1,4 +1,4 @@
-"""Rig: one HAL on any bus, closed in order, and the ends of a run."""
+"""Tests of the rig: a HAL on any bus, its closing, and how a run ends."""
 
 from __future__ import annotations
 
@@ -119,7 +119,7 @@ def test_pose_operator_and_record_of_the_caller_are_used(network: Network, robot
 
 
 @pytest.mark.parametrize(("lockstep", "patience"), [(False, PATIENCE), (True, LOCKSTEP_PATIENCE)])
-def test_a_bus_waits_for_the_nodes_by_its_clock(
+def test_wait_for_the_nodes_depends_on_the_clock_of_the_bus(
     network: Network, robot: Robot, lockstep: bool, patience: float
 ) -> None:
     with open_hal(Target("virtual", "rig-clock", lockstep), network=network, robot=robot) as rig:
@@ -128,7 +128,7 @@ def test_a_bus_waits_for_the_nodes_by_its_clock(
         assert rig.operator is None
 
 
-def test_several_channels_become_one_bus_and_one_stays_itself(network: Network) -> None:
+def test_several_channels_are_joined_and_one_channel_is_not(network: Network) -> None:
     channels = "left_leg=rig-a,right_leg=rig-b,left_sense=rig-a,right_sense=rig-b"
     buses = open_buses(network, Target("virtual", channels, lockstep=False))
     joined = join(network, buses)
@@ -147,13 +147,13 @@ def test_a_missing_bus_is_rejected(network: Network, robot: Robot) -> None:
 
 def test_missing_pybullet_fails_with_the_installation_command(robot: Robot, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "pybullet", None)
-    monkeypatch.delitem(sys.modules, "atalante_emulator.body", raising=False)
+    monkeypatch.delitem(sys.modules, "atalante_emulator.bodies.pybullet_body", raising=False)
     with pytest.raises(Failed, match=r"pip install 'atalante-hal\[emulator\]' \(Python 3\.11\)$"), open_body(robot):
         raise AssertionError("opened")
 
 
 @pytest.mark.parametrize("python", [(3, 12), (3, 13), (4, 0)])
-def test_on_a_python_without_a_wheel_the_message_names_the_one_that_has_it(
+def test_missing_pybullet_error_on_newer_python_names_version_3_11(
     robot: Robot, python: tuple[int, int], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setitem(sys.modules, "pybullet", None)
@@ -161,7 +161,8 @@ def test_on_a_python_without_a_wheel_the_message_names_the_one_that_has_it(
     with pytest.raises(Failed) as refused, open_body(robot):
         raise AssertionError("opened")
     assert str(refused.value) == (
-        "the emulated robot needs PyBullet; type: python3.11 -m pip install 'atalante-hal[emulator]'"
+        "the emulated robot needs PyBullet; type: pip install 'atalante-hal[mujoco]' and add --engine mujoco, "
+        "or python3.11 -m pip install 'atalante-hal[emulator]'"
         f" (PyBullet has no wheel for Python above 3.11, got {python[0]}.{python[1]})"
     )
 
@@ -169,7 +170,7 @@ def test_on_a_python_without_a_wheel_the_message_names_the_one_that_has_it(
 # -- how a run ends --------------------------------------------------------------------------------------------------
 
 
-def test_a_signal_ends_the_run_in_hold_with_its_code(network: Network, robot: Robot) -> None:
+def test_signal_ends_the_run_in_hold_with_its_exit_code(network: Network, robot: Robot) -> None:
     stop = StopRequest()
     with embedded(network, robot) as rig:
         watch = watched(
@@ -192,14 +193,14 @@ def test_stop_of_the_operator_ends_the_run_as_failed(network: Network, robot: Ro
 
 
 @pytest.mark.parametrize("cycle", [150, 400])  # before and in ACTIVE
-def test_a_drive_fault_is_code_4(network: Network, robot: Robot, cycle: int) -> None:
+def test_drive_fault_ends_the_run_with_exit_code_4(network: Network, robot: Robot, cycle: int) -> None:
     with embedded(network, robot) as rig:
         assert rig.emulator is not None
-        place = rig.emulator.signals.index("LEFT_SK_STATE", "DriveState")
+        index = rig.emulator.signals.index("LEFT_SK_STATE", "DriveState")
 
         def break_drive(now: int, values: Any) -> None:
             if now >= cycle:
-                values[place] = DriveState.FAULT
+                values[index] = DriveState.FAULT
 
         rig.emulator.before_send.append(break_drive)
         watch = watched(rig, seconds=1.0)
@@ -208,7 +209,7 @@ def test_a_drive_fault_is_code_4(network: Network, robot: Robot, cycle: int) -> 
     assert end.value.exit_code == 4
 
 
-def test_a_controller_that_raises_ends_as_failed_with_its_error(network: Network, robot: Robot) -> None:
+def test_controller_exception_ends_the_run_as_failed(network: Network, robot: Robot) -> None:
     class Broken(PoseHold):
         def update(self, state: State) -> Command:
             if self.elapsed > 0.01:
@@ -241,11 +242,11 @@ def test_a_waiting_run_prints_the_command_to_type(network: Network, robot: Robot
 
 
 @pytest.mark.parametrize(
-    ("fault", "said"),
+    ("fault", "reason"),
     [
         (
             Fault("encoder_jump", "LEFT_SA", by=1.0),
-            "OFF: left_SA is at 57.3 degrees, outside its range of -16.0 to 9.0",
+            "OFF: left_SA is at 58.0 degrees, outside its range of -16.0 to 9.0",
         ),
         (
             Fault("value", "RIGHT_FH_STATE", Torque=-400.0),
@@ -253,12 +254,12 @@ def test_a_waiting_run_prints_the_command_to_type(network: Network, robot: Robot
         ),
     ],
 )
-def test_the_reason_of_a_refused_start_is_printed(network: Network, robot: Robot, fault: Fault, said: str) -> None:
+def test_the_reason_of_a_refused_start_is_printed(network: Network, robot: Robot, fault: Fault, reason: str) -> None:
     with embedded(network, robot, operator=Operator(), faults=[fault]) as rig:
         for _ in range(400):
             rig.hal.read()
             rig.hal.hold()
-        assert waiting_for(rig).startswith(said)
+        assert waiting_for(rig).startswith(reason)
 
 
 def test_a_run_on_the_wall_clock_requests_real_time_priority(
@@ -277,14 +278,14 @@ def test_a_run_on_the_wall_clock_requests_real_time_priority(
 
 def test_pose_hold_keeps_every_joint_at_its_measured_angle(network: Network, robot: Robot) -> None:
     with embedded(network, robot) as rig:
-        # Limp until ACTIVE, the legs are still falling when they are caught.
+        # The joints are free until ACTIVE, so the legs move when the hold begins.
         watched(rig, seconds=0.5).conclude()
-        caught = rig.hal.record[rig.hal.layout["controller.reference"]]
-        assert np.abs(rig.hal.state.position - caught).max() < math.radians(0.1)
+        target = rig.hal.record[rig.hal.layout["controller.reference"]]
+        assert np.abs(rig.hal.state.position - target).max() < math.radians(0.1)
 
 
 @pytest.mark.parametrize("resumes", [False, True])
-def test_a_hold_ends_the_run_or_waits_for_the_next_start(
+def test_hold_ends_the_run_unless_it_resumes_at_start(
     network: Network, robot: Robot, capsys: pytest.CaptureFixture[str], resumes: bool
 ) -> None:
     with embedded(network, robot) as rig:

@@ -12,7 +12,7 @@ from atalante_hal.telemetry.process import Recording
 from atalante_tools.console.outcome import Failed
 from atalante_tools.session.run_folder import Result, run_folder, write_summary
 
-WALKED = Result("pinched", True, 1.97, 1.18, 2, 0.934, 0.99876, 0.5, 4697, 6.25, 90000, 0)
+WALKED = Result("pinched", True, 1.97, 1.18, 2, 0.934, 0.99876, 0.5, 4697, 6.25, 90000, 0, 0)
 
 
 def test_a_second_run_in_the_same_folder_is_rejected(tmp_path: Path) -> None:
@@ -49,9 +49,9 @@ def test_an_incomplete_recording_gives_a_summary_but_no_figure(
 ) -> None:
     (tmp_path / "recording.mcap").write_bytes(recording)
     write_summary(tmp_path, {"steps": 2}, [WALKED], Recording(("recording.mcap", "recording-1.mcap"), False, 7))
-    said = capsys.readouterr().err.splitlines()
-    assert said[0].startswith("no figure: recording.mcap is incomplete")
-    assert said[1] == f"in {tmp_path}: recording.mcap, recording-1.mcap, summary.json"
+    printed = capsys.readouterr().err.splitlines()
+    assert printed[0].startswith("no figure: recording.mcap is incomplete")
+    assert printed[1] == f"in {tmp_path}: recording.mcap, recording-1.mcap, summary.json"
     summary = json.loads((tmp_path / "summary.json").read_text())
     assert (summary["steps"], summary["shapes"][0]["shape"]) == (2, "pinched")
     files = ["recording.mcap", "recording-1.mcap"]

@@ -1,4 +1,4 @@
-"""Takeover rule of the pendants: what counts as another pendant, and that exactly one pendant is left."""
+"""Takeover rule of the pendants: how another pendant is recognised, and that only one pendant still sends at the end."""
 
 from __future__ import annotations
 
@@ -24,13 +24,13 @@ from atalante_tools.session.takeover import (
     pendant_messages,
 )
 
-#: Longest time from the start of the newest pendant until exactly one is left [cycles]. The longest of 12,100 random takeovers
-#: was 234 cycles.
+#: Longest time from the start of the newest pendant until exactly one pendant still sends [cycles]. The longest of 12,100
+#: random takeovers was 234 cycles.
 SETTLED = 300
 
 
 def after(rule: Takeover, *cycles: tuple[int, ...], first: int = 0) -> Takeover:
-    """Run one cycle for each tuple, with the counters of the frames received after its SYNC, relative to the SYNC."""
+    """Run one cycle per tuple. A tuple lists the counters of the frames received after a SYNC, relative to that SYNC."""
     for tag, counters in enumerate(cycles, first):
         rule.sync(tag & 0xFF)
         for counter in counters:
@@ -65,7 +65,7 @@ def test_only_consecutive_answers_to_the_present_sync_silence_a_pendant(
 
 
 @pytest.mark.parametrize(("more", "lost"), [(LOST_FRAMES - 1, False), (LOST_FRAMES, True)])
-def test_a_silent_pendant_gives_up_only_if_the_other_continues(more: int, lost: bool) -> None:
+def test_silent_pendant_stops_for_good_only_if_the_other_continues(more: int, lost: bool) -> None:
     rule = after(Takeover(established=True), *[(0,)] * (PRESENT_FRAMES + more), *[()] * (QUIET_CYCLES + 1))
     assert rule.lost is lost
     assert rule.sends is not lost
@@ -85,7 +85,7 @@ def test_a_pendant_that_stopped_early_does_not_silence_a_new_pendant() -> None:
     assert rule.established
 
 
-def test_a_pendant_that_sends_again_does_so_for_some_cycles() -> None:
+def test_pendant_retries_for_a_random_time_after_a_silence() -> None:
     times = []
     for seed in range(200):
         rule = after(Takeover(established=True, seed=seed), (0,), (0,), *[()] * (QUIET_CYCLES + 1))
@@ -108,7 +108,7 @@ def test_a_silence_is_shorter_than_the_timeout_of_the_pendant(network: Network) 
     assert pendant_messages(network)[0].timeout_ms > QUIET_CYCLES + 1  # one cycle for the latency of the answer
 
 
-def test_a_new_pendant_sends_for_its_random_time_before_it_gives_up() -> None:
+def test_new_pendant_sends_for_a_random_time_before_it_stops() -> None:
     times = set()
     for seed in range(300):
         rule = Takeover(seed=seed)
@@ -124,7 +124,7 @@ def test_a_new_pendant_sends_for_its_random_time_before_it_gives_up() -> None:
 
 
 def settle(rules: dict[Takeover, int], cycles: int) -> int:
-    """Run pendants on one bus, each from its cycle. Return the first cycle after which exactly one is left.
+    """Run pendants on one bus, each from its start cycle. Return the first cycle after which only one pendant sends.
 
     Args:
         rules: Rule of each pendant and the cycle in which it starts to send.
@@ -149,7 +149,7 @@ def settle(rules: dict[Takeover, int], cycles: int) -> int:
 
 @pytest.mark.parametrize("older", [False, True])
 @pytest.mark.parametrize("newcomers", [2, 3])
-def test_exactly_one_pendant_is_left_at_every_offset(newcomers: int, older: bool) -> None:
+def test_exactly_one_pendant_is_left_at_every_start_offset(newcomers: int, older: bool) -> None:
     for offset, seed in itertools.product(range(121), range(6)):
         random = Random(f"{offset} {seed}")
         starts = [10, 10 + offset, 10 + random.randrange(121)][:newcomers]
@@ -159,13 +159,13 @@ def test_exactly_one_pendant_is_left_at_every_offset(newcomers: int, older: bool
         settle(rules, max(starts) + SETTLED)
 
 
-def test_two_established_pendants_do_not_both_give_up() -> None:
+def test_two_established_pendants_do_not_both_stop() -> None:
     for seed in range(300):
         rules = {Takeover(established=True, seed=2 * seed + i): 0 for i in range(2)}
         assert settle(rules, SETTLED) >= RETRY_CYCLES
 
 
-def test_an_emulated_pendant_yields_to_a_pendant_process_that_sends_at_the_same_time() -> None:
+def test_emulated_pendant_yields_to_a_simultaneous_pendant_process() -> None:
     for seed in range(100):
         emulated, process = Takeover(established=True, quiet=PENDANT_QUIET), Takeover(established=True, seed=seed)
         settle({emulated: 0, process: 0}, SETTLED)
@@ -272,7 +272,7 @@ def test_frames_are_read_in_the_order_of_the_bus(network: Network, traffic: Traf
 
 
 @pytest.mark.parametrize("bit", range(64))
-def test_a_damaged_frame_is_no_frame_of_another_pendant(network: Network, traffic: Traffic, bit: int) -> None:
+def test_damaged_frame_does_not_count_as_another_pendant(network: Network, traffic: Traffic, bit: int) -> None:
     frames = [f for c in range(1, 9) for f in (traffic.sync(c), with_changed_bit(traffic.state(c), bit))]
     assert read(network, frames).sends
 

@@ -1,4 +1,4 @@
-"""The pytest plugin as its users meet it: their tests in a folder of their own, run by a pytest of their own."""
+"""Tests of the pytest plugin: pytest runs test files of a user in a temporary folder."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from pathlib import Path
 import can
 import pytest
 
-# pytester forgets what a run imported; what is here already stays.
+# pytester removes the modules that a run imported; modules imported here stay loaded.
 import atalante_emulator.emulator  # noqa: F401
 import atalante_tools.testing.frame_filter
 import atalante_tools.testing.hil  # noqa: F401
@@ -26,7 +26,7 @@ VIRTUAL = ("--can-interface", "virtual", "--can-channel")
 
 @pytest.fixture
 def run(pytester: pytest.Pytester):
-    """Run a test file with warnings as errors, without plugins that take longer than the run."""
+    """Return a function that runs a test file with warnings as errors and without slow plugins."""
 
     def run_(text: str, *arguments: str) -> pytest.RunResult:
         pytester.makepyfile(text)
@@ -40,7 +40,7 @@ def test_the_plugin_is_installed_with_the_project():
     assert plugin.value == "atalante_tools.testing.pytest_plugin"
 
 
-def test_a_pytest_that_does_not_use_it_does_not_pay_for_it():
+def test_plugin_import_loads_no_heavy_module():
     heavy = "numpy can cantools pybullet pinocchio atalante_hal atalante_dbc click"
     program = (
         f"import sys, atalante_tools.testing.pytest_plugin; print(sorted(set({heavy!r}.split()) & set(sys.modules)))"
@@ -52,18 +52,18 @@ def test_a_pytest_that_does_not_use_it_does_not_pay_for_it():
 # -- on the embedded robot ---------------------------------------------------------------------------------------------
 
 
-def test_the_example_passes(run):
+def test_example_of_the_documentation_passes(run):
     run(EXAMPLE).assert_outcomes(passed=1)
 
 
-def test_each_test_gets_a_robot_of_its_own_and_all_fixtures_belong_to_it(run):
+def test_each_test_has_a_new_robot_shared_by_all_its_fixtures(run):
     run(
         """
         import pytest
         from atalante_hal.types import SupervisorState
 
-        @pytest.mark.parametrize("again", range(2))
-        def test_all(bus, emulator, hal, loop, faults, recorded_run, again):
+        @pytest.mark.parametrize("repetition", range(2))
+        def test_fixtures(bus, emulator, hal, loop, faults, recorded_run, repetition):
             assert loop.state.cycle == 0 and hal.bus is bus is faults and loop.hal is hal
             loop.until(SupervisorState.READY)
             emulator.operator.release()
@@ -74,7 +74,7 @@ def test_each_test_gets_a_robot_of_its_own_and_all_fixtures_belong_to_it(run):
     ).assert_outcomes(passed=2)
 
 
-def test_a_test_that_fails_says_why_the_robot_is_not_where_it_should_be(run):
+def test_missed_state_error_names_the_missing_node(run):
     result = run(
         """
         from atalante_hal.types import SupervisorState
@@ -98,7 +98,7 @@ def test_bad(loop):
 def test_good(loop):
     loop.run(30)
 
-def test_of_something_else():
+def test_without_robot():
     assert True
 """
 
@@ -107,7 +107,7 @@ def logs(pytester: pytest.Pytester, folder: str = "runs/can-logs") -> list[Path]
     return sorted((pytester.path / folder).glob("*"))
 
 
-def test_a_failed_test_leaves_a_can_log_and_says_where(run, pytester: pytest.Pytester):
+def test_failed_test_writes_a_can_log_and_prints_its_path(run, pytester: pytest.Pytester):
     result = run(FAILS_AND_PASSES)
     result.assert_outcomes(passed=2, failed=1)
     (log,) = logs(pytester)
@@ -119,53 +119,53 @@ def test_a_failed_test_leaves_a_can_log_and_says_where(run, pytester: pytest.Pyt
     assert (len(syncs), len(states)) == (30, 30)
     assert {m.channel for m in syncs} == {"left_leg"}
     assert [(m.is_rx, m.is_fd, m.dlc) for m in (syncs[0], states[0])] == [(False, True, 8), (True, True, 12)]
-    # The robot's time: a millisecond a cycle, frames in order.
+    # Time of the robot: 1 ms per cycle, frames in order of time.
     assert [round(m.timestamp * 1e3) for m in syncs] == list(range(1, 31))
     stamps = [m.timestamp for m in messages]
     assert stamps == sorted(stamps)
 
 
-def test_logs_of_all_tests_or_of_none(run, pytester: pytest.Pytester):
+def test_can_log_option_selects_no_log_or_every_log(run, pytester: pytest.Pytester):
     run(FAILS_AND_PASSES, "--can-log", "never")
     assert logs(pytester) == []
     run(FAILS_AND_PASSES, "--can-log", "always", "--can-log-dir", "all")
     assert [log.name.rsplit(".py_")[1] for log in logs(pytester, "all")] == ["test_bad.log", "test_good.log"]
 
 
-def test_a_log_that_cannot_be_written_does_not_hide_the_failure(run, pytester: pytest.Pytester):
+def test_unwritable_can_log_does_not_hide_the_test_failure(run, pytester: pytest.Pytester):
     pytester.path.joinpath("taken").write_text("a file")
     result = run(FAILS_AND_PASSES, "--can-log-dir", "taken")
     result.assert_outcomes(passed=2, failed=1)
     result.stdout.fnmatch_lines(["*on purpose*", "*cannot be created*"])
 
 
-# -- buses that are there, and that are not ----------------------------------------------------------------------------
+# -- present and missing buses -----------------------------------------------------------------------------------------
 
 HIL = """
 import pytest
 
 @pytest.mark.hil
-def test_of_the_robot(bus):
+def test_bus_receives(bus):
     from atalante_hal.wire.frame import new_frames
     assert bus.receive(new_frames(1), 5.0) == 1
 """
 
 
-def test_a_hil_test_without_a_robot_fails_with_what_to_type(run):
+def test_hil_test_without_a_bus_fails_with_the_options_to_type(run):
     result = run(HIL)
     result.assert_outcomes(errors=1)
     result.stdout.fnmatch_lines(["*--can-interface socketcan --can-channel can0*--can-missing=skip*"])
     assert result.ret == pytest.ExitCode.TESTS_FAILED
 
 
-def test_it_is_skipped_only_when_that_was_asked_for(run):
+def test_hil_test_without_a_bus_is_skipped_with_can_missing_skip(run):
     result = run(HIL, "--can-missing", "skip", "-rs")
     result.assert_outcomes(skipped=1)
     result.stdout.fnmatch_lines(["SKIPPED*--can-interface socketcan*"])
 
 
 @pytest.mark.parametrize(("arguments", "outcome"), [((), "errors"), (("--can-missing=skip",), "skipped")])
-def test_a_bus_that_is_not_there_is_named(run, arguments: tuple[str, ...], outcome: str):
+def test_unknown_can_interface_is_named_with_the_valid_ones(run, arguments: tuple[str, ...], outcome: str):
     result = run(EXAMPLE, "--can-interface", "no-such", "--can-channel", "can7", "-rs", *arguments)
     result.assert_outcomes(**{outcome: 1})
     result.stdout.fnmatch_lines(["*no-such*socketcan*"])
@@ -178,20 +178,20 @@ def test_a_bus_that_is_not_there_is_named(run, arguments: tuple[str, ...], outco
         (("--can-channel", "can0"), "--can-interface socketcan"),
     ],
 )
-def test_half_a_bus_is_a_usage_error(run, arguments: tuple[str, ...], hint: str):
+def test_interface_or_channel_alone_is_a_usage_error(run, arguments: tuple[str, ...], hint: str):
     result = run(EXAMPLE, *arguments)
     assert result.ret == pytest.ExitCode.USAGE_ERROR
     result.stderr.fnmatch_lines([f"*{hint}*"])
 
 
-def test_the_same_test_passes_on_a_wire(run):
-    """python-can's virtual bus: both ends packed and unpacked by it, the emulated robot polled at its end."""
+def test_example_passes_on_a_virtual_can_bus(run):
+    """Python-can packs and unpacks the frames at both ends of its virtual bus; the emulated robot is polled at its end."""
     run(EXAMPLE, *VIRTUAL, "test-plugin-wire").assert_outcomes(passed=1)
 
 
 @pytest.fixture
 def heartbeat() -> Iterator[str]:
-    """A robot's heartbeat on a virtual channel, ten times as often as a real one; gives the channel."""
+    """Send the heartbeat of a robot on a virtual channel, at ten times the real rate; yield the channel."""
     channel, done = "test-plugin-robot", threading.Event()
     bus = can.Bus(interface="virtual", channel=channel, protocol=can.CanProtocol.CAN_FD)
     message = can.Message(arbitration_id=0x701, is_extended_id=False, is_fd=True, bitrate_switch=True, data=bytes(16))
@@ -208,33 +208,33 @@ def heartbeat() -> Iterator[str]:
     bus.shutdown()
 
 
-def test_a_hil_test_meets_the_robot_that_is_there(run, heartbeat: str):
+def test_hil_test_receives_the_frames_of_the_robot(run, heartbeat: str):
     run(HIL, *VIRTUAL, heartbeat).assert_outcomes(passed=1)
 
 
-def test_no_emulated_robot_is_put_beside_a_real_one(run, heartbeat: str):
+def test_emulated_robot_is_rejected_on_the_bus_of_a_real_one(run, heartbeat: str):
     result = run(EXAMPLE, *VIRTUAL, heartbeat, "--can-missing=skip")
     result.assert_outcomes(errors=1)
-    result.stdout.fnmatch_lines(["*must be free*got frame 0x701*pytest.mark.hil*"])
+    result.stdout.fnmatch_lines(["*must carry no frames*got frame 0x701*pytest.mark.hil*"])
 
 
-def test_a_hil_test_has_no_emulator(run):
+def test_emulator_fixture_in_a_hil_test_is_an_error(run):
     result = run(
         """
         import pytest
 
         @pytest.mark.hil
-        def test_confused(emulator):
+        def test_uses_emulator(emulator):
             pass
         """,
         *VIRTUAL,
         "test-plugin-empty",
     )
     result.assert_outcomes(errors=1)
-    result.stdout.fnmatch_lines(["*test_confused is marked hil*"])
+    result.stdout.fnmatch_lines(["*test_uses_emulator is marked hil*"])
 
 
-def test_the_marker_and_the_options_are_documented(pytester: pytest.Pytester):
+def test_help_lists_the_marker_and_the_options(pytester: pytest.Pytester):
     short = ("-p", "no:hypothesispytest")
     pytester.runpytest_inprocess("--markers", *short).stdout.fnmatch_lines(["@pytest.mark.hil: *"])
     listed = pytester.runpytest_inprocess("--help", *short).stdout

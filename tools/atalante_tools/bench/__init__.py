@@ -1,6 +1,6 @@
 """Command `atalante bench`: measure the speed of the stack against baselines in the same run.
 
-nodes, generated_c, python_can_hal -> wire, motion, startup -> catalogue -> table or JSON lines
+The modules `wire`, `motion`, `startup`, `gaits`, `gait_solve` and `log_check` contain the benchmarks, and `catalogue` lists them.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from atalante_tools.console.names import find
 from atalante_tools.console.options import json_option
 from atalante_tools.console.outcome import Failed
 from atalante_tools.console.stop_request import check_stop
-from atalante_tools.console.terminal import Progress, say, show_json, table
+from atalante_tools.console.terminal import Progress, print_message, show_json, table
 
 if TYPE_CHECKING:
     from atalante_tools.bench.catalogue import Benchmark
@@ -25,11 +25,11 @@ if TYPE_CHECKING:
 @click.option("--quick", is_flag=True, help="Run only a few rounds per benchmark, to check that all benchmarks work.")
 @json_option
 def command(names: tuple[str, ...], quick: bool, as_json: bool) -> None:
-    """Measure the speed of the stack against baselines and print the ratio of the medians.
+    """Measure the speed of the stack against baselines and print the ratios of the median times.
 
-    Value and baseline are measured alternately in short blocks. Absolute times depend on the machine and its load, so
-    only the ratio is comparable. Every benchmark checks its results; the exit code is 1 if a result is wrong. A missed
-    target is shown and does not change the exit code.
+    The measured function and the baseline run alternately in short blocks. Absolute times depend on the machine and the
+    load of the machine, so only the ratio is comparable. Every benchmark checks the computed results. The exit code is
+    1 if a result is wrong. The report shows each missed target, but a missed target does not change the exit code.
 
     \b
     Example: atalante bench
@@ -58,7 +58,7 @@ def command(names: tuple[str, ...], quick: bool, as_json: bool) -> None:
             raise Failed(f"the benchmark {benchmark.name} is invalid: {error}") from error
         progress.clear()
         for remark in measured.remarks:
-            say(f"{benchmark.name}: {remark}")
+            print_message(f"{benchmark.name}: {remark}")
         if as_json:
             show_json(line(benchmark, measured))
         rows.append(row(benchmark, measured))

@@ -6,7 +6,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Final
 
-from atalante_tools.bench import gait_solve, gaits, log_check, motion, startup, wire
+from atalante_tools.bench import gait_solve, gaits, ground, log_check, motion, startup, wire
 from atalante_tools.bench.measure import Effort, Measurement
 
 _UNITS: Final = {"us": 1e6, "s": 1.0}
@@ -14,17 +14,17 @@ _UNITS: Final = {"us": 1e6, "s": 1.0}
 
 @dataclass(frozen=True)
 class Benchmark:
-    """Benchmark with its unit, baseline and target ratio."""
+    """Benchmark with measuring function, unit, baseline and target ratio."""
 
     name: str
     run: Callable[[Effort], Measurement]
     unit: str
     baseline: str  # description of the baseline
-    target: float | None = None  # largest accepted ratio of value to baseline; None: no target
+    target: float | None = None  # largest accepted ratio of the measured time to the baseline; None means no target
 
     @property
     def per_second(self) -> float:
-        """Return the number of units in a second, such as 1e6 for us."""
+        """Return the number of time units per second, such as 1e6 for the unit us."""
         return _UNITS[self.unit]
 
 
@@ -77,6 +77,12 @@ BENCHMARKS: Final = (
         2.3,
     ),
     Benchmark(
+        "ground_tick",
+        ground.ground_tick,
+        "us",
+        "the same step of PyBullet: a robot with a patient stands on the corners of its soles",
+    ),
+    Benchmark(
         "lockstep",
         motion.lockstep,
         "s",
@@ -84,15 +90,15 @@ BENCHMARKS: Final = (
         1 / 6,
     ),
     Benchmark(
-        "judge_log",
-        log_check.judge_log,
+        "validate_log",
+        log_check.validate_log,
         "us",
         "python-can and cantools reading and decoding the same candump log, per frame",
         1 / 20,
     ),
     Benchmark(
-        "judge_against_mdf",
-        log_check.judge_against_mdf,
+        "validate_against_mdf",
+        log_check.validate_against_mdf,
         "us",
         "asammdf decoding the same frames from MF4, per frame",
         1.0,

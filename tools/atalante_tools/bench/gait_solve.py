@@ -1,4 +1,4 @@
-"""Benchmarks of the gait optimiser on one core, with two initial guesses: a kinematic guess and a neighbouring gait."""
+"""Benchmarks of the gait optimiser on one core. The initial guess is a kinematic guess or a neighbouring gait."""
 
 from __future__ import annotations
 
@@ -39,14 +39,14 @@ def gait_solve_warm(effort: Effort) -> Measurement:
 
 @cache
 def _centre() -> Gait:
-    """Return the neighbouring gait that serves as initial guess. The first call also builds the nonlinear program."""
+    """Return the neighbouring gait that serves as initial guess. The first call solves this gait."""
     from atalante_control.gait_optimization.solve import solve
 
     return solve(_CENTRE).gait
 
 
 def _solved(effort: Effort, neighbour: Gait | None) -> float:
-    """Return the median processor time to solve a gait [s], without the time to build and compile the nonlinear program."""
+    """Return the median processor time to solve a gait [s]. The time to build the nonlinear program is excluded."""
     from atalante_control.gait_optimization.solve import solve
 
     if effort.quick:

@@ -18,7 +18,7 @@ from atalante_tools.bench.measure import Effort, Measurement, require, timed
 _PATIENT: Final = Patient(75.0, 1.75)
 #: Target time for one evaluation of the gait network [s].
 _BUDGET: Final = 50e-6
-#: Target time for one gait of a library on one core [s].
+#: Target time to solve one gait of a gait library on one core [s].
 _GAIT: Final = 3.0
 _BUILDS: Final = 3
 _EVALUATIONS: Final = 100
@@ -26,7 +26,7 @@ _DYNAMICS: Final = 100
 
 
 def model_build(effort: Effort) -> Measurement:
-    """Measure the time to build the Pinocchio model from mass and height of a patient."""
+    """Measure the time to build the Pinocchio model from the mass and the height of a patient."""
     robot, parameters = load_robot(), ExoskeletonParameters()
     text = urdf(parameters, robot, _PATIENT)
     return effort.interleave(
@@ -37,7 +37,7 @@ def model_build(effort: Effort) -> Measurement:
 
 
 def inverse_dynamics(effort: Effort) -> Measurement:
-    """Measure the time to compute joint torques and ground wrench from a motion of the robot on its stance foot."""
+    """Measure the time to compute joint torques and ground wrench from the motion of a robot that stands on one foot."""
     robot = load_robot()
     dynamics = stance_dynamics(robot, _PATIENT)
     model = pinocchio_model(urdf(ExoskeletonParameters(), robot, _PATIENT), fixed_base=False).model
@@ -58,7 +58,7 @@ def inverse_dynamics(effort: Effort) -> Measurement:
 
 
 def network_evaluation(effort: Effort) -> Measurement:
-    """Measure the time of the gait network to compute twelve joint trajectories from subject parameters."""
+    """Measure the time in which the gait network computes twelve joint trajectories from subject parameters."""
     network = load_network()
     inputs = np.random.default_rng(0).uniform(network.low, network.high, (64, len(network.low)))
     spread = np.ptp([network.coefficients(row) for row in inputs], axis=0).max()
@@ -69,17 +69,20 @@ def network_evaluation(effort: Effort) -> Measurement:
 
 
 def library_one_process(effort: Effort) -> Measurement:
-    """Measure the time per gait when one process solves a library of gaits."""
+    """Measure the time per gait when one process solves all gaits of a library."""
     return _library(effort, 1)
 
 
 def library_two_processes(effort: Effort) -> Measurement:
-    """Measure the time per gait when two processes solve a library of gaits in parallel."""
+    """Measure the time per gait when two processes solve all gaits of a library in parallel."""
     return _library(effort, 2)
 
 
 def _library(effort: Effort, jobs: int) -> Measurement:
-    """Measure the time per gait of a library. The first gait of each process is excluded, because it includes the set-up."""
+    """Measure the time per gait of a library.
+
+    The first gait of each process does not count, because its time includes the set-up.
+    """
     from atalante_control.gait_optimization.library import solve_subject
     from atalante_control.gait_optimization.network_error import random_subjects
     from atalante_control.gait_optimization.parallel import fan_out

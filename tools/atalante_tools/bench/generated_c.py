@@ -1,9 +1,9 @@
 """Baseline of `decode_cycle` and `encode_cycle`: C code that cantools generates from the DBC, compiled with gcc -O2.
 
-`network -> cantools generate_c_source -> driver -> gcc -> ctypes`. The driver does the work of the codec: for each message
-of a cycle it unpacks the payload, checks the range of every signal and converts it to a double, or does the reverse. The
-time is taken inside C, without any Python code. The generated functions are those of the HAL: decode for received
-messages, encode for sent messages.
+`network -> cantools generate_c_source -> driver -> gcc -> ctypes`. The driver is a C function that does the work of the
+codec. To decode, it unpacks the payload of each message, checks the range of every signal and converts every signal to
+a double. To encode, it does the reverse. As in the HAL, received messages are decoded and sent messages are encoded.
+The clock is read inside the C code, so the measured time excludes all Python code.
 """
 
 from __future__ import annotations
@@ -50,9 +50,9 @@ def available() -> bool:
 
 
 class GeneratedC:
-    """Generated C code that decodes or encodes the messages of a codec. Row i of the frames contains message i of the codec.
+    """Generated C code that decodes or encodes the messages of a codec.
 
-    The values are in the order of the codec's signals.
+    Row i of the frames contains message i of the codec. The values are in the order of `codec.signals`.
 
     Raises:
         subprocess.CalledProcessError: If the generator or the compiler fails.
@@ -75,7 +75,7 @@ class GeneratedC:
 
     @property
     def inside(self) -> bool:
-        """Return whether every signal of the last call was in its range."""
+        """Return whether all signals in the last call were inside their DBC ranges."""
         return self._inside.value
 
     def decode(self, frames: Frames, out: Vector, repetitions: int) -> float:
@@ -89,7 +89,7 @@ class GeneratedC:
 
 @cache
 def _network() -> tuple[bytes, bytes]:
-    """Return the generated C header and the compiled functions. They are cached, because compilation takes some seconds."""
+    """Return the generated C header and the compiled functions. The result is cached to save compilation time."""
     with tempfile.TemporaryDirectory(prefix="atalante-bench-") as folder:
         generate = [sys.executable, "-m", "cantools", "generate_c_source", "--database-name", "net", "--node", _NODE]
         _run([*generate, "-o", folder, str(DBC_FILE)])
@@ -145,7 +145,7 @@ def _payload(row: int) -> int:
 
 
 def _c_name(name: str) -> str:
-    """Convert CamelCase to snake_case as cantools does."""
+    """Convert a CamelCase name to snake_case in the same way as cantools."""
     name = re.sub(r"(.)([A-Z][a-z]+)", r"\1_\2", name)
     name = re.sub(r"(_+)", "_", name)
     return re.sub(r"([a-z0-9])([A-Z])", r"\1_\2", name).lower()

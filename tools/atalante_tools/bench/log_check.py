@@ -1,7 +1,7 @@
 """Benchmarks of the CAN log validator, with other decoders as baselines.
 
-The log contains a recorded run of the emulated robot in ACTIVE, repeated to 1.3 million frames. The repeated frames have new
-alive counters and CRCs, because otherwise the rules would report repeated frames.
+The log has 1.3 million frames. It repeats a short recording of the emulated robot in the state ACTIVE. The copied
+frames get new alive counters and CRCs, because otherwise the validator would report repeated frames.
 """
 
 from __future__ import annotations
@@ -24,18 +24,18 @@ from atalante_tools.canlog.column_codec import crc_differences, crc_of_zeros
 from atalante_tools.canlog.plan import Plan
 from atalante_tools.canlog.validate.project import Project
 
-#: Length of the recording in a normal and in a quick run [cycles]. Each is a multiple of the period of every message.
+#: Length of the recording in a normal and in a quick run [cycles], a multiple of the period of every message.
 _CYCLES, _QUICK_CYCLES = 2000, 300
-#: Number of repetitions of the recording in the log, in a normal and in a quick run.
+#: Number of copies of the recording in the log of a normal run, and in the log of a quick run.
 _REPEATED, _QUICK_REPEATED = 25, 2
-#: Number of frames that the slow baseline of python-can and cantools decodes per block.
+#: Number of frames that the baseline of python-can and cantools decodes per block. It is small, because this baseline is slow.
 _SLICE = 30_000
 _MS = 1_000_000  # ns
 _BEGIN = 1_700_000_000 * 1000 * _MS
 _LENGTHS = np.array([0, 1, 2, 3, 4, 5, 6, 7, 8, 12, 16, 20, 24, 32, 48, 64])
 
 
-def judge_log(effort: Effort) -> Measurement:
+def validate_log(effort: Effort) -> Measurement:
     """Measure the CPU time to read, decode and check a candump log with all rules.
 
     The baseline reads and decodes the same log with python-can and cantools.
@@ -65,10 +65,10 @@ def judge_log(effort: Effort) -> Measurement:
         return effort.interleave(_validation(path, frames), baseline, share=0.02)
 
 
-def judge_against_mdf(effort: Effort) -> Measurement:
+def validate_against_mdf(effort: Effort) -> Measurement:
     """Measure the CPU time to check a candump log, compared with the asammdf decoder.
 
-    The baseline decodes the same frames from MF4. It parses no text and checks no rule.
+    The baseline decodes the same frames from an MF4 file, without parsing text and without checking rules.
 
     Args:
         effort: number of rounds, and whether the log is short.
@@ -98,7 +98,7 @@ def judge_against_mdf(effort: Effort) -> Measurement:
 
 
 def _validation(path: Path, frames: Frames) -> Block:
-    """Return a benchmark block that checks the log and fails if the report has findings."""
+    """Return a benchmark block that validates the log, and fails if the report has findings."""
     from atalante_dbc.foreign import catalogue
     from atalante_tools.canlog.validate.run import validate_log
 
@@ -125,7 +125,7 @@ def _dbc() -> Path:
 
 @contextmanager
 def _log(effort: Effort) -> Iterator[tuple[Path, Frames]]:
-    """Yield the path of a temporary candump log, and its frames."""
+    """Yield the path of a temporary candump log, and the frames of this log."""
     cycles, repeated = (_QUICK_CYCLES, _QUICK_REPEATED) if effort.quick else (_CYCLES, _REPEATED)
     frames, cycle, sent = _repeat(*_record(cycles), cycles, repeated)
     with tempfile.TemporaryDirectory(prefix="atalante-bench-") as folder:
@@ -135,7 +135,7 @@ def _log(effort: Effort) -> Iterator[tuple[Path, Frames]]:
 
 
 class _Tap:
-    """`FrameTap` that records all frames of the HAL with their cycles and directions."""
+    """`FrameTap` that records every frame of the HAL: content, cycle and direction."""
 
     def __init__(self) -> None:
         self.cycle = 0
@@ -150,15 +150,17 @@ class _Tap:
 
 @cache
 def _record(cycles: int) -> tuple[Frames, npt.NDArray[np.int64], npt.NDArray[np.bool_]]:
-    """Record the CAN frames while the robot holds its pose in ACTIVE.
+    """Record the CAN frames while the robot holds its pose in the state ACTIVE.
 
-    The hold compensates gravity, so the joints return to their first position and a repetition begins without a jump.
+    The pose controller compensates gravity, so the joints end where they began. Therefore the recording can be repeated
+    without a jump.
 
     Args:
         cycles: number of cycles in ACTIVE.
 
     Returns:
-        The frames, the cycle of each frame from 0, and which frames the HAL sent; shapes (n,).
+        The frames, the cycle of each frame (the first cycle is 0), and the mask of the frames that the HAL sent; shape
+        (n,) each.
     """
     from atalante_hal.types import SupervisorState
     from atalante_tools.console.options import EMBEDDED, Target
@@ -193,9 +195,9 @@ def _record(cycles: int) -> tuple[Frames, npt.NDArray[np.int64], npt.NDArray[np.
 def _repeat(
     frames: Frames, cycle: npt.NDArray[np.int64], sent: npt.NDArray[np.bool_], cycles: int, times: int
 ) -> tuple[Frames, npt.NDArray[np.int64], npt.NDArray[np.bool_]]:
-    """Repeat the recorded frames, with the alive counters and CRCs of one continuous run.
+    """Repeat the recorded frames, and give the copies the alive counters and CRCs of one continuous run.
 
-    The arrays have shape (n,), the results have shape (times * n,).
+    The given arrays have shape (n,), the returned arrays have shape (times * n,).
     """
     whole = new_frames(len(frames) * times)
     whole.view("<u8").reshape(times, -1)[:] = frames.view("<u8")

@@ -1,7 +1,7 @@
-"""Measurement of a benchmark. Short blocks of value and baseline run alternately. The results are the medians.
+"""Measurement of a benchmark: the median times of a measured function and a baseline, which run alternately in blocks.
 
-Absolute times depend on the machine and its load. Value and baseline run under the same conditions, so their ratio is comparable
-between machines.
+Absolute times depend on the machine and the load of the machine. The measured function and the baseline run under the
+same conditions, so the ratio of the two times is comparable between machines.
 """
 
 from __future__ import annotations
@@ -13,9 +13,9 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Final
 
-#: Number of blocks of the value, and of the baseline, in a normal run. The number gives a robust median.
+#: Number of blocks of the measured function in a normal run, large enough for a robust median. The baseline has as many blocks.
 ROUNDS: Final = 200
-#: Number of blocks of the value, and of the baseline, with `--quick`.
+#: Number of blocks of the measured function with the option `--quick`. The baseline has as many blocks.
 QUICK_ROUNDS: Final = 5
 
 #: Function that runs one block and returns the time per repetition [s].
@@ -23,15 +23,15 @@ Block = Callable[[], float]
 
 
 class BenchmarkError(Exception):
-    """A benchmark computed a wrong result, so its times are meaningless."""
+    """Raised if a benchmark computed a wrong result, because the measured times are then meaningless."""
 
 
 @dataclass(frozen=True)
 class Measurement:
-    """Result of a benchmark: its time and the time of its baseline [s]. A time that was not measured is None.
+    """Result of a benchmark: measured time and baseline time [s]. A time that was not measured is None.
 
-    A measured time is usually the median of many blocks. The baseline may also be a fixed limit. `remarks` are sentences to log,
-    such as the reason why a time is missing.
+    A measured time is usually the median of many blocks. The baseline may also be a fixed limit. The field `remarks`
+    contains sentences to log, such as the reason why a time is missing.
     """
 
     value: float | None
@@ -40,7 +40,7 @@ class Measurement:
 
     @property
     def ratio(self) -> float | None:
-        """Return the value divided by the baseline, or None if either was not measured."""
+        """Return the measured time divided by the baseline time, or None if one of these times was not measured."""
         return None if self.value is None or not self.baseline else self.value / self.baseline
 
 
@@ -52,17 +52,17 @@ class Effort:
     progress: Callable[[int, int], None] = field(default=lambda _done, _total: None)
 
     def rounds(self, share: float = 1.0) -> int:
-        """Return the number of rounds of the measurement, at least `QUICK_ROUNDS`.
+        """Return the number of rounds of a measurement, at least `QUICK_ROUNDS`.
 
         Args:
-            share: fraction of the usual number; below 1 for benchmarks with long blocks.
+            share: fraction of the usual number of rounds, below 1 for benchmarks with long blocks.
         """
         return QUICK_ROUNDS if self.quick else max(QUICK_ROUNDS, round(ROUNDS * share))
 
     def interleave(self, value: Block, baseline: Block, share: float = 1.0) -> Measurement:
-        """Run both blocks alternately and return the median times.
+        """Run the two blocks alternately and return the median time of each block.
 
-        Each block runs once before the measurement, to warm up. Garbage collection is off.
+        Before the measurement, each block runs once to warm up. During the measurement, garbage collection is off.
 
         Args:
             value: block of the measured function.
@@ -81,7 +81,7 @@ class Effort:
 
 
 def timed(work: Callable[[], object], repetitions: int) -> Block:
-    """Return a block that calls the function `work` `repetitions` times."""
+    """Return a block that calls the function `work` `repetitions` times, and returns the time per call [s]."""
     counter = range(repetitions)
     # The processor time of this thread excludes the time of other processes.
     now = time.thread_time
@@ -96,7 +96,7 @@ def timed(work: Callable[[], object], repetitions: int) -> Block:
 
 
 def require(condition: object, message: str) -> None:
-    """Check a condition that every valid benchmark meets.
+    """Raise an error if a condition that every valid benchmark meets is false.
 
     Args:
         condition: condition that must be true.

@@ -1,8 +1,8 @@
-"""Recorded nodes, which replace the emulator in benchmarks of the HAL. They answer each SYNC with frames prepared in advance.
+"""Recorded nodes, which replace the emulator in benchmarks of the HAL, and answer each SYNC with prepared frames.
 
-The frames have valid counters and CRCs. To answer a SYNC, they are only copied, which takes little time. The joints
-oscillate about the first pose of a swing with a small tracking error, so the guide filter gets realistic values and no
-plausibility check fails.
+The frames have valid alive counters and CRCs. To answer a SYNC, the prepared frames are only copied, which takes little
+time. The joints oscillate about the first pose of a swing with a small tracking error. Therefore the guide filter gets
+realistic values, and no plausibility check fails.
 """
 
 from __future__ import annotations
@@ -19,6 +19,7 @@ import atalante_dbc
 from atalante_control.airwalk.controller import AirwalkController
 from atalante_control.gait.gait import AIRWALK_GAIT, Gait, StepTables, load_gait
 from atalante_control.guide.filter import GuideFilter
+from atalante_control.guide.kernel import LegState
 from atalante_control.guide.shapes import CONSTANT
 from atalante_dbc import Message, Network
 from atalante_hal.bus import Stamps
@@ -33,8 +34,9 @@ from atalante_tools.bench.measure import require
 
 #: Number of cycles after which an alive counter wraps to 0.
 TURN = 256
-#: Number of poses of the recording. It is odd, because the HAL makes slow checks in every 16th cycle only, and each of these
-#: must get a new pose.
+#: Number of poses in the recording. The HAL runs its slow checks in every 16th cycle. 15 and 16 have no common factor, so the
+#: slow checks read all poses, one after the other. With 16 poses, they would always read the same pose, and report constant
+#: sensor values as a fault.
 POSES = 15
 #: Tracking error of the recorded joints [rad], too small to saturate the guide filter.
 ERROR = 0.01
@@ -64,23 +66,23 @@ def walk() -> Walk:
 
 
 def cyclic_messages(network: Network) -> list[Message]:
-    """Return the messages that the HAL receives in every cycle, in the order of the buses."""
+    """Return the messages that the HAL receives in every cycle, ordered by bus."""
     return [m for bus in network.buses for m in network.received_by("HAL") if m.bus == bus and m.cycle_ms == 1]
 
 
 def syncs(network: Network) -> list[Message]:
-    """Return the SYNC message of each bus, in the order in which the HAL sends them."""
+    """Return the SYNC messages of all buses, in the order in which the HAL sends these messages."""
     return [m for m in network.sent_by("HAL") if m.name.startswith("SYNC_")]
 
 
 class Recording:
     """Recorded frames of all nodes. Each call of `play` writes the frames of the next cycle into `frames`.
 
-    The recording consists of `POSES` payloads, and the CRC of each payload for each counter. It is small, so it stays in the
-    processor caches.
+    The recording consists of `POSES` payloads per message, and a CRC for each payload and each alive counter. The
+    recording is small, so it stays in the processor caches.
 
     Attributes:
-        cyclic: messages of every cycle, in order.
+        cyclic: messages that are sent in every cycle, in the order of the frames.
         slow: messages with longer periods, each with its period and phase [cycles].
         frames: frames of the current cycle, written by `play`.
         values: physical values of the cyclic messages, shape (POSES, signals), in the order of `Codec(cyclic).signals`.
@@ -100,13 +102,13 @@ class Recording:
         error = rng.uniform(-ERROR, ERROR, len(JOINTS))
         self.values[:, codec.slice("Position")] = (walk.tables.q[0] + error + swing) * motor
         self.values[:, codec.slice("Velocity")] = ERROR_RATE * np.cos(phase) * motor
-        # The HAL detects constant sensor values as a fault, so the noise alternates in sign.
+        # The noise alternates in sign, because the HAL reports constant sensor values as a fault.
         sign = np.where(np.arange(POSES) % 2, 1.0, -1.0)[:, None]
         for name, noise in (("Torque", 0.05), ("Gyro", 0.01), ("Accel", 0.05), ("Force", 1.0)):
             columns = codec.slice(name)
             self.values[:, columns] += sign * rng.uniform(0.5 * noise, noise, (POSES, columns.stop - columns.start))
         for side, leg in (("LEFT", 0), ("RIGHT", len(JOINTS) // 2)):
-            # The tibia pitch is the sum of hip and knee angle [rad]. Its quaternion contains half of this angle.
+            # The pitch angle of the tibia is the sum of hip and knee angle [rad]. Quaternions contain half angles.
             half_pitch = 0.5 * (walk.tables.q[0] + error)[leg + 2 : leg + 4].sum()
             for axis, value in (("W", np.cos(half_pitch)), ("Y", np.sin(half_pitch))):
                 self.values[:, codec.index(f"IMU_{side}_TIBIA_STATE", f"Quaternion{axis}")] = value
@@ -121,8 +123,8 @@ class Recording:
         image.values[image.codec.slice("NodeState")] = 5  # operational
         image.values[image.codec.slice("SupplyVoltage")] = 48.0
         gap = max(m.cycle_ms for m in slow) // len(slow)
-        #: Messages with long periods: (message, period, phase) [cycles].
-        #: The phases are spread evenly, so every block of ten cycles has the same number of frames.
+        #: Messages with long periods: (message, period in cycles, phase in cycles).
+        #: The phases are spread evenly, so that every block of ten cycles has the same number of frames.
         self.slow = tuple((m, m.cycle_ms, gap * row % m.cycle_ms) for row, m in enumerate(slow))
         self._slow = _seal(image, image.values[None, :])
         self._slow_turn = [0] * len(slow)
@@ -139,10 +141,10 @@ class Recording:
         self.pose = 0
 
     def play(self) -> int:
-        """Write the frames of the next cycle into `frames`; return their number."""
+        """Write the frames of the next cycle into `frames`; return the number of frames."""
         cycle = self.cycles
         self.cycles = cycle + 1
-        tag = self.cycles % TURN  # low byte of the SYNC cycle number, which starts at 1
+        tag = self.cycles % TURN  # low byte of the cycle number in SYNC; the first cycle number is 1
         self.pose = tag % POSES
         sealed = self._before if cycle < TURN else self._steady
         self._cyclic_memory[:] = sealed.payloads[self.pose]
@@ -175,7 +177,7 @@ def _seal(image: TransmitImage, values: Vector) -> _Sealed:
 
 
 def _e2e_fields(frames: Frames) -> tuple[npt.NDArray[np.uint8], npt.NDArray[np.uint16]]:
-    """Return a view of the counters and a view of the CRCs of the frames, shape (frames,) each."""
+    """Return a view of the alive counters and a view of the CRCs of the frames, shape (frames,) each."""
     octets, halves = (
         frames.view(np.uint8).reshape(-1, FRAME_BYTES),
         frames.view(np.uint16).reshape(-1, FRAME_BYTES // 2),
@@ -184,7 +186,10 @@ def _e2e_fields(frames: Frames) -> tuple[npt.NDArray[np.uint8], npt.NDArray[np.u
 
 
 def _walking(walk: Walk, image: TransmitImage) -> Vector:
-    """Return plausible constant values of all signals, which report no fault. Shape (signals,)."""
+    """Return a plausible value of each signal, shape (signals,). `Recording` adds motion and noise to these values.
+
+    The HAL reports no fault if it receives the resulting values.
+    """
     codec, rng = image.codec, np.random.default_rng(1)
     values = np.zeros(codec.size)
     for name, low, high in (
@@ -218,19 +223,19 @@ class RecordedBus:
         self._prepared: list[bytes] = []  # frames of each prepared cycle, in reverse order
 
     def prepare(self, cycles: int) -> None:
-        """Prepare the frames of the next cycles, so that `receive` only copies them."""
+        """Prepare the frames of the next cycles, so that `receive` only has to copy the frames."""
         memory = self._memory
         self._prepared = [memory[: self._recording.play() * FRAME_BYTES].tobytes() for _ in range(cycles)][::-1]
 
     def send(self, frames: Frames) -> None:
-        """Count the frames that the HAL sends. A batch with one frame per bus contains the SYNCs of all buses."""
+        """Count the frames that the HAL sends. A batch with exactly one frame per bus is a batch of SYNC frames."""
         count = len(frames)
         self.sent += count
         if count == self._syncs:
             self._synced = True
 
     def receive(self, frames: Frames, timeout: float = 0.0) -> int:
-        """Copy the frames of the next cycle into `frames` if SYNC was sent; return their number."""
+        """Copy the frames of the next cycle into `frames` if SYNC was sent; return the number of copied frames."""
         if not self._synced:
             return 0
         self._synced = False
@@ -249,7 +254,7 @@ class RecordedBus:
 
 @dataclass
 class RecordedHal:
-    """HAL in ACTIVE, with recorded nodes as its robot."""
+    """HAL in the state ACTIVE, with recorded nodes instead of a robot."""
 
     hal: Hal
     bus: RecordedBus
@@ -257,7 +262,7 @@ class RecordedHal:
 
 
 def active_hal() -> RecordedHal:
-    """Create a HAL with recorded nodes and run it until ACTIVE.
+    """Create a HAL with recorded nodes and run this HAL until its state is ACTIVE.
 
     Raises:
         BenchmarkError: If the HAL does not reach ACTIVE.
@@ -276,7 +281,7 @@ def active_hal() -> RecordedHal:
 
 
 class FilterOnly:
-    """Controller that consists only of the guide filter on two joints."""
+    """Controller that consists only of the guide filter for the left SH and SK."""
 
     def __init__(self, walk: Walk) -> None:
         self._guide, self._cycle = walk.guide, 0
@@ -284,12 +289,12 @@ class FilterOnly:
         self._command = Command(np.zeros(len(JOINTS)), np.full(8, 0.25))
 
     def update(self, state: State) -> Command:
-        """Return the command of one cycle."""
+        """Return the command of the controller in one cycle."""
         self.filter(self._command.torque, *state.position[2:4].tolist(), *state.velocity[2:4].tolist())
         return self._command
 
     def filter(self, torque: Vector, hip: float, knee: float, hip_rate: float, knee_rate: float) -> None:
-        """Write the guide torques u_v of the left SH and SK into `torque`.
+        """Write the virtual guide torques u_v of the left hip (SH) and the left knee (SK) into `torque`.
 
         Args:
             torque: joint torques [Nm], shape (12,); entries 2 and 3 are written.
@@ -303,4 +308,5 @@ class FilterOnly:
             self._guide.start_step(ASSISTANCE, (0.01, -0.01), (0.05, 0.05))
         self._cycle += 1
         q_hip, q_knee = self._desired
-        torque[2:4] = self._guide.tick(cycle, hip - q_hip, hip_rate, knee - q_knee, knee_rate)
+        leg = LegState(hip, knee, hip_rate, knee_rate, q_hip, q_knee, float(torque[2]), float(torque[3]), 0.0, 0.0)
+        torque[2:4] = self._guide.tick(cycle, leg)

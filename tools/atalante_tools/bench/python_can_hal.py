@@ -1,8 +1,9 @@
 """Baseline of `hal_cycle`: a HAL cycle written with python-can and cantools.
 
-It processes the same frames one by one, with the same checks of CRC, counter and range and the same filter and limiter. It
-omits the ages of values, the state machine, the telemetry record and HOLD, which makes it faster. The bus is the in-process
-`virtual` bus of python-can. The time in which the nodes send is not measured.
+This HAL processes the same frames as the Atalante HAL, but one frame at a time. The checks of CRC, counter and range,
+the guide filter and the limiter are the same. The ages of values, the state machine, the telemetry record and HOLD are
+missing, which saves time. The bus is the in-process `virtual` bus of python-can. The time in which the nodes send
+frames is not measured.
 """
 
 from __future__ import annotations
@@ -23,16 +24,16 @@ from atalante_tools.bench.nodes import FilterOnly, Recording, Walk, syncs
 
 
 class VirtualNodes:
-    """Recorded nodes on a python-can `virtual` bus."""
+    """Replay of recorded node frames on a python-can `virtual` bus."""
 
     def __init__(self, recording: Recording) -> None:
         self._recording = recording
         self._bus = can.Bus(interface="virtual", channel="bench")
 
     def answer(self, cycles: int) -> list[int]:
-        """Send the recorded frames of the next cycles to the HAL, and return the number of frames of each cycle.
+        """Send the recorded frames of the next cycles to the HAL, and return the number of frames in each cycle.
 
-        Frames from the HAL are discarded.
+        Frames that the HAL has sent are discarded.
 
         Args:
             cycles: number of cycles.
@@ -63,7 +64,7 @@ class VirtualNodes:
 
 
 class PythonCanHal:
-    """HAL written with python-can and cantools. Each call of `cycle` runs one cycle. The state is in plain arrays."""
+    """HAL written with python-can and cantools. Each call of `cycle` runs one cycle and updates the public arrays."""
 
     def __init__(self, walk: Walk, recording: Recording, controller: FilterOnly) -> None:
         network, robot = walk.network, walk.robot
@@ -102,7 +103,7 @@ class PythonCanHal:
         """Run one cycle: send SYNC, receive frames, run the guide filter and the limiter, send commands.
 
         Args:
-            count: number of frames that the nodes sent.
+            count: number of frames that the nodes sent in this cycle.
         """
         self._cycle += 1
         for frame_id in self._syncs:

@@ -1,4 +1,4 @@
-"""Benchmark of the start of a process, up to the first cycle of HAL and emulator."""
+"""Benchmark of the start of a process with HAL and emulator, up to the end of the first cycle."""
 
 from __future__ import annotations
 

@@ -1,8 +1,9 @@
-"""Codec for logs. It decodes many frames of one message in one call, for any DBC, and computes E2E CRCs.
+"""Codec for logs, which decodes many frames of one message in one call, for any DBC, and computes E2E CRCs.
 
-The codec of the control loop (`codec.Codec`) decodes many messages of one cycle and requires that no signal crosses a 64-bit
-word. This codec decodes many frames of one message. It supports Intel and Motorola layouts, signals across 64-bit words, 64-bit
-signals, IEEE floats and multiplexed signals. The values are equal to those of cantools.
+The codec of the control loop (`codec.Codec`) decodes all messages of one cycle and requires that no signal crosses a
+64-bit word. The codec in this module decodes many frames of one message. It supports Intel and Motorola layouts,
+signals across 64-bit words, 64-bit signals, IEEE floats and multiplexed signals. The decoded values are equal to those
+of cantools.
 """
 
 from __future__ import annotations
@@ -40,8 +41,8 @@ class Column:
     Attributes:
         values: physical values, shape (n,), DBC units. The type is float64 if factor or offset in the DBC is not an integer;
             otherwise int64, uint64, or Python integers for values of more than 64 bits.
-        present: mask of the frames that contain the signal, shape (n,); None: all frames. A frame without the signal contains
-            another signal of the multiplexer, so its value here is meaningless.
+        present: mask of the frames that contain the signal, shape (n,); None means all frames. A frame without this signal
+            contains another multiplexed signal, so the element of `values` for this frame is meaningless.
     """
 
     values: Values
@@ -49,7 +50,7 @@ class Column:
 
 
 def payload_words(frames: Frames, length: int) -> Words:
-    """Return the payloads as 64-bit little-endian words; row k holds word k of every frame. Shape (words, n).
+    """Return the payloads as 64-bit little-endian words. Row k contains word k of every frame. Shape (words, n).
 
     Args:
         frames: `FRAME` records, shape (n,).
@@ -60,7 +61,7 @@ def payload_words(frames: Frames, length: int) -> Words:
 
 
 class ColumnCodec:
-    """Decoder for one message layout. `fields` lists the signed fields first, then the unsigned fields, then the floats."""
+    """Decoder for one message layout. The order in `fields` is: signed fields, unsigned fields, float fields."""
 
     def __init__(self, layout: Layout) -> None:
         self.layout = layout
@@ -71,7 +72,7 @@ class ColumnCodec:
         self._plan()
 
     def index(self, name: str) -> int:
-        """Return the index of a signal in `fields`, which is its row in the result of `extract`.
+        """Return the index of a signal in `fields`. The result of `extract` has the signal in the row with this index.
 
         Raises:
             KeyError: If the message has no such signal; the error lists the signals.
@@ -84,11 +85,11 @@ class ColumnCodec:
             ) from None
 
     def _plan(self) -> None:
-        """Assign a source to each field: an Intel word, a byte-swapped Motorola word, or a word joined from two words."""
+        """Assign a source word to each field: an Intel word, a byte-swapped Motorola word, or two joined words."""
         rows: dict[tuple[str, int], int] = {}
         self._little: list[int] = []  # Intel words
         self._big: list[int] = []  # Motorola words, byte-swapped
-        self._joined: list[tuple[bool, int, int]] = []  # fields in two words: (is Motorola, first word, shift)
+        self._joined: list[tuple[bool, int, int]] = []  # fields that lie in two words: (is Motorola, first word, shift)
         sources: list[tuple[str, int]] = []
         left: list[int] = []
         for number, field in enumerate(self.fields):
@@ -115,7 +116,7 @@ class ColumnCodec:
         self._right_unsigned = np.array(right[self._signed :], np.uint64)[:, None]
 
     def extract(self, words: Words) -> Words:
-        """Return the raw code of every field in every frame, as 64 bits. Shape (fields, n).
+        """Return the raw code of every field in every frame, as a 64-bit word. Shape (fields, n).
 
         Signed codes are sign-extended. A float field keeps its bit pattern.
 
@@ -152,7 +153,7 @@ class ColumnCodec:
         field, codes = self.fields[index], raw[index]
         if field.kind == "float":
             unsigned, floating = _FLOATS[field.length]
-            with np.errstate(invalid="ignore", over="ignore"):  # a signalling NaN in a payload is no error
+            with np.errstate(invalid="ignore", over="ignore"):  # a payload may contain a signalling NaN
                 real = codes.astype(unsigned).view(floating).astype(np.float64)
                 return np.asarray(real * field.factor + field.offset)
         integers = codes.view(np.int64) if field.kind == "signed" or field.length < _WORD else codes
@@ -178,7 +179,7 @@ class ColumnCodec:
         return mask
 
     def undefined(self, raw: Words, multiplexer: str) -> Mask:
-        """Return the mask of the frames with a multiplexer value that the DBC does not define. Shape (n,).
+        """Return the mask of the frames in which a multiplexer has a value that the DBC does not define. Shape (n,).
 
         Args:
             raw: result of `extract`, shape (fields, n).
@@ -216,9 +217,9 @@ def raw_range(field: Field) -> range:
 
 
 def _integer_type(field: Field) -> Any:
-    """Return the integer type that can hold every raw and physical value of a field with integer factor and offset.
+    """Return an integer type for all raw and physical values of a field whose factor and offset are integers.
 
-    The type is int64, uint64, or object for Python integers.
+    The type is int64, uint64, or `object` for Python integers.
     """
     factor, offset = int(field.factor), int(field.offset)
     codes = raw_range(field)
@@ -234,12 +235,12 @@ def _integer_type(field: Field) -> Any:
 
 @cache
 def _byte_table(followed_by: int) -> npt.NDArray[np.uint16]:
-    """Return the CRC contribution of one payload byte, for each byte value. Shape (256,).
+    """Return the contribution of one payload byte to the CRC, for each value of this byte. Shape (256,).
 
-    The contribution is the CRC with start value 0 over the byte and the zero bytes after it.
+    The contribution is the CRC with start value 0 over this byte and a zero in place of each byte that follows.
 
     Args:
-        followed_by: number of bytes after the byte.
+        followed_by: number of bytes that follow in the CRC calculation, in the payload and in the Data ID.
     """
     zeros = bytes(followed_by)
     return np.array([crc_hqx(bytes([byte]) + zeros, 0) for byte in range(256)], np.uint16)
@@ -247,10 +248,10 @@ def _byte_table(followed_by: int) -> npt.NDArray[np.uint16]:
 
 @cache
 def _pair_table(followed_by: int) -> npt.NDArray[np.uint16]:
-    """Return the CRC contribution of two adjacent payload bytes, for each little-endian value. Shape (65536,).
+    """Return the contribution of two adjacent payload bytes to the CRC, for each little-endian value. Shape (65536,).
 
     Args:
-        followed_by: number of bytes after the two bytes.
+        followed_by: number of bytes that follow the two bytes in the CRC calculation, in the payload and in the Data ID.
     """
     return np.bitwise_xor.outer(_byte_table(followed_by), _byte_table(followed_by + 1)).reshape(-1)
 
@@ -258,7 +259,7 @@ def _pair_table(followed_by: int) -> npt.NDArray[np.uint16]:
 def crc_of_zeros(length: int, data_id: int) -> int:
     """Return the CRC of a payload of zeros.
 
-    The CRC of any payload is this CRC, XORed with the contributions of the payload bytes.
+    The CRC of any other payload is this CRC, XORed with the contributions of all payload bytes.
 
     Args:
         length: payload length with the CRC, bytes.

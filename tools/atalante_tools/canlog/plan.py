@@ -1,4 +1,4 @@
-"""Plan: the DBC compiled to arrays with one row per message, and a lookup from CAN identifiers to rows."""
+"""Plan: the DBC compiled to arrays with one element per message, and the message index of each CAN identifier."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from atalante_dbc.foreign import Catalogue, Layout, Refused
 from atalante_hal.wire.frame import FLAG_BRS, FLAG_FDF, ID_EXTENDED, header_word
 from atalante_tools.canlog.column_codec import ColumnCodec, crc_of_zeros
 
-#: Row number of an identifier that is not in the DBC.
+#: Message index for an identifier that is not in the DBC.
 UNKNOWN = -1
 _STANDARD = 1 << 11
 _ALL_BITS = 0x1FFF_FFFF
@@ -22,22 +22,22 @@ Rows = npt.NDArray[np.int16]
 
 @dataclass(frozen=True)
 class Family:
-    """Group of messages with equal fields, which are decoded together."""
+    """Family of messages: all messages with equal fields, which are decoded together."""
 
     rows: range
     codec: ColumnCodec
 
     @property
     def length(self) -> int:
-        """Return the length of the messages, bytes."""
+        """Return the payload length of the messages, bytes."""
         return self.codec.layout.length
 
 
 class Plan:
-    """Arrays of message properties, indexed by row.
+    """Arrays of message properties. The index of a message is the same in all arrays; the code calls this index `row`.
 
-    The rows are ordered by length, then by layout. Therefore the rows of a family are contiguous. The messages with an
-    unsupported layout have the last rows. Their frames are counted but not decoded.
+    The messages are ordered by length, then by layout, so the indices of messages with equal fields (a family) are
+    contiguous. Messages with an unsupported layout come last. Frames of these messages are counted but not decoded.
     """
 
     def __init__(self, catalogue: Catalogue) -> None:
@@ -52,7 +52,7 @@ class Plan:
         self._index_identifiers()
         count = len(self.layouts)
         headers = [header_word(_can_id(m), m.length, _flags(m)) for m in self.layouts]
-        #: Expected header word of each row; 0 for unsupported messages. The last element is 0, for the index `UNKNOWN`.
+        #: Expected header word of each message; 0 for an unsupported layout. The last element, for `UNKNOWN`, is 0.
         self.headers = np.array([*headers, *([0] * len(self.refused)), 0], np.uint64)
         self.lengths = np.array([m.length for m in self.layouts], np.int64)
         self.cycle_ns = np.array([1e6 * (m.cycle_ms or 0.0) if m.cyclic else 0.0 for m in self.layouts])
@@ -74,16 +74,19 @@ class Plan:
 
     @property
     def has_buses(self) -> bool:
-        """Return whether the DBC assigns messages to buses."""
+        """Return whether the DBC assigns each message to a bus."""
         return bool(self.catalogue.buses)
 
     def name(self, row: int) -> str:
-        """Return the name of the message of a row."""
+        """Return the name of the message with the index `row`."""
         count = len(self.layouts)
         return self.layouts[row].name if row < count else self.refused[row - count].name
 
     def sender(self, row: int) -> str:
-        """Return the node that sends the message of a row; empty if the DBC has no sender for the message."""
+        """Return the name of the node that sends the message with the index `row`.
+
+        The name is empty if the DBC names no sender, or if the layout of the message is not supported.
+        """
         return self.layouts[row].sender or "" if row < len(self.layouts) else ""
 
     # -- identifiers -------------------------------------------------------------------------------------------------
@@ -100,7 +103,7 @@ class Plan:
                 continue
             extended[frame_id] = row
             if mask != _ALL_BITS:
-                # With two messages in one parameter group, the masked identifier is ambiguous, so it counts as unknown.
+                # If a parameter group has two messages, the masked identifier is ambiguous and is treated as unknown.
                 known = groups.setdefault(mask, {})
                 known[frame_id & mask] = UNKNOWN if frame_id & mask in known else row
         self._standard = standard
@@ -108,7 +111,7 @@ class Plan:
         self._groups = [(np.uint32(mask), _Table(rows)) for mask, rows in groups.items()]
 
     def rows(self, can_ids: npt.NDArray[np.uint32]) -> Rows:
-        """Return the row of each identifier; `UNKNOWN` for identifiers that are not in the DBC. Shape (n,).
+        """Return the message index of each identifier; `UNKNOWN` for identifiers that are not in the DBC. Shape (n,).
 
         Args:
             can_ids: identifiers with SocketCAN flags, shape (n,).
@@ -132,9 +135,9 @@ class Plan:
         return rows
 
     def rows_in_other_format(self, can_ids: npt.NDArray[np.uint32]) -> Rows:
-        """Return the row of each identifier in the other format: 29 bits instead of 11, or 11 instead of 29. Shape (n,).
+        """Return the index of the message whose identifier is the same number in the other format. Shape (n,).
 
-        The row is `UNKNOWN` if the DBC has no such message.
+        The two formats are 11 bits and 29 bits. The index is `UNKNOWN` if the DBC has no such message.
         """
         numbers = can_ids & np.uint32(_ALL_BITS)
         short = self._standard[np.where(numbers < _STANDARD, numbers, 0)]
@@ -144,7 +147,7 @@ class Plan:
 
 
 class _Table:
-    """Lookup table from identifiers to rows, searched by bisection."""
+    """Lookup table from identifiers to message indices, searched by bisection."""
 
     def __init__(self, rows: dict[int, int]) -> None:
         self._numbers = np.array(sorted(rows), np.uint32)
@@ -168,7 +171,7 @@ def _flags(layout: Layout) -> int:
 
 
 def _shape(layout: Layout) -> tuple[object, ...]:
-    """Return the properties that are equal for all messages of a family."""
+    """Return the properties that are equal for all messages of one family."""
     fields = tuple(
         (
             *(f.name, f.start, f.length, f.big_endian, f.kind, f.factor, f.offset, f.minimum, f.maximum, f.invalid_raw),

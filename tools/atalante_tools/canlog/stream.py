@@ -1,7 +1,7 @@
 """Stream: valid frames of a chunk, sorted by message. The frames of each message are contiguous.
 
-Differences between consecutive frames (counter steps, intervals) are computed for all messages in one operation. The first frame
-of each slice is compared with the last frame of the message in the previous chunks.
+Differences between consecutive frames (counter increments, intervals) are computed for all messages in one operation.
+The first frame of each message is compared with the last frame of this message in the previous chunks.
 """
 
 from __future__ import annotations
@@ -21,25 +21,25 @@ _Column = TypeVar("_Column", bound=npt.NDArray[Any])
 
 @dataclass(frozen=True)
 class Stream:
-    """Frames of a chunk: n frames of m messages, sorted by message row. Each message keeps the order of the log."""
+    """Frames of a chunk: n frames of m messages, sorted by message. Within a message, the order is that of the log."""
 
-    rows: Rows  # row of the message of each frame, shape (n,)
+    rows: Rows  # for each frame, the index of its message in the plan, shape (n,)
     stamps: npt.NDArray[np.int64]  # ns
     indices: npt.NDArray[np.intp]  # index of each frame in the chunk, shape (n,)
     frames: Frames
-    present: npt.NDArray[np.intp]  # rows of the messages with frames, ascending, shape (m,)
+    present: npt.NDArray[np.intp]  # indices of the messages that have frames, ascending, shape (m,)
     starts: npt.NDArray[np.intp]  # index of the first frame of each message, shape (m,)
-    stops: npt.NDArray[np.intp]  # index after the last frame of each message, shape (m,)
+    stops: npt.NDArray[np.intp]  # 1 + index of the last frame of each message, shape (m,)
 
     def __len__(self) -> int:
         return len(self.rows)
 
     def before(self, column: _Column, carried: npt.NDArray[Any]) -> _Column:
-        """Return for each frame the value of the previous frame of the same message. Shape (n,).
+        """Return the value of the previous frame of the same message, for each frame. Shape (n,).
 
         Args:
             column: value of each frame, shape (n,).
-            carried: last value of each row in the previous chunks, shape (rows,).
+            carried: last value of each message in the previous chunks, shape (messages,).
         """
         shifted: Any = np.empty_like(column)
         shifted[1:] = column[:-1]
@@ -52,23 +52,26 @@ class Stream:
 
         Args:
             column: value of each frame, shape (n,).
-            carried: last value of each row, updated for the rows in the chunk, shape (rows,).
+            carried: last value of each message, shape (messages,), updated for the messages in the chunk.
         """
         carried[self.present] = column[self.stops - 1]
 
     def span(self, rows: range) -> slice:
-        """Return the slice that selects the frames of a range of rows."""
+        """Return the slice that selects the frames of a range of message indices."""
         first, end = self.present.searchsorted((rows.start, rows.stop)).tolist()
         if first == end:
             return slice(0, 0)
         return slice(int(self.starts[first]), int(self.stops[end - 1]))
 
     def of(self, row: int) -> slice:
-        """Return the slice that selects the frames of one row."""
+        """Return the slice that selects the frames of one message."""
         return self.span(range(row, row + 1))
 
     def bounds(self, family: Family) -> list[tuple[int, int, int]]:
-        """Return (row, first, end) of each message of a family; `first` and `end` are indices into the family's frames."""
+        """Return (message index, first, end) for each message of a family.
+
+        The numbers `first` and `end` are indices into the frames of the whole family.
+        """
         first, end = self.present.searchsorted((family.rows.start, family.rows.stop)).tolist()
         if first == end:
             return []
@@ -97,8 +100,8 @@ def sort(chunk: Chunk, rows: Rows, indices: npt.NDArray[np.intp] | None) -> Stre
 
     Args:
         chunk: frames of the log, n of them.
-        rows: row of each frame, shape (n,).
-        indices: indices of the frames to keep, shape (k,); None: all frames.
+        rows: for each frame, the index of its message in the plan, shape (n,).
+        indices: indices of the frames to keep, shape (k,); None means all frames.
     """
     wanted = rows if indices is None else rows[indices]
     order = np.argsort(wanted, kind="stable")

@@ -5,7 +5,8 @@ from __future__ import annotations
 import click
 
 from atalante_tools.console.options import Target, target_options
-from atalante_tools.session.airwalk import SHAPE_NAMES, Options, run_trial, trial_options
+from atalante_tools.session.airwalk import Options, run_trial, trial_options
+from atalante_tools.session.shapes import SHAPE_HELP
 
 
 @click.command()
@@ -13,8 +14,8 @@ from atalante_tools.session.airwalk import SHAPE_NAMES, Options, run_trial, tria
     "--shape",
     default="constant",
     show_default=True,
-    metavar="NAME",
-    help=f"Shape of the guide: {SHAPE_NAMES}.",
+    metavar="NAME|FILE",
+    help=f"Shape of the guide: {SHAPE_HELP}.",
 )
 @target_options(embedded=True)
 @trial_options(steps=30, out="runs/airwalk")
@@ -22,8 +23,8 @@ def command(shape: str, target: Target, options: Options, as_json: bool) -> None
     """Walk in the air inside one virtual guide, with a real or an emulated robot.
 
     The robot starts when the operator presses START (`atalante pendant start`). The operator may change the assistance
-    factor at any time. After a HOLD the command waits for the next START and counts the steps from 0 again; with -i embedded
-    it ends instead. After the steps or Ctrl-C the robot is in HOLD. If a fault ends the command, the robot stays in
+    factor at any time. After a HOLD the command waits for the next START and counts the steps from 0 again. With -i embedded
+    the command ends after a HOLD. After the steps or Ctrl-C the robot is in HOLD. If a fault ends the command, the robot stays in
     FAULT.
 
     \b

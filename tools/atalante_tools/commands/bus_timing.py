@@ -1,4 +1,4 @@
-"""Time on the bus between a SYNC and the answers to it, from receive timestamps.
+"""Measurement of the time on the bus from a SYNC to the frames that answer the SYNC, with receive timestamps.
 
 frames, stamps -> BusTiming -> Latency of states and commands, per bus
 """
@@ -17,11 +17,11 @@ from atalante_hal.types import PERIOD
 from atalante_hal.wire.frame import Frames
 from atalante_tools.session.rig import PATIENCE
 
-#: Longest accepted time from a SYNC to a state [us]. On the wall clock, the HAL waits half a cycle for the states.
+#: Longest accepted time from a SYNC to the state frame of a node [us]. In real time, the HAL waits half a cycle for the states.
 STATE_BUDGET: Final = PATIENCE * 1e6
-#: Longest accepted time from a SYNC to a command [us]: one cycle, because the drives apply the command at the next SYNC.
+#: Longest accepted time from a SYNC to a command frame of the HAL [us]. Drives apply a command at the next SYNC.
 COMMAND_BUDGET: Final = PERIOD * 1e6
-#: Node kinds that answer every SYNC with a state.
+#: Node kinds that answer every SYNC with a state frame.
 _ANSWERING: Final = ("drive", "imu", "foot")
 _NS_PER_US: Final = 1e3
 
@@ -37,7 +37,7 @@ class Latency:
     median_us: float
     p99_us: float
     max_us: float
-    wire_us: float  # worst-case sum of the wire times of these frames in one cycle, computed from the DBC
+    wire_us: float  # longest total wire time of all these frames of one cycle, computed from the DBC
     budget_us: float
 
     @property
@@ -49,11 +49,12 @@ class Latency:
 class BusTiming:
     """Measurement of the time from each SYNC to the states and commands on the same bus.
 
-    Both timestamps of a sample come from the same channel. Clocks of several adapters are never compared. The time of a
-    frame that arrives after the next SYNC is measured from that next SYNC.
+    Both timestamps of a sample come from the same channel. Clocks of several adapters are never compared. The time of each
+    frame is measured from the last SYNC before the frame, even if the frame answers an earlier SYNC.
 
     Attributes:
-        skipped: Number of frames without a sample: received before the first SYNC, or with a timestamp before that of the SYNC.
+        skipped: Number of frames that give no sample. Such a frame was received before the first SYNC, or its timestamp is
+            earlier than the timestamp of the SYNC.
     """
 
     def __init__(self, network: Network) -> None:
@@ -103,7 +104,7 @@ class BusTiming:
                     self._samples[key].append(stamp - since)
 
     def report(self) -> list[Latency]:
-        """Return the distributions with at least one sample, in the order of the network."""
+        """Return one time distribution for each bus and kind of frame that has samples, in the order of the DBC messages."""
         return [self._latency(bus, kind) for bus, kind in self._wire if self._samples[bus, kind]]
 
     def _latency(self, bus: str, kind: str) -> Latency:
@@ -114,7 +115,7 @@ class BusTiming:
 
 
 def rows(latencies: Sequence[Latency]) -> list[tuple[str, ...]]:
-    """Return the distributions as rows of a table, with the header first.
+    """Return the time distributions as rows of a table. The first row is the header.
 
     Args:
         latencies: Distributions to print.

@@ -4,23 +4,26 @@ from __future__ import annotations
 
 import click
 
-from atalante_tools.console.options import EMBEDDED, Target
-from atalante_tools.session.airwalk import SHAPE_NAMES, Options, run_trial, trial_options
+from atalante_tools.console.options import EMBEDDED, Target, engine_option
+from atalante_tools.session.airwalk import Options, run_trial, trial_options
+from atalante_tools.session.shapes import SHAPE_HELP
 
 
 @click.command()
 @click.option(
     "--shape",
-    metavar="NAME",
+    metavar="NAME|FILE",
     multiple=True,
-    help=f"Shape of the guide: {SHAPE_NAMES}. Repeat the option for several shapes.  [default: all]",
+    help=f"Shape of the guide: {SHAPE_HELP}. Repeat the option for several shapes.  [default: all]",
 )
+@engine_option
 @trial_options(steps=30, out="runs/demo")
-def command(shape: tuple[str, ...], options: Options, as_json: bool) -> None:
+def command(shape: tuple[str, ...], engine: str, options: Options, as_json: bool) -> None:
     """Walk in the air inside each guide shape with an emulated robot, faster than real time.
 
     The demo runs HAL, emulator, controller, telemetry (Zenoh, loopback only) and recording. Before the run it prints the
-    certificate of each guide. After the run it prints the largest tracking error: 1.00 is the edge of the guide.
+    certificate of each guide. After the run it prints the largest tracking error as a fraction of the distance to the edge of
+    the guide: above 1.00, a joint left the guide.
 
     \b
     Example: atalante demo
@@ -28,4 +31,4 @@ def command(shape: tuple[str, ...], options: Options, as_json: bool) -> None:
     """
     from atalante_control.guide.shapes import SHAPES
 
-    run_trial(Target(EMBEDDED, "", lockstep=True), shape or tuple(SHAPES), options, as_json=as_json)
+    run_trial(Target(EMBEDDED, "", lockstep=True, engine=engine), shape or tuple(SHAPES), options, as_json=as_json)

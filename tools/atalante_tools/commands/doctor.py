@@ -1,13 +1,12 @@
 """Command `atalante doctor`: checks whether this computer is ready for a bus, and prints the commands that fix problems.
 
-Machine (commands/machine.py) -> examine -> CheckResult -> one line each, exit code
-interface -> Adapter (atalante_hal/bus/adapters.py) -> what is known of the interface
+Machine (commands/machine.py) -> examine -> CheckResult -> one line per check, exit code
+interface -> Adapter (atalante_hal/bus/adapters.py) -> facts about the interface
 bus -> BusTiming (commands/bus_timing.py) -> time from a SYNC to states and commands, with --bus
 """
 
 from __future__ import annotations
 
-import time
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass, replace
 from typing import TYPE_CHECKING, Final
@@ -26,25 +25,25 @@ if TYPE_CHECKING:
     from atalante_tools.commands.bus_timing import BusTiming
     from atalante_tools.commands.machine import Interface, Machine
 
-#: Recommended length of a transmit queue [frames]. In one cycle, the four buses together carry 22 frames.
+#: Recommended length of a transmit queue [frames]. In one cycle, the four buses together carry at least 26 frames.
 QUEUE: Final = 1000
 #: MTU of a CAN FD interface [bytes].
 FD_MTU: Final = 72
 #: SCHED_FIFO priority that the 1 kHz loop requests.
 PRIORITY: Final = 50
-#: Longest wait for a frame [s]. After this time, clock and stop request are checked.
-POLL_TIMEOUT: Final = 0.02
 #: Linux file with the real-time limits of each user.
 LIMITS: Final = "/etc/security/limits.conf"
-#: Name of a Python package -> its purpose, and the extra of `atalante-hal` that installs it.
+#: Name of a Python package -> purpose of the package, and the pip extra of `atalante-hal` that installs it.
+#: The extra is "" if `atalante-hal` installs the package without an extra.
 PACKAGES: Final = {
     "pinocchio": ("the model of the controller", ""),
     "pybullet": ("the emulated robot", "[emulator]"),
+    "mujoco": ("the emulated robot with --engine mujoco", "[mujoco]"),
     "zenoh": ("telemetry", "[telemetry]"),
     "mcap": ("recordings", "[telemetry]"),
     "matplotlib": ("figures", "[plot]"),
 }
-#: Name of a program -> its purpose, and the Debian package that contains it.
+#: Name of a program -> purpose of the program, and name of the Debian package.
 PROGRAMS: Final = {
     "candump": ("an independent log of a bus", "can-utils"),
     "gcc": ("the C baseline of `atalante bench`", "gcc"),
@@ -53,12 +52,12 @@ PROGRAMS: Final = {
 
 @dataclass(frozen=True)
 class CheckResult:
-    """Result of one check. `--json` prints these fields."""
+    """Result of one check of the computer. The option `--json` prints all fields."""
 
     name: str
     ok: bool
-    needed: bool  # whether the chosen interface works only if this check passes
-    text: str  # result of the check for the user
+    needed: bool  # whether the chosen interface requires that this check passes
+    text: str  # result of the check in words
     fix: str = ""  # shell command that fixes the problem
 
 
@@ -95,9 +94,10 @@ def command(interface: str, channel: str, measure: bool, seconds: float, as_json
     """Check whether this computer is ready, and print the commands that fix problems.
 
     With -i, the command prints the known facts about the interface: CAN FD, driver, form of the channel, bit timing, tests.
-    With -c, it opens the channels as every other command does, and closes them. It sends no frames and changes nothing.
-    With --bus, it listens to a running HAL and its nodes, and compares the receive timestamps with the cycle of 1 ms. The exit
-    code is 1 if the chosen interface requires something that is missing, or if the bus does not fit into the cycle.
+    With -c, the command opens every channel in the same way as all other commands, and closes the channel again. With --bus,
+    the command listens to a running HAL and its nodes, and checks with receive timestamps that 99 % of the frames arrive within
+    their time budget. The command sends no frames and changes nothing. The exit code is 1 if the chosen interface requires a
+    check that fails, or if the frames are too late.
 
     \b
     Example: atalante doctor
@@ -177,7 +177,8 @@ def examine(machine: Machine, interface: str, channels: Sequence[str]) -> Iterat
 def _packages(machine: Machine, interface: str) -> Iterator[CheckResult]:
     for name, (purpose, extra) in PACKAGES.items():
         found = machine.package(name)
-        needed = not extra or (name == "pybullet" and interface == EMBEDDED)
+        # The embedded robot needs one physics engine.
+        needed = not extra or (name == "pybullet" and interface == EMBEDDED and not machine.package("mujoco"))
         text = f"{'installed' if found else 'not installed'}, for {purpose}"
         fix = engine_hint() if name == "pybullet" else f"pip install 'atalante-hal{extra}'"
         yield CheckResult(name, found, needed, text, fix)
@@ -241,7 +242,7 @@ def _python_can(machine: Machine, interface: str, channels: Sequence[str]) -> It
 
 
 def facts(adapter: Adapter) -> str:
-    """Return what is known of an interface as text for the terminal.
+    """Return the known facts about an interface as text for the terminal.
 
     Args:
         adapter: Facts about the interface.
@@ -298,7 +299,9 @@ def _measure(target: Target, seconds: float, as_json: bool) -> None:
     if timing.skipped and not as_json:
         click.echo(f"{timing.skipped} frames without an earlier SYNC on their bus")
     if late := [f"{x.kind} on {x.bus}" for x in latencies if not x.fits]:
-        raise Failed(f"99 % of the frames must be within the budget, but these are later: {', '.join(late)}")
+        raise Failed(
+            f"99 % of the frames must arrive within the time budget, got too many late frames: {', '.join(late)}"
+        )
 
 
 def listen(bus: Bus, timing: BusTiming, seconds: float, stop: StopRequest) -> None:
@@ -310,17 +313,14 @@ def listen(bus: Bus, timing: BusTiming, seconds: float, stop: StopRequest) -> No
         seconds: Listening time [s].
         stop: Stop request, which ends the listening early.
     """
-    from atalante_hal.wire.frame import new_frames
+    from atalante_tools.session.listening import received
 
-    frames = new_frames(256)
-    end = time.monotonic() + seconds
-    while (now := time.monotonic()) < end and not stop.wanted:
-        count = bus.receive(frames, min(POLL_TIMEOUT, end - now))
+    for frames, count in received(bus, seconds, stop):
         timing.accept(frames, bus.stamps, count)
 
 
 def stamp_clock(interface: str) -> str:
-    """Return the clock of the receive timestamps of an interface: hardware, kernel, software or unknown.
+    """Return which clock sets the receive timestamps of an interface: hardware, kernel, software or unknown.
 
     Args:
         interface: Name of the interface in python-can.

@@ -1,6 +1,6 @@
 """Command `atalante emulator`: emulates the robot on a bus until Ctrl-C.
 
-HAL in another process <- bus -> Line -> Emulator -> PyBullet body
+HAL in another process <-> bus <-> Line <-> Emulator <-> body
 """
 
 from __future__ import annotations
@@ -11,10 +11,10 @@ from typing import TYPE_CHECKING, Final
 
 import click
 
-from atalante_tools.console.options import SEED, Between, Target, patient_options, target_options
+from atalante_tools.console.options import SEED, Between, Target, engine_option, patient_options, target_options
 from atalante_tools.console.outcome import Failed
 from atalante_tools.console.stop_request import StopRequest, stop_requested
-from atalante_tools.console.terminal import Progress, say
+from atalante_tools.console.terminal import Progress, print_message
 
 if TYPE_CHECKING:
     from atalante_control.model import Patient
@@ -45,28 +45,71 @@ LISTEN: Final = 0.25
     metavar="X",
     help="Assistance factor that the emulated operator sets, 0 to 1.  [default: the HAL keeps its own factor]",
 )
+@engine_option
+@click.option(
+    "--ground",
+    "friction",
+    type=Between(0.01, 2.0),
+    is_flag=False,
+    flag_value=0.6,
+    metavar="MU",
+    help="Put the robot on the ground, with this coefficient of friction (0.6 without a number). A crane lowers the robot "
+    "when the HAL is ACTIVE.  [default: suspended in the air]",
+)
+@click.option(
+    "--wearer",
+    type=click.Choice(("none", "passive")),
+    default="none",
+    show_default=True,
+    help="With passive, the relaxed limbs of the wearer act on the joints as springs and dampers.",
+)
+@click.option(
+    "--virtual-operator",
+    "operator_force",
+    type=Between(0.0, 1000.0),
+    default=0.0,
+    show_default=True,
+    metavar="N",
+    help="Largest horizontal force with which a virtual operator steadies the pelvis of the robot [N]. Requires --ground. "
+    "With 0, there is no operator.",
+)
 @patient_options(legs=False)
-def command(target: Target, seed: int, operator: bool, xi: float | None, patient: Patient | None) -> None:
+def command(
+    target: Target,
+    seed: int,
+    operator: bool,
+    xi: float | None,
+    friction: float | None,
+    wearer: str,
+    operator_force: float,
+    patient: Patient | None,
+) -> None:
     """Emulate the robot on a bus: drives, IMUs, feet, vibration motors and the operator's pendant.
 
     With --wall the emulator runs in real time. With --lockstep it advances by one cycle at each SYNC of the HAL. If the
-    interface goes down, the emulator waits until it is up again. It does not start if another robot answers on the bus.
+    interface goes down, the emulator waits until the interface is up again. The emulator does not start if another robot
+    answers on the bus.
 
-    --mass and --height adjust the leg lengths to a patient. `atalante airwalk` requires the same values. The emulated
-    exoskeleton is empty and suspended in the air.
+    --mass and --height adjust the leg lengths to a patient. Give the same values to `atalante airwalk`. In the air, the
+    exoskeleton is empty. On the ground, the patient wears the exoskeleton.
 
     \b
     Example: atalante emulator -i socketcan -c vcan0
              atalante emulator -i socketcan -c vcan0 --mass 75 --height 175
+             atalante emulator -i socketcan -c vcan0 --mass 75 --height 175 --ground --engine mujoco
     """
+    if operator_force and friction is None:
+        raise click.UsageError("--virtual-operator requires a robot on the ground: add --ground")
     if xi is not None and not operator:
         raise click.UsageError(
             "--xi requires the emulated operator: remove --no-operator, or use `atalante pendant xi`"
         )
     import atalante_dbc
     from atalante_control.model import ExoskeletonParameters
+    from atalante_emulator.mechanics import Ground, Mechanics
+    from atalante_emulator.wearer import LimbParameters
     from atalante_hal.robot import load_robot
-    from atalante_tools.session.body import open_body
+    from atalante_tools.session.body import describe, open_mechanics
     from atalante_tools.session.rig import join, open_buses
 
     network, robot, exoskeleton = atalante_dbc.load(), load_robot(), ExoskeletonParameters()
@@ -74,7 +117,14 @@ def command(target: Target, seed: int, operator: bool, xi: float | None, patient
     if patient is not None:
         exoskeleton = exoskeleton.fitted(patient)
         other_side += f" --mass {patient.mass:g} --height {patient.height:g}"
-    with stop_requested() as stop, open_body(robot, exoskeleton=exoskeleton) as body:
+    ground = None if friction is None else Ground(friction, operator_force=operator_force)
+    mechanics = Mechanics(
+        describe(robot, exoskeleton, patient if ground else None),
+        target.engine,
+        ground,
+        LimbParameters() if wearer == "passive" else None,
+    )
+    with stop_requested() as stop, open_mechanics(mechanics) as body:
         from atalante_emulator.emulator import Emulator
         from atalante_emulator.pendant import Operator
         from atalante_tools.commands.emulator_line import Line
@@ -84,10 +134,13 @@ def command(target: Target, seed: int, operator: bool, xi: float | None, patient
             if message := bus.listen(LISTEN):
                 raise Failed(f"another robot answers on {target} (received {message}): stop it first")
             pendant = Operator(xi) if operator else None
-            emulator = Emulator(network, robot, body, bus, seed=seed, operator=pendant)
-            say(f"the emulated robot is on {target}; now type in another terminal: {other_side}")
+            emulator = Emulator(
+                network, robot, body, bus, seed=seed, operator=pendant, parameters=mechanics.node_parameters
+            )
+            mechanics.complete(emulator)
+            print_message(f"the emulated robot is on {target}; now type in another terminal: {other_side}")
             if not operator:
-                say(f"to operate it, type: atalante pendant start {target.arguments}")
+                print_message(f"to operate it, type: atalante pendant start {target.arguments}")
             run(emulator, target, end_condition(stop, emulator, bus))
         finally:
             bus.close()
@@ -110,7 +163,7 @@ def run(emulator: Emulator, target: Target, is_over: Callable[[], bool]) -> None
 
 
 def end_condition(stop: StopRequest, emulator: Emulator, bus: Line) -> Callable[[], bool]:
-    """Return a function that returns whether the emulator must end. The function also prints the status line when it is due.
+    """Return the end condition of the emulator. Each call of the end condition also prints the status line if it is due.
 
     Args:
         stop: Stop request of the process.
@@ -120,36 +173,44 @@ def end_condition(stop: StopRequest, emulator: Emulator, bus: Line) -> Callable[
     progress = Progress(period=STATUS_PERIOD)
     has_pendant = emulator.operator is not None
     alone = True
+    received = 0  # frames up to the last status line
 
     def is_over() -> bool:
-        nonlocal has_pendant, alone
+        nonlocal has_pendant, alone, received
         if alone and bus.other_robot:
             alone = False
             progress.clear()
-            say(f"another robot answers, too (received {bus.other_robot}): stop one of them; the HAL refuses START")
+            print_message(
+                f"another robot answers, too (received {bus.other_robot}): stop one of them; the HAL refuses START"
+            )
         if has_pendant and bus.pendant_displaced:
             has_pendant = False
             progress.clear()
-            say("another pendant sends: the emulated pendant stopped")
+            print_message("another pendant sends: the emulated pendant stopped")
         if stop.wanted:
             progress.clear()
         elif progress.due():
-            progress.show(status_line(emulator, bus))
+            progress.show(status_line(emulator, bus, silent=bus.received == received))
+            received = bus.received
         return stop.wanted
 
     return is_over
 
 
-def status_line(emulator: Emulator, bus: Line) -> str:
-    """Return the status line with cycles, frames and drive states. Append a note about another robot or a failed interface.
+def status_line(emulator: Emulator, bus: Line, *, silent: bool) -> str:
+    """Return the status line with cycles, frames and drive states.
+
+    A note follows if another robot answers, if the interface failed, or if no HAL sends.
 
     Args:
         emulator: Emulator whose status is printed.
         bus: Bus of the emulator.
+        silent: Whether no frame was received since the last status line.
     """
     states = Counter(state.name for state in emulator.drives.state)
     drives = ", ".join(f"{count} {name}" for name, count in states.items())
     lost = f", {emulator.frames_lost} lost" if emulator.frames_lost else ""
-    down = f"; {bus.down}" if bus.down else ""
+    missing = "; no SYNC received: waiting for a HAL" if silent else ""
+    down = f"; {bus.down}" if bus.down else missing
     other = "; another robot answers, too" if bus.other_robot else ""
     return f"{emulator.cycle} cycles, {bus.received} frames in, {bus.sent} out{lost}; drives: {drives}{other}{down}"

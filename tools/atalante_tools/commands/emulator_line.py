@@ -18,29 +18,29 @@ from atalante_hal.wire.e2e import COUNTER_BYTE, check_counter
 from atalante_hal.wire.frame import Frames, new_frames
 from atalante_tools.session.takeover import PendantReader, Takeover
 
-#: Time without a frame of another pendant after which the emulated pendant sends again [cycles]. It is longer than the
-#: `QUIET_CYCLES` of a pendant process, so that the process sends first.
+#: The emulated pendant resumes sending if no frame of another pendant is received for this time [cycles].
+#: The time is longer than `QUIET_CYCLES`, so that a pendant in another process resumes first.
 PENDANT_QUIET: Final = 12
-#: Number of consecutive frames of one message after which another robot is recognised.
+#: Another robot is recognised after this number of consecutive frames of one message.
 ROBOT_FRAMES: Final = 3
 
 
 class Line(ResilientBus):
-    """Bus of the emulated robot. It counts frames, and recognises other senders of the emulated nodes' messages.
+    """Bus of the emulated robot. It counts frames, and detects another robot that sends messages of the emulated nodes.
 
     The frames of the emulated pendant are dropped during and after a takeover by another pendant, see `takeover`.
 
     Attributes:
         sent: Number of frames sent so far.
         received: Number of frames received so far.
-        other_robot: Message of the emulated nodes that another robot sends. Empty: no other robot was recognised.
+        other_robot: Name of a message of the emulated nodes that another robot sends. Empty if no other robot was recognised.
     """
 
     def __init__(self, bus: Bus, network: Network) -> None:
         """Wrap a bus.
 
         Args:
-            bus: Open bus that carries the frames of all buses. `close` closes it, too.
+            bus: Open bus that carries the frames of all buses. `close` also closes this bus.
             network: Nodes and messages of the DBC.
         """
         super().__init__(bus)
@@ -76,7 +76,7 @@ class Line(ResilientBus):
         return ""
 
     def send(self, frames: Frames) -> None:
-        """Send frames as `ResilientBus.send`. Omit the frames of the emulated pendant if the takeover rule forbids them.
+        """Send frames with `ResilientBus.send`. Omit frames of the emulated pendant while the takeover rule forbids them.
 
         Args:
             frames: Frames to send.
@@ -88,7 +88,7 @@ class Line(ResilientBus):
             self.sent += len(frames)
 
     def receive(self, frames: Frames, timeout: float = 0.0) -> int:
-        """Receive frames as `ResilientBus.receive`, and recognise another pendant and another robot.
+        """Receive frames with `ResilientBus.receive`, and detect another pendant and another robot.
 
         Args:
             frames: Buffer for the received frames.
@@ -108,7 +108,7 @@ class Line(ResilientBus):
         return count
 
     def _from_another_robot(self, frames: Frames) -> list[tuple[int, int]]:
-        """Return identifier and counter of the intact frames that only the emulated nodes may send. The pendant is left out."""
+        """Return identifier and counter of each intact frame that belongs to an emulated node other than the pendant."""
         ids = frames["can_id"].tolist()
         if self._own.keys().isdisjoint(ids):
             return []

@@ -11,7 +11,7 @@ from atalante_tools.console.names import find
 from atalante_tools.console.options import SEED, Target, json_option, target_options
 from atalante_tools.console.outcome import Failed
 from atalante_tools.console.stop_request import stop_requested
-from atalante_tools.console.terminal import say, show_json
+from atalante_tools.console.terminal import print_message, show_json
 
 if TYPE_CHECKING:
     from atalante_hal.robot import Robot
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 #: Longest wait after the move until the joint is at rest [s].
 SETTLE: Final = 1.0
-#: Position deviation [rad] and speed [rad/s] below which the joint counts as at rest.
+#: Position deviation [rad] and speed [rad/s] below which the joint is considered to be at rest.
 RESTED: Final = (math.radians(0.05), math.radians(0.5))
 #: Largest accepted position deviation at the end of the move [rad]. If the deviation is larger, the command fails.
 TOLERANCE: Final = math.radians(1.0)
@@ -93,7 +93,7 @@ def command(joint: str, degrees: float, speed: float, seed: int, target: Target,
         raise Failed(
             f"{name} must reach {degrees:g} degrees, got {math.degrees(reached):.1f}: check that the joint can move freely"
         )
-    say("the robot is in HOLD")
+    print_message("the robot is in HOLD")
 
 
 def _angle(robot: Robot, index: int, name: str, degrees: float) -> float:

@@ -15,11 +15,11 @@ from atalante_hal.safety.diagnostics import by_number
 from atalante_hal.wire.frame import Frames
 from atalante_hal.wire.process_image import NEVER, ReceiveImage
 
-#: Names of the signals that contain a node state. The report shows the first signal of the list that the node sends.
+#: Names of the signals that contain a node state. The report shows the first of these signals that the node sends.
 _STATES: Final = ("HalState", "DriveState", "ImuState", "FootState", "NodeState")
 #: Milliseconds per second.
 MS: Final = 1000.0
-#: Age of the last frame above which HAL and pendant count as lost [ms].
+#: The HAL or the pendant is considered lost if its last frame is older than this time [ms].
 LOST_AGE: Final = 500
 
 
@@ -29,8 +29,8 @@ class NodeReport:
 
     node: str
     kind: str
-    age_ms: int | None  # time since the last frame of the node's fastest messages (HAL: SYNC). None: no frame received.
-    late: bool  # whether the age is above the timeout of the DBC
+    age_ms: int | None  # time since the last frame of the node's fastest messages. None if no frame was received.
+    late: bool  # whether the age exceeds the timeout in the DBC
     state: str | None
     dbc_ok: bool | None
     supply_v: float | None
@@ -59,11 +59,11 @@ class Report:
     cycle: int | None
     assistance_factor: float | None
     overruns: int | None
-    diagnostic: str | None  # most severe active diagnostic. None: no active diagnostic.
+    diagnostic: str | None  # most severe active diagnostic. None if no diagnostic is active.
     dead_man: bool | None
     nodes: tuple[NodeReport, ...]
     joints: tuple[JointReport, ...]
-    load: dict[str, tuple[float, float]]  # bus -> measured bus load and worst case from the DBC, 0 to 1
+    load: dict[str, tuple[float, float]]  # bus -> measured load, and largest possible load by the DBC, each 0 to 1
     frames: int
     foreign: int  # number of frames with an identifier that is not in the DBC
     crc_errors: int
@@ -153,7 +153,7 @@ class Observer:
     def _fast(self, node: Node) -> list[Message]:
         cyclic = [m for m in self._network.sent_by(node.name) if m.cycle_ms]
         fastest = min(m.cycle_ms for m in cyclic)
-        if node.kind == "master":  # only SYNC counts for the HAL, because the HAL does not always send commands
+        if node.kind == "master":  # the HAL always sends SYNC, but not always commands
             return [m for m in cyclic if m.name.startswith("SYNC_")]
         return [m for m in cyclic if m.cycle_ms == fastest]
 

@@ -15,7 +15,7 @@ import click
 from atalante_tools.console.options import Between, Target, target_options
 from atalante_tools.console.outcome import Failed
 from atalante_tools.console.stop_request import stop_requested
-from atalante_tools.console.terminal import say
+from atalante_tools.console.terminal import print_message
 
 if TYPE_CHECKING:
     from atalante_dbc import Network
@@ -79,7 +79,7 @@ def xi(factor: float, target: Target, seconds: float | None) -> None:
     with session(target) as operator:
         operator.take_over()
         operator.node.assist(factor)
-        say(f"assistance factor {factor:g}")
+        print_message(f"assistance factor {factor:g}")
         operator.run(seconds)
     raise SystemExit(operator.stop.exit_code)
 
@@ -134,8 +134,7 @@ def press_once(target: Target, button: str) -> None:
         operator.answer_syncs(PRESS_SYNCS)
         if operator.stop.wanted:
             raise SystemExit(operator.stop.exit_code)
-        if node.takeover_failed:
-            raise Failed("another pendant must stop sending, but it still sends: use that pendant, or end it first")
+        operator.check_takeover()
         after = node.hal
     if after in (SupervisorState.ACTIVE, SupervisorState.FULL_ASSIST):
         raise Failed(f"the HAL must be in HOLD after {button}, got {after.name}")
@@ -158,7 +157,7 @@ def session(target: Target) -> Iterator[Session]:
     from atalante_tools.session.pendant_session import Keyboard, Session
 
     network, opened = open_pendant_bus(target)
-    bus = ResilientBus(opened, say)
+    bus = ResilientBus(opened, print_message)
     try:
         with stop_requested() as stop:
             yield Session(

@@ -13,14 +13,12 @@ import click
 from atalante_tools.console.options import Between, Target, json_option, target_options
 from atalante_tools.console.outcome import Failed, FaultLatched
 from atalante_tools.console.stop_request import StopRequest, stop_requested
-from atalante_tools.console.terminal import say, show_json, table
+from atalante_tools.console.terminal import print_message, show_json, table
 
 if TYPE_CHECKING:
     from atalante_hal.bus import Bus
     from atalante_tools.commands.observer import Observer, Report
 
-#: Longest wait for a frame [s]. After this time, clock and stop request are checked.
-POLL_TIMEOUT: Final = 0.02
 _BLANK: Final = "-"
 
 
@@ -41,8 +39,8 @@ def command(target: Target, seconds: float, watch: bool, as_json: bool) -> None:
     """Listen to a bus and print its nodes, joints (degrees, Nm), supervisor state and bus load.
 
     The measured load counts each received frame with its longest possible wire time. The computed worst case counts every
-    message of the DBC at its shortest period. The command sends no frames. The exit code is 1 if
-    no frame was received, and 4 if a fault is latched.
+    message of the DBC at its shortest period. The command sends no frames. The exit code is 1 if no frame was received, and 4 if
+    a fault is latched.
 
     \b
     Example: atalante status -i socketcan -c vcan0
@@ -56,7 +54,7 @@ def command(target: Target, seconds: float, watch: bool, as_json: bool) -> None:
 
     network, robot = atalante_dbc.load(), load_robot()
     with stop_requested() as stop:
-        bus = ResilientBus(join(network, open_buses(network, target)), say)
+        bus = ResilientBus(join(network, open_buses(network, target)), print_message)
         try:
             listener = observer.Observer(network, robot, time.monotonic())
             while True:
@@ -85,12 +83,9 @@ def listen(bus: Bus, listener: Observer, seconds: float, stop: StopRequest) -> R
         seconds: Listening time [s].
         stop: Stop request, which ends the listening early.
     """
-    from atalante_hal.wire.frame import new_frames
+    from atalante_tools.session.listening import received
 
-    frames = new_frames(256)
-    end = time.monotonic() + seconds
-    while (now := time.monotonic()) < end and not stop.wanted:
-        count = bus.receive(frames, min(POLL_TIMEOUT, end - now))
+    for frames, count in received(bus, seconds, stop):
         listener.accept(frames, count, time.monotonic())
     return listener.report(time.monotonic(), bus.dropped)
 

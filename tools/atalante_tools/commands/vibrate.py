@@ -9,7 +9,7 @@ import click
 from atalante_tools.console.names import find
 from atalante_tools.console.options import Between, Target, json_option, target_options
 from atalante_tools.console.stop_request import stop_requested
-from atalante_tools.console.terminal import say, show_json
+from atalante_tools.console.terminal import print_message, show_json
 
 if TYPE_CHECKING:
     from atalante_hal.types import State
@@ -77,4 +77,4 @@ def command(motor: str, level: float, seconds: float, target: Target, as_json: b
         )
     else:
         click.echo(f"{MOTORS[index]}: commanded {level:.2f}, measured at most {strongest:.2f}, for {seconds:g} s")
-    say("the robot is in HOLD")
+    print_message("the robot is in HOLD")

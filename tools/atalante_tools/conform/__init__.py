@@ -11,7 +11,7 @@ import click
 from atalante_tools.console.options import Between, Target, json_option, target_options
 from atalante_tools.console.outcome import FAILED
 from atalante_tools.console.stop_request import check_stop, ended_by
-from atalante_tools.console.terminal import say, show_json
+from atalante_tools.console.terminal import print_message, show_json
 
 if TYPE_CHECKING:
     from atalante_tools.conform.node_tester import NodeTester
@@ -55,8 +55,9 @@ def command(
 ) -> None:
     """Test one NODE (LEFT_SK, IMU_TORSO, FOOT_LEFT, HAPTICS, PENDANT, ...) and print an acceptance report.
 
-    The command sends SYNC and commands in place of the HAL. When a drive is tested, its joint must be free to move by about
-    10 cm, and the exoskeleton must be empty. The exit code is 1 if a requirement failed or could not be tested.
+    The command sends SYNC and commands in place of the HAL. For the test of a drive, no patient may be in the
+    exoskeleton, and the joint of the drive must be free to move by about 10 cm. The exit code is 1 if a requirement
+    failed or could not be tested.
 
     \b
     Example: atalante conform LEFT_SK
@@ -85,8 +86,8 @@ def command(
             with ended_by(lambda: None):  # a second stop signal must not interrupt `make_safe`
                 make_safe(tester)
     for skipped in without:
-        say(f"skipped on request: {skipped.upper()}")
-    say(conclusion(tester, results))
+        print_message(f"skipped on request: {skipped.upper()}")
+    print_message(conclusion(tester, results))
     if any(result.verdict is not Verdict.PASSED for result in results):
         raise SystemExit(FAILED)
 
@@ -115,7 +116,7 @@ def _open_tester(name: str, target: Target, torque: float, patience: float) -> I
         from atalante_hal.bus.pair import lockstep_pair
         from atalante_tools.session.body import open_body
 
-        with open_body(robot) as body:
+        with open_body(robot, engine=target.engine) as body:
             from atalante_emulator.emulator import Emulator
             from atalante_emulator.pendant import Operator
 
@@ -140,7 +141,7 @@ def _open_tester(name: str, target: Target, torque: float, patience: float) -> I
         tester = NodeTester(network, robot, node, bus, WallClock(), HumanTechnician(patience), limits)
         tester.require_no_other_master()
         for problem in realtime():
-            say(problem)
+            print_message(problem)
         yield tester
     finally:
         bus.close()

@@ -17,15 +17,17 @@ from atalante_tools.conform.technician import Action
 
 #: NMT states in the heartbeat (CiA 301).
 NMT: Final = {0: "BOOTUP", 4: "STOPPED", 5: "OPERATIONAL", 127: "PRE_OPERATIONAL"}
-#: Number of cycles without any frame after which a node counts as switched off.
+#: Number of cycles without any frame after which a node is considered to be switched off.
 _OFF: Final = 250
-#: Number of cycles for the test of the heartbeat, and for the test of the answers to SYNC.
+#: `_HEARTBEAT_CYCLES` is the duration of the heartbeat test [cycles].
+#: `_ANSWER_CYCLES` is the duration of the test that checks the answers to SYNC [cycles].
 _HEARTBEAT_CYCLES, _ANSWER_CYCLES = 520, 200
-#: Largest accepted deviation of the mean heartbeat period, and of a single one, as a fraction of the period in the DBC.
+#: Largest accepted deviations of the measured heartbeat period, as a fraction of the period in the DBC.
+#: `_MEAN` is for the mean of all measured periods. `_SINGLE` is for each single measured period.
 _MEAN, _SINGLE = 0.1, 0.5
-#: Flood test: number of random frames per cycle, and number of cycles. The bus load stays below 100 %.
+#: The flood test sends `_FLOOD` random frames in each of `_FLOOD_CYCLES` cycles. The bus load stays below 100 %.
 _FLOOD, _FLOOD_CYCLES = 6, 100
-#: Bits of SYNC that are flipped, one in each wrong SYNC: bits of the CRC, the HAL state and the cycle number.
+#: Payload bits of SYNC in the CRC, the HAL state and the cycle number. Each damaged SYNC has one of these bits flipped.
 _DAMAGED: Final = (0, 5, 10, 15, *range(24, 32), *range(48, 56))
 #: Number of wrong SYNCs sent for each kind of defect.
 _WRONG: Final = len(_DAMAGED)
@@ -34,10 +36,11 @@ _LISTED: Final = 3
 
 
 def requirements(tester: NodeTester) -> tuple[list[Requirement], list[Requirement]]:
-    """Return the requirements for every node in two lists: those tested first, and those tested last.
+    """Return the requirements for every node in two lists: requirements to test first, and requirements to test last.
 
-    The first list is tested on the node at rest. The second list is evaluated on all frames received in the examination.
-    Requirements for the kind of node are tested between the two.
+    The requirements in the first list are tested while the node is at rest. The requirements in the second list are
+    tested on all frames received in the examination. The requirements for the kind of the node, such as drive or IMU, are
+    tested after the first list and before the second list.
     """
     node, state = tester.node.name, tester.state_message
     e2e = "AUTOSAR E2E Profile 5"
@@ -200,7 +203,7 @@ def boots_up(tester: NodeTester) -> Outcome:
 
 
 def reports_the_dbc_hash(tester: NodeTester) -> Outcome:
-    """Test NODE-02: the node reports the hash of the DBC of this computer."""
+    """Test NODE-02: the node reports the same DBC hash as this computer."""
     received = _statuses(tester) or _statuses(tester, tester.idle(2 * tester.status_message.cycle_ms))
     if not received:
         raise NotTested("no heartbeat received")
@@ -210,7 +213,7 @@ def reports_the_dbc_hash(tester: NodeTester) -> Outcome:
 
 
 def keeps_its_heartbeat(tester: NodeTester) -> Outcome:
-    """Test NODE-03: the node sends its heartbeat with the period of the DBC."""
+    """Test NODE-03: the node sends heartbeats with the period in the DBC."""
     period = tester.status_message.cycle_ms * 1e-3
     times = [frame.time for frame in _statuses(tester, tester.idle(_HEARTBEAT_CYCLES))]
     gaps = np.diff(times)
@@ -222,7 +225,7 @@ def keeps_its_heartbeat(tester: NodeTester) -> Outcome:
 
 
 def answers_every_sync(tester: NodeTester) -> Outcome:
-    """Test NODE-04: the node answers every SYNC with one state frame, or sends its state with the period in the DBC."""
+    """Test NODE-04: the node sends one state frame per SYNC, or sends state frames with the period in the DBC."""
     return _answered(tester, tester.idle(_ANSWER_CYCLES), _ANSWER_CYCLES)
 
 
@@ -294,7 +297,7 @@ def _foreign_frames(random: np.random.Generator, known: list[int]) -> Frames:
 
 
 def _all(defects_of: Callable[[list[ReceivedFrame]], list[str]]) -> Callable[[NodeTester], Outcome]:
-    """Return a test of all received frames. It passes if `defects_of` returns no defect."""
+    """Return a test of all received frames. The test passes if `defects_of` returns no defect."""
 
     def test(tester: NodeTester) -> Outcome:
         if tester.dropped:
@@ -335,7 +338,7 @@ def _statuses(tester: NodeTester, received: list[ReceivedFrame] | None = None) -
 
 
 def _answered(tester: NodeTester, received: list[ReceivedFrame], cycles: int) -> Outcome:
-    """Return the outcome: passed if the state frames in `cycles` cycles have the expected number and spacing."""
+    """Return whether the number and the spacing of the state frames in `cycles` cycles are as expected."""
     period = tester.state_message.cycle_ms
     at = [frame.cycle for frame in received if frame.message is tester.state_message]
     if period == 1:

@@ -1,6 +1,7 @@
 """Joint of the drive under test, and the CiA 402 state machine that the drive must have (IEC 61800-7-201).
 
-The table of transitions is independent of `atalante_hal.wire.cia402`, because the emulated drive uses that module.
+This module does not use the transition table of `atalante_hal.wire.cia402`. The emulated drive uses that table, so a test with
+the same table would not detect an error in it.
 """
 
 from __future__ import annotations
@@ -16,8 +17,8 @@ from atalante_tools.conform.node_tester import NodeTester, NotTested
 
 _S, _C = DriveState, Controlword
 
-#: Legal transitions: (state, command) -> (transition number in the standard, next state).
-#: A command without a transition must leave the state unchanged.
+#: Legal transitions of a drive: (state, command) -> (transition number in CiA 402, next state).
+#: A command that has no transition in the current state must leave this state unchanged.
 LEGAL: Final[dict[tuple[DriveState, Controlword], tuple[int, DriveState]]] = {
     (_S.SWITCH_ON_DISABLED, _C.SHUTDOWN): (2, _S.READY_TO_SWITCH_ON),
     (_S.READY_TO_SWITCH_ON, _C.SWITCH_ON): (3, _S.SWITCHED_ON),
@@ -45,11 +46,11 @@ ROUTES: Final[dict[DriveState, tuple[Controlword, ...]]] = {
 
 #: Largest number of cycles that a drive may take for a transition.
 FOLLOW: Final = 50
-#: Number of cycles in which a command without a transition is repeated.
+#: Number of cycles for which the test repeats a command that must leave the drive state unchanged.
 STAY: Final = 8
-#: Largest number of cycles from a command to the first state frame that shows its effect.
+#: Largest number of cycles from a command to the first state frame that shows the effect of the command.
 SHOWN: Final = 3
-#: Largest difference between measured and commanded torque that counts as noise [Nm].
+#: Largest difference between measured and commanded torque that is attributed to noise [Nm].
 NOISE: Final = 0.3
 
 
@@ -86,12 +87,12 @@ class Axis:
         Args:
             controlword: CiA 402 command.
             torque: target torque [Nm].
-            limit: largest torque [Nm]; None: the limit of the examination.
-            raw: raw code for each named quantity of this joint, in place of its value.
-            counter: alive counter in place of the next one.
-            data_id: E2E Data ID in place of that of the message.
-            length: payload length [byte] in place of that of the message.
-            flip: payload bit that is inverted after the CRC is written.
+            limit: largest torque [Nm]; None means the limit of the examination.
+            raw: raw code for each named signal of this joint, which replaces the encoded value of the signal.
+            counter: alive counter of the frame; None means the next alive counter.
+            data_id: E2E Data ID for the CRC; None means the Data ID of the message.
+            length: payload length [byte]; None means the length in the DBC.
+            flip: payload bit that is inverted after the CRC is written; None means no bit.
         """
         values = {
             self.signal("Controlword"): float(controlword),
@@ -109,13 +110,13 @@ class Axis:
         length: int | None = None,
         flip: int | None = None,
     ) -> Frames:
-        """Return a defective command frame, shape (1,). It commands the torque limit of the examination.
+        """Return a defective command frame, shape (1,). The commanded torque is the torque limit of the examination.
 
         Args:
-            counter: alive counter in place of the next one.
-            data_id: E2E Data ID in place of that of the message.
-            length: payload length [byte] in place of that of the message.
-            flip: payload bit that is inverted after the CRC is written.
+            counter: alive counter of the frame; None means the next alive counter.
+            data_id: E2E Data ID for the CRC; None means the Data ID of the message.
+            length: payload length [byte]; None means the length in the DBC.
+            flip: payload bit that is inverted after the CRC is written; None means no bit.
         """
         torque = self.tester.limits.torque
         return self.command(_C.ENABLE_OPERATION, torque, counter=counter, data_id=data_id, length=length, flip=flip)
@@ -131,14 +132,14 @@ class Axis:
         return self.tester.states(self.tester.cycle(command))
 
     def follow(self, controlword: Controlword, goal: DriveState, cycles: int = FOLLOW) -> int | None:
-        """Repeat a command until the drive is in `goal`; return the number of cycles, or None after `cycles` cycles."""
+        """Repeat a command until the drive reaches the state `goal`; return the number of cycles, or None if it does not."""
         for number in range(1, cycles + 1):
             if any(state_of(frame) == goal for frame in self.send(self.command(controlword))):
                 return number
         return None
 
     def go(self, goal: DriveState) -> None:
-        """Bring the drive to the state `goal` through the transitions of the standard.
+        """Bring the drive to the state `goal` through the transitions of CiA 402.
 
         Raises:
             NotTested: If the drive does not follow.
@@ -162,12 +163,12 @@ class Axis:
 
 
 def state_of(received: ReceivedFrame) -> int:
-    """Return the raw `DriveState` of a state frame."""
+    """Return the value of the signal `DriveState` in a state frame."""
     return int(received.values["DriveState"])
 
 
 def name_of(state: int) -> str:
-    """Return the name of a drive state in the standard."""
+    """Return the CiA 402 name of a drive state, or a text that shows the number of an undefined state."""
     try:
         return DriveState(state).name
     except ValueError:
@@ -175,17 +176,17 @@ def name_of(state: int) -> str:
 
 
 def torque_of(received: list[ReceivedFrame]) -> float:
-    """Return the measured torque with the largest magnitude [Nm]; 0 without frames."""
+    """Return the measured torque with the largest magnitude [Nm]; 0 if there are no frames."""
     return max((frame.values["Torque"] for frame in received), key=abs, default=0.0)
 
 
 def mean_torque(received: list[ReceivedFrame]) -> float:
-    """Return the mean measured torque [Nm]; NaN without frames."""
+    """Return the mean measured torque [Nm]; NaN if there are no frames."""
     return sum(frame.values["Torque"] for frame in received) / len(received) if received else math.nan
 
 
 def names_of(received: list[ReceivedFrame]) -> str:
-    """Return the names of the drive states in the frames, without repetitions, in order of first appearance."""
+    """Return the names of all drive states in the frames, each name once, in order of first appearance."""
     return " -> ".join(dict.fromkeys(name_of(state_of(frame)) for frame in received)) or "no state frame"
 
 
@@ -195,7 +196,7 @@ def all_in(received: list[ReceivedFrame], state: DriveState) -> bool:
 
 
 def emergencies_of(tester: NodeTester, first: int) -> list[int]:
-    """Return the error codes of the emergencies in `tester.received` from index `first`."""
+    """Return the error codes of the emergency messages in `tester.received`, starting at the index `first`."""
     return [
         int(frame.values["ErrorCode"])
         for frame in tester.received[first:]

@@ -1,4 +1,4 @@
-"""Requirements for a drive: CiA 402 state machine, torque and its limit, latched hold on loss of commands or SYNC."""
+"""Requirements for a drive: CiA 402 state machine, torque, torque limit, and reaction to loss of commands or SYNC."""
 
 from __future__ import annotations
 
@@ -181,5 +181,12 @@ def requirements(tester: NodeTester) -> list[Requirement]:
             "all other commands, then FAULT_RESET",
             f"{CIA402} transition 15",
             states.leaves_fault_when_reset,
+        ),
+        Requirement(
+            "DRIVE-24",
+            f"Latches a local hold when commands are {LATCHED} cycles late; a command has the counter of the next SYNC.",
+            f"three times {TOLERATED} cycles without command, then commands with the counter that follows the last command",
+            "fault matrix F25",
+            commands.latches_late_commands,
         ),
     ]

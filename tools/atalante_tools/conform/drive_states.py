@@ -1,4 +1,4 @@
-"""Tests of the state machine of a drive: transitions of CiA 402, quick stop, position hold, fault and its reset."""
+"""Tests of the state machine of a drive: transitions of CiA 402, quick stop, position hold, fault and fault reset."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ _S, _C = DriveState, Controlword
 STOP: Final = 5
 #: Largest movement of a joint in QUICK STOP ACTIVE [rad].
 MOVEMENT: Final = math.radians(1.0)
-#: Class of the CiA 301 emergency codes for temperature.
+#: Class of the CiA 301 emergency codes that report a temperature fault.
 TEMPERATURE_CLASS: Final = 0x4000
 
 
@@ -43,7 +43,7 @@ def starts_disabled(tester: NodeTester) -> Outcome:
 
 
 def makes_legal_transitions(tester: NodeTester) -> Outcome:
-    """Test DRIVE-02: the drive makes every transition of the standard."""
+    """Test DRIVE-02: the drive makes every transition of CiA 402 that a command causes."""
     axis, slowest, wrong = Axis(tester), 0, []
     unreached: set[DriveState] = set()
     for (state, controlword), (number, goal) in LEGAL.items():
@@ -65,7 +65,7 @@ def makes_legal_transitions(tester: NodeTester) -> Outcome:
 
 
 def refuses_illegal_transitions(tester: NodeTester) -> Outcome:
-    """Test DRIVE-03: a command without a transition leaves the state unchanged."""
+    """Test DRIVE-03: a command that has no transition in the current state leaves this state unchanged."""
     axis, wrong, tried = Axis(tester), [], 0
     for state in ROUTES:
         axis.go(state)
@@ -104,7 +104,7 @@ def holds_its_position(tester: NodeTester) -> Outcome:
 
 
 def trips_when_hot(tester: NodeTester) -> Outcome:
-    """Test DRIVE-22: overheating leads to FAULT, zero torque and one emergency."""
+    """Test DRIVE-22: overheating leads to FAULT, zero torque and one emergency message."""
     axis = Axis(tester)
     axis.enable()
     first = len(tester.received)

@@ -11,7 +11,7 @@ _S, _C = DriveState, Controlword
 
 
 def makes_no_torque_disabled(tester: NodeTester) -> Outcome:
-    """Test DRIVE-06: the drive makes no torque in any state below OPERATION ENABLED."""
+    """Test DRIVE-06: the drive produces no torque in the three states on the way to OPERATION ENABLED."""
     axis, most = Axis(tester), 0.0
     stay = {
         _S.SWITCH_ON_DISABLED: _C.DISABLE_VOLTAGE,
@@ -20,13 +20,13 @@ def makes_no_torque_disabled(tester: NodeTester) -> Outcome:
     }
     for state, controlword in stay.items():
         axis.go(state)
-        axis.run(3, controlword)  # wait until the torque of a previous hold has decayed
+        axis.run(3, controlword)  # wait until the torque of a previous position hold has decayed
         most = max(most, torque_of(axis.run(10, controlword, tester.limits.torque)), key=abs)
     return Outcome(abs(most) <= NOISE, f"at most {most:.2f} Nm")
 
 
 def follows_torque(tester: NodeTester) -> Outcome:
-    """Test DRIVE-07: the mean torque equals the target."""
+    """Test DRIVE-07: the mean measured torque equals the target torque."""
     axis, most, found, passed = Axis(tester), tester.limits.torque, [], True
     axis.enable()
     for target_torque in (0.0, most, -most, most / 2.0):
@@ -51,7 +51,7 @@ def respects_the_limit(tester: NodeTester) -> Outcome:
 
 
 def takes_the_largest_limit(tester: NodeTester) -> Outcome:
-    """Test DRIVE-09: the drive accepts the largest MaxTorque of the DBC as its limit."""
+    """Test DRIVE-09: the drive accepts the largest MaxTorque of the DBC as torque limit."""
     axis, target_torque = Axis(tester), tester.limits.torque
     axis.enable()
     usual = mean_torque(axis.run(12, _C.ENABLE_OPERATION, target_torque)[2 * SHOWN :])

@@ -1,4 +1,4 @@
-"""Requirements of each kind of node, in the order in which they are tested."""
+"""Requirements for the node under test (drive, IMU, foot, haptics node or pendant), in the order of the tests."""
 
 from __future__ import annotations
 
@@ -20,7 +20,8 @@ _REQUIREMENTS = {
 def requirements_of(tester: NodeTester) -> list[Requirement]:
     """Return the requirements for the node under test, in the order of the tests.
 
-    The order is: start-up and rest, requirements for the kind of node, requirements for all received frames.
+    The requirements at start-up and at rest come first. The requirements for the kind of the node, such as drive or IMU,
+    come next. The requirements for all received frames come last.
     """
     before, after = any_node.requirements(tester)
     special = _REQUIREMENTS[tester.node.kind](tester)

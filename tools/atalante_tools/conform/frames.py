@@ -1,4 +1,4 @@
-"""Sender of valid or defective test frames of one message, and receiver that records every defect of a frame."""
+"""Sender of valid or defective test frames of a message, and receiver that records every defect of a received frame."""
 
 from __future__ import annotations
 
@@ -17,10 +17,15 @@ _FD: Final = FLAG_FDF | FLAG_BRS
 
 
 class MessageSender:
-    """Sender of test frames of one message. Frames are valid, unless the caller of `frame` requests a defect."""
+    """Sender of test frames of one message. Frames are valid, unless the caller of `frame` requests a defect.
 
-    def __init__(self, message: Message) -> None:
-        self.message = message
+    Args:
+        message: message to send.
+        sync: sender of the SYNC if the message is a command. A command has the alive counter of the SYNC of the next cycle.
+    """
+
+    def __init__(self, message: Message, sync: MessageSender | None = None) -> None:
+        self.message, self._sync = message, sync
         self._codec = Codec([message])
         self._template = self._codec.template()
         self._values = np.zeros(self._codec.size)
@@ -37,14 +42,15 @@ class MessageSender:
         classic: bool = False,
         flip: int | None = None,
     ) -> Frames:
-        """Return the next frame to send, shape (1,). The keyword arguments can give it defects.
+        """Return the next frame to send, shape (1,). The keyword arguments can make the frame defective.
 
         Args:
             values: physical value of each signal, in DBC units; signals that are missing are 0.
-            raw: raw codes to write in place of values, without range check.
-            counter: alive counter in place of the next one; the sequence does not advance.
-            data_id: E2E Data ID in place of that of the message.
-            length: payload length [byte] in place of that of the message; the CRC is valid for this length.
+            raw: raw code per signal, which replaces the encoded value and is not range-checked.
+            counter: alive counter of the frame; None means the next alive counter. For a command, it is the alive counter
+                that its SYNC will have if the frame is sent after the next SYNC. A given counter does not advance the sequence.
+            data_id: E2E Data ID for the CRC; None means the Data ID of the message.
+            length: payload length [byte], for which the CRC is valid; None means the length in the DBC.
             classic: True for a classic CAN frame.
             flip: payload bit that is inverted after the CRC is written.
         """
@@ -61,7 +67,8 @@ class MessageSender:
             shift, mask = np.uint64(signal.start % 64), np.uint64((1 << signal.length) - 1)
             word[0] = word[0] & ~(mask << shift) | np.uint64(code) << shift
         if counter is None:
-            self._counter = counter = (self._counter + 1) & 0xFF
+            before = self._counter if self._sync is None else self._sync.counter + 1
+            self._counter = counter = (before + 1) & 0xFF
         data[COUNTER_BYTE] = counter
         if length is not None:
             frames["len"] = length
@@ -76,13 +83,13 @@ class MessageSender:
 
     @property
     def counter(self) -> int:
-        """Return the alive counter of the last frame whose counter was not chosen by the caller."""
+        """Return the alive counter of the last frame that was created without the argument `counter`."""
         return self._counter
 
 
 @dataclass(frozen=True)
 class ReceivedFrame:
-    """Frame received from the node under test, with its defects. Defective frames are also recorded."""
+    """Received frame of the node under test, with a list of all defects of the frame."""
 
     message: Message
     cycle: int  # number of the cycle in which the frame was received
@@ -113,7 +120,7 @@ class MessageReceiver:
         self._reserved = (~used)[: message.length]
 
     def decode(self, frame: Frames, cycle: int, time: float) -> ReceivedFrame:
-        """Decode one frame and record its defects.
+        """Decode one frame and record all defects of the frame.
 
         Args:
             frame: received frame, shape (1,).

@@ -1,4 +1,4 @@
-"""Requirements for the haptics node: its eight motors follow their levels as first-order lags, and stop on timeout."""
+"""Requirements for the haptics node: eight motors follow commanded levels as first-order lags and stop on timeout."""
 
 from __future__ import annotations
 
@@ -18,11 +18,11 @@ E2E: Final = "AUTOSAR E2E Profile 5"
 TIME_CONSTANT = 0.06
 #: Largest accepted deviation of the amplitude from a first-order lag, as a fraction of full amplitude.
 LAG = 0.05
-#: Number of cycles within which a motor must reach its commanded level, and longest wait for it.
+#: Number of cycles within which a motor must reach its commanded level.
 _SETTLED: Final = 250
-#: Largest deviation of a measured amplitude from its expected value that counts as noise, as a fraction of full amplitude.
+#: Largest difference between measured and expected amplitude that is attributed to noise (fraction of full amplitude).
 _STILL: Final = 0.02
-#: Number of cycles in which a test of defective commands sends them.
+#: Number of defective commands that a test sends, one per cycle.
 _BAD: Final = 40
 
 
@@ -104,15 +104,15 @@ def requirements(tester: NodeTester) -> list[Requirement]:
 
 
 def is_still(tester: NodeTester) -> Outcome:
-    """Test HAPTICS-01: the amplitude is 0 without commands."""
+    """Test HAPTICS-01: the vibration amplitude of every motor is 0 without commands."""
     most = _amplitudes(tester, tester.idle(50)).max()
     return Outcome(bool(most <= _STILL), f"amplitude {most:.3f} at most")
 
 
 def follows_like_a_lag(tester: NodeTester) -> Outcome:
-    """Test HAPTICS-02: the amplitude approaches the level as a first-order lag.
+    """Test HAPTICS-02: the amplitude of each motor approaches the commanded level as a first-order lag.
 
-    The distance to the level shrinks by the same factor from one state frame to the next.
+    In a first-order lag, the distance from the level shrinks by the same factor from one state frame to the next.
     """
     _settle(tester, 0.0)
     remaining = 1.0 - _amplitudes(tester, _run(tester, _SETTLED, 1.0))
@@ -132,7 +132,7 @@ def follows_like_a_lag(tester: NodeTester) -> Outcome:
 
 
 def reaches_both_ends(tester: NodeTester) -> Outcome:
-    """Test HAPTICS-03: the amplitude is 1 at level 1, and 0 at level 0."""
+    """Test HAPTICS-03: the amplitude of every motor is 1 at level 1, and 0 at level 0."""
     high = _amplitudes(tester, _run(tester, _SETTLED, 1.0))[-1].min()
     low = _amplitudes(tester, _run(tester, _SETTLED, 0.0))[-1].max()
     return Outcome(
@@ -141,7 +141,7 @@ def reaches_both_ends(tester: NodeTester) -> Outcome:
 
 
 def moves_one_motor(tester: NodeTester) -> Outcome:
-    """Test HAPTICS-04: a level drives its own motor and no other."""
+    """Test HAPTICS-04: a commanded level drives the motor of this level and no other motor."""
     wrong = []
     names = _motors(tester)
     for index, name in enumerate(names):
@@ -153,7 +153,7 @@ def moves_one_motor(tester: NodeTester) -> Outcome:
 
 
 def stays_in_range(tester: NodeTester) -> Outcome:
-    """Test HAPTICS-05: the amplitude is at most 1 for a level above the DBC range."""
+    """Test HAPTICS-05: the amplitude of every motor is at most 1 for a commanded level above the DBC range."""
     found, passed = [], True
     for code in (201, 230, 254):
         _settle(tester, 0.5)
@@ -213,12 +213,12 @@ def _run(tester: NodeTester, cycles: int, level: float, only: str | None = None)
 
 
 def _settle(tester: NodeTester, level: float, only: str | None = None) -> Vector:
-    """Command a level until the motors reach it, but for at most `_SETTLED` cycles; return the last amplitudes.
+    """Command a level until the motors reach this level or `_SETTLED` cycles have passed; return the last amplitudes.
 
     Args:
         tester: tester of the haptics node.
         level: level of the motors, 0 to 1.
-        only: name of the only motor with that level; None: all motors.
+        only: name of the only motor with this level, while the other motors have level 0; None means all motors.
 
     Returns:
         Last measured amplitudes, shape (motors,), 0 to 1.

@@ -1,7 +1,7 @@
-"""Node tester, which replaces the HAL for one node. Each cycle is `SYNC -> answer of the node -> command`.
+"""Node tester, which replaces the HAL for one node. Each cycle is `SYNC -> state message of the node -> command`.
 
-Every frame of the node is recorded. The same examination runs on a real bus in real time, and on the emulator in this
-process in lock-step.
+The tester records every frame of the node. The same examination tests a real node on a bus in real time, or an emulated
+node in this process in lock-step.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
 #: Largest number of frames that one `receive` call returns.
 _RECEIVE_BUDGET: Final = 128
-#: Longest wait for the answer of the node before the command is sent [s].
+#: Longest wait for the state message that answers SYNC [s]. After this time, the command is sent without it.
 _PATIENCE: Final = 0.6e-3
 #: Time to listen for another HAL before the first frame is sent [s].
 _LISTEN: Final = 0.2
@@ -38,14 +38,14 @@ class NotTested(Exception):  # noqa: N818
 class Clock(Protocol):
     """Clock that starts the cycles."""
 
-    delay: float  # longest delay of a cycle start on this computer [s]; each test resets it to 0
+    delay: float  # longest delay of a cycle start on this computer [s], reset to 0 at the start of each test
 
     def next_cycle(self, *, sync: bool, listen: Callable[[float], None]) -> None:
         """Wait for the start of the next cycle.
 
         Args:
             sync: True if the cycle starts with SYNC.
-            listen: function that receives frames for a given time [s]; called during the wait.
+            listen: function that receives frames for a given time [s]. It is called during the wait.
         """
 
     def time_of(self, stamp_ns: int, cycle: int) -> float:
@@ -60,7 +60,7 @@ class Clock(Protocol):
 class LockStep:
     """Lock-step clock for an emulated node, which answers without delay.
 
-    Cycles without SYNC advance the emulated node as in `Emulator.run`.
+    An emulated node normally runs one cycle per SYNC. After several cycles without SYNC, this clock advances the node.
     """
 
     def __init__(self, emulator: Emulator) -> None:
@@ -72,7 +72,7 @@ class LockStep:
         self._silent = 0
 
     def next_cycle(self, *, sync: bool, listen: Callable[[float], None]) -> None:
-        """Start the next cycle without a wait. Advance the emulated node if the tester has not sent SYNC for several cycles."""
+        """Start the next cycle without a wait. Advance the emulated node if no SYNC was sent in the last cycles."""
         self._silent = 0 if sync else self._silent + 1
         if self._silent >= self._watchdog:
             self._emulator.idle()
@@ -83,7 +83,7 @@ class LockStep:
 
 
 class WallClock:
-    """Real-time clock at 1 kHz with absolute deadlines. Missed cycles are skipped to avoid bursts of SYNC frames."""
+    """Real-time clock at 1 kHz with absolute deadlines. The clock skips missed cycles to avoid SYNC bursts."""
 
     def __init__(self) -> None:
         self.delay = 0.0
@@ -113,12 +113,12 @@ class Limits:
 
 
 class NodeTester:
-    """Tester of one node. It sends SYNC and commands, and records every frame of the node.
+    """Tester of one node, which sends SYNC and commands, and records every frame of the node.
 
     Attributes:
         received: frames of the node since the start of the examination.
         frame_count: number of frames of the node recorded so far, including the frames that were removed from `received`.
-        cycle_number: number of cycles of 1 ms, with or without SYNC.
+        cycle_number: number of past cycles of 1 ms, with or without SYNC.
     """
 
     def __init__(
@@ -144,7 +144,7 @@ class NodeTester:
             m for m in network.received_by(node.name) if m.sender == "HAL" and m.cycle_ms and m != self.sync.message
         ]
         commands = [m for m in commands if not m.name.endswith("_STATUS")]
-        self._command = MessageSender(commands[0]) if commands else None
+        self._command = MessageSender(commands[0], self.sync) if commands else None
         self._bus = bus
         self._receivers = {m.frame_id: MessageReceiver(m) for m in network.sent_by(node.name)}
         self._masters = {m.frame_id: m.name for m in network.sent_by("HAL")}
@@ -216,8 +216,8 @@ class NodeTester:
         """Return the next SYNC, optionally defective. Shape (1,).
 
         Args:
-            counter: alive counter in place of the next one.
-            length: payload length [byte] in place of that of the message.
+            counter: alive counter of the frame; None means the next alive counter.
+            length: payload length [byte]; None means the length in the DBC.
             classic: True for a classic CAN frame.
             flip: payload bit that is inverted after the CRC is written.
         """
@@ -275,11 +275,11 @@ class NodeTester:
     def run_until(
         self, shows: Callable[[list[ReceivedFrame]], bool], cycle: Callable[[], list[ReceivedFrame]] | None = None
     ) -> bool:
-        """Run cycles until a condition holds, for at most `technician.patience`. Return whether it holds.
+        """Run cycles until a condition holds, for at most `technician.patience`; return whether the condition holds.
 
         Args:
             shows: condition on the frames received in a cycle.
-            cycle: function that runs one cycle; None: `self.cycle`.
+            cycle: function that runs one cycle; None means `self.cycle`.
         """
         cycle = cycle or self.cycle
         return any(shows(cycle()) for _ in range(round(self.technician.patience / PERIOD)))
@@ -290,15 +290,15 @@ class NodeTester:
         shows: Callable[[list[ReceivedFrame]], bool],
         cycle: Callable[[], list[ReceivedFrame]] | None = None,
     ) -> bool:
-        """Request a manual action, run cycles, and return whether its effect was measured.
+        """Request a manual action, run cycles, and return whether the effect of the action was measured.
 
         Args:
             action: manual action on the node.
             shows: function that returns whether the frames of one cycle show the effect.
-            cycle: function that runs one cycle; None: `self.cycle`.
+            cycle: function that runs one cycle; None means `self.cycle`.
 
         Raises:
-            NotTested: If there is no effect and the action may not have been carried out.
+            NotTested: If no effect was measured, and the technician may have ignored the request.
         """
         technician = self.technician
         technician.request(action, self.node.name)

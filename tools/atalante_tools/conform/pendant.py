@@ -12,7 +12,7 @@ from atalante_tools.conform.technician import Action
 
 #: Values of `PENDANT_STATE.Request`.
 START, STOP, HOLD = 1, 2, 3
-#: Number of cycles after a press in which the pendant must send no further request.
+#: Number of cycles after a button press in which the pendant must not send a second request.
 _AFTER: Final = 50
 SOURCE: Final = "DBC PENDANT_STATE"
 
@@ -60,7 +60,7 @@ def requirements(_tester: NodeTester) -> list[Requirement]:
 
 
 def sends_no_request(tester: NodeTester) -> Outcome:
-    """Test PENDANT-01: the request counter does not change without a press."""
+    """Test PENDANT-01: the request counter of the pendant does not change without a button press."""
     received = tester.states(tester.idle(200))
     if not received:
         raise NotTested("no state frame received")
@@ -69,7 +69,7 @@ def sends_no_request(tester: NodeTester) -> Outcome:
 
 
 def reports_the_dead_man(tester: NodeTester) -> Outcome:
-    """Test PENDANT-02: the dead-man switch is reported as released and as pressed."""
+    """Test PENDANT-02: the pendant reports the dead-man switch as released and as pressed."""
 
     def reports(pressed: bool) -> Callable[[list[ReceivedFrame]], bool]:
         return lambda received: any(bool(frame.values["DeadMan"]) is pressed for frame in tester.states(received))

@@ -1,4 +1,4 @@
-"""Requirement for a node, and examination that tests the requirements in order and gives each a verdict."""
+"""Requirement for a node, and examination that tests all requirements in order and returns a verdict on each."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import Final
 
 from atalante_tools.conform.node_tester import NodeTester, NotTested
 
-#: Delay of a cycle start [s]. With a larger delay, this computer may be the cause of a failed test.
+#: Largest accepted delay of a cycle start [s]. After a larger delay, this computer may be the cause of a failed test.
 LATE: Final = 2e-3
 #: Number of attempts for a test that fails while this computer is late.
 ATTEMPTS: Final = 3
@@ -69,7 +69,8 @@ def _result(tester: NodeTester, requirement: Requirement) -> Result:
         silence = _silence(tester, frames, cycle)
         measured = silence + outcome.measured
         if outcome.passed:
-            # Without a frame of the node, the requirement was not tested: an absent node also sends no forbidden frame.
+            # Without a frame of the node, the requirement is not tested.
+            # Otherwise a node that is switched off would pass, because it sends no forbidden frame.
             return Result(requirement, Verdict.NOT_TESTED if silence else Verdict.PASSED, measured)
         if tester.clock.delay < LATE:
             return Result(requirement, Verdict.FAILED, measured)
@@ -80,7 +81,7 @@ def _result(tester: NodeTester, requirement: Requirement) -> Result:
 def _silence(tester: NodeTester, frames: int, cycle: int) -> str:
     """Return a remark if the test received no frame of the node, otherwise an empty text.
 
-    A test that runs no cycle evaluates all frames received before it.
+    If the test runs no cycles, it evaluates all frames that were received earlier.
 
     Args:
         tester: tester of the node.

@@ -13,12 +13,12 @@ from atalante_tools.conform.node_tester import NodeTester, NotTested
 from atalante_tools.conform.requirement import Outcome, Requirement
 
 GRAVITY: Final = 9.81  # m/s2
-#: Number of cycles over which a sensor is measured.
+#: Number of cycles in which a test measures a sensor.
 _MEASURED: Final = 100
 NORM: Final = 1e-3  # largest deviation of a quaternion from unit length
 SPECIFIC_FORCE: Final = 0.3  # largest deviation of the mean acceleration from gravity [m/s2]
-TILT: Final = math.radians(3.0)  # largest angle between measured gravity and the vertical of the attitude [rad]
-RATE: Final = 0.05  # largest deviation of the mean gyro rate from the rate of the attitude [rad/s]
+TILT: Final = math.radians(3.0)  # largest angle between measured gravity and the measured vertical [rad]
+RATE: Final = 0.05  # largest deviation of the mean gyro rate from the rate of change of the attitude [rad/s]
 UNLOADED: Final = 10.0  # largest mean force on an axis of an unloaded force cell [N]
 
 _VECTOR: Final = ("X", "Y", "Z")
@@ -122,7 +122,7 @@ def agrees_with_gravity(tester: NodeTester) -> Outcome:
 def agrees_with_attitude(tester: NodeTester) -> Outcome:
     """Test IMU-04: the mean gyro rate equals the rate of change of the attitude.
 
-    An emulated robot without power sinks slowly, so the rate is compared with the attitude instead of zero.
+    An emulated robot without power sinks slowly, so the expected gyro rate is not zero.
     """
     measured = _signals(tester, [f"Quaternion{axis}" for axis in ("W", *_VECTOR)] + [f"Gyro{axis}" for axis in _VECTOR])
     (w0, *v0), (w1, *v1) = measured[0, :4].tolist(), measured[-1, :4].tolist()

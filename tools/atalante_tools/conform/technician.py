@@ -6,7 +6,7 @@ from enum import Enum
 from typing import TYPE_CHECKING, Protocol
 
 from atalante_hal.robot import JOINTS
-from atalante_tools.console.terminal import say
+from atalante_tools.console.terminal import print_message
 
 if TYPE_CHECKING:
     from atalante_emulator.emulator import Emulator
@@ -31,15 +31,15 @@ class Technician(Protocol):
     """Person or program that carries out manual actions on the node."""
 
     patience: float  # longest wait for the effect of an action [s]
-    fresh: bool  # True: the node was switched on at the start of the examination
-    certain: bool  # True: every requested action is carried out; False: a person may have ignored the request
+    fresh: bool  # whether the node was switched on at the start of the examination
+    certain: bool  # whether every requested action is carried out; a person may ignore a request
 
     def request(self, action: Action, node: str) -> None:
-        """Carry out the action, or ask a person for it."""
+        """Carry out the action, or ask a person to carry out the action."""
 
 
 class HumanTechnician:
-    """Person beside the node, who gets instructions on the terminal."""
+    """Person beside the node. The terminal shows this person the instruction for each action."""
 
     def __init__(self, patience: float) -> None:
         self.patience = patience
@@ -48,11 +48,11 @@ class HumanTechnician:
 
     def request(self, action: Action, node: str) -> None:
         """Print the instruction for the action on stderr."""
-        say(f"please {action.value.format(node=node)}  (waiting {self.patience:.0f} s)")
+        print_message(f"please {action.value.format(node=node)}  (waiting {self.patience:.0f} s)")
 
 
 class EmulatorTechnician:
-    """Program that carries out manual actions on an emulated robot. The robot starts with the examination."""
+    """Program that carries out manual actions on an emulated robot, which is powered on when the examination starts."""
 
     def __init__(self, emulator: Emulator, operator: Operator) -> None:
         self._emulator, self._operator = emulator, operator

@@ -19,6 +19,16 @@ if TYPE_CHECKING:
 _Command = TypeVar("_Command", bound=Callable[..., Any])
 
 EMBEDDED: Final = "embedded"
+#: Physics engines of the emulated robot, as in `atalante_emulator.bodies.ENGINES`. The first one is the default.
+PYBULLET, MUJOCO = ENGINES = ("pybullet", "mujoco")
+#: Option `--engine`.
+engine_option = click.option(
+    "--engine",
+    type=click.Choice(ENGINES),
+    default=PYBULLET,
+    show_default=True,
+    help="Physics engine of the emulated robot. MuJoCo runs on every supported version of Python.",
+)
 #: Option `--json`. JSON objects go to stdout, all other text goes to stderr.
 json_option = click.option("--json", "as_json", is_flag=True, help="Print JSON objects on stdout, one per line.")
 
@@ -42,7 +52,7 @@ class Between(click.FloatRange):
 
 
 class OutputFile(click.Path):
-    """Option type for an output file in an existing folder. Its suffix must be one of the allowed suffixes.
+    """Option type for an output file in an existing folder. The suffix of the file must be one of the allowed suffixes.
 
     An invalid path is rejected before the command starts its work.
     """
@@ -65,7 +75,7 @@ class OutputFile(click.Path):
         return path
 
 
-#: A typed number of at least 5 is a length in centimetres. A smaller number is a length in metres.
+#: If the user enters a length as a number of at least 5, the number is in centimetres. A smaller number is in metres.
 _CENTIMETRES: Final = 5.0
 
 #: Default step length [m] and default step duration [s] of a patient.
@@ -73,7 +83,7 @@ DEFAULT_STEP: Final = (0.15, 0.9)
 
 
 def length(text: str) -> float:
-    """Convert a typed length to metres (option type). For example, 1.75 and 175 are both 1.75 m.
+    """Convert a length that the user entered to metres (option type). For example, 1.75 and 175 are both 1.75 m.
 
     Args:
         text: Length of a body part or a step. Numbers below 5 are metres, other numbers are centimetres.
@@ -91,12 +101,12 @@ def length(text: str) -> float:
 def options_as(
     name: str, meaning: Callable[..., object], options: Sequence[Callable[[Any], Any]]
 ) -> Callable[[_Command], _Command]:
-    """Return a decorator that adds several options to a command and passes them to it as one argument.
+    """Return a decorator that adds several options to a command. The command receives their values as one argument.
 
     Args:
         name: Name of the argument of the command.
         meaning: Function that computes the argument from the option values. Its parameters have the names of the options.
-        options: Click options, or decorators of this kind, in the order of the help text.
+        options: Click options, or other decorators that this function returned. The help text shows them in this order.
     """
     parameters = inspect.signature(meaning).parameters
 
@@ -149,7 +159,7 @@ def patient_options(*, legs: bool) -> Callable[[_Command], _Command]:
 
 
 def subject_options(command: _Command) -> _Command:
-    """Add `--mass`, `--height`, `--step-length` and `--step-duration` to a command, and pass it the argument `subject`.
+    """Add `--mass`, `--height`, `--step-length`, `--step-duration` to a command, which then gets the argument `subject`.
 
     `subject` is None if the user gave none of the options.
 
@@ -214,11 +224,12 @@ class Target:
 
     interface: str
     channel: str  # one channel, or a channel map of the four buses. Empty for the embedded robot.
-    lockstep: bool  # True: a cycle ends after the answers of all nodes. False: a cycle ends after 1 ms.
+    lockstep: bool  # whether a cycle ends after the answers of all nodes (lock-step) instead of after 1 ms (wall clock)
+    engine: str = PYBULLET  # physics engine of the embedded robot
 
     @property
     def embedded(self) -> bool:
-        """Return whether the robot is emulated by the command itself, in its process or in a subprocess."""
+        """Return whether the command that drives the robot also emulates this robot, without a CAN bus."""
         return self.interface == EMBEDDED
 
     def __str__(self) -> str:
@@ -227,7 +238,7 @@ class Target:
 
     @property
     def arguments(self) -> str:
-        """Return the options `-i` and `-c` with which another `atalante` command uses the same bus."""
+        """Return the options `-i` and `-c` of this bus as text for the command line of another `atalante` command."""
         return f"-i {self.interface} -c {self.channel}"
 
 
@@ -257,6 +268,8 @@ def target_options(*, embedded: bool, clock: bool = True) -> Callable[[_Command]
             "(left_leg=can0,right_leg=can1,left_sense=can2,right_sense=can3).",
         ),
     ]
+    if embedded:
+        options.append(engine_option)
     if clock:
         default = "lock-step when embedded, else wall" if embedded else "wall"
         options.append(
@@ -278,7 +291,9 @@ def _refusal(interface: str) -> str:
     return refusal(interface) if interface in ADAPTERS else ""
 
 
-def _target(interface: str, channel: str, lockstep: bool | None = None, *, embedded: bool) -> Target:
+def _target(
+    interface: str, channel: str, lockstep: bool | None = None, engine: str = PYBULLET, *, embedded: bool
+) -> Target:
     if interface == EMBEDDED:
         if not embedded:
             raise click.UsageError(
@@ -292,4 +307,4 @@ def _target(interface: str, channel: str, lockstep: bool | None = None, *, embed
         raise click.UsageError(refused)
     elif not channel:
         raise click.UsageError(f"{interface} requires a channel: -c vcan0, or a channel map of the four buses")
-    return Target(interface, channel, interface == EMBEDDED if lockstep is None else lockstep)
+    return Target(interface, channel, interface == EMBEDDED if lockstep is None else lockstep, engine)

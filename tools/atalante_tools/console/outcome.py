@@ -62,6 +62,7 @@ KNOWN: Final[tuple[tuple[str, str, type[Failed]], ...]] = (
     ("atalante_hal.telemetry.sink", "SinkError", Failed),
     ("atalante_control.gait_optimization.parallel", "FanOutError", Failed),
     ("atalante_control.gait.gait", "GaitError", Failed),
+    ("atalante_control.guide.shape_file", "ShapeError", Failed),
     ("atalante_control.dynamics.gait_network", "NetworkError", Failed),
     ("atalante_control.gait_optimization.library", "LibraryError", Failed),
     ("atalante_tools.canlog.reader.log_file", "LogError", Failed),

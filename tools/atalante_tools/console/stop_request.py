@@ -28,7 +28,7 @@ class Stopped(SystemExit):
 
 
 class StopRequest:
-    """Record of the first stop signal. `wanted` is True after the signal, and `exit_code` is its exit code."""
+    """Record of the first stop signal. After the signal, `wanted` is True and `exit_code` is the exit code to use."""
 
     def __init__(self) -> None:
         self.wanted = False
@@ -64,7 +64,7 @@ _request: StopRequest | None = None
 
 
 def check_stop() -> None:
-    """Raise `Stopped` if a stop signal arrived. Call it after library code that may have discarded the exception.
+    """Raise `Stopped` if a stop signal arrived. Call this function after library code that may have discarded the exception.
 
     Raises:
         Stopped: If a signal arrived, with its exit code.
@@ -75,7 +75,7 @@ def check_stop() -> None:
 
 @contextmanager
 def _handled(react: Callable[[StopRequest, int, bool], None]) -> Iterator[StopRequest]:
-    """Record the stop signals that arrive inside the block in the stop request of this process.
+    """Record every stop signal that arrives inside the `with` block. The record is the stop request of this process.
 
     Python handles signals in the main thread only. In any other thread the block gets a request that is never set.
 
@@ -107,10 +107,10 @@ def _handled(react: Callable[[StopRequest, int, bool], None]) -> Iterator[StopRe
 
 @contextmanager
 def interruptible() -> Iterator[StopRequest]:
-    """Raise `Stopped` at each SIGINT and SIGTERM inside the block. Use it once, around the whole program.
+    """Raise `Stopped` at each SIGINT and SIGTERM inside the block. Use this block once, around the whole program.
 
-    Python reports an exception that it ignores, for example in `__del__`. It does not report an ignored `Stopped`, because the
-    request is stored. After the block, a signal ends the process with the default action of the system.
+    Python prints a warning if it ignores an exception, for example in `__del__`. Inside the block this warning is suppressed for
+    `Stopped`, because the request is stored. After the block, a signal ends the process with the default action of the system.
     """
 
     def stop(request: StopRequest, _number: int, _repeated: bool) -> None:

@@ -11,13 +11,13 @@ from typing import Any, Final, TextIO
 
 import click
 
-#: Period of the progress line on a terminal [s]. Each line overwrites the previous line.
+#: Time between two progress lines on a terminal [s]. Each line overwrites the previous line.
 LIVE: Final = 0.2
-#: Period of the progress line in a file or pipe [s].
+#: Time between two progress lines if stderr is a file or a pipe [s].
 LOGGED: Final = 5.0
 
 
-def say(text: str) -> None:
+def print_message(text: str) -> None:
     """Print a message of one line on stderr."""
     click.echo(text, err=True)
 
@@ -40,7 +40,7 @@ class CompilationNotice(logging.Handler):
         """Print the message at the first log record. Every log record reports a compilation."""
         if not self._printed:
             self._printed = True
-            say("compiling: takes some seconds, only once after an installation or an update")
+            print_message("compiling: takes some seconds, only once after an installation or an update")
 
 
 def show_json(value: Mapping[str, Any]) -> None:
@@ -72,8 +72,8 @@ class Progress:
         """Set up the progress line and start its first period.
 
         Args:
-            period: Time between two lines [s]. None: `LIVE` on a terminal, `LOGGED` otherwise.
-            stream: Text stream of the lines. None: stderr.
+            period: Time between two lines [s]. None means `LIVE` on a terminal, `LOGGED` otherwise.
+            stream: Text stream of the lines. None means stderr.
             now: Monotonic clock [s].
         """
         self._stream = stream or sys.stderr

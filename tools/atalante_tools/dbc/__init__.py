@@ -8,7 +8,7 @@ import click
 
 from atalante_tools.console.options import SEED, Between, json_option
 from atalante_tools.console.outcome import FAILED, Failed
-from atalante_tools.console.terminal import say, show_json, table
+from atalante_tools.console.terminal import print_message, show_json, table
 
 _FILE = click.Path(exists=True, dir_okay=False, path_type=Path)
 #: Argument FILE: a DBC file. The default is the DBC file of the robot.
@@ -29,7 +29,7 @@ def command() -> None:
 @_file_argument
 @json_option
 def lint(file: Path | None, as_json: bool) -> None:
-    """List all errors in FILE with their line numbers; the exit code is 1 if there are any."""
+    """List all errors in FILE with line numbers. The exit code is 1 if FILE has an error."""
     from atalante_tools.dbc.lint import findings
 
     path = file or _own()
@@ -40,9 +40,9 @@ def lint(file: Path | None, as_json: bool) -> None:
         else:
             click.echo(f"{path}:{finding.line or ''}{':' if finding.line else ''} {finding.text}")
     if found:
-        say(f"{path}: {len(found)} error{'s' * (len(found) > 1)}")
+        print_message(f"{path}: {len(found)} error{'s' * (len(found) > 1)}")
         raise SystemExit(FAILED)
-    say(f"{path}: no errors")
+    print_message(f"{path}: no errors")
 
 
 @command.command("table")
@@ -70,7 +70,7 @@ def print_table(file: Path | None, signals: bool, as_json: bool) -> None:
 )
 @json_option
 def busload(file: Path | None, limit: float, as_json: bool) -> None:
-    """Print the worst-case load of each bus and its messages; the exit code is 1 if a load is above the limit."""
+    """Print the worst-case load per bus and per message. The exit code is 1 if a bus load is above the limit."""
     import atalante_dbc
     from atalante_tools.dbc.tables import load_rows
 
@@ -93,7 +93,7 @@ def busload(file: Path | None, limit: float, as_json: bool) -> None:
 @click.argument("new", type=_FILE)
 @json_option
 def diff(old: Path, new: Path, as_json: bool) -> None:
-    """List the changes from OLD to NEW; the exit code is 1 if a node with OLD cannot communicate with a node with NEW."""
+    """List the changes from OLD to NEW. The exit code is 1 if nodes with OLD and nodes with NEW cannot communicate."""
     import atalante_dbc
     from atalante_tools.dbc.diff import changes
 
@@ -105,7 +105,7 @@ def diff(old: Path, new: Path, as_json: bool) -> None:
             show_json({"kind": kind, "subject": change.subject, "where": change.where, "text": change.text})
         else:
             click.echo(f"{kind:<10}  {change.where}: {change.text}")
-    say(f"{len(breaking)} breaking and {len(found) - len(breaking)} compatible changes")
+    print_message(f"{len(breaking)} breaking and {len(found) - len(breaking)} compatible changes")
     if breaking:
         raise SystemExit(FAILED)
 
@@ -140,7 +140,7 @@ def c_code(
 ) -> None:
     """Generate C code for FILE: pack, unpack, E2E protect and check, with test vectors and a host test.
 
-    The host test is a C program that compares the C code with the Python codec. An image is one payload of every message.
+    The host test is a C program that compares the C code with the Python codec.
     """
     from atalante_tools.dbc.build import Build
     from atalante_tools.dbc.c_code import write
@@ -161,7 +161,7 @@ def c_code(
         if as_json:
             show_json({"images": images, "compared": compared, "equal": True})
         else:
-            say(f"C and Python agree on {images} images, {compared} frames")
+            print_message(f"C and Python agree on {images} images, {compared} frames")
 
 
 def _own() -> Path:

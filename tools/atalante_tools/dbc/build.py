@@ -19,7 +19,7 @@ class Build:
     network: Network
     text: str  # content of the DBC file
     name: str  # prefix of every C identifier
-    node: str | None  # node for which code is generated; None: all nodes
+    node: str | None  # node for which code is generated; None means all nodes
 
     @classmethod
     def of(cls, path: Path, node: str | None) -> Build:
@@ -27,7 +27,7 @@ class Build:
 
         Args:
             path: DBC file.
-            node: name of the node whose messages are generated; None: all messages.
+            node: name of the node whose messages are generated; None means all messages.
 
         Raises:
             DbcError: If the strict loader rejects the file.
@@ -52,5 +52,5 @@ class Build:
         return tuple(s for s in message.signals if self.node is None or self.node in s.receivers)
 
     def c_name(self, message: Message) -> str:
-        """Return the prefix of all C identifiers of a message, without the underscore at its end."""
+        """Return the prefix of all C identifiers of a message, without the trailing underscore."""
         return f"{self.name}_{camel_to_snake_case(message.name)}"

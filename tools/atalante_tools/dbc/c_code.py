@@ -19,13 +19,13 @@ from atalante_tools.dbc.e2e_c import e2e_header, e2e_source
 from atalante_tools.dbc.host_test import makefile, source
 from atalante_tools.dbc.vectors import Vectors
 
-#: Number of images in the file of test vectors. An image is one payload of every message.
+#: Number of images in the file of test vectors. An image is a set of payloads, one payload per message.
 _IMAGES: Final = 100
 _HOST_TEST, _VECTORS, _EXAMPLES, _MAKEFILE = "host_test.c", "vectors.bin", "vectors.json", "Makefile"
 
 
 def write(build: Build, folder: Path, seed: int) -> list[Path]:
-    """Write all generated files and return their paths. Equal arguments give equal bytes.
+    """Write all generated files and return their paths. Equal arguments give identical files.
 
     Args:
         build: messages for which code is generated.
@@ -53,7 +53,7 @@ def write(build: Build, folder: Path, seed: int) -> list[Path]:
 
 
 def _cantools(build: Build) -> tuple[str, str]:
-    # `strict` is off, because the loader of `atalante_dbc` has already accepted the file and checks more than cantools.
+    # `strict` is off, because the loader of `atalante_dbc` has already checked the file more strictly than cantools.
     database = cantools.database.load_string(build.text, database_format="dbc", strict=False)
     assert isinstance(database, Database)
     header, code, _, _ = generate(
@@ -63,7 +63,7 @@ def _cantools(build: Build) -> tuple[str, str]:
         f"{build.name}.c",
         "",
         node_name=build.node,
-        use_round=True,  # without rounding, the encoder would truncate 0.0375 Nm to 0.025 Nm
+        use_round=True,  # without this option, the generated encoder would truncate 0.0375 Nm to 0.025 Nm
     )
     # Remove the date of generation, so that the files depend only on the DBC.
     header, code = (re.sub(r"(by cantools version \S+) .*", r"\1.", part) for part in (header, code))

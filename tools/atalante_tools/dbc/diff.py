@@ -1,8 +1,8 @@
 """Comparison of two versions of a DBC file.
 
-A change is breaking if a node with the old version and a node with the new version cannot communicate. The criterion is the
-behaviour of the receivers in this project: they reject a wrong length, a wrong Data ID and a value out of range, and report
-a message as late after its timeout.
+A change is breaking if a node with the old version and a node with the new version cannot communicate. The criterion is
+the behaviour of the receivers in this project: they reject frames with a wrong length, a wrong Data ID or a value out
+of range, and they report a message as late after the timeout of the message.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ class Change:
 
 
 def changes(old: Network, new: Network) -> list[Change]:
-    """Return all differences between two networks, in the order of `new`; removed items are at the end."""
+    """Return all differences between two networks, in the order of the network `new`; removed items come last."""
     return [*_network(old, new), *_messages(old, new)]
 
 
@@ -77,7 +77,9 @@ def _message(old: Message, new: Message) -> Iterator[Change]:
     if old.data_id != new.data_id:
         yield breaking("data id", f"E2E Data ID {old.data_id:#06x} -> {new.data_id:#06x}: every CRC check fails")
     if old.sender != new.sender:
-        yield breaking("sender", f"sender {old.sender} -> {new.sender}: with mixed versions both nodes send, or none")
+        yield breaking(
+            "sender", f"sender {old.sender} -> {new.sender}: with mixed versions both nodes send, or neither"
+        )
     if old.bus != new.bus:
         yield breaking("bus", f"bus {old.bus} -> {new.bus}")
     yield from _timing(old, new)
@@ -90,7 +92,7 @@ def _timing(old: Message, new: Message) -> Iterator[Change]:
     elif old.cycle_ms != new.cycle_ms:
         yield Change(True, "timing", new.name, f"cycle {old.cycle_ms} -> {new.cycle_ms} ms")
     if old.timeout_ms != new.timeout_ms:
-        # A changed timeout breaks communication only if it is at most the cycle time of the other version.
+        # A changed timeout breaks communication only if one timeout is at most the cycle time in the other version.
         late = 0 < old.timeout_ms <= new.cycle_ms or 0 < new.timeout_ms <= old.cycle_ms
         yield Change(late, "timing", new.name, f"timeout {old.timeout_ms} -> {new.timeout_ms} ms")
     if old.inhibit_ms != new.inhibit_ms:

@@ -1,6 +1,6 @@
 """C code generator for AUTOSAR E2E Profile 5 (protect and check), invalid codes and range checks.
 
-The C code is equivalent to `atalante_hal.wire.e2e`. The generated host test compares both.
+The C code is equivalent to the Python module `atalante_hal.wire.e2e`. The generated host test compares the two.
 """
 
 from __future__ import annotations

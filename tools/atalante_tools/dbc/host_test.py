@@ -22,7 +22,7 @@ from atalante_tools.dbc.vectors import MAGIC, Vectors, signals_after_header
 if TYPE_CHECKING:
     from atalante_tools.dbc.build import Build
 
-#: Compiler flags. Fused multiply-add (contraction) is off, because its rounding differs from that of the Python codec.
+#: Compiler flags. Fused multiply-add (contraction) is off, because it rounds differently from the Python codec.
 FLAGS: Final = (
     "-std=c11 -Wall -Wextra -Werror -O1 -g -ffp-contract=off -fsanitize=undefined,address -fno-sanitize-recover=all"
 )
@@ -39,7 +39,7 @@ def compile_host_test(build: Build, folder: Path) -> Path:
         folder: folder of the generated files.
 
     Raises:
-        Failed: If there is no compiler, or it reports an error or a warning.
+        Failed: If there is no compiler, or the compiler reports an error or a warning.
     """
     compiler = os.environ.get("CC", "gcc")
     if shutil.which(compiler) is None:
@@ -55,12 +55,12 @@ def compile_host_test(build: Build, folder: Path) -> Path:
 
 
 def run_host_test(build: Build, program: Path, images: int, seed: int) -> int:
-    """Run the host test on test vectors and return the number of frames that it compared.
+    """Run the host test on test vectors and return the number of compared frames.
 
     Args:
         build: network and node.
         program: compiled host test.
-        images: number of images, each with one payload of every message.
+        images: number of images. An image is a set of payloads, one payload per message.
         seed: seed of the random payloads.
 
     Raises:
@@ -246,7 +246,7 @@ def _size(build: Build, message: Message) -> int:
 
 
 def _message(build: Build, message: Message, other: Message) -> str:
-    """Return the C test function of a message. It also tests that the Data ID of the message `other` fails the check."""
+    """Return the C test function of a message. The E2E check is also called with the Data ID of the message `other`."""
     body = ""
     if received := build.received(message):
         body += _receive(build, message, received, other)
@@ -263,7 +263,7 @@ def _receive(build: Build, message: Message, received: tuple[Signal, ...], other
     names = [camel_to_snake_case(s.name) for s in received]
     values = "\n".join(f"        EXPECT({prefix}_{name}_decode(message.{name}) == next(&in_p));" for name in names)
     wrong_id = f"{build.name}_e2e_check(&copy, payload, sizeof(payload), sizeof(payload), {other.data_id:#06x}u)"
-    # A network with a single message has no other Data ID.
+    # In a network with a single message, no Data ID of another message can be tested.
     other_id = f"            EXPECT({wrong_id} == {upper}_E2E_CRC);\n" if other is not message else ""
     return f"""
     {{

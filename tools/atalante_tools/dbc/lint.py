@@ -1,4 +1,4 @@
-"""Errors of the DBC loader, split into findings with line numbers."""
+"""Errors that the DBC loader reports, split into one finding with a line number per error."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ _LINE = re.compile(r"at line (\d+)")
 
 @dataclass(frozen=True)
 class Finding:
-    """Error in a DBC file. `line` is None if the error concerns the whole file."""
+    """Error in a DBC file. The field `line` is None if the error concerns the whole file."""
 
     line: int | None
     text: str

@@ -1,4 +1,4 @@
-"""Tables of a network: its messages, its signals, and the bus load of each message."""
+"""Tables of a network: messages, signals, and the bus load of each message."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ def signal_rows(network: Network) -> list[Row]:
 
 
 def load_rows(network: Network, bus: str) -> list[Row]:
-    """Return one row per message of a bus with its worst-case load, the largest load first.
+    """Return one row with the worst-case bus load per message, the largest load first.
 
     The period of a cyclic message is its cycle time. The shortest period of an event message is its inhibit time.
 

@@ -1,12 +1,14 @@
-"""Test vectors of a network: payloads, and the signal values that the Python codec gives for them, as binary stream or JSON.
+"""Test vectors of a network: payloads and the signal values that the Python codec decodes, as binary stream or JSON.
 
-An image is one payload of every message. The generated host test reads the stream, which is little endian: 8 bytes magic,
-u32 network hash, u32 number of images, then the images. Each image has the messages of the build in DBC order:
+An image is a set of payloads, one per message. The generated host test reads the binary stream, which is little endian.
+The stream begins with 8 bytes magic, u32 network hash and u32 number of images; then the images follow. Each image
+contains the messages of the `Build` in DBC order:
 
-- received: payload, u8 "every signal in range", f64 value of each received signal;
-- sent: f64 value of each signal after the E2E header (NaN: invalid code), resulting payload.
+- message that the node receives: payload, u8 flag (1: every signal is in range), f64 value of each decoded signal;
+- message that the node sends: f64 value of each signal after the E2E header (NaN: invalid code), encoded payload.
 
-Every second received payload has random bits; the others are encoded from values. The counter is the number of the image.
+The received payloads of the images 5, 7, 9, ... have random bits; all other payloads are encoded from signal values.
+The alive counter is the low byte of the image number, which starts at 0.
 """
 
 from __future__ import annotations
@@ -51,13 +53,13 @@ class Vectors:
         ]
         self._minimum = np.array([s.minimum for _, s in codec.signals])
         self._maximum = np.array([s.maximum for _, s in codec.signals])
-        # NaN is encoded as the invalid code. A signal without invalid code is sent with its minimum.
+        # NaN is encoded as the invalid code. For a signal without invalid code, the minimum of the signal is sent.
         no_code = [s.invalid_raw is None for _, s in codec.signals]
         self._invalid = np.where(no_code, self._minimum, np.nan)
         self._order = self._stream_order()
 
     def _stream_order(self) -> npt.NDArray[np.intp]:
-        """Return, for each byte of an image in the stream, its index in the concatenated arrays of `images`."""
+        """Return the stream layout of an image: the index of each byte in the concatenated arrays of `images`."""
         build, codec = self._build, self._codec
         rows = len(build.messages)
         parts = (FRAME_BYTES * rows, FRAME_BYTES * rows, 8 * codec.size, 8 * codec.size, rows)
@@ -84,14 +86,20 @@ class Vectors:
         return HEADER.pack(MAGIC, self._build.network.hash32, images)
 
     def images(self, count: int) -> Iterator[bytes]:
-        """Yield the images of the stream: minimum, maximum, invalid codes, then random. Can be called once per instance."""
+        """Yield images with minimum, maximum, invalid and then random values.
+
+        Call this only once per instance, because a second call would continue the counters and the random numbers.
+        """
         for image in range(count):
             encoded = self._next(image)
             parts = (self._received, self._sender.frames, self._decoded, encoded, self._in_range)
             yield np.concatenate([part.view(np.uint8) for part in parts])[self._order].tobytes()
 
     def examples(self) -> Iterator[dict[str, Any]]:
-        """Yield four JSON objects per message: minimum, maximum, invalid and random values. Can be called once per instance."""
+        """Yield JSON objects with minimum, maximum, invalid and random values.
+
+        Call this only once per instance, because a second call would continue the counters and the random numbers.
+        """
         for image, kind in enumerate(("minimum", "maximum", "invalid codes", "random")):
             self._next(image)
             for row, message in enumerate(self._build.messages):
@@ -109,7 +117,7 @@ class Vectors:
                 }
 
     def _next(self, image: int) -> Vector:
-        """Create image number `image` and return its values before encoding, shape (signals,)."""
+        """Create the image with the number `image`, and return the signal values before encoding, shape (signals,)."""
         limits = (self._minimum, self._maximum, self._invalid)
         encoded = limits[image] if image < len(limits) else self._random.uniform(self._minimum, self._maximum)
         self._sender.values[:] = encoded

@@ -1,6 +1,7 @@
 """Command `atalante faults`: inject the faults of the fault matrix into an emulated robot that walks suspended in the air.
 
-FAULTS.md -> matrix        link, node, sensor, drive, host, operator -> scenarios -> runner -> verdict -> campaign, report
+`fault matrix (FAULTS.md), scenarios -> runner -> verdict -> report`. The modules `link`, `node`, `sensor`, `drive`, `host` and
+`operator` define the scenarios. `campaign` runs many scenarios in parallel.
 """
 
 from __future__ import annotations
@@ -14,10 +15,10 @@ from typing import TYPE_CHECKING
 import click
 
 from atalante_tools.console.names import find
-from atalante_tools.console.options import json_option
+from atalante_tools.console.options import engine_option, json_option
 from atalante_tools.console.outcome import Failed, InvalidUsage
 from atalante_tools.console.stop_request import check_stop
-from atalante_tools.console.terminal import Progress, say, show_json, table
+from atalante_tools.console.terminal import Progress, print_message, show_json, table
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence
@@ -33,8 +34,8 @@ _BAR = 24  # characters
 def command() -> None:
     """Inject the faults of the fault matrix into an emulated robot, and check the reaction of the HAL.
 
-    Every fault has an ID, a bound in cycles of 1 ms, a final state and a diagnostic code. The file FAULTS.md of this package
-    contains the fault matrix.
+    The fault matrix, in the file FAULTS.md of this package, lists for every fault an ID, the largest accepted reaction
+    time in cycles of 1 ms, the final state of the HAL and the diagnostic code.
 
     \b
     Example: atalante faults list
@@ -46,7 +47,7 @@ def command() -> None:
 @command.command("list", short_help="List all faults with bound, code and proof.")
 @json_option
 def list_(as_json: bool) -> None:
-    """List all faults with their bounds, final states, diagnostic codes and proofs."""
+    """List all faults with the largest accepted reaction time, final state, diagnostic code and proof."""
     from atalante_tools.faults.matrix import load_matrix
 
     rows = load_matrix().values()
@@ -63,9 +64,10 @@ def list_(as_json: bool) -> None:
 @command.command("run", short_help="Run the cases of one fault and check the reactions.")
 @click.argument("id_", metavar="ID")
 @click.option("--case", "name", metavar="TEXT", default="", help="Run only the cases whose name contains this text.")
+@engine_option
 @json_option
-def run(id_: str, name: str, as_json: bool) -> None:
-    """Run the cases of one fault and check the reactions. Every case starts a new emulated robot."""
+def run(id_: str, name: str, engine: str, as_json: bool) -> None:
+    """Run all test cases of one fault and check the reactions. Every case starts a new emulated robot."""
     from atalante_tools.faults.catalogue import SCENARIOS
     from atalante_tools.faults.report import Summary, number
     from atalante_tools.faults.tasks import CaseTask
@@ -77,13 +79,13 @@ def run(id_: str, name: str, as_json: bool) -> None:
             f"{row.id} has only tests and no scenario: run `pytest {' '.join(f'tests/{t}' for t in row.tests)}`"
         )
     cases = SCENARIOS[row.id].cases
-    tasks = [CaseTask(row.id, index) for index, case in enumerate(cases) if name in case.name]
+    tasks = [CaseTask(row.id, index, engine) for index, case in enumerate(cases) if name in case.name]
     if not tasks:
         raise InvalidUsage(
             f"--case must be part of the name of a case of {row.id}, got {name!r}; "
             f"valid cases: {', '.join(c.name for c in cases)}"
         )
-    summary = Summary.of(verdicts := [v for v in _done(tasks) if isinstance(v, Verdict)])
+    summary = Summary.of(verdicts := [v for v in _done(tasks, engine=engine) if isinstance(v, Verdict)])
     if as_json:
         show_json(asdict(summary.lines[0]))
     else:
@@ -124,9 +126,10 @@ def run(id_: str, name: str, as_json: bool) -> None:
     metavar="DIR",
     help="Folder for report.md and report.json.",
 )
+@engine_option
 @json_option
 def campaign_(
-    ids: tuple[str, ...], jobs: int, dask: str, pairs: bool, endurance: bool, out: Path, as_json: bool
+    ids: tuple[str, ...], jobs: int, dask: str, pairs: bool, endurance: bool, out: Path, engine: str, as_json: bool
 ) -> None:
     """Run all faults, or the faults with the given IDs, and write a report."""
     from atalante_tools.faults.catalogue import SCENARIOS
@@ -136,11 +139,11 @@ def campaign_(
     chosen = [_row(id_).id for id_ in ids] or list(SCENARIOS)
     if without := [id_ for id_ in chosen if id_ not in SCENARIOS]:
         raise InvalidUsage(f"{without[0]} has only tests and no scenario: `atalante faults list` shows the tests")
-    tasks = plan(chosen, endurance=endurance, pairs=pairs and not ids)
-    out.mkdir(parents=True, exist_ok=True)  # reports an invalid folder before the runs start
+    tasks = plan(chosen, endurance=endurance, pairs=pairs and not ids, engine=engine)
+    out.mkdir(parents=True, exist_ok=True)  # created now, so that an invalid folder is reported before the runs start
     begun = time.monotonic()
-    say(f"{len(tasks)} runs on {f'the workers of {dask}' if dask else f'{jobs} processes'}")
-    found = list(_done(tasks, jobs=jobs, dask=dask))
+    print_message(f"{len(tasks)} runs on {f'the workers of {dask}' if dask else f'{jobs} processes'}")
+    found = list(_done(tasks, jobs=jobs, dask=dask, engine=engine))
     summary = Summary.of(found, time.monotonic() - begun)
     summary.write(out)
     if as_json:
@@ -148,7 +151,7 @@ def campaign_(
             show_json(asdict(line))
     else:
         click.echo(_table(summary))
-    say(f"{len(found)} runs in {summary.seconds:.0f} s; in {out}: report.md, report.json")
+    print_message(f"{len(found)} runs in {summary.seconds:.0f} s; in {out}: report.md, report.json")
     _conclude(summary)
 
 
@@ -159,13 +162,13 @@ def _row(id_: str) -> Row:
     return rows[find(id_, [row.id for row in rows], "fault")]
 
 
-def _done(tasks: Sequence[Task], *, jobs: int = 1, dask: str = "") -> Iterator[Result]:
-    """Yield the results in the order of completion, and show a progress bar."""
+def _done(tasks: Sequence[Task], *, engine: str, jobs: int = 1, dask: str = "") -> Iterator[Result]:
+    """Yield each result as soon as it is complete, and show a progress bar."""
     from atalante_tools.faults.campaign import results
     from atalante_tools.session.body import require_engine
 
-    if not dask:  # on a cluster, PyBullet is needed only on the workers
-        require_engine()
+    if not dask:  # on a cluster, the engine is needed only on the workers
+        require_engine(engine)
     progress, begun = Progress(), time.monotonic()
     try:
         for count, result in enumerate(results(tasks, jobs=jobs, dask=dask), 1):
@@ -180,7 +183,7 @@ def _done(tasks: Sequence[Task], *, jobs: int = 1, dask: str = "") -> Iterator[R
 
 
 def _table(summary: Summary) -> str:
-    """Return a table with one row per fault: its result, and its longest duration that the walk survives [cycles]."""
+    """Return a table with one row per fault: result, and longest fault duration that the walk survives [cycles]."""
     from atalante_tools.faults.report import number, survived
 
     lasts = {one.id: survived(one) for one in summary.endurance}
@@ -201,10 +204,10 @@ def _conclude(summary: Summary) -> None:
     """
     for line in summary.lines:
         for failure in line.failures:
-            say(f"{line.id} {failure}")
+            print_message(f"{line.id} {failure}")
     for pair in summary.pairs:
         for failure in pair.failures:
-            say(f"{pair.first} and {pair.second}: {failure}")
+            print_message(f"{pair.first} and {pair.second}: {failure}")
     if not summary.passed:
         faults, pairs = (
             sum(not line.passed for line in summary.lines),

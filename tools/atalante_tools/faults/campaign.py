@@ -9,12 +9,12 @@ from atalante_control.gait_optimization.parallel import FanOutError, fan_out
 from atalante_tools.console.outcome import Failed
 from atalante_tools.faults.tasks import Result, Task, run_task
 
-#: Longest time between two results [s]. The campaign fails after this time without a result.
+#: Longest accepted time between two results [s]. If no result comes within this time, the campaign fails.
 RESULT_TIMEOUT: Final = 300.0
 
 
 def results(tasks: Sequence[Task], *, jobs: int = 1, dask: str = "") -> Iterator[Result]:
-    """Run the tasks with `fan_out` and yield the results in the order of completion.
+    """Run the tasks in parallel and yield each result as soon as it is complete.
 
     Args:
         tasks: tasks to run.

@@ -1,4 +1,4 @@
-"""All scenarios by ID. Each row of the matrix with the proof `scenario` has one scenario."""
+"""All scenarios by fault ID. Each row of the fault matrix FAULTS.md with the proof `scenario` has one scenario."""
 
 from __future__ import annotations
 

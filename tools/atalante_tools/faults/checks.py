@@ -1,4 +1,4 @@
-"""Additional checks for some scenarios. A check returns None if it passes, and a sentence if it fails."""
+"""Additional checks for some fault scenarios. A check returns None if it passes, and a sentence if it fails."""
 
 from __future__ import annotations
 
@@ -12,8 +12,8 @@ from atalante_hal.wire.cia402 import Controlword, DriveState
 from atalante_tools.faults.observation import Observation
 
 _KNEE: Final = JOINTS.index("left_SK")
-#: Number of cycles without a command after which a drive must start its local hold.
-#: It is not imported from the emulated drive, so that an error in the emulator does not change the check.
+#: Number of cycles without a command after which a drive must hold its position without the HAL (local hold).
+#: This number is not imported from the emulated drive, so that an error in the emulator cannot change the check.
 _WATCHDOG: Final = 5
 _LEFT_LEG: Final = slice(0, len(LEG_JOINTS))
 
@@ -30,7 +30,7 @@ def guide_kept(run: Observation) -> str | None:
 
 
 def guide_regained(run: Observation) -> str | None:
-    """Check that an assisted joint left its guide, and that at the end all assisted joints are inside their guides.
+    """Check that an assisted joint left its guide, and that all assisted joints are inside their guides at the end.
 
     Args:
         run: observation of the run.
@@ -42,7 +42,7 @@ def guide_regained(run: Observation) -> str | None:
 
 
 def data_stays_fresh(run: Observation) -> str | None:
-    """Check that the data of all messages has age 0 during the fault.
+    """Check that the data age of all messages is 0 during the fault.
 
     Args:
         run: observation of the run.
@@ -52,7 +52,7 @@ def data_stays_fresh(run: Observation) -> str | None:
 
 
 def not_enabled_in_motion(run: Observation) -> str | None:
-    """Check that the drive of the left knee stays disabled from the fault until the operator presses START.
+    """Check that the left knee drive is never enabled between the start of the fault and the operator's next START.
 
     Args:
         run: observation of the run.
@@ -62,7 +62,7 @@ def not_enabled_in_motion(run: Observation) -> str | None:
 
 
 def drives_report_two_senders(run: Observation) -> str | None:
-    """Check that at least one drive of the left leg reports two senders of its commands.
+    """Check that at least one drive of the left leg reports that two senders command this drive.
 
     A report by the HAL alone is not sufficient.
 
@@ -74,7 +74,9 @@ def drives_report_two_senders(run: Observation) -> str | None:
 
 
 def full_queue_is_confirmed(run: Observation) -> str | None:
-    """Check that the HAL confirms the diagnostic of a full transmit queue. Diagnostics of the resulting timeouts do not suffice.
+    """Check that the HAL confirms the diagnostic code BUS_TX_FULL.
+
+    Diagnostics of the timeouts that follow from a full transmit queue are not sufficient.
 
     Args:
         run: observation of the run.
@@ -84,7 +86,7 @@ def full_queue_is_confirmed(run: Observation) -> str | None:
 
 
 def left_leg_in_local_hold(run: Observation) -> str | None:
-    """Check that all drives of the left leg are in local hold from the fifth faulty cycle until the operator's START.
+    """Check that all drives of the left leg hold their position from the fifth faulty cycle until the operator's START.
 
     Args:
         run: observation of the run.
@@ -95,7 +97,7 @@ def left_leg_in_local_hold(run: Observation) -> str | None:
 
 
 def start_is_rejected(run: Observation) -> str | None:
-    """Check that START is rejected with a reason, and that no later command enables a drive.
+    """Check that the HAL rejects START with a reason, and that no later command enables a drive.
 
     Args:
         run: observation of the run.
@@ -110,7 +112,9 @@ def start_is_rejected(run: Observation) -> str | None:
 
 
 def limit_follows_temperature(run: Observation) -> str | None:
-    """Check that every torque limit sent to the left knee is at most the limit for its reported temperature.
+    """Check that the torque limits sent to the left knee drive follow the temperature that this drive reports.
+
+    A sent limit must be at most the robot's torque limit at the reported temperature.
 
     Args:
         run: observation of the run.

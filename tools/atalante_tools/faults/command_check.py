@@ -1,6 +1,7 @@
-"""Independent check of all command frames of the HAL. It decodes them by the bit positions of the DBC and checks the limits.
+"""Independent check of all command frames of the HAL, decoded by the bit positions in the DBC, against the limits.
 
-It shares no code with the limiter, the codec and the process image, so it can detect errors in them.
+This module shares no code with the limiter, the codec and the process image of the HAL, so it can detect errors in
+these modules.
 """
 
 from __future__ import annotations
@@ -16,16 +17,16 @@ from atalante_hal.wire.cia402 import Controlword
 from atalante_hal.wire.frame import FRAME, Frames
 
 Vector = npt.NDArray[np.float64]
-#: Resolution of the torque signals [Nm]. Rounding may raise a sent torque above its limit by this value.
+#: Resolution of the torque signals [Nm]. Because of rounding, a sent torque may exceed the torque limit by this value.
 _RESOLUTION: Final = 0.0125
 _PERIOD: Final = 1e-3  # s
 
 
 class SentFrames:
-    """`FrameTap` that records the frames from the HAL and their cycles."""
+    """`FrameTap` that records each frame from the HAL and the HAL cycle of the frame."""
 
     def __init__(self) -> None:
-        self.cycle = 0  # HAL cycle of the next frames, set by the runner
+        self.cycle = 0  # current HAL cycle, set by the runner
         self._cycles: list[int] = []
         self._sizes: list[int] = []
         self._memory = bytearray()
@@ -49,12 +50,12 @@ class SentFrames:
         """
 
     def frames(self) -> tuple[npt.NDArray[np.int64], Frames]:
-        """Return the HAL cycle of each sent frame, and the frames, shape (n,) each."""
+        """Return the HAL cycles of the sent frames, shape (n,), and the sent frames, shape (n,)."""
         return np.repeat(self._cycles, self._sizes).astype(np.int64), np.frombuffer(bytes(self._memory), FRAME)
 
 
 class _Leg:
-    """Command frames of one leg: HAL cycles, shape (n,), and the signals of the six joints, shape (n, 6) each."""
+    """Command frames of one leg: HAL cycles, shape (n,), and one array of shape (n, 6) per signal of the six joints."""
 
     def __init__(self, message: Message, cycles: npt.NDArray[np.int64], frames: Frames) -> None:
         selected = (frames["can_id"] == message.frame_id) & (frames["len"] == message.length)
@@ -67,7 +68,7 @@ class _Leg:
 
 
 class Commands:
-    """Decoded commands of a run, and the check of their limits."""
+    """Decoded commands of a run, with a check of identifiers, torques, torque limits and torque rates."""
 
     def __init__(self, network: Network, cycles: npt.NDArray[np.int64], frames: Frames) -> None:
         """Decode the command frames.
@@ -83,7 +84,7 @@ class Commands:
         self._foreign_ids = np.setdiff1d(frames["can_id"], own)
 
     def words(self, cycle: int) -> list[int]:
-        """Return the controlwords of the command frames that were sent in a cycle, in the order of JOINTS.
+        """Return the controlwords of all joints in the command frames of a HAL cycle, in the order of JOINTS.
 
         Args:
             cycle: HAL cycle.
@@ -115,7 +116,7 @@ class Commands:
         return leg.cycle, leg.limit[:, joint % len(LEG_JOINTS)]
 
     def violations(self, robot: Robot) -> list[str]:
-        """Return a sentence for each kind of violation: identifier, torque, torque limit, torque rate, torque with QUICK STOP.
+        """Return a sentence per violated limit: identifier, torque, torque limit, torque rate, torque in QUICK STOP.
 
         Args:
             robot: torque limits of the joints.

@@ -1,4 +1,4 @@
-"""Injection of host faults. Wrappers make the controller, the clock and the bus of the HAL fail in chosen cycles."""
+"""Injection of host faults: wrappers that make the controller, clock or bus of the HAL fail in chosen cycles."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from atalante_hal.types import PERIOD, Command, Controller, State, Vector
 from atalante_hal.wire.frame import Frames
 from atalante_tools.faults.scenario import HostFault
 
-#: Joint that the fault `shake` disturbs: 1 for the left hip, 0 for all other joints, shape (12,).
+#: Mask of the joint that the fault `shake` disturbs, shape (12,): 1 for the left hip, 0 for all other joints.
 _HIP: Final = np.array([joint == "left_SH" for joint in JOINTS], np.float64)
 
 
@@ -24,15 +24,15 @@ class HostFaults:
 
     def __init__(self, faults: Sequence[HostFault], begins: int) -> None:
         self._faults, self._begins = faults, begins
-        self.cycle = 0  # present HAL cycle, set by the runner
-        #: First HAL cycle in which a fault was active; None: no fault was active yet.
+        self.cycle = 0  # current HAL cycle, set by the runner
+        #: First HAL cycle in which a fault was active; None if no fault was active yet.
         self.first_active: int | None = None
 
     def of(self, *kinds: str) -> HostFault | None:
-        """Return the active fault of the given kinds, or None.
+        """Return the first active fault of one of the given kinds, or None.
 
         Args:
-            *kinds: kinds of `HostFault` faults.
+            *kinds: accepted values of `HostFault.kind`.
         """
         since = self.cycle - self._begins
         for fault in self._faults:
@@ -66,7 +66,7 @@ class DisturbedController:
         self._raise(self._now.of("raise_in_reset"))
 
     def update(self, state: State) -> Command:
-        """Return the command of the wrapped controller, or a wrong command or an exception if a fault is active.
+        """Return the command of the wrapped controller. During a fault, return a wrong command or raise an exception.
 
         Args:
             state: state of the HAL.
@@ -96,7 +96,7 @@ class DisturbedClock:
         self._behind = 0.0  # accumulated delay of the loop during the fault `slow` [s]
 
     def wait(self) -> float:
-        """Return the delay of the cycle behind its deadline [s], as `WallClock.wait` does."""
+        """Return the time from the deadline of the cycle to its start [s], as `WallClock.wait` does."""
         fault = self._now.of("late", "slow")
         if fault is None:
             self._behind = 0.0

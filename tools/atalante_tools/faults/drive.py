@@ -6,13 +6,13 @@ from typing import Final
 
 from atalante_emulator.faults import Fault
 from atalante_hal.types import SupervisorState
-from atalante_tools.faults.checks import guide_regained, left_leg_in_local_hold, limit_follows_temperature
+from atalante_tools.faults.checks import guide_kept, left_leg_in_local_hold, limit_follows_temperature
 from atalante_tools.faults.scenario import Case, HostFault, Scenario
 
 _S = SupervisorState
 _KNEE: Final = "LEFT_SK"
 _COMMAND: Final = "COMMAND_LEFT_LEG"
-#: Time until a lowered knee is at rest and its drive can be enabled again [cycles].
+#: A knee that sinks in LOWER or FAULT is at rest after this time [cycles]. Then its drive can be enabled again.
 _LOWERED: Final = 4500
 
 SCENARIOS: Final = (
@@ -79,7 +79,7 @@ SCENARIOS: Final = (
         ),
         permanent=Case("one leg", (Fault("drop", "SYNC_LEFT_LEG"),)),
     ),
-    # A drive detects lost commands by the counter of the next command, so the detection takes one more cycle.
+    # A drive detects lost commands from the alive counter of the next command, so the detection takes one more cycle.
     Scenario("F24", tuple(Case(f"{n} frames", (Fault("drop", _COMMAND, 0, n),), detected=n + 1) for n in range(1, 5))),
     Scenario(
         "F25",
@@ -87,6 +87,12 @@ SCENARIOS: Final = (
             Case("5 frames", (Fault("drop", _COMMAND, 0, 5),), checks=(left_leg_in_local_hold,)),
             Case("200 frames", (Fault("drop", _COMMAND, 0, 200),), checks=(left_leg_in_local_hold,)),
             Case("permanent", (Fault("drop", _COMMAND),), recovers=False, checks=(left_leg_in_local_hold,)),
+            Case(
+                "growing delay",
+                (Fault("delay", _COMMAND, 0, 20, by=4), Fault("delay", _COMMAND, 20, 80, by=8)),
+                first_faulty=20,
+                checks=(left_leg_in_local_hold,),
+            ),
         ),
         permanent=Case("left leg", (Fault("drop", _COMMAND),)),
     ),
@@ -100,15 +106,21 @@ SCENARIOS: Final = (
     ),
     Scenario(
         "F35",
-        tuple(
+        (
+            *(
+                Case(
+                    f"{torque:g} Nm on {node}",
+                    (Fault("push", node, 0, 60, torque=torque),),
+                    state=_S.ACTIVE,
+                    detected=60,
+                    observed=400,
+                    checks=(guide_kept,),
+                )
+                for node, torque in (("LEFT_SH", -180.0), ("LEFT_SH", 180.0), (_KNEE, -110.0), (_KNEE, 110.0))
+            ),
             Case(
-                f"{torque:g} Nm on {node}",
-                (Fault("push", node, 0, 60, torque=torque),),
-                detected=60,
-                observed=400,
-                checks=(guide_regained,),
-            )
-            for node, torque in (("LEFT_SH", -80.0), ("LEFT_SH", 80.0), (_KNEE, -50.0), (_KNEE, 50.0))
+                "90 Nm on the knee, 400 cycles", (Fault("push", _KNEE, 0, 400, torque=90.0),), detected=60, reacted=400
+            ),
         ),
         permanent=Case("40 Nm on the knee", (Fault("push", _KNEE, torque=40.0),)),
     ),
@@ -130,7 +142,7 @@ SCENARIOS: Final = (
                 checks=(limit_follows_temperature,),
             ),
             Case(
-                "up to 105 degC, 1 K per cycle",  # the drive reduces its torque limit above 90 degC, from cycle 65
+                "up to 105 degC, 1 K per cycle",  # the drive reduces its torque limit above 90 degC, after 65 cycles
                 (Fault("heat_ramp", _KNEE, 0, 400, rate=1000.0, up_to=105.0),),
                 node=_KNEE,
                 detected=70,
@@ -149,10 +161,10 @@ SCENARIOS: Final = (
             Case("one drive", (Fault("under_voltage", _KNEE, 0, 200, volts=30.0),), node=_KNEE),
             Case(
                 "battery removed",
-                (Fault("battery_removed", "battery", 0, 300),),
+                (Fault("battery_removed", "battery", 0, 600),),
                 dtc="SUPPLY_LOW",
-                detected=150,
-                reacted=200,
+                detected=300,
+                reacted=450,
             ),
         ),
     ),

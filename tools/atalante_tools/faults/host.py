@@ -1,4 +1,4 @@
-"""Scenarios of faults of the computer that runs the HAL: late cycles, bus errors and controller errors."""
+"""Fault scenarios of the computer that runs the HAL: late cycles, bus errors and controller errors."""
 
 from __future__ import annotations
 

@@ -7,6 +7,7 @@ from typing import Final
 from atalante_emulator.faults import Fault
 from atalante_hal.robot import CELLS, JOINTS
 from atalante_hal.types import SupervisorState
+from atalante_hal.wire.frame import FLAG_BRS, FLAG_ESI, FLAG_FDF
 from atalante_tools.faults.checks import (
     data_stays_fresh,
     drives_report_two_senders,
@@ -19,11 +20,15 @@ _HOLD: Final = SupervisorState.HOLD
 _ACTIVE: Final = SupervisorState.ACTIVE
 _OFF: Final = SupervisorState.OFF
 _BUSES: Final = ("left_leg", "right_leg", "left_sense", "right_sense")
-#: Node, state message and command message for the faults of a single drive.
+#: Drive to which the faults of a single drive are applied.
 _KNEE: Final = "LEFT_SK"
+#: State message of this drive.
 _STATE: Final = "LEFT_SK_STATE"
+#: Message with the command of this drive.
 _COMMAND: Final = "COMMAND_LEFT_LEG"
 _PENDANT: Final = "PENDANT"
+#: Flags of a CAN FD frame from a node that is error passive.
+_ERROR_PASSIVE: Final = FLAG_FDF | FLAG_BRS | FLAG_ESI
 _DRIVES: Final = tuple(joint.upper() for joint in JOINTS)
 
 
@@ -81,7 +86,7 @@ SCENARIOS: Final = (
         "F04",
         (
             *(_lost(drive, f"{drive}_STATE", 5, node=drive) for drive in _DRIVES),
-            # The right foot is on the ground, so the left leg must finish its step before HOLD.
+            # The right foot is on the ground, so the left leg must finish its step before the HAL enters HOLD.
             *(
                 Case(
                     f"{frames or 'all'} frames of the swing leg",
@@ -95,7 +100,7 @@ SCENARIOS: Final = (
                     node=_KNEE,
                     reacted=reacted,
                     recovers=False,
-                    observed=40,  # short, because the HAL reports the constant forces as a fault after 100 cycles
+                    observed=40,  # the HAL reports foot forces that are constant for 100 cycles as a fault
                 )
                 for frames, state, dtc, reacted in (
                     (5, SupervisorState.FINISH_STEP, "SWING_TIMEOUT", 5),
@@ -107,14 +112,14 @@ SCENARIOS: Final = (
     ),
     Scenario(
         "F05",
-        (Case(_KNEE, (Fault("duplicate", _STATE, 0, 50),), node=_KNEE, checks=(data_stays_fresh,)),),
+        (Case(_KNEE, (Fault("duplicate", _STATE, 0, 10),), node=_KNEE, checks=(data_stays_fresh,)),),
         permanent=Case("permanent", (Fault("duplicate", _STATE),)),
     ),
     Scenario(
         "F06",
         (
             Case("0 cycles", (), dtc="", state=_ACTIVE, observed=200),
-            # The HAL detects the delay when the first delayed frame arrives, which is `k` cycles after the fault begins.
+            # The HAL detects the delay when the first delayed frame arrives, `k` cycles after the start of the fault.
             *(
                 Case(f"{k} cycles", (Fault("delay", _STATE, 0, 200, by=k),), node=_KNEE, detected=k + 1, state=_ACTIVE)
                 for k in range(1, 5)
@@ -123,7 +128,7 @@ SCENARIOS: Final = (
         ),
         permanent=Case("by 4 cycles, permanent", (Fault("delay", _STATE, 0, None, by=4),)),
     ),
-    # The first frame with the frozen counter still has the expected counter. Only the second frame is faulty.
+    # The first frame with a frozen counter still has the expected counter value. The second frame is the first faulty frame.
     Scenario(
         "F07",
         (
@@ -238,7 +243,64 @@ SCENARIOS: Final = (
         ),
         permanent=Case("permanent", (Fault("inject", _COMMAND, SK_TargetTorque=200.0),)),
     ),
-    # Each frame of the second sender has the counter of the last genuine frame plus `ahead`.
+    Scenario(
+        "F63",
+        (
+            *(
+                Case(
+                    f"{node}, {copies + 1} frames in every cycle",
+                    (Fault("duplicate", f"{node}_STATE", 0, 200, copies=copies),),
+                    node=node,
+                )
+                for node, copies in ((_KNEE, 1), (_KNEE, 11), (_PENDANT, 1), ("FOOT_LEFT", 1), ("IMU_TORSO", 3))
+            ),
+            Case(
+                "for 10 cycles",
+                (Fault("duplicate", _STATE, 0, 10),),
+                state=_ACTIVE,
+                dtc="E2E_REPEATED",
+                detected=1,
+                checks=(data_stays_fresh,),
+            ),
+        ),
+        permanent=Case("permanent", (Fault("duplicate", _STATE),)),
+    ),
+    Scenario(
+        "F64",
+        (
+            *(
+                Case(
+                    f"{count} per cycle",
+                    tuple(Fault("error_frame", "left_leg", 0, 200, error=0x88) for _ in range(count)),
+                )
+                for count in (1, 8)
+            ),
+            Case("for 5 cycles", (Fault("error_frame", "left_leg", 0, 5, error=0x88),), state=_ACTIVE),
+        ),
+        permanent=Case("permanent", (Fault("error_frame", "left_leg", error=0x88),)),
+    ),
+    Scenario(
+        "F65",
+        (
+            *(
+                Case(
+                    f"{node}, in every frame",
+                    (Fault("flags", f"{node}_STATE", 0, 200, flags=_ERROR_PASSIVE),),
+                    node=node,
+                )
+                for node in (_KNEE, _PENDANT, "IMU_PELVIS")
+            ),
+            Case(
+                "for 10 cycles",
+                (Fault("flags", _STATE, 0, 10, flags=_ERROR_PASSIVE),),
+                state=_ACTIVE,
+                node=_KNEE,
+                checks=(data_stays_fresh,),
+            ),
+        ),
+        permanent=Case("permanent", (Fault("flags", _STATE, flags=_ERROR_PASSIVE),)),
+    ),
+    # The alive counter in a frame of the second sender is the last counter of the genuine sender plus `ahead`.
     Scenario(
         "F58",
         (

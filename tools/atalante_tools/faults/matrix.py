@@ -1,4 +1,4 @@
-"""Loader of the fault matrix FAULTS.md: bound, final state, diagnostic code and proof of each fault.
+"""Loader of the fault matrix FAULTS.md: time limit, final state, diagnostic code and proof of each fault.
 
 FAULTS.md -> rows -> verdicts of the scenarios -> report
 """
@@ -16,14 +16,14 @@ from atalante_hal.types import SupervisorState
 
 MATRIX_FILE: Final = Path(__file__).with_name("FAULTS.md")
 COLUMNS: Final = ("ID", "Fault", "Detected by", "Cycles", "Reaction", "State", "DTC", "Proof")
-#: Entry in the column Proof. It means that the scenario with the ID of the row proves the row.
+#: Text in the column Proof of a fault whose proof is the scenario with the same ID.
 SCENARIO: Final = "scenario"
 _ID = re.compile(r"F\d\d")
 _BOUND = re.compile(r"(\d+)(?: / (\d+))?")
 
 
 class MatrixError(ValueError):
-    """FAULTS.md is invalid. The message names the line and the valid content."""
+    """Raised if FAULTS.md is invalid. The message names the line and the valid content."""
 
 
 @dataclass(frozen=True)
@@ -33,21 +33,29 @@ class Row:
     id: str
     fault: str  # description of the fault
     noticed_by: str  # check that detects it
-    cycles: str  # bounds as text, such as "1 / 5"; `detected` and `reacted` return the numbers
+    cycles: str  # time limits as text, such as "1 / 5"; `detected` and `reacted` return the numbers
     behaviour: str  # reaction in words
     state: SupervisorState  # final state of the HAL
-    dtc: str  # diagnostic code; empty: none
-    proof: tuple[str, ...]  # each entry is SCENARIO or a test `path::test` in tests/; a final * matches any text
+    dtc: str  # diagnostic code; empty means no code
+    #: Proofs of the row. A proof is SCENARIO or the name of a test in tests/, such as `faults/test_frames.py::test_f08_*`.
+    #: An * at the end of the name stands for any text.
+    proof: tuple[str, ...]
 
     @property
     def detected(self) -> int | None:
-        """Return the cycle by which the diagnostic must be reported. The first faulty cycle is 1. None without a number."""
+        """Return the cycle by which the diagnostic must be reported; None if the row has no number.
+
+        The first faulty cycle is cycle 1.
+        """
         bound = _BOUND.fullmatch(self.cycles)
         return int(bound[1]) if bound else None
 
     @property
     def reacted(self) -> int | None:
-        """Return the cycle by which the reaction must occur: the number after `/`, or the only number. None without a number."""
+        """Return the cycle by which the reaction must occur; None if the row has no number.
+
+        The first faulty cycle is cycle 1. In the text "1 / 5", the cycle of the reaction is 5.
+        """
         bound = _BOUND.fullmatch(self.cycles)
         return int(bound[2] or bound[1]) if bound else None
 
@@ -59,7 +67,7 @@ class Row:
 
 @functools.cache
 def load_matrix(path: Path = MATRIX_FILE) -> Mapping[str, Row]:
-    """Load all rows by ID, in the order of the file.
+    """Load all rows of the fault matrix by fault ID, in the order of the file.
 
     Args:
         path: Markdown file with the table.

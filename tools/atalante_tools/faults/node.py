@@ -1,4 +1,4 @@
-"""Scenarios of faults of a whole node: restart, silence, lost heartbeat and wrong DBC."""
+"""Fault scenarios of a whole node: restart, no frames, lost heartbeat and wrong DBC."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ _ACTIVE: Final = SupervisorState.ACTIVE
 _HOLD: Final = SupervisorState.HOLD
 _DRIVES: Final = tuple(joint.upper() for joint in JOINTS)
 _SENSORS: Final = (*(f"IMU_{name.upper()}" for name in IMUS), *(f"FOOT_{name.upper()}" for name in FEET))
-#: Timeout of IMUs and feet [cycles].
+#: Time without a frame after which the HAL reports a timeout of an IMU or a foot [cycles].
 _SENSOR_TIMEOUT: Final = 10
 
 SCENARIOS: Final = (

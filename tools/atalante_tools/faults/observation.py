@@ -16,13 +16,13 @@ from atalante_tools.faults.command_check import Commands
 
 @dataclass(frozen=True)
 class Observation:
-    """Record of one run. All cycle numbers are HAL cycles, from 1. Row k of an array belongs to cycle k + 1."""
+    """Record of one run. The first HAL cycle of a run has the number 1. Row k of an array belongs to cycle k + 1."""
 
     network: Network
     robot: Robot
     first: int  # first faulty cycle
-    over: int | None  # first cycle after the end of all stimuli; None if a stimulus is permanent
-    pressed: int | None  # cycle of the operator's START after the fault; None: no START
+    over: int | None  # first cycle after the end of all faults and operator actions; None if a fault is permanent
+    pressed: int | None  # cycle of the operator's START after the fault; None if there is no START
     states: tuple[SupervisorState, ...]  # state of each cycle
     events: tuple[Event, ...]  # events of the HAL
     commands: Commands  # commands that the HAL sent
@@ -31,12 +31,13 @@ class Observation:
     position: Vector  # true joint angles [rad], shape (cycles, 12)
     velocity: Vector  # true joint velocities [rad/s], shape (cycles, 12)
     temperature: Vector  # reported temperature of the drives [degC], shape (cycles, 12)
-    age: npt.NDArray[np.int64]  # age of the data of each message in the HAL [cycles], shape (cycles, messages)
-    guide_exit: Vector  # largest distance of an assisted joint outside its guide [rad], shape (cycles,); inside: < 0
+    age: npt.NDArray[np.int64]  # data age of each message in the HAL [cycles], shape (cycles, messages)
+    #: largest distance of an assisted joint outside its guide [rad], shape (cycles,); negative inside
+    guide_exit: Vector
     messages: tuple[str, ...]  # name of the message in each column of `age`
 
     def state(self, cycle: int) -> SupervisorState:
-        """Return the state of a cycle.
+        """Return the state of the HAL in a cycle.
 
         Args:
             cycle: HAL cycle, from 1.
@@ -45,7 +46,7 @@ class Observation:
 
     @property
     def last_before_start(self) -> int:
-        """Return the last cycle before the operator's START after the fault, or the last cycle of a run without START."""
+        """Return the cycle before `pressed`, or the last cycle of the run if START was not pressed after the fault."""
         return (self.pressed or self.last + 1) - 1
 
     @property
@@ -54,7 +55,7 @@ class Observation:
         return len(self.states)
 
     def latency(self, cycle: int) -> int:
-        """Return the number of cycles from the first faulty cycle to the given cycle. Both are counted.
+        """Return the number of cycles from the first faulty cycle to the given cycle, including these two cycles.
 
         Args:
             cycle: HAL cycle.

@@ -1,4 +1,4 @@
-"""Scenarios of STOP and HOLD by the operator, a released dead-man switch, and a lost pendant."""
+"""Scenarios of operator actions and pendant faults: STOP, HOLD, a released dead-man switch, and a lost pendant."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Report of a campaign in Markdown and JSON: result of each fault, endurance runs and pairs of faults.
+"""Report of a fault campaign in Markdown and JSON: results of single faults, endurance runs and pairs of faults.
 
 results -> Summary -> table on the terminal, report.md, report.json
 """
@@ -19,16 +19,16 @@ from atalante_tools.faults.verdict import Verdict
 
 @dataclass(frozen=True)
 class Line:
-    """Result of one fault: the worst of its cases. The fields are the keys of `--json`."""
+    """Result of one fault, taken from the worst of its test cases. The field names are the keys of `--json`."""
 
     id: str
     passed: bool
     state: str
-    cycles: int | None  # latency of the worst case, which is a failed case or the case closest to its bound
+    cycles: int | None  # reaction time of the worst case: a failed case, otherwise the case closest to its time limit
     bound: int
     dtc: str
     cases: int
-    failures: tuple[str, ...]  # name of the case and one sentence for each failure
+    failures: tuple[str, ...]  # one text per failure: name of the case and a sentence
 
 
 def line_of(verdicts: Sequence[Verdict]) -> Line:
@@ -75,7 +75,7 @@ class Summary:
 
     @property
     def passed(self) -> bool:
-        """Return whether every case and every pair passed."""
+        """Return whether every single fault and every pair of faults passed."""
         return all(line.passed for line in self.lines) and not any(pair.failures for pair in self.pairs)
 
     def write(self, folder: Path) -> None:
@@ -129,7 +129,7 @@ class Summary:
         return "\n\n".join(parts) + "\n"
 
     def _pairs(self) -> str:
-        """Return a table of the final states of all pairs. Each row is a first fault, each column is a second fault."""
+        """Return a table of the final states of all fault pairs: a row per first fault, a column per second fault."""
         names = [f"{id_} {name}" for id_, name in REPRESENTATIVES]
         found = {(pair.first, pair.second): pair for pair in self.pairs}
         rows = [["", *(name.split()[0] for name in names)]]

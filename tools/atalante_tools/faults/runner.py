@@ -1,4 +1,4 @@
-"""Runner of the fault cases: an emulated robot walks in lock-step, the faults of a case are injected, and the run is recorded.
+"""Runner of the fault cases: it injects faults while an emulated robot walks in lock-step, and records the run.
 
 case -> rig -> walk -> fault begins -> fault ends -> operator's START -> observation
 """
@@ -24,7 +24,7 @@ from atalante_emulator.faults import Fault
 from atalante_hal.loop import run
 from atalante_hal.robot import Robot, load_robot
 from atalante_hal.types import State, SupervisorState, Vector
-from atalante_tools.console.options import EMBEDDED, Target
+from atalante_tools.console.options import EMBEDDED, PYBULLET, Target
 from atalante_tools.faults.command_check import Commands, SentFrames
 from atalante_tools.faults.disturbed import DisturbedBus, DisturbedClock, DisturbedController, HostFaults
 from atalante_tools.faults.observation import Observation
@@ -35,16 +35,16 @@ if TYPE_CHECKING:
     from atalante_emulator.pendant import Operator
     from atalante_hal.safety.events import Event
 
-#: Telemetry fields of the controller: tracking error of the assisted joints, and half-width of their guide [rad].
+#: Telemetry fields of the controller: tracking errors of the assisted joints, and half-widths of their guides [rad].
 _GUIDE: Final = ("error", "q_bound")
-#: Controller settings. The startup is short, because the robot is already in the first pose of the gait.
+#: Controller settings. A short startup is sufficient, because the robot is already in the first pose of the gait.
 CONFIG: Final = AirwalkConfig(startup=0.1)
 ASSISTANCE: Final = 0.5
 #: Number of cycles within which a robot without fault must reach ACTIVE after power-on.
 _START: Final = 600
-#: Cycles between the two presses of START after the fault. The first press leaves FAULT, the second press leaves HOLD.
+#: Cycles between two presses of START after the fault: the first ends the state FAULT, the second the state HOLD.
 RECOVERY: Final = 100
-#: Number of consecutive cycles in ACTIVE that count as a restart of the walk.
+#: The walk is considered restarted after this number of consecutive cycles in ACTIVE.
 RESTARTED: Final = 10
 
 
@@ -66,20 +66,23 @@ def run_context() -> RunContext:
     gait = load_gait(AIRWALK_GAIT, robot)
     pose = gait.tables().q[0].tolist()
     shared = RunContext(network, robot, gait, pose, AirwalkController(robot, gait, SHAPES["constant"], CONFIG))
-    # Exclude these permanent objects from later garbage collections, which makes every run faster.
+    # Exclude the permanent objects from later garbage collections. This makes every run faster.
     gc.collect()
     gc.freeze()
     return shared
 
 
 @functools.cache
-def first_walk_cycle() -> int:
-    """Return the HAL cycle in which the first walking step of a fault-free walk begins. It is the same in every run.
+def first_walk_cycle(engine: str = PYBULLET) -> int:
+    """Return the HAL cycle in which the first walking step begins in a run without fault. It is the same in all runs.
+
+    Args:
+        engine: physics engine of the emulated robot.
 
     Raises:
-        RuntimeError: If the robot does not start without a fault.
+        RuntimeError: If the robot does not become ACTIVE although there is no fault.
     """
-    trial = _Run(Case("nothing", ()), begins=1)
+    trial = _Run(Case("nothing", (), engine=engine), begins=1)
     trial.execute(lambda state: state.supervisor is SupervisorState.ACTIVE or state.cycle >= _START)
     if trial.states[-1] is not SupervisorState.ACTIVE:
         raise RuntimeError(f"a robot without fault must be ACTIVE within {_START} cycles, got {trial.states[-1].name}")
@@ -87,14 +90,16 @@ def first_walk_cycle() -> int:
 
 
 def observe(case: Case, bound: int, *, recovery: bool = True) -> Observation:
-    """Run a case and return its record.
+    """Run a test case and return the record of the run.
 
     Args:
         case: faults to inject and actions of the operator.
         bound: cycles within which the reaction must occur. A permanent fault lasts `bound + case.observed` cycles.
-        recovery: whether the operator presses START after the fault, to restart the walk.
+        recovery: whether the operator presses START twice after the fault, to restart the walk.
     """
-    begins = 1 if case.phase is None else first_walk_cycle() + round(case.phase * run_context().gait.duration / PERIOD)
+    begins = 1
+    if case.phase is not None:
+        begins = first_walk_cycle(case.engine) + round(case.phase * run_context().gait.duration / PERIOD)
     start_pressed = begins + max(case.first_faulty + bound, case.ends or 0) + case.observed
     case_run = _Run(case, begins)
     if recovery:
@@ -118,7 +123,7 @@ class _Run:
     def __init__(self, case: Case, begins: int) -> None:
         self._case, self._begins = case, begins
         self.states: list[SupervisorState] = []
-        #: HAL cycle -> actions of the operator in this cycle.
+        #: Actions of the operator, listed by HAL cycle.
         self.presses: defaultdict[int, list[str]] = defaultdict(list)
         for stimulus in case.stimuli:
             if isinstance(stimulus, OperatorAction):
@@ -131,11 +136,11 @@ class _Run:
         )
         self._sent = SentFrames()
         self._samples: list[_Sample] = []
-        self._events: list[Event] = []  # events of the HAL, without the events of the shutdown
-        self._copied = 0  # number of events of the HAL that were copied or dropped
+        self._events: list[Event] = []  # events that the HAL reported before its shutdown
+        self._copied = 0  # number of events that the HAL had reported when they were last copied
 
     def execute(self, until: Callable[[State], bool]) -> None:
-        """Run HAL and emulator. The operator presses START when the HAL is READY for the first time.
+        """Run the HAL and the emulator. The operator presses START when the HAL is READY for the first time.
 
         Args:
             until: end condition, called with the state after every cycle.
@@ -146,7 +151,7 @@ class _Run:
         operator = Operator(starts=False)
         controller = DisturbedController(shared.controller, self._host_faults)
         with open_hal(
-            Target(EMBEDDED, "", lockstep=True),
+            Target(EMBEDDED, "", lockstep=True, engine=self._case.engine),
             network=shared.network,
             robot=shared.robot,
             seed=self._case.seed,
@@ -180,7 +185,7 @@ class _Run:
             self._messages = hal.messages
 
     def _prepare(self, cycle: int, operator: Operator) -> None:
-        """Set the number of the next cycle, and execute the actions of the operator in this cycle."""
+        """Set the number of the next cycle, and execute the operator actions of the next cycle."""
         self._host_faults.cycle = self._sent.cycle = cycle
         for press in self.presses.get(cycle, ()):
             getattr(operator, press)()
@@ -189,7 +194,7 @@ class _Run:
         """Return the record of the run.
 
         Args:
-            pressed: cycle of the operator's START after the fault; None: no START.
+            pressed: cycle of the operator's START after the fault; None if there is no START.
         """
         shared, ends = run_context(), self._case.ends
         cycles, frames = self._sent.frames()
@@ -210,7 +215,7 @@ class _Run:
 
 
 class _Sample(NamedTuple):
-    """Values of one cycle. They become one row of each array of an `Observation`."""
+    """Values of one cycle, which become one row in each array of an `Observation`."""
 
     drive_state: list[int]
     torque: Vector
@@ -222,7 +227,7 @@ class _Sample(NamedTuple):
 
     @classmethod
     def of(cls, rig: Rig) -> _Sample:
-        """Return the values of the present cycle. Drive states, torques and motion are true values of the emulated robot."""
+        """Return the values of the current cycle. Drive states, torques and motion are true values in the emulator."""
         hal, emulator = rig.hal, rig.emulator
         assert emulator is not None
         (hip, knee), (hip_bound, knee_bound) = (hal.record[hal.layout[f"controller.{name}"]] for name in _GUIDE)

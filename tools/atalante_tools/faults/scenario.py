@@ -1,8 +1,9 @@
-"""Scenarios as data: faults and operator actions with their timing, and the expected reaction.
+"""Data types of fault scenarios: faults and operator actions with their timing, and the expected reaction of the HAL.
 
     row of the matrix -> scenario: its cases -> runner -> observation -> verdict
 
-State, code and bounds that a case does not define are taken from its row of the matrix.
+If a case does not define the expected state, the diagnostic code or a time limit, its row of the fault matrix gives the
+value.
 """
 
 from __future__ import annotations
@@ -13,11 +14,12 @@ from typing import TYPE_CHECKING, Final
 
 from atalante_emulator.faults import Fault
 from atalante_hal.types import SupervisorState
+from atalante_tools.console.options import PYBULLET
 
 if TYPE_CHECKING:
     from atalante_tools.faults.observation import Observation
 
-#: Default start of a case, as phase of the first walking step (0 to 1). At this phase, the left leg swings fastest.
+#: Default start of a case, as phase of the first walking step (0 to 1). The left leg swings fastest at this phase.
 MID_SWING: Final = 0.35
 
 
@@ -28,12 +30,12 @@ class HostFault:
     Kinds of faults:
 
     - `late`: the cycle begins `value` seconds late.
-    - `slow`: each cycle takes `value` seconds instead of its period.
+    - `slow`: each cycle takes `value` seconds instead of 1 ms.
     - `raise`, `raise_in_reset`: the controller raises the builtin exception named `value`.
     - `request`: the controller requests `value` Nm on every joint.
     - `shake`: the controller adds a torque on the left hip that alternates between `value` Nm and -`value` Nm.
-    - `shape`: the controller requests an array of `value` torques.
-    - `bus_down`, `bus_full`: the bus of the HAL raises an error when it sends.
+    - `shape`: the controller returns an array with `value` torques instead of one torque per joint.
+    - `bus_down`, `bus_full`: the bus raises an error when the HAL sends frames.
     """
 
     kind: str
@@ -52,40 +54,44 @@ class OperatorAction:
 
 
 Stimulus = Fault | HostFault | OperatorAction
-#: Additional check of a run. It returns None if it passes, and a sentence if it fails.
+#: Additional check of a run. The check returns None if it passes, and a sentence if it fails.
 ObservationCheck = Callable[["Observation"], str | None]
 
 
 @dataclass(frozen=True)
 class Case:
-    """Case of a scenario: stimuli and expected reaction of one run."""
+    """Test case of a scenario: faults, operator actions and expected reaction of one run."""
 
     name: str  # unique name in the scenario
     stimuli: tuple[Stimulus, ...]  # faults and operator actions; `start` counts from the start of the case
-    phase: float | None = MID_SWING  # start of the case, as phase of the first walking step (0 to 1); None: power-on
+    #: start of the case, as phase of the first walking step (0 to 1); None means power-on
+    phase: float | None = MID_SWING
     first_faulty: int = 0  # first faulty cycle, counted from the start of the case
-    state: SupervisorState | None = None  # expected final state; None: as in the matrix
-    dtc: str | None = None  # expected diagnostic code; "": no code; None: as in the matrix
-    detected: int | None = None  # time limit for the diagnostic [cycles]; None: as in the matrix
-    reacted: int | None = None  # time limit for the reaction [cycles]; None: as in the matrix
-    node: str | None = None  # node that the diagnostic must name; None: any node
-    recovers: bool = True  # True: START after the fault must lead to ACTIVE; False: it must not
-    observed: int = 60  # cycles from the end of the fault (of a permanent fault: from its reaction limit) to START
+    state: SupervisorState | None = None  # expected final state of the HAL; None means as in the fault matrix
+    dtc: str | None = None  # expected diagnostic code; "" means no code, None means as in the fault matrix
+    detected: int | None = None  # time limit for the diagnostic [cycles]; None means as in the fault matrix
+    reacted: int | None = None  # time limit for the reaction [cycles]; None means as in the fault matrix
+    node: str | None = None  # node that the diagnostic must name; None means any node
+    recovers: bool = True  # whether START after the fault must lead to ACTIVE; if not, START must not lead to ACTIVE
+    #: cycles from the end of the fault to START; for a permanent fault, from the time limit of the reaction to START
+    observed: int = 60
     seed: int = 0  # seed of the random numbers in the emulator
     checks: tuple[ObservationCheck, ...] = ()  # additional checks of the run
+    engine: str = PYBULLET  # physics engine of the emulated robot
 
     @property
     def ends(self) -> int | None:
-        """Return the first cycle after all stimuli, counted from the start of the case. None if a stimulus is permanent."""
+        """Return the first cycle after all stimuli, counted from the start of the case; None if a stimulus is permanent."""
         ends = [None if one.cycles is None else one.start + one.cycles for one in self.stimuli]
         return None if None in ends else max((end for end in ends if end is not None), default=0)
 
 
 @dataclass(frozen=True)
 class Scenario:
-    """All cases that prove one row of the matrix."""
+    """All test cases that prove one row of the fault matrix."""
 
     id: str
     cases: tuple[Case, ...]
-    #: Case with a permanent fault, for the endurance run; None: no endurance run.
+    #: Case with a permanent fault, for the endurance run. The endurance run repeats this case with a shorter and shorter fault,
+    #: until the fault does not stop the walk. None means no endurance run.
     permanent: Case | None = None

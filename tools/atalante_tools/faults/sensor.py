@@ -8,24 +8,24 @@ from atalante_emulator.faults import Fault
 from atalante_hal.robot import CELLS, FEET, IMUS
 from atalante_hal.types import SupervisorState
 from atalante_tools.faults.checks import start_is_rejected
-from atalante_tools.faults.scenario import Case, OperatorAction, Scenario
+from atalante_tools.faults.scenario import MID_SWING, Case, OperatorAction, Scenario
 
 _ACTIVE: Final = SupervisorState.ACTIVE
 _HOLD: Final = SupervisorState.HOLD
 _KNEE: Final = "LEFT_SK"
-#: Joint that hardly moves while the left leg swings, so a small jump of its encoder is detectable.
+#: Joint that hardly moves while the left leg swings, so that a small jump of the joint encoder is detectable.
 _STILL: Final = "RIGHT_FH"
 _IMUS: Final = tuple(f"IMU_{name.upper()}" for name in IMUS)
 _FEET: Final = tuple(f"FOOT_{name.upper()}" for name in FEET)
-#: Vertical forces of the cells of a foot on the ground [N].
-_ON_GROUND: Final = {f"{cell}_ForceZ": 150.0 for cell in CELLS}
+#: Share of doubled frames that is tolerated for ever; a share of more than 0.2 is not.
+_OFTEN: Final = 0.15
 #: Permanent communication faults that must not prevent the detection of a sensor fault.
-#: The last two faults delay messages that the sensor checks use.
+#: The last two faults delay messages that the sensor checks use. A message that is doubled in every cycle is a fault (F63).
 _TOLERATED: Final = {
-    "FOOT_LEFT doubled": Fault("duplicate", "FOOT_LEFT_STATE"),
+    "FOOT_LEFT often doubled": Fault("duplicate", "FOOT_LEFT_STATE", p=_OFTEN),
     "FOOT_LEFT a cycle late": Fault("delay", "FOOT_LEFT_STATE"),
-    "IMU_TORSO doubled": Fault("duplicate", "IMU_TORSO_STATE"),
-    "PENDANT doubled": Fault("duplicate", "PENDANT_STATE"),
+    "IMU_TORSO often doubled": Fault("duplicate", "IMU_TORSO_STATE", p=_OFTEN),
+    "PENDANT often doubled": Fault("duplicate", "PENDANT_STATE", p=_OFTEN),
     "PENDANT a cycle late": Fault("delay", "PENDANT_STATE"),
     "unknown frames": Fault("foreign", "left_leg", can_id=0x7FF),
     f"{_STILL} a cycle late": Fault("delay", f"{_STILL}_STATE"),
@@ -34,7 +34,7 @@ _TOLERATED: Final = {
 
 
 def _imu(kind: str, cycles: int, *, tolerated: int) -> tuple[Case, ...]:
-    """Return one case per IMU, and one case with a short fault during which the walk must continue."""
+    """Return one test case per IMU, and one test case with a short fault during which the walk must continue."""
     return (
         *(Case(imu, (Fault(kind, imu, 0, cycles),), node=imu) for imu in _IMUS),
         Case(f"for {tolerated} cycles", (Fault(kind, _IMUS[0], 0, tolerated),), state=_ACTIVE, node=_IMUS[0]),
@@ -42,15 +42,49 @@ def _imu(kind: str, cycles: int, *, tolerated: int) -> tuple[Case, ...]:
 
 
 def _stuck(node: str, cycles: int) -> tuple[Fault, ...]:
-    """Return two faults: a stuck encoder, and a later restart of its drive, which initialises the encoder again."""
+    """Return two faults: a stuck encoder, and later a restart of the drive, which initialises the encoder again."""
     return Fault("encoder_stuck", node, 0, cycles), Fault("reset", node, cycles + 30, 3)
 
+
+def _standing(foot: str, cycles: int) -> tuple[Fault, ...]:
+    """Return faults that simulate a foot on the ground. The force changes every 50 cycles, because a constant force is a fault.
+
+    Args:
+        foot: name of the foot node.
+        cycles: duration [cycles].
+    """
+    return tuple(
+        Fault("value", f"{foot}_STATE", start, 50, **{f"{cell}_ForceZ": 150.0 + start / 50 % 2 for cell in CELLS})
+        for start in range(0, cycles, 50)
+    )
+
+
+def _every(cycles: int, kind: str, target: str, count: int, **parameters: float) -> tuple[Fault, ...]:
+    """Return faults of one cycle each, one in every `cycles` cycles.
+
+    Args:
+        cycles: interval of the faults [cycles].
+        kind: kind of the faults.
+        target: target of the faults.
+        count: number of faults.
+        parameters: parameters of the faults.
+    """
+    return tuple(Fault(kind, target, cycles * number, 1, **parameters) for number in range(count))
+
+
+#: Raw code of the signal Position that marks an invalid value.
+_INVALID_CODE: Final = 1 << 23
 
 SCENARIOS: Final = (
     Scenario(
         "F27",
         (
-            *(Case(node, _stuck(node, 200), node=node) for node in ("LEFT_SH", _KNEE, "RIGHT_SH")),
+            *(Case(node, _stuck(node, 200), node=node) for node in ("LEFT_SH", "RIGHT_SH")),
+            # With a stuck knee encoder, the guide commands the largest torque of the drive, which reveals the fault early.
+            *(
+                Case(f"{_KNEE} at {phase:g} T", _stuck(_KNEE, 200), node=_KNEE, phase=phase, detected=20, reacted=20)
+                for phase in (0.1, MID_SWING, 0.65, 0.8)
+            ),
             *(
                 Case(
                     f"{node} with little load",
@@ -89,7 +123,7 @@ SCENARIOS: Final = (
             ),
             *(
                 Case(f"{1e3 * by:g} mrad for 100 cycles", (Fault("encoder_jump", _STILL, 0, 100, by=by),), node=_STILL)
-                for by in (0.025, -0.025, 0.1, -1.0)  # larger than 20 mrad, the largest possible motion in five cycles
+                for by in (0.025, -0.025, 0.1, -1.0)  # a joint can move by at most 22.5 mrad in five cycles
             ),
             Case(
                 "25 mrad, permanent",
@@ -136,21 +170,21 @@ SCENARIOS: Final = (
             for cell, force in zip(CELLS, (400.0, 0.0, -50.0, 61.0), strict=True)
         ),
     ),
-    # For 60 cycles, injected forces simulate ground contact. The fault begins when they end and no foot is on the ground.
-    # After 100 cycles without contact, the HAL assumes that the robot was lifted on purpose, and the fault ends.
+    # Injected forces simulate that the robot stands on both feet. The fault begins when these forces end.
+    # After 140 cycles without contact, the HAL assumes that the robot was lifted on purpose, and the fault ends.
     Scenario(
         "F34",
         tuple(
             Case(
                 name,
-                tuple(Fault("value", f"{foot}_STATE", 0, 60, **_ON_GROUND) for foot in feet),
-                first_faulty=60,
+                (*_standing(_FEET[0], left), *_standing(_FEET[1], right)),
+                first_faulty=600,
                 observed=1000,
             )
-            for name, feet in (
-                ("both feet lift", _FEET),
-                ("the left foot lifts", _FEET[:1]),
-                ("the right foot lifts", _FEET[1:]),
+            for name, left, right in (
+                ("both feet lift", 600, 600),
+                ("the left foot lifts", 600, 550),
+                ("the right foot lifts", 550, 600),
             )
         ),
     ),
@@ -184,8 +218,8 @@ SCENARIOS: Final = (
                 recovers=False,
                 checks=(start_is_rejected,),
             ),
-            # The controller compensates the drift by moving the joint. The reported position leaves its range only
-            # after the joint has reached its mechanical limit, so the detection takes up to 400 cycles.
+            # The controller moves the joint to compensate the drift, until the joint reaches its mechanical limit.
+            # Only then the reported position leaves its range, so the detection takes up to 400 cycles.
             Case(
                 "RIGHT_SA at 2 rad/s",
                 (Fault("encoder_drift", "RIGHT_SA", rate=2.0),),
@@ -246,6 +280,39 @@ SCENARIOS: Final = (
                     recovers=False,
                 )
                 for name, disturbance in _TOLERATED.items()
+            ),
+        ),
+    ),
+    Scenario(
+        "F66",
+        (
+            Case(
+                "every second position of a joint is invalid",
+                _every(2, "raw", f"{_STILL}_STATE", 40, Position=_INVALID_CODE),
+                node=_STILL,
+            ),
+            Case(
+                "every second frame of an IMU is invalid",
+                _every(2, "imu_invalid", "IMU_PELVIS", 40),
+                state=SupervisorState.FULL_ASSIST,
+                dtc="IMU_INVALID",
+                node="IMU_PELVIS",
+            ),
+        ),
+    ),
+    Scenario(
+        "F67",
+        (
+            Case("one sample", (Fault("value", f"{_KNEE}_STATE", 0, 1, Temperature=130.0),), state=_ACTIVE, node=_KNEE),
+            Case(
+                "every fifth sample",
+                _every(5, "value", f"{_KNEE}_STATE", 60, Temperature=130.0),
+                state=_ACTIVE,
+                node=_KNEE,
+            ),
+            Case("every second sample", _every(2, "value", f"{_KNEE}_STATE", 60, Temperature=130.0), node=_KNEE),
+            Case(
+                "every sample", (Fault("value", f"{_KNEE}_STATE", 0, 100, Temperature=112.0),), node=_KNEE, reacted=20
             ),
         ),
     ),

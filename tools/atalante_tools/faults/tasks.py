@@ -2,7 +2,7 @@
 
     task -> runner -> verdict
 
-Tasks and results are small, because they are sent between processes or computers.
+Tasks and results are kept small, because they are sent between processes or computers.
 """
 
 from __future__ import annotations
@@ -14,6 +14,7 @@ from dataclasses import dataclass, replace
 from typing import Final
 
 from atalante_emulator.faults import Fault
+from atalante_tools.console.options import PYBULLET
 from atalante_tools.faults.catalogue import SCENARIOS
 from atalante_tools.faults.matrix import load_matrix
 from atalante_tools.faults.runner import observe
@@ -27,11 +28,11 @@ from atalante_tools.faults.verdict import (
     limit_violations,
 )
 
-#: Longest duration of a fault in an endurance run [cycles]. It is longer than a walking step.
+#: Longest duration of a fault in an endurance run [cycles]. This duration is longer than a walking step.
 HORIZON: Final = 1000
 #: Cycles between the first and the second fault of a pair.
 PAIR_DELAY: Final = 3
-#: Cases that a campaign also runs in pairs. Each entry has the ID of a fault and the name of one of its cases.
+#: Test cases that a campaign also runs in pairs: (fault ID, name of a case of this fault).
 REPRESENTATIVES: Final = (
     ("F03", "4 frames"),
     ("F04", "LEFT_SK"),
@@ -52,11 +53,11 @@ REPRESENTATIVES: Final = (
 
 @dataclass(frozen=True)
 class Endurance:
-    """Result of an endurance run: the longest duration of a fault that the walk survives."""
+    """Result of an endurance run: the longest fault duration that the walk survives."""
 
     id: str
     case: str
-    survived: int | None  # duration [cycles]; None: at least `HORIZON`
+    survived: int | None  # longest fault duration that the walk survives [cycles]; None means at least `HORIZON`
 
 
 @dataclass(frozen=True)
@@ -75,22 +76,25 @@ class CaseTask:
 
     id: str
     index: int
+    engine: str = PYBULLET
 
     def __call__(self) -> Verdict:
-        """Run the case and return its verdict."""
-        return run_case(self.id, SCENARIOS[self.id].cases[self.index])
+        """Run the case and return the verdict."""
+        return run_case(self.id, replace(SCENARIOS[self.id].cases[self.index], engine=self.engine))
 
 
 @dataclass(frozen=True)
 class EnduranceTask:
-    """Task to measure how long the walk survives the permanent fault of a scenario."""
+    """Task to measure the longest duration for which the fault of `Scenario.permanent` does not stop the walk."""
 
     id: str
+    engine: str = PYBULLET
 
     def __call__(self) -> Endurance:
-        """Shorten the fault until the walk survives it, and return the result."""
+        """Repeat the case with a shorter and shorter fault until the fault does not stop the walk, and return its duration."""
         case = SCENARIOS[self.id].permanent
         assert case is not None
+        case = replace(case, engine=self.engine)
         cycles = HORIZON
         while cycles and (walked := _cycles_until_stop(case, cycles)) is not None:
             cycles = min(cycles - 1, walked)
@@ -103,12 +107,13 @@ class PairTask:
 
     first: tuple[str, str]
     second: tuple[str, str]
+    engine: str = PYBULLET
 
     def __call__(self) -> PairVerdict:
-        """Run both cases in one run and check limits and states.
+        """Run the two cases in one run and check the limits and the states of the HAL.
 
-        No limit may be exceeded. The state may not improve without the operator. The final state must be at least as severe as
-        after each fault alone.
+        No limit may be exceeded. The state must not become less severe without the operator. The final state must be at
+        least as severe as the expected final state of each fault alone.
         """
         matrix = load_matrix()
         cases = [_case_of(*key) for key in (self.first, self.second)]
@@ -119,7 +124,7 @@ class PairTask:
         bound = max(one.reacted for one in expected) + PAIR_DELAY
         first, second = (f"{id_} {name}" for id_, name in (self.first, self.second))
         try:
-            run = observe(Case(f"{first} and {second}", stimuli), bound, recovery=False)
+            run = observe(Case(f"{first} and {second}", stimuli, engine=self.engine), bound, recovery=False)
         except Exception as error:  # noqa: BLE001 - any exception of the stack is a finding
             return PairVerdict(first, second, "-", (_crash(error),))
         failures = [*limit_violations(run), *automatic_improvements(run, run.last)]
@@ -136,11 +141,11 @@ Result = Verdict | Endurance | PairVerdict
 
 
 def run_case(id_: str, case: Case) -> Verdict:
-    """Run a case and return its verdict. A case that raises an exception has failed.
+    """Run a test case and return the verdict. A test case that raises an exception has failed.
 
     Args:
-        id_: ID of the row of the matrix.
-        case: case of its scenario.
+        id_: fault ID, as in the fault matrix.
+        case: case of the scenario with this fault ID.
     """
     row = load_matrix()[id_]
     expected = Expectation.of(case, row)
@@ -151,30 +156,31 @@ def run_case(id_: str, case: Case) -> Verdict:
     return evaluate(row, case, run)
 
 
-def plan(ids: Sequence[str], *, endurance: bool, pairs: bool) -> list[Task]:
-    """Return the tasks of a campaign. Long tasks come first.
+def plan(ids: Sequence[str], *, endurance: bool, pairs: bool, engine: str = PYBULLET) -> list[Task]:
+    """Return the tasks of a campaign, ordered so that the long tasks come first.
 
     Args:
         ids: IDs of the scenarios.
         endurance: whether to include endurance runs.
         pairs: whether to include the pairs of `REPRESENTATIVES`.
+        engine: physics engine of the emulated robot.
     """
     chosen = [SCENARIOS[id_] for id_ in ids]
     tasks: list[Task] = []
     if endurance:
-        tasks += [EnduranceTask(scenario.id) for scenario in chosen if scenario.permanent is not None]
-    tasks += [CaseTask(scenario.id, index) for scenario in chosen for index in range(len(scenario.cases))]
+        tasks += [EnduranceTask(scenario.id, engine) for scenario in chosen if scenario.permanent is not None]
+    tasks += [CaseTask(scenario.id, index, engine) for scenario in chosen for index in range(len(scenario.cases))]
     if pairs:
-        tasks += [PairTask(*pair) for pair in itertools.combinations(REPRESENTATIVES, 2)]
+        tasks += [PairTask(*pair, engine) for pair in itertools.combinations(REPRESENTATIVES, 2)]
     return tasks
 
 
-#: Lock for the threads of a dask worker. All runs of a process share a controller, so only one run may be active.
+#: Lock for the threads of a dask worker. All runs of a process share one controller, so only one run may be active.
 _one_at_a_time = threading.Lock()
 
 
 def run_task(task: Task) -> Result:
-    """Run a task, called in a worker process.
+    """Run a task. This function is called in a worker process.
 
     Args:
         task: task to run.
@@ -184,7 +190,7 @@ def run_task(task: Task) -> Result:
 
 
 def _cycles_until_stop(case: Case, cycles: int) -> int | None:
-    """Run a permanent fault for `cycles` cycles. Return the number of cycles until the walk stopped; None if it continued."""
+    """Run a permanent fault for `cycles` cycles; return the cycles until the walk stopped, or None if the walk continued."""
     limited = replace(case, stimuli=tuple(_limited(stimulus, cycles) for stimulus in case.stimuli))
     run = observe(limited, cycles, recovery=False)
     for cycle in range(run.first, run.last + 1):
@@ -198,7 +204,7 @@ def _case_of(id_: str, name: str) -> Case:
 
 
 def _limited(stimulus: Stimulus, cycles: int) -> Stimulus:
-    """Return the stimulus. A permanent stimulus is limited to `cycles` cycles."""
+    """Return the fault or action; limit its duration to `cycles` cycles if it is permanent."""
     if stimulus.cycles is not None:
         return stimulus
     if isinstance(stimulus, Fault):
@@ -207,7 +213,7 @@ def _limited(stimulus: Stimulus, cycles: int) -> Stimulus:
 
 
 def _shifted(stimulus: Stimulus, cycles: int) -> Stimulus:
-    """Return the stimulus with its start delayed by `cycles` cycles."""
+    """Return the same fault or action, but let it start `cycles` cycles later."""
     return (
         stimulus.starting(stimulus.start + cycles)
         if isinstance(stimulus, Fault)

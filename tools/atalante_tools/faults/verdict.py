@@ -1,11 +1,11 @@
-"""Evaluation of a run by four checks. Each failure is a sentence.
+"""Evaluation of a fault run by four checks. Each failed check gives a sentence.
 
     observation + row of the matrix -> verdict
 
-1. The expected state must be reached within its bound.
-2. The expected diagnostic must be reported within its bound.
+1. The expected state must be reached within the time limit for the reaction.
+2. The expected diagnostic must be reported within the time limit for the diagnostic.
 3. Commands, motors and joints must stay within their limits.
-4. The state must not improve without the operator. START must lead to ACTIVE, unless the fault persists.
+4. The state must not become less severe without the operator. START must lead to ACTIVE, unless the fault persists.
 """
 
 from __future__ import annotations
@@ -27,31 +27,31 @@ from atalante_tools.faults.scenario import Case
 _S = SupervisorState
 #: States in which the torques of the controller are sent to the drives.
 WALKING: Final = (_S.ACTIVE, _S.FULL_ASSIST, _S.FINISH_STEP)
-#: Accepted overshoot past the position limit while a drive stops its joint [rad].
+#: Accepted motion beyond the position limit while a drive stops its joint [rad].
 _OVERSHOOT: Final = 0.05
-#: Accepted ratio of joint velocity to velocity limit.
+#: Largest accepted ratio of joint velocity to velocity limit.
 _VELOCITY_RATIO: Final = 1.2
 
 
 @dataclass(frozen=True)
 class Expectation:
-    """Expected result of a case. Values that the case does not define are taken from its row of the fault matrix."""
+    """Expected result of a test case. The row of the fault matrix gives the values that the case does not define."""
 
     state: SupervisorState
-    dtc: str  # regular expression for the diagnostic code; "": no code is expected
+    dtc: str  # regular expression for the diagnostic code; "" if no code is expected
     detected: int  # time limit for the diagnostic [cycles]
     reacted: int  # time limit for the reaction [cycles]
 
     @classmethod
     def of(cls, case: Case, row: Row) -> Expectation:
-        """Return the expectation of a case.
+        """Return the expected result of a test case.
 
         Args:
             case: case of the scenario.
-            row: row of the matrix that the scenario proves.
+            row: row of the fault matrix that the scenario proves.
 
         Raises:
-            ValueError: If neither case nor row has a bound in cycles.
+            ValueError: If neither the case nor the row defines a time limit in cycles.
         """
         detected = row.detected if case.detected is None else case.detected
         reacted = row.reacted if case.reacted is None else case.reacted
@@ -75,12 +75,11 @@ class Verdict:
 
     id: str
     case: str
-    state: str  # state of the HAL just before the operator's START
-    cycles: (
-        int | None
-    )  # cycles until the reaction, or until the diagnostic if there was no reaction; None: neither occurred
-    bound: int  # largest accepted value of `cycles`
-    dtc: str  # first reported code that matches the expected code
+    state: str  # state of the HAL just before the operator presses START
+    #: cycles until the reaction, or until the diagnostic if there was no reaction; None if there was neither
+    cycles: int | None
+    bound: int  # time limit for `cycles`
+    dtc: str  # first reported diagnostic code that matches the expected code
     failures: tuple[str, ...]  # one sentence each
 
     @property
@@ -90,7 +89,7 @@ class Verdict:
 
 
 def evaluate(row: Row, case: Case, run: Observation) -> Verdict:
-    """Evaluate a run by the four checks and the additional checks of the case.
+    """Evaluate a run by the four checks of this module and the additional checks of the test case.
 
     Args:
         row: row of the matrix.
@@ -118,8 +117,9 @@ def evaluate(row: Row, case: Case, run: Observation) -> Verdict:
 def reacted(run: Observation, state: SupervisorState) -> int | None:
     """Return the first cycle with the expected reaction, or None.
 
-    The reaction is the expected state or a more severe state. For HOLD and more severe states, a command without ENABLE OPERATION
-    is a reaction, too. If ACTIVE is expected, any other state is a reaction.
+    The reaction is the expected state or a more severe state. If HOLD or a more severe state is expected, a cycle in
+    which no drive gets the command ENABLE OPERATION is also a reaction. If ACTIVE is expected, any more severe state is
+    a reaction.
 
     Args:
         run: observation of the run.
@@ -156,7 +156,7 @@ def limit_violations(run: Observation) -> list[str]:
 
 
 def automatic_improvements(run: Observation, until: int) -> list[str]:
-    """Return a sentence if the state became less severe without the operator after the first faulty cycle.
+    """Return a sentence if the state became less severe after the first faulty cycle without an action of the operator.
 
     Args:
         run: observation of the run.
@@ -201,14 +201,13 @@ def _diagnostic(run: Observation, case: Case, expected: Expectation) -> list[str
 
 
 def _reported(run: Observation, expected: Expectation) -> list[Event]:
-    """Return the events with the expected diagnostic code since the first faulty cycle."""
+    """Return all events since the first faulty cycle that have the expected diagnostic code."""
     return [event for event in run.events if event.cycle >= run.first and re.fullmatch(expected.dtc, event.code)]
 
 
 def _recovery(run: Observation, case: Case, expected: Expectation) -> list[str]:
-    found = (
-        [] if case.phase is None else automatic_improvements(run, run.last_before_start)
-    )  # a case that starts at power-on is exempt, because the start-up improves the state
+    # a case that starts at power-on is exempt, because the state becomes less severe during start-up
+    found = [] if case.phase is None else automatic_improvements(run, run.last_before_start)
     if run.pressed is None:
         return found
     restarted = _S.ACTIVE in (run.state(cycle) for cycle in range(run.pressed, run.last + 1))

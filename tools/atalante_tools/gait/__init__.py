@@ -11,9 +11,9 @@ import click
 from atalante_tools.console.options import SEED, OutputFile, json_option
 from atalante_tools.console.outcome import FAILED, Failed
 from atalante_tools.console.stop_request import stop_requested
-from atalante_tools.console.terminal import Progress, say, show_json, table
-from atalante_tools.gait.extra import extra
+from atalante_tools.console.terminal import Progress, print_message, show_json, table
 from atalante_tools.gait.solve import solve
+from atalante_tools.session.extra import extra
 
 _FOLDER = click.Path(file_okay=False, path_type=Path)
 _FILE = click.Path(dir_okay=False, path_type=Path)
@@ -57,14 +57,14 @@ command.add_command(solve)
     "--compile/--no-compile",
     "machine_code",
     default=False,
-    help="Compile the nonlinear program with gcc first: takes minutes, once per computer, and halves the time per gait.",
+    help="Compile the nonlinear program with gcc first. This takes minutes once per computer, and halves the time per gait.",
 )
 @click.option("--dask", "cluster", metavar="ADDRESS", help="Solve on the workers of this dask scheduler.")
 @click.option(
     "--mass",
     type=levels_of,
     metavar="KG,...",
-    help="Patient masses of the grid, in kg.  [default: four levels over the subjects of the paper]",
+    help="Patient masses of the grid, in kg.  [default: four levels that cover the subjects of the paper]",
 )
 @click.option("--height", type=levels_of, metavar="M,...", help="Patient heights of the grid, in m.")
 @click.option("--step-length", type=levels_of, metavar="M,...", help="Step lengths of the grid, in m.")
@@ -91,10 +91,10 @@ def library(
         raise click.UsageError(str(error)) from error
     collection = Library(out, grid)
     points, todo = len(grid.points()), len(collection.missing())
-    say(f"{points} gaits in {out}, {points - todo} of them already solved")
+    print_message(f"{points} gaits in {out}, {points - todo} of them already solved")
     progress, start = Progress(), time.monotonic()
     solve = solve_compiled if machine_code else solve_subject
-    # A signal such as Ctrl-C takes effect after the gait, because the optimiser would report its exception as a failed gait.
+    # A signal such as Ctrl-C takes effect after the current solve. Otherwise the optimiser would report a failed gait.
     with stop_requested() as stop, closing(collection.generate(solve, jobs=jobs, cluster=cluster)) as outcomes:
         for done, (_, solved) in enumerate(outcomes, 1):
             if as_json:
@@ -106,12 +106,16 @@ def library(
                 break
     progress.clear()
     if stop.wanted:
-        say(f"interrupted, {points - len(collection.missing())} of {points} gaits solved; repeat the command to resume")
+        print_message(
+            f"interrupted, {points - len(collection.missing())} of {points} gaits solved; repeat the command to resume"
+        )
         raise SystemExit(stop.exit_code)
     failures = collection.failures()
     for index, status in failures.items():
-        say(f"failed: {grid.subject(index)}: {status}")
-    say(f"{points - len(collection.missing())} of {points} gaits solved, {_minutes(time.monotonic() - start)}")
+        print_message(f"failed: {grid.subject(index)}: {status}")
+    print_message(
+        f"{points - len(collection.missing())} of {points} gaits solved, {_minutes(time.monotonic() - start)}"
+    )
     if failures:
         raise Failed(f"{len(failures)} gaits failed; their records are in {out / 'failed'}")
 
@@ -121,7 +125,7 @@ def library(
 @click.option("--out", type=OutputFile(".npz"), required=True, metavar="FILE", help="File for the network, .npz.")
 @json_option
 def fit(folder: Path, out: Path, as_json: bool) -> None:
-    """Fit the gait network to a library, which takes about a minute. Equal libraries give equal networks.
+    """Fit the gait network to a library. This takes about a minute. Equal libraries give equal networks.
 
     \b
     Example: atalante gait fit --library runs/library --out runs/network.npz
@@ -137,11 +141,11 @@ def fit(folder: Path, out: Path, as_json: bool) -> None:
     collection = Library(folder)
     gaits = collection.gaits(load_robot())
     if missing := collection.missing():
-        say(
+        print_message(
             f"{len(missing)} of {len(gaits) + len(missing)} gaits are missing in {folder}; "
             "the network is less accurate near the missing gaits"
         )
-    say(f"fitting {len(gaits)} gaits")
+    print_message(f"fitting {len(gaits)} gaits")
     start = time.monotonic()
     fitted = fit_network(list(gaits.values()), collection.grid)
     save_network(fitted.network, out)
@@ -155,9 +159,9 @@ def fit(folder: Path, out: Path, as_json: bool) -> None:
     }
     if as_json:
         show_json(summary)
-    say(
+    print_message(
         f"{out}: {summary['bytes'] / 1024:.0f} KiB, joint error on the gaits of the library {summary['rms_deg']:.3f} deg rms, "
-        f"{summary['worst_deg']:.3f} deg at most; measure the error between them with `atalante gait check --network {out}`"
+        f"{summary['worst_deg']:.3f} deg at most; measure the error on other gaits with `atalante gait check --network {out}`"
     )
 
 
@@ -171,7 +175,7 @@ def fit(folder: Path, out: Path, as_json: bool) -> None:
 @click.option("--seed", type=SEED, default=0, show_default=True, metavar="N", help="Seed of the random subjects.")
 @json_option
 def check(file: Path | None, count: int, seed: int, as_json: bool) -> None:
-    """Compare the gait network with newly solved gaits of random subjects; the exit code is 1 if a deviation is too large.
+    """Compare the gait network with newly solved gaits of random subjects. The exit code is 1 if a deviation is too large.
 
     \b
     Example: atalante gait check

@@ -11,8 +11,8 @@ import click
 from atalante_tools.console.options import OutputFile, json_option, subject_options
 from atalante_tools.console.outcome import Failed
 from atalante_tools.console.stop_request import stop_requested
-from atalante_tools.console.terminal import Progress, say, show_json, table
-from atalante_tools.gait.extra import extra
+from atalante_tools.console.terminal import Progress, print_message, show_json, table
+from atalante_tools.session.extra import extra
 
 if TYPE_CHECKING:
     from atalante_control.gait.subject import Subject
@@ -68,7 +68,7 @@ def solve(
         if progress.due():
             progress.show(f"{subject}: iteration {iteration}, constraints violated by up to {violation:.1e}")
 
-    # A signal such as Ctrl-C takes effect after the gait, because the optimiser would report its exception as a failed gait.
+    # A signal such as Ctrl-C takes effect after the solve. Otherwise the optimiser would report a failed gait.
     with stop_requested() as stop:
         solved = optimise(subject, kind=kind, progress=show)
     progress.clear()
@@ -85,12 +85,12 @@ def solve(
         click.echo(_residuals(solved))
         click.echo()
         click.echo(_verification(checks))
-    say(f"{kind} step of {subject}: {solved.iterations} iterations, {solved.solve_s:.2f} s")
+    print_message(f"{kind} step of {subject}: {solved.iterations} iterations, {solved.solve_s:.2f} s")
     if failed := [check.name for check in checks if not check.holds]:
         raise Failed(f"the gait fails the verification with Pinocchio: {', '.join(failed)}")
     if out is not None:
         write_gait(solved.gait, out)
-        say(f"gait in {out}")
+        print_message(f"gait in {out}")
     if plot is not None or animate is not None:
         _draw(solved, subject, plot, animate)
 
@@ -147,4 +147,4 @@ def _draw(solved: SolvedGait, subject: Subject, plot: Path | None, animate: Path
     for draw, file, kind in ((draw_plot, plot, "plot"), (draw_animation, animate, "animation")):
         if file is not None:
             draw(solved.gait, subject.patient, file)
-            say(f"{kind} in {file}")
+            print_message(f"{kind} in {file}")

@@ -9,7 +9,7 @@ import click
 
 from atalante_tools.console.options import OutputFile, json_option, patient_options
 from atalante_tools.console.outcome import Failed
-from atalante_tools.console.terminal import say, show_json, table
+from atalante_tools.console.terminal import print_message, show_json, table
 
 if TYPE_CHECKING:
     from atalante_control.model import Link, Patient
@@ -35,11 +35,11 @@ if TYPE_CHECKING:
 )
 @json_option
 def command(patient: Patient | None, urdf_file: Path | None, picture: Path | None, as_json: bool) -> None:  # fmt: skip
-    """Print the links of the model and check its consistency; the exit code is 1 if a check fails.
+    """Print the links of the model and check its consistency. The exit code is 1 if a check fails.
 
-    With --mass and --height the model is the exoskeleton with a patient. Without them it is the empty exoskeleton, whose
-    dynamics the controller cancels (joint idealization). Masses are in kg, centres of mass in m in the
-    frame of the link, moments of inertia in kg m2 about the centre of mass.
+    With --mass and --height the model is the exoskeleton with a patient. Without these options the model is the empty
+    exoskeleton. The controller cancels the dynamics of the empty exoskeleton (joint idealization). Masses are in kg, centres of
+    mass in m in the frame of the link, moments of inertia in kg m2 about the centre of mass.
 
     \b
     Example: atalante model --mass 75 --height 175
@@ -64,7 +64,7 @@ def command(patient: Patient | None, urdf_file: Path | None, picture: Path | Non
             click.echo(f"{'ok  ' if check.ok else '--  ' if check.ok is None else 'FAIL'}  {check.name}: {check.text}")
     if urdf_file is not None:
         urdf_file.write_text(urdf(parameters, robot, patient), encoding="utf-8")
-        say(f"URDF in {urdf_file}")
+        print_message(f"URDF in {urdf_file}")
     if picture is not None:
         _draw(picture, bodies)
     if failed := [check.name for check in found if check.ok is False]:
@@ -103,4 +103,4 @@ def _draw(picture: Path, bodies: tuple[Link, ...]) -> None:
             f"the picture needs the package {error.name}: install it with `pip install 'atalante-hal[plot]'`"
         ) from error
     draw(bodies, picture)
-    say(f"picture in {picture}")
+    print_message(f"picture in {picture}")

@@ -24,7 +24,7 @@ class ModelCheck:
     """Name and result of one check of the model."""
 
     name: str
-    ok: bool | None  # None: the check could not be run
+    ok: bool | None  # None if the check could not be run
     text: str
 
 
@@ -34,7 +34,7 @@ def model_checks(parameters: ExoskeletonParameters, robot: Robot, patient: Patie
     Args:
         parameters: parameters of the exoskeleton.
         robot: robot with the joint limits.
-        patient: patient in the exoskeleton; None: no patient.
+        patient: patient in the exoskeleton; None means no patient.
     """
     bodies = links(parameters, patient)
     total, empty = (math.fsum(body.inertia.mass for body in tree) for tree in (bodies, links(parameters)))

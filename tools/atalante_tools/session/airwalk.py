@@ -6,9 +6,8 @@ guide shape -> certificate (printed) -> steps -> recording, summary.json, figure
 from __future__ import annotations
 
 import functools
-import math
 import os
-from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import asdict, dataclass, field
 from importlib.metadata import version
@@ -17,14 +16,28 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 import click
 
-from atalante_tools.console.names import find
 from atalante_tools.console.options import SEED, Between, Target, json_option, options_as, subject_options
-from atalante_tools.console.outcome import Failed
 from atalante_tools.console.stop_request import stop_requested
-from atalante_tools.console.terminal import say, show_json
+from atalante_tools.console.terminal import print_message, show_json
+from atalante_tools.session.certificates import announce
+from atalante_tools.session.law import Law, law_options
+from atalante_tools.session.recording import (
+    RECORDING_OPTIONS,
+    EndpointReport,
+    Outputs,
+    Recorder,
+    close_telemetry,
+    outlet_of,
+    require_complete,
+    require_complete_log,
+    require_format,
+    start_telemetry,
+)
 from atalante_tools.session.run_folder import Result, results_table, run_folder, write_summary
+from atalante_tools.session.shapes import guide_shapes
 
 if TYPE_CHECKING:
+    from atalante_control.airwalk.config import AirwalkConfig
     from atalante_control.airwalk.controller import AirwalkController
     from atalante_control.gait.gait import Gait
     from atalante_control.gait.subject import Subject
@@ -41,12 +54,6 @@ if TYPE_CHECKING:
     from atalante_tools.session.rig import Rig
 
 _Command = TypeVar("_Command", bound=Callable[..., Any])
-#: Names of the guide shapes, copied from `shapes.SHAPES` because the help must not import the slow controller.
-SHAPE_NAMES = "constant, widening, narrowing, pinched, asymmetric, snap"
-#: Longest wait for the telemetry process before a run on the wall clock [s]. A process that is ready later joins the run.
-_TELEMETRY_WAIT = 5.0
-#: Period of the check of the telemetry process [cycles].
-_TEND_CYCLES = 250
 
 
 @dataclass(frozen=True)
@@ -58,11 +65,12 @@ class Options:
     seed: int  # seed of the sensor noise
     out: Path  # run folder
     record_rate: int  # recording rate [Hz]
-    can_log: Path | None  # log file for all CAN frames. None: no CAN log.
-    telemetry: (
-        Path | None
-    )  # TOML file with endpoint, TLS certificate and users. None: publish on the loopback interface only.
-    subject: Subject | None = None  # patient and step parameters: inputs of the gait network. None: default gait.
+    can_log: Path | None  # log file for all CAN frames. None means no CAN log.
+    #: TOML file with endpoint, TLS certificate and users. If None, the run publishes on the loopback interface only.
+    telemetry: Path | None
+    law: Law  # control law of the assisted joints
+    #: patient and step parameters: inputs of the gait network. None means the default gait.
+    subject: Subject | None = None
 
 
 @dataclass
@@ -72,20 +80,6 @@ class Walked:
     results: list[Result] = field(default_factory=list)  # one result per finished guide shape
     recording: Recording | None = None  # None until the telemetry is closed
     can_log_complete: bool = True  # False if frames are missing in the CAN log
-
-
-def _record_rate(text: str) -> int:
-    """Convert a typed recording rate to a number [Hz] (option type). It must be a divisor of the loop rate 1000 Hz.
-
-    Args:
-        text: Rate as the user typed it.
-
-    Raises:
-        click.BadParameter: If the text is not a divisor of 1000.
-    """
-    if text.isdecimal() and int(text) and not 1000 % int(text):
-        return int(text)
-    raise click.BadParameter(f"must be a divisor of 1000 (1, 10, 50, 100, 200, 250, 500, 1000, ...), got {text!r}")
 
 
 def trial_options(steps: int, out: str) -> Callable[[_Command], _Command]:
@@ -106,17 +100,10 @@ def trial_options(steps: int, out: str) -> Callable[[_Command], _Command]:
         click.option("--out", type=click.Path(path_type=Path, file_okay=False), default=out, show_default=True,
                      metavar="DIR", help="Folder for recording.mcap, summary.json and guide_shapes.png. Existing files are "
                                          "replaced."),
-        click.option("--record-rate", type=_record_rate, default="100", show_default=True, metavar="HZ",
-                     help="Recording rate [Hz]. It must be a divisor of 1000. With 1000, every cycle is recorded."),
-        click.option("--can-log", type=click.Path(path_type=Path, dir_okay=False), metavar="FILE",
-                     help="Log every CAN frame to this file. The suffix sets the format: .log, .asc, .blf, .log.gz, .asc.gz.  "
-                          "[default: no CAN log]"),
-        click.option("--telemetry", type=click.Path(path_type=Path, dir_okay=False), metavar="FILE",
-                     help="TOML file with Zenoh endpoint, TLS certificate and users.  "
-                          "[default: publish on the loopback interface only]"),
+        *RECORDING_OPTIONS,
     ]  # fmt: skip
 
-    return options_as("options", Options, [*options, json_option, subject_options])
+    return options_as("options", Options, [*options, law_options(), json_option, subject_options])
 
 
 def run_trial(target: Target, shapes: Sequence[str], options: Options, *, as_json: bool) -> None:
@@ -126,27 +113,26 @@ def run_trial(target: Target, shapes: Sequence[str], options: Options, *, as_jso
 
     Args:
         target: Bus and clock.
-        shapes: Names of the guide shapes.
+        shapes: Names or files of the guide shapes, see `guide_shapes`.
         options: Options of the user.
         as_json: Whether to print JSON objects instead of a table.
 
     Raises:
         Failed: If the robot left ACTIVE before the last step, or the recording or the CAN log is incomplete.
+        ShapeError: If a shape file is invalid.
         FaultLatched: If the robot is in FAULT.
         SystemExit: If a signal ended the run.
     """
-    from atalante_control.guide.shapes import SHAPES
-    from atalante_hal.telemetry.access import load_telemetry_file
-
-    names = tuple(SHAPES)
-    wanted = {name: SHAPES[name] for name in (names[find(shape, names, "guide shape")] for shape in shapes)}
+    wanted = guide_shapes(shapes)
     if options.can_log is not None:
-        _require_format(options.can_log)
-    outlet = load_telemetry_file(options.telemetry) if options.telemetry else {}
+        require_format(options.can_log)
+    outputs = Outputs(
+        options.out / "recording.mcap", options.record_rate, options.can_log, outlet_of(options.telemetry)
+    )
     walked = Walked()
     with run_folder(options.out):
         try:
-            _walk_all(target, wanted, options, outlet, walked, as_json=as_json)
+            _walk_all(target, wanted, options, outputs, walked, as_json=as_json)
         finally:
             if walked.results and walked.recording is not None:
                 if as_json:
@@ -154,46 +140,22 @@ def run_trial(target: Target, shapes: Sequence[str], options: Options, *, as_jso
                 else:
                     click.echo(results_table(walked.results))
                 write_summary(options.out, _summary_options(options), walked.results, walked.recording)
-    _require_complete(walked.recording)
-    if not walked.can_log_complete:
-        raise Failed(f"the CAN log {options.can_log} must contain every frame, but frames are missing")
-
-
-def _require_complete(recording: Recording | None) -> None:
-    """Check that the recording is one file that contains every cycle.
-
-    Raises:
-        Failed: If cycles are missing or the file is truncated. The message contains the files and the number of missing cycles.
-    """
-    if recording is not None and not recording.complete:
-        raise Failed(
-            f"the recording must be one file with every cycle, got {', '.join(recording.files) or 'no file'} "
-            f"with {recording.missing_cycles} cycles missing"
-        )
+    require_complete(walked.recording)
+    require_complete_log(options.can_log, walked.can_log_complete)
 
 
 def _summary_options(options: Options) -> dict[str, Any]:
     """Return the options for summary.json, as JSON types and without the output paths."""
     given = {key: value for key, value in asdict(options).items() if key not in ("out", "can_log")}
-    telemetry = None if options.telemetry is None else str(options.telemetry)
-    return {**given, "telemetry": telemetry, "version": version("atalante-hal")}
-
-
-def _require_format(can_log: Path) -> None:
-    from atalante_hal.telemetry.can_log import check_format
-    from atalante_hal.telemetry.sink import SinkError
-
-    try:
-        check_format(can_log)
-    except SinkError as error:
-        raise click.UsageError(str(error)) from error
+    telemetry, law = None if options.telemetry is None else str(options.telemetry), given.pop("law")
+    return {**given, **law, "telemetry": telemetry, "version": version("atalante-hal")}
 
 
 def _walk_all(
     target: Target,
     shapes: Mapping[str, GuideShape],
     options: Options,
-    outlet: Mapping[str, Any],
+    outputs: Outputs,
     walked: Walked,
     *,
     as_json: bool,
@@ -201,13 +163,17 @@ def _walk_all(
     """Walk inside one guide shape after another, and add results and recording to `walked`. Raise the errors of `run_trial`."""
     import atalante_dbc
     from atalante_hal.robot import load_robot
+    from atalante_hal.telemetry.child import TelemetryChild
 
     with ExitStack() as stack:
-        robot_process = _start_robot(
-            target, stack
-        )  # start it early: it imports its modules while this process creates the controllers
+        # start the subprocesses early: they import their modules while this process creates the controllers
+        robot_process = _start_robot(target, stack)
+        telemetry_child = stack.enter_context(TelemetryChild())
         network, robot = atalante_dbc.load(), load_robot()
-        exoskeleton, gait, controllers = _controllers(options.subject, robot, shapes)
+        exoskeleton, gait, controllers = _controllers(options.law.config(), options.subject, robot, shapes)
+        if not target.lockstep:
+            for controller in controllers.values():
+                controller.prepare()
         certificates: dict[str, Certificate] = {}
         telemetry: TelemetryProcess | None = None
         last = [*controllers][-1]
@@ -217,13 +183,13 @@ def _walk_all(
                 if telemetry is None:
                     # The certificates are printed only after the bus could be opened.
                     certificates = {shape: walking.certificate(options.xi) for shape, walking in controllers.items()}
-                    _announce(certificates.values())
-                    telemetry = _telemetry(target, options, outlet, rig.hal, network, gait.hash32)
-                    telemetry.start() if target.lockstep else telemetry.start(_TELEMETRY_WAIT)
+                    announce(certificates.values(), controller.config.mismatch, "swing leg of the empty exoskeleton")
+                    about = {"seed": options.seed, "steps": options.steps, "xi": options.xi, **asdict(options.law)}
+                    telemetry = start_telemetry(target, outputs, rig.hal, network, gait.hash32, about, telemetry_child)
                     stack.callback(_close, telemetry, walked)
-                    report_endpoint = _EndpointReport(telemetry)
-                telemetry.begin_run(name, {"shape": name, "xi": options.xi, **_bounds(certificates[name])})
-                walk = _Walk(rig, controller, telemetry, report_endpoint, name, options.steps)
+                    report_endpoint = EndpointReport(telemetry)
+                telemetry.begin_run(name, {"shape": name, "xi": options.xi, **_promise(certificates[name])})
+                walk = _Walk(rig, controller, Recorder(rig, telemetry, report_endpoint), name, options.steps)
                 with stop_requested() as stop:
                     statistics = walk.run(stop)
                 factors = controller.statistics.factors or {options.xi}
@@ -240,25 +206,17 @@ class _Walk:
         self,
         rig: Rig,
         controller: AirwalkController,
-        telemetry: TelemetryProcess,
-        report_endpoint: _EndpointReport,
+        recorder: Recorder,
         name: str,
         steps: int,
     ) -> None:
         from atalante_tools.session.rig import Watch
 
-        self._rig, self._controller, self._telemetry = rig, controller, telemetry
-        self._report_endpoint, self._name, self._steps = report_endpoint, name, steps
-        self._reported = 0
+        self._rig, self._controller, self._recorder = rig, controller, recorder
+        self._name, self._steps = name, steps
         self._watch_of = functools.partial(
             Watch, rig, done=self._done, describe=self._describe, resumes=not rig.target.embedded
         )
-        hal = rig.hal
-        if telemetry.frames is not None:
-            if rig.target.lockstep:
-                hal.tap = telemetry.tap(lambda: hal.state.cycle * 1_000_000)
-            else:
-                hal.tap = telemetry.tap(stamps=lambda: hal.bus.stamps)
 
     def run(self, stop: Any) -> Statistics:
         """Walk until all steps are done, a stop signal arrives, or the robot leaves ACTIVE.
@@ -267,35 +225,20 @@ class _Walk:
             stop: Stop request of the process.
         """
         self._watch = self._watch_of(stop)
-        statistics = self._rig.run(self._controller, until=self._watch, record=self._record)
-        self._report_events()
+        statistics = self._rig.run(self._controller, until=self._watch, record=self._recorder.write)
+        self._recorder.report_events()
         return statistics
 
     def conclude(self) -> None:
         """End the command with an error unless all steps are done. See `Watch.conclude`."""
         self._watch.conclude()
 
-    def _record(self) -> None:
-        hal = self._rig.hal
-        self._telemetry.write(hal.record)
-        if not hal.state.cycle % _TEND_CYCLES:
-            self._telemetry.tend()
-            self._report_endpoint()
-        if hal.events.count != self._reported:
-            self._report_events()
-
-    def _report_events(self) -> None:
-        events = self._rig.hal.events
-        for event in events.since(self._reported):
-            self._telemetry.event(event.cycle, event.code, event.text, event.severity, event.node, event.value)
-        self._reported = events.count
-
     def _done(self, state: State) -> bool:
         return self._controller.statistics.steps >= self._steps
 
     def _describe(self, state: State) -> str:
         statistics = self._controller.statistics
-        # The statistics contain no ratio before the first step is completed.
+        # The statistics contain no ratio |e|/q_bound before the first step is completed.
         largest = f"   largest |e|/q_bound {statistics.max_ratio:.2f}" if statistics.cycles else ""
         return (
             f"{self._name:<11} step {statistics.steps:3d}/{self._steps}   t {state.time:6.1f} s   "
@@ -304,10 +247,10 @@ class _Walk:
 
 
 def _controllers(
-    subject: Subject | None, robot: Robot, shapes: Mapping[str, GuideShape]
+    config: AirwalkConfig, subject: Subject | None, robot: Robot, shapes: Mapping[str, GuideShape]
 ) -> tuple[ExoskeletonParameters, Gait, dict[str, AirwalkController]]:
     """Return the exoskeleton, the gait, and one controller per guide shape. Leg lengths and gait fit the subject."""
-    from atalante_control.airwalk.controller import AirwalkConfig, AirwalkController
+    from atalante_control.airwalk.controller import AirwalkController
     from atalante_control.dynamics.gait_network import load_network
     from atalante_control.dynamics.suspended import suspended_gait
     from atalante_control.gait.gait import AIRWALK_GAIT, load_gait
@@ -315,50 +258,30 @@ def _controllers(
 
     exoskeleton = ExoskeletonParameters()
     if subject is None:
-        gait, config = load_gait(AIRWALK_GAIT, robot), AirwalkConfig()
+        gait = load_gait(AIRWALK_GAIT, robot)
     else:
         exoskeleton = exoskeleton.fitted(subject.patient)
         gait = suspended_gait(load_network().gait(subject, robot), exoskeleton, robot)
-        config = AirwalkConfig(feedforward=True)
     controllers = {name: AirwalkController(robot, gait, shape, config, exoskeleton) for name, shape in shapes.items()}
     if subject is not None:  # the gait is valid, because the controllers accepted it
-        say(f"gait of the network: {subject}; the exoskeleton is empty")
+        print_message(f"gait of the network: {subject}; the exoskeleton is empty")
     return exoskeleton, gait, controllers
 
 
-def _announce(certificates: Collection[Certificate]) -> None:
-    """Print the certificate of each guide shape: the tolerated disturbance torques and the effects that are not included."""
-    for certificate in certificates:
-        name, xi, bound = certificate.shape, certificate.xi, certificate.joint_torque
-        if bound is None:
-            say(f"{name}: NOT CERTIFIED at Xi {xi:g}, the robot may leave the guide: {certificate.reason}")
-            continue
-        say(
-            f"{name}: certified on the model at Xi {xi:g} for disturbances of {bound.hip:.2f} Nm at the hip and "
-            f"{bound.knee:.2f} Nm at the knee together (worst pose: knee at {math.degrees(bound.worst_knee):.0f} deg); "
-            f"{certificate.reason}"
-        )
-    if any(certificate.certified for certificate in certificates):
-        say(
-            "a certificate is a margin on the model, no guarantee: joint torque and rate limits, delay, the torque carried "
-            "over a step change, and errors of friction and mass are not included"
-        )
-
-
-def _bounds(certificate: Certificate) -> dict[str, Any]:
-    """Return the fields `certified`, `bound_hip_nm` and `bound_knee_nm` of `Result` for a certificate."""
-    bound = certificate.joint_torque
+def _promise(certificate: Certificate) -> dict[str, Any]:
+    """Return the fields `certified`, `promise_hip_nm` and `promise_knee_nm` of `Result` for a certificate."""
+    promise = certificate.promise
     return {
         "certified": certificate.certified,
-        "bound_hip_nm": None if bound is None else bound.hip,
-        "bound_knee_nm": None if bound is None else bound.knee,
+        "promise_hip_nm": None if promise is None else promise.hip,
+        "promise_knee_nm": None if promise is None else promise.knee,
     }
 
 
 def _weakest(controller: AirwalkController, factors: Iterable[float]) -> Certificate:
-    """Return the certificate for the assistance factor of the run that has the smallest hip bound."""
+    """Return the certificate with the smallest promise, among the certificates of all assistance factors of the run."""
     certificates = [controller.certificate(xi) for xi in factors]
-    return min(certificates, key=lambda c: -1.0 if c.joint_torque is None else c.joint_torque.hip)
+    return min(certificates, key=lambda c: -1.0 if c.promise is None else c.promise.hip)
 
 
 #: Smallest number of processor cores for HAL, telemetry and embedded robot in three processes.
@@ -366,11 +289,11 @@ _CORES = 3
 
 
 def _start_robot(target: Target, stack: ExitStack) -> EmbeddedRobot | None:
-    """Start the embedded robot in a subprocess. Return None for a real robot or a computer with too few cores."""
+    """Start the emulated robot in a subprocess. Return None for a real robot or a computer with too few cores."""
     from atalante_tools.session.embedded import EmbeddedRobot
 
     robot_process = target.embedded and len(os.sched_getaffinity(0)) >= _CORES
-    return stack.enter_context(EmbeddedRobot()) if robot_process else None
+    return stack.enter_context(EmbeddedRobot(target.engine)) if robot_process else None
 
 
 def _open(
@@ -383,6 +306,8 @@ def _open(
     robot_process: EmbeddedRobot | None,
     exoskeleton: ExoskeletonParameters,
 ) -> Any:
+    from atalante_emulator.mechanics import Mechanics
+    from atalante_tools.session.body import describe
     from atalante_tools.session.rig import open_hal
 
     return open_hal(
@@ -394,71 +319,14 @@ def _open(
         controller_fields=controller.telemetry_fields,
         gait_hash=gait_hash,
         robot_process=robot_process,
-        exoskeleton=exoskeleton,
+        mechanics=Mechanics(describe(robot, exoskeleton), target.engine),
     )
-
-
-def _telemetry(
-    target: Target, options: Options, outlet: Mapping[str, Any], hal: Hal, network: Network, gait_hash: int
-) -> TelemetryProcess:
-    from atalante_hal.safety.diagnostics import Dtc
-    from atalante_hal.telemetry.process import TelemetryConfig, TelemetryProcess
-
-    config = TelemetryConfig(
-        recording=options.out / "recording.mcap",
-        record_rate=options.record_rate,
-        can_log=options.can_log,
-        lock_step=target.lockstep,
-        slots=8192,  # buffer for 8192 cycles, because a demo runs faster than real time and the recorder may pause
-        **outlet,
-    )
-    return TelemetryProcess(
-        config,
-        hal.layout,
-        bus_of={message.frame_id: message.bus for message in network.messages},
-        buses=network.buses,
-        diagnostics=[dtc.value for dtc in Dtc],
-        about={
-            "version": version("atalante-hal"),
-            "dbc_hash": f"{network.hash32:08x}",
-            "config_hash": f"{hal.robot.hash32:08x}",
-            "gait_hash": f"{gait_hash:08x}",
-            "target": target,
-            "seed": options.seed,
-            "steps": options.steps,
-            "xi": options.xi,
-        },
-    )
-
-
-class _EndpointReport:
-    """Printer of the Zenoh endpoint. It prints the endpoint at the start and after each change."""
-
-    def __init__(self, telemetry: TelemetryProcess) -> None:
-        for notice in telemetry.notices:
-            say(notice)
-        self._telemetry = telemetry
-        self._endpoint: str | None = None
-        self()
-
-    def __call__(self) -> None:
-        """Print the endpoint if it changed since the last call."""
-        endpoint = self._telemetry.endpoint
-        if endpoint != self._endpoint:
-            self._endpoint = endpoint
-            keys = f"keys atalante/{self._telemetry.config.robot}/**"
-            say(f"telemetry on Zenoh at {endpoint}, {keys}" if endpoint else "telemetry is no longer published")
 
 
 def _close(telemetry: TelemetryProcess, walked: Walked) -> None:
-    """Close the telemetry, print its messages about lost data, and add its recording to `walked`."""
-    summary = telemetry.close()
+    """Close the telemetry, and add its recording to `walked`."""
+    summary = close_telemetry(telemetry)
     walked.recording, walked.can_log_complete = summary.recording, summary.can_log_complete
-    for notice in summary.notices:
-        if notice not in telemetry.notices:  # the messages in `telemetry.notices` are already printed
-            say(notice)
-    if not summary.complete and not summary.notices:
-        say("the telemetry process ended unexpectedly: the recording may be truncated")
 
 
 def _result(certificate: Certificate, controller: AirwalkController, hal: Hal, statistics: Statistics) -> Result:
@@ -467,7 +335,7 @@ def _result(certificate: Certificate, controller: AirwalkController, hal: Hal, s
     counted = walking.steps >= 2
     return Result(
         shape=certificate.shape,
-        **_bounds(certificate),
+        **_promise(certificate),
         steps=walking.steps,
         max_ratio=round(walking.max_ratio, 4) if counted else None,
         inside=round(walking.inside_fraction, 4) if counted else None,
@@ -476,4 +344,5 @@ def _result(certificate: Certificate, controller: AirwalkController, hal: Hal, s
         real_time_factor=round(statistics.real_time_factor, 2),
         frames=int(hal.record[hal.layout["frames"]][0]),
         crc_errors=hal.crc_errors,
+        hand_overs_exceeded=walking.hand_overs_exceeded,
     )

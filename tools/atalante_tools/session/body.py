@@ -1,4 +1,4 @@
-"""Body of the emulated robot: an exoskeleton without a patient in PyBullet, suspended at its pelvis."""
+"""Body of the emulated robot: exoskeleton and patient in a physics engine, suspended at the pelvis or on the ground."""
 
 from __future__ import annotations
 
@@ -10,82 +10,92 @@ from importlib.util import find_spec
 from typing import TYPE_CHECKING, Final
 
 from atalante_hal.robot import Robot
+from atalante_tools.console.options import PYBULLET
 from atalante_tools.console.outcome import Failed
 
 if TYPE_CHECKING:
-    from atalante_control.model import ExoskeletonParameters
-    from atalante_emulator.body import PyBulletBody
+    from atalante_control.model import ExoskeletonParameters, Patient
+    from atalante_emulator.bodies import Body
+    from atalante_emulator.mechanics import Mechanics
 
 
 #: Newest Python version for which the package index has a wheel of PyBullet.
 ENGINE_PYTHON: Final = (3, 11)
+_NAMES: Final = {"pybullet": "PyBullet", "mujoco": "MuJoCo"}
 
 
 def engine_hint() -> str:
-    """Return the command that installs PyBullet, together with the Python version that it requires."""
+    """Return the commands that install a physics engine, with the Python version that PyBullet requires."""
     python = sys.version_info[:2]
     newest = "{}.{}".format(*ENGINE_PYTHON)
     if python <= ENGINE_PYTHON:
         return f"pip install 'atalante-hal[emulator]' (Python {newest})"
     reason = f"PyBullet has no wheel for Python above {newest}, got {python[0]}.{python[1]}"
-    return f"python{newest} -m pip install 'atalante-hal[emulator]' ({reason})"
+    return (
+        "pip install 'atalante-hal[mujoco]' and add --engine mujoco, "
+        f"or python{newest} -m pip install 'atalante-hal[emulator]' ({reason})"
+    )
 
 
-def require_engine() -> None:
-    """Check that PyBullet is installed, without importing it.
+def require_engine(engine: str = PYBULLET) -> None:
+    """Check that a physics engine is installed, without importing it.
+
+    Args:
+        engine: Name of the engine.
 
     Raises:
-        Failed: If PyBullet is not installed. The message contains the command that installs it.
+        Failed: If the engine is not installed. The message contains the command that installs it.
     """
-    if find_spec("pybullet") is None:
-        raise Failed(f"the emulated robot needs PyBullet; type: {engine_hint()}")
+    if find_spec(engine) is None:
+        hint = engine_hint() if engine == PYBULLET else "pip install 'atalante-hal[mujoco]'"
+        raise Failed(f"the emulated robot needs {_NAMES[engine]}; type: {hint}")
 
 
-def describe(robot: Robot, exoskeleton: ExoskeletonParameters | None = None) -> str:
-    """Return the URDF text of the exoskeleton.
+def describe(robot: Robot, exoskeleton: ExoskeletonParameters | None = None, wearer: Patient | None = None) -> str:
+    """Return the URDF text of the exoskeleton, empty or with a patient.
 
     Args:
         robot: Joint limits of the robot.
-        exoskeleton: Geometry and masses. None: default leg lengths.
+        exoskeleton: Geometry and masses. None means default leg lengths.
+        wearer: Patient whose segments are part of the links. If None, the exoskeleton is empty.
     """
     from atalante_control.model import ExoskeletonParameters, urdf
 
-    return urdf(exoskeleton or ExoskeletonParameters(), robot)
+    return urdf(exoskeleton or ExoskeletonParameters(), robot, wearer)
 
 
 @contextmanager
-def open_body(
-    robot: Robot, pose: Sequence[float] | None = None, exoskeleton: ExoskeletonParameters | None = None
-) -> Iterator[PyBulletBody]:
-    """Create the body of a robot in PyBullet, and close it after the block.
+def open_body(robot: Robot, *, engine: str = PYBULLET) -> Iterator[Body]:
+    """Create the body of an empty exoskeleton that is suspended at its pelvis, and close it after the block.
 
     Args:
         robot: Joint limits of the robot.
-        pose: Initial joint angles, shape (12,) [rad]. None: all zero.
-        exoskeleton: Geometry and masses. None: default leg lengths.
+        engine: Name of the physics engine.
 
     Raises:
-        Failed: If PyBullet is not installed.
+        Failed: If the engine is not installed.
     """
-    require_engine()
-    with open_described(describe(robot, exoskeleton), pose) as body:
+    from atalante_emulator.mechanics import Mechanics
+
+    with open_mechanics(Mechanics(describe(robot), engine)) as body:
         yield body
 
 
 @contextmanager
-def open_described(urdf: str, pose: Sequence[float] | None = None) -> Iterator[PyBulletBody]:
-    """Create a body from a URDF in PyBullet, and close it after the block.
+def open_mechanics(mechanics: Mechanics, pose: Sequence[float] | None = None) -> Iterator[Body]:
+    """Create the body of an emulated robot, and close it after the block.
 
     Args:
-        urdf: URDF text.
-        pose: Initial joint angles, shape (12,) [rad]. None: all zero.
+        mechanics: Description of the body.
+        pose: Initial joint angles, shape (12,) [rad]. None means all zero.
+
+    Raises:
+        Failed: If the engine is not installed.
     """
+    require_engine(mechanics.engine)
     with no_banner():
-        from atalante_emulator.body import PyBulletBody
-    body = PyBulletBody(urdf)
+        body = mechanics.make_body(pose)
     try:
-        if pose is not None:
-            body.reset(pose)
         yield body
     finally:
         body.close()

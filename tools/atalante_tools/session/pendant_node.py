@@ -3,9 +3,9 @@
 Only one pendant sends at a time, see `takeover`. A new pendant listens first and copies the signals of the older pendant: request
 counter, dead-man switch and assistance factor. The older pendant stops sending when it receives frames of the new pendant.
 
-During the takeover both pendants answer the same SYNC in two cycles. Both frames have the same counter, the low byte of the
-signal Cycle in SYNC. The HAL accepts the first frame. It reports the second frame as a repetition, or as a second sender if the
-contents differ. After four such cycles the HAL holds the robot.
+During the takeover there are two cycles in which both pendants answer the SYNC. Both frames have the same counter, which is the
+low byte of the signal Cycle in SYNC. The HAL accepts the first frame. The HAL reports the second frame as a repetition if the
+contents are equal, and as a second sender if the contents differ. After four such cycles the HAL holds the robot.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ FIRMWARE_VERSION: Final = 0x0100
 
 
 class Request(IntEnum):
-    """Button that the operator pressed last: values of the signal `PENDANT_STATE.Request`."""
+    """Button that the operator pressed last. The values are those of the signal `PENDANT_STATE.Request`."""
 
     NONE = 0
     START = 1
@@ -40,9 +40,10 @@ class PendantNode:
     """Pendant node. It listens until `start_sending()`, then answers every SYNC until another pendant takes over.
 
     Attributes:
-        hal: State of the HAL in the last SYNC. None: no SYNC received.
+        hal: State of the HAL in the last SYNC. None if no SYNC was received.
         cycles: Number of received SYNCs.
-        answered_in_row: Number of SYNCs answered since the last gap. The HAL ignores requests until it trusts the pendant again.
+        answered_in_row: Number of SYNCs answered since the last lost SYNC. After a gap, the HAL ignores requests of the pendant
+            until enough consecutive frames of the pendant were received.
         answered: Number of answered SYNCs.
         found_another: Whether another pendant sent before `start_sending()`.
     """
@@ -53,7 +54,7 @@ class PendantNode:
         Args:
             network: Nodes and messages of the DBC.
             bus: Bus that carries `PENDANT_STATE`.
-            seed: Seed of the random cycles of a takeover. None: random seed of the operating system.
+            seed: Seed of the random waiting times in a takeover. None means a random seed of the operating system.
         """
         state, status = network.message("PENDANT_STATE"), network.message("PENDANT_STATUS")
         self._bus = bus
@@ -136,7 +137,7 @@ class PendantNode:
             self._copy_signals()
         if self._takeover.silent and not was_silent:
             self._release_start()
-        if self._reader.gaps > gaps:
+        if self._reader.gaps > gaps or synced > 1:  # only the last of several SYNCs is answered
             self.answered_in_row = 0
         if not synced:
             return False
@@ -152,7 +153,7 @@ class PendantNode:
             self._tx.values[self._at[name]] = value
 
     def _release_start(self) -> None:
-        """Release START, because the HAL would read a changed request counter after the silence as a new press."""
+        """Reset the request START. After a pause, the HAL would interpret a changed request counter as a new press of START."""
         if self._tx.values[self._at["Request"]] == Request.START:
             self._tx.values[self._at["Request"]] = Request.NONE
 

@@ -16,14 +16,14 @@ from atalante_hal.wire.e2e import REQUALIFY
 from atalante_tools.console.options import Target
 from atalante_tools.console.outcome import Failed
 from atalante_tools.console.stop_request import StopRequest
-from atalante_tools.console.terminal import say
+from atalante_tools.console.terminal import print_message
 from atalante_tools.session.pendant_node import PendantNode, Request
 
 #: Shortest time in which a new pendant listens for another pendant before it sends [s].
 LISTEN: Final = 0.05
 #: Smallest number of SYNCs that a new pendant must receive before it sends.
 LISTEN_CYCLES: Final = 3
-#: Time without a SYNC after which the HAL counts as absent [s].
+#: Time without a SYNC after which the HAL is considered absent [s].
 HAL_TIMEOUT: Final = 1.0
 #: Longest wait for a frame [s]. After this time, stop request and keyboard are checked.
 POLL_TIMEOUT: Final = 0.02
@@ -58,14 +58,14 @@ class Session:
             node: Pendant node on its bus.
             target: Bus named in the messages.
             stop: Stop request of the process.
-            keyboard: Reader of typed lines.
+            keyboard: Reader of the lines that the user types.
             now: Clock [s].
-            losses: Returns how often the link of the bus was lost.
+            losses: Function that returns how often the link to the bus was lost so far.
         """
         self.node, self.stop = node, stop
         #: Whether to press START as soon as the HAL is in READY or HOLD.
         self.start_wanted = False
-        self._start_typed = False  # START was typed, and is pressed as soon as the HAL trusts the pendant
+        self._start_typed = False  # the operator typed start; START is pressed when the HAL accepts requests
         self._target, self._keyboard, self._now = target, keyboard, now
         self._begun = self._synced_at = now()
         self._hal_present = True
@@ -83,9 +83,9 @@ class Session:
                 return
 
     def take_over(self) -> None:
-        """Copy the signals of another pendant if one sends. Then press the dead-man switch and send until the other one stops."""
+        """Listen, and copy the signals of another pendant if one sends. Then press the dead-man switch and answer each SYNC."""
         self.listen()
-        say(
+        print_message(
             f"taking over from another pendant on {self._target}"
             if self.node.found_another
             else "the pendant is active"
@@ -98,7 +98,7 @@ class Session:
     def answer_syncs(self, count: int) -> None:
         """Answer a number of SYNCs.
 
-        It ends early if the HAL stops sending, another pendant takes over, or a signal arrives.
+        The method returns early if the HAL stops sending, another pendant takes over, or a stop signal arrives.
 
         Args:
             count: Number of SYNCs to answer.
@@ -116,15 +116,15 @@ class Session:
                 return
 
     def run(self, seconds: float | None) -> None:
-        """Answer each SYNC until the time is over, a signal arrives, or another pendant takes over. Then press STOP.
+        """Answer each SYNC until the time is over or a signal arrives, and then press STOP.
 
-        STOP is not pressed after a takeover by another pendant.
+        The method returns without STOP if another pendant takes over.
 
         Args:
-            seconds: Duration [s]. None: until a signal arrives.
+            seconds: Duration [s]. None means no limit.
 
         Raises:
-            Failed: If the older pendant keeps sending.
+            Failed: If another pendant does not stop sending.
         """
         node = self.node
         self._begun = self._now()
@@ -133,27 +133,37 @@ class Session:
                 self._react_to_sync()
             elif self._hal_present and self._now() - self._synced_at > HAL_TIMEOUT:
                 self._hal_present = False
-                say(f"no SYNC received on {self._target}: waiting for a HAL")
+                print_message(f"no SYNC received on {self._target}: waiting for a HAL")
             if node.displaced:
-                say("another pendant has taken over")
+                print_message("another pendant has taken over")
                 return
-            if node.takeover_failed:
-                raise Failed("another pendant must stop sending, but it still sends: use that pendant, or end it first")
+            self.check_takeover()
             if self._losses() > self._lost_before:
                 self._release_after_loss()
             for line in self._keyboard.lines():
                 self.execute(line)
         self.press_stop()
 
+    def check_takeover(self) -> None:
+        """Raise an error if the takeover failed, because another pendant did not stop sending.
+
+        Raises:
+            Failed: If the takeover failed.
+        """
+        if self.node.takeover_failed:
+            raise Failed(
+                "another pendant is already in use on this bus: operate the robot with that pendant, or end it first"
+            )
+
     def _release_after_loss(self) -> None:
         """Release the dead-man switch after the link to the bus was lost, so that the operator must press it again."""
         self._lost_before = self._losses()
         self.node.dead_man = False
         self.start_wanted = self._start_typed = False
-        say("the dead-man switch is released; type start to press it again, with START")
+        print_message("the dead-man switch is released; type start to press it again, with START")
 
     def _elapsed(self) -> float:
-        """Return the time since the start [s]: answered SYNCs times `PERIOD`, or wall-clock time before the first answer."""
+        """Return the time since the start [s]. After the first answer, it is the number of answered SYNCs times `PERIOD`."""
         return self.node.answered * PERIOD if self.node.answered else self._now() - self._begun
 
     def press_stop(self) -> None:
@@ -164,7 +174,7 @@ class Session:
         self.node.dead_man = False
         self.answer_syncs(RELEASE_SYNCS)
         if self.node.hal is not None:
-            say(f"STOP: the HAL is {self.node.hal.name}")
+            print_message(f"STOP: the HAL is {self.node.hal.name}")
 
     def execute(self, line: str) -> None:
         """Execute a command that the operator typed.
@@ -181,41 +191,44 @@ class Session:
                 self.node.dead_man = True
             else:
                 self.node.press(Request[word.upper()])
-                say(f"{word.upper()} pressed")
+                print_message(f"{word.upper()} pressed")
         elif word == "xi" and len(arguments) == 1 and (factor := _factor(arguments[0])) is not None:
             self.node.assist(factor)
-            say(f"assistance factor {factor:g}")
+            print_message(f"assistance factor {factor:g}")
         elif word:
-            say(f"a command must be start, stop, hold or xi X with X from 0 to 1, got {line.strip()!r}")
+            print_message(f"a command must be start, stop, hold or xi X with X from 0 to 1, got {line.strip()!r}")
 
     def _press_start(self) -> None:
-        """Press START if the HAL trusts the pendant, which needs `REQUALIFY` consecutive valid frames."""
+        """Press START if more than `REQUALIFY` SYNCs were answered in a row. Before that, the HAL accepts no request."""
         if self.node.answered_in_row > REQUALIFY:
             self.start_wanted = self._start_typed = False
             self._pressed_at = self.node.cycles
             self.node.press(Request.START)
-            say("START pressed")
+            print_message("START pressed")
 
     def _react_to_sync(self) -> None:
-        """Print a change of the HAL state, and press START if START is requested and the HAL accepts it."""
+        """Print a change of the HAL state, and press START if it is due.
+
+        START is due if the operator typed start, or if `start_wanted` is True and the HAL is in READY or HOLD.
+        """
         node = self.node
         self._synced_at, self._hal_present = self._now(), True
         if node.hal is not self._hal and node.hal is not None:
             self._hal = node.hal
-            say(f"the HAL is {node.hal.name}")
+            print_message(f"the HAL is {node.hal.name}")
             if self._pressed_at is not None and node.hal is not SupervisorState.ACTIVE:
-                say("each START changes the state once; type start to press START again")
+                print_message("each START changes the state once; type start to press START again")
             self._pressed_at = None
         startable = node.hal in (SupervisorState.READY, SupervisorState.HOLD)
         if self._start_typed or (self.start_wanted and startable):
             self._press_start()
         elif self._pressed_at is not None and node.cycles - self._pressed_at > START_TIMEOUT:
             self._pressed_at = None
-            say("the HAL did not become ACTIVE, see its event log; type start to press START again")
+            print_message("the HAL did not become ACTIVE, see its event log; type start to press START again")
 
 
 class Keyboard:
-    """Non-blocking reader of typed lines from a file descriptor. Without a file descriptor it returns no lines."""
+    """Non-blocking reader of the lines that the user types. Without a file descriptor it returns no lines."""
 
     def __init__(self, file: int | None) -> None:
         self._file = file

@@ -56,8 +56,8 @@ class PoseHold:
 
         Args:
             robot: Hold gains and joint limits of the robot.
-            move: Motion of one joint. None: hold all joints.
-            vibration: Level of each vibration motor, shape (8,), 0 to 1. None: all motors are off.
+            move: Motion of one joint. If None, all joints are held.
+            vibration: Level of each vibration motor, shape (8,), 0 to 1. If None, all motors are off.
         """
         self._robot, self._move = robot, move
         self._gravity = Gravity(pinocchio_model(urdf(ExoskeletonParameters(), robot)))

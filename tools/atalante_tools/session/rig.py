@@ -22,20 +22,21 @@ from atalante_hal.bus.pair import lockstep_pair
 from atalante_hal.hal import Hal
 from atalante_hal.loop import LockStep, Statistics, WallClock, realtime, run
 from atalante_hal.robot import Robot, load_robot
+from atalante_hal.safety.diagnostics import Dtc
 from atalante_hal.safety.start import REFUSED
 from atalante_hal.transceiver import FrameTap
 from atalante_hal.types import Controller, State, SupervisorState
 from atalante_tools.console.options import Target
 from atalante_tools.console.outcome import Failed, FaultLatched
 from atalante_tools.console.stop_request import StopRequest, check_stop, ended_by
-from atalante_tools.console.terminal import Progress, say
-from atalante_tools.session.body import describe, open_body
+from atalante_tools.console.terminal import Progress, print_message
+from atalante_tools.session.body import describe, open_mechanics
 from atalante_tools.session.embedded import EmbeddedRobot, SpawnConfig
 
 if TYPE_CHECKING:
-    from atalante_control.model import ExoskeletonParameters
     from atalante_emulator.emulator import Emulator
     from atalante_emulator.faults import Fault
+    from atalante_emulator.mechanics import Mechanics
     from atalante_emulator.pendant import Operator
 
 #: Timeout of the answers to a SYNC on the wall clock: half a cycle [s].
@@ -51,8 +52,8 @@ class Rig:
     Attributes:
         target: Bus and clock.
         hal: HAL of the run.
-        emulator: Emulator of a robot in this process. None: the robot is real or in another process.
-        operator: Emulated operator of a robot in this process. None: the robot is real or in another process.
+        emulator: Emulator of a robot in this process. None if the robot is real or in another process.
+        operator: Emulated operator of a robot in this process. None if the robot is real or in another process.
     """
 
     target: Target
@@ -61,17 +62,24 @@ class Rig:
     operator: Operator | None = None
 
     def run(
-        self, controller: Controller, *, until: Callable[[State], bool], record: Callable[[], None] = lambda: None
+        self,
+        controller: Controller,
+        *,
+        until: Callable[[State], bool],
+        record: Callable[[], None] = lambda: None,
+        on_stop: Callable[[], None] | None = None,
     ) -> Statistics:
         """Run the control loop on the clock of the target. The run ends in HOLD.
 
         On the wall clock, the process requests real-time priority and locked memory. After a stop signal, the HAL rejects every
-        START and changes to HOLD. Further signals do not interrupt this. The function `until` must read the stop request.
+        START and changes to HOLD. Further signals do not interrupt this. The function `until` must read the stop request. With
+        `on_stop`, only the second signal has this effect.
 
         Args:
             controller: Controller that computes the command of every cycle.
             until: End condition, called with the state after every cycle.
             record: Function called after every cycle to record it.
+            on_stop: Function called at the first stop signal. It must only set a flag. If None, the first signal ends the run.
 
         Returns:
             Statistics of the loop.
@@ -79,12 +87,17 @@ class Rig:
         Raises:
             Stopped: If a signal arrived before the run. The robot then did not move.
         """
-        with ended_by(self.hal.end) as stop:
+        ends = [self.hal.end] if on_stop is None else [self.hal.end, on_stop]
+
+        def end() -> None:
+            (ends.pop() if len(ends) > 1 else ends[0])()
+
+        with ended_by(end) as stop:
             stop.check()
             if self.target.lockstep:
                 return run(self.hal, controller, LockStep(), until=until, record=record)
             for refused in realtime():
-                say(refused)
+                print_message(refused)
             return run(self.hal, controller, WallClock(), until=until, record=record)
 
 
@@ -103,32 +116,33 @@ def open_hal(
     tap: FrameTap | None = None,
     faults: Sequence[Fault] = (),
     robot_process: EmbeddedRobot | None = None,
-    exoskeleton: ExoskeletonParameters | None = None,
+    mechanics: Mechanics | None = None,
 ) -> Iterator[Rig]:
     """Open the buses and create the HAL. For an embedded target, also create the emulated robot. Close them after the block.
 
     Args:
         target: Bus and clock.
-        network: Nodes and messages. None: read from the DBC of the project.
-        robot: Robot parameters. None: read from the robot file of the project.
+        network: Nodes and messages. If None, they are read from the DBC of the project.
+        robot: Robot parameters. If None, they are read from the robot file of the project.
         seed: Seed of the sensor noise of the embedded robot.
-        pose: Initial joint angles of the embedded robot, shape (12,) [rad]. None: all zero.
-        operator: Emulated operator of the embedded robot. None: an operator who presses START when the HAL is in READY.
+        pose: Initial joint angles of the embedded robot, shape (12,) [rad]. None means all zero.
+        operator: Emulated operator of the embedded robot. None means an operator who presses START when the HAL is in READY.
         assistance_factor: Initial assistance factor Xi, 0 to 1.
         controller_fields: Name and size of each telemetry field of the controller.
         gait_hash: Hash of the gait that the HAL reports.
-        tap: Recorder of all frames. None: frames are not recorded.
+        tap: Recorder of all frames. If None, frames are not recorded.
         faults: Faults to inject into the embedded robot.
         robot_process: Subprocess for the embedded robot, which is closed after the block. Its operator presses START when the
-            HAL is in READY. None: the embedded robot runs in this process.
-        exoskeleton: Geometry and masses of the embedded robot. None: default leg lengths.
+            HAL is in READY. If None, the embedded robot runs in this process.
+        mechanics: Engine, exoskeleton, wearer and ground of the embedded robot. None means an empty exoskeleton with default leg
+            lengths that is suspended at its pelvis, in the engine of the target.
 
     Raises:
         ValueError: If both `operator` and `robot_process` are given.
-        FaultError: If the network does not have the target or a signal of a fault.
+        FaultError: If the target or a signal of a fault is not in the network.
         BusError: If a bus cannot be opened, or another HAL uses it.
         ChannelMapError: If the channel map is invalid.
-        Failed: If the embedded robot needs PyBullet and it is not installed.
+        Failed: If the physics engine of the embedded robot is not installed.
         Stopped: If a signal arrived before or during the start.
     """
     check_stop()  # imports before this call may have discarded the exception that a stop signal raised
@@ -142,17 +156,22 @@ def open_hal(
                 raise ValueError(
                     f"operator must be None for a robot in a subprocess, got {operator!r}: the subprocess has its own operator"
                 )
-            robot_process.begin(SpawnConfig(network, robot, describe(robot, exoskeleton), pose, seed, faults))
+            robot_process.begin(SpawnConfig(network, robot, mechanics or _suspended(robot, target), pose, seed, faults))
             bus: Bus = robot_process.bus
         elif target.embedded:
             hal_end, robot_end = lockstep_pair()
             bus = hal_end
-            body = stack.enter_context(open_body(robot, pose, exoskeleton))
+            mechanics = mechanics or _suspended(robot, target)
+            body = stack.enter_context(open_mechanics(mechanics, pose))
             from atalante_emulator.emulator import Emulator
             from atalante_emulator.pendant import Operator
 
             operator = operator or Operator()
-            emulator = Emulator(network, robot, body, robot_end, seed=seed, operator=operator, faults=faults)
+            emulator = Emulator(
+                network, robot, body, robot_end,
+                seed=seed, operator=operator, parameters=mechanics.node_parameters, faults=faults,
+            )  # fmt: skip
+            mechanics.complete(emulator)
             hal_end.step = emulator.poll
         else:
             bus = join(network, open_buses(network, target))
@@ -171,6 +190,12 @@ def open_hal(
             hal.listen()
         check_stop()
         yield Rig(target, hal, emulator, operator if emulator else None)
+
+
+def _suspended(robot: Robot, target: Target) -> Mechanics:
+    from atalante_emulator.mechanics import Mechanics
+
+    return Mechanics(describe(robot), target.engine)
 
 
 def open_buses(network: Network, target: Target) -> dict[str, Bus]:
@@ -194,16 +219,16 @@ def join(network: Network, buses: dict[str, Bus]) -> Bus:
         network: Nodes and messages. Each message is assigned to a bus.
         buses: Bus name -> open bus. Several names may share one bus object.
     """
-    first, *others = {id(bus): bus for bus in buses.values()}.values()
+    first, *others = dict.fromkeys(buses.values())
     return JoinedBus(network, buses) if others else first
 
 
 class Watch:
     """End condition of a run, called once per cycle. It also prints a progress line.
 
-    A run ends when `done(state)` returns True while ACTIVE, when a signal arrives, or when the robot is in FAULT. If the robot
-    leaves ACTIVE for another state, the run ends too, unless `resumes` is True: then it waits for the operator's START. After the
-    run, `conclude` raises an error unless `done` ended the run.
+    A run ends when `done(state)` returns True while the robot is ACTIVE, when a signal arrives, or when the robot is in FAULT. If
+    the robot leaves ACTIVE for another state, the run ends too, but with `resumes` it waits for the operator's START instead.
+    After the run, `conclude` raises an error unless `done` ended the run.
     """
 
     def __init__(
@@ -222,7 +247,7 @@ class Watch:
             stop: Stop request of the process.
             done: Returns whether the run is complete; called in each cycle in ACTIVE.
             describe: Returns the progress line in ACTIVE.
-            resumes: Whether the run continues when the operator presses START in HOLD. False: HOLD ends the run.
+            resumes: Whether the run continues when the operator presses START in HOLD. If False, HOLD ends the run.
         """
         self._rig, self._stop, self._done, self._describe = rig, stop, done, describe
         self._resumes = resumes
@@ -244,12 +269,12 @@ class Watch:
             if not self._started:
                 self._started = True
                 self._progress.clear()
-                say(f"ACTIVE on {self._rig.target}; Ctrl-C ends in HOLD")
+                print_message(f"ACTIVE on {self._rig.target}; Ctrl-C ends in HOLD")
             over = self._finished = self._done(state)
         elif self._started and self._resumes and state.supervisor is not SupervisorState.FAULT:
             self._started = over = False
             self._progress.clear()
-            say(f"{state.supervisor.name}: {self._rig.hal.reason}")
+            print_message(f"{state.supervisor.name}: {self._rig.hal.reason}")
         else:
             over = self._started or state.supervisor is SupervisorState.FAULT
         if over:
@@ -268,7 +293,7 @@ class Watch:
             Failed: If the robot left ACTIVE early.
         """
         if self._stop.wanted:
-            say("stopped, the robot is in HOLD")
+            print_message("stopped, the robot is in HOLD")
             raise SystemExit(self._stop.exit_code)
         if self._state is SupervisorState.FAULT:
             raise FaultLatched(f"the robot is in FAULT: {self._reason}")
@@ -277,12 +302,14 @@ class Watch:
 
 
 def waiting_for(rig: Rig) -> str:
-    """Return the condition that the robot still waits for before ACTIVE, with the command that the user must type.
+    """Return the missing condition for ACTIVE as text, with the command that the user must type to fulfil it.
 
     Args:
         rig: Rig of the run.
     """
     hal, target = rig.hal, rig.target
+    if Dtc.BUS_DOWN in hal.conditions.diagnostics:
+        return f"{hal.state.supervisor.name}: {hal.reason}"
     if hal.state.supervisor is SupervisorState.OFF:
         missing = hal.missing()
         if hal.silent:

@@ -1,4 +1,4 @@
-"""Output folder of `atalante demo` and `atalante airwalk`. It is locked during a run and gets summary and figure at its end.
+"""Output folder of `atalante demo` and `atalante airwalk`. The folder is locked during a run.
 
 results -> table, summary.json; recording -> figure
 """
@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from atalante_tools.console.outcome import Failed
-from atalante_tools.console.terminal import say, table
+from atalante_tools.console.terminal import print_message, table
 
 if TYPE_CHECKING:
     from atalante_hal.telemetry.process import Recording
@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Result:
-    """Result of one guide shape. The field names are the JSON keys of `--json` and of summary.json.
+    """Result of the walk inside one guide shape. The field names are the JSON keys of `--json` and of summary.json.
 
     `max_ratio`, `inside` and `filter_active` are measured after the first completed step. They are None if the run ended before
     the second step.
@@ -31,12 +31,10 @@ class Result:
 
     shape: str
     certified: bool  # whether the guide has a certificate at every assistance factor of the run
-    bound_hip_nm: (
-        float | None
-    )  # certified disturbance torque at the hip, if the knee is disturbed at the same time [Nm]. None: not certified.
-    bound_knee_nm: (
-        float | None
-    )  # certified disturbance torque at the knee, if the hip is disturbed at the same time [Nm]. None: not certified.
+    #: promised torque at the hip [Nm]: disturbances up to this torque at the hip, together with disturbances up to
+    #: `promise_knee_nm` at the knee, leave both joints in the guide. None if the guide has no promise.
+    promise_hip_nm: float | None
+    promise_knee_nm: float | None  # promised torque at the knee [Nm], see `promise_hip_nm`
     steps: int  # number of completed right-stance steps
     max_ratio: float | None  # largest ratio of tracking error to guide width, |e| / q_bound
     inside: float | None  # share of the time with both assisted joints inside the guide, 0 to 1
@@ -45,6 +43,8 @@ class Result:
     real_time_factor: float
     frames: int
     crc_errors: int
+    #: number of steps that started outside the hand-over box, which is the range of start deviations for which the promise holds
+    hand_overs_exceeded: int
 
 
 @contextmanager
@@ -89,26 +89,26 @@ def write_summary(out: Path, options: Mapping[str, Any], results: Sequence[Resul
     summary = {**options, "recording": asdict(recording), "shapes": [asdict(result) for result in results]}
     (out / "summary.json").write_text(json.dumps(summary, indent=2) + "\n")
     figure = _figure(out, recording)
-    say(f"in {out}: {', '.join([*recording.files, 'summary.json', *([figure] if figure else [])])}")
+    print_message(f"in {out}: {', '.join([*recording.files, 'summary.json', *([figure] if figure else [])])}")
 
 
 def _figure(out: Path, recording: Recording) -> str:
     """Draw the figure and return its file name. If it cannot be drawn, print the reason and return an empty string."""
     name = "guide_shapes.png"
     if "recording.mcap" not in recording.files:
-        say("no figure: recording.mcap was not written")
+        print_message("no figure: recording.mcap was not written")
         return ""
     try:
         from mcap.exceptions import McapError
 
         from atalante_tools.session.figures import guide_shapes
     except ModuleNotFoundError as error:
-        say(f"no figure: {error.name} is not installed; type `pip install 'atalante-hal[plot]'`")
+        print_message(f"no figure: {error.name} is not installed; type `pip install 'atalante-hal[plot]'`")
         return ""
     try:
         guide_shapes(out / "recording.mcap", out / name)
     except McapError as error:
-        say(f"no figure: recording.mcap is incomplete: {error}")
+        print_message(f"no figure: recording.mcap is incomplete: {error}")
         return ""
     return name
 
@@ -119,19 +119,20 @@ def results_table(results: Sequence[Result]) -> str:
     Args:
         results: One result per guide shape.
     """
-    head = ["shape", "certified", "bound hip Nm", "bound knee Nm", "steps", "max |e|/q_bound", "inside %", "filter active %",
-            "cycles", "x real time", "frames", "CRC errors"]  # fmt: skip
+    head = ["shape", "certified", "promise hip Nm", "promise knee Nm", "steps", "max |e|/q_bound", "inside %", "filter active %",
+            "cycles", "x real time", "frames", "CRC errors", "hand-overs"]  # fmt: skip
     rows = [
         [
             r.shape,
             "yes" if r.certified else "NO",
-            *("-" if bound is None else f"{bound:.2f}" for bound in (r.bound_hip_nm, r.bound_knee_nm)),
+            *("-" if torque is None else f"{torque:.2f}" for torque in (r.promise_hip_nm, r.promise_knee_nm)),
             str(r.steps),
             *_tracking_cells(r),
             str(r.cycles),
             f"{r.real_time_factor:.1f}",
             str(r.frames),
             str(r.crc_errors),
+            str(r.hand_overs_exceeded),
         ]
         for r in results
     ]
@@ -139,7 +140,7 @@ def results_table(results: Sequence[Result]) -> str:
 
 
 def _tracking_cells(result: Result) -> tuple[str, str, str]:
-    """Return the three table cells of the tracking error, each "-" if it was not measured."""
+    """Return the three table cells of the tracking error. A cell is "-" if its value was not measured."""
     if result.max_ratio is None or result.inside is None or result.filter_active is None:
         return "-", "-", "-"
     return f"{result.max_ratio:.2f}", f"{100 * result.inside:.1f}", f"{100 * result.filter_active:.1f}"

@@ -3,11 +3,12 @@
     SYNC and frames of other pendants -> PendantReader -> Takeover -> answer or silence
 
 A pendant answers each SYNC with a frame whose counter is the low byte of the signal Cycle. Only an intact frame with the counter
-of the present SYNC counts as a frame of another pendant. A damaged, old or replayed frame changes nothing.
+of the last SYNC is treated as a frame of another pendant. A damaged, old or replayed frame changes nothing.
 
 A pendant that receives such frames stops sending and listens. If the other pendant continues, the listening pendant gives up. If
-no frame comes, it sends again. An established pendant stops at once, and a new pendant at a random cycle of its takeover. Two
-pendants that stop together therefore send again after a new random time, until one of them hears the other.
+no frame is received, the listening pendant resumes sending. An established pendant stops at once. A new pendant stops at a random
+cycle of its takeover. Two pendants that stop in the same cycle also resume in the same cycle. Each of them then stops after
+a new random time, until one pendant stops alone and gives up.
 """
 
 from __future__ import annotations
@@ -26,22 +27,23 @@ TAKEOVER_CYCLES: Final = 50
 RETRY_CYCLES: Final = 8
 #: Upper limit of the random time that is added to `TAKEOVER_CYCLES` or `RETRY_CYCLES` [cycles].
 DRAW_CYCLES: Final = 50
-#: Number of consecutive frames of another pendant after which a pendant stops sending. The HAL tolerates two senders for three
-#: cycles.
+#: A pendant stops sending after this number of consecutive frames of another pendant.
+#: The HAL tolerates two senders for three cycles.
 PRESENT_FRAMES: Final = 2
-#: Number of consecutive frames of another pendant after which a silent pendant gives up.
+#: A silent pendant gives up after this number of consecutive frames of another pendant.
 LOST_FRAMES: Final = 3
-#: Time without a frame of another pendant after which a silent pendant sends again [cycles]. The HAL times out after 5.
+#: A silent pendant resumes sending if no frame of another pendant is received for this time [cycles].
+#: The HAL reports a timeout after 5 cycles without a frame.
 QUIET_CYCLES: Final = 3
 #: E2E check results of a frame with a valid CRC, whether or not its counter is as expected.
 _INTACT: Final = (Check.OK, Check.SOME_LOST, Check.REPEATED, Check.CONFLICT, Check.WRONG_SEQUENCE)
 
 
 class Takeover:
-    """Takeover rule of one pendant. It decides whether the pendant answers the present SYNC.
+    """Takeover rule of one pendant. It decides whether the pendant answers the last SYNC.
 
     Attributes:
-        established: Whether this pendant was the only one at the end of its takeover.
+        established: Whether this pendant was the only pendant that sent at the end of its takeover.
         silent: Whether this pendant stopped sending to listen for another pendant.
         lost: Whether this pendant gave up. It never sends again.
     """
@@ -51,27 +53,27 @@ class Takeover:
 
         Args:
             established: Whether this pendant sends from the beginning, and stops for each new pendant.
-            quiet: Time without a frame of another pendant after which this pendant sends again [cycles].
-            seed: Seed of the random times. None: random seed of the operating system.
+            quiet: Time without a frame of another pendant after which this pendant resumes sending [cycles].
+            seed: Seed of the random times. None means a random seed of the operating system.
         """
         self._quiet, self._random = quiet, Random(seed)
         self._sending = self.established = established
         self.silent = self.lost = False
-        self._tag = -1  # counter of the answers to the present SYNC; -1 before the first SYNC
+        self._tag = -1  # counter that an answer to the last SYNC contains; -1 before the first SYNC
         self._cycle = 0  # number of SYNCs
-        self._free_from = 0  # cycle from which this pendant may stop sending
-        self._quiet_from = 0  # cycle from which the silence of other pendants is counted
-        self._heard_at = -MAX_DELTA - 1  # cycle of the last frame of another pendant
-        self._heard = 0  # consecutive frames of another pendant
+        self._free_from = 0  # first cycle in which this pendant may stop sending
+        self._quiet_from = 0  # first cycle of the current time without frames of other pendants
+        self._received_at = -MAX_DELTA - 1  # cycle in which the last frame of another pendant was received
+        self._received = 0  # number of consecutive frames of another pendant
 
     @property
     def present(self) -> bool:
         """Return whether frames of another pendant are being received."""
-        return self._heard >= PRESENT_FRAMES and self._cycle - self._heard_at <= MAX_DELTA
+        return self._received >= PRESENT_FRAMES and self._cycle - self._received_at <= MAX_DELTA
 
     @property
     def sends(self) -> bool:
-        """Return whether this pendant answers the present SYNC."""
+        """Return whether this pendant answers the last SYNC."""
         return self._sending and not self.silent and not self.lost
 
     def start(self) -> None:
@@ -83,7 +85,7 @@ class Takeover:
         """Process a SYNC received from the HAL: decide whether this pendant answers it.
 
         Args:
-            tag: Counter of the answers to this SYNC, 0 to 255.
+            tag: Counter that an answer to this SYNC contains, 0 to 255.
         """
         self._cycle += 1
         self._tag = tag
@@ -93,25 +95,25 @@ class Takeover:
         elif self.sends and self._cycle >= self._free_from:
             if self.present:
                 self.silent = True
-                self._quiet_from, self._heard = self._cycle, 0
+                self._quiet_from, self._received = self._cycle, 0
             else:
                 self.established = True
 
     def answer(self, counter: int) -> bool:
-        """Count an intact frame of another pendant if it answers the present SYNC.
+        """Count an intact frame of another pendant if the frame answers the last SYNC.
 
         Args:
             counter: Alive counter of the frame, 0 to 255.
 
         Returns:
-            Whether the frame answers the present SYNC, and is the first such frame.
+            Whether the frame is the first answer of another pendant to the last SYNC.
         """
-        if counter != self._tag or self._heard_at == self._cycle:
+        if counter != self._tag or self._received_at == self._cycle:
             return False
-        in_row = self._cycle - self._heard_at <= MAX_DELTA
-        self._heard = self._heard + 1 if in_row else 1
-        self._heard_at, self._quiet_from = self._cycle, self._cycle + 1
-        if self.silent and self._heard >= LOST_FRAMES:
+        in_row = self._cycle - self._received_at <= MAX_DELTA
+        self._received = self._received + 1 if in_row else 1
+        self._received_at, self._quiet_from = self._cycle, self._cycle + 1
+        if self.silent and self._received >= LOST_FRAMES:
             self.lost, self.silent = True, False
         return True
 
@@ -120,10 +122,10 @@ class PendantReader:
     """Reader of the frames on the bus of the pendant: passes each SYNC and each frame of another pendant to the takeover rule.
 
     Attributes:
-        tag: Counter of the answers to the last SYNC, 0 to 255.
+        tag: Counter that an answer to the last SYNC contains, 0 to 255.
         hal_state: Signal HalState of the last SYNC.
-        gaps: Number of rejected SYNCs. After a gap, SYNCs are rejected until enough consecutive ones were received.
-        other: Signals of the last frame of another pendant that answered its SYNC, by name. Empty before.
+        gaps: Number of rejected SYNCs. After a gap, SYNCs are rejected until enough consecutive SYNCs were received.
+        other: Signal name -> value in the last frame with which another pendant answered a SYNC. Empty before the first one.
     """
 
     def __init__(self, network: Network, takeover: Takeover) -> None:
@@ -131,7 +133,7 @@ class PendantReader:
 
         Args:
             network: Nodes and messages of the DBC.
-            takeover: Rule that receives the events.
+            takeover: Rule to which each SYNC and each frame of another pendant is passed.
         """
         state, sync = pendant_messages(network)
         self._takeover = takeover
@@ -146,20 +148,20 @@ class PendantReader:
         self.gaps = 0
         self.other: dict[str, float] = {}
 
-    def read(self, frames: Frames, count: int) -> bool:
-        """Read received frames in the order of the bus. Other messages are ignored.
+    def read(self, frames: Frames, count: int) -> int:
+        """Process SYNC frames and pendant frames in the order in which they were received; ignore all other messages.
 
         Args:
             frames: Receive buffer.
             count: Number of received frames at the start of the buffer.
 
         Returns:
-            Whether a SYNC is among them.
+            Number of SYNCs in these frames.
         """
-        synced = False
+        synced = 0
         for index, can_id in enumerate(frames["can_id"][:count].tolist()):
             if can_id in self._ids:
-                synced |= self._read_one(frames[index : index + 1])
+                synced += self._read_one(frames[index : index + 1])
         return synced
 
     def _read_one(self, frame: Frames) -> bool:
@@ -182,7 +184,7 @@ class PendantReader:
 
 
 def pendant_messages(network: Network) -> tuple[Message, Message]:
-    """Return the cyclic message of the pendant, and the SYNC that it answers.
+    """Return the cyclic message of the pendant, and the SYNC message that the pendant answers.
 
     Args:
         network: Nodes and messages of the DBC.

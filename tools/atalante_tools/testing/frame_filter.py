@@ -27,20 +27,20 @@ _BATCH: Final = 128
 
 @dataclass
 class Fault:
-    """Fault of chosen messages. It ends after it has affected `frames` frames of each message, or by a call of `end`."""
+    """Fault of chosen messages. It ends when it has affected `frames` frames of each message, or when `end` is called."""
 
     kind: str  # drop, delay or corrupt
     messages: tuple[str, ...]  # names of the messages
     ids: frozenset[int]  # identifiers of the messages
     probability: float  # probability that a frame is affected
-    frames: int | None  # largest number of affected frames of each message; None: no limit
+    frames: int | None  # largest number of affected frames of each message; None means no limit
     cycles: int = 0  # duration of a delay [cycles]
-    bit: int | None = None  # index of the bit to invert; None: random
+    bit: int | None = None  # index of the bit to invert; None means a random bit
     hits: dict[int, int] = field(default_factory=dict)  # CAN identifier -> number of affected frames
 
     @property
     def hit(self) -> int:
-        """Number of affected frames so far."""
+        """Return the number of frames that the fault has affected so far."""
         return sum(self.hits.values())
 
     def end(self) -> None:
@@ -49,20 +49,21 @@ class Fault:
 
     @property
     def over(self) -> bool:
-        """Whether the fault has ended."""
+        """Return whether the fault has ended."""
         return self.frames is not None and all(self.hits.get(frame_id, 0) >= self.frames for frame_id in self.ids)
 
 
 class FrameFilter(WrappedBus):
     """Bus that applies faults to frames. Without a fault it passes all frames on.
 
-    Time stamps are not moved with the frames. After a dropped or delayed frame, the next frames have time stamps of other frames.
+    The filter does not change the list of time stamps. If a frame is dropped or delayed, the following stamps no longer match.
 
     Args:
         bus: wrapped bus, owned by the caller.
         network: nodes and messages of the DBC.
-        tap: recorder of the frames that are passed on; None: frames are not recorded.
-        step: function that runs the emulated robot. Every `receive` calls it and then does not wait. None: a real robot.
+        tap: recorder of the frames that are passed on. If None, frames are not recorded.
+        step: function that runs the emulated robot. Each `receive` first calls this function, and then receives without
+            waiting. None means a real robot.
         seed: seed of the random faults.
     """
 
@@ -82,14 +83,15 @@ class FrameFilter(WrappedBus):
         self._random = np.random.default_rng(seed)
         self._syncs = {m.frame_id for m in network.messages if m.name.startswith("SYNC_")}
         self._cycle = 0
-        self._delayed: tuple[list[tuple[int, Frames]], list[tuple[int, Frames]]] = ([], [])  # out, in: (due, frame)
+        #: Delayed frames of the HAL, and delayed frames of the nodes, each as (cycle in which the frame is due, frame).
+        self._delayed: tuple[list[tuple[int, Frames]], list[tuple[int, Frames]]] = ([], [])
 
     def drop(self, name: str, *, frames: int | None = None, probability: float = 1.0) -> Fault:
         """Drop frames of the given messages.
 
         Args:
             name: name of a message (LEFT_SK_STATE), of a node (LEFT_SK: all its messages), or a pattern (LEFT_*, *_STATE).
-            frames: number of frames of each message. None means until the fault ends.
+            frames: number of affected frames of each message. None means no limit until the caller ends the fault.
             probability: probability that a frame is affected, above 0 and at most 1.
 
         Returns:
@@ -105,8 +107,8 @@ class FrameFilter(WrappedBus):
 
         Args:
             name: name or pattern of messages or nodes, as in `drop`.
-            cycles: delay in cycles, from 1.
-            frames: number of frames of each message. None means until the fault ends.
+            cycles: delay in cycles, at least 1.
+            frames: number of affected frames of each message. None means no limit until the caller ends the fault.
             probability: probability that a frame is affected, above 0 and at most 1.
 
         Returns:
@@ -116,7 +118,7 @@ class FrameFilter(WrappedBus):
             ValueError: If an argument is out of range, or there is no such message or node.
         """
         if cycles < 1:
-            raise ValueError(f"cycles of a delay must be 1 or more, got {cycles}")
+            raise ValueError(f"the parameter 'cycles' must be 1 or more, got {cycles}")
         fault = self._add("delay", name, frames, probability)
         fault.cycles = cycles
         return fault
@@ -129,7 +131,7 @@ class FrameFilter(WrappedBus):
         Args:
             name: name or pattern of messages or nodes, as in `drop`.
             bit: index of the bit, modulo the payload length. None means a random bit.
-            frames: number of frames of each message. None means until the fault ends.
+            frames: number of affected frames of each message. None means no limit until the caller ends the fault.
             probability: probability that a frame is affected, above 0 and at most 1.
 
         Returns:
@@ -198,7 +200,7 @@ class FrameFilter(WrappedBus):
         return count
 
     def _apply_faults(self, frames: Frames, delayed: list[tuple[int, Frames]]) -> Frames:
-        """Apply the faults to a batch. Return the delayed frames that are due, then the remaining frames of the batch."""
+        """Apply the faults to new frames. Return the delayed frames that are due, then the new frames that remain."""
         due = [frame for cycle, frame in delayed if cycle <= self._cycle][:_BATCH]
         delayed[:] = [(cycle, frame) for cycle, frame in delayed if cycle > self._cycle]
         arriving = due

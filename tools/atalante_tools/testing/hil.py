@@ -29,22 +29,23 @@ from atalante_tools.session.rig import join, open_buses
 if TYPE_CHECKING:
     from atalante_emulator.emulator import Emulator
 
-#: Longest time for which the emulated robot waits for the frames of a cycle on a CAN interface [s].
+#: On a CAN interface, the emulated robot waits at most this time for the frames of one cycle [s].
 _POLL: Final = 0.01
-#: Time to listen on a CAN interface before the emulated robot uses it [s]. Without a frame in this time, it counts as free.
+#: Time to listen on a CAN interface before the emulated robot uses the interface [s].
+#: The interface is considered free if no frame arrives during this time.
 _QUIET: Final = 0.15
 #: Largest number of frames in a recording, about 30 s.
 KEPT: Final = 600_000
-#: Difference between the time stamps of consecutive frames of a cycle in a recording [ns].
+#: In a recording, the time stamps of consecutive frames of one cycle differ by this time [ns].
 _FRAME_NS: Final = 20_000
 
 
 class BusInUse(BusError):  # noqa: N818
-    """The bus carries frames of another robot, so an emulated robot cannot use it."""
+    """Raised if frames of another robot are on the bus, so that an emulated robot cannot use the bus."""
 
 
 def open_bus(network: Network, target: Target, *, emulated: bool) -> tuple[Bus, Bus | None]:
-    """Open the bus for the HAL, and a second time for the robot if it is emulated.
+    """Open the bus for the HAL. If the robot is emulated, open the bus for the robot, too.
 
     Args:
         network: nodes and messages of the DBC.
@@ -52,7 +53,7 @@ def open_bus(network: Network, target: Target, *, emulated: bool) -> tuple[Bus, 
         emulated: whether the robot is emulated.
 
     Returns:
-        Bus for the HAL, and bus for the emulated robot; the latter is None for a real robot.
+        Bus for the HAL, and bus for the emulated robot. For a real robot, the second bus is None.
 
     Raises:
         BusError: If the bus cannot be opened.
@@ -68,22 +69,25 @@ def open_bus(network: Network, target: Target, *, emulated: bool) -> tuple[Bus, 
     if hal_bus.receive(scratch, _QUIET):
         hal_bus.close()
         raise BusInUse(
-            f"{target} must be free for the emulated robot, got frame {int(scratch['can_id'][0]):#x}: mark tests of the "
-            "connected robot with @pytest.mark.hil, and run all others on another bus"
+            f"{target} must carry no frames before the emulated robot uses it, got frame {int(scratch['can_id'][0]):#x}: mark "
+            "the tests of the connected robot with @pytest.mark.hil, and run all other tests on another bus"
         )
     return hal_bus, join(network, open_buses(network, target))
 
 
 @contextmanager
-def emulated_robot(network: Network, robot: Robot, robot_bus: Bus) -> Iterator[Emulator]:
+def emulated_robot(network: Network, robot: Robot, robot_bus: Bus, engine: str) -> Iterator[Emulator]:
     """Create the emulated robot, with an operator who presses START when the HAL is READY.
 
     Args:
         network: nodes and messages of the DBC.
         robot: joint properties.
         robot_bus: bus of the robot.
+        engine: name of the physics engine.
     """
-    with open_body(robot) as body:  # opened before the imports, because its error names the missing package
+    with open_body(
+        robot, engine=engine
+    ) as body:  # opened before the imports, because its error names the missing package
         from atalante_emulator.emulator import Emulator
         from atalante_emulator.pendant import Operator
 
@@ -95,7 +99,7 @@ def connect(hal_bus: Bus, emulator: Emulator) -> Callable[[], object] | None:
 
     Args:
         hal_bus: bus of the HAL.
-        emulator: emulated robot at the other end.
+        emulator: emulated robot that answers the HAL.
 
     Returns:
         Function to call before every receive of the HAL. None for a `PairBus`, which calls the emulator directly.
@@ -107,7 +111,7 @@ def connect(hal_bus: Bus, emulator: Emulator) -> Callable[[], object] | None:
 
 
 class Stepper:
-    """HAL loop whose cycles are run by the test. The default `controller` holds the pose in which the robot became ACTIVE."""
+    """HAL loop that a test advances cycle by cycle. The default `controller` holds the pose at the start of ACTIVE."""
 
     def __init__(self, hal: Hal, clock: Clock) -> None:
         self.hal = hal
@@ -178,7 +182,7 @@ class Recording:
         self._batches: list[tuple[Frames, Stamps, bool]] = []
         self._count = 0
         self._cycle, self._in_cycle = 0, 0
-        #: Function that returns the HAL cycle. The time stamps are computed from this cycle.
+        #: Function that returns the number of the current HAL cycle. The time stamps are computed from this number.
         self.cycle: Callable[[], int] = lambda: 0
 
     def sent(self, frames: Frames) -> None:
@@ -194,7 +198,7 @@ class Recording:
 
         Args:
             frames: receive buffer.
-            count: number of frames in it.
+            count: number of frames in the receive buffer.
         """
         self._add(frames[:count], sent=False)
 

@@ -1,6 +1,6 @@
 """Pytest fixtures for tests with a robot: an emulated robot in this process, or a real robot on `--can-interface`.
 
-    emulator -> bus -> faults -> hal -> loop          recorded_run: all frames
+`loop` uses `hal`, `hal` uses `bus`, and `bus` uses `emulator` and `recorded_run`. `faults` and `bus` are the same object.
 
 - `emulator`: emulated robot; `emulator.operator` is its emulated operator.
 - `bus`, `hal`: bus of the HAL, and the HAL.
@@ -9,7 +9,7 @@
 - `recorded_run`: all frames of the test, written to a CAN log if the test fails.
 
 A test marked `hil` runs with the robot on the bus, without emulator. If the bus is missing, the test fails and prints the options
-to use; `--can-missing=skip` skips it instead. Every pytest run loads this module, so it imports nothing heavy.
+to use. With `--can-missing=skip` the test is skipped. Every pytest run loads this module, so the module imports no slow package.
 """
 
 from __future__ import annotations
@@ -54,6 +54,12 @@ def pytest_addoption(parser: pytest.Parser) -> None:
         "left_leg=can0,right_leg=can1,left_sense=can2,right_sense=can3",
     )
     group.addoption(
+        "--engine",
+        choices=("pybullet", "mujoco"),
+        default="pybullet",
+        help="physics engine of the emulated robot (default: %(default)s)",
+    )
+    group.addoption(
         "--can-missing",
         choices=("fail", "skip"),
         default="fail",
@@ -86,7 +92,7 @@ def pytest_configure(config: pytest.Config) -> None:
 
 @pytest.hookimpl(wrapper=True)
 def pytest_runtest_makereport(item: pytest.Item) -> Generator[None, pytest.TestReport, pytest.TestReport]:
-    """Write the recorded frames of a test to a CAN log, and add its path to the report.
+    """Write the recorded frames of a test to a CAN log, and add the path of the log to the test report.
 
     Args:
         item: test item.
@@ -178,7 +184,8 @@ def emulator(
             f"{request.node.name} is marked hil and has no emulator: remove the marker or the fixture `emulator`",
             pytrace=False,
         )
-    with emulated_robot(_atalante_network, _atalante_robot, robot_bus) as robot:
+    engine = request.config.getoption("--engine")
+    with emulated_robot(_atalante_network, _atalante_robot, robot_bus, engine) as robot:
         yield robot
 
 
@@ -222,7 +229,7 @@ def hal(
     _atalante_robot: Robot,
     recorded_run: Recording,
 ) -> Iterator[Hal]:
-    """Return a HAL on the bus. After the test, the HAL is stopped in HOLD."""
+    """Return a HAL on the bus. After the test, the HAL sends HOLD for some cycles and is stopped."""
     from atalante_hal.hal import Hal
     from atalante_tools.session.rig import LOCKSTEP_PATIENCE, PATIENCE
 

@@ -29,8 +29,8 @@ PERIOD = 1e-3  # s
 GEAR = ROBOT.gear * ROBOT.polarity
 #: Middle of the range of each joint [rad].
 MIDDLE = (ROBOT.position_min + ROBOT.position_max) / 2.0
-#: Largest change of each position in one cycle that is no jump [rad].
-REACH = ROBOT.velocity_max * PERIOD + 3.0 * ROBOT.encoder_noise
+#: Largest change of each joint position in one cycle that is not regarded as a jump [rad].
+REACH = ROBOT.top_speed * PERIOD + 3.0 * ROBOT.encoder_noise
 
 _MODEL = pinocchio_model(urdf(ExoskeletonParameters(), ROBOT))
 _DATA = _MODEL.model.createData()
@@ -43,7 +43,7 @@ imus = pytest.mark.parametrize("imu", range(len(IMUS)), ids=IMUS)
 cells = pytest.mark.parametrize(("foot", "cell"), [(f, c) for f in range(len(FEET)) for c in range(len(CELLS))])
 signs = pytest.mark.parametrize("sign", [1.0, -1.0])
 
-#: Changes the signals of a cycle in place.
+#: Function that changes the signals of a cycle in place.
 Change = Callable[[Signals], object]
 
 
@@ -73,7 +73,7 @@ def only(found: tuple[Finding, ...]) -> Finding:
 
 
 def must_not_be_called(*_: object) -> None:
-    """Fail the test; replaces a function that must not be called."""
+    """Fail the test. A test puts this in place of a function that must not be called."""
     raise AssertionError
 
 
@@ -100,12 +100,12 @@ class SimulatedRobot:
 
     @property
     def time(self) -> float:
-        """Time since the first cycle [s]."""
+        """Return the time since the first cycle [s]."""
         return self.cycles * PERIOD
 
     @property
     def rejected(self) -> dict[int, int]:
-        """Age [cycles] of the values of each row whose new values were rejected in this cycle."""
+        """Return row -> age of its values [cycles], for each row whose new values were rejected in this cycle."""
         rows = np.flatnonzero(self.image.check == Check.IMPLAUSIBLE).tolist()
         assert not rows or not self.image.all_fresh
         return {row: int(self.image.age[row]) for row in rows}
@@ -151,14 +151,14 @@ class SimulatedRobot:
         return found
 
     def run(self, cycles: int, change: Change = lambda now: None) -> tuple[Finding, ...]:
-        """Simulate cycles with the same change, and return the findings of the last one."""
+        """Simulate cycles with the same change, and return the findings of the last cycle."""
         found: tuple[Finding, ...] = ()
         for _ in range(cycles):
             found = self.cycle(change)
         return found
 
     def until_found(self, dtc: Dtc, cycles: int, change: Change) -> int:
-        """Return the number of cycles until the fault is found and confirmed; the first faulty cycle is 1."""
+        """Return the number of cycles from the first faulty cycle, which counts as 1, until the finding is confirmed."""
         for cycle in range(1, cycles + 1):
             if any(f.dtc is dtc and f.confirmed for f in self.cycle(change)):
                 return cycle

@@ -108,7 +108,7 @@ class TestQuaternion:
 
 
 class TestImusAlone:
-    """The IMU checks without the schedule, exactly at thresholds that are binary fractions."""
+    """The IMU checks, called directly instead of by the schedule, exactly at thresholds that are binary fractions."""
 
     robot = replace(ROBOT, sensors=replace(ROBOT.sensors, quaternion_error=0.125))
     ends = tuple(

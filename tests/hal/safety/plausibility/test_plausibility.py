@@ -54,7 +54,7 @@ def test_lost_frames_cause_no_findings():
 
 
 def test_rejected_jumps_keep_the_last_good_position():
-    """A jump, a lost frame and another jump."""
+    """The history is a jump, a lost frame and another jump."""
     robot = SimulatedRobot()
     good = float(robot.now.position[4])
     for change, missing in ((1.0, set()), (0.0, {row("left_SA")}), (1.0, set())):
@@ -77,20 +77,20 @@ def test_each_slow_check_runs_in_its_scheduled_cycle(monkeypatch: pytest.MonkeyP
     made: list[str] = []
     for owner, name in (
         (Stillness, "sample"),
-        (EncoderChecks, "judge_velocity"),
-        (Legs, "judge_left"),
-        (Legs, "judge_right"),
-        (FootChecks, "judge"),
-        (Unchecked, "judge"),
+        (EncoderChecks, "check_velocity"),
+        (Legs, "check_left"),
+        (Legs, "check_right"),
+        (FootChecks, "evaluate"),
+        (Unchecked, "evaluate"),
     ):
         monkeypatch.setattr(owner, name, lambda *_, name=f"{owner.__name__}.{name}": bool(made.append(name)))
     image = ReceiveImage(MESSAGES, np.zeros(CODEC.size))
     checks = Plausibility(ROBOT, image, PERIOD)
     assert checks.findings == ()
-    expected = {0: "Stillness.sample", 2: "EncoderChecks.judge_velocity", 4: "Unchecked.judge"}
+    expected = {0: "Stillness.sample", 2: "EncoderChecks.check_velocity", 4: "Unchecked.evaluate"}
     expected |= {cycle + 16: name for cycle, name in expected.items()}
-    expected |= {8: "Legs.judge_left", 24: "Legs.judge_right"}
-    expected |= dict.fromkeys(range(1, 32, 4), "FootChecks.judge")
+    expected |= {8: "Legs.check_left", 24: "Legs.check_right"}
+    expected |= dict.fromkeys(range(1, 32, 4), "FootChecks.evaluate")
     for cycle in range(64):
         assert checks.check() == ()
         assert made == ([expected[cycle % 32]] if cycle % 32 in expected else [])
@@ -122,7 +122,7 @@ def test_missing_joint_does_not_hide_jump_of_another():
 
 
 class TestAfterLostFrames:
-    """Frames after lost frames are checked like all others."""
+    """A frame after lost frames is checked like every other frame."""
 
     def test_joint_that_jumps_is_found(self):
         robot = SimulatedRobot()

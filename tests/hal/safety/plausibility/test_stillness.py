@@ -6,13 +6,29 @@ import math
 
 import numpy as np
 import pytest
-from simulated_robot import CODEC, GEAR, MESSAGES, MIDDLE, ROBOT, SimulatedRobot, cells, imus, joints, only, row, signs
+from simulated_robot import (
+    CODEC,
+    GEAR,
+    MESSAGES,
+    MIDDLE,
+    PERIOD,
+    ROBOT,
+    SimulatedRobot,
+    cells,
+    imus,
+    joints,
+    only,
+    row,
+    signs,
+)
 
 from atalante_hal.robot import CELLS, FEET, IMUS, JOINTS
 from atalante_hal.safety.diagnostics import Dtc
 from atalante_hal.safety.plausibility.finding import Signals, signals_of
 from atalante_hal.safety.plausibility.stillness import Stillness
 from atalante_hal.wire.process_image import ReceiveImage
+
+ANKLES = [JOINTS.index(name) for name in ("left_SA", "left_HA", "right_SA", "right_HA")]
 
 
 class TestStuckEncoder:
@@ -27,7 +43,7 @@ class TestStuckEncoder:
             now.position[joint] = stuck
             now.velocity[joint] = 0.0
 
-        assert 32 < robot.until_found(Dtc.ENC_STUCK, 50, stick) <= 48
+        assert 12 < robot.until_found(Dtc.ENC_STUCK, 50, stick) <= 48
         finding = only(robot.checks.findings)
         assert finding.node == JOINTS[joint].upper()
         assert finding.value >= ROBOT.breakaway[joint]
@@ -36,6 +52,84 @@ class TestStuckEncoder:
         )
         assert robot.rejected == {}
         assert robot.run(17) == ()
+
+    @joints
+    @signs
+    @pytest.mark.parametrize("ridden_through", [False, True])
+    def test_stuck_encoder_is_found_within_12_cycles_of_a_fast_torque(
+        self, joint: int, sign: float, ridden_through: bool
+    ):
+        robot = SimulatedRobot(amplitude=0.0)
+        robot.run(20)
+        robot.missing = {row("IMU_torso")} if ridden_through else set()
+        torque = 0.0
+
+        def push(now: Signals) -> None:
+            nonlocal torque
+            torque += sign * 20.0
+            now.torque[joint] = torque
+
+        assert 4 < robot.until_found(Dtc.ENC_STUCK, 12, push) <= 8
+        found = [f for f in robot.checks.findings if f.dtc is Dtc.ENC_STUCK]
+        assert only(tuple(found)).node == JOINTS[joint].upper()
+        assert found[0].value == pytest.approx(abs(torque), abs=21.0)
+        assert f"{JOINTS[joint]} has a constant reading while the torque varies by" in found[0].text
+        move = robot.run(17, lambda now: now.position.__iadd__(1e-4 * robot.cycles))
+        assert [f for f in move if f.dtc is Dtc.ENC_STUCK] == []
+
+    @joints
+    def test_accepted_time_of_a_constant_reading_shrinks_with_the_torque(self, joint: int):
+        cycles = []
+        for beyond in (10.0, 40.0, 160.0):
+            robot, torque = SimulatedRobot(amplitude=0.0), 1.0
+
+            def push(now: Signals) -> None:
+                now.torque[joint] = torque  # noqa: B023 - called in the same iteration
+
+            robot.run(4, push)
+            torque += ROBOT.breakaway[joint] + beyond
+            cycles.append(robot.until_found(Dtc.ENC_STUCK, 50, push))
+        # A joint with 100 kg m2 turns by beyond * t^2 / 2 / 100 kg m2 in the time t. The finding requires that this is 10 urad.
+        assert cycles == [14, 7, 4]
+
+    @joints
+    def test_torque_pulse_too_short_to_move_the_heaviest_joint_reports_nothing(self, joint: int):
+        robot, torque = SimulatedRobot(amplitude=0.0), 0.0
+
+        def push(now: Signals) -> None:
+            now.torque[joint] = torque
+
+        robot.run(4, push)
+        torque = ROBOT.breakaway[joint] + 40.0
+        assert robot.run(1, push) == ()
+        torque = 0.0
+        assert robot.run(24, push) == ()
+
+    @joints
+    def test_torque_that_stops_a_joint_is_not_counted(self, joint: int):
+        robot, torque = SimulatedRobot(amplitude=0.0), 100.0
+
+        def brake(now: Signals) -> None:
+            now.torque[joint] = torque
+
+        robot.run(20, lambda now: (brake(now), now.position.__iadd__(1e-3 * robot.cycles)))
+        for torque in (100.0, 50.0, 0.0):  # noqa: B007 - read by `brake`
+            robot.cycle(lambda now: (brake(now), now.position.__iadd__(1e-3 * 20)))
+        assert robot.run(8, lambda now: (brake(now), now.position.__iadd__(1e-3 * 20))) == ()
+
+    def test_late_values_count_with_the_time_between_their_measurements(self):
+        stillness, image, now = TestStillnessAlone().stillness()
+        image.values_before[:] = image.values
+        now.position[7] = image.values_before[CODEC.slice("Position")][7] = MIDDLE[7] * GEAR[7]
+        for _ in range(3):
+            stillness.follow_joint(7, 1)
+        now.torque[7] = ROBOT.breakaway[7] + 40.0
+        stillness.follow_joint(7, 0)  # the values are not newer than the last ones
+        stillness.follow_joint(7, 4)
+        assert not stillness.check_driven()
+        stillness.follow_joint(7, 4)
+        assert stillness.check_driven()
+        assert [f.node for f in stillness.findings()] == [JOINTS[7].upper()]
 
     @joints
     def test_torque_change_below_breakaway_reports_nothing(self, joint: int):
@@ -66,16 +160,16 @@ class TestStuckEncoder:
 
         def move(now: Signals) -> None:
             push(now)
-            now.position[:] += 1e-5 * robot.cycles * GEAR
+            now.position[:] += 1e-6 * robot.cycles * GEAR
 
         for torque in (sign * 100.0, -sign * 100.0, 0.0):  # noqa: B007 - read by `push`
             assert robot.run(32, move) == ()
             assert robot.run(96, push) == ()
-        torque = sign * 100.0
+        torque = sign * 12.0
         robot.run(32, move)
         assert robot.run(16, push) == ()  # one sample
         torque = 0.0
-        assert robot.until_found(Dtc.ENC_STUCK, 48, push) > 16
+        assert robot.until_found(Dtc.ENC_STUCK, 48, push) > 8
 
     @joints
     @pytest.mark.parametrize("limit", ["position_min", "position_max"])
@@ -125,6 +219,47 @@ class TestStuckEncoder:
         robot.run(16, hold)
         assert [f.node for f in robot.checks.findings] == [joint.upper() for joint in JOINTS]
         assert [f.value for f in robot.checks.findings] == ROBOT.breakaway.tolist()
+
+    @pytest.mark.parametrize("joint", ANKLES, ids=lambda joint: JOINTS[joint])
+    def test_still_ankle_of_a_loaded_foot_is_not_stuck(self, joint: int):
+        """The torque varies by 40 Nm, but it would have to move the whole robot."""
+        robot = SimulatedRobot(standing=True)
+        at = float(robot.now.position[joint])
+        assert robot.run(400, lambda now: now.position.__setitem__(joint, at)) == ()
+
+    @pytest.mark.parametrize("joint", ANKLES, ids=lambda joint: JOINTS[joint])
+    @signs
+    def test_ankle_of_a_loaded_foot_is_stuck_when_its_shank_turns(self, joint: int, sign: float):
+        robot = SimulatedRobot(standing=True)
+        at, shank = float(robot.now.position[joint]), IMUS.index(f"{JOINTS[joint].split('_')[0]}_tibia")
+
+        def turn(now: Signals, rate: float) -> None:
+            now.position[joint] = at
+            now.gyro[shank, 1] += sign * rate
+
+        assert robot.run(100, lambda now: turn(now, 0.0)) == ()
+        assert robot.run(160, lambda now: turn(now, 0.03)) == ()  # 0.3 degrees
+        assert robot.until_found(Dtc.ENC_STUCK, 260, lambda now: turn(now, 0.03)) > 100
+        finding = next(f for f in robot.checks.findings if f.dtc is Dtc.ENC_STUCK)
+        assert finding.node == JOINTS[joint].upper()
+        assert finding.value == pytest.approx(0.01, abs=2e-3)
+        assert f"{JOINTS[joint]} has a constant reading while the shank turns by 0.6 degrees" in finding.text
+
+    @pytest.mark.parametrize("joint", ANKLES, ids=lambda joint: JOINTS[joint])
+    def test_turn_and_torque_in_the_swing_do_not_count_on_the_ground(self, joint: int):
+        robot = SimulatedRobot()
+        side = JOINTS[joint].split("_")[0]
+        foot, shank, at = FEET.index(side), IMUS.index(f"{side}_tibia"), float(robot.now.position[joint])
+
+        def still(now: Signals, *, loaded: bool) -> None:
+            now.position[joint] = at
+            now.gyro[shank, 1] += 0.0 if loaded else 5.0
+            now.force[foot, :, 2] += 100.0 if loaded else 0.0
+
+        assert robot.run(16, lambda now: still(now, loaded=False)) == ()
+        assert robot.run(300, lambda now: still(now, loaded=True)) == ()
+        # When the foot is in the air again, only the torque since then is evaluated.
+        robot.until_found(Dtc.ENC_STUCK, 64, lambda now: still(now, loaded=False))
 
     def test_joint_without_frames_is_not_reported_stuck(self):
         robot = SimulatedRobot()
@@ -199,14 +334,15 @@ class TestRepeatedForce:
 
 
 class TestStillnessAlone:
-    """The standstill check without the schedule, one sample at a time."""
+    """The standstill check, called directly for each sample instead of by the schedule."""
 
     rng = np.random.default_rng(4)
 
     def stillness(self, every: int = 16) -> tuple[Stillness, ReceiveImage, Signals]:
         image = ReceiveImage(MESSAGES, np.zeros(CODEC.size))
         now = signals_of(CODEC, image.values)
-        return Stillness(ROBOT, image, now, every), image, now
+        before = signals_of(CODEC, image.values_before)
+        return Stillness(ROBOT, image, now, before, every, PERIOD), image, now
 
     def move(self, now: Signals) -> None:
         now.position[:] = MIDDLE * GEAR + 1e-3 * self.rng.random(12)
@@ -230,11 +366,13 @@ class TestStillnessAlone:
             now.force[1, 3, 0] = 1.0
 
         for hold, repetitions in ((hold_encoder, to_stuck), (hold_gyro, to_freeze), (hold_cell, to_freeze)):
-            stillness, _, now = self.stillness(every)
+            stillness, image, now = self.stillness(every)
             for sample in range(repetitions + 2):
+                image.values_before[:] = image.values
                 self.move(now)
                 hold(now)
-                now.torque[:] = 100.0 * sample
+                now.torque[:] = 12.0 * sample
+                stillness.follow_joint(7, 1)
                 assert stillness.sample(True) is (sample >= repetitions)
                 assert len(stillness.findings()) == (sample >= repetitions)
             self.move(now)
@@ -256,7 +394,7 @@ class TestStillnessAlone:
 
         assert not sample(1.0, new=True)
         assert not sample(2.0, new=False)
-        assert not sample(2.0, new=True)  # another value than in the last sample
+        assert not sample(2.0, new=True)  # not the value of the last sample
         for _ in range(4):
             assert not sample(2.0, new=True)
             assert not sample(2.0, new=False)

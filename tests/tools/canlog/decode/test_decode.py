@@ -60,7 +60,7 @@ def random_log(dbc: Path, path: Path, count: int) -> tuple[Path, Series]:
 
 
 def _decode(message: Any, data: bytes) -> dict[str, Any]:
-    """Return the values that cantools decodes; nothing for an undefined multiplexer."""
+    """Return the values that cantools decodes, or an empty dictionary if the multiplexer value is undefined."""
     try:
         return dict(message.decode(data, decode_choices=False))
     except cantools.database.DecodeError:
@@ -234,7 +234,7 @@ def test_unsupported_messages_are_named(tmp_path: Path) -> None:
 
 
 def test_field_numbers_with_long_tags_are_encoded() -> None:
-    """Field numbers above 15 have tags of two bytes, above 2047 of three."""
+    """A field number above 15 has a tag of two bytes, and a field number above 2047 has a tag of three bytes."""
     numbers = [1, 15, 16, 300, 2047, 2048]
     files = descriptor_pb2.FileDescriptorProto(name="m.proto", package="p")
     message = files.message_type.add(name="M")

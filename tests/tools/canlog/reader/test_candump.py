@@ -25,7 +25,7 @@ def parsed(text: str | bytes) -> tuple[Parsed, list[str]]:
 
 
 def one(line: str) -> tuple[dict[str, object], bool]:
-    """Return the frame of a line, and whether the line is a frame."""
+    """Return the frame in a line, and whether the line contains a frame."""
     result, names = parsed(line + "\n")
     if not len(result.chunk):
         return {}, False
@@ -153,8 +153,8 @@ def test_lines_of_every_format_are_read(line: str, expected: dict[str, object]) 
         "(1700000000.000000) vcan0 4000000F#00",
     ],
 )
-def test_lines_that_are_no_frame_are_counted(line: str) -> None:
-    """The line is rejected alone and between valid lines, which are all read."""
+def test_invalid_lines_are_counted_as_unreadable(line: str) -> None:
+    """The line is rejected alone and between valid lines. All valid lines are read."""
     good = "(1700000000.000000) left_leg 181##1AABB R"
     assert one(line) == ({}, False)
     for lines in ([line, good, good], [good, line, good], [good, good, line]):
@@ -171,7 +171,7 @@ def test_blank_lines_are_ignored() -> None:
 
 @pytest.mark.parametrize("seed", range(6))
 def test_damaged_lines_never_give_a_wrong_frame(seed: int) -> None:
-    """A line with one changed byte is read as by `parse_simply`, or counted as unreadable."""
+    """A line with one changed byte gives the same frame as `parse_simply`, or is counted as unreadable."""
     generator = np.random.default_rng(seed)
     lines = random_lines(seed, 400)
     damaged = []
@@ -193,7 +193,7 @@ def test_damaged_lines_never_give_a_wrong_frame(seed: int) -> None:
 
 
 def parse_simply(line: str) -> tuple[int, int, bytes]:
-    """Parse a line part by part; raise an exception if it is no frame."""
+    """Parse a line part by part. Raise an exception if the line contains no frame."""
     time, _, frame, *direction = line.split()
     assert time[0] + time[-1] == "()"
     assert direction in ([], ["R"], ["T"], ["r"], ["t"])

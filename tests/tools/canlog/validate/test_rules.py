@@ -71,16 +71,16 @@ class Recording:
         return [line for line in self.lines if line.identifier == identifier]
 
     def at(self, message: str, after: int = MIDDLE) -> Line:
-        """Return the first frame of a message `after` cycles or more from the begin of the log."""
+        """Return the first frame of a message `after` cycles or more from the beginning of the log."""
         return next(line for line in self.of(message) if line.stamp >= self.lines[0].stamp + after * MS)
 
-    def behind(self, line: Line) -> list[Line]:
+    def starting_at(self, line: Line) -> list[Line]:
         """Return the frames of the same message from this frame to the end."""
         same = [other for other in self.lines if other.identifier == line.identifier]
         return same[[other is line for other in same].index(True) :]
 
     def insert(self, line: Line, new: Line) -> None:
-        """Insert a line after another."""
+        """Insert a line after another line."""
         self.lines.insert([other is line for other in self.lines].index(True) + 1, new)
 
     def remove(self, lines: list[Line]) -> None:
@@ -239,11 +239,11 @@ def repeated(log: Recording) -> None:
 
 
 def lost(log: Recording) -> None:
-    log.remove(log.behind(log.at("LEFT_FH_STATE"))[:3])
+    log.remove(log.starting_at(log.at("LEFT_FH_STATE"))[:3])
 
 
 def jumped(log: Recording) -> None:
-    for line in log.behind(log.at("LEFT_FH_STATE")):
+    for line in log.starting_at(log.at("LEFT_FH_STATE")):
         set_raw(line, "LEFT_FH_STATE", "Counter", raw_of(line, "LEFT_FH_STATE", "Counter") + 100)
 
 
@@ -289,13 +289,13 @@ def jitter(log: Recording) -> None:
 
 
 def late_once(log: Recording) -> None:
-    for line in log.behind(log.at("COMMAND_LEFT_LEG")):
+    for line in log.starting_at(log.at("COMMAND_LEFT_LEG")):
         line.stamp += 1_400_000
     log.sort()
 
 
 def too_often(log: Recording) -> None:
-    first, *others = log.behind(log.at("COMMAND_LEFT_LEG"))
+    first, *others = log.starting_at(log.at("COMMAND_LEFT_LEG"))
     first.stamp -= 550_000
     for line in others:
         line.stamp -= 1_050_000
@@ -311,11 +311,11 @@ def emergencies(log: Recording) -> None:
 
 
 def silent(log: Recording) -> None:
-    log.remove(log.behind(log.at("LEFT_FH_STATE")))
+    log.remove(log.starting_at(log.at("LEFT_FH_STATE")))
 
 
 def silent_for_a_while(log: Recording) -> None:
-    log.remove(log.behind(log.at("LEFT_FH_STATE"))[:12])
+    log.remove(log.starting_at(log.at("LEFT_FH_STATE"))[:12])
 
 
 def never(log: Recording) -> None:
@@ -344,7 +344,7 @@ def overflow(log: Recording) -> None:
 
 
 def biased_velocity(log: Recording) -> None:
-    for line in log.behind(log.at("LEFT_SK_STATE"))[:200]:
+    for line in log.starting_at(log.at("LEFT_SK_STATE"))[:200]:
         raw = raw_of(line, "LEFT_SK_STATE", "Velocity")
         set_raw(line, "LEFT_SK_STATE", "Velocity", raw + 1000)
 
@@ -354,7 +354,7 @@ def short_quaternion(log: Recording) -> None:
 
 
 def frozen_gyro(log: Recording) -> None:
-    for line in log.behind(log.at("IMU_PELVIS_STATE"))[:150]:
+    for line in log.starting_at(log.at("IMU_PELVIS_STATE"))[:150]:
         set_raw(line, "IMU_PELVIS_STATE", "GyroX", 7)
 
 
@@ -367,7 +367,7 @@ def illegal_transition(log: Recording) -> None:
 
 
 def not_followed(log: Recording) -> None:
-    for line in log.behind(log.at("COMMAND_LEFT_LEG"))[:30]:
+    for line in log.starting_at(log.at("COMMAND_LEFT_LEG"))[:30]:
         set_raw(line, "COMMAND_LEFT_LEG", "FH_Controlword", Controlword.SWITCH_ON)
 
 
@@ -376,7 +376,7 @@ def garbage(log: Recording) -> None:
 
 
 def exchanged(log: Recording) -> None:
-    """Move a frame behind frames with later stamps."""
+    """Move a frame after frames with later stamps."""
     status, sync = log.at("LEFT_FH_STATUS"), log.at("SYNC_LEFT_LEG", MIDDLE + 150)
     log.remove([status])
     log.insert(sync, status)

@@ -110,7 +110,7 @@ def write(path: Path, messages: list[can.Message]) -> Path:
 
 
 def run(*arguments: object) -> Result:
-    """Run the command; any exception but an exit code fails the test."""
+    """Run the command. Any exception except `SystemExit` fails the test."""
     result = CliRunner().invoke(cli, [str(argument) for argument in arguments])
     assert result.exception is None or isinstance(result.exception, SystemExit), result.exception
     return result
@@ -215,7 +215,7 @@ def test_unsorted_log_is_sorted_and_checked(tmp_path: Path) -> None:
     assert "not in order of time" in result.stderr
 
 
-def test_copy_on_a_second_channel_is_on_the_wrong_bus(tmp_path: Path) -> None:
+def test_copy_on_a_second_channel_is_reported_as_wrong_bus(tmp_path: Path) -> None:
     """A gateway copies the frames: only the copies are reported."""
     twice = [m for message in MESSAGES for m in (message, _on(message, 1))]
     result = run("validate", write(tmp_path / "twice.blf", twice), "--node", "LEFT_FH", "--json")
@@ -309,11 +309,11 @@ class _Outside(HTMLParser):
     def __init__(self) -> None:
         super().__init__()
         self.tags: list[str] = []
-        self.asked: list[str] = []
+        self.links: list[str] = []
 
     def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
         self.tags.append(tag)
-        self.asked += [f"{tag} {name}={value}" for name, value in attrs if name in ("src", "href", "action", "srcset")]
+        self.links += [f"{tag} {name}={value}" for name, value in attrs if name in ("src", "href", "action", "srcset")]
 
 
 def test_html_has_the_plots_and_no_external_resources(good: Path, tmp_path: Path) -> None:
@@ -324,7 +324,7 @@ def test_html_has_the_plots_and_no_external_resources(good: Path, tmp_path: Path
     page = path.read_text()
     parser = _Outside()
     parser.feed(page)
-    assert parser.asked == []
+    assert parser.links == []
     assert parser.tags.count("svg") == 4  # load, gaps, two histograms
     assert parser.tags.count("circle") == 1
     assert "rect" in parser.tags
@@ -458,7 +458,7 @@ def test_silenced_findings_are_reported_as_silenced(good: Path, tmp_path: Path) 
     assert "silenced for LEFT_TH_STATE: one drive on the desk" in junit.read_text()
 
 
-def test_thresholds_change_what_is_found(good: Path, tmp_path: Path) -> None:
+def test_thresholds_of_the_rules_file_change_the_findings(good: Path, tmp_path: Path) -> None:
     rules = tmp_path / "rules.toml"
     rules.write_text("[cycle-fast]\ncycles = 2.5\n[step]\nFirmwareVersion = 1.0\n")
     result = run("validate", good, "--rules", rules, "--node", "LEFT_FH", "--json")
@@ -482,7 +482,7 @@ def test_channels_are_assigned_to_buses(tmp_path: Path) -> None:
     [
         ("[no-rule]\nx = 1\n", "a rule must be one of log-empty, .*, got 'no-rule'"),
         ("[crc]\nx = 1\n", "crc has no threshold"),
-        ("[cycle-gap]\nx = 1\n", "a threshold of cycle-gap must be one of cycles, got 'x'"),
+        ("[cycle-gap]\nx = 1\n", "the name of a threshold of cycle-gap must be one of cycles, got 'x'"),
         ("[cycle-gap]\ncycles = -1\n", "must be a number of at least 0, got -1"),
         ("[cycle-gap]\ncycles = 'two'\n", "must be a number of at least 0, got 'two'"),
         ("[cycle-gap]\ncycles = nan\n", "must be a number of at least 0, got nan"),
@@ -590,7 +590,7 @@ def test_live_bus_gives_the_findings_of_its_log(fails: bool, count: int, good: P
 
 
 class Tap:
-    """Every frame that a HAL sends or receives, in order."""
+    """Recorder of every frame that a HAL sends or receives, in order."""
 
     def __init__(self) -> None:
         self.kept: list[Frames] = []
@@ -603,7 +603,7 @@ class Tap:
 
 
 def lock_step_chunk(make_rig: MakeRig, seed: int = 0) -> tuple[Chunk, int]:
-    """Return the frames of a lock-step run at a speed that changes from 0.05 to 50 times real time, and its cycles."""
+    """Return the frames of a lock-step run, and its number of cycles. Its speed varies from 0.05 to 50 times real time."""
     rig, frames = make_rig(), Tap()
     rig.hal.tap = frames
     rig.run(2000)
@@ -672,7 +672,7 @@ def test_jitter_is_the_distance_from_the_median() -> None:
     assert jitter_p99(shifted) == pytest.approx(0.3)
 
 
-def test_log_without_frames_is_not_approved(plan: Plan) -> None:
+def test_report_of_an_empty_log_states_that_nothing_was_checked(plan: Plan) -> None:
     validator = Validator(plan)
     validator.check(Chunk(np.zeros(0, FRAME), np.zeros(0, np.int64), np.zeros(0, np.uint8), np.zeros(0, np.int8)), [])
     validator.finish()

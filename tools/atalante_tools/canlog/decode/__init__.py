@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 import click
 
 from atalante_tools.console.outcome import FAILED, Failed
-from atalante_tools.console.terminal import Progress, say
+from atalante_tools.console.terminal import Progress, print_message
 
 if TYPE_CHECKING:
     from atalante_tools.canlog.decode.signals import Sink
@@ -26,14 +26,14 @@ _FILE = click.Path(exists=True, dir_okay=False, path_type=Path)
 @click.argument("logs", nargs=-1, required=True, metavar="LOG...", type=click.Path(path_type=Path))
 @click.option(
     "-o", "--out", required=True, type=click.Path(dir_okay=False, path_type=Path), metavar="FILE",
-    help="Output file: .parquet (one row per value) or .mcap (protobuf, one topic per message).",
+    help="Output file: .parquet (one row per signal value) or .mcap (protobuf, one topic per message).",
 )  # fmt: skip
 @click.option("--dbc", type=_FILE, default=None, help="DBC to decode with.  [default: the DBC of the robot]")
 def command(logs: tuple[Path, ...], out: Path, dbc: Path | None) -> None:
     """Decode CAN logs (.log of candump, .asc, .blf, .mf4, .trc, .csv) to signals in physical units.
 
-    No rule is checked; use `atalante validate` for that. Frames with an unknown identifier or a payload that is too short are
-    counted and skipped.
+    The command checks no rules; for that, use `atalante validate`. Frames with an unknown identifier or a payload that
+    is too short are counted and skipped.
 
     \b
     Example: atalante decode night.log -o night.parquet
@@ -49,7 +49,7 @@ def command(logs: tuple[Path, ...], out: Path, dbc: Path | None) -> None:
 
     plan = Plan(catalogue(dbc or DBC_FILE))
     for unsupported in plan.refused:
-        say(f"{unsupported.name} is not decoded: {unsupported.reason}")
+        print_message(f"{unsupported.name} is not decoded: {unsupported.reason}")
     sources = [open_log(path) for path in logs]
     decoder = Decoder(plan)
     progress = Progress()
@@ -64,19 +64,19 @@ def command(logs: tuple[Path, ...], out: Path, dbc: Path | None) -> None:
                     progress.show(f"{source.path.name}: {share:.0f} %, {decoder.frames} frames, {sink.values} values")
             progress.clear()
             for remark in source.remarks:
-                say(remark.sentence)
-    say(f"{out}: {sink.values} values of {decoder.decoded} frames")
+                print_message(remark.sentence)
+    print_message(f"{out}: {sink.values} values of {decoder.decoded} frames")
     if decoder.skipped:
-        say(f"skipped: {decoder.skipped}")
+        print_message(f"skipped: {decoder.skipped}")
     if not decoder.decoded:
         raise SystemExit(FAILED)
 
 
 @contextmanager
 def _complete_file(out: Path) -> Iterator[Path]:
-    """Yield the path of a temporary file, which is renamed to `out` after the `with` block.
+    """Yield the path of a temporary file, and rename this file to `out` after the `with` block.
 
-    If the block raises an exception, the temporary file is removed and an existing `out` is unchanged.
+    If the block raises an exception, the temporary file is removed, and a file `out` that already exists is unchanged.
 
     Raises:
         Failed: If the file cannot be written.
@@ -92,7 +92,7 @@ def _complete_file(out: Path) -> Iterator[Path]:
 
 
 def _sink(out: Path, suffix: str, plan: Plan) -> Sink:
-    """Open the output file as Parquet or MCAP, according to its suffix.
+    """Open the output file as Parquet or MCAP, according to the suffix of the file name.
 
     Raises:
         Failed: If a package for the format is not installed.

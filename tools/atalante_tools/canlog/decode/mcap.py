@@ -1,7 +1,8 @@
 """Writer of decoded signals as MCAP, with one topic per message (`/can/LEFT_FH_STATE`) and protobuf schemas from the DBC.
 
-Every field has eight bytes: a double, or a fixed-width integer if the values in the DBC are integers. The equal width allows
-array operations to encode all messages of a chunk. Fields that the multiplexer does not select are absent from the message.
+Every protobuf field has eight bytes: a double, or a fixed-width integer if the values in the DBC are integers. Because
+all fields have the same width, array operations can encode all messages of a chunk. Fields that the multiplexer does
+not select are absent from the protobuf message.
 """
 
 from __future__ import annotations
@@ -41,11 +42,11 @@ class McapSink:
         self._writer.add_metadata("dbc", {"file": plan.catalogue.path.name, "crc32": f"{plan.catalogue.hash32:08X}"})
         self._topics: dict[tuple[int, int], int] = {}
         self._schemas: dict[int, int] = {}
-        #: Messages for the next `flush`: (index in the chunk, topic, time stamp [ns], payload).
+        #: Messages to write at the next `flush`: (index in the chunk, topic number, time stamp [ns], payload).
         self._buffered: list[tuple[int, int, int, bytes]] = []
 
     def write(self, decoded: DecodedFrames, channels: Sequence[str]) -> None:
-        """Encode the decoded frames of one message.
+        """Encode the decoded frames of one CAN message as protobuf messages.
 
         Args:
             decoded: decoded frames of one message.
@@ -78,16 +79,17 @@ class McapSink:
             )
 
     def flush(self) -> None:
-        """Write the encoded messages of the chunk to the file."""
+        """Write the encoded messages of the current chunk to the file."""
         self._buffered.sort(key=lambda message: message[0])
         for _, topic, stamp, payload in self._buffered:
             self._writer.add_message(topic, stamp, payload, stamp)
         self._buffered.clear()
 
     def _topic(self, row: int, channel: int, channels: Sequence[str]) -> int:
-        """Return the MCAP topic number of a message on a channel.
+        """Return the MCAP topic number of a message on a log channel.
 
-        The topic name is `/can/MESSAGE` for the first channel of the message and `/can/CHANNEL/MESSAGE` for further channels.
+        The topic name is `/can/MESSAGE` on the first channel with this message, and `/can/CHANNEL/MESSAGE` on further
+        channels.
         """
         topic = self._topics.get((row, channel))
         if topic is None:
@@ -109,7 +111,7 @@ def encode(fields: Sequence[tuple[int, npt.NDArray[Any]]], count: int) -> list[b
     """Encode protobuf messages in which every field has eight bytes.
 
     Args:
-        fields: (field number, values of shape (count,)) of each field.
+        fields: (protobuf field number, values with shape (count,)) for each field.
         count: number of messages.
     """
     tags = [_varint(number << 3 | _FIXED64) for number, _ in fields]
@@ -135,7 +137,7 @@ def _varint(number: int) -> bytes:
 
 
 def _descriptor(layout: Layout, fields: Sequence[tuple[str, str]]) -> bytes:
-    """Return the serialized protobuf descriptor of a message, as proto2 because its fields are optional."""
+    """Return the serialized protobuf descriptor of a message. The syntax is proto2, because the fields are optional."""
     files = FileDescriptorSet()
     file = files.file.add(name=f"{layout.name}.proto", package=_PACKAGE)
     message = file.message_type.add(name=layout.name)

@@ -28,7 +28,7 @@ from atalante_tools.canlog.column_codec import Column, raw_range
 from atalante_tools.canlog.decode.signals import DecodedFrames
 from atalante_tools.canlog.plan import Plan
 
-_EXACT = 1 << 53  # float64 is exact for integers up to this magnitude
+_EXACT = 1 << 53  # largest magnitude up to which float64 represents all integers exactly
 _DECIMAL = pa.decimal128(38, 0)
 _NAMES = pa.dictionary(pa.int32(), pa.string())
 _SCHEMA = pa.schema(
@@ -45,7 +45,7 @@ _SCHEMA = pa.schema(
 
 
 class ParquetSink:
-    """Parquet file with one row group per chunk."""
+    """Parquet file with one row group per chunk of the log."""
 
     def __init__(self, path: Path, plan: Plan) -> None:
         self._plan = plan
@@ -121,7 +121,7 @@ class ParquetSink:
         self._integers.clear()
 
     def _texts_of(self, field: Field, codes: npt.NDArray[np.int64]) -> npt.NDArray[np.int32] | None:
-        """Return for each raw code the index of its name in `_texts`; -1 for a raw code without a name.
+        """Return for each raw code the index of the value name in `_texts`, or -1 if the raw code has no name.
 
         Returns:
             The indices, shape (n,); None if the field has no value table.
@@ -139,7 +139,7 @@ class ParquetSink:
 
 
 def _exact(field: Field, values: npt.NDArray[Any]) -> Any:
-    """Return the column `integer`: exact decimals if float64 cannot hold every value of the field, otherwise nulls."""
+    """Return the column `integer`. It has exact decimals if float64 cannot represent all values, otherwise nulls."""
     codes = raw_range(field) if field.kind != "float" else range(0)
     if values.dtype.kind == "f" or not codes or max(-codes[0], codes[-1]) * abs(field.factor) <= _EXACT:
         return pa.nulls(len(values), _DECIMAL)

@@ -21,15 +21,15 @@ from atalante_tools.canlog.stream import sort
 class DecodedFrames:
     """Decoded frames of one message in one chunk."""
 
-    row: int  # row of the message in the plan
+    row: int  # index of the message in the plan
     codec: ColumnCodec
     raw: Words  # shape (fields, n)
     stamps: npt.NDArray[np.int64]  # ns
-    channels: npt.NDArray[np.uint8]  # index of the channel of each frame in the channel list of the log
-    indices: npt.NDArray[np.intp]  # index of each frame in the chunk
+    channels: npt.NDArray[np.uint8]  # for each frame: index of its channel in the channel list of the log
+    indices: npt.NDArray[np.intp]  # for each frame: index in the chunk
 
     def column(self, index: int) -> Column:
-        """Return the physical values of the field at `index` in `codec.fields`."""
+        """Return the physical values of the field with the given index in `codec.fields`."""
         return Column(self.codec.values(self.raw, index), self.codec.present(self.raw, index))
 
 
@@ -57,7 +57,7 @@ class Sink(Protocol):
 
 
 class Decoder:
-    """Decoder for the chunks of a log. It counts the skipped frames by reason."""
+    """Decoder for the chunks of a log, which counts the skipped frames for each reason."""
 
     def __init__(self, plan: Plan) -> None:
         self._plan = plan
@@ -71,7 +71,7 @@ class Decoder:
         return ", ".join(f"{count} frames {reason}" for reason, count in self._skipped.items() if count)
 
     def decode(self, chunk: Chunk) -> Iterator[DecodedFrames]:
-        """Decode a chunk and yield the frames of one message at a time."""
+        """Decode a chunk. Each yielded item contains all frames of one message."""
         plan, can_ids = self._plan, chunk.frames["can_id"]
         rows = plan.rows(can_ids & np.uint32(~ID_REMOTE & 0xFFFFFFFF))
         carries = (can_ids & np.uint32(ID_ERROR | ID_REMOTE)) == 0

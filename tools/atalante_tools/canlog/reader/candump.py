@@ -1,11 +1,11 @@
-"""Parser for candump logs (`candump -l`, .log of python-can). It parses many lines at a time with array operations.
+"""Parser for candump logs (`candump -l`, .log of python-can), which parses many lines at a time with array operations.
 
     (1700000000.123456) left_leg 181##15A0F004000000041 R
      time                channel id fd flags, payload   direction (may be missing)
 
-The array operations accept a line only if it has exactly this format. A regular expression parses all other lines individually
-(remote frame, raw DLC, other spacing). Lines that are not a frame are counted. A damaged line is never read as a shorter frame,
-because the validator would then report a wrong length or a lost frame.
+The array operations accept only lines with exactly this format. A regular expression parses every other line
+individually (remote frame, raw DLC, other spacing). Lines that contain no frame are counted. A damaged line is never
+read as a shorter frame, because the validator would then report a wrong length or a lost frame.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ from atalante_tools.canlog.reader.chunk import NO_DIRECTION, RECEIVED, SENT, Cha
 Text = npt.NDArray[np.uint8]
 Positions = npt.NDArray[np.intp]
 
-#: Padding before and after the text [byte]. The parser may read bytes outside a line, but never more than this.
+#: Padding before and after the text [byte]. The parser may read up to this number of bytes outside a line.
 MARGIN = 160
 _NEWLINE, _RETURN, _SPACE, _OPEN, _CLOSE, _HASH, _DOT = b"\n\r ()#."
 _NAME_BYTES = 16  # longest channel name that the array operations parse; Linux allows 15
@@ -42,7 +42,8 @@ _NOT_HEX = 255
 _HEX = np.full(256, _NOT_HEX, np.uint8)
 _HEX[np.frombuffer(b"0123456789", np.uint8)] = np.arange(10)
 _HEX[np.frombuffer(b"ABCDEF", np.uint8)] = _HEX[np.frombuffer(b"abcdef", np.uint8)] = np.arange(10, 16)
-#: Value of two hexadecimal digits, indexed by the two characters as a little-endian number; 0xFFFF if not hexadecimal.
+#: Value of two hexadecimal digits, or 0xFFFF if one of the two characters is not a hexadecimal digit.
+#: The index is the little-endian number of the two characters.
 _HEX_PAIR = np.full(1 << 16, 0xFFFF, np.uint16)
 _HEX_PAIR.reshape(256, 256)[:] = np.where(
     (_HEX < 16) & (_HEX < 16)[:, None], _HEX.astype(np.uint16) << 4 | _HEX[:, None], 0xFFFF
@@ -58,7 +59,7 @@ _LINE = re.compile(
 
 @dataclass
 class Parsed:
-    """Frames parsed from a text, and the number of lines that are not a frame."""
+    """Frames parsed from a text, and the number of lines that contain no frame."""
 
     chunk: Chunk
     unreadable: int  # lines
@@ -71,7 +72,7 @@ def parse(text: Text, begin: int, end: int, channels: Channels) -> Parsed:
     Args:
         text: log as bytes, with at least `MARGIN` bytes before `begin` and after `end`.
         begin: index of the first byte of a line.
-        end: index after the newline of the last line.
+        end: index of the byte after the newline of the last line.
         channels: channel names of the log; new names are appended.
     """
     lines = _Lines(text, begin, end)
@@ -90,7 +91,7 @@ def parse(text: Text, begin: int, end: int, channels: Channels) -> Parsed:
 
 
 class _Lines:
-    """Positions of the fields in each line (time, channel, identifier, payload), as indices into the text. Shape (lines,)."""
+    """Positions of time, channel, identifier and payload in each line, as indices into the text. Shape (lines,)."""
 
     def __init__(self, text: Text, begin: int, end: int) -> None:
         self.text, self.begin, self.end = text, begin, end
@@ -115,7 +116,7 @@ class _Lines:
         return np.ndarray((len(self.text) - 2,), "<u2", self.text, strides=(1,))[positions]
 
     def split(self) -> npt.NDArray[np.bool_]:
-        """Find the fields of each line, and return the mask of the lines with the regular format. Shape (lines,)."""
+        """Find the fields of each line, and return the mask of the lines in the regular format. Shape (lines,)."""
         stops = self.ends - (self.text[self.ends[0] - 1] == _RETURN)
         last = self.pair(stops - 2)
         has_direction = last & 0xFF == _SPACE
@@ -125,7 +126,7 @@ class _Lines:
         regular: npt.NDArray[np.bool_] = ~has_direction | is_sent | (letter == ord("R"))
         self.stops: Positions = stops - 2 * has_direction
         self.marks = self._marks(regular)
-        #: Eight characters of each line: the four before the first #, the # itself and three after it.
+        #: Eight characters of each line: four before the first #, the # itself, and three after the #.
         self.head = self.word(self.marks - 4)
         self.fd = self.head >> np.uint64(40) & np.uint64(0xFF) == _HASH
         self.data: Positions = self.marks + 1 + 2 * self.fd
@@ -141,13 +142,15 @@ class _Lines:
 
     def _marks(self, regular: npt.NDArray[np.bool_]) -> Positions:
         """Return the position of the first # in each line. Shape (lines,)."""
-        is_hash = (self.text[self.begin - 1 : self.end] == _HASH).view(np.uint8)
-        return self._one_per_line(np.flatnonzero(is_hash[1:] > is_hash[:-1]) + self.begin, regular)
+        found = np.flatnonzero(self.text[self.begin : self.end] == _HASH) + self.begin
+        alone = np.ones(len(found), np.bool_)  # False: the character before is a #, too
+        np.not_equal(found[1:], found[:-1] + 1, out=alone[1:])
+        return self._one_per_line(found[alone], regular)
 
     def _closes(self, regular: npt.NDArray[np.bool_]) -> Positions:
         """Return the position of the closing parenthesis in each line. Shape (lines,).
 
-        The parenthesis is usually at the same offset in all lines, so the offset of the first line is tried first.
+        The parenthesis is usually at the same offset in all lines, so the offset in the first line is tried first.
         """
         text, starts = self.text, self.starts
         width = int(np.argmax(text[starts[0] : starts[0] + MARGIN] == _CLOSE))
@@ -162,12 +165,13 @@ class _Lines:
         return closes
 
     def _one_per_line(self, found: Positions, regular: npt.NDArray[np.bool_], *, alone: bool = True) -> Positions:
-        """Return for each line the first of the found positions. Shape (lines,).
+        """Return the first of the found positions in each line. Shape (lines,).
 
         Args:
             found: positions in the text, ascending.
-            regular: mask of the lines, set to False for a line without a position; shape (lines,).
-            alone: True to set `regular` to False also for a line with several positions.
+            regular: mask of the lines, shape (lines,); this method sets it to False for a line without a found
+                position.
+            alone: whether this method also sets `regular` to False for a line with several found positions.
         """
         if len(found) == len(self.starts) and bool(((found > self.starts) & (found < self.stops)).all()):
             return found
@@ -185,7 +189,7 @@ class _Lines:
 
 
 def _times(lines: _Lines, stamps: npt.NDArray[np.int64]) -> npt.NDArray[np.bool_]:
-    """Parse the time of each line into `stamps` [ns], and return the mask of the lines with a regular time. Shape (lines,)."""
+    """Parse the time of each line into `stamps` [ns]; return the mask of lines with a regular time. Shape (lines,)."""
     text, closes = lines.text, lines.closes
     decimals = 9 if text[closes[0] - 10] == _DOT else 6
     dots = closes - decimals - 1
@@ -218,17 +222,17 @@ def _number(
 
     Args:
         word: eight characters of each line, shape (lines,).
-        digits: number of characters to parse, shape (lines,) or (1,).
+        digits: number of characters to parse per line, shape (lines,) or (1,).
 
     Returns:
-        The numbers, and the mask of the lines in which all these characters are digits; shapes (lines,).
+        The numbers, and the mask of the lines in which all parsed characters are digits; shape (lines,) each.
     """
     tail = _TAIL[digits]
     word = (word & tail) | (_ZEROS & ~tail)
     changes = np.flatnonzero(word[1:] != word[:-1]) + 1
     if len(changes) * 4 > len(word):
         return _parse_digits(word)
-    runs = np.concatenate([[0], changes])  # consecutive lines with equal words, such as the seconds, are parsed once
+    runs = np.concatenate([[0], changes])  # equal words in consecutive lines, such as the seconds, are parsed only once
     number, valid = _parse_digits(word[runs])
     lengths = np.diff(runs, append=len(word))
     return number.repeat(lengths), valid.repeat(lengths)
@@ -237,13 +241,13 @@ def _number(
 def _parse_digits(word: npt.NDArray[np.uint64]) -> tuple[npt.NDArray[np.uint64], npt.NDArray[np.bool_]]:
     """Parse words of eight decimal digits. The first digit is in the lowest byte.
 
-    The digits are combined in pairs, then in fours, then in one number.
+    The digits are combined to pairs, the pairs to groups of four digits, and these groups to one number.
 
     Args:
         word: eight characters, shape (n,).
 
     Returns:
-        The numbers, and the mask of the words in which all characters are digits; shapes (n,).
+        The numbers, and the mask of the words in which all characters are digits; shape (n,) each.
     """
     above, below = word + np.uint64(0x4646464646464646), word - _ZEROS
     valid: npt.NDArray[np.bool_] = ((above | below) & np.uint64(0x8080808080808080)) == 0
@@ -254,7 +258,7 @@ def _parse_digits(word: npt.NDArray[np.uint64]) -> tuple[npt.NDArray[np.uint64],
 
 
 def _channels(lines: _Lines, numbers: npt.NDArray[np.uint8], channels: Channels) -> npt.NDArray[np.bool_]:
-    """Parse the channel of each line into `numbers`, and return the mask of the lines with a regular name. Shape (lines,)."""
+    """Parse the channel of each line into `numbers`; return the mask of lines with a regular name. Shape (lines,)."""
     stops = lines.id_starts - 1
     length = stops - lines.closes - 2
     regular: npt.NDArray[np.bool_] = (length > 0) & (length <= _NAME_BYTES)
@@ -277,7 +281,7 @@ def _channels(lines: _Lines, numbers: npt.NDArray[np.uint8], channels: Channels)
 
 
 def _identifiers(lines: _Lines, frames: npt.NDArray[np.void]) -> npt.NDArray[np.bool_]:
-    """Parse identifier, length and flags of each line, and return the mask of the regular lines. Shape (lines,)."""
+    """Parse identifier, length and flags of each line; return the mask of the regular lines. Shape (lines,)."""
     head = lines.head.view(np.int64)
     number = _HEX[head >> 8 & 0xFF].astype(np.uint32) << 8 | _HEX_PAIR[head >> 16 & 0xFFFF]
     regular: npt.NDArray[np.bool_] = number < 16 << 8
@@ -299,7 +303,7 @@ def _identifiers(lines: _Lines, frames: npt.NDArray[np.void]) -> npt.NDArray[np.
 
 
 def _payloads(lines: _Lines, frames: npt.NDArray[np.void], wanted: npt.NDArray[np.bool_]) -> npt.NDArray[np.bool_]:
-    """Parse the payloads of the `wanted` lines, and return the mask of the lines with a hexadecimal payload. Shape (lines,).
+    """Parse the payloads of the `wanted` lines; return the mask of lines with a hexadecimal payload. Shape (lines,).
 
     Lines of equal length are parsed together.
     """
@@ -324,7 +328,7 @@ def _payloads(lines: _Lines, frames: npt.NDArray[np.void], wanted: npt.NDArray[n
 
 
 def _parse_individually(lines: _Lines, chunk: Chunk, regular: npt.NDArray[np.bool_], channels: Channels) -> Parsed:
-    """Parse the irregular lines one by one; remove and count the lines that are not a frame."""
+    """Parse the irregular lines one by one; remove and count the lines that contain no frame."""
     keep = np.ones(len(regular), np.bool_)
     unreadable, first = 0, b""
     for row in np.flatnonzero(~regular).tolist():
@@ -339,7 +343,7 @@ def _parse_individually(lines: _Lines, chunk: Chunk, regular: npt.NDArray[np.boo
 
 
 def _read_line(line: bytes, chunk: Chunk, row: int, channels: Channels) -> bool:
-    """Parse a line in any candump format into row `row` of the chunk; return whether the line is a frame."""
+    """Parse a line in any candump format into row `row` of the chunk; return whether the line contains a frame."""
     match = _LINE.fullmatch(line)
     if match is None:
         return False

@@ -15,7 +15,7 @@ from atalante_tools.canlog.reader.candump import MARGIN
 from atalante_tools.canlog.reader.chunk import Chunk, concatenated
 from atalante_tools.canlog.reader.log_file import LogFile
 
-_TEXT_BYTES = 1 << 21  # text parsed in one call [byte]; its arrays fit into the processor cache
+_TEXT_BYTES = 1 << 21  # length of the text parsed in one call [byte]; the arrays fit into the processor cache
 
 
 def read(log: LogFile, chunk_frames: int) -> Iterator[Chunk]:
@@ -23,7 +23,7 @@ def read(log: LogFile, chunk_frames: int) -> Iterator[Chunk]:
 
     Args:
         log: log to read; channels, position and remarks are updated.
-        chunk_frames: minimum number of frames in each chunk but the last.
+        chunk_frames: minimum number of frames per chunk; only the last chunk may be smaller.
     """
     text = np.zeros(_TEXT_BYTES + 2 * MARGIN, np.uint8)
     memory = text.data
@@ -37,7 +37,7 @@ def read(log: LogFile, chunk_frames: int) -> Iterator[Chunk]:
             log.position = file.tell() if not log.compressed else log.position
             end = MARGIN + kept + got
             if not got:
-                break  # the file has ended, or `broken` describes a read error
+                break  # now the file has ended, or `broken` describes a read error
             stop = _after_last_newline(text, end - got, end)
             if not stop:
                 kept += got
@@ -85,10 +85,10 @@ def _open(log: LogFile) -> io.RawIOBase | gzip.GzipFile:
 
 
 def _fill(file: io.RawIOBase | gzip.GzipFile, memory: memoryview) -> tuple[int, str]:
-    """Read from the file until the memory is full or the file ends.
+    """Read from the file until the given memory is full or the file ends.
 
     Returns:
-        The number of bytes read, and the read error if no byte was read.
+        The number of bytes read, and the read error if no byte could be read.
     """
     if not isinstance(file, gzip.GzipFile):
         return file.readinto(memory) or 0, ""
@@ -105,9 +105,9 @@ def _fill(file: io.RawIOBase | gzip.GzipFile, memory: memoryview) -> tuple[int, 
 
 
 def _after_last_newline(text: npt.NDArray[np.uint8], begin: int, end: int) -> int:
-    """Return the index after the last newline in `text[begin:end]`, or 0 without a newline.
+    """Return the index after the last newline in `text[begin:end]`, or 0 if this text has no newline.
 
-    The last bytes are searched first.
+    The search starts at the end of the text.
     """
     for first in (max(begin, end - 4 * MARGIN), begin):
         newlines = np.flatnonzero(text[first:end] == ord("\n"))

@@ -1,4 +1,4 @@
-"""Chunk: consecutive frames of a log as arrays. The log readers return chunks, and the rules check them."""
+"""Chunk: consecutive frames of a log as arrays. The log readers return chunks; the validator rules check chunks."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import numpy.typing as npt
 
 from atalante_hal.wire.frame import Frames, as_words, new_frames
 
-#: Direction of a frame in its log; `NO_DIRECTION` if the log does not record it.
+#: Direction of a frame according to the log; `NO_DIRECTION` if the log contains no directions.
 SENT, RECEIVED, NO_DIRECTION = 1, 0, -1
 _MAX_CHANNELS = 256
 
@@ -22,8 +22,8 @@ class Chunk:
 
     frames: Frames  # `FRAME` records
     stamps: npt.NDArray[np.int64]  # ns
-    channels: npt.NDArray[np.uint8]  # index of the channel of each frame in the channel list of the log
-    sent: npt.NDArray[np.int8]  # direction: SENT, RECEIVED or NO_DIRECTION
+    channels: npt.NDArray[np.uint8]  # for each frame: index of its channel in the channel list of the log
+    sent: npt.NDArray[np.int8]  # direction of each frame: SENT, RECEIVED or NO_DIRECTION
 
     def __len__(self) -> int:
         return len(self.frames)
@@ -53,14 +53,14 @@ def concatenated(chunks: Sequence[Chunk]) -> Chunk:
 
 @dataclass
 class Channels:
-    """Channel names of a log, in the order of their first frames."""
+    """Channel names of a log, ordered by the first frame of each channel."""
 
     names: list[str] = field(default_factory=list)
 
     def index(self, name: str) -> int:
-        """Return the index of a channel name, and append the name if it is new.
+        """Return the index of a channel name, and append the name to the list if the name is new.
 
-        Names after the 256th name share the last index. Only a damaged log has that many names.
+        The list has at most 256 names. All further names share the last index. Only a damaged log has so many names.
 
         Args:
             name: name of the channel in the log.

@@ -1,7 +1,7 @@
 """Reader of CAN logs in chunks of frames: an array parser for candump logs, and python-can for all other formats.
 
-The chunk size limits the memory for a log of any length. The reader returns all readable frames. Unreadable parts of a log
-become remarks, which the validator reports as findings.
+The chunk size limits the memory that a log of any length needs. The reader returns all readable frames. It describes
+unreadable parts of a log in remarks, which the validator reports as findings.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ _CHUNK_FRAMES = 120_000  # minimum number of frames in a chunk; only the last ch
 
 
 class Log(LogFile):
-    """Open log. The list `remarks` is complete after all chunks were read."""
+    """Log that is open for reading. The list `remarks` is complete after all chunks were read."""
 
     def chunks(self) -> Iterator[Chunk]:
         """Yield the frames in chunks, sorted by time within a chunk."""
@@ -57,7 +57,7 @@ def open_log(path: Path) -> Log:
     """Open a log for reading.
 
     Args:
-        path: file with a suffix of `FORMATS`, or such a suffix and .gz.
+        path: file with a suffix in `FORMATS`, or with such a suffix followed by .gz.
 
     Raises:
         LogError: If the file does not exist, cannot be read, or has a suffix that is not supported.

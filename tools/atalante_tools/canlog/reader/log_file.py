@@ -1,4 +1,4 @@
-"""Log file: its format, and the channels, defects and read position that a reader records in it."""
+"""Log file: its format, and its channels, defects and read position. The log reader updates the last three."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from pathlib import Path
 
 from atalante_tools.canlog.reader.chunk import Channels
 
-#: Log formats by file suffix: (has the direction of a frame, has the CAN FD flags).
+#: Log formats by file suffix: (whether the format records the direction of frames, whether it records the CAN FD flags).
 FORMATS = {
     ".log": (True, True),
     ".asc": (True, True),
@@ -26,18 +26,18 @@ class LogError(ValueError):
 class Remark:
     """Defect of a log file."""
 
-    rule: str  # identifier of the rule that reports the defect
+    rule: str  # identifier of the validator rule that reports the defect
     sentence: str
     count: int
-    stamp: int  # time stamp of the first occurrence [ns]; -1: unknown
+    stamp: int  # time stamp of the first frame with the defect [ns]; -1 means unknown
 
 
 @dataclass
 class LogFile:
-    """Log file, with the state of its reader."""
+    """Log file, with the channels, defects and read position that the log reader updates."""
 
     path: Path
-    suffix: str  # suffix of the format, lower case, without .gz
+    suffix: str  # file suffix of the format, in lower case, without .gz
     size: int  # bytes
     channels: Channels = field(default_factory=Channels)
     remarks: list[Remark] = field(default_factory=list)
@@ -62,9 +62,9 @@ class LogFile:
         """Add a defect of the log to `remarks`.
 
         Args:
-            rule: identifier of the rule that reports the defect.
+            rule: identifier of the validator rule that reports the defect.
             sentence: description for the report.
             count: number of occurrences.
-            stamp: time stamp of the first occurrence [ns]; -1: unknown.
+            stamp: time stamp of the first occurrence [ns]; -1 means unknown.
         """
         self.remarks.append(Remark(rule, sentence, count, stamp))

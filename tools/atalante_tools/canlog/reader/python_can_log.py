@@ -1,7 +1,8 @@
 """Reader of the logs of python-can (.asc, .blf, .mf4, .trc, .csv) in chunks of frames.
 
-The readers of python-can skip entries that they cannot parse and only log a warning. They return a truncated record as a shorter
-frame, and they leave files open. This module counts the skipped entries, detects truncated records and closes the files.
+If the readers of python-can cannot parse an entry, they log a warning and skip this entry. They return a truncated
+record as a shorter frame, and they leave files open. This module counts the skipped entries, detects truncated records
+and closes the files.
 """
 
 from __future__ import annotations
@@ -33,7 +34,7 @@ from atalante_hal.wire.frame import (
 from atalante_tools.canlog.reader.chunk import NO_DIRECTION, RECEIVED, SENT, Channels, Chunk
 from atalante_tools.canlog.reader.log_file import LogError, LogFile
 
-#: Formats with one frame per line. Without a newline at the end of the file, the last frame is truncated.
+#: Formats with one frame per line. If the file does not end with a newline, the last frame is truncated.
 _LINE_FORMATS = (".asc", ".trc", ".csv")
 _BLF_HEADER = struct.Struct("<4sLBBBBBBBBQQ")
 #: First bytes of an MDF file.
@@ -46,10 +47,10 @@ def read(log: LogFile, chunk_frames: int) -> Iterator[Chunk]:
 
     Args:
         log: log to read; channels, position and remarks are updated.
-        chunk_frames: number of frames in each chunk but the last.
+        chunk_frames: number of frames per chunk; only the last chunk may be smaller.
 
     Raises:
-        LogError: If the file has no readable frame of its format.
+        LogError: If a read error occurs before the first frame.
     """
     from atalante_hal.bus.replay import UNREADABLE
 
@@ -72,7 +73,7 @@ def read(log: LogFile, chunk_frames: int) -> Iterator[Chunk]:
         except (*UNREADABLE, _mdf_error()) as error:
             broken = " ".join(str(error).split()) or type(error).__name__
         if broken and log.suffix == ".mf4":
-            gc.collect()  # destroys the half-opened MDF object now, while `_quiet_asammdf` suppresses its error
+            gc.collect()  # destroy the half-opened MDF object while `_quiet_asammdf` suppresses the destructor's error
     if batch.count:
         yield batch.take()
     _remark(log, count, broken, ends_within, warnings)
@@ -82,8 +83,8 @@ def read(log: LogFile, chunk_frames: int) -> Iterator[Chunk]:
 def _messages(log: LogFile) -> Iterator[tuple[Iterator[Any], Callable[[], int]]]:
     """Yield an iterator over the messages of the log, and a function that returns the number of bytes read so far.
 
-    python-can does not close a file that its reader rejects. Therefore this function opens the file. Only .mf4 files are opened
-    by asammdf.
+    If a reader of python-can rejects a file, python-can does not close this file. Therefore this function opens and
+    closes the file itself. Only .mf4 files are opened by asammdf.
     """
     import can
     from can.io.generic import BinaryIOMessageReader
@@ -127,7 +128,7 @@ def _remark(log: LogFile, count: int, broken: str, ends_within: bool, warnings: 
 
 
 class _Batch:
-    """Buffer of frames that are converted from python-can messages."""
+    """Buffer of frames, which were converted from python-can messages."""
 
     def __init__(self, capacity: int) -> None:
         self._frames = new_frames(capacity)
@@ -147,7 +148,7 @@ class _Batch:
             can_id |= ID_ERROR
         elif message.is_extended_id:
             can_id |= ID_EXTENDED
-        if message.is_remote_frame and not message.is_fd:  # the .asc reader marks an empty FD frame as remote
+        if message.is_remote_frame and not message.is_fd:  # the .asc reader marks empty FD frames as remote frames
             can_id, length = can_id | ID_REMOTE, message.dlc
         if message.is_fd:
             flags = FLAG_FDF | bool(message.bitrate_switch) * FLAG_BRS | bool(message.error_state_indicator) * FLAG_ESI
@@ -171,7 +172,7 @@ class _Batch:
 
 
 class _Warnings(logging.Handler):
-    """Counter of the warnings that the python-can readers log for skipped entries."""
+    """Counter of the warnings that the python-can readers log, one warning per skipped entry."""
 
     def __init__(self) -> None:
         super().__init__(logging.WARNING)
@@ -180,7 +181,7 @@ class _Warnings(logging.Handler):
 
     @contextmanager
     def captured(self) -> Iterator[None]:
-        """Count the warnings of python-can inside the `with` block."""
+        """Count the warnings that python-can logs inside the `with` block."""
         logging.getLogger("can").addHandler(self)
         try:
             yield
@@ -236,7 +237,7 @@ def _last_byte(path: Path) -> bytes:
 
 
 def _missing_bytes(path: Path) -> int:
-    """Return the number of bytes that are missing in a .blf file according to its header."""
+    """Return the number of bytes that are missing in a .blf file according to the file header."""
     with path.open("rb") as file:
         header = file.read(_BLF_HEADER.size)
     if len(header) < _BLF_HEADER.size:

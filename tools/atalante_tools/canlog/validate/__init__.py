@@ -16,7 +16,7 @@ import click
 from atalante_tools.console.options import Between, OutputFile, json_option, options_as
 from atalante_tools.console.outcome import FAILED, INTERRUPTED, Failed
 from atalante_tools.console.stop_request import stop_requested
-from atalante_tools.console.terminal import Progress, say, show_json
+from atalante_tools.console.terminal import Progress, print_message, show_json
 
 if TYPE_CHECKING:
     from atalante_tools.canlog.plan import Plan
@@ -30,12 +30,12 @@ _FILE = click.Path(exists=True, dir_okay=False, path_type=Path)
 class Options:
     """Options of `atalante validate`."""
 
-    interface: str  # python-can interface of the live bus; empty: check log files
+    interface: str  # python-can interface of the live bus; empty means log files
     channel: str  # channels of the live bus
-    lockstep: bool  # True: stamp the frames of the live bus by the cycle number in SYNC
-    seconds: float | None  # listening time on the live bus [s]; None: until Ctrl-C
-    dbc: Path | None  # None: the DBC of the robot
-    node: str | None  # require only the messages of this node; None: of all nodes
+    lockstep: bool  # whether the time stamps of the live bus are computed from the cycle number in SYNC
+    seconds: float | None  # listening time on the live bus [s]; None means until Ctrl-C
+    dbc: Path | None  # None means the DBC of the robot
+    node: str | None  # report missing messages of this node only; None means all nodes
     rules_file: Path | None
     list_rules: bool
     junit: Path | None
@@ -64,7 +64,7 @@ _options = options_as(
         click.option(
             "--lockstep",
             is_flag=True,
-            help="The live bus runs in lock-step: judge times by the cycle number of SYNC.  [default: wall clock]",
+            help="The live bus runs in lock-step: take times from the cycle number in SYNC.  [default: wall clock]",
         ),
         click.option(
             "--for",
@@ -79,7 +79,7 @@ _options = options_as(
             "--node",
             default=None,
             metavar="NODE",
-            help="Require only the messages of this node, for a test bench with one node.  [default: all nodes]",
+            help="Report missing messages of this node only, for a test bench with one node.  [default: all nodes]",
         ),
         click.option(
             "--rules",
@@ -111,9 +111,10 @@ _options = options_as(
 def command(logs: tuple[Path, ...], options: Options) -> None:
     """Check CAN logs (.log of candump, .asc, .blf, .mf4, .trc, .csv) or a live bus against the DBC.
 
-    The rules cover cycle time, jitter, timeout, alive counter, CRC with Data ID, length, flags, range, value table, reserved
-    bits, order, bus load, plausibility and drive state. The report lists the findings, the silenced findings and the signals
-    that no rule checked. The exit code is 1 if there are findings or no frame was checked.
+    The rules check cycle time, jitter, timeout, alive counter, CRC with Data ID, length, flags, range, value table,
+    reserved bits, frame order, bus load, plausibility and drive state. The report lists all findings, the findings that
+    the rules file silences, and the signals that no rule checked. The exit code is 1 if there are findings that are not
+    silenced, or if no frame was checked.
 
     \b
     Example: atalante validate night.log --html night.html
@@ -151,7 +152,8 @@ def _prepare(options: Options) -> tuple[Plan, Project]:
     """Load the DBC and the rules file.
 
     Raises:
-        click.UsageError: If the DBC has no message of the node or lacks a bus that the rules file names.
+        click.UsageError: If no message in the DBC is sent by the node, or the rules file names a bus that is not in the
+            DBC.
     """
     from atalante_dbc import DBC_FILE
     from atalante_dbc.foreign import catalogue
@@ -172,10 +174,10 @@ def _prepare(options: Options) -> tuple[Plan, Project]:
 
 
 def _read(logs: Sequence[Path], plan: Plan, project: Project, node: str | None) -> tuple[list[Report], int]:
-    """Check the logs in turn. A log that cannot be opened is reported on stderr and skipped.
+    """Check the logs one after another. A log that cannot be opened is reported on stderr and skipped.
 
     Returns:
-        The reports of the logs that could be opened, and the exit code.
+        The reports of all logs that could be opened, and the exit code.
     """
     from atalante_tools.canlog.reader.log_file import LogError
     from atalante_tools.canlog.validate.run import validate_log
@@ -191,7 +193,7 @@ def _read(logs: Sequence[Path], plan: Plan, project: Project, node: str | None) 
         try:
             results.append(validate_log(path, plan, project, node=node, progress=show))
         except LogError as error:
-            say(f"atalante: {error}")
+            print_message(f"atalante: {error}")
             code = FAILED
         progress.clear()
     return results, code
@@ -201,7 +203,7 @@ def _listen(options: Options, plan: Plan, project: Project) -> tuple[list[Report
     """Check a live bus until the listening time ends or a stop signal is received.
 
     Returns:
-        The report, and the exit code; Ctrl-C is the normal end and gives 0.
+        The report, and the exit code of the stop signal. Ctrl-C is the normal end, so its exit code is 0.
     """
     from atalante_tools.canlog.validate.run import listen, open_channels
 
@@ -215,7 +217,7 @@ def _listen(options: Options, plan: Plan, project: Project) -> tuple[list[Report
 
     def notice(message: str) -> None:
         progress.clear()
-        say(message)
+        print_message(message)
 
     try:
         with stop_requested() as stop:
@@ -242,13 +244,13 @@ def _listen(options: Options, plan: Plan, project: Project) -> tuple[list[Report
 
 
 def _show(result: Report, as_json: bool) -> None:
-    """Print the report as text on stdout. With `as_json`, print the findings on stdout and the text on stderr."""
+    """Print the report as text on stdout. With `as_json`, print JSON findings on stdout and the text on stderr."""
     from atalante_tools.canlog.validate.report import text
 
     if as_json:
         for finding in result.findings:
             show_json(finding.as_json())
-        say(text(result))
+        print_message(text(result))
     else:
         click.echo(text(result))
 

@@ -1,4 +1,4 @@
-"""Assignment of the channels of a log to the buses of the DBC, and of each message to its channel."""
+"""Assignment of log channels to the buses of the DBC, and of each message to the channel that should carry it."""
 
 from __future__ import annotations
 
@@ -10,20 +10,21 @@ import numpy.typing as npt
 from atalante_tools.canlog.plan import UNKNOWN, Plan, Rows
 from atalante_tools.canlog.reader.chunk import Chunk
 
-#: A channel is assigned to a bus if at least this share of its known frames belongs to that bus (0 to 1).
+#: A channel is assigned to a bus if at least this share (0 to 1) of the known frames on the channel belongs to the bus.
 _MAJORITY = 0.9
 
 
 class ChannelMap:
     """Bus of each channel and expected channel of each message, derived from the frames.
 
-    A channel with the name of a bus is assigned to that bus. Any other channel is assigned to the bus of most of its frames. A
-    channel that carries several buses (all four buses on one vcan0) is assigned to no bus. The expected channel of a message is
-    the channel of its bus. If the message has no such channel, it is the channel of the first frame of the message.
+    A channel with the name of a bus is assigned to this bus. Any other channel is assigned to the bus to which most
+    frames on the channel belong. A channel with the frames of several buses (such as all four buses on one vcan0) is
+    assigned to no bus. A message is expected on the channel of its bus. If this bus has no channel, the message is
+    expected on the channel of its first frame.
     """
 
     def __init__(self, plan: Plan, named: Mapping[str, str]) -> None:
-        """Create a map for a log of which no frames have been read yet.
+        """Create an empty map for a new log.
 
         Args:
             plan: compiled DBC.
@@ -31,16 +32,16 @@ class ChannelMap:
         """
         self._plan = plan
         self._named = dict(named)
-        #: Bus number of each channel in the log so far; `UNKNOWN` for a channel with messages of several buses.
+        #: Bus number of each known channel of the log; `UNKNOWN` for a channel with messages of several buses.
         self.bus_of_channel: list[int] = []
         self._channel_of_row = np.full(len(plan.layouts) + len(plan.refused), UNKNOWN, np.int16)
 
     def update(self, chunk: Chunk, rows: Rows, names: list[str]) -> None:
-        """Assign the channels and messages that are new in a chunk.
+        """Assign a bus to each new channel, and a channel to each new message of a chunk.
 
         Args:
             chunk: next frames of the log.
-            rows: row of the message of each frame, shape (n,).
+            rows: index of the message of each frame in the plan, shape (n,).
             names: channels of the log so far.
         """
         known = (rows >= 0) & (rows < len(self._plan.layouts))
@@ -54,7 +55,7 @@ class ChannelMap:
                 self._channel_of_row[row] = self._expected_channel(row, int(chunk.channels[index]))
 
     def on_wrong_channel(self, chunk: Chunk, rows: Rows) -> npt.NDArray[np.bool_]:
-        """Return the mask of the frames that are not on the expected channel of their message. Shape (n,)."""
+        """Return the mask of the frames whose channel differs from the expected channel of the message. Shape (n,)."""
         if len(self.bus_of_channel) < 2:
             return np.zeros(len(chunk), np.bool_)
         known = rows >= 0

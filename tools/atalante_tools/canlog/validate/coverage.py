@@ -1,6 +1,6 @@
-"""List of the rules, messages and signals that were not checked in a log, each with the reason.
+"""List of all rules, messages and signals that were not checked in a log, each with the reason.
 
-Without this list, a report without findings would look like an approval of the whole log.
+If this list were missing, a report without findings would look like an approval of the whole log.
 """
 
 from __future__ import annotations
@@ -20,10 +20,10 @@ _E2E = ("Crc", "Counter")
 
 @dataclass(frozen=True)
 class Unchecked:
-    """Messages, signals or channels that some rules did not check, with the reason."""
+    """Messages, signals or channels that some rules did not check, and the reason."""
 
-    rules: tuple[str, ...]  # empty: all rules
-    items: tuple[str, ...]  # messages, signals or channels; empty: the whole log
+    rules: tuple[str, ...]  # empty means all rules
+    items: tuple[str, ...]  # messages, signals or channels; empty means the whole log
     reason: str
 
     def __str__(self) -> str:
@@ -36,7 +36,7 @@ def unchecked(validator: Validator, *, live: bool = False) -> list[Unchecked]:
 
     Args:
         validator: finished validator of the log.
-        live: whether the frames came from a live bus, which counts lost frames.
+        live: whether the frames came from a live bus. Only a live bus reports how many frames were lost.
     """
     found = [*_of_the_log(validator, live), *_of_the_network(validator), *_of_messages(validator)]
     signals = tuple(f"{layout.name}.{name}" for layout, name in unseen_signals(validator))
@@ -110,6 +110,8 @@ def _of_the_network(validator: Validator) -> Iterator[Unchecked]:
 def _of_messages(validator: Validator) -> Iterator[Unchecked]:
     plan, counts = validator.plan, validator.counts
     seen = [row for row in range(len(plan.layouts)) if counts[row]]
+    for_jitter = validator.project.number("cycle-jitter", "min_intervals")
+    for_mean = validator.project.number("cycle-mean", "min_intervals")
     for rules, rows, reason in (
         (("crc", "crc-data-id", "counter-repeated", "counter-lost", "counter-sequence"),
          [r for r in seen if not plan.protected[r]],
@@ -124,12 +126,10 @@ def _of_messages(validator: Validator) -> Iterator[Unchecked]:
          sorted(validator.shared),
          "parameter groups with several sender addresses"),
         (("cycle-jitter",),
-         [r for r in seen if 0 < validator.timing.intervals[r] < validator.project.number("cycle-jitter", "min_intervals")
-          and plan.cycle_ns[r]],
+         [r for r in seen if 0 < validator.timing.intervals[r] < for_jitter and plan.cycle_ns[r]],
          "too few intervals in the log for the 99 % quantile"),
         (("cycle-mean",),
-         [r for r in seen if validator.timing.intervals[r] < validator.project.number("cycle-mean", "min_intervals")
-          and plan.cycle_ns[r]],
+         [r for r in seen if validator.timing.intervals[r] < for_mean and plan.cycle_ns[r]],
          "too few intervals in the log"),
     ):  # fmt: skip
         if rows:
@@ -141,28 +141,30 @@ def _of_messages(validator: Validator) -> Iterator[Unchecked]:
 
 
 def unseen_signals(validator: Validator) -> list[tuple[Layout, str]]:
-    """Return the received signals that no rule checked, each with the layout of its message."""
+    """Return (message layout, signal) for each received signal that no rule checked."""
     plan = validator.plan
     found = []
     for family in plan.families:
         motion = {name for names in validator.motion.checked(family).values() for name in names}
         drives = {validator.drives.state} if family.rows.start in validator.drives.drives else set()
+        family_layout = family.codec.layout
+        checked = {f.name for f in family_layout.fields if _is_checked(validator, family_layout, f)}
         for row in family.rows:
             layout = plan.layouts[row]
             if not validator.counts[row]:
                 continue
             commands = _commands(validator, row)
-            covered = motion | drives | commands | (set(_E2E) if plan.protected[row] else set())
-            found += [
-                (layout, f.name)
-                for f in layout.fields
-                if f.name not in covered and not _is_checked(validator, layout, f)
-            ]
+            covered = checked | motion | drives | commands | (set(_E2E) if plan.protected[row] else set())
+            found += [(layout, f.name) for f in layout.fields if f.name not in covered]
     return found
 
 
 def _is_checked(validator: Validator, layout: Layout, field: Field) -> bool:
-    """Return whether a value rule can reject a value of the field: range, invalid code, value table, hash or multiplexer."""
+    """Return whether a rule can reject a value of the field.
+
+    A rule can do so if the field has a limited range, an invalid code or a value table, or if the field is a hash, or a
+    multiplexer with unused codes.
+    """
     if is_limited(field) or is_enumeration(field) or field.invalid_raw is not None:
         return True
     if is_hash(field, validator.values.hash_signal):

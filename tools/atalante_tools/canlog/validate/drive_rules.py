@@ -1,10 +1,12 @@
 """Rules for drive states: only transitions of CiA 402 are legal, and a drive must respond to a controlword in time.
 
-State and controlword change rarely. To save time, the rules check only the frames with a change.
+The drive state and the controlword change rarely. To save time, the rules check only frames in which the drive state or the
+controlword changes.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -28,13 +30,14 @@ _SPONTANEOUS = {(s, f) for s in DriveState for f in (_S.FAULT_REACTION_ACTIVE, _
 LEGAL = {(int(state), int(after)) for (state, _), after in TRANSITIONS.items()} | {
     (int(a), int(b)) for a, b in _SPONTANEOUS
 }
-#: Pairs (state, controlword) that need no response: the quick stop may lack its acknowledgement, the fault may still be present.
+#: Pairs (state, controlword) to which a drive need not respond.
+#: A drive ignores these controlwords if the quick stop is not acknowledged yet, or if the cause of the fault persists.
 EXEMPT = {(int(_S.QUICK_STOP_ACTIVE), int(_C.ENABLE_OPERATION)), (int(_S.FAULT), int(_C.FAULT_RESET))}
 _NOTHING = -1
 
 
 def must_respond(state: int, controlword: int) -> bool:
-    """Return whether the controlword requires a drive in this state to change its state.
+    """Return whether a drive in this state must change its state on receiving the controlword.
 
     Args:
         state: value of `DriveState`.
@@ -47,15 +50,25 @@ def must_respond(state: int, controlword: int) -> bool:
 
 @dataclass
 class _Drive:
-    """Drive with its messages, and with its last state and command in the log so far."""
+    """Drive: indices of its messages, last reported state and last command."""
 
-    row: int  # row of the state message
-    command_row: int  # row of the command message; -1: the DBC has no command for the drive
+    row: int  # index of the state message in the plan
+    command_row: int  # index of the command message in the plan; -1 if the DBC has no command for the drive
     command_index: int  # index of the controlword in the fields of the command message
     state: int = _NOTHING
     command: int = _NOTHING
-    since: int = 0  # time stamp of the last change of state or command [ns]
+    since: int = 0  # time stamp of the last frame with a changed state or command [ns]
     state_stamp: int = 0  # time stamp of the last state frame [ns]
+
+
+@dataclass(frozen=True)
+class _CommandField:
+    """Field of a command message that carries a controlword."""
+
+    row: int  # index of the command message in the plan
+    index: int  # index of the field in the fields of its message
+    joint: str  # joint in the name of the signal; empty: the name has no joint
+    receivers: tuple[str, ...]  # nodes that receive the field
 
 
 class DriveRules:
@@ -65,42 +78,28 @@ class DriveRules:
         self._plan, self._findings = plan, findings
         self._limit_ns = project.number("cia402-response", "limit_ms") * 1e6
         state, command = project.text("cia402-transition", "state"), project.text("cia402-response", "command")
-        #: Drives with equal state messages (`plan.Family`). The key is the first row of the family.
+        commands = _command_fields(plan, command)
+        #: Drives by the message family (`plan.Family`) of their state messages. Key: first message index of the family.
         self.drives: dict[int, list[_Drive]] = {}
         for family in plan.families:
             index = next((p for p, f in enumerate(family.codec.fields) if f.name == state), None)
             if index is not None:
-                self.drives[family.rows.start] = [self._drive(plan, row, command) for row in family.rows]
+                self.drives[family.rows.start] = [_drive(row, plan.sender(row), commands) for row in family.rows]
         self.state, self.command = state, command
-
-    @staticmethod
-    def _drive(plan: Plan, row: int, command: str) -> _Drive:
-        """Create a drive and find its command message.
-
-        The command is a signal that the node receives. Its name is `Controlword`, or `FH_Controlword` for the node LEFT_FH.
-        """
-        node = plan.sender(row)
-        for family in plan.families:
-            for command_row in family.rows:
-                for field in plan.layouts[command_row].fields:
-                    joint, _, quantity = field.name.rpartition("_")
-                    if quantity == command and node in field.receivers and (not joint or node.endswith(f"_{joint}")):
-                        return _Drive(row, command_row, family.codec.index(field.name))
-        return _Drive(row, _NOTHING, _NOTHING)
 
     @property
     def command_rows(self) -> set[int]:
-        """Return the rows of the command messages of all drives."""
+        """Return the indices of the command messages of all drives."""
         return {drive.command_row for drives in self.drives.values() for drive in drives} - {_NOTHING}
 
     def check(self, decoded: dict[int, Decoded], family_of: dict[int, Family], stream: Stream, steps: Steps) -> None:
         """Check the drive states and the responses to controlwords in a chunk.
 
         Args:
-            decoded: decoded frames of the families in the chunk, by the first row of the family.
-            family_of: family of each row.
-            stream: frames of the chunk by message, shape (n,).
-            steps: increments of the alive counters, shape (n,).
+            decoded: decoded frames of each message family in the chunk. Key: first message index of the family.
+            family_of: message family of each message index.
+            stream: frames of the chunk, sorted by message, shape (n,).
+            steps: increment of the alive counter at each frame, shape (n,).
         """
         for first, drives in self.drives.items():
             states = decoded.get(first)
@@ -165,7 +164,7 @@ class DriveRules:
         indices: npt.NDArray[np.intp],
         stamps: npt.NDArray[np.int64],
     ) -> None:
-        """Apply the changes in order of time and check the response time at each change.
+        """Apply all changes of state and command in order of time, and check the response time at each change.
 
         Args:
             drive: drive that is updated with each change.
@@ -184,7 +183,7 @@ class DriveRules:
         drive.state_stamp = int(stamps[-1])
 
     def _check(self, drive: _Drive, until: int) -> None:
-        """Report the drive if it has not responded to its command before the time stamp `until` [ns]."""
+        """Report a drive that has not responded to the last command before the time stamp `until` [ns]."""
         waited = until - drive.since
         if waited > self._limit_ns and must_respond(drive.state, drive.command):
             self._findings.add(
@@ -196,7 +195,7 @@ class DriveRules:
             )
 
     def finish(self) -> None:
-        """Check the last command of each drive at the end of the log."""
+        """Check the response to the last command of each drive at the end of the log."""
         for drives in self.drives.values():
             for drive in drives:
                 if drive.state_stamp:
@@ -204,11 +203,44 @@ class DriveRules:
 
 
 def _changes(codes: npt.NDArray[np.int64], before: int) -> list[int]:
-    """Return the indices of the codes that differ from the previous code.
+    """Return the indices of all codes that differ from the previous code.
 
     Args:
         codes: codes of consecutive frames, shape (n,).
-        before: code before the first of them.
+        before: code of the frame before these frames.
     """
     changed = np.flatnonzero(codes[1:] != codes[:-1]) + 1
     return [*([0] if int(codes[0]) != before else []), *changed.tolist()]
+
+
+def _command_fields(plan: Plan, command: str) -> list[_CommandField]:
+    """Return all fields with a controlword, in the order of the plan.
+
+    The command signal has the name `Controlword`, or a name with the joint, such as `FH_Controlword` for the node LEFT_FH.
+
+    Args:
+        plan: compiled DBC.
+        command: quantity in the name of the command signal.
+    """
+    found = []
+    for family in plan.families:
+        for row in family.rows:
+            for field in plan.layouts[row].fields:
+                joint, _, quantity = field.name.rpartition("_")
+                if quantity == command:
+                    found.append(_CommandField(row, family.codec.index(field.name), joint, field.receivers))
+    return found
+
+
+def _drive(row: int, node: str, commands: Sequence[_CommandField]) -> _Drive:
+    """Create a drive with the first command field that its node receives.
+
+    Args:
+        row: index of the state message in the plan.
+        node: node of the drive.
+        commands: result of `_command_fields`.
+    """
+    for field in commands:
+        if node in field.receivers and (not field.joint or node.endswith(f"_{field.joint}")):
+            return _Drive(row, field.row, field.index)
+    return _Drive(row, _NOTHING, _NOTHING)

@@ -14,7 +14,8 @@ from atalante_tools.canlog.validate.findings import Findings
 
 Steps = npt.NDArray[np.int64]
 
-#: Increment of the alive counter in a repeated frame; value for a frame without a counter or without a previous frame.
+#: `REPEATED` is the counter increment at a repeated frame.
+#: `NO_STEP` replaces the increment at a frame that has no alive counter or no previous frame.
 REPEATED, NO_STEP = 0, -1
 
 
@@ -29,12 +30,12 @@ def counter_steps(counters: npt.NDArray[np.uint8], before: npt.NDArray[np.uint8]
 
 
 class CrcRules:
-    """Rules for the CRC over payload and Data ID."""
+    """Rules for the CRC, which covers payload and Data ID."""
 
     def __init__(self, plan: Plan, findings: Findings) -> None:
         self._plan, self._findings = plan, findings
         lengths = np.where(plan.protected, plan.lengths, 0)
-        #: Rows of the protected messages, as one range per payload length.
+        #: Indices of the messages with a CRC, as one range per payload length.
         self._spans = [
             range(int(r[0]), int(r[-1]) + 1) for n in np.unique(lengths[lengths > 0]) for r in [_at(plan, n)]
         ]
@@ -48,10 +49,10 @@ class CrcRules:
         """Report the frames with a wrong CRC.
 
         Args:
-            stream: frames of the chunk by message, n of them.
+            stream: n frames of the chunk, sorted by message.
 
         Returns:
-            Mask of the intact frames, shape (n,); None: all frames are intact.
+            Mask of the intact frames, shape (n,); None if all frames are intact.
         """
         intact: npt.NDArray[np.bool_] | None = None
         for rows in self._spans:
@@ -74,10 +75,10 @@ class CrcRules:
     ) -> None:
         """Report wrong CRCs.
 
-        If the CRC matches the Data ID of another message, the frame has the wrong identifier.
+        If a CRC matches the Data ID of another message, the frame is reported with a wrong identifier.
 
         Args:
-            of: row of each frame, shape (k,).
+            of: index of the message of each frame in the plan, shape (k,).
             stamps: stamp of each frame [ns], shape (k,).
             differences: result of `crc_differences`, shape (k,).
             length: payload length of the frames, bytes.
@@ -98,7 +99,7 @@ def _at(plan: Plan, length: int) -> npt.NDArray[np.intp]:
 
 
 class Counters:
-    """Calculator of alive counter increments. It stores the last counter of each message."""
+    """Calculator of alive counter increments, which stores the last counter of each message."""
 
     def __init__(self, plan: Plan) -> None:
         self._protected = plan.protected
@@ -106,7 +107,7 @@ class Counters:
         self._seen = np.zeros(len(plan.layouts), np.bool_)
 
     def steps(self, stream: Stream) -> Steps:
-        """Return the counter increment of each frame; `NO_STEP` for a frame without counter or previous frame. Shape (n,)."""
+        """Return the counter increment at each frame; `NO_STEP`: no counter or no previous frame. Shape (n,)."""
         counters = stream.frames.view(np.uint8).reshape(-1, FRAME_BYTES)[:, HEADER_BYTES + COUNTER_BYTE].copy()
         steps = counter_steps(counters, stream.before(counters, self._last))
         steps[stream.starts[~self._seen[stream.present]]] = NO_STEP

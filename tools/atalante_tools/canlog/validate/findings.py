@@ -1,4 +1,4 @@
-"""Findings of the validator. One finding combines all violations of one rule by one message or signal."""
+"""Findings of the validator. One finding combines all violations of the same rule by the same message or signal."""
 
 from __future__ import annotations
 
@@ -13,16 +13,16 @@ from atalante_tools.canlog.plan import Plan
 from atalante_tools.canlog.validate.rules import RULE_OF
 
 Stamps = npt.NDArray[np.int64]
-#: Maximum number of unknown identifiers with a finding of their own. The finding `OTHERS` combines all further identifiers.
+#: Maximum number of unknown identifiers with one finding each. All further identifiers share the finding `OTHERS`.
 MAX_UNKNOWN_IDS = 100
 OTHERS = "(others)"
-#: Rules that can have more findings than the DBC has messages.
+#: Rules whose findings can outnumber the messages of the DBC.
 _UNBOUNDED = ("unknown-id",)
 
 
 @dataclass(kw_only=True)
 class Finding:
-    """All violations of one rule by one signal, message or bus."""
+    """All violations of the same rule by the same signal, message or bus."""
 
     rule: str
     message: str
@@ -31,17 +31,17 @@ class Finding:
     count: int
     first: int  # ns
     last: int  # ns
-    worst: str  # value of the worst occurrence, with unit
-    badness: float  # severity of the worst occurrence; larger is worse
+    worst: str  # value at the worst violation, with unit
+    badness: float  # severity of the worst violation; larger is worse
 
     @property
     def first_s(self) -> float:
-        """Return the time stamp of the first occurrence in the log [s]."""
+        """Return the time stamp of the first violation in the log [s]."""
         return self.first * 1e-9
 
     @property
     def last_s(self) -> float:
-        """Return the time stamp of the last occurrence in the log [s]."""
+        """Return the time stamp of the last violation in the log [s]."""
         return self.last * 1e-9
 
     def as_json(self) -> dict[str, Any]:
@@ -58,7 +58,7 @@ class Finding:
 
 
 class Findings:
-    """Collection of the findings of one log. Each rule adds its violations as arrays."""
+    """Collection of the findings of one log. The validator rules add violations as arrays."""
 
     def __init__(self, plan: Plan) -> None:
         self._plan = plan
@@ -68,7 +68,7 @@ class Findings:
         return len(self._found)
 
     def all(self) -> list[Finding]:
-        """Return the findings in the order of the rules, then by first occurrence."""
+        """Return the findings ordered by rule, then by the time of the first violation."""
         order = list(RULE_OF)
         return sorted(self._found.values(), key=lambda f: (order.index(f.rule), f.first, f.message, f.signal))
 
@@ -88,7 +88,7 @@ class Findings:
 
         Args:
             rule: identifier of the rule.
-            message: name of the message; a bus for the bus load, an identifier for an unknown message.
+            message: name of the message. For the bus load, the name of the bus. For an unknown message, the identifier.
             stamps: time stamp of each violation, shape (n,) [ns], n >= 1.
             node: sender of the message, if known.
             signal: name of the signal; empty for a rule about the whole frame.
@@ -129,7 +129,7 @@ class Findings:
 
         Args:
             rule: identifier of the rule.
-            rows: row of the message of each violation, shape (n,).
+            rows: index of the message in the plan, for each violation, shape (n,).
             stamps: time stamp of each violation, shape (n,) [ns], n >= 1.
             signal: name of the signal; empty for a rule about the whole frame.
             shown: value of each violation for the report, shape (n,).
@@ -150,7 +150,7 @@ class Findings:
             )
 
     def add_whole(self, rule: str, row: int, first: int, last: int, *, shown: float, count: int = 1) -> None:
-        """Add a violation by one message. The violation lasts from the time stamp `first` to `last` [ns]."""
+        """Add a violation by one message. It lasts from the time stamp `first` to the time stamp `last` [ns]."""
         worst = _text(shown, RULE_OF[rule].worst, "")
         self._merge(
             Finding(
@@ -167,7 +167,7 @@ class Findings:
         )
 
     def add_log(self, rule: str, stamp: int, count: int, sentence: str) -> None:
-        """Add a finding about the log file, with a sentence that describes it."""
+        """Add a finding about the log file. The sentence describes the defect of the file."""
         self._merge(
             Finding(
                 rule=rule,

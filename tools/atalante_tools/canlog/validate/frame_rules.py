@@ -1,7 +1,7 @@
-"""Rules for frame headers: identifier, bus, sender, flags and length. They are the first stage of the validator.
+"""Rules for frame headers: identifier, bus, sender, flags and length. These rules are the first stage of the validator.
 
-Nearly all frames pass one comparison of their header word with the DBC. Only the remaining frames are checked one property at a
-time.
+The header word of nearly all frames equals the header word expected by the DBC. In all other frames, each header
+property is checked separately.
 """
 
 from __future__ import annotations
@@ -21,10 +21,11 @@ Indices = npt.NDArray[np.intp]
 
 _FD_LENGTH = np.isin(np.arange(256), FD_LENGTHS)
 _CLASSIC_LENGTH = np.arange(256) <= 8
-#: Bits of an error frame (linux/can/error.h): class "controller problem", and receive and transmit overflow in byte 1.
+#: Bits of an error frame (linux/can/error.h). `_CONTROLLER` is the identifier bit "controller problem".
+#: `_OVERFLOW` is the mask of two bits in payload byte 1: receive overflow and transmit overflow.
 _CONTROLLER, _OVERFLOW = 0x4, 0x3
 _NUMBER = 0x1FFF_FFFF
-#: A node is the recorder of the log if it sent at least this share of the frames marked as sent (0 to 1).
+#: A node is the recorder of the log if at least this share (0 to 1) of the frames marked as sent comes from the node.
 _RECORDER = 0.99
 
 
@@ -32,29 +33,29 @@ _RECORDER = 0.99
 class Sorted:
     """Result of the header check: frames that can be decoded, and rejected frames."""
 
-    good: Indices | None  # indices of the frames that can be decoded; None: all
-    rejected_rows: Rows  # messages of the rejected frames; shape (k,)
-    rejected_indices: Indices  # indices of the rejected frames; shape (k,)
+    good: Indices | None  # indices of the frames that can be decoded; None means all frames
+    rejected_rows: Rows  # message index of each rejected frame in the plan; shape (k,)
+    rejected_indices: Indices  # index of each rejected frame in the chunk; shape (k,)
 
 
 class FrameRules:
-    """Rules for the frame headers. They also identify the node that recorded the log."""
+    """Rules for frame headers. This class also identifies the node that recorded the log."""
 
     def __init__(self, plan: Plan, findings: Findings, channel_map: ChannelMap, *, keeps_flags: bool) -> None:
         self._plan, self._findings, self._channel_map, self._keeps_flags = plan, findings, channel_map, keeps_flags
         layouts = plan.layouts
-        #: Expected FDF and BRS flags of each message: 0, 1, or `UNKNOWN` if the DBC has no such attribute.
+        #: Expected FDF and BRS flags of each message: 0, 1, or `UNKNOWN` if the DBC does not define the flag.
         fd = [UNKNOWN if m.fd is None else int(m.fd) for m in layouts]
         switch = [UNKNOWN if m.bit_rate_switch is None else int(m.bit_rate_switch) for m in layouts]
-        # The last element is never used; it allows index 0 for a DBC without messages.
+        # For a DBC without messages, the additional last element makes the index 0 valid. No message uses this element.
         self._fd, self._switch = np.array([*fd, UNKNOWN], np.int8), np.array([*switch, UNKNOWN], np.int8)
         self._length, self._sender = np.append(plan.lengths, 0), np.append(plan.sender_of_row, UNKNOWN)
-        #: Node that recorded the log; None: not known yet; empty: several nodes.
+        #: Node that recorded the log; None if not known yet; empty if frames of several nodes are marked as sent.
         self.recorder: str | None = None
         self.direction_seen = False
 
     def rows(self, chunk: Chunk) -> Rows:
-        """Return the row of each frame; `UNKNOWN` for error frames and for identifiers that are not in the DBC. Shape (n,)."""
+        """Return the message index of each frame; `UNKNOWN` for error frames and unknown identifiers. Shape (n,)."""
         can_ids = chunk.frames["can_id"]
         if int(can_ids.max(initial=0)) < ID_ERROR:
             return self._plan.rows(can_ids)
@@ -66,12 +67,12 @@ class FrameRules:
         """Report the frames with a wrong header.
 
         Args:
-            chunk: frames of the log, n of them.
-            rows: row of each frame, result of `rows`, shape (n,).
-            channel_names: channels of the log so far.
+            chunk: n frames of the log.
+            rows: index of the message of each frame in the plan (result of `rows`), shape (n,).
+            channel_names: known channels of the log.
 
         Returns:
-            The frames that can be decoded, and the rejected ones.
+            The frames that can be decoded, and the rejected frames.
         """
         self._channel_map.update(chunk, rows, channel_names)
         self._check_sender(chunk, rows)
@@ -139,10 +140,10 @@ class FrameRules:
         return fits
 
     def _check_sender(self, chunk: Chunk, rows: Rows) -> None:
-        """Report messages with the wrong direction.
+        """Report messages with a wrong direction mark (sent or received).
 
-        If the frames marked as sent come from one node, that node recorded the log. All its messages must then be marked as
-        sent, and all other messages must be marked as received.
+        If at least 99 % of the frames marked as sent come from one node, this node is the recorder of the log. Then all
+        messages of the recorder must be marked as sent, and all other messages must be marked as received.
         """
         sent = chunk.sent == SENT
         known = (rows >= 0) & (rows < len(self._plan.layouts))
@@ -188,7 +189,8 @@ class FrameRules:
         """Report identifiers that are not in the DBC.
 
         Returns:
-            Row of the message with the same identifier in the other format (11 or 29 bits), otherwise `UNKNOWN`. Shape (k,).
+            Index of the message with the same identifier in the other format (11 or 29 bits), otherwise `UNKNOWN`.
+            Shape (k,).
         """
         can_ids = part.frames["can_id"] & np.uint32(~ID_REMOTE & 0xFFFFFFFF)
         found = self._plan.rows_in_other_format(can_ids)

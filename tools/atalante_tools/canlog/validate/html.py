@@ -17,10 +17,10 @@ from atalante_tools.canlog.validate.timing_rules import BINS, BINS_A_CYCLE
 
 _WIDTH, _HEIGHT = 760, 200
 _LEFT, _RIGHT, _TOP, _BOTTOM = 64, 28, 24, 36
-_LETTER = 7.0  # width of a legend character [px]
+_LETTER = 7.0  # width of a character in the legend [px]
 _COLOURS = ("#1b6ca8", "#c8553d", "#4f772d", "#7b4b94", "#b08900", "#3d5a6c", "#8d5524", "#555555")
-_POINTS = 720  # maximum points of a curve, about one per pixel
-_HISTOGRAMS = 12  # maximum number of histograms per log
+_POINTS = 720  # maximum number of points of a curve, about one point per pixel
+_HISTOGRAMS = 12  # maximum number of interval histograms in the report of a log
 _TIMING = ("cycle-mean", "cycle-jitter", "cycle-gap", "cycle-fast", "timeout", "recovered", "state-late")
 _STYLE = """
 body { font: 14px/1.45 system-ui, sans-serif; margin: 2em auto; max-width: 74em; padding: 0 1em; color: #1c1c1c; }
@@ -34,7 +34,7 @@ svg text { font: 11px system-ui, sans-serif; fill: #333; }
 
 
 def write_html(results: Sequence[Report], path: Path) -> None:
-    """Write the reports of all logs into one file."""
+    """Write the reports of all logs into one HTML file."""
     parts = ["<!DOCTYPE html><html lang='en'><head><meta charset='utf-8'><title>atalante validate</title>"]
     parts.append(f"<style>{_STYLE}</style></head><body><h1>CAN log against DBC</h1>")
     for result in results:
@@ -94,7 +94,7 @@ def _rules() -> str:
 
 
 class _Axes:
-    """Plot area. It converts data coordinates to pixels and draws axes, labels and curves."""
+    """Plot area, which converts data coordinates to pixels and draws axes, labels and curves."""
 
     def __init__(self, x: tuple[float, float], y: tuple[float, float], x_label: str, y_label: str) -> None:
         self._x, self._y = x, (y[0], y[1] if y[1] > y[0] else y[0] + 1.0)
@@ -138,7 +138,7 @@ class _Axes:
         )
 
     def legend(self, names: Sequence[str]) -> None:
-        """Draw the legend. An ellipsis replaces the names that do not fit into the width of the plot."""
+        """Draw the legend. If the plot is too narrow for all names, an ellipsis replaces the last names."""
         across = float(_LEFT)
         for number, name in enumerate(names):
             width = 26 + _LETTER * len(name)
@@ -174,7 +174,7 @@ class _Axes:
 
 
 def _ticks(low: float, high: float, most: int) -> list[float]:
-    """Return about `most` axis ticks between `low` and `high`. Their spacing is 1, 2 or 5 times a power of ten."""
+    """Return about `most` axis ticks between `low` and `high`, with a spacing of 1, 2 or 5 times a power of ten."""
     rough = (high - low) / most or 1.0
     power = 10.0 ** math.floor(math.log10(rough))
     step = next(power * unit for unit in (1.0, 2.0, 5.0, 10.0) if power * unit >= rough * (1 - 1e-9))
@@ -200,7 +200,7 @@ def _load_plot(result: Report) -> str:
 
 
 def _thinned(x: Vector, y: Vector) -> tuple[Vector, Vector]:
-    """Reduce a curve to at most `_POINTS` points. Each point is the maximum of its section of the curve."""
+    """Reduce a curve to at most `_POINTS` points, each of which is the maximum of a section of the curve."""
     step = math.ceil(len(x) / _POINTS)
     if step == 1:
         return x, y
@@ -225,7 +225,7 @@ def _gap_plot(result: Report) -> str:
 
 
 def _histograms(result: Report) -> list[str]:
-    """Plot interval histograms: first the messages with timing findings, then the messages with the widest spread."""
+    """Plot interval histograms, first of messages with timing findings, then of messages with the widest spread."""
     validator = result.validator
     reported = {f.message for f in result.findings if f.rule in _TIMING}
     rows = [r for r in np.flatnonzero(validator.timing.intervals > 0).tolist() if validator.plan.cycle_ns[r] > 0]

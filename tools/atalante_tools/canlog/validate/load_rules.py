@@ -22,8 +22,8 @@ _ERROR_BITS = 17
 def wire_time(extended: bool, fd: bool, switch: bool, length: int, nominal: float, data: float) -> float:
     """Return the worst-case time of a frame on the wire [s], with stuff bits and interframe space (ISO 11898-1).
 
-    Classic CAN follows Davis et al. 2007. CAN FD follows `atalante_dbc.wire_time`; a 29-bit identifier adds 20 bits and their
-    stuff bits to the arbitration phase.
+    Classic CAN follows Davis et al. 2007. CAN FD follows `atalante_dbc.wire_time`. A 29-bit identifier adds 20 bits
+    plus stuff bits to the arbitration phase.
 
     Args:
         extended: whether the identifier has 29 bits.
@@ -43,7 +43,7 @@ def wire_time(extended: bool, fd: bool, switch: bool, length: int, nominal: floa
 
 
 class LoadRules:
-    """Rule for the bus load: the sum of the wire times per bus and time window."""
+    """Rule for the bus load, computed as the sum of the wire times of all frames per bus and time window."""
 
     def __init__(self, plan: Plan, findings: Findings, project: Project, channel_map: ChannelMap) -> None:
         self._plan, self._findings, self._channel_map = plan, findings, channel_map
@@ -54,12 +54,12 @@ class LoadRules:
         self._over, self._limit = project.number("bus-load", "over_nominal"), project.number("bus-load", "limit")
         self._of_row = np.array([self._layout_time(row) for row in range(len(plan.layouts))] + [0.0])
         self._bus_of_row = np.append(plan.bus_of_row, 0)
-        self._numbers: list[npt.NDArray[np.int64]] = []  # per chunk: numbers of its windows, shape (windows,)
-        self._busy: list[npt.NDArray[np.float64]] = []  # per chunk: wire times [s], shape (windows, buses)
-        #: Start time of each window with a frame [s], set by `finish`. Shape (windows,).
+        self._numbers: list[npt.NDArray[np.int64]] = []  # for each chunk: window numbers, shape (windows,)
+        self._busy: list[npt.NDArray[np.float64]] = []  # for each chunk: wire times [s], shape (windows, buses)
+        #: Start time of each time window with at least one frame [s], set by `finish`. Shape (windows,).
         self.begins: npt.NDArray[np.float64] = np.zeros(0)
-        #: Bus load in each window, 1 at full load, set by `finish`. Shape (windows, buses).
-        #: The columns are the buses of the DBC, then the channels without a bus.
+        #: Bus load in each time window, 1 at full load, set by `finish`. Shape (windows, buses).
+        #: The first columns are the buses of the DBC; the other columns are the log channels without a bus.
         self.load: npt.NDArray[np.float64] = np.zeros((0, len(plan.buses)))
 
     @property
@@ -75,13 +75,14 @@ class LoadRules:
         return wire_time(layout.extended, fd, switch, layout.length, self._nominal, self._data)
 
     def expected(self, bus: int) -> float | None:
-        """Return the largest bus load that the messages of the DBC can cause, 1 at full load.
+        """Return the largest load of a bus that the messages of the DBC can cause, 1 at full load.
 
         Args:
             bus: index of the bus in the plan.
 
         Returns:
-            The load; None if the DBC lacks the cycle time or inhibit time of a message.
+            The load, or None if it cannot be computed: the DBC has no message on this bus, or a message on this bus has
+            neither cycle time nor inhibit time.
         """
         rows = (
             np.flatnonzero(self._plan.bus_of_row == bus) if self._plan.has_buses else np.arange(len(self._plan.layouts))
@@ -92,11 +93,11 @@ class LoadRules:
         return float((self._of_row[rows] / (period * 1e-9)).sum())
 
     def check(self, chunk: Chunk, rows: Rows) -> None:
-        """Add the wire time of the frames of a chunk.
+        """Add the wire times of all frames in a chunk.
 
         Args:
-            chunk: frames of the log, n of them.
-            rows: row of each frame, shape (n,).
+            chunk: n frames of the log.
+            rows: index of the message of each frame in the plan, shape (n,).
         """
         if not self.checked or not len(chunk):
             return
@@ -138,9 +139,9 @@ class LoadRules:
             seconds[indices[key == value]] = time
 
     def _bus(self, chunk: Chunk, known: npt.NDArray[np.bool_], rows: npt.NDArray[np.int16]) -> npt.NDArray[np.int64]:
-        """Return for each frame the column of its bus in `load`. Shape (n,).
+        """Return the column of `load` to which each frame belongs. Shape (n,).
 
-        The column is the bus of the channel. On a channel with several buses, it is the bus of the message.
+        This column is the bus of the channel. On a channel with several buses, the column is the bus of the message.
         """
         buses = len(self._plan.buses)
         of_channel = np.array(self._channel_map.bus_of_channel, np.int64)

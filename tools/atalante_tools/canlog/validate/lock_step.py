@@ -2,7 +2,8 @@
 
     chunk with wall-clock stamps -> lock-step clock -> chunk with stamps in robot time -> rules
 
-In lock-step a cycle takes as long as the slowest program needs, so the wall clock says nothing about the period of a message.
+In lock-step, a cycle takes as long as the slowest program needs, so the period of a message on the wall clock is
+meaningless.
 """
 
 from __future__ import annotations
@@ -22,32 +23,36 @@ Stamps = npt.NDArray[np.int64]
 
 #: Signal of SYNC that contains the cycle number.
 CYCLE: Final = "Cycle"
-#: Time without a SYNC after which the loop of the HAL counts as stopped and the stamps follow the wall clock [ns].
+#: If no SYNC arrives within this time [ns], the HAL has probably stopped, and the time stamps follow the wall clock.
 PAUSE_NS: Final = 200_000_000
-#: Largest accepted increment of the cycle number between two SYNCs. A larger one (restarted HAL, damaged frame) counts as 1.
+#: Largest accepted increment of the cycle number between two SYNCs.
+#: Any other increment (restarted HAL, damaged frame) is replaced by 1.
 MOST_STEPS: Final = 1000
-#: Time between the stamps of two consecutive frames in a cycle [ns]; latest stamp in a cycle, as a share of the cycle time.
+#: `_SPACING_NS` is the time between the stamps of two consecutive frames in a cycle [ns].
+#: `_LAST` is the latest stamp in a cycle, as a share of the cycle time (0 to 1).
 _SPACING_NS, _LAST = 1000, 0.7
 
 
 @dataclass
 class _Channel:
-    """State of the clock for one channel, after the last frame of the channel."""
+    """State of the clock for one channel after the last frame on this channel."""
 
-    sync: int = -1  # row of the SYNC message that was received first, whose cycle number is used; -1: none yet
+    #: index in the plan of the SYNC message that gives the cycle number: the SYNC message that was received first on this
+    #: channel; -1 if no SYNC message was received yet
+    sync: int = -1
     cycle: int = 0  # cycle number of the last SYNC
-    begin: int = 0  # robot time of the last SYNC [ns]
-    wall: int = 0  # wall clock of the last SYNC [ns]
+    begin: int = 0  # time stamp of the last SYNC in robot time [ns]
+    wall: int = 0  # time stamp of the last SYNC on the wall clock [ns]
     count: int = 0  # number of frames since the last SYNC
     last: int = -(1 << 62)  # stamp of the last frame [ns]
 
 
 class LockStepClock:
-    """Clock that replaces wall-clock stamps by robot time.
+    """Clock that replaces wall-clock stamps by robot time, in which each cycle has the nominal cycle time.
 
-    A frame gets the start time of its cycle and a small offset, in the order of arrival. The first SYNC has the same
-    stamp in robot time and on the wall clock. Before the first SYNC of a channel, and while SYNC pauses, the stamps follow the
-    wall clock.
+    The new stamp of a frame is the start time of the cycle plus a small offset, which grows in the order of arrival.
+    The first SYNC has the same stamp in robot time and on the wall clock. Before the first SYNC on a channel, and
+    during a pause without SYNC, the stamps follow the wall clock.
 
     Args:
         plan: compiled DBC.
@@ -74,7 +79,7 @@ class LockStepClock:
         """Return the chunk with stamps in robot time.
 
         Args:
-            chunk: next frames of all channels; the frames of each channel in the order of arrival.
+            chunk: next frames of all channels. The frames of the same channel are in the order of arrival.
         """
         rows = self._plan.rows(chunk.frames["can_id"])
         stamps = chunk.stamps.copy()
@@ -84,7 +89,7 @@ class LockStepClock:
         return Chunk(chunk.frames, stamps, chunk.channels, chunk.sent)
 
     def _of_channel(self, channel: _Channel, chunk: Chunk, rows: npt.NDArray[np.int16]) -> Stamps:
-        """Return the stamps of the frames of one channel in robot time. Shape (n,) [ns]."""
+        """Return the stamps in robot time of all frames on one channel. Shape (n,) [ns]."""
         wall = chunk.stamps
         if channel.sync < 0:
             known = np.flatnonzero(np.isin(rows, list(self._codecs)))
@@ -97,21 +102,21 @@ class LockStepClock:
             begins.append(self._next_begin(channel, cycle, int(wall[index]), int(wall[max(0, index - 1)])))
             walls.append(channel.wall)
         number = np.searchsorted(syncs, np.arange(len(wall)), side="right")
-        place = np.arange(len(wall)) - np.concatenate([[-channel.count], syncs])[number]
+        offset = np.arange(len(wall)) - np.concatenate([[-channel.count], syncs])[number]
         limit = int(_LAST * self._plan.cycle_ns[channel.sync])
         since = wall - np.array(walls)[number]
-        stamps = np.array(begins)[number] + np.where(since > PAUSE_NS, since, np.minimum(_SPACING_NS * place, limit))
+        stamps = np.array(begins)[number] + np.where(since > PAUSE_NS, since, np.minimum(_SPACING_NS * offset, limit))
         if not walls[0]:  # no earlier chunk had a SYNC
             stamps[: syncs[0]] = np.minimum(wall[: syncs[0]], begins[1])
         stamps = np.maximum.accumulate(np.maximum(stamps, channel.last))
-        channel.last, channel.count = int(stamps[-1]), int(place[-1]) + 1
+        channel.last, channel.count = int(stamps[-1]), int(offset[-1]) + 1
         return stamps
 
     def _cycles(self, row: int, chunk: Chunk, syncs: npt.NDArray[np.intp]) -> list[int]:
         """Return the cycle number of each SYNC.
 
         Args:
-            row: row of the SYNC message.
+            row: index of the SYNC message in the plan.
             chunk: frames of the channel.
             syncs: indices of the SYNC frames in the chunk, shape (k,).
         """
@@ -121,13 +126,13 @@ class LockStepClock:
         return numbers
 
     def _next_begin(self, channel: _Channel, cycle: int, wall: int, wall_before: int) -> int:
-        """Return the robot time of the next SYNC [ns], and store it in the channel.
+        """Return the robot time of a SYNC [ns], and store this SYNC as the last SYNC of the channel.
 
         Args:
-            channel: channel of the SYNC.
+            channel: clock state of the channel, which is updated.
             cycle: cycle number in the SYNC.
-            wall: wall clock of the SYNC [ns].
-            wall_before: wall clock of the frame before the SYNC [ns].
+            wall: time stamp of the SYNC on the wall clock [ns].
+            wall_before: time stamp of the frame before the SYNC on the wall clock [ns].
         """
         period = int(self._plan.cycle_ns[channel.sync])
         if self._origin is None:

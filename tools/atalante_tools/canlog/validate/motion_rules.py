@@ -1,6 +1,7 @@
-"""Plausibility rules: velocity against position, norm of quaternions, change of slow values, and measured values without noise.
+"""Plausibility rules for signals: velocity, quaternion norm, change of slow values, and measured values without noise.
 
-The signals are selected by name (`codec.group_of`). The rules file of a project may set other names.
+The velocity is compared with the change of the position. The signals are selected by name (`codec.group_of`). The rules
+file of a project may set other names.
 """
 
 from __future__ import annotations
@@ -23,7 +24,7 @@ _ELEMENTS = 4  # elements of a quaternion
 
 
 class MotionRules:
-    """Plausibility rules for the signals of all messages."""
+    """Plausibility rules, applied to the signals of all messages."""
 
     def __init__(self, plan: Plan, findings: Findings, project: Project) -> None:
         self._families = {
@@ -41,18 +42,18 @@ class MotionRules:
         }
 
     def check(self, decoded: Decoded, stream: Stream, steps: Steps) -> None:
-        """Check the frames of a family.
+        """Check the frames of a message family.
 
         Args:
-            decoded: decoded frames of the family.
-            stream: frames of the chunk by message, shape (n,).
-            steps: increments of the alive counters of the whole stream, shape (n,).
+            decoded: decoded frames of the message family.
+            stream: frames of the chunk, sorted by message, shape (n,).
+            steps: increment of the alive counter at each frame of the stream, shape (n,).
         """
         for rule in self._families[decoded.family.rows.start]:
             rule.check(decoded, stream, steps)
 
     def finish(self, end: int) -> None:
-        """Apply the rules about the whole log.
+        """Report the values that are stuck at the end of the log.
 
         Args:
             end: last time stamp of the log [ns].
@@ -63,16 +64,16 @@ class MotionRules:
                     rule.finish(end)
 
     def checked(self, family: Family) -> dict[str, list[str]]:
-        """Return the names of the checked signals of a family, by rule identifier."""
+        """Return the names of the checked signals in a message family, by rule identifier."""
         return {
             rule.id: [family.codec.fields[p].name for p in rule.indices] for rule in self._families[family.rows.start]
         }
 
 
 class _Velocity:
-    """Rule that compares the mean velocity in a window with the change of position.
+    """Rule that compares the mean of a velocity signal in a time window with the change of the position signal.
 
-    The tolerance includes the lag of the velocity filter.
+    The tolerance allows for the lag of the velocity filter in the drive.
     """
 
     id = "velocity"
@@ -121,7 +122,7 @@ class _Velocity:
             return
         ends = np.arange(windows + 1) * width
         duration = np.diff(stamps[ends]) * 1e-9
-        # The first velocity in a window covers the time before the window, so the mean excludes it.
+        # The first velocity value covers the time before the window, so the mean excludes this value.
         inside = velocity[1 : whole + 1].reshape(windows, width)
         mean = inside.mean(axis=1)
         moved = np.diff(position[ends]) / np.where(duration > 0, duration, np.inf)
@@ -134,7 +135,7 @@ class _Velocity:
 
 
 class _Quaternion:
-    """Rule for the norm of quaternions."""
+    """Rule that checks whether the norm of each quaternion is 1."""
 
     id = "quaternion-norm"
 
@@ -169,7 +170,7 @@ class _Quaternion:
 
 
 class _Columns:
-    """Pairing of each frame with the previous frame of its message, for some fields of a family. It stores the last raw codes."""
+    """Memory of the last raw codes, so that each frame can be compared with the previous frame of the same message."""
 
     def __init__(self, family: Family, indices: Sequence[int]) -> None:
         self._indices = np.array(indices, np.intp)
@@ -180,11 +181,11 @@ class _Columns:
     def with_before(
         self, decoded: Decoded, stream: Stream
     ) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64], list[int]]:
-        """Pair the raw codes of each frame with the raw codes of the previous frame, even if that is in an earlier chunk.
+        """Return the raw codes of each frame and of the previous frame, which may be in an earlier chunk.
 
         Returns:
-            The codes, the codes of the previous frame, shape (fields, n) each, and the indices of the frames without a previous
-            frame.
+            The codes of each frame, the codes of the previous frame (shape (fields, n) each), and the indices of the
+            frames without a previous frame.
         """
         codes = decoded.codes[self._indices]
         before = np.empty_like(codes)
@@ -203,7 +204,7 @@ class _Columns:
 
 
 class _Steps:
-    """Rule that limits the change of a slow value from one frame to the next."""
+    """Rule that limits how much a slowly varying value may change from one frame to the next."""
 
     id = "step"
 
@@ -214,7 +215,7 @@ class _Steps:
         fields = [family.codec.fields[p] for p in self.indices]
         self._limits = np.array([limit / abs(f.factor) for limit, f in zip(limits.values(), fields, strict=True)])
         self._first_row = family.rows.start
-        #: Whether the last value was invalid, shape (fields, rows). A change from an invalid to a valid value is no finding.
+        #: Whether the last value was invalid, shape (fields, messages). The change after an invalid value is not checked.
         self._was_bad = np.zeros((len(self.indices), len(family.rows)), np.bool_)
 
     @classmethod
@@ -243,7 +244,8 @@ class _Steps:
     ) -> None:
         """Check the changes of one field.
 
-        A change is not checked if frames were lost before it, or if one of its two values is invalid.
+        The change from one frame to the next is not checked if frames between them were lost, or if one of the two
+        values is invalid.
         """
         index = self.indices[at]
         wrong = (moved > self._limits[at]) & (steps[decoded.span] <= 1)
@@ -271,9 +273,9 @@ class _Stuck:
         self.indices = list(indices)
         self._family, self._findings, self._frames = family, findings, frames
         self._columns = _Columns(family, indices)
-        #: Number of consecutive frames with an unchanged raw code, shape (fields, rows).
+        #: Number of consecutive frames with an unchanged raw code, shape (fields, messages).
         self._run = np.zeros((len(self.indices), len(family.rows)), np.int64)
-        #: Time stamp of the last frame of each row [ns].
+        #: Time stamp of the last frame of each message [ns], shape (messages,).
         self._stamp = np.zeros(len(family.rows), np.int64)
 
     @classmethod
@@ -284,7 +286,7 @@ class _Stuck:
 
     def check(self, decoded: Decoded, stream: Stream, steps: Steps) -> None:
         codes, before, _ = self._columns.with_before(decoded, stream)
-        repeated = steps[decoded.span] == REPEATED  # a repeated frame has no new value
+        repeated = steps[decoded.span] == REPEATED  # a repeated frame contains no new value
         still = codes == before
         for row, first, end in stream.bounds(decoded.family):
             number = row - self._family.rows.start
@@ -300,7 +302,9 @@ class _Stuck:
         if not len(moves):
             self._run[at, number] += len(still)
             return
-        runs = np.diff(moves, prepend=-1 - int(self._run[at, number])) - 1
+        runs = moves.copy()
+        runs[1:] -= moves[:-1] + 1
+        runs[0] += int(self._run[at, number])
         long = runs >= self._frames
         if bool(long.any()):
             self._report(at, number, stamps[np.minimum(moves[long], len(stamps) - 1)], runs[long])

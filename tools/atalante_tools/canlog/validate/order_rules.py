@@ -1,4 +1,4 @@
-"""Rules for the order of frames in a cycle: first SYNC, then the states of all nodes of the bus before a deadline."""
+"""Rules for the order of frames in a cycle: first SYNC, then the state frames of all nodes before a deadline."""
 
 from __future__ import annotations
 
@@ -15,28 +15,27 @@ from atalante_tools.canlog.validate.project import Project
 
 Indices = npt.NDArray[np.intp]
 
-#: Name prefix of the messages that start the cycle of a bus.
+#: Name prefix of the messages that start a cycle on a bus.
 SYNC = "SYNC"
 
 
 @dataclass
 class _Bus:
-    """Bus with a SYNC message, and the state of the order check after the last chunk."""
+    """Bus with a SYNC message, and intermediate results of the order check after the last chunk."""
 
-    sync: int  # row of the SYNC message
-    states: list[int]  # rows of the state messages
+    sync: int  # index of the SYNC message in the plan
+    states: list[int]  # indices of the state messages in the plan
     cycle_ns: float
     count: int = 0  # SYNC frames so far
     stamp: int = 0  # time stamp of the last SYNC frame [ns]
-    cycle_of: dict[int, int] = field(default_factory=dict)  # SYNC cycle of the last state frame, by row
-    jump_of: dict[int, int] = field(default_factory=dict)  # SYNC cycles between the last two states, by row
-    doubtful: dict[int, int] = field(
-        default_factory=dict
-    )  # time stamp of a second state frame in one cycle, if the next cycle is not known yet [ns], by row
+    cycle_of: dict[int, int] = field(default_factory=dict)  # cycle number of the last state frame, by message index
+    jump_of: dict[int, int] = field(default_factory=dict)  # cycles between the last two state frames, by message index
+    #: time stamp of a second state frame in one cycle [ns], by message index, if the next cycle is not known yet
+    doubtful: dict[int, int] = field(default_factory=dict)
 
 
 class OrderRules:
-    """Rules that check whether each state frame comes in the right SYNC cycle, and soon enough after its SYNC frame."""
+    """Rules that check whether each state frame arrives in the right cycle, and early enough after the SYNC frame."""
 
     def __init__(self, plan: Plan, findings: Findings, project: Project) -> None:
         self._findings = findings
@@ -53,15 +52,15 @@ class OrderRules:
 
     @property
     def checked(self) -> set[int]:
-        """Return the rows of the messages that the order rules check."""
+        """Return the plan indices of the messages that the order rules check."""
         return {row for bus in self.buses for row in (bus.sync, *bus.states)}
 
     def check(self, stream: Stream, steps: Steps) -> None:
         """Check the order of SYNC and state frames in a chunk.
 
         Args:
-            stream: frames of the chunk by message, shape (n,).
-            steps: increments of the alive counters, shape (n,).
+            stream: frames of the chunk, sorted by message, shape (n,).
+            steps: increment of the alive counter at each frame, shape (n,).
         """
         for bus in self.buses:
             span = stream.of(bus.sync)
@@ -82,7 +81,7 @@ class OrderRules:
     ) -> None:
         """Report the state frames that were received after the deadline of their cycle, but before the next SYNC.
 
-        `_check_order` reports the state frames that were received after the next SYNC.
+        State frames that were received after the next SYNC are reported by `_check_order`.
         """
         after = stamps - begins
         late = (after > self._deadline * bus.cycle_ns) & (after < bus.cycle_ns)
@@ -102,20 +101,24 @@ class OrderRules:
     ) -> None:
         """Report the state frames that were received in the wrong cycle.
 
-        If a cycle has two states and the next cycle has none, the second state was received before its SYNC. If a cycle has no
-        state and the next cycle has two, the first state was late. A SYNC that is missing in the log also gives two states in
-        one cycle, but then the next cycle has one state.
+        The rule counts the state frames of one node per cycle. If a cycle with two frames precedes a cycle without a frame,
+        the second frame was received before its SYNC. If a cycle without a frame precedes a cycle with two frames, the
+        first of the two frames was late. If a SYNC is missing in the log, a cycle also has two state frames, but then the
+        cycles before and after it have one state frame each, and nothing is reported.
 
         Args:
             bus: bus of the state message.
-            row: row of the state message.
-            stamps: time stamp of each state [ns], shape (n,).
-            steps: increment of the alive counter of each state, shape (n,).
-            cycles: number of the cycle of each state, shape (n,).
-            begins: time stamps of the last SYNC before the chunk and of each SYNC in the chunk [ns], shape (m + 1,).
+            row: index of the state message in the plan.
+            stamps: time stamp of each state frame [ns], shape (n,).
+            steps: increment of the alive counter at each state frame, shape (n,).
+            cycles: number of the cycle in which each state frame was received, shape (n,).
+            begins: time stamp of the last SYNC before the chunk, then time stamps of all SYNCs in the chunk [ns], shape
+                (m + 1,).
         """
         first = bus.cycle_of.get(row)
-        jumps = np.diff(cycles, prepend=cycles[0] - 1 if first is None else first)
+        jumps = cycles.copy()
+        jumps[1:] -= cycles[:-1]
+        jumps[0] = 1 if first is None else cycles[0] - first
         before = np.concatenate([[bus.jump_of.get(row, 1)], jumps[:-1]])
         if (stamp := bus.doubtful.pop(row, None)) is not None and jumps[0] == 2:
             self._report("sync-order", row, np.array([stamp]), np.zeros(1))
@@ -142,7 +145,7 @@ class OrderRules:
 
 
 def _cycles(syncs: Indices, states: Indices) -> Indices:
-    """Return the number of SYNC frames before each state frame, shape (n,).
+    """Return, for each state frame, the number of earlier SYNC frames in the same chunk, shape (n,).
 
     Args:
         syncs: indices of the SYNC frames in the chunk, ascending, shape (m,).

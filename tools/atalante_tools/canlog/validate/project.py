@@ -35,27 +35,27 @@ class ProjectError(ValueError):
 
 @dataclass(frozen=True)
 class Silence:
-    """Entry of a rules file that silences a rule, with the reason."""
+    """Table [[silence]] of a rules file, which silences a rule for some messages."""
 
     rule: str
     message: str  # name or pattern
     reason: str
 
     def covers(self, rule: str, message: str) -> bool:
-        """Return whether this entry applies to the findings of a rule about a message."""
+        """Return whether this table silences the findings of a rule about a message."""
         return rule == self.rule and fnmatch.fnmatchcase(message, self.message)
 
 
 @dataclass(frozen=True)
 class Project:
-    """Content of a rules file. Missing thresholds have the defaults of `rules.RULES`."""
+    """Content of a rules file. A threshold that is not in the file has the default value in `rules.RULES`."""
 
     thresholds: Mapping[str, Mapping[str, Threshold]] = field(default_factory=dict)
     silences: tuple[Silence, ...] = ()
-    channels: Mapping[str, str] = field(default_factory=dict)  # channel of the log -> bus in the DBC
+    channels: Mapping[str, str] = field(default_factory=dict)  # name of the bus in the DBC for each channel of the log
 
     def threshold(self, rule: str, name: str) -> Threshold:
-        """Return a threshold of a rule."""
+        """Return the threshold of a rule with the given name."""
         return self.thresholds.get(rule, {}).get(name, RULE_OF[rule].thresholds[name])
 
     def number(self, rule: str, name: str) -> float:
@@ -75,16 +75,16 @@ class Project:
         return value
 
     def quantities(self, rule: str) -> dict[str, float]:
-        """Return the numeric threshold of each quantity of a rule."""
+        """Return all thresholds of a rule that are numbers, by the name of the threshold."""
         found = {**RULE_OF[rule].thresholds, **self.thresholds.get(rule, {})}
         return {name: value for name, value in found.items() if isinstance(value, float)}
 
     def silence(self, rule: str, message: str) -> Silence | None:
-        """Return the entry that silences a rule for a message; None if the rule is not silenced."""
+        """Return the [[silence]] table that silences a rule for a message; None if the rule is not silenced."""
         return next((s for s in self.silences if s.covers(rule, message)), None)
 
 
-#: Rules with one threshold per quantity of the DBC. A rules file may add quantities.
+#: Rules with one threshold per signal name, such as Position. A rules file may add signal names to these rules.
 _OPEN = ("step",)
 
 
@@ -92,7 +92,8 @@ def load_project(path: Path) -> Project:
     """Read a rules file.
 
     Raises:
-        ProjectError: If a rule, threshold or key is unknown, a value has the wrong type, or a [[silence]] has no reason.
+        ProjectError: If a rule, threshold or key is unknown, a value has the wrong type, or a [[silence]] table has no
+            reason.
     """
     try:
         document = tomllib.loads(path.read_text())
@@ -125,7 +126,9 @@ def _thresholds(path: Path, rule: str, table: Any) -> dict[str, Threshold]:
     for name, value in table.items():
         like = known.get(name, 0.0 if rule in _OPEN else None)
         if like is None:
-            raise ProjectError(f"{path}: a threshold of {rule} must be one of {', '.join(known)}, got {name!r}")
+            raise ProjectError(
+                f"{path}: the name of a threshold of {rule} must be one of {', '.join(known)}, got {name!r}"
+            )
         found[name] = _value(f"{path}: {rule}.{name}", value, like)
     return found
 
@@ -151,7 +154,7 @@ def _silence(path: Path, entry: Any) -> Silence:
         or not all(isinstance(v, str) for v in entry.values())
     ):
         raise ProjectError(
-            f"{path}: a [[silence]] must have only the keys {', '.join(_SILENCE_KEYS)}, each with a text, got {entry!r}"
+            f"{path}: a [[silence]] table must have only the keys {', '.join(_SILENCE_KEYS)}, each with a text, got {entry!r}"
         )
     if entry.get("rule") not in RULE_OF:
         raise ProjectError(

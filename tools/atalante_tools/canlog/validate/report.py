@@ -14,13 +14,13 @@ from atalante_tools.canlog.validate.rules import RULE_OF, RULES
 from atalante_tools.canlog.validate.validator import Validator
 from atalante_tools.console.terminal import table
 
-#: Maximum number of unchecked items per reason in the text report. The HTML report lists all of them.
+#: Maximum number of unchecked items that the text report lists per reason. The HTML report lists all unchecked items.
 _NAMES = 12
 
 
 @dataclass(frozen=True)
 class Report:
-    """Result of the check of one log or one live bus."""
+    """Report of the check of one log or one live bus."""
 
     name: str  # name of the log or the bus
     validator: Validator
@@ -30,7 +30,7 @@ class Report:
 
     @property
     def duration_s(self) -> float:
-        """Return the time from the first frame to the last [s]."""
+        """Return the time from the first to the last frame of the log [s]."""
         return 0.0 if self.validator.begin is None else (self.validator.end - self.validator.begin) * 1e-9
 
 
@@ -78,7 +78,7 @@ def text(result: Report) -> str:
 
 
 def verdict(result: Report) -> str:
-    """Return the number of findings and occurrences in one line."""
+    """Return one line with the number of findings and the total number of violations."""
     if result.findings:
         count = sum(finding.count for finding in result.findings)
         findings = "1 finding" if len(result.findings) == 1 else f"{len(result.findings)} findings"

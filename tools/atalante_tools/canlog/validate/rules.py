@@ -1,9 +1,10 @@
-"""Table of all rules: meaning, source in the DBC, unit of the worst value, and default thresholds.
+"""Table of all validator rules: meaning, source in the DBC, unit of the worst value, and default thresholds.
 
 The modules `frame_rules`, `e2e_rules`, `value_rules`, `timing_rules`, `order_rules`, `load_rules`, `motion_rules` and
-`drive_rules` check many frames at a time. Only one rule reports each cause: a frame with a wrong length is not also reported as
-lost, a timeout is not also a counter jump, and a value outside its range is not also missing in the value table. The rules file
-of a project (`project.py`) changes thresholds and silences rules.
+`drive_rules` check many frames at a time. Each defect is reported by one rule only. For example, a frame with a wrong
+length is not also reported as lost, a timeout is not also reported as a counter jump, and a value outside its range is
+not also reported as missing in the value table. The rules file of a project (`project.py`) can change thresholds and
+silence rules.
 """
 
 from __future__ import annotations
@@ -16,11 +17,11 @@ Threshold = float | str | Mapping[str, float] | tuple[str, ...]
 
 @dataclass(frozen=True)
 class Rule:
-    """Rule: a property of frames or logs that the validator checks."""
+    """Rule of the validator: a property of frames or logs that must hold."""
 
     id: str
     meaning: str  # the violation, in one line
-    source: str  # DBC entry or standard that defines the correct value
+    source: str  # DBC attribute or standard that defines the correct value
     worst: str = ""  # unit of the worst value
     thresholds: Mapping[str, Threshold] = field(default_factory=dict)
 

@@ -1,4 +1,4 @@
-"""Check of a log or a live bus. It passes the frames to the validator and returns the report."""
+"""Check of a log or a live bus: pass all frames to the validator and return the report."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from atalante_tools.canlog.validate.project import Project
 from atalante_tools.canlog.validate.report import Report, report
 from atalante_tools.canlog.validate.validator import Validator
 
-#: Period of the checks on a live bus, and longest wait for a frame [s].
+#: `_CHECK_PERIOD` is the period of the checks on a live bus [s]. `_RECEIVE_TIMEOUT` is the longest wait for a frame [s].
 _CHECK_PERIOD, _RECEIVE_TIMEOUT = 0.5, 0.02
 _LIVE_FRAMES = 4096  # size of the receive buffer
 
@@ -40,8 +40,9 @@ def validate_log(
         path: file of the log.
         plan: compiled DBC.
         project: thresholds, silenced rules and channel names.
-        node: require only the messages of this node; None: of all nodes.
-        progress: called after each chunk with the share of the log that has been read, 0 to 1, and the frames so far.
+        node: report missing messages of this node only; None means all nodes.
+        progress: called after each chunk with the share of the log that has been read (0 to 1) and the number of
+            checked frames.
 
     Raises:
         LogError: If the file cannot be opened as a log.
@@ -56,9 +57,10 @@ def validate_log(
 
 
 def _read_ahead(log: Log) -> Iterator[tuple[Chunk, float]]:
-    """Yield the chunks of a log. Each comes with the share of the log that has been read, 0 to 1.
+    """Yield each chunk of a log together with the share of the log that has been read, 0 to 1.
 
-    A thread reads the next chunk while the caller checks the current one. numpy releases the interpreter lock in both.
+    A thread reads the next chunk while the caller checks the current chunk. Both threads spend most of their time in
+    numpy operations, which release the interpreter lock.
     """
     ready: queue.Queue[tuple[Chunk, float] | BaseException | None] = queue.Queue(maxsize=1)
     abandoned = threading.Event()
@@ -108,7 +110,8 @@ def listen(
 ) -> Report:
     """Check the frames of one or more open buses until `stopped` returns True. Send nothing.
 
-    The check continues when a lost link is back. Each channel with a lost link is a finding of the report.
+    After the loss of a link, the check continues when the link is back. The report contains a finding for each channel
+    that lost its link.
 
     Args:
         buses: open bus of each channel name.
@@ -116,13 +119,13 @@ def listen(
         project: thresholds, silenced rules and channel names.
         name: name of the report.
         stopped: function that is called in every iteration; True ends the loop.
-        node: require only the messages of this node; None: of all nodes.
-        lockstep: True: judge times in robot time, see `lock_step`; False: by the stamps of the bus.
-        progress: called after each check with the frames so far.
+        node: report missing messages of this node only; None means all nodes.
+        lockstep: whether the times are checked in robot time (see `lock_step`) instead of by the time stamps of the bus.
+        progress: called after each check with the number of checked frames.
         notice: called with a message when a link is lost or back.
 
     Raises:
-        ValueError: If lock-step time is requested and the DBC has no SYNC with a cycle number.
+        ValueError: If `lockstep` is True and no SYNC message in the DBC has a cycle number.
     """
     clock = LockStepClock(plan) if lockstep else None
     validator = Validator(plan, project, node=node)
@@ -180,13 +183,13 @@ def open_channels(interface: str, channels: str) -> dict[str, Bus]:
 
     Args:
         interface: interface of python-can.
-        channels: one channel, `can0`, or several with names, `left_leg=can0,right_leg=can1`.
+        channels: one channel such as `can0`, or several named channels such as `left_leg=can0,right_leg=can1`.
 
     Returns:
         Open buses by the name of the channel.
 
     Raises:
-        BusAbsent: If a channel cannot be opened; the channels that are already open are closed.
+        BusAbsent: If a channel cannot be opened. The other channels are then closed.
     """
     opened: dict[str, Bus] = {}
     try:

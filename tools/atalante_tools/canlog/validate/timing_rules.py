@@ -1,10 +1,12 @@
 """Rules for the time of frames and for lost frames: cycle time, gaps, timeouts, inhibit time, alive counter.
 
-Intervals and alive counters are checked together. A lost frame (counter-lost) is not also reported as late. A node may restart
-its counter after a timeout.
+The intervals and the alive counters are checked together, so that a lost frame (rule counter-lost) is not also reported
+as a late frame. After a timeout, a node may restart its alive counter.
 """
 
 from __future__ import annotations
+
+from functools import lru_cache
 
 import numpy as np
 import numpy.typing as npt
@@ -16,11 +18,12 @@ from atalante_tools.canlog.validate.e2e_rules import REPEATED, Steps
 from atalante_tools.canlog.validate.findings import Findings
 from atalante_tools.canlog.validate.project import Project
 
-#: Interval histogram: bins per cycle, and range in cycles. The last bin counts all longer intervals.
+#: The interval histogram of a message has `BINS_A_CYCLE` bins per cycle time, and covers intervals up to `CYCLES` cycle times.
+#: One more bin, the last one, counts all longer intervals.
 BINS_A_CYCLE, CYCLES = 100, 4
 BINS = BINS_A_CYCLE * CYCLES + 1
 _NEVER = -(1 << 62)
-#: Maximum number of counter gaps in the plot of the report.
+#: Maximum number of alive counter gaps that are stored for the plot in the report.
 _MAX_GAPS = 20_000
 
 
@@ -32,39 +35,44 @@ class TimingRules:
         count = len(plan.layouts)
         self._cycle = plan.cycle_ns.copy()
         self._inhibit = plan.inhibit_ns * project.number("inhibit", "share")
+        self._mean_intervals = project.number("cycle-mean", "min_intervals")
+        self._mean_tolerance = project.number("cycle-mean", "tolerance")
+        self._jitter_intervals = project.number("cycle-jitter", "min_intervals")
+        self._jitter_limit = project.number("cycle-jitter", "p99")
         default = project.number("timeout", "default_cycles") * plan.cycle_ns
         self._timeout = np.where(plan.cycle_ns > 0, np.where(plan.timeout_ns > 0, plan.timeout_ns, default), 0.0)
-        self._last = np.full(count, _NEVER, np.int64)  # time stamp of the last valid frame [ns], by row
-        self._arrived = np.full(count, _NEVER, np.int64)  # time stamp of the last valid or rejected frame [ns], by row
+        self._last = np.full(count, _NEVER, np.int64)  # time stamp of the last valid frame of each message [ns]
+        self._arrived = np.full(count, _NEVER, np.int64)  # time stamp of the last frame of each message [ns]
         self._first = np.full(count, _NEVER, np.int64)
         self._last_share = np.full(count, np.inf)
         self._last_steps = np.zeros(count, np.int64)
-        #: Histogram, number and sum [ns] of the intervals without lost frames, by message row.
+        #: Histogram of the intervals of each message, without the intervals in which a frame was lost.
         self.histogram = np.zeros((count, BINS), np.int64)
+        #: Number of intervals in the histogram of each message.
         self.intervals = np.zeros(count, np.int64)
-        self._sum = np.zeros(count)
-        #: Counter gaps for the plot: (time stamp of the frame after the gap [ns], row, number of lost frames).
+        self._sum = np.zeros(count)  # sum of these intervals [ns]
+        #: Counter gaps for the plot: (time stamp of the frame after the gap [ns], message index, lost frames).
         self.gaps: list[tuple[int, int, int]] = []
 
     def exclude(self, row: int) -> None:
-        """Exclude a message with several senders from the timing rules."""
+        """Exclude a message from the timing rules, because several senders send this message."""
         self._cycle[row] = self._timeout[row] = self._inhibit[row] = 0.0
 
     @property
     def checked(self) -> npt.NDArray[np.bool_]:
-        """Return the mask of the messages with a cycle time or inhibit time. Shape (rows,)."""
+        """Return the mask of the messages with a cycle time or inhibit time. Shape (messages,)."""
         checked: npt.NDArray[np.bool_] = (self._cycle > 0) | (self._inhibit > 0)
         return checked
 
     def seen(self, row: int) -> bool:
-        """Return whether at least one frame of the message was received, even if it was rejected."""
+        """Return whether at least one valid or rejected frame of the message was received."""
         return bool(self._arrived[row] != _NEVER)
 
     def arrived(self, rows: Rows, stamps: npt.NDArray[np.int64]) -> None:
         """Store the arrival times of rejected frames.
 
         Args:
-            rows: row of each frame, shape (k,).
+            rows: index of the message of each frame in the plan, shape (k,).
             stamps: time stamp of each frame [ns], shape (k,).
         """
         np.maximum.at(self._arrived, rows, stamps)
@@ -73,9 +81,10 @@ class TimingRules:
         """Check the intervals and alive counters in a chunk.
 
         Args:
-            stream: valid frames of the chunk by message, shape (n,).
+            stream: valid frames of the chunk, sorted by message, shape (n,).
             steps: result of `e2e_rules.Counters.steps`, shape (n,).
-            rejected_before: number of rejected frames before each valid frame, shape (n,); None: no frame was rejected.
+            rejected_before: number of rejected frames between the previous and this valid frame of the message, shape
+                (n,); None if no frame was rejected.
         """
         if not len(stream):
             return
@@ -101,7 +110,7 @@ class TimingRules:
     def _check_timeouts(
         self, stream: Stream, intervals: Steps, share: Vector, rejected_before: Steps | None
     ) -> npt.NDArray[np.intp]:
-        """Report the messages that returned after a timeout. Return the indices of their first frames after the timeout."""
+        """Report all timeouts that have ended, and return the index of the first frame after each timeout."""
         timeout = self._timeout[stream.present]
         shortest = float(timeout[timeout > 0].min(initial=np.inf))
         indices = np.flatnonzero(intervals > shortest)
@@ -186,10 +195,10 @@ class TimingRules:
         steps: Steps,
         rejected_before: Steps | None,
     ) -> None:
-        """Add the intervals without lost frames to the statistics of each message."""
+        """Add all intervals without lost frames to the interval statistics of the messages."""
         bins = np.minimum(np.maximum(share * BINS_A_CYCLE, 0.0), float(BINS - 1)).astype(np.int64)
         bins += (np.arange(len(stream.present)) * BINS).repeat(stream.stops - stream.starts)
-        # Intervals of a message without a counter (`NO_STEP`) are included.
+        # The statistics include the intervals of messages without an alive counter (`NO_STEP`).
         incomplete = (
             odd[steps[odd] >= REPEATED]
             if rejected_before is None
@@ -230,7 +239,7 @@ class TimingRules:
         Args:
             begin: first time stamp of the log [ns].
             end: last time stamp of the log [ns].
-            expected: mask of the messages that must be in the log, shape (rows,).
+            expected: mask of the messages that must be in the log, shape (messages,).
         """
         for row in np.flatnonzero(self._cycle > 0).tolist():
             if self.seen(row):
@@ -251,31 +260,40 @@ class TimingRules:
             return
         first, last = int(self._first[row]), int(self._last[row])
         mean = self._sum[row] / count
-        if count >= self._project.number("cycle-mean", "min_intervals"):
-            tolerance = self._project.number("cycle-mean", "tolerance")
-            # A wrong cycle time changes mean and median. A long gap changes only the mean, and another rule reports it.
-            if abs(mean / cycle - 1.0) > tolerance and abs(median(self.histogram[row]) - 1.0) > 0.5 * tolerance:
-                self._findings.add_whole("cycle-mean", row, first, last, shown=mean * 1e-6, count=count)
-        if count >= self._project.number("cycle-jitter", "min_intervals"):
+        # A wrong cycle time changes both the mean and the median.
+        # A long gap changes only the mean, and the rule cycle-gap reports this gap.
+        if (
+            count >= self._mean_intervals
+            and abs(mean / cycle - 1.0) > self._mean_tolerance
+            and abs(median(self.histogram[row]) - 1.0) > 0.5 * self._mean_tolerance
+        ):
+            self._findings.add_whole("cycle-mean", row, first, last, shown=mean * 1e-6, count=count)
+        if count >= self._jitter_intervals:
             jitter = jitter_p99(self.histogram[row])
-            if jitter > self._project.number("cycle-jitter", "p99"):
+            if jitter > self._jitter_limit:
                 self._findings.add_whole("cycle-jitter", row, first, last, shown=jitter * cycle * 1e-6, count=count)
 
     def mean_ms(self, row: int) -> float:
-        """Return the mean interval of a message [ms]."""
+        """Return the mean interval between consecutive frames of a message [ms]."""
         return float(self._sum[row] / max(1, self.intervals[row]) * 1e-6)
 
 
 def median(histogram: npt.NDArray[np.int64]) -> float:
-    """Return the median interval of a histogram of shape (BINS,), in cycles."""
+    """Return the median interval of a histogram, in cycle times. The histogram has the shape (BINS,)."""
     half = (int(histogram.sum()) + 1) // 2
     return (int(np.searchsorted(np.cumsum(histogram), half)) + 0.5) / BINS_A_CYCLE
 
 
 def jitter_p99(histogram: npt.NDArray[np.int64]) -> float:
-    """Return the jitter of a histogram of shape (BINS,): 99 % quantile of the deviation from the median interval, in cycles."""
+    """Return the 99 % quantile of the deviation from the median interval, in cycle times."""
     total = int(histogram.sum())
-    distance = np.abs(np.arange(len(histogram)) - int(median(histogram) * BINS_A_CYCLE))
-    order = np.argsort(distance, kind="stable")
+    distance, order = _by_distance(len(histogram), int(median(histogram) * BINS_A_CYCLE))
     reached = np.cumsum(histogram[order])
-    return float(distance[order][int(np.searchsorted(reached, 0.99 * total))]) / BINS_A_CYCLE
+    return float(distance[order[int(np.searchsorted(reached, 0.99 * total))]]) / BINS_A_CYCLE
+
+
+@lru_cache(maxsize=64)  # most messages have the same median
+def _by_distance(bins: int, middle: int) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.intp]]:
+    """Return the distance of each bin to the middle bin, and the bins in the order of this distance. Shape (bins,) each."""
+    distance = np.abs(np.arange(bins) - middle)
+    return distance, np.argsort(distance, kind="stable")

@@ -1,4 +1,4 @@
-"""Validator of one log. It checks each chunk of frames, and at the end of the log applies the rules about the whole log.
+"""Validator of one log, which checks each chunk of frames and finally applies the rules about the whole log.
 
 chunk -> headers (frame_rules) -> sort by message (stream) -> CRC, counters, time -> payloads by family -> values, motion, drives
 """
@@ -30,18 +30,18 @@ _ALL_BITS = 0x1FFF_FFFF
 
 
 class Validator:
-    """Validator of one log against one DBC. The findings are complete after `finish`."""
+    """Validator of one log against one DBC. The list of findings is complete after `finish`."""
 
     def __init__(
         self, plan: Plan, project: Project | None = None, *, node: str | None = None, keeps_flags: bool = True
     ) -> None:
-        """Create a validator that has not received any frames yet.
+        """Create a validator for a new log.
 
         Args:
-            plan: compiled DBC; several validators may share it.
-            project: thresholds, silenced rules and channel names; None: the default thresholds.
-            node: require only the messages of this node; None: of all nodes.
-            keeps_flags: whether the log has the flags of CAN FD frames.
+            plan: compiled DBC, which several validators may share.
+            project: thresholds, silenced rules and channel names; None means the default thresholds.
+            node: report missing messages of this node only; None means all nodes.
+            keeps_flags: whether the log format records the flags of CAN FD frames.
         """
         self.project = project or Project()
         self.plan = plan
@@ -59,11 +59,11 @@ class Validator:
         self.motion = MotionRules(self.plan, self.findings, self.project)
         self.drives = DriveRules(self.plan, self.findings, self.project)
         self._family_of = {row: family for family in self.plan.families for row in family.rows}
-        #: Number of rejected frames of each message since its last valid frame.
+        #: Number of rejected frames since the last valid frame, for each message.
         self._pending = np.zeros(len(self.plan.layouts), np.int64)
         self._groups = [row for row, m in enumerate(self.plan.layouts) if m.pgn_mask != _ALL_BITS]
         self._address: dict[int, int] = {}
-        #: Rows of J1939 messages with several sender addresses, which the timing rules do not check.
+        #: Indices of the J1939 messages that the timing rules do not check, because several sender addresses send them.
         self.shared: set[int] = set()
         self.frames = 0
         self.counts = np.zeros(len(self.plan.layouts) + len(self.plan.refused), np.int64)
@@ -76,7 +76,7 @@ class Validator:
 
         Args:
             chunk: next frames of the log.
-            channels: names of the channels of the log so far.
+            channels: names of the known channels of the log.
         """
         if not len(chunk):
             return
@@ -100,7 +100,7 @@ class Validator:
         self._check_payloads(stream, steps)
 
     def _check_crc(self, stream: Stream, sorted_frames: Sorted) -> tuple[Stream, tuple[Rows, npt.NDArray[np.intp]]]:
-        """Return the frames with a valid CRC, and the rows and indices of all rejected frames of the chunk."""
+        """Return the frames with a valid CRC, and the message indices and frame indices of all rejected frames."""
         refused = sorted_frames.rejected_rows, sorted_frames.rejected_indices
         intact = self._crc.check(stream)
         if intact is not None:
@@ -110,15 +110,16 @@ class Validator:
         return stream, refused
 
     def _rejected_before(self, stream: Stream, rows: Rows, indices: npt.NDArray[np.intp]) -> Steps | None:
-        """Count the rejected frames between consecutive valid frames of a message.
+        """Count the rejected frames between consecutive valid frames of the same message.
 
         Args:
-            stream: valid frames of the chunk, n of them.
-            rows: row of each rejected frame, shape (k,).
+            stream: n valid frames of the chunk.
+            rows: index of the message of each rejected frame in the plan, shape (k,).
             indices: index of each rejected frame in the chunk, shape (k,).
 
         Returns:
-            Number of rejected frames before each valid frame, shape (n,); None: no frame was rejected.
+            Number of rejected frames between the previous and this valid frame, shape (n,); None if no frame was
+            rejected.
         """
         if not len(rows) and not bool(self._pending.any()):
             return None
@@ -137,9 +138,9 @@ class Validator:
         return rejected_before
 
     def _find_shared(self, stream: Stream) -> None:
-        """Exclude J1939 parameter groups with several sender addresses from the timing rules.
+        """Exclude each J1939 parameter group with several sender addresses from the timing rules.
 
-        Each sender address has its own cycle.
+        Frames from different addresses are not synchronous, so the interval between them is not the cycle time.
         """
         for row in self._groups:
             can_ids = np.unique(stream.frames[stream.of(row)]["can_id"]).tolist()
@@ -177,9 +178,9 @@ class Validator:
         self.drives.finish()
 
     def expected(self) -> npt.NDArray[np.bool_]:
-        """Return the mask of the messages that must be in the log. Shape (rows,).
+        """Return the mask of the messages that must be in the log. Shape (messages,).
 
-        These are the messages of `node` on the recorded buses.
+        These messages are sent by `node` (None means any node) on the recorded buses.
         """
         count = len(self.plan.layouts)
         wanted = np.ones(count, np.bool_)

@@ -1,7 +1,7 @@
 """Rules for payloads: ranges, codes for "no value", value tables, reserved bits, multiplexers.
 
-The messages of a family are checked together. First, the smallest and largest raw code of each field are checked. Only if one of
-them is wrong, the field is checked value by value.
+Messages with equal fields (a message family) are checked together. First, the smallest and the largest raw code of each
+field are checked. If one of these codes is wrong, all values of the field are checked.
 """
 
 from __future__ import annotations
@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from functools import lru_cache
 
 import numpy as np
 import numpy.typing as npt
@@ -20,7 +21,7 @@ from atalante_tools.canlog.stream import Stream
 from atalante_tools.canlog.validate.findings import Findings
 from atalante_tools.canlog.validate.project import Project
 
-#: Longest field for which named values are stored as a lookup table [bit].
+#: Length of the longest field whose value table is stored as a lookup array [bit].
 _TABLE_BITS = 16
 _WORD = 64
 _HASH_BITS = 32
@@ -28,12 +29,12 @@ _HASH_BITS = 32
 
 @dataclass
 class Decoded:
-    """Raw codes of the frames of a family, with masks of the invalid values."""
+    """Raw codes of all fields in the frames of a message family, with masks of the invalid values."""
 
     family: Family
-    span: slice  # frames of the family in the stream
+    span: slice  # position of these frames in the stream
     raw: Words  # shape (fields, n)
-    bad: dict[int, Mask] = field(default_factory=dict)  # mask of the frames with an invalid value, by field index
+    bad: dict[int, Mask] = field(default_factory=dict)  # for each field index: mask of the frames with an invalid value
 
     @property
     def codes(self) -> npt.NDArray[np.int64]:
@@ -42,7 +43,7 @@ class Decoded:
 
 
 class ValueRules:
-    """Rules for the payloads of each family."""
+    """Rules for payloads, with the limits and tables of each message family."""
 
     def __init__(self, plan: Plan, findings: Findings, project: Project) -> None:
         self._findings = findings
@@ -54,7 +55,7 @@ class ValueRules:
         }
 
     def check(self, family: Family, stream: Stream) -> Decoded | None:
-        """Decode and check the frames of a family; return None if the chunk has no frame of the family."""
+        """Decode and check the frames of a message family; return None if the chunk has no such frame."""
         span = stream.span(family.rows)
         if span.start == span.stop or not family.codec.fields:
             return None
@@ -118,14 +119,17 @@ class ValueRules:
                 self._check_outside(decoded, stream, index, outside, decoded.codes[index].astype(np.float64))
 
     def _check_limit(self, checks: _FamilyChecks, decoded: Decoded, stream: Stream, index: int) -> None:
-        """Check a field with at least one raw code outside the range."""
+        """Check each value of a field in which at least one raw code is outside the range."""
         codec, codes = decoded.family.codec, decoded.codes[index]
         low, high = checks.bounds[index]
         outside = (codes < low) | (codes > high)
         self._check_outside(decoded, stream, index, outside, codec.values(decoded.raw, index).astype(np.float64))
 
     def _check_special(self, decoded: Decoded, stream: Stream, index: int) -> None:
-        """Check a float or 64-bit field by its physical value, because its raw codes are not ordered as int64."""
+        """Check the physical values of a float or 64-bit field.
+
+        The raw codes of such a field are not ordered like the values, so the codes cannot be compared with the range.
+        """
         values = decoded.family.codec.values(decoded.raw, index).astype(np.float64)
         limits = decoded.family.codec.fields[index]
         low = -math.inf if limits.minimum is None else limits.minimum
@@ -137,11 +141,14 @@ class ValueRules:
     def _check_outside(
         self, decoded: Decoded, stream: Stream, index: int, outside: Mask, values: npt.NDArray[np.float64]
     ) -> None:
-        """Report the values outside the range. The code for "no value" has its own rule. A value with a name is valid.
+        """Report all values outside the range of a field.
+
+        The code for "no value" is reported under the rule invalid-code instead of the rule range. A value in the value
+        table is valid, even outside the range.
 
         Args:
-            decoded: decoded frames of the family, in which invalid values are marked.
-            stream: frames of the chunk by message.
+            decoded: decoded frames of a message family, in which this method marks the invalid values.
+            stream: frames of the chunk, sorted by message.
             index: index of the field.
             outside: mask of the frames with a value outside the range, shape (n,).
             values: physical values of the field, shape (n,).
@@ -200,7 +207,7 @@ class ValueRules:
 
 
 class _FamilyChecks:
-    """Limits, lookup tables and bit masks for the payloads of a family, computed once."""
+    """Limits, lookup tables and bit masks for the payloads of a message family, computed once."""
 
     def __init__(self, codec: ColumnCodec, pattern: float, hash_signal: str) -> None:
         fields = list(enumerate(codec.fields))
@@ -210,7 +217,7 @@ class _FamilyChecks:
         self.limited = np.array(list(self.bounds), np.intp)
         self.low = np.array([low for low, _ in self.bounds.values()], np.int64)
         self.high = np.array([high for _, high in self.bounds.values()], np.int64)
-        #: Code for "no value" of each field without a range, by field index.
+        #: For each field that has no range, by field index: code for "no value".
         self.coded = {
             p: _as_signed(f, f.invalid_raw) for p, f in fields if f.invalid_raw is not None and (p, f) not in ranged
         }
@@ -226,13 +233,13 @@ class _FamilyChecks:
 
 
 def reserved_bits(layout: Layout) -> list[int]:
-    """Return the numbers of the payload bits without a signal; bit 0 is the least significant bit of byte 0."""
+    """Return the numbers of all payload bits that belong to no signal. Bit 0 is the least significant bit of byte 0."""
     used = {bit for f in layout.fields for bit in f.bits}
     return [bit for bit in range(8 * layout.length) if bit not in used]
 
 
 def is_limited(limits: Field) -> bool:
-    """Return whether a raw code of the field can be outside its range."""
+    """Return whether a field can have a raw code outside its DBC range."""
     if limits.minimum is None or limits.maximum is None or limits.factor == 0:
         return False
     if limits.kind == "float":
@@ -243,11 +250,15 @@ def is_limited(limits: Field) -> bool:
 
 
 def raw_bounds(limits: Field) -> tuple[int, int]:
-    """Return the smallest and largest raw code inside the range, with a tolerance for rounded decimals in the DBC."""
+    """Return the smallest and the largest raw code inside the DBC range, with a tolerance for rounded decimals."""
     assert limits.minimum is not None
     assert limits.maximum is not None
-    raw = sorted((x - limits.offset) / limits.factor for x in (limits.minimum, limits.maximum))
-    codes = raw_range(limits)
+    return _codes_within(limits.minimum, limits.maximum, limits.factor, limits.offset, raw_range(limits))
+
+
+@lru_cache(maxsize=4096)  # many signals of a DBC have equal limits
+def _codes_within(minimum: float, maximum: float, factor: float, offset: float, codes: range) -> tuple[int, int]:
+    raw = sorted((x - offset) / factor for x in (minimum, maximum))
     low, high = math.ceil(raw[0] - 1e-6), math.floor(raw[1] + 1e-6)
     return max(low, codes[0]), min(high, codes[-1])
 
@@ -255,9 +266,9 @@ def raw_bounds(limits: Field) -> tuple[int, int]:
 def is_enumeration(named: Field) -> bool:
     """Return whether the value table names all valid values of the field.
 
-    Some value tables name only a few special values of a number. With a range, the table must have names for both ends of the
-    range. Without a range, it must have at least two names, and one of them for 0. For a table with a name for every code, the
-    result is False, because no value can be wrong.
+    Some value tables name only a few special values of a number, so they do not restrict the other values. A table with
+    at least two names is considered complete if it names the minimum and the maximum of the range, or, for a field without
+    a range, if it names the value 0. If every raw code has a name, the result is False, because no value can be wrong.
     """
     if len(named.choices) < 2 or named.kind == "float" or named.factor != 1 or named.offset != 0:
         return False
@@ -269,7 +280,7 @@ def is_enumeration(named: Field) -> bool:
 
 
 def is_hash(field: Field, signal: str) -> bool:
-    """Return whether the field contains the DBC hash that a node reports.
+    """Return whether a field contains the DBC hash that a node reports.
 
     Args:
         field: field of a message.
@@ -289,7 +300,7 @@ def _table(named: Field) -> npt.NDArray[np.bool_] | Sequence[int]:
 
 
 def _as_signed(limits: Field, raw: int) -> int:
-    """Convert a raw code from unsigned bits to the signed integer in `Decoded.codes`."""
+    """Convert a raw code from an unsigned integer to the signed integer that `Decoded.codes` contains."""
     if limits.kind == "signed" and raw >> limits.length - 1:
         return raw - (1 << limits.length)
     return raw - (1 << _WORD) if raw >= 1 << _WORD - 1 else raw

@@ -1,12 +1,12 @@
 """Embedded robot in a subprocess. The physics of the robot runs in parallel with the HAL and the controller.
 
-    HAL <- SharedBus -> python -m atalante_tools.session.embedded: emulator -> body
+    HAL <-> SharedBus <-> emulator and body (python -m atalante_tools.session.embedded)
 
 The subprocess ("child") is a new Python interpreter in a separate process group. Ctrl-C therefore reaches only the parent. The
 loop of the parent ends in HOLD and then closes the bus. If one process ends, the other process detects it on the bus and ends.
 
 The two processes are assigned to different cores. Otherwise the scheduler of Linux puts both on one core, because they wait
-for each other, and both run several times slower.
+for each other. Then both run several times slower.
 """
 
 from __future__ import annotations
@@ -25,24 +25,27 @@ from atalante_hal.bus import BusDown
 from atalante_hal.bus.shared import SharedBus, descriptors
 from atalante_hal.closing import Closing
 from atalante_hal.robot import Robot
+from atalante_tools.console.options import PYBULLET
 from atalante_tools.console.outcome import Failed
 from atalante_tools.session.body import require_engine
 
 if TYPE_CHECKING:
     from atalante_emulator.faults import Fault
+    from atalante_emulator.mechanics import Mechanics
 
-#: Longest waits for the answer to a SYNC, for the creation of the robot, and for the end of the child [s].
+#: `_PATIENCE` is the timeout of the answer to a SYNC [s]. `_START` is the timeout of the creation of the robot [s].
+#: `_END` is the longest wait for the end of the child after the bus is closed [s].
 _PATIENCE, _START, _END = 2.0, 60.0, 5.0
 
 
 @dataclass(frozen=True)
 class SpawnConfig:
-    """Description of the robot that the child creates. The parent sends it to the stdin of the child."""
+    """Description from which the child process creates the robot. The parent process writes it to the stdin of the child."""
 
     network: Network
     robot: Robot
-    urdf: str
-    pose: Sequence[float] | None  # initial joint angles, shape (12,) [rad]. None: all zero.
+    mechanics: Mechanics
+    pose: Sequence[float] | None  # initial joint angles, shape (12,) [rad]. None means all zero.
     seed: int
     faults: Sequence[Fault]
 
@@ -50,22 +53,25 @@ class SpawnConfig:
 class EmbeddedRobot(Closing):
     """Subprocess with the embedded robot. As a context manager, it closes itself after the block.
 
-    Create it early: the child imports its modules while the parent prepares the run.
+    Create this object early, because the child then imports its modules while the parent prepares the run.
 
     Attributes:
-        bus: End of the HAL on the bus to the child.
+        bus: HAL side of the bus to the child.
     """
 
     _open: ClassVar[list[EmbeddedRobot]] = []
     _cores: ClassVar[set[int]] = set()  # processor cores of this thread before the first robot was opened
 
-    def __init__(self) -> None:
+    def __init__(self, engine: str = PYBULLET) -> None:
         """Start the child process.
 
+        Args:
+            engine: Name of the physics engine, the same as in the `SpawnConfig`.
+
         Raises:
-            Failed: If PyBullet is not installed.
+            Failed: If the engine is not installed.
         """
-        require_engine()
+        require_engine(engine)
         memory, parent_bell, child_bell = descriptors()
         self._child = subprocess.Popen(
             [sys.executable, "-P", "-m", "atalante_tools.session.embedded", str(memory), str(child_bell)],
@@ -126,7 +132,7 @@ class EmbeddedRobot(Closing):
             if not self._open:
                 os.sched_setaffinity(0, self._cores)
         if not self._begun:
-            self._child.kill()  # the child still imports its modules or waits for its `SpawnConfig`, so nothing is lost
+            self._child.kill()  # the child has not created the robot yet, so it can be ended at once
         try:
             self._child.wait(_END)
         except subprocess.TimeoutExpired:

@@ -12,7 +12,7 @@ import sys
 
 from atalante_hal.bus import BusDown
 from atalante_hal.bus.shared import SharedBus
-from atalante_tools.session.body import no_banner, open_described
+from atalante_tools.session.body import no_banner, open_mechanics
 from atalante_tools.session.embedded import SpawnConfig
 
 with no_banner():  # these imports are slow; they run while the parent prepares the run
@@ -27,10 +27,12 @@ def emulate(bus: SharedBus, config: SpawnConfig) -> None:
         bus: Bus to the HAL.
         config: Description of the robot to create.
     """
-    with open_described(config.urdf, config.pose) as body:
+    with open_mechanics(config.mechanics, config.pose) as body:
         emulator = Emulator(
-            config.network, config.robot, body, bus, seed=config.seed, operator=Operator(), faults=config.faults
-        )
+            config.network, config.robot, body, bus,
+            seed=config.seed, operator=Operator(), parameters=config.mechanics.node_parameters, faults=config.faults,
+        )  # fmt: skip
+        config.mechanics.complete(emulator)
         # All objects that exist now are needed until the end, so the garbage collector need not scan them.
         gc.collect()
         gc.freeze()

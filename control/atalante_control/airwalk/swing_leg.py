@@ -1,0 +1,48 @@
+"""Swing leg of the airwalk controller: `gait, gravity of the suspended exoskeleton -> Leg of the guides`."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from atalante_control.airwalk.config import AirwalkConfig
+from atalante_control.dynamics.gravity import Gravity
+from atalante_control.gait.gait import PERIOD, Gait, motion
+from atalante_control.gait.recentering import Deadbeat
+from atalante_control.guide.disturbance import Leg
+from atalante_control.joint.idealization import AssistedInertia
+from atalante_hal.robot import LEG_JOINTS
+
+_SH, _SK = LEG_JOINTS.index("SH"), LEG_JOINTS.index("SK")
+#: Number of cycles of the next step that the predictions of the guides cover.
+OVERLAP = 100
+
+
+def swing_leg(
+    config: AirwalkConfig, gait: Gait, inertia: AssistedInertia, gravity: Gravity, overlap: int = OVERLAP
+) -> Leg:
+    """Return the swing leg along the nominal trajectory of a step and of the first cycles of the next step.
+
+    Args:
+        config: end of the re-centring, and friction.
+        gait: right-stance step that repeats.
+        inertia: mass matrix of SH and SK.
+        gravity: gravity of the exoskeleton.
+        overlap: number of cycles of the next step.
+    """
+    cycles = gait.cycles
+    this = motion(gait.coefficients, gait.duration, np.arange(cycles + 1) / cycles)
+    after = motion(gait.mirrored().coefficients, gait.duration, np.arange(1, overlap + 1) / cycles)
+    q, qd, qdd = (np.concatenate(rows) for rows in zip(this, after, strict=True))
+    level = (1.0, 0.0, 0.0, 0.0)
+    weight = np.array([gravity.torque(pose, level).copy() for pose in q.copy()])
+    assisted = [_SH, _SK]
+    return Leg(
+        deadbeat=Deadbeat(gait.duration, config.alpha),
+        time=np.arange(cycles + 1 + overlap, dtype=np.float64) * PERIOD,
+        q=q[:, assisted],
+        qd=qd[:, assisted],
+        qdd=qdd[:, assisted],
+        gravity=weight[:, assisted],
+        inertia=inertia,
+        friction=config.friction,
+    )

@@ -1,0 +1,125 @@
+"""Gaits of a walk from standing to standing: start step, periodic step and stop step, in one object and in one file.
+
+`walk file -> WalkGaits`. The walking controller follows these gaits. The start step begins at rest, with the weight on the
+right foot. It ends with the angles and speeds at the end of the periodic step. The stop step begins with the angles and
+speeds at the start of the periodic step. It ends at rest, with the weight on the stance foot.
+"""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from atalante_control.gait.gait import (
+    POSITION_JUMP,
+    VELOCITY_JUMP,
+    Gait,
+    GaitError,
+    check_gait,
+    check_step,
+    gait_from,
+    gait_object,
+    motion,
+    read_object,
+    write_object,
+)
+from atalante_hal.robot import JOINTS, Robot
+from atalante_hal.types import Vector
+
+FORMAT = "atalante-walk/1"
+#: Walk of the default subject: 75 kg, 1.75 m, steps of 0.16 m in 0.8 s.
+DEFAULT_WALK = Path(__file__).parents[1] / "gaits" / "walk.json"
+
+
+class WalkGaits(NamedTuple):
+    """Right-stance steps of a walk. The mirrored steps are the left-stance steps."""
+
+    start: Gait  # begins at rest with the weight on the right foot, and ends as the periodic step ends
+    step: Gait  # periodic step
+    stop: Gait  # begins as the periodic step begins, and ends at rest with the weight on the stance foot
+
+    @property
+    def hash32(self) -> int:
+        """Return the identifier of the walk, equal to the identifier of the periodic step."""
+        return self.step.hash32
+
+
+def load_walk(path: Path, robot: Robot) -> WalkGaits:
+    """Read a walk file (JSON) and check it against the limits of the robot.
+
+    Required keys: `format` ("atalante-walk/1"), and `start`, `step` and `stop`, each an object with the keys of a gait file.
+
+    Args:
+        path: path of the walk file.
+        robot: limits of the joints.
+
+    Raises:
+        GaitError: If a key is unknown, missing or malformed, if the steps do not fit together, or if a step is beyond a limit of
+            the robot.
+    """
+    document = read_object(path)
+    keys = {"format", *WalkGaits._fields}
+    if set(document) != keys:
+        raise GaitError(f"{path}: the keys of a walk file must be {', '.join(sorted(keys))}, got {sorted(document)}")
+    if document["format"] != FORMAT:
+        raise GaitError(f"{path}: format must be {FORMAT!r}, got {document['format']!r:.80}")
+    gaits = []
+    for kind in WalkGaits._fields:
+        if not isinstance(document[kind], dict):
+            raise GaitError(f"{path}: {kind} must be an object, got {type(document[kind]).__name__}")
+        gaits.append(gait_from(document[kind], f"{path}: {kind}"))
+    walk = WalkGaits(*gaits)
+    check_walk(walk, robot, str(path))
+    return walk
+
+
+def write_walk(walk: WalkGaits, path: Path) -> None:
+    """Write a walk file atomically. `load_walk` returns the same numbers bit for bit.
+
+    Args:
+        walk: walk to write.
+        path: path of the file, replaced if it exists.
+    """
+    write_object({"format": FORMAT, **{kind: gait_object(gait) for kind, gait in walk._asdict().items()}}, path)
+
+
+def check_walk(walk: WalkGaits, robot: Robot, where: str = "walk") -> None:
+    """Raise `GaitError` if a step is invalid, or if the steps of a walk do not fit together.
+
+    Args:
+        walk: walk to check.
+        robot: limits of the joints.
+        where: start of the error message, for example the name of the file.
+
+    Raises:
+        GaitError: If the walk is rejected. The message states the step and the joint.
+    """
+    check_gait(walk.step, robot, f"{where}: step")
+    check_step(walk.start, robot, f"{where}: start")
+    check_step(walk.stop, robot, f"{where}: stop")
+    at_rest = np.zeros(len(JOINTS))
+    ends: dict[str, tuple[Gait, float]] = {"start": (walk.start, 1.0), "stop": (walk.stop, 0.0)}
+    for name, (gait, phase) in ends.items():
+        (q, qd), (q_step, qd_step) = _at(gait, phase), _at(walk.step, phase)
+        _compare(q, q_step, POSITION_JUMP, f"{where}: angle between {name} and step", math.degrees(1.0), "deg")
+        _compare(qd, qd_step, VELOCITY_JUMP, f"{where}: speed between {name} and step", 1.0, "rad/s")
+        resting = _at(gait, 1.0 - phase)[1]
+        _compare(resting, at_rest, VELOCITY_JUMP, f"{where}: speed at rest of {name}", 1.0, "rad/s")
+
+
+def _at(gait: Gait, phase: float) -> tuple[Vector, Vector]:
+    q, qd, _ = motion(gait.coefficients, gait.duration, np.array([phase]))
+    return q[0], qd[0]
+
+
+def _compare(one: Vector, other: Vector, limit: float, what: str, scale: float, unit: str) -> None:
+    jump = np.abs(one - other)
+    worst = int(jump.argmax())
+    if not jump[worst] <= limit:
+        raise GaitError(
+            f"{what} must differ by at most {scale * limit:.3g} {unit}, "
+            f"got {scale * jump[worst]:.3g} {unit} at {JOINTS[worst]}"
+        )

@@ -1,0 +1,52 @@
+"""Parameters of the virtual guides of a walk: gains, promise, and assumptions of the promise. `config -> step guides`."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+
+from atalante_control.guide.disturbance import HandOver, Mismatch
+from atalante_control.joint.idealization import Friction
+
+Pair = tuple[float, float]
+
+
+@dataclass(frozen=True)
+class StepGuideConfig:
+    """Parameters of the guide filters of all steps.
+
+    Raises:
+        ValueError: If a parameter is out of range.
+    """
+
+    friction: Friction = field(default_factory=Friction)
+    stiffness: Pair = (2800.0, 2900.0)  # Nm/rad, stiffness of SH and SK under the stiffest backup policy
+    #: stiffnesses of the softer backup policies as fractions of `stiffness`, ascending
+    gentler: tuple[float, ...] = (0.78,)
+    damping: Pair = (1.3, 0.85)  # damping ratios of the two modes of the backup policy
+    #: Nm, chosen promise: disturbance torques of SH and SK that the guide tolerates, if possible
+    promise: Pair = (30.0, 18.0)
+    mismatch: Mismatch = field(default_factory=Mismatch)
+    hand_over: HandOver = field(default_factory=HandOver)
+    torque_reserve: float = 14.0  # Nm, distance of the largest predicted torque from the torque limit of the robot
+    speed_reserve: float = 0.2  # rad/s, distance of the largest predicted speed from the velocity limit of the robot
+    zeta: float = 0.01  # s, gain of the derivative term lambda_d of the guide filter
+    idealization: float = 1.0  # intensity of u_i in [0, 1] while the gate of the guide is 0
+    feedforward: float = 1.0  # intensity of u_f in [0, 1] while the gate of the guide is 0
+    #: Counter value above which the controller reports that the leg has left the guide, if the guide has a promise. The counter
+    #: rises by 1 in each cycle with h < 0. In each other cycle it falls by 1, but not below 0.
+    outside_cycles: int = 150
+    active: float = 0.05  # weight of the backup torque above which the filter is considered active
+
+    def __post_init__(self) -> None:
+        for name in ("stiffness", "damping", "promise"):
+            if not all(math.isfinite(value) and value > 0.0 for value in getattr(self, name)):
+                raise ValueError(f"{name} must be two positive and finite numbers, got {getattr(self, name)!r}")
+        for name in ("torque_reserve", "speed_reserve"):
+            if not (math.isfinite(getattr(self, name)) and getattr(self, name) >= 0.0):
+                raise ValueError(f"{name} must be finite and at least 0, got {getattr(self, name)!r}")
+        for name in ("idealization", "feedforward"):
+            if not 0.0 <= getattr(self, name) <= 1.0:
+                raise ValueError(f"intensity of {name} must be between 0 and 1, got {getattr(self, name)!r}")
+        if list(self.gentler) != sorted(self.gentler) or not all(0.0 < part < 1.0 for part in self.gentler):
+            raise ValueError(f"gentler must be ascending fractions of stiffness in (0, 1), got {self.gentler!r}")

@@ -1,0 +1,216 @@
+r"""Disturbances of the assisted leg and their largest effect under the backup policy: `leg, mismatch, responses -> reach`.
+
+For each cycle of the step, this module bounds the torques at sagittal hip and knee (SH, SK) that the model does not explain. The
+bound is the sum of the promise (the disturbance torques of the certificate) and a budget. The budget is the sum of four torques:
+
+- a part of the friction torque, since the friction parameters may be wrong,
+- a part of the torque of inertia, gravity and velocity along the desired trajectory, since the inertia may be wrong,
+- the torque that is carried over the stance change, while it fades out,
+- a constant for errors that have no model: noise, lost frames, lag of the friction compensation, motion of the other joints.
+
+Each of these torques may have any sign in any cycle. The largest error that they cause is therefore a sum of absolute values,
+
+.. math:: D(k, n) = \sum_{i=k}^{n-1} \max_{M} |G(n - i) M^{-1}| \, p_i,
+
+with the response G to an acceleration that lasts one cycle, the bound p, and every mass matrix M that the leg can have in
+cycle i inside the guide. `spread` computes this sum for every start cycle k and every number n - k of cycles ahead.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+
+from atalante_control.gait.recentering import Deadbeat
+from atalante_control.joint.idealization import AssistedInertia, Friction
+from atalante_hal.types import Vector
+
+Pair = tuple[float, float]
+
+_POSTURES = 3  # number of knee angles for which the mass matrix is evaluated in each cycle
+
+
+@dataclass(frozen=True)
+class Mismatch:
+    """Largest errors of the model under which a promise holds.
+
+    Raises:
+        ValueError: If a value is out of range.
+    """
+
+    friction: float = 0.2  # largest error of the friction torque, as a fraction of this torque
+    inertia: float = 0.1  # largest error of mass and inertia of the leg, as a fraction; one factor for the whole leg
+    residual: Pair = (1.0, 1.0)  # Nm, torque errors of SH and SK that have no model
+
+    def __post_init__(self) -> None:
+        for name in ("friction", "inertia"):
+            if not 0.0 <= getattr(self, name) < 1.0:
+                raise ValueError(f"{name} of the mismatch must be a fraction in [0, 1), got {getattr(self, name)!r}")
+        if not all(0.0 <= value < math.inf for value in self.residual):
+            raise ValueError(f"residual of the mismatch must be finite and at least 0 Nm, got {self.residual!r}")
+
+
+@dataclass(frozen=True)
+class HandOver:
+    """Hand-over box: range of deviations at the start of a step within which a promise holds.
+
+    Raises:
+        ValueError: If a value is negative or not finite.
+    """
+
+    deviation: float = math.radians(2.7)  # rad, largest |s(0)| of SH and SK
+    rate: float = 0.25  # rad/s, largest |s'(0)| of SH and SK
+    torque: Pair = (25.0, 13.0)  # Nm, largest torques of SH and SK that are carried over the stance change
+    #: rad/s2, largest joint acceleration before the stance change. Due to this acceleration, the measured velocity differs from
+    #: the true velocity at the start of the step.
+    acceleration: float = 20.0
+
+    def __post_init__(self) -> None:
+        for name in ("deviation", "rate", "acceleration"):
+            if not 0.0 <= getattr(self, name) < math.inf:
+                raise ValueError(f"{name} of the hand-over must be finite and at least 0, got {getattr(self, name)!r}")
+        if not all(0.0 <= value < math.inf for value in self.torque):
+            raise ValueError(f"torque of the hand-over must be finite and at least 0 Nm, got {self.torque!r}")
+
+    def largest(self, values: Vector) -> Vector:
+        """Return the largest absolute value of the re-centring s, s' or s'' for all deviations in the box.
+
+        Args:
+            values: values of s, s' or s'' for s(0) = 1 rad (first row) and for s'(0) = 1 rad/s (second row), shape (2, n).
+
+        Returns:
+            Shape (n,). s is linear in the deviations, so a corner of the box is the worst case.
+        """
+        return np.asarray(np.abs(values).T @ [self.deviation, self.rate])
+
+
+class Leg(NamedTuple):
+    """Swing leg along the nominal trajectory. The rows are cycles, to the end of the overlap; the columns are SH and SK."""
+
+    deadbeat: Deadbeat  # re-centring of the gait
+    time: Vector  # (n,) s, since the stance change
+    q: Vector  # (n, 2) rad, nominal angles
+    qd: Vector  # (n, 2) rad/s, nominal velocities
+    qdd: Vector  # (n, 2) rad/s2, nominal accelerations
+    gravity: Vector  # (n, 2) Nm, u_g
+    inertia: AssistedInertia  # mass matrix of SH and SK
+    friction: Friction  # friction parameters
+
+    def masses(self, knee: Vector) -> Vector:
+        """Return the mass matrix at knee angles of any shape, shape (..., 2, 2) [kg m2].
+
+        Args:
+            knee: angles of SK [rad].
+        """
+        basis = np.stack([np.ones_like(knee), np.cos(knee), np.sin(knee)], axis=-1)
+        return np.asarray((basis @ self.inertia.fit.T)[..., [[0, 1], [1, 2]]])
+
+    def velocity_torque(self) -> Vector:
+        """Return the centrifugal and Coriolis torques along the nominal trajectory, shape (n, 2) [Nm]."""
+        rows = zip(self.q[:, 1].tolist(), *self.qd.T.tolist(), strict=True)
+        return np.array([self.inertia.velocity_torques(*row) for row in rows])
+
+    def friction_torque(self, margin: float = 0.0) -> Vector:
+        """Return the friction torque along the nominal trajectory, shape (n, 2) [Nm].
+
+        Args:
+            margin: speed that is added to the absolute value of the velocity [rad/s]; the result is then an absolute value.
+        """
+        speed = np.abs(self.qd) + margin if margin else self.qd
+        coulomb, viscous = (np.array(row[2:4]) for row in (self.friction.coulomb, self.friction.viscous))
+        return np.asarray(coulomb * np.tanh(speed / self.friction.smoothing) + viscous * speed)
+
+    def torque(self) -> Vector:
+        """Return the torque of gravity, velocity and acceleration along the nominal trajectory, shape (n, 2) [Nm]."""
+        needed = np.einsum("nij,nj->ni", self.masses(self.q[:, 1]), self.qdd)
+        return np.asarray(needed + self.velocity_torque() + self.gravity)
+
+    def mobilities(self, hand_over: HandOver, width: float) -> Vector:
+        """Return the inverse mass matrices that are possible inside the guide, shape (n, postures, 2, 2) [1/(kg m2)].
+
+        Args:
+            hand_over: largest deviations at the start of a step.
+            width: largest distance of SK from the desired trajectory [rad].
+        """
+        moved = width + hand_over.largest(self.deadbeat.basis(self.time)[0])
+        knee = self.q[:, 1, None] + moved[:, None] * np.linspace(-1.0, 1.0, _POSTURES)
+        inverse: Vector = np.linalg.inv(self.masses(knee)).astype(np.float64)
+        return inverse
+
+    def budget(self, mismatch: Mismatch, hand_over: HandOver, blend: Vector) -> Vector:
+        """Return the largest torque error of the model in each cycle, shape (n, 2) [Nm], as the module docstring describes.
+
+        Args:
+            mismatch: errors of the model.
+            hand_over: largest deviations at the start of a step.
+            blend: factor of the torque that is carried over the stance change, in each cycle since then, shape (m,).
+        """
+        moved = hand_over.largest(self.deadbeat.basis(self.time)[2])
+        needed = np.abs(self.torque()) + np.abs(self.masses(self.q[:, 1])).sum(axis=2) * moved[:, None]
+        friction = self.friction_torque(_SPEED_MARGIN)
+        total: Vector = mismatch.inertia * needed + mismatch.friction * friction + mismatch.residual
+        total[: len(blend)] += np.outer(blend, hand_over.torque)
+        return total
+
+
+#: The bound of the friction error covers joint speeds up to the nominal speed plus this margin [rad/s].
+_SPEED_MARGIN = 1.0
+
+
+class Effect(NamedTuple):
+    """Effect of a disturbance on two outputs, one of SH and one of SK. An output is an error, a torque or a speed."""
+
+    #: (lags + 1, 2, 2) response to an acceleration that lasts one cycle, for each number of cycles ahead.
+    pushed: Vector
+    #: (lags + 1, 2, 2) response to an acceleration at the start of a prediction. The measured velocity lags behind the true
+    #: velocity and does not contain the effect of this acceleration yet, so the prediction starts with a wrong velocity.
+    #: Shape (0, 2, 2): this response is left out.
+    hidden: Vector
+    #: (n, 2, 2) matrix for each cycle of the step. The output is this matrix times the response.
+    left: Vector
+
+
+def spread(effect: Effect, mobilities: Vector, bounds: Vector, starts: int, lags: int) -> Vector:
+    """Return the largest output that disturbances can cause, for every start cycle and every number of cycles ahead.
+
+    Args:
+        effect: effect of a disturbance on the outputs.
+        mobilities: inverse mass matrices of each cycle, shape (n, postures, 2, 2).
+        bounds: torque bounds of SH and SK (rows), budget and chosen promise (columns), in each cycle, shape (n, 2, 2) [Nm].
+        starts: number of start cycles; a disturbance begins in one of the cycles 0 to starts - 1.
+        lags: largest number of cycles ahead.
+
+    Returns:
+        Shape (starts, lags + 1, 4). Columns 0 and 1 are the sums of the absolute effects of the budget on the two outputs,
+        columns 2 and 3 those of the chosen promise. A sum is zero where the predicted cycle is past the end of `bounds`.
+    """
+    count, postures = len(bounds), mobilities.shape[1]
+    total, result = np.zeros((count, 4)), np.zeros((starts, lags + 1, 4))
+    both = np.zeros((2, 2, 2))  # the responses `pushed` and `hidden` after `lag` cycles
+    for lag in range(min(lags, count - 1) + 1):
+        both[0] = effect.pushed[lag]
+        if len(effect.hidden):
+            both[1] = effect.hidden[lag]
+        for start in range(count - lag):
+            end = start + lag
+            for r in range(2):
+                h, k = effect.left[end, r, 0], effect.left[end, r, 1]
+                for i in range(2 if start < starts else 1):
+                    on_hip, on_knee = h * both[i, 0, 0] + k * both[i, 1, 0], h * both[i, 0, 1] + k * both[i, 1, 1]
+                    # The largest effects of the start cycle. A call of another function here would take five times longer.
+                    budget = promise = 0.0
+                    for m in range(postures):
+                        hip = abs(on_hip * mobilities[start, m, 0, 0] + on_knee * mobilities[start, m, 1, 0])
+                        knee = abs(on_hip * mobilities[start, m, 0, 1] + on_knee * mobilities[start, m, 1, 1])
+                        budget = max(budget, hip * bounds[start, 0, 0] + knee * bounds[start, 1, 0])
+                        promise = max(promise, hip * bounds[start, 0, 1] + knee * bounds[start, 1, 1])
+                    if i == 0:
+                        total[end, r] += budget
+                        total[end, r + 2] += promise
+                    else:
+                        result[start, lag, r] = total[end, r] + budget
+                        result[start, lag, r + 2] = total[end, r + 2] + promise
+    return result

@@ -1,0 +1,187 @@
+"""Assistive torque computed literally as the paper prints it: `measured motion -> u_a = u_i + u_f + u_v` of SH and SK.
+
+This law is for comparisons with the paper. Its guides have no promise: no disturbance is certified to keep the joints inside.
+Each joint is treated as a separate inertia, J q'' = u_v + u_f + u_ext. The backup torque u_b is the PD part of the baseline PID.
+In each cycle the motion under u_b is integrated to the end of the step twice, for both constant extremes of u_ext. With the
+smallest h of both predictions,
+
+    lambda = (1 + (Xi^10 - 1) h)^3,   lambda_d = -zeta dh/dt,   u_v = (lambda + (1 - lambda) lambda_d) u_b.
+
+lambda is 1 for h < 0, where the paper defines no torque. Beyond this, neither lambda nor lambda_d is limited or filtered.
+`docs/reference/paper.md` lists what the coupled filter does instead, and why.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Annotated, NamedTuple
+
+import numpy as np
+
+from atalante_control.gait.gait import PERIOD
+from atalante_control.guide.certificate import Certificate
+from atalante_control.guide.disturbance import Leg
+from atalante_control.guide.kernel import Guard, LegState
+from atalante_control.guide.shapes import GuideShape
+from atalante_control.joint.pid import LegGains
+from atalante_control.structured import Records, zeros
+from atalante_hal.robot import LEG_JOINTS
+from atalante_hal.types import Vector
+
+Pair = tuple[float, float]
+
+_ASSISTED = [LEG_JOINTS.index("SH"), LEG_JOINTS.index("SK")]
+
+
+class Letter:
+    """Constants and state of the literal law. Each pair has a value for SH and a value for SK."""
+
+    kp: Annotated[Vector, 2]  # Nm/rad
+    kd: Annotated[Vector, 2]  # Nm s/rad
+    inertia: Annotated[Vector, 2]  # kg m2, J
+    coulomb: Annotated[Vector, 2]  # Nm, k_d
+    viscous: Annotated[Vector, 2]  # Nm s/rad, k_v
+    push: Annotated[Vector, 2]  # Nm, largest absolute value of u_ext
+    zeta: float  # s, gain of lambda_d
+    idealization: float  # intensity of u_i
+    feedforward: float  # intensity of u_f
+    xi: float  # assistance factor of the step
+    fresh: bool  # true before the first cycle of a step
+    h: Annotated[Vector, 2]  # h of the last cycle
+
+
+class LiteralTables(NamedTuple):
+    """Tables of the literal law. `LiteralGuide` owns them; `assistive_torque` writes to `letters` only."""
+
+    letters: Records[Letter]  # (1,)
+    step: Vector  # (cycles + 1, 8) values of each cycle of the step, columns below
+
+
+BOUND = 0  # columns 0 to 3 of `step`: distances to the upper and lower bound of SH, then of SK [rad]
+REFERENCE = 4  # columns 4 and 5: q_des'' of SH and SK [rad/s2]
+FEEDFORWARD = 6  # columns 6 and 7: u_f of SH and SK at full intensity [Nm]
+
+
+@dataclass(frozen=True)
+class LiteralConfig:
+    """Parameters of the literal law."""
+
+    gains: LegGains  # gains of the baseline PID of the swing leg
+    push: Pair  # Nm, largest absolute value of u_ext of SH and SK
+    zeta: float  # s, gain of lambda_d
+    idealization: float  # intensity of u_i, in [0, 1]
+    feedforward: float  # intensity of u_f, in [0, 1]
+
+
+class LiteralGuide:
+    """Literal law for one gait and one shape. Call `start_step` at each stance change.
+
+    Attributes:
+        tables: tables of `assistive_torque`.
+    """
+
+    def __init__(self, config: LiteralConfig, shape: GuideShape, leg: Leg, feedforward: Vector) -> None:
+        """Compute the tables that are the same in every step.
+
+        Args:
+            config: parameters.
+            shape: shape of the guide.
+            leg: swing leg along the nominal trajectory; the cycles after the step are ignored.
+            feedforward: u_f of SH and SK in each cycle of the step, shape (cycles + 1, 2) [Nm].
+        """
+        count = len(feedforward)
+        self._shape, self._phase = shape, np.arange(count) / (count - 1)
+        self._nominal: Vector = leg.qdd[:count]
+        self._basis = leg.deadbeat.basis(leg.time[:count])[2][:, :, None]
+        self.tables = LiteralTables(zeros(Letter, 1), np.zeros((count, 8)))
+        self.tables.step[:, FEEDFORWARD:] = config.feedforward * feedforward
+        letter, gains, friction = self.tables.letters[0], config.gains, leg.friction
+        letter.kp[:], letter.kd[:] = ([row[i] for i in _ASSISTED] for row in (gains.kp, gains.kd))
+        letter.coulomb[:], letter.viscous[:] = (
+            [row[i] for i in _ASSISTED] for row in (friction.coulomb, friction.viscous)
+        )
+        letter.inertia[:], letter.push[:], letter.zeta = leg.inertia.inertias, config.push, config.zeta
+        letter.idealization = config.idealization
+        self.start_step(0.0, (0.0, 0.0), (0.0, 0.0))
+
+    def start_step(self, xi: float, deviation: Pair, rate: Pair) -> None:
+        """Start a step: compute guide and reference.
+
+        Args:
+            xi: assistance factor of the whole step.
+            deviation: deviations s(0) of SH and SK at the stance change [rad].
+            rate: deviations s'(0) of SH and SK at the stance change [rad/s].
+        """
+        letter, step = self.tables.letters[0], self.tables.step
+        step[:, BOUND : BOUND + 4] = self._shape.bounds(self._phase, xi).transpose(1, 0, 2).reshape(-1, 4)
+        moved = self._basis[0] * np.array(deviation) + self._basis[1] * np.array(rate)
+        step[:, REFERENCE : REFERENCE + 2] = self._nominal + moved
+        letter.xi, letter.fresh = xi, True
+
+
+def no_promise(shape: str, xi: float) -> Certificate:
+    """Return the certificate of a guide under the literal law, which states that there is no promise.
+
+    Args:
+        shape: name of the shape.
+        xi: assistance factor in [0, 1).
+    """
+    reason = "no promise: the paper's literal law controls each joint by itself, but hip and knee are coupled"
+    return Certificate(shape, xi, False, reason, None, None, -math.inf)
+
+
+def assistive_torque(tables: LiteralTables, guard: Guard, cycle: int, leg: LegState, rates: Pair) -> Pair:
+    """Compute the assistive torque u_a = u_i + u_f + u_v of SH and SK for one cycle [Nm].
+
+    Args:
+        tables: tables of the literal law.
+        guard: record of the guide filter. The smaller h, the larger gate and the guide are written to it, for the telemetry.
+        cycle: cycles since the stance change. A number above the length of the step is replaced by this length.
+        leg: measurements of the swing leg.
+        rates: q_des' of SH and SK [rad/s].
+    """
+    letter, step = tables.letters[0], tables.step
+    now = step[min(cycle, len(step) - 1)]
+    hip_h, hip_gate, hip = _guide_torque(tables, cycle, 0, leg.hip - leg.hip_desired, leg.hip_rate - rates[0])
+    knee_h, knee_gate, knee = _guide_torque(tables, cycle, 1, leg.knee - leg.knee_desired, leg.knee_rate - rates[1])
+    letter.fresh = False
+    guard.h, guard.gate = min(hip_h, knee_h), max(hip_gate, knee_gate)
+    for side in range(4):
+        guard.bounds[side] = now[BOUND + side]
+    return (
+        hip + now[FEEDFORWARD] + letter.idealization * (_friction(letter, 0, leg.hip_rate) + leg.hip_gravity),
+        knee + now[FEEDFORWARD + 1] + letter.idealization * (_friction(letter, 1, leg.knee_rate) + leg.knee_gravity),
+    )
+
+
+def _guide_torque(tables: LiteralTables, cycle: int, joint: int, e: float, rate: float) -> tuple[float, float, float]:
+    """Return h, the gate and u_v [Nm] of a joint."""
+    letter = tables.letters[0]
+    ratio = max(_largest_ratio(tables, cycle, joint, e, rate, 1.0), _largest_ratio(tables, cycle, joint, e, rate, -1.0))
+    h = 1.0 - ratio * ratio
+    slope = 0.0 if letter.fresh else (h - letter.h[joint]) / PERIOD
+    letter.h[joint] = h
+    weight = (1.0 + (letter.xi**10 - 1.0) * max(h, 0.0)) ** 3
+    gate = weight + (1.0 - weight) * -letter.zeta * slope
+    return h, gate, gate * (-letter.kp[joint] * e - letter.kd[joint] * rate)
+
+
+def _largest_ratio(tables: LiteralTables, cycle: int, joint: int, e: float, rate: float, side: float) -> float:
+    """Return the largest |e| / q_bound under the backup policy to the end of the step, with u_ext = `side` times the push."""
+    letter, step = tables.letters[0], tables.step
+    kp, kd, inertia = letter.kp[joint], letter.kd[joint], letter.inertia[joint]
+    push, worst = side * letter.push[joint], 0.0
+    for at in range(min(cycle, len(step) - 1), len(step)):
+        now = step[at]
+        worst = max(worst, e / now[BOUND + 2 * joint], -e / now[BOUND + 2 * joint + 1])
+        torque = now[FEEDFORWARD + joint] + push - kp * e - kd * rate
+        rate += PERIOD * (torque / inertia - now[REFERENCE + joint])
+        e += PERIOD * rate
+    return worst
+
+
+def _friction(letter: Letter, joint: int, rate: float) -> float:
+    """Return k_d sign(q') + k_v q' [Nm]."""
+    sign = math.copysign(1.0, rate) if rate != 0.0 else 0.0
+    return float(letter.coulomb[joint] * sign + letter.viscous[joint] * rate)

@@ -1,0 +1,207 @@
+"""Tables of the prediction under the backup policy, for one set of gains and one gait. All guide shapes share the tables.
+
+`leg, backup policy, mismatch -> rows of the predicted errors, largest effect of the disturbances`. The guide filter and the
+certificate use the tables.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from dataclasses import dataclass, field
+from typing import NamedTuple
+
+import numpy as np
+
+from atalante_control.guide.backup_policy import STATES, BackupPolicy, SampledLoop, responses
+from atalante_control.guide.disturbance import Effect, HandOver, Leg, Mismatch, spread
+from atalante_control.guide.kernel import COMPRESSED, SLACK_CYCLES, START_CYCLES
+from atalante_hal.compiled import compiled
+from atalante_hal.types import Vector
+
+Pair = tuple[float, float]
+
+#: Numbers of cycles ahead at which torque and speed are predicted.
+FEW = np.array([1, 2, 3, 4, 6, 8, 11, 15, 20, 27, 36, 48, 64, 85, 113, 150, 200, 250, 300])
+#: Typical magnitude of each element of the state, which is its weight in the compression of the state.
+SIZES = np.repeat([0.07, 1.0, 1.0, 140.0, 140.0], 2)
+
+
+@dataclass(frozen=True)
+class Assumptions:
+    """Assumptions of a promise: chosen torques, time behaviour of the drives, model errors, deviations at the stance change."""
+
+    #: Nm, promised disturbance: largest torques at SH and SK under which the joints must stay inside the guide
+    promise: Pair = (30.0, 18.0)
+    loop: SampledLoop = field(default_factory=SampledLoop)
+    mismatch: Mismatch = field(default_factory=Mismatch)
+    hand_over: HandOver = field(default_factory=HandOver)
+    #: Smallest and largest number of cycles between a measurement and the torque that is computed from it.
+    delays: tuple[int, int] = (1, 2)
+    horizon: int = 300  # number of predicted cycles
+    overlap: int = 100  # number of cycles after the end of a step that the tables cover
+
+    def __post_init__(self) -> None:
+        """Check the ranges of the values.
+
+        Raises:
+            ValueError: If a value is out of range.
+        """
+        if not all(0.0 < torque < np.inf for torque in self.promise):
+            raise ValueError(f"promise must be positive and finite [Nm], got {self.promise!r}")
+        if not 1 <= self.delays[0] <= self.delays[1]:
+            raise ValueError(f"delays must be two ascending numbers of cycles, each at least 1, got {self.delays!r}")
+
+
+class StartReach(NamedTuple):
+    """Largest effect of the disturbances since the start of a step.
+
+    The columns are the effect of the budget on SH and SK, then the effect of the chosen promise on SH and SK.
+    """
+
+    error: Vector  # (n, 4) rad
+    torque: Vector  # (n, 4) Nm
+    speed: Vector  # (n, 4) rad/s
+    worst_speed: Vector  # (n, 4) rad/s, for the worst errors of inertia and delay
+    change: Vector  # (n, 4) Nm, change of the backup torque within one cycle
+
+
+class Prediction:
+    """Tables of the prediction under the backup policy.
+
+    Attributes:
+        policy: gains of the backup policy.
+        leg: swing leg along the nominal trajectory.
+        assumptions: assumptions of the promise for which the tables are computed.
+        cycles: number of cycles of a step.
+        nominal: responses of the loop without model errors.
+        compress: matrix from the state to the compressed state, shape (COMPRESSED, STATES).
+        ahead: matrices from the compressed state to the predicted errors e of SH and SK, shape (lags, 2, COMPRESSED).
+        beyond: matrix from the state to the errors one cycle beyond the horizon, shape (2, STATES).
+        slack: largest change of the predicted errors by model errors, per unit of each element of `Guard.magnitude`, for each
+            block of `SLACK_CYCLES` cycles ahead, shape (blocks, 2, STATES).
+        reach: `GuideTables.reach`.
+        few_ahead: matrices from the state to the predicted feedback [rad/s2] of SH and SK and the predicted e' [rad/s] of SH and
+            SK, `FEW` cycles ahead, shape (rows, 4, STATES).
+        few_reach: `GuideTables.few_reach`.
+        few_slack: largest change of e' ahead by model errors, per unit of each element of `Guard.magnitude`, shape
+            (rows, 2, STATES).
+        start: largest effect of the disturbances since the start of a step.
+        torque: torque that the leg needs along the nominal trajectory, shape (n, 2) [Nm].
+        mass: mass matrix along the nominal trajectory, shape (n, 2, 2) [kg m2].
+    """
+
+    def __init__(self, policy: BackupPolicy, leg: Leg, assumptions: Assumptions, blend: Vector, width: float) -> None:
+        """Compute the tables.
+
+        Args:
+            policy: gains of the backup policy.
+            leg: swing leg along the nominal trajectory, to the end of the overlap.
+            assumptions: assumptions of the promise for which the tables are computed.
+            blend: factor of the torque that is carried over the stance change, in each cycle since then, shape (m,).
+            width: largest width of the guides for which the tables are used [rad].
+        """
+        self.policy, self.leg, self.assumptions = policy, leg, assumptions
+        last = len(leg.time) - 1
+        self.cycles = last - assumptions.overlap
+        horizon, hand_over = assumptions.horizon, assumptions.hand_over
+        self.nominal = nominal = responses(policy, assumptions.loop, 1.0, last)
+        rows = nominal.error[: horizon + 1]
+        _, _, basis = np.linalg.svd((rows * SIZES).reshape(-1, STATES), full_matrices=False)
+        self.compress: Vector = np.ascontiguousarray(basis[:COMPRESSED] / SIZES)
+        self.ahead: Vector = np.ascontiguousarray((rows * SIZES) @ basis[:COMPRESSED].T)
+
+        self.beyond: Vector = nominal.error[horizon + 1]
+        deviation = assumptions.mismatch.inertia
+        family = [
+            responses(policy, assumptions.loop, 1.0 / (1.0 + sign * deviation), last, delay)
+            for delay in sorted({*assumptions.delays})
+            for sign in (-1.0, 1.0)
+        ]
+        lightest = family[0]
+        changes = [_separated(one.error[: horizon + 1] - self.ahead @ self.compress) for one in family]
+        self.slack = _blocks(np.abs(changes).max(axis=0), SLACK_CYCLES)
+
+        mobilities = leg.mobilities(hand_over, width)
+        budget = leg.budget(assumptions.mismatch, hand_over, blend)
+        bounds = np.stack([budget, np.broadcast_to(assumptions.promise, budget.shape)], axis=2)
+        self.mass = leg.masses(leg.q[:, 1])
+        self.torque = leg.torque() + leg.friction_torque()
+        same = np.broadcast_to(np.eye(2), self.mass.shape).copy()
+        nothing = np.zeros((0, 2, 2))
+        run = compiled(spread)
+
+        def ahead(effect: Effect) -> Vector:
+            return np.asarray(run(effect, mobilities, bounds, self.cycles + 1, horizon))
+
+        def start(effect: Effect) -> Vector:
+            return np.asarray(run(effect, mobilities, bounds, 1, last)[0])
+
+        lag = assumptions.loop.velocity_lag
+        errors, first = [], []
+        for one in family:
+            late = np.ascontiguousarray(one.error[:, :, 2:4])
+            errors.append(ahead(Effect(one.pushed_error, lag * late, same)))
+            first.append(start(Effect(one.pushed_error, nothing, same)))
+            first[-1][:, :2] += np.abs(late).sum(axis=2) * lag * hand_over.acceleration
+        self.reach = _blocks(np.max(errors, axis=0), START_CYCLES)
+        torque, speed = Effect(nominal.pushed_feedback, nothing, self.mass), Effect(nominal.pushed_rate, nothing, same)
+        # A leg that is lighter than the model, or a later command, makes the joints faster.
+        late_rates = [np.ascontiguousarray(one.rate[:, :, 2:4]) for one in family]
+        pushed = [
+            ahead(Effect(one.pushed_rate, lag * late, same)) for one, late in zip(family, late_rates, strict=True)
+        ]
+        worst_ahead = np.max(pushed, axis=0)[:, FEW]
+        few = np.stack([ahead(torque)[:, FEW], ahead(speed)[:, FEW]], axis=2)  # (starts, rows, kind, joint and bound)
+        by_bound = few.reshape(*few.shape[:3], 2, 2).swapaxes(2, 3)
+        by_kind = [by_bound.reshape(*few.shape[:2], 8), worst_ahead]
+        self.few_reach = _blocks(np.concatenate(by_kind, axis=2), START_CYCLES)
+        self.few_ahead: Vector = np.concatenate([nominal.feedback[FEW], nominal.rate[FEW]], axis=1)
+        worst_speed = np.max([start(Effect(one.pushed_rate, nothing, same)) for one in family], axis=0)
+        torque_reach, speed_reach = start(torque), start(speed)
+        rates = [_separated(one.rate[FEW] - nominal.rate[FEW]) for one in family]
+        self.few_slack: Vector = np.abs(rates).max(axis=0)
+        change = np.diff(lightest.pushed_feedback, axis=0, prepend=0.0)
+        # The torque that is carried over the stance change varies slowly, so it is left out of the change within one cycle.
+        bounds[:, :, 0] = leg.budget(assumptions.mismatch, hand_over, np.zeros(0))
+        changes_of_torque = start(Effect(change, nothing, self.mass))
+        self.start = StartReach(np.max(first, axis=0), torque_reach, speed_reach, worst_speed, changes_of_torque)
+
+
+#: Cached tables of the last gaits and gains, ordered from the earliest to the latest use.
+_kept: dict[bytes, Prediction] = {}
+_MOST_KEPT = 8
+
+
+def prediction_of(policy: BackupPolicy, leg: Leg, assumptions: Assumptions, blend: Vector, width: float) -> Prediction:
+    """Return the tables of `Prediction`. The last tables are cached, because all guide shapes of a gait share them.
+
+    Args:
+        policy: gains of the backup policy.
+        leg: swing leg along the nominal trajectory, to the end of the overlap.
+        assumptions: assumptions of the promise for which the tables are computed.
+        blend: factor of the torque that is carried over the stance change, in each cycle since then, shape (m,).
+        width: largest width of the guides for which the tables are used [rad].
+    """
+    parts = [leg.time, leg.q, leg.qd, leg.qdd, leg.gravity, leg.inertia.fit, blend]
+    content = hashlib.sha256(repr((policy, assumptions, leg.deadbeat, leg.friction, width)).encode())
+    for part in parts:
+        content.update(np.ascontiguousarray(part).tobytes())
+    key = content.digest()
+    tables = _kept.pop(key) if key in _kept else Prediction(policy, leg, assumptions, blend, width)
+    _kept[key] = tables
+    if len(_kept) > _MOST_KEPT:
+        del _kept[next(iter(_kept))]
+    return tables
+
+
+def _separated(rows: Vector) -> Vector:
+    """Return the rows for a state in which the true velocity is replaced by the difference (true - measured velocity)."""
+    result = rows.copy()
+    result[..., 4:6] += rows[..., 2:4]
+    return result
+
+
+def _blocks(rows: Vector, size: int) -> Vector:
+    """Return the maximum of each block of `size` consecutive elements along the first axis."""
+    starts = np.arange(0, len(rows), size)
+    return np.maximum.reduceat(rows, starts, axis=0)

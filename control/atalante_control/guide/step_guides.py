@@ -1,0 +1,148 @@
+"""Virtual guides of a walk, in the air or on the ground: one guide filter for each set of gains, and the selection for each step.
+
+`assistance factor -> guide filter, promise, certificate`. A narrow guide requires a stiff backup policy, but a stiff policy
+reaches the torque limit in a wide guide. Each step uses the softest filter that is certified for the chosen promise (disturbance
+torques) at the assistance factor of the step.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+from atalante_control.gait.gait import PERIOD
+from atalante_control.guide.backup_policy import BackupPolicy
+from atalante_control.guide.certificate import Certificate, certify, largest_promise
+from atalante_control.guide.config import StepGuideConfig
+from atalante_control.guide.disturbance import Leg
+from atalante_control.guide.filter import GuideConfig, GuideFilter
+from atalante_control.guide.prediction import Assumptions, prediction_of
+from atalante_control.guide.shapes import GuideShape
+from atalante_control.joint.idealization import AssistedInertia
+from atalante_hal.robot import LEG_JOINTS, Robot
+from atalante_hal.types import Vector
+
+#: Reference knee angle of the backup policy [rad], in the middle of the swing, see `BackupPolicy.mass`.
+_MIDDLE = math.radians(30.0)
+#: Indices of SH and SK of the left leg. The limits of the left leg apply to both legs, because both legs have the same limits.
+_ASSISTED = [LEG_JOINTS.index("SH"), LEG_JOINTS.index("SK")]
+#: Largest width of any guide [rad].
+_WIDEST = math.radians(7.5)
+#: If no filter is certified for the chosen promise, the filter with the largest promise is used, and assumes this fraction of
+#: its largest promise. If it assumed the whole largest promise, the gate would be 1 even without a disturbance.
+_USED = 0.95
+#: Number of decimal digits of the assistance factor, as on the bus.
+_DIGITS = 4
+
+
+class Choice(NamedTuple):
+    """Guide filter of a step, and the promise that this filter assumes, as a fraction of the chosen promise."""
+
+    guide: GuideFilter
+    promise: float
+
+
+class StepGuides:
+    """Guide filters of one gait and one shape.
+
+    Attributes:
+        filters: guide filters in ascending order of their gains.
+    """
+
+    def __init__(
+        self, config: StepGuideConfig, robot: Robot, shape: GuideShape, leg: Leg, blend: Vector, overlap: int
+    ) -> None:
+        """Build the filters.
+
+        Args:
+            config: gains, promise, and assumptions of the promise.
+            robot: limits of the joints.
+            shape: shape of the guide.
+            leg: swing leg along the nominal trajectory, to the end of the overlap.
+            blend: smallest gate for each cycle since the stance change, shape (m,).
+            overlap: cycles of the leg after the end of the step.
+        """
+        assumptions = Assumptions(
+            promise=config.promise, mismatch=config.mismatch, hand_over=config.hand_over, overlap=overlap
+        )
+        limits = filter_config(config, robot)
+        self.filters = [
+            GuideFilter(limits, shape, prediction_of(policy, leg, assumptions, blend, _WIDEST), blend)
+            for policy in policies(config, leg.inertia)
+        ]
+        self._choices: dict[float, Choice] = {}
+
+    def prepare(self) -> None:
+        """Choose and store the filter, and its promised disturbance, for every assistance factor from 0 to 1 in steps of 0.01.
+
+        The computation for one assistance factor takes longer than a cycle. On the wall clock, `prepare` must therefore be called
+        before a walk.
+        """
+        for percent in range(101):
+            self.at(percent / 100)
+
+    def at(self, xi: float) -> Choice:
+        """Return the softest filter certified for the chosen promise; if there is none, the filter with the largest promise.
+
+        Args:
+            xi: assistance factor in [0, 1].
+        """
+        key = round(xi, _DIGITS)
+        if key not in self._choices:
+            self._choices[key] = self._choose(key)
+        return self._choices[key]
+
+    def _choose(self, xi: float) -> Choice:
+        best, most = self.filters[0], -math.inf
+        for guide in self.filters:
+            scale = largest_promise(guide, xi)
+            if scale >= 1.0:
+                return Choice(guide, 1.0)
+            if scale > most:
+                best, most = guide, scale
+        return Choice(best, min(1.0, max(0.0, _USED * most)))
+
+    def certificate(self, xi: float) -> Certificate:
+        """Return the certificate of the filter used at an assistance factor.
+
+        Args:
+            xi: assistance factor in [0, 1].
+        """
+        guide, promise = self.at(xi)
+        if xi >= 1.0:
+            reason = "no promise: at Xi = 1 only the baseline controller drives the joints"
+            return Certificate(guide.shape.name, xi, False, reason, None, None, -math.inf)
+        return certify(guide, xi, promise)
+
+
+def filter_config(config: StepGuideConfig, robot: Robot) -> GuideConfig:
+    """Return the parameters of the guide filters. The limits of torque and speed follow from the limits of SH and SK.
+
+    Args:
+        config: reserves, gains and intensities.
+        robot: limits of the joints.
+
+    Raises:
+        ValueError: If a reserve is not smaller than the limit of the robot.
+    """
+    return GuideConfig(
+        torque_limit=float(robot.torque_max[_ASSISTED].min()) - config.torque_reserve,
+        rate_limit=float(robot.torque_rate_max[_ASSISTED].min()) * PERIOD,
+        speed_limit=float(robot.velocity_max[_ASSISTED].min()) - config.speed_reserve,
+        worst_speed_limit=float(robot.top_speed[_ASSISTED].min()),
+        zeta=config.zeta,
+        idealization=config.idealization,
+        feedforward=config.feedforward,
+    )
+
+
+def policies(config: StepGuideConfig, inertia: AssistedInertia) -> list[BackupPolicy]:
+    """Return the backup policies, from the softest to the stiffest.
+
+    Args:
+        config: stiffness and damping.
+        inertia: mass matrix of SH and SK.
+    """
+    hip, knee = config.stiffness
+    mass = inertia.block(_MIDDLE)
+    return [BackupPolicy((part * hip, part * knee), config.damping, mass) for part in (*config.gentler, 1.0)]

@@ -1,0 +1,130 @@
+r"""Velocity-aided attitude observer: `gyro, accelerometer, velocity of the IMU -> attitude of the pelvis`.
+
+The gyro drifts, and the accelerometer of a walking robot measures much more than gravity. The observer therefore compares the
+integral of the specific force with a measured velocity of the IMU. This velocity follows from the joint angles, the joint speeds
+and the gyro, because a sole on the ground is at rest. With the rotation :math:`\hat R` from pelvis to world, the specific
+force a, the angular velocity :math:`\omega`, the gravitational acceleration :math:`g_b = \hat R^T g` and the velocity error
+:math:`\tilde v = v - \hat v`, all in the axes of the pelvis:
+
+.. math:: \dot{\hat v} = a - \omega \times \hat v + g_b + 2 w \tilde v, \quad
+          \dot{\hat R} = \hat R\,[\omega + (w / |g|)^2\,\tilde v \times g_b]_\times
+
+The error of roll and pitch obeys a critically damped equation with natural frequency w. The heading is the integral of the gyro.
+(After P. Martin and E. Salaun, Design and implementation of a low-cost observer-based attitude and heading reference system,
+Control Engineering Practice 18, 2010.)
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Annotated
+
+import numpy as np
+
+from atalante_control.gait.gait import PERIOD
+from atalante_control.model import GRAVITY
+from atalante_control.structured import Records, zeros
+from atalante_control.walking.rotation import about_z, cross, rotation_of
+from atalante_hal.compiled import compiled
+from atalante_hal.types import Vector
+
+Vector3 = tuple[float, float, float]
+
+
+class Attitude:
+    """State of the attitude observer."""
+
+    rotation: Annotated[Vector, (3, 3)]  # rotation matrix from pelvis to world
+    velocity: Annotated[Vector, 3]  # m/s, velocity of the IMU in the axes of the pelvis
+    bandwidth: float  # rad/s, natural frequency w of the decay of roll and pitch errors
+
+
+class AttitudeObserver:
+    """Velocity-aided observer of the attitude of the pelvis.
+
+    Attributes:
+        records: record of `observe`, shape (1,).
+    """
+
+    def __init__(self, bandwidth: float = 2.0) -> None:
+        """Allocate the state, and compile the kernel.
+
+        Args:
+            bandwidth: natural frequency w of the decay of roll and pitch errors [rad/s].
+        """
+        self.records: Records[Attitude] = zeros(Attitude, 1)
+        self.records[0].bandwidth = bandwidth
+        self._observe = compiled(observe)
+        self.reset((1.0, 0.0, 0.0, 0.0))
+        self.update(np.zeros(3), np.array([0.0, 0.0, GRAVITY]), (0.0, 0.0, 0.0))
+        self.reset((1.0, 0.0, 0.0, 0.0))
+
+    def reset(self, quaternion: Sequence[float]) -> None:
+        """Set the attitude to a measured attitude without its heading, and the velocity to zero.
+
+        Args:
+            quaternion: attitude of the pelvis IMU, unit quaternion wxyz, pelvis to world.
+        """
+        record, rotation = self.records[0], rotation_of(quaternion)
+        heading = math.atan2(rotation[1, 0], rotation[0, 0])
+        record.rotation[:] = about_z(-heading) @ rotation
+        record.velocity[:] = 0.0
+
+    def update(self, gyro: Vector, accel: Vector, velocity: Vector3) -> None:
+        """Advance the attitude by one cycle, as `observe` does."""
+        self._observe(self.records, gyro, accel, velocity)
+
+    @property
+    def rotation(self) -> Vector:
+        """Return the rotation matrix from pelvis to world, shape (3, 3), overwritten by `update`."""
+        return self.records[0].rotation
+
+
+def observe(attitudes: Records[Attitude], gyro: Vector, accel: Vector, measured: Vector3) -> None:
+    """Advance the attitude by one cycle.
+
+    Args:
+        attitudes: state of the observer, shape (1,), updated.
+        gyro: angular velocity of the pelvis in the axes of the pelvis, shape (3,) [rad/s].
+        accel: specific force at the IMU in the axes of the pelvis, shape (3,) [m/s2].
+        measured: velocity of the IMU, computed from the sole at rest, in the axes of the pelvis [m/s].
+    """
+    state = attitudes[0]
+    rotation, velocity, w = state.rotation, state.velocity, state.bandwidth
+    gravity = -GRAVITY * rotation[2, 0], -GRAVITY * rotation[2, 1], -GRAVITY * rotation[2, 2]
+    error = measured[0] - velocity[0], measured[1] - velocity[1], measured[2] - velocity[2]
+    turning = cross(gyro, velocity)
+    correction = cross(error, gravity)
+    gain = (w / GRAVITY) ** 2
+    x, y, z = (
+        (gyro[0] + gain * correction[0]) * PERIOD,
+        (gyro[1] + gain * correction[1]) * PERIOD,
+        (gyro[2] + gain * correction[2]) * PERIOD,
+    )
+    for k in range(3):
+        velocity[k] += (accel[k] - turning[k] + gravity[k] + 2.0 * w * error[k]) * PERIOD
+    # The second-order series of the rotation keeps the matrix orthogonal, with an error of third order in the angle.
+    for row in range(3):
+        a, b, c = rotation[row, 0], rotation[row, 1], rotation[row, 2]
+        da, db, dc = b * z - c * y, c * x - a * z, a * y - b * x
+        rotation[row, 0] = a + da + 0.5 * (db * z - dc * y)
+        rotation[row, 1] = b + db + 0.5 * (dc * x - da * z)
+        rotation[row, 2] = c + dc + 0.5 * (da * y - db * x)
+    _orthonormalise(rotation)
+
+
+def _orthonormalise(rotation: Vector) -> None:
+    """Remove the rounding error from a rotation matrix. The direction of the last row (the vertical) does not change."""
+    norm = math.sqrt(rotation[2, 0] ** 2 + rotation[2, 1] ** 2 + rotation[2, 2] ** 2)
+    for k in range(3):
+        rotation[2, k] /= norm
+    along = rotation[0, 0] * rotation[2, 0] + rotation[0, 1] * rotation[2, 1] + rotation[0, 2] * rotation[2, 2]
+    for k in range(3):
+        rotation[0, k] -= along * rotation[2, k]
+    norm = math.sqrt(rotation[0, 0] ** 2 + rotation[0, 1] ** 2 + rotation[0, 2] ** 2)
+    for k in range(3):
+        rotation[0, k] /= norm
+    rotation[1, 0] = rotation[2, 1] * rotation[0, 2] - rotation[2, 2] * rotation[0, 1]
+    rotation[1, 1] = rotation[2, 2] * rotation[0, 0] - rotation[2, 0] * rotation[0, 2]
+    rotation[1, 2] = rotation[2, 0] * rotation[0, 1] - rotation[2, 1] * rotation[0, 0]

@@ -1,0 +1,93 @@
+"""Parameters of the walking controller."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field, replace
+
+from atalante_control.gait.gait import PERIOD
+from atalante_control.guide.config import StepGuideConfig
+from atalante_control.guide.disturbance import HandOver
+from atalante_control.joint.pid import PidGains
+from atalante_control.walking.contact import ImpactConfig
+
+Pair = tuple[float, float]
+
+#: Default steering gains: 0.5 rad per rad of heading, 0.15 rad per m of sideways deviation, at most 3 degrees per step.
+STEERING = 0.5, 0.15, math.radians(3.0)
+
+_NO_INTEGRAL = (0.0,) * 6
+#: Gains without integral terms. With integral terms, the robot began to limp after about 120 steps in MuJoCo.
+#: The integral terms of the two legs drifted apart, because the ankle stabiliser moves the robot too.
+WALK_GAINS = PidGains(
+    stance=replace(PidGains().stance, ki=_NO_INTEGRAL), swing=replace(PidGains().swing, ki=_NO_INTEGRAL)
+)
+#: Guide on the ground. It is stiffer than in the air, because the leg with the patient is heavier than the empty leg.
+#: The hand-over box (largest deviations at a stance change for which a promise holds) covers the deviations at the landings.
+WALK_GUIDE = StepGuideConfig(stiffness=(4500.0, 3300.0), hand_over=HandOver(deviation=math.radians(1.0), rate=0.3))
+
+
+@dataclass(frozen=True)
+class WalkConfig:
+    """Parameters of the walking controller.
+
+    Raises:
+        ValueError: If a parameter is out of range.
+    """
+
+    gains: PidGains = WALK_GAINS
+    impact: ImpactConfig = field(default_factory=ImpactConfig)
+    alpha: float = 0.3  # end of the re-centring, as a fraction of the step duration
+    #: True: baseline controller and assistive torque of the paper in the periodic steps, see `literal`; without a promise
+    literal_law: bool = False
+    #: m/m, gain of the ankle stabiliser: shift of the centre of pressure per error of the divergent component of motion
+    stabiliser: float = 2.5
+    shift_limit: Pair = (0.12, 0.05)  # m, largest shifts of the centre of pressure: along the walk, sideways
+    flat_foot: bool = True  # whether the ankle of the swing leg holds the sole level
+    #: m/s, downward speed of the swing foot after the nominal end of a step: normal step, stop step
+    reach_speed: Pair = (0.3, 0.03)
+    #: s, longest time in which the swing foot moves down after the nominal end of a step. `reach_knee` can end it earlier.
+    reach_time: float = 0.2
+    #: rad/s, largest speed of SH and SK in this motion. An almost straight leg could follow `reach_speed` only at higher speeds.
+    reach_rate: float = 2.5
+    reach_knee: float = 0.05  # rad, smallest knee angle in this motion
+    #: Steering gains: TH offset per heading [rad/rad], TH offset per sideways deviation [rad/m], largest TH offset [rad].
+    steering: tuple[float, float, float] = STEERING
+    #: s, time after the nominal end of a step at which the step ends if no landing is detected
+    landing_timeout: float = 0.4
+    load_bandwidth: float = 35.0  # Hz, cut-off frequency of the low-pass of the vertical foot forces
+    observer_bandwidth: float = 2.0  # rad/s, natural frequency of the attitude observer
+    loaded: float = 0.3  # load at and above which a standing foot counts as loaded, as a fraction of the weight
+    #: loads at which the stance gains are fully applied (standing, walking), as fractions of the weight
+    full_gains: Pair = (0.25, 0.5)
+    settle: float = 1.0  # s, time for which both feet must be loaded before the robot walks
+    posture: float = 2.0  # s, duration of the motion from the measured pose to the standing pose
+    shift: float = 1.5  # s, duration of a weight shift, onto one foot or back to both feet
+    rest: float = 0.3  # s, wait between the weight shift and the first step
+    guide: StepGuideConfig = WALK_GUIDE
+    #: End of the re-centring of SH and SK in a guided step, as a fraction of the step duration. With `alpha`, the re-centring of
+    #: the heavy leg would need more torque than the drives have. The other joints keep `alpha`, because the robot falls if they
+    #: are re-centred as slowly as SH and SK.
+    guided_alpha: float = 0.5
+    engage: float = 0.02  # s, time at the start of a guided step in which the lower bound of the gate falls from 1 to 0
+    release: float = 0.03  # s, time after the nominal end of a guided step in which the baseline takes over SH and SK
+
+    @classmethod
+    def literal(cls) -> WalkConfig:
+        """Return the parameters of the paper to the letter, for comparisons.
+
+        In the periodic steps, the baseline controller is the PID with re-centring, impact detection and flat foot. It has no
+        gravity torque, no feedforward, no ankle stabiliser and no steering. Below Xi = 1, `guide.literal` drives SH and SK of the
+        swing leg. Standing, weight shifts, start step and stop step are those of `WalkConfig`, because the paper has none.
+        """
+        return cls(literal_law=True, gains=PidGains(), steering=(0.0, 0.0, 0.0))
+
+    def __post_init__(self) -> None:
+        for name in ("reach_time", "landing_timeout", "settle", "posture", "shift", "rest", "engage", "release"):
+            if not (math.isfinite(getattr(self, name)) and getattr(self, name) >= PERIOD):
+                raise ValueError(f"{name} must be at least one cycle ({PERIOD} s), got {getattr(self, name)!r}")
+        if not 0.0 <= self.stabiliser <= 10.0:
+            raise ValueError(f"stabiliser must be a gain from 0 to 10, got {self.stabiliser!r}")
+        for name, part in (("loaded", self.loaded), ("full_gains[0]", self.full_gains[0])):
+            if not 0.0 < part < 0.5:
+                raise ValueError(f"{name} must be in (0, 0.5), as a fraction of the weight, got {part!r}")

@@ -1,0 +1,428 @@
+"""Walking controller for an exoskeleton with a patient on the ground: `State -> Command`, once per cycle.
+
+    state -> loads, attitude, divergent component of motion (DCM) -> phase (re-centring, steering) -> torque command u
+
+A walk begins and ends with standing: weight shift, start step, periodic steps, stop step, weight shift back (`walking.phases`).
+The controller uses only measurements from the bus. The torque is the sum of the PID torque, the gravity torque u_g, the
+feedforward u_f and the torque of the ankle stabiliser. In a periodic step with Xi < 1, the sagittal hip and knee (SH, SK) of the
+swing leg get the torque of the guide filter alone until the nominal end of the step. The start step and the stop step are always
+fully assisted. As in the air, Xi changes only at a stance change.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from atalante_control.dynamics.gravity import Gravity
+from atalante_control.gait.gait import PERIOD
+from atalante_control.gait.recentering import Deadbeat
+from atalante_control.gait.walk import WalkGaits
+from atalante_control.guide.certificate import Certificate
+from atalante_control.guide.literal import LiteralConfig, LiteralGuide, no_promise
+from atalante_control.guide.shapes import PINCHED, GuideShape
+from atalante_control.guide.step_guides import Choice, StepGuides
+from atalante_control.joint.flat_foot import ankle_records, flat_feet, recentring_rows
+from atalante_control.joint.pid import LEFT, RIGHT, Pid
+from atalante_control.model import GRAVITY, ExoskeletonParameters, Patient, pinocchio_model, urdf
+from atalante_control.structured import Records, zeros
+from atalante_control.walking.attitude import AttitudeObserver
+from atalante_control.walking.config import WalkConfig
+from atalante_control.walking.contact import ImpactDetector
+from atalante_control.walking.dcm import Balance, Stabiliser
+from atalante_control.walking.kernel import (
+    Assistance,
+    Constants,
+    Measured,
+    Outputs,
+    Parts,
+    Sensed,
+    Stage,
+    act,
+    sense,
+    start,
+)
+from atalante_control.walking.kinematics import Kinematics
+from atalante_control.walking.phases import STEPPING, WALKING, Facts, Phase, next_phase
+from atalante_control.walking.reference import PhaseTable, Reach, shift_tables, step_table
+from atalante_control.walking.standing import Standing
+from atalante_control.walking.steering import Steering
+from atalante_control.walking.swing_leg import swing_leg
+from atalante_control.walking.telemetry import TELEMETRY_FIELDS, Telemetry, WalkStatistics
+from atalante_hal.compiled import specialised
+from atalante_hal.robot import CELLS, FEET, IMUS, JOINTS, LEG_JOINTS, MOTORS, Robot
+from atalante_hal.types import Command, State, SupervisorState, Vector
+
+_N, _LEG = len(JOINTS), len(LEG_JOINTS)
+_SH, _SK = LEG_JOINTS.index("SH"), LEG_JOINTS.index("SK")
+_PELVIS, _TORSO = IMUS.index("pelvis"), IMUS.index("torso")
+_IMU_AGE = 10  # cycles, largest valid age of an IMU message, equal to the timeout of this message in the DBC
+
+
+class WalkController:
+    """Walking controller. It implements `atalante_hal.types.Controller`.
+
+    Attributes:
+        phase: current phase.
+        statistics: statistics of the walk since `reset`.
+        steering: deviation of the walk from the straight line that begins at the first step, and the steering offset.
+        telemetry: telemetry of the last cycle, for the recording.
+        telemetry_fields: name and width of each field of `telemetry`.
+    """
+
+    telemetry_fields = TELEMETRY_FIELDS
+
+    def __init__(
+        self,
+        robot: Robot,
+        patient: Patient | None,
+        gaits: WalkGaits,
+        steps: int,
+        config: WalkConfig | None = None,
+        shape: GuideShape = PINCHED,
+    ) -> None:
+        """Build the parts and allocate all arrays, because the control loop must not allocate memory.
+
+        Args:
+            robot: limits of the joints.
+            patient: patient in the exoskeleton, or None for an empty exoskeleton.
+            gaits: start step, periodic step and stop step.
+            steps: number of periodic steps until the stop step.
+            config: parameters of the controller. If None, the defaults are used.
+            shape: shape of the virtual guide of the periodic steps.
+
+        Raises:
+            GaitError: If a pose of the weight shift cannot be reached.
+        """
+        self.config = config = config or WalkConfig()
+        self._steps_wanted, self._step_duration = steps, gaits.step.duration
+        exoskeleton = ExoskeletonParameters() if patient is None else ExoskeletonParameters().fitted(patient)
+        worn, empty = pinocchio_model(urdf(exoskeleton, robot, patient)), pinocchio_model(urdf(exoskeleton, robot))
+        gravity, kinematics = Gravity(empty), Kinematics(worn, exoskeleton)
+        standing = Standing(worn, gravity, exoskeleton, robot)
+        self._tables = _tables(gaits, standing, kinematics, config, exoskeleton.toe_out)
+
+        swinging = swing_leg(gaits.step, config.guided_alpha, worn, kinematics, gravity, config.guide.friction)
+        # The guide ends with the step, because the foot lands. So the prediction needs no cycles of the next step.
+        self._guides = StepGuides(config.guide, robot, shape, swinging.leg, _fading(config.engage), 0)
+        guide = config.guide
+        self._literal = LiteralGuide(
+            LiteralConfig(config.gains.swing, guide.promise, guide.zeta, guide.idealization, guide.feedforward),
+            shape,
+            swinging.leg,
+            gaits.step.tables().uf[:, [_SH, _SK]],
+        )
+        self._assistance = Assistance(
+            self._guides.filters[-1].tables, self._literal.tables, swinging.unmodelled.copy(), _fading(config.release)
+        )
+
+        pid, self._observer = Pid(config.gains), AttitudeObserver(config.observer_bandwidth)
+        self._imus = {_PELVIS: np.array(exoskeleton.pelvis_imu), _TORSO: np.array(exoskeleton.torso_imu)}
+        swing, stance = config.gains.swing, config.gains.stance
+        weight = kinematics.mass * GRAVITY
+        self._constants = Constants(
+            weight=weight,
+            keep=math.exp(-2.0 * math.pi * config.load_bandwidth * PERIOD),
+            standing_gains=config.full_gains[0] * weight,
+            walking_gains=config.full_gains[1] * weight,
+            gains=np.array([[2 * g.kp, 2 * g.kd, np.array(2 * g.ki) * PERIOD] for g in (swing, stance)]),
+        )
+        self._stabiliser = Stabiliser(
+            config.stabiliser, *config.shift_limit, flat_feet(exoskeleton)[LEFT].geometry[2], exoskeleton.toe_out
+        )
+        self._measured = Measured(
+            np.zeros(_N),
+            np.zeros(_N),
+            np.zeros(3),
+            np.zeros(3),
+            np.zeros(3),
+            np.zeros((len(FEET), len(CELLS), 3)),
+            np.zeros(_N),
+        )
+        stages: Records[Stage] = zeros(Stage, 1)
+        sensed: Records[Sensed] = zeros(Sensed, 1)
+        balances: Records[Balance] = zeros(Balance, 1)
+        outputs: Records[Outputs] = zeros(Outputs, 1)
+        telemetry = zeros(Telemetry, 1)
+        self.telemetry: Vector = telemetry.view(np.float64)
+        self._record = telemetry[0]
+        self._stage, self._load, self._step, self._heading = (
+            stages[0],
+            sensed[0].load,
+            sensed[0].step,
+            sensed[0].heading,
+        )
+        self._stage.flat = config.flat_foot
+        self._pid, self._impact, self.steering = pid, ImpactDetector(config.impact), Steering(config.steering)
+        ankles = ankle_records(robot, exoskeleton, 0.0)
+        self._parts = Parts(
+            chain=kinematics.chain,
+            attitudes=self._observer.records,
+            links=gravity.links,
+            pids=pid.records,
+            ankles=ankles,
+            stages=stages,
+            sensed=sensed,
+            balances=balances,
+            outputs=outputs,
+            telemetry=telemetry,
+        )
+        self._command = Command(outputs[0].torque, np.zeros(len(MOTORS)))
+        self._table = self._tables[Phase.POSTURE, RIGHT]
+        self._compile()
+        self._forget(0)
+
+    def _compile(self) -> None:
+        """Compile the kernels by one call, and discard the results."""
+        measured, table, constants, stabiliser = self._measured, self._table, self._constants, self._stabiliser
+        self._sense = specialised(sense, measured, table, constants, stabiliser, self._parts)
+        self._start = specialised(start, measured, table, self._parts)
+        self._act = specialised(act, 0, measured, table, constants, stabiliser, self._assistance, self._parts)
+
+    def _forget(self, cycle: int) -> None:
+        """Reset all values of the last walk."""
+        self.phase, self._since, self._loaded, self._stopping, self._landed = Phase.POSTURE, cycle, 0, False, False
+        self._stance, self._finishing = RIGHT, False
+        self._stage.stance, self._stage.double, self._stage.steering = RIGHT, True, 0.0
+        self._assisted, self._outside, self._promised, self._exceeded = False, 0, False, False
+        self._stage.assisted = self._stage.literal = False
+        self._command.walking = False
+        self._command.outside = self._command.guide_left = self._command.hand_over_exceeded = False
+        self._load[:] = 0.0
+        self._pid.reset()
+        self._table = self._tables[Phase.POSTURE, RIGHT]
+        self.telemetry.fill(0.0)
+        self.statistics = WalkStatistics()
+
+    @property
+    def done(self) -> bool:
+        """Return whether the walk is over and the robot stands on both feet."""
+        return self.phase is Phase.REST
+
+    @property
+    def walking(self) -> bool:
+        """Return whether the robot steps, or shifts its weight for a step."""
+        return self.phase in WALKING
+
+    @property
+    def standing_pose(self) -> Vector:
+        """Return the joint angles of the standing pose, shape (12,) [rad]."""
+        pose: Vector = self._tables[Phase.STAND, RIGHT].rows[0, :_N]
+        return pose
+
+    @property
+    def halfway(self) -> bool:
+        """Return whether the middle step of the walk has reached phase 0.3."""
+        steps, middle = self.statistics.steps, self._steps_wanted // 2
+        return steps > middle or (
+            steps == middle and self.phase is Phase.STEP and self._record.elapsed >= 0.3 * self._step_duration
+        )
+
+    @property
+    def vertical(self) -> Vector:
+        """Return the upward unit vector in the axes of the pelvis, from the attitude observer, shape (3,)."""
+        up: Vector = self._observer.rotation[2]
+        return up
+
+    @property
+    def max_dcm_error(self) -> float:
+        """Return the largest error of the divergent component of motion (DCM) in the steps of the walk [m]."""
+        return float(self._record.max_dcm_error)
+
+    def prepare(self) -> None:
+        """Compute the guides of all assistance factors before a walk on the wall clock, see `StepGuides.prepare`."""
+        if not self.config.literal_law:
+            self._guides.prepare()
+
+    def certificate(self, xi: float) -> Certificate:
+        """Return the certificate of the guide used at an assistance factor, see `StepGuides.certificate`.
+
+        Args:
+            xi: assistance factor in [0, 1].
+        """
+        if self.config.literal_law and xi < 1.0:
+            return no_promise(self._guides.filters[0].shape.name, xi)
+        return self._guides.certificate(xi)
+
+    def stop(self) -> None:
+        """End the walk with a stop step after the current step."""
+        self._stopping = True
+
+    def reset(self, state: State) -> None:
+        """Restart the walk from the measured pose.
+
+        Args:
+            state: measured state of the robot.
+        """
+        self._forget(state.cycle)
+        self._observer.reset(state.imu_quaternion[_PELVIS].tolist())
+        self._measure(state)
+        self._sense(self._measured, self._table, self._constants, self._stabiliser, self._parts)
+        self._start(self._measured, self._table, self._parts)
+        self._pid.store_request(state.torque if state.torque_sent is None else state.torque_sent)
+
+    # -- one cycle ---------------------------------------------------------------------------------------------------
+
+    def update(self, state: State) -> Command:
+        """Compute the command of one cycle. If the current phase is over, start the next phase first.
+
+        Args:
+            state: measured state of the robot.
+
+        Returns:
+            The command, overwritten by the next call.
+        """
+        self._measure(state)
+        self._sense(self._measured, self._table, self._constants, self._stabiliser, self._parts)
+        if state.supervisor is SupervisorState.FINISH_STEP:
+            self._finishing = True
+            self.stop()
+        cycle = state.cycle - self._since
+        following = next_phase(self.phase, self._facts(cycle))
+        if following is not None:
+            self._begin(following, state.cycle, state.assistance_factor)
+            cycle = 0
+        self._act(cycle, self._measured, self._table, self._constants, self._stabiliser, self._assistance, self._parts)
+        self._watch_guide(cycle)
+        return self._command
+
+    def _measure(self, state: State) -> None:
+        measured = self._measured
+        lost = bool(state.imu_rows) and state.age[state.imu_rows[_PELVIS]] > _IMU_AGE
+        imu = _TORSO if lost else _PELVIS
+        measured.q[:], measured.qd[:] = state.position, state.velocity
+        measured.imu[:], measured.gyro[:], measured.accel[:] = (
+            self._imus[imu],
+            state.imu_gyro[imu],
+            state.imu_accel[imu],
+        )
+        measured.force[:] = state.foot_force
+        measured.sent[:] = self._pid.requested if state.torque_sent is None else state.torque_sent
+
+    def _facts(self, cycle: int) -> Facts:
+        config, load, weight = self.config, self._load, self._constants.weight
+        self._loaded = self._loaded + 1 if min(load.tolist()) >= config.loaded * weight else 0
+        nominal, landed = len(self._table.rows) - 1, False
+        if self.phase in STEPPING:
+            landed = self._impact.update(float(load[1 - self._stance]), cycle / nominal)
+            self._landed = landed
+        return Facts(
+            elapsed=cycle,
+            nominal=nominal,
+            rest=round(config.rest / PERIOD),
+            timeout=round(config.landing_timeout / PERIOD),
+            landed=landed,
+            loaded=self._loaded >= round(config.settle / PERIOD),
+            stopping=self._stopping or self.statistics.steps + (self.phase is Phase.STEP) >= self._steps_wanted,
+        )
+
+    def _begin(self, phase: Phase, cycle: int, xi: float) -> None:
+        """Start a phase: set stance leg and steering, re-centre on the measured motion, and start the guide."""
+        before, stage, record = self.phase, self._stage, self._record
+        swing = 1 - self._stance
+        if before in STEPPING:
+            self.steering.land(swing, self._step, self._heading)
+            self.statistics.steps += before is Phase.STEP
+            self.statistics.unnoticed += not self._landed
+        if phase is Phase.START:
+            self.steering.begin(self._step, self._heading)
+        if phase in (Phase.STEP, Phase.STOP):
+            self._stance = swing
+        if phase in STEPPING:
+            self._impact.start_step()
+        # In FINISH_STEP, the HAL changes to HOLD when the step number changes. A HOLD during a step would make the robot fall.
+        # In this state, the step number therefore does not change before the robot stands on both feet.
+        if phase is Phase.REST or (phase in STEPPING and not self._finishing):
+            self._command.step = (self._command.step or 0) + 1
+        self._command.walking = phase in WALKING
+        stage.stance, stage.double = self._stance, phase not in STEPPING
+        stage.steering = self.steering.offset() if phase is Phase.STEP else 0.0
+        self.phase, self._since, self._table = phase, cycle, self._tables[phase, self._stance]
+        stage.literal = self.config.literal_law and phase is Phase.STEP
+        self._assisted = stage.assisted = phase is Phase.STEP and xi < 1.0
+        self._start(self._measured, self._table, self._parts)
+        self._start_guide(min(1.0, max(0.0, xi)))
+        record.feet[:], record.yaw = self.steering.feet.reshape(-1), self.steering.yaw
+        record.phase, record.step, record.stance = phase, self.statistics.steps, self._stance
+
+    def _start_guide(self, xi: float) -> None:
+        """Start the guide of a step. Count the stance change if its deviation is larger than the certificate assumes."""
+        stage, record, statistics = self._stage, self._record, self.statistics.guide
+        record.assistance_factor, record.gate, record.h = 1.0, 0.0, 1.0
+        record.error[:], record.q_bound[:] = 0.0, 0.0
+        self._promised = self._exceeded = False
+        if not self._assisted:
+            return
+        leg = _LEG * (1 - self._stance)
+        angles = float(stage.deviation[leg + _SH]), float(stage.deviation[leg + _SK])
+        rates = float(stage.rate[leg + _SH]), float(stage.rate[leg + _SK])
+        literal = self.config.literal_law
+        guide, promise = Choice(self._guides.filters[0], 0.0) if literal else self._guides.at(xi)
+        if literal:
+            self._literal.start_step(xi, angles, rates)
+        guide.start_step(xi, angles, rates, promise)
+        self._assistance = self._assistance._replace(guide=guide.tables)
+        largest = self.config.guide.hand_over
+        self._promised = promise > 0.0
+        self._exceeded = max(map(abs, angles)) > largest.deviation or max(map(abs, rates)) > largest.rate
+        statistics.hand_overs_exceeded += self._exceeded
+        statistics.factors.add(xi)
+        record.assistance_factor = xi
+
+    def _watch_guide(self, cycle: int) -> None:
+        """Add a guided cycle to the statistics, and report to the HAL if the leg is outside the guide."""
+        command, record, guide = self._command, self._record, self.config.guide
+        guided = self._assisted and cycle < len(self._assistance.unmodelled)
+        command.outside = guided and record.h < 0.0
+        command.hand_over_exceeded = guided and cycle == 0 and self._exceeded
+        if guided:
+            ratio = float(np.max(np.abs(record.error) / record.q_bound))
+            self.statistics.guide.count(cycle, ratio, float(record.h), bool(record.gate > guide.active))
+            self._outside = self._outside + 1 if command.outside else max(0, self._outside - 1)
+        command.guide_left = self._promised and self._outside > guide.outside_cycles
+
+
+def _fading(duration: float) -> Vector:
+    """Return factors that fall from 1 to 0 in a duration [s], one for each cycle."""
+    factors: Vector = 0.5 + 0.5 * np.cos(math.pi * np.arange(round(duration / PERIOD)) * (PERIOD / duration))
+    return factors
+
+
+def _tables(
+    gaits: WalkGaits, standing: Standing, kinematics: Kinematics, config: WalkConfig, toe_out: float
+) -> dict[tuple[Phase, int], PhaseTable]:
+    """Return the table of each phase for each stance leg. A walk starts on the right foot and can stop on either foot."""
+    tables: dict[tuple[Phase, int], PhaseTable] = {}
+    steps = {Phase.START: gaits.start, Phase.STEP: gaits.step, Phase.STOP: gaits.stop}
+    for phase, gait in steps.items():
+        for stance in (LEFT, RIGHT):
+            speed, alphas = config.reach_speed[phase is Phase.STOP], (config.alpha, config.guided_alpha)
+            reach = Reach(speed, config.reach_rate, config.reach_time, config.reach_knee)
+            tables[phase, stance] = step_table(gait, stance, alphas, reach, kinematics, toe_out)
+    ahead, _ = shift_tables(standing.shift(gaits.start.coefficients[:, 0], RIGHT), config.shift, config.alpha)
+    tables[Phase.SHIFT, RIGHT] = ahead
+    tables[Phase.POSTURE, RIGHT] = _held(ahead, 0, config.posture)
+    tables[Phase.STAND, RIGHT] = _held(ahead, 0, config.settle)
+    for stance in (LEFT, RIGHT):
+        last = tables[Phase.STOP, stance].rows[-1, :_N]
+        _, back = shift_tables(standing.shift(last, stance), config.shift, config.alpha)
+        tables[Phase.BACK, stance] = back
+        tables[Phase.REST, stance] = _held(back, -1, config.settle)
+    return tables
+
+
+def _held(table: PhaseTable, row: int, duration: float) -> PhaseTable:
+    """Return the table of a phase that moves from the measured pose to one row of another table and holds this row.
+
+    Args:
+        table: table that contains the row.
+        row: index of the row.
+        duration: duration of the motion [s].
+    """
+    count = round(duration / PERIOD) + 1
+    rows, feedforward, dcm = (
+        np.repeat(array[[row]], count, axis=0) for array in (table.rows, table.feedforward, table.dcm)
+    )
+    recentring = recentring_rows(Deadbeat(duration, 1.0), count)
+    return table._replace(rows=rows, feedforward=feedforward, dcm=dcm, recentring=recentring, guided=recentring)

@@ -1,0 +1,79 @@
+"""Ankle stabiliser: `error of the DCM -> shift of the centre of pressure -> torques of sagittal and henke ankle (SA, HA)`.
+
+The divergent component of motion (DCM) of an inverted pendulum moves away from the centre of pressure with the rate w. A
+shift of the centre of pressure by k times the DCM error makes this error decay with the rate (k - 1) w. Let F be the vertical
+force on a foot. The SA torque F d shifts the centre of pressure forwards by d. The HA torque -F d a shifts the centre of pressure
+sideways by d, where a is the forward component of the henke axis. F is measured, so a foot without load gets no torque.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Annotated, NamedTuple
+
+from atalante_hal.types import Vector
+
+Pair = tuple[float, float]
+
+
+class Stabiliser(NamedTuple):
+    """Parameters of the ankle stabiliser."""
+
+    gain: float  # shift of the centre of pressure per DCM error, above 1
+    forward: float  # m, largest shift forwards and backwards
+    sideways: float  # m, largest shift to each side
+    henke: float  # forward component of the unit Henke axis in the foot frame
+    toe_out: float  # rad, toe-out of the left foot, positive to the left
+
+
+class Balance:
+    """Divergent component of motion (DCM) of one cycle in the walking frame, with x forward and y to the left."""
+
+    dcm: Annotated[Vector, 2]  # m, measured DCM
+    error: Annotated[Vector, 2]  # m, measured minus nominal DCM
+    shift: Annotated[Vector, 2]  # m, shift of the centre of pressure
+    heading: float  # rad, heading of the walking frame
+
+
+def dcm(lever: tuple[float, float, float], speed: tuple[float, float, float], heading: float, frequency: float) -> Pair:
+    """Return the divergent component of motion (DCM) in the walking frame [m].
+
+    Args:
+        lever: position of the centre of mass relative to the reference point, in world axes [m].
+        speed: velocity of the centre of mass in world axes [m/s].
+        heading: heading of the walking frame [rad].
+        frequency: natural frequency w of the pendulum [rad/s].
+    """
+    x, y = lever[0] + speed[0] / frequency, lever[1] + speed[1] / frequency
+    c, s = math.cos(heading), math.sin(heading)
+    return c * x + s * y, c * y - s * x
+
+
+def pressure_shift(parameters: Stabiliser, error: Vector) -> Pair:
+    """Return the shift of the centre of pressure in the walking frame, forwards and to the left [m].
+
+    Args:
+        parameters: gain and limits.
+        error: measured minus nominal DCM, shape (2,) [m].
+    """
+    x, y = parameters.gain * error[0], parameters.gain * error[1]
+    return (
+        min(max(x, -parameters.forward), parameters.forward),
+        min(max(y, -parameters.sideways), parameters.sideways),
+    )
+
+
+def ankle_torques(parameters: Stabiliser, shift: Vector, load: float, side: int) -> Pair:
+    """Return the SA and HA torques that shift the centre of pressure of one foot [Nm].
+
+    Args:
+        parameters: geometry of the foot.
+        shift: shift of the centre of pressure in the walking frame, shape (2,) [m].
+        load: measured vertical force on the foot [N]; a negative force counts as zero.
+        side: foot, 0 left, 1 right.
+    """
+    yaw = -parameters.toe_out if side else parameters.toe_out
+    c, s = math.cos(yaw), math.sin(yaw)
+    forward, sideways = c * shift[0] + s * shift[1], c * shift[1] - s * shift[0]
+    force = max(load, 0.0)
+    return force * forward, -force * sideways * parameters.henke

@@ -1,0 +1,370 @@
+"""Compiled control cycle of the walk: `measurements -> attitude, load, DCM`, then `phase -> torque command u`.
+
+    sense: foot forces -> loads; joints -> kinematics; gyro, accelerometer, sole at rest -> attitude; all -> DCM, headings
+    act:   q_nom + s, steering, lowering of the swing foot, flat foot -> PID, gravity, feedforward, ankle stabiliser, guide -> u
+
+DCM is the divergent component of motion (`walking.dcm`). The controller calls `sense`, selects the phase, and calls `act`. Each
+part is documented in its own module.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Annotated, NamedTuple
+
+from atalante_control.dynamics.gravity import LinkRecord, hold
+from atalante_control.gait.gait import PERIOD
+from atalante_control.guide.kernel import GuideTables, leg_state, tick
+from atalante_control.guide.literal import LiteralTables, assistive_torque
+from atalante_control.joint.flat_foot import Ankle, start_level_ankle, write_level_ankle
+from atalante_control.joint.pid import PidRecord, control
+from atalante_control.structured import Records
+from atalante_control.walking.attitude import Attitude, observe
+from atalante_control.walking.dcm import Balance, Stabiliser, ankle_torques, dcm, pressure_shift
+from atalante_control.walking.kinematics import Chain, move
+from atalante_control.walking.reference import PhaseTable
+from atalante_control.walking.rotation import cross, rotated, tilt_quaternion
+from atalante_control.walking.telemetry import Telemetry, write_guide, write_telemetry
+from atalante_hal.robot import JOINTS, LEG_JOINTS, SIDES
+from atalante_hal.types import Vector
+
+_LEG = len(LEG_JOINTS)
+_TH, _SH, _SK, _SA, _HA = (LEG_JOINTS.index(name) for name in ("TH", "SH", "SK", "SA", "HA"))
+_ANKLES = (_SA, _HA)
+_REACH_RISE = 0.03  # s, time constant of the downward speed of a swing foot after the nominal end of a step
+
+Vector3 = tuple[float, float, float]
+Quaternion = tuple[float, float, float, float]
+
+
+class Measured(NamedTuple):
+    """Measurements of this cycle, and torque command of the previous cycle."""
+
+    q: Vector  # (12,) rad
+    qd: Vector  # (12,) rad/s
+    imu: Vector  # (3,) m, position of the IMU in the pelvis frame; the axes of IMU and pelvis are parallel
+    gyro: Vector  # (3,) rad/s, angular velocity of the IMU in the axes of the IMU
+    accel: Vector  # (3,) m/s2, specific force at the IMU in the axes of the IMU
+    force: Vector  # (2, 4, 3) N, forces of all cells
+    sent: Vector  # (12,) Nm, torque command of the previous cycle after the limiter
+
+
+class Stage:
+    """Data of the current phase. The controller writes them when the phase starts."""
+
+    stance: int  # stance leg, 0 left, 1 right
+    double: bool  # whether no foot swings, because both feet are on the ground or the robot is suspended
+    steering: float  # rad, offset of TH of the swing leg at the end of the step
+    #: rad, joint angles at the start of the phase minus those of the first row
+    deviation: Annotated[Vector, len(JOINTS)]
+    rate: Annotated[Vector, len(JOINTS)]  # rad/s, deviation of the speeds from the first row at the start of the phase
+    literal: bool  # True: the law of the paper drives the robot, see `WalkConfig.literal`
+    flat: bool  # True: the sole of the swing foot is held level
+    #: True: the guide filter drives SH and SK of the swing leg; False at Xi = 1 and in all phases except the periodic step
+    assisted: bool
+    #: Nm, torque of the guide filter minus torque of the baseline controller at SH and SK, in the last guided cycle
+    excess: Annotated[Vector, 2]
+
+
+class Sensed:
+    """Results of `sense`."""
+
+    load: Annotated[Vector, 2]  # N, filtered vertical force on the left and the right foot
+    #: N, the smaller of filtered and unfiltered vertical force, which drops without delay when a foot leaves the ground
+    bearing: Annotated[Vector, 2]
+    heading: Annotated[Vector, 2]  # rad, heading of each foot without the toe-out
+    step: Annotated[Vector, 3]  # m, position of the right sole relative to the left sole, world axes
+
+
+class Constants(NamedTuple):
+    """Constants of the kernel."""
+
+    weight: float  # N, weight of robot and patient
+    keep: float  # weight of the last value in the low-pass of the foot forces
+    standing_gains: float  # N, load of a foot at which the full stance gains are applied while standing
+    walking_gains: (
+        float  # N, load of the stance foot at which the full stance gains are applied to its ankle while walking
+    )
+    gains: Vector  # (2, 3, 12) gains of swing leg and stance leg: Kp [Nm/rad], Kd [Nm s/rad], Ki times the cycle time [Nm/rad]
+
+
+class Assistance(NamedTuple):
+    """Guide of the swing leg in the current step."""
+
+    guide: GuideTables  # `GuideFilter.tables`
+    literal: LiteralTables  # `LiteralGuide.tables`, used instead of the guide if `Stage.literal`
+    unmodelled: Vector  # (n + 1, 2) Nm, `SwingLeg.unmodelled`: torque of SH and SK in each cycle of the step
+    fade: Vector  # (m,) factor of `Stage.excess` in each cycle after the nominal end of the step, from 1 to 0
+
+
+class Parts(NamedTuple):
+    """Arrays of the controller parts. The kernels read and update them. Each part allocates the arrays that it owns."""
+
+    chain: Chain  # `Kinematics.chain`
+    attitudes: Records[Attitude]  # (1,) `AttitudeObserver.records`
+    links: Records[LinkRecord]  # (n,) `Gravity.links`
+    pids: Records[PidRecord]  # (1,) `Pid.records`
+    ankles: Records[Ankle]  # (2,) `ankle_records`
+    stages: Records[Stage]  # (1,)
+    sensed: Records[Sensed]  # (1,)
+    balances: Records[Balance]  # (1,)
+    outputs: Records[Outputs]  # (1,) results
+    telemetry: Records[Telemetry]  # (1,) telemetry of the cycle
+
+
+class Outputs:
+    """Results of `act`."""
+
+    desired: Annotated[Vector, 2 * len(JOINTS)]  # q_des [rad], then q_des' [rad/s]
+    gravity: Annotated[Vector, len(JOINTS)]  # Nm, u_g
+    torque: Annotated[Vector, len(JOINTS)]  # Nm, torque command u
+
+
+def sense(measured: Measured, table: PhaseTable, constants: Constants, stabiliser: Stabiliser, parts: Parts) -> None:
+    """Update loads, kinematics, attitude, headings and DCM from the measurements.
+
+    Args:
+        measured: measurements of the cycle.
+        table: table of the current phase.
+        constants: constants of the kernel.
+        stabiliser: geometry of the feet.
+        parts: arrays of the parts; updated.
+    """
+    stage, sensed, balance = parts.stages[0], parts.sensed[0], parts.balances[0]
+    soles, centre, load = parts.chain.soles, parts.chain.centre[0], sensed.load
+    for side in range(len(SIDES)):
+        force = 0.0
+        for cell in range(measured.force.shape[1]):
+            force += measured.force[side, cell, 2]
+        load[side] += (1.0 - constants.keep) * (force - load[side])
+        sensed.bearing[side] = min(force, load[side])
+    move(parts.chain, measured.q, measured.qd)
+
+    # A foot that has just landed may bounce, so the stance foot is the reference as long as the stance foot carries load.
+    base = stage.stance
+    if stage.double and load[base] < 0.1 * (load[0] + load[1]):
+        base = 1 - base
+    sole, gyro = soles[base], measured.gyro
+    suspended = stage.double and load[0] + load[1] < 0.1 * constants.weight
+    velocity = (0.0, 0.0, 0.0) if suspended else _velocity(measured.imu, sole.position, sole.linear, gyro)
+    observe(parts.attitudes, gyro, measured.accel, velocity)
+    rotation = parts.attitudes[0].rotation
+
+    for side in range(len(SIDES)):
+        # The heading of a foot is the heading of its x axis in world axes.
+        foot = soles[side].rotation
+        ahead = rotated(rotation, (foot[0, 0], foot[1, 0], foot[2, 0]))
+        toe_out = -stabiliser.toe_out if side else stabiliser.toe_out
+        sensed.heading[side] = math.atan2(ahead[1], ahead[0]) - toe_out
+    left, right = soles[0].position, soles[1].position
+    step = rotated(rotation, (right[0] - left[0], right[1] - left[1], right[2] - left[2]))
+    for k in range(3):
+        sensed.step[k] = step[k]
+
+    about = sole.position
+    lever = rotated(
+        rotation, (centre.position[0] - about[0], centre.position[1] - about[1], centre.position[2] - about[2])
+    )
+    moved = _velocity(centre.position, sole.position, sole.linear, gyro)
+    speed = rotated(
+        rotation,
+        (moved[0] + centre.velocity[0], moved[1] + centre.velocity[1], moved[2] + centre.velocity[2]),
+    )
+    balance.heading = sensed.heading[stage.stance]
+    if stage.double:
+        balance.heading = 0.5 * (sensed.heading[0] + sensed.heading[1])
+        half = 0.5 if base == 1 else -0.5
+        lever = lever[0] + half * step[0], lever[1] + half * step[1], lever[2] + half * step[2]
+    balance.dcm[0], balance.dcm[1] = dcm(lever, speed, balance.heading, table.frequency)
+
+
+def _velocity(point: Vector, sole: Vector, sole_velocity: Vector, gyro: Vector) -> Vector3:
+    """Return the velocity of a point that is fixed to the pelvis, while a sole is at rest, in the axes of the pelvis [m/s].
+
+    Args:
+        point: position of the point, shape (3,) [m].
+        sole: position of the sole, shape (3,) [m].
+        sole_velocity: velocity of the sole relative to the pelvis, shape (3,) [m/s].
+        gyro: angular velocity of the pelvis, shape (3,) [rad/s].
+    """
+    turned = cross(gyro, (point[0] - sole[0], point[1] - sole[1], point[2] - sole[2]))
+    return turned[0] - sole_velocity[0], turned[1] - sole_velocity[1], turned[2] - sole_velocity[2]
+
+
+def start(measured: Measured, table: PhaseTable, parts: Parts) -> None:
+    """Store the deviations of the measured motion at the start of a phase. The re-centring starts from these deviations.
+
+    Args:
+        measured: measurements of the cycle.
+        table: table of the new phase.
+        parts: arrays of the parts; `stages` and `ankles` are updated.
+    """
+    stage, n = parts.stages[0], len(measured.q)
+    for joint in range(n):
+        stage.deviation[joint] = measured.q[joint] - table.rows[0, joint]
+        # With both feet on the ground, the speeds of the landing are ignored: re-centring on them would press the foot down.
+        stage.rate[joint] = 0.0 if stage.double else measured.qd[joint] - table.rows[0, n + joint]
+    swing = 1 - stage.stance
+    attitude, gyro = _tibia(swing, measured, parts)
+    start_level_ankle(parts.ankles[swing], attitude, gyro, measured.q, measured.qd)
+
+
+def _tibia(side: int, measured: Measured, parts: Parts) -> tuple[Quaternion, Vector3]:
+    """Return the tilt of a tibia as a unit quaternion wxyz, and its angular velocity in the axes of the tibia [rad/s]."""
+    # The link of the tibia is two links above the foot.
+    shank = parts.chain.links[parts.chain.soles[side].link - 2]
+    rotation, up, gyro = shank.rotation.T, parts.attitudes[0].rotation[2], measured.gyro
+    rate = rotated(
+        rotation,
+        (gyro[0] + shank.angular[0], gyro[1] + shank.angular[1], gyro[2] + shank.angular[2]),
+    )
+    return tilt_quaternion(rotated(rotation, up)), rate
+
+
+def act(
+    cycle: int,
+    measured: Measured,
+    table: PhaseTable,
+    constants: Constants,
+    stabiliser: Stabiliser,
+    assistance: Assistance,
+    parts: Parts,
+) -> None:
+    """Compute the torque command of one cycle.
+
+    Args:
+        cycle: cycles since the start of the phase.
+        measured: measurements of the cycle.
+        table: table of the phase.
+        constants: constants of the kernel.
+        stabiliser: parameters of the ankle stabiliser.
+        assistance: guide of the swing leg; read if `Stage.assisted`.
+        parts: arrays of the parts; updated, and the results are written to `outputs` and `telemetry`.
+    """
+    stage, sensed, balance, output = parts.stages[0], parts.sensed[0], parts.balances[0], parts.outputs[0]
+    desired, torque, n = output.desired, output.torque, len(measured.q)
+    row = _desired(cycle, table, stage, desired)
+    swing = 1 - stage.stance
+    if stage.flat and not stage.double:
+        attitude, gyro = _tibia(swing, measured, parts)
+        write_level_ankle(parts.ankles[swing], table.recentring, cycle, attitude, gyro, desired)
+
+    _set_gains(constants, stage, sensed.load, parts.pids)
+    control(parts.pids, desired, measured.q, measured.qd, measured.sent, torque)
+    up = parts.attitudes[0].rotation[2]
+    hold(parts.links, measured.q, tilt_quaternion(up), output.gravity)
+    carried = min(max((sensed.load[0] + sensed.load[1]) / constants.weight, 0.0), 1.0) if stage.double else 1.0
+    if not stage.literal:
+        for joint in range(n):
+            torque[joint] += output.gravity[joint] + carried * table.feedforward[row, joint]
+
+    for k in range(2):
+        balance.error[k] = balance.dcm[k] - table.dcm[row, k]
+    balance.shift[0], balance.shift[1] = pressure_shift(stabiliser, balance.error)
+    for side in range(len(SIDES)):
+        if (stage.double or side == stage.stance) and not stage.literal:
+            sagittal, henke = ankle_torques(stabiliser, balance.shift, sensed.bearing[side], side)
+            torque[side * _LEG + _SA] += sagittal
+            torque[side * _LEG + _HA] += henke
+    if stage.assisted:
+        _assist(cycle, measured, assistance, parts)
+    parts.pids[0].requested[:] = torque
+    write_telemetry(parts.telemetry, cycle * PERIOD, not stage.double, desired, sensed.load, balance, up)
+
+
+def _assist(cycle: int, measured: Measured, assistance: Assistance, parts: Parts) -> None:
+    """Replace the torques of SH and SK of the swing leg by the torques of the guide filter.
+
+    After the nominal end of the step, the baseline controller lowers the foot. `Stage.excess`, the difference of both torques in
+    the last guided cycle, is added to its torque and fades out with `fade`, so the command is continuous.
+
+    Args:
+        cycle: cycles since the start of the step.
+        measured: measurements of the cycle.
+        assistance: guide of the swing leg.
+        parts: arrays of the parts; `stages`, `outputs` and `telemetry` are updated.
+    """
+    stage, output, guide = parts.stages[0], parts.outputs[0], assistance.guide
+    q, qd, sent = measured.q, measured.qd, measured.sent
+    desired, torque, gravity = output.desired, output.torque, output.gravity
+    hip, knee = _LEG * (1 - stage.stance) + _SH, _LEG * (1 - stage.stance) + _SK
+    last = len(assistance.unmodelled) - 1
+    if cycle <= last:
+        added = assistance.unmodelled[cycle]
+        if stage.literal:
+            leg = leg_state(hip, q, qd, desired, sent, (gravity[hip], gravity[knee]))
+            rates = desired[len(q) + hip], desired[len(q) + knee]
+            u_hip, u_knee = assistive_torque(assistance.literal, guide.guards[0], cycle, leg, rates)
+        else:
+            leg = leg_state(hip, q, qd, desired, sent, (gravity[hip] + added[0], gravity[knee] + added[1]))
+            u_hip, u_knee = tick(guide, cycle, leg)
+        stage.excess[0], stage.excess[1] = u_hip - torque[hip], u_knee - torque[knee]
+        torque[hip], torque[knee] = u_hip, u_knee
+        write_guide(parts.telemetry, guide.guards[0], (q[hip] - desired[hip], q[knee] - desired[knee]))
+    elif cycle - last < len(assistance.fade):
+        torque[hip] += assistance.fade[cycle - last] * stage.excess[0]
+        torque[knee] += assistance.fade[cycle - last] * stage.excess[1]
+
+
+def _desired(cycle: int, table: PhaseTable, stage: Stage, desired: Vector) -> int:
+    """Write q_des and q_des' without the correction for a flat foot, and return the row index in the table.
+
+    Args:
+        cycle: cycles since the start of the phase.
+        table: table of the phase.
+        stage: data of the phase.
+        desired: q_des [rad], then q_des' [rad/s], shape (24,), overwritten.
+    """
+    n, last = len(desired) // 2, len(table.rows) - 1
+    row = min(cycle, last)
+    for joint in range(n):
+        desired[joint] = table.rows[row, joint]
+        desired[n + joint] = table.rows[row, n + joint] if cycle <= last else 0.0
+    leg = _LEG * (1 - stage.stance)
+    for joint in range(n):
+        guided = stage.assisted and (joint == leg + _SH or joint == leg + _SK)
+        recentring = table.guided if guided else table.recentring
+        if cycle < len(recentring):
+            cubic, deviation, rate = recentring[cycle], stage.deviation[joint], stage.rate[joint]
+            desired[joint] += deviation * cubic[0] + rate * cubic[1]
+            desired[n + joint] += deviation * cubic[2] + rate * cubic[3]
+    if stage.double:
+        return row
+    x = row / last
+    desired[leg + _TH] += stage.steering * x**3 * (10.0 - 15.0 * x + 6.0 * x * x)
+    desired[n + leg + _TH] += stage.steering * 30.0 * x * x * (1.0 - x) ** 2 / (last * PERIOD)
+    if cycle > last:
+        # The speed of the foot rises slowly. A jump would turn a foot that already touches the ground with one corner.
+        time = min(cycle - last, table.reach_cycles) * PERIOD
+        moving = 1.0 - math.exp(-time / _REACH_RISE)
+        time -= _REACH_RISE * moving
+        moving = moving if cycle - last < table.reach_cycles else 0.0
+        for joint, speed in ((_SH, table.reach[0]), (_SK, table.reach[1])):
+            desired[leg + joint] += speed * time
+            desired[n + leg + joint] += speed * moving
+    return row
+
+
+def _set_gains(constants: Constants, stage: Stage, load: Vector, pids: Records[PidRecord]) -> None:
+    """Set the PID gains of both legs. A leg with little load gets the gains of a swing leg.
+
+    Args:
+        constants: gains of swing leg and stance leg, and loads at which the full stance gains are applied.
+        stage: data of the phase.
+        load: vertical forces on both feet, shape (2,) [N].
+        pids: `Pid.records`; the gains are overwritten.
+    """
+    gains, pair = pids[0].gains, constants.gains
+    for side in range(len(SIDES)):
+        carrying = min(max(load[side] / constants.standing_gains, 0.0), 1.0)
+        ankle = min(max(load[side] / constants.walking_gains, 0.0), 1.0)
+        for joint in range(_LEG):
+            if stage.double:
+                share = carrying
+            elif side != stage.stance:
+                share = 0.0
+            else:
+                share = ankle if joint in _ANKLES else 1.0
+            i = side * _LEG + joint
+            for k in range(3):
+                gains[k, i] = pair[0, k, i] + share * (pair[1, k, i] - pair[0, k, i])

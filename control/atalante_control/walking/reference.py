@@ -1,0 +1,125 @@
+"""Tables of one phase of the walk, sampled at every cycle: `gait or weight shift -> desired motion, feedforward, DCM`.
+
+The divergent component of motion (DCM) is c + c' / w, with the horizontal position c of the centre of mass and
+w = sqrt(g / height). In a step the DCM is relative to the centre of the stance sole. While standing the DCM is relative to the
+middle between both soles. The axes are those of the walking frame: x forward, y left, without the toe-out of the feet.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from atalante_control.gait.gait import PERIOD, Gait, bezier, derivative
+from atalante_control.gait.recentering import Deadbeat
+from atalante_control.joint.flat_foot import recentring_rows
+from atalante_control.joint.pid import RIGHT
+from atalante_control.model import GRAVITY
+from atalante_control.walking.kinematics import Kinematics
+from atalante_control.walking.rotation import about_z
+from atalante_control.walking.standing import Shift
+from atalante_hal.robot import LEG_JOINTS
+from atalante_hal.types import Vector
+
+_LEG = len(LEG_JOINTS)
+_SH, _SK = LEG_JOINTS.index("SH"), LEG_JOINTS.index("SK")
+
+
+class PhaseTable(NamedTuple):
+    """Desired motion of one phase with n cycles. After the last cycle, the last row is held."""
+
+    rows: Vector  # (n + 1, 24) q_nom [rad], then q_nom' [rad/s]
+    feedforward: Vector  # (n + 1, 12) Nm, u_f
+    dcm: Vector  # (n + 1, 2) m, nominal DCM
+    frequency: float  # rad/s, natural frequency w of the pendulum
+    recentring: Vector  # (m, 4) rows of `flat_foot.recentring_rows`
+    guided: Vector  # (m, 4) as `recentring`, for SH and SK of the swing leg, which a guide can assist
+    reach: Vector  # (2,) rad/s, speeds of SH and SK of the swing leg that lower the swing foot after the last cycle
+    reach_cycles: int  # number of cycles of this motion
+
+
+class Reach(NamedTuple):
+    """Downward motion of a swing foot that has not landed at the nominal end of a step."""
+
+    speed: float  # m/s, downward speed of the foot
+    rate: float  # rad/s, largest speed of SH and SK; it takes precedence over `speed`
+    time: float  # s, longest duration
+    knee: float  # rad, smallest knee angle
+
+
+def step_table(
+    gait: Gait, stance: int, alphas: tuple[float, float], reach: Reach, kinematics: Kinematics, toe_out: float
+) -> PhaseTable:
+    """Sample a step.
+
+    Args:
+        gait: right-stance step.
+        stance: stance leg, LEFT or RIGHT; for LEFT the mirrored step is sampled.
+        alphas: end of the re-centring, as a fraction of the step duration: of all joints, and of the joints that a guide assists.
+        reach: downward motion of the swing foot after the last cycle.
+        kinematics: kinematics of the robot with the patient.
+        toe_out: toe-out of the left foot, positive to the left [rad].
+    """
+    table = (gait if stance == RIGHT else gait.mirrored()).tables()
+    yaw = -toe_out if stance == RIGHT else toe_out
+    centre, speed = np.zeros((2, gait.cycles + 1, 3))
+    upright = about_z(0.0)
+    for cycle, (q, qd) in enumerate(zip(table.q, table.qd, strict=True)):
+        chain = kinematics.update(q, qd)
+        sole = chain.soles[stance]
+        upright = _product(about_z(yaw), sole.rotation.T)  # rotation from pelvis to walking frame
+        lever = chain.centre[0].position - sole.position
+        # The sole is at rest on the ground, so the twist of the pelvis is the negative twist of the sole in the pelvis frame.
+        relative = chain.centre[0].velocity - sole.linear - np.cross(sole.angular, lever)
+        centre[cycle], speed[cycle] = upright @ lever, upright @ relative
+    frequency = math.sqrt(GRAVITY / float(centre[:, 2].mean()))
+    swing = 1 - stance
+    rates = reach.speed * _reach(table.q[-1], swing, kinematics, upright)
+    rates *= min(1.0, reach.rate / float(np.abs(rates).max()))
+    bend = float(table.q[-1, swing * _LEG + _SK]) - reach.knee
+    time = min(reach.time, max(0.0, bend) / abs(float(rates[1])))
+    rows = np.hstack([table.q, table.qd])
+    recentring, guided = (recentring_rows(Deadbeat(gait.duration, alpha), len(rows)) for alpha in alphas)
+    dcm = (centre + speed / frequency)[:, :2].copy()
+    return PhaseTable(rows, table.uf.copy(), dcm, frequency, recentring, guided, rates, round(time / PERIOD))
+
+
+def shift_tables(shift: Shift, duration: float, alpha: float) -> tuple[PhaseTable, PhaseTable]:
+    """Sample a weight shift from the middle between the feet onto one foot, and the weight shift back.
+
+    Args:
+        shift: weight shift.
+        duration: duration of each weight shift [s].
+        alpha: end of the re-centring, as a fraction of the duration.
+    """
+    recentring = recentring_rows(Deadbeat(duration, alpha), round(duration / PERIOD))
+    x: Vector = np.arange(round(duration / PERIOD) + 1, dtype=np.float64) * (PERIOD / duration)
+    path = x**3 * (10.0 - 15.0 * x + 6.0 * x * x)
+    pace = 30.0 * x * x * (1.0 - x) ** 2 / duration
+    tables = []
+    for part, speed in ((path, pace), (path[::-1], -pace[::-1])):
+        q, centre = bezier(shift.q, part), bezier(shift.centre, part)
+        qd = bezier(derivative(shift.q), part) * speed[:, None]
+        velocity = bezier(derivative(shift.centre), part) * speed[:, None]
+        frequency = math.sqrt(GRAVITY / float(centre[:, 2].mean()))
+        dcm = (centre + velocity / frequency)[:, :2].copy()
+        feedforward = np.ascontiguousarray(bezier(shift.feedforward, part))
+        rows = np.hstack([q, qd])
+        tables.append(PhaseTable(rows, feedforward, dcm, frequency, recentring, recentring, np.zeros(2), 0))
+    return tables[0], tables[1]
+
+
+def _product(a: Vector, b: Vector) -> Vector:
+    return np.asarray(a @ b)
+
+
+def _reach(q: Vector, swing: int, kinematics: Kinematics, upright: Vector) -> Vector:
+    """Return the changes of SH and SK per metre of vertical downward motion of the swing foot, shape (2,) [rad/m]."""
+    columns = []
+    for joint in (_SH, _SK):
+        rate = np.zeros(len(q))
+        rate[swing * _LEG + joint] = 1.0
+        columns.append((upright @ kinematics.update(q, rate).soles[swing].linear)[[0, 2]])
+    return np.asarray(np.linalg.solve(np.array(columns).T, [0.0, -1.0]))

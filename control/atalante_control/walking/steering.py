@@ -1,0 +1,75 @@
+"""Steering by the soles: `sole positions, headings -> deviation from the line -> offset of TH of the swing leg in the next step`.
+
+The line is the straight path that the robot must follow. It starts in the middle between the feet when the walk begins, in the
+direction of the mean heading of the soles. The position on the ground is the sum of the relative sole positions at each landing.
+The heading of the pelvis is not used, because the pelvis turns by several degrees during a step. TH is the transverse hip.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from atalante_hal.types import Vector
+
+
+class Steering:
+    """Deviation of the walk from the line, and the steering offset.
+
+    Attributes:
+        feet: positions of left and right sole, x along the line and y to the left of the line, shape (2, 2) [m].
+        yaw: mean heading of both soles relative to the line [rad].
+    """
+
+    def __init__(self, gains: tuple[float, float, float]) -> None:
+        """Set the gains.
+
+        Args:
+            gains: TH offset per heading [rad/rad], TH offset per sideways deviation [rad/m], and largest TH offset [rad].
+        """
+        self._gains = gains
+        self.feet: Vector = np.zeros((2, 2))
+        self.yaw = self._origin = 0.0
+
+    @property
+    def lateral(self) -> float:
+        """Return the distance from the line to the middle between the feet, positive to the left [m]."""
+        return float(self.feet[:, 1].mean())
+
+    @property
+    def distance(self) -> float:
+        """Return the distance walked along the line [m]."""
+        return float(self.feet[:, 0].mean())
+
+    def begin(self, step: Vector, headings: Vector) -> None:
+        """Start the line in the middle between the feet.
+
+        Args:
+            step: position of the right sole relative to the left sole in world axes, shape (3,) [m].
+            headings: headings of both feet without the toe-out, shape (2,) [rad].
+        """
+        self._origin, self.yaw = float(headings.mean()), 0.0
+        right = self._on_line(step)
+        self.feet[0], self.feet[1] = -0.5 * right, 0.5 * right
+
+    def land(self, side: int, step: Vector, headings: Vector) -> None:
+        """Update the position at the landing of a foot.
+
+        Args:
+            side: foot that landed, 0 left, 1 right.
+            step: position of the right sole relative to the left sole in world axes, shape (3,) [m].
+            headings: headings of both feet without the toe-out, shape (2,) [rad].
+        """
+        right = self._on_line(step)
+        self.feet[side] = self.feet[1 - side] + (right if side else -right)
+        self.yaw = float(headings.mean()) - self._origin
+
+    def offset(self) -> float:
+        """Return the offset of TH of the swing leg for the next step, positive to the left [rad]."""
+        per_yaw, per_metre, largest = self._gains
+        return -min(max(per_yaw * self.yaw + per_metre * self.lateral, -largest), largest)
+
+    def _on_line(self, step: Vector) -> Vector:
+        c, s = math.cos(self._origin), math.sin(self._origin)
+        return np.array([c * step[0] + s * step[1], c * step[1] - s * step[0]])

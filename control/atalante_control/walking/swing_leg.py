@@ -1,0 +1,74 @@
+"""Swing leg of a step on the ground, with the leg of the patient: `gait, kinematics -> Leg of the guides, unmodelled torque`.
+
+The guide filter computes the torques of sagittal hip and knee (SH, SK) with the mass matrix of the leg of robot and patient, for
+a fixed pelvis. On the ground, the pelvis moves with the stance leg. The torque u_g + u_f of the gait includes the effect of this
+motion, but a torque that is computed with this mass matrix does not. The filter therefore adds the missing torque w to the
+gravity torque. w depends on the time t in the step:
+
+    w(t) = u_f - M(q_nom) q_nom'' - c(q_nom, q_nom')
+
+Here c are the velocity torques. A motion of the pelvis that differs from the motion in the gait acts as a disturbance.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from atalante_control.dynamics.gravity import Gravity
+from atalante_control.gait.gait import PERIOD, Gait, motion
+from atalante_control.gait.recentering import Deadbeat
+from atalante_control.guide.disturbance import Leg
+from atalante_control.joint.idealization import AssistedInertia, Friction
+from atalante_control.joint.pid import RIGHT
+from atalante_control.model import ArticulatedModel
+from atalante_control.walking.kinematics import Kinematics
+from atalante_control.walking.rotation import tilt_quaternion
+from atalante_hal.robot import LEG_JOINTS
+from atalante_hal.types import Vector
+
+_SH, _SK = LEG_JOINTS.index("SH"), LEG_JOINTS.index("SK")
+
+
+class SwingLeg(NamedTuple):
+    """Swing leg of a step, and the torque that the model of the swing leg leaves out."""
+
+    leg: Leg
+    unmodelled: Vector  # (n + 1, 2) Nm, torque w of SH and SK that is added to u_g
+
+
+def swing_leg(
+    gait: Gait, alpha: float, worn: ArticulatedModel, kinematics: Kinematics, gravity: Gravity, friction: Friction
+) -> SwingLeg:
+    """Return the swing leg along the nominal trajectory of a step, to the end of the step, because the foot lands then.
+
+    Args:
+        gait: right-stance step. By symmetry, the result also applies to the left-stance step.
+        alpha: end of the re-centring, as a fraction of the step duration.
+        worn: model of the robot with the patient, with a fixed pelvis.
+        kinematics: kinematics of the robot with the patient.
+        gravity: gravity torques u_g, which the controller adds to the feedforward.
+        friction: friction of the joints.
+    """
+    table, assisted = gait.tables(), [_SH, _SK]
+    _, _, acceleration = motion(gait.coefficients, gait.duration, np.arange(gait.cycles + 1) / gait.cycles)
+    weight = np.array([_gravity(q, qd, kinematics, gravity)[assisted] for q, qd in zip(table.q, table.qd, strict=True)])
+    leg = Leg(
+        deadbeat=Deadbeat(gait.duration, alpha),
+        time=np.arange(gait.cycles + 1, dtype=np.float64) * PERIOD,
+        q=table.q[:, assisted],
+        qd=table.qd[:, assisted],
+        qdd=acceleration[:, assisted],
+        gravity=np.zeros((gait.cycles + 1, 2)),
+        inertia=AssistedInertia(worn, table.q),
+        friction=friction,
+    )
+    unmodelled = table.uf[:, assisted] - leg.torque()
+    return SwingLeg(leg._replace(gravity=weight + unmodelled), unmodelled)
+
+
+def _gravity(q: Vector, qd: Vector, kinematics: Kinematics, gravity: Gravity) -> Vector:
+    """Return u_g of a pose on the right foot, which is flat on the ground, shape (12,) [Nm]."""
+    up = kinematics.update(q, qd).soles[RIGHT].rotation[:, 2]
+    return gravity.torque(q, tilt_quaternion((up[0], up[1], up[2])))

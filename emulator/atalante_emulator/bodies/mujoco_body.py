@@ -1,0 +1,268 @@
+"""Body in MuJoCo: `URDF, joint torques -> motion, sole forces`."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any, Final, NamedTuple
+
+import mujoco
+import numpy as np
+
+from atalante_emulator.bodies import FRICTION, GRAVITY, LINK_STATE, PELVIS, Motion, Pose
+from atalante_emulator.bodies.links import FOOT_LINKS, IMU_LINKS, PAD_LINKS, find
+from atalante_emulator.bodies.soles import into_frame, read_soles, total_mass
+from atalante_hal.compiled import compiled
+from atalante_hal.robot import CELLS, FEET, IMUS, JOINTS
+from atalante_hal.types import PERIOD, Vector
+
+_FREE: Final = 7  # elements of the pose of a free pelvis in qpos: position (3), quaternion wxyz (4)
+#: Warnings after which MuJoCo resets the simulation.
+_DIVERGED: Final = (
+    mujoco.mjtWarning.mjWARN_BADQPOS,
+    mujoco.mjtWarning.mjWARN_BADQVEL,
+    mujoco.mjtWarning.mjWARN_BADQACC,
+)
+
+
+class Contact(NamedTuple):
+    """Contact model of MuJoCo, see "Solver parameters" in its documentation.
+
+    With the default values of this class, the stiffness at each corner is 1.4 MN/m. With MuJoCo's own default, solimp
+    (0.9, 0.95), the soles sink so far into the floor that a walking robot falls.
+    """
+
+    solref: tuple[float, float] = (0.02, 1.0)  # time constant [s] and damping ratio
+    solimp: tuple[float, float] = (0.99, 0.99)  # impedance at no and at full penetration
+    impratio: float = 1.0  # ratio of friction to normal impedance
+
+
+class _Sensed(NamedTuple):
+    """Sensor data of MuJoCo. All arrays are views of `sensordata`."""
+
+    attitude: Vector  # quaternion wxyz of the IMU links and the feet, shape (6, 4)
+    velocity: Vector  # velocity of the IMU links in the world, shape (4, 3) [m/s]
+    rate: Vector  # angular velocity of the IMU links in world axes, shape (4, 3) [rad/s]
+    force: Vector  # force of the floor on each corner in world axes, shape (8, 3) [N]
+
+
+def _unpack(sensed: _Sensed, imu: Vector, force: Vector) -> bool:
+    """Convert the sensor data of a time step. Return whether a corner touches the floor.
+
+    Args:
+        sensed: sensor data.
+        imu: output for the link states of the IMUs, shape (4, LINK_STATE).
+        force: output for the forces on the corners in the axes of the feet, shape (2, 4, 3) [N].
+    """
+    attitude, velocity, rate, pads = sensed
+    imus = len(imu)
+    for i in range(imus):
+        imu[i, 0], imu[i, 1], imu[i, 2], imu[i, 3] = attitude[i, 1], attitude[i, 2], attitude[i, 3], attitude[i, 0]
+        imu[i, 4:7] = velocity[i]
+        imu[i, 7:10] = rate[i]
+    touching = False
+    foot_attitude = np.empty(4)
+    for foot in range(force.shape[0]):
+        row = attitude[imus + foot]
+        foot_attitude[0], foot_attitude[1], foot_attitude[2], foot_attitude[3] = row[1], row[2], row[3], row[0]
+        for pad in range(force.shape[1]):
+            x, y, z = pads[foot * force.shape[1] + pad]
+            touching |= z != 0.0
+            force[foot, pad] = into_frame(foot_attitude, x, y, z)
+    return touching
+
+
+class MuJoCoBody:
+    """Exoskeleton in MuJoCo, see `Body`.
+
+    Two bodies with the same URDF and the same calls give identical results, bit by bit.
+    """
+
+    def __init__(
+        self,
+        urdf: str,
+        *,
+        free: bool = False,
+        ground: float | None = None,
+        friction: float = FRICTION,
+        contact: Contact | None = None,
+    ) -> None:
+        """Load the URDF.
+
+        Args:
+            urdf: text of the URDF, not a path.
+            free: whether the pelvis is free to move. False fixes it at the origin.
+            ground: height of the floor in the world [m]. None if there is no floor.
+            friction: coefficient of friction between soles and floor.
+            contact: contact model. With None, the default values of `Contact` are used.
+
+        Raises:
+            ValueError: If the text is not a URDF, or a required joint or link is missing.
+        """
+        try:
+            spec = mujoco.MjSpec.from_string(urdf)
+        except ValueError as error:
+            raise ValueError(f"MuJoCo cannot load the URDF: {error}") from error
+        self._free = free
+        find(JOINTS, {joint.name: joint.id for joint in spec.joints}, "joint")
+        find((*IMU_LINKS, *FOOT_LINKS, *PAD_LINKS), {body.name: body.id for body in spec.bodies}, "link")
+        self.soles, self.mass = read_soles(urdf), total_mass(urdf)
+        _prepare(spec, free, ground, friction, contact or Contact())
+        self._model = model = spec.compile()
+        self._data = data = mujoco.MjData(model)
+        assert abs(float(model.body_mass.sum()) - self.mass) < 1e-9
+        first = model.jnt_dofadr[model.joint(JOINTS[0]).id]
+        assert [model.jnt_dofadr[model.joint(name).id] - first for name in JOINTS] == list(range(len(JOINTS)))
+        q = model.jnt_qposadr[model.joint(JOINTS[0]).id]
+        self._q, self._v = data.qpos[q : q + len(JOINTS)], data.qvel[first : first + len(JOINTS)]
+        self._torque = data.qfrc_applied[first : first + len(JOINTS)]
+        pelvis = model.body(PELVIS).id
+        self._wrench = data.xfrc_applied[pelvis]
+        self._sensed = _views(data.sensordata)
+        self.position, self.velocity = np.zeros((2, len(JOINTS)))
+        self.imu = np.zeros((len(IMUS), LINK_STATE))
+        self.sole_force, self.touching = np.zeros((len(FEET), len(CELLS), 3)), False
+        self._unpack = compiled(_unpack)
+        # This call also compiles the kernel, because compilation takes longer than a cycle.
+        self.reset([0.0] * len(JOINTS))
+
+    def reset(self, position: Sequence[float], base: Pose | None = None) -> None:
+        """Set the joint positions and the pose of the pelvis, and zero all velocities and the external wrench.
+
+        Args:
+            position: joint positions, shape (12,) [rad].
+            base: pose of the pelvis. With None, the pelvis is upright at the origin. Must be None if the pelvis is fixed.
+
+        Raises:
+            ValueError: If a pose is given and the pelvis is fixed.
+        """
+        if not self._free and base is not None:
+            raise ValueError(f"base must be None for a fixed pelvis, got {base}")
+        mujoco.mj_resetData(self._model, self._data)
+        if self._free:
+            pelvis, (x, y, z, w) = self._data.qpos[:_FREE], (base or Pose((0.0, 0.0, 0.0))).attitude
+            pelvis[:3] = (0.0, 0.0, 0.0) if base is None else base.position
+            pelvis[3:] = w, x, y, z
+        self._q[:] = position
+        mujoco.mj_step1(self._model, self._data)
+        # MuJoCo computes contact forces only in a time step, and there was no time step since the reset.
+        self._sensed.force.fill(0.0)
+        self._read()
+
+    def push(self, force: Sequence[float], moment: Sequence[float] = (0.0, 0.0, 0.0)) -> None:
+        """Set the external wrench on the pelvis link. It acts in every time step until the next call.
+
+        Args:
+            force: force at the centre of mass of the pelvis link, world axes, shape (3,) [N].
+            moment: moment in world axes, shape (3,) [Nm].
+        """
+        self._wrench[:3] = force
+        self._wrench[3:] = moment
+
+    def motion(self, link: str) -> Motion:
+        """Return the true pose and velocity of a link.
+
+        Args:
+            link: name of the link in the URDF.
+
+        Raises:
+            KeyError: If the URDF has no such link.
+        """
+        body = self._model.body(link).id
+        w, x, y, z = self._data.xquat[body]
+        twist = np.zeros(6)
+        mujoco.mj_objectVelocity(self._model, self._data, mujoco.mjtObj.mjOBJ_XBODY, body, twist, 0)
+        return Motion(self._data.xpos[body].copy(), np.array([x, y, z, w]), twist[3:], twist[:3])
+
+    def step(self, torque: Sequence[float]) -> None:
+        """Apply joint torques for one `PERIOD` and update the motion, the link states and the sole forces.
+
+        Args:
+            torque: joint torques, shape (12,) [Nm].
+
+        Raises:
+            FloatingPointError: If the simulation diverged.
+        """
+        self.exchange(torque)
+        self._read()
+
+    def exchange(self, torque: Sequence[float]) -> None:
+        """Run the MuJoCo calls of `step` without unpacking the results. Benchmarks use this as a baseline.
+
+        Args:
+            torque: joint torques, shape (12,) [Nm].
+        """
+        self._torque[:] = torque
+        # Each call runs the second half of a time step, then the first half of the next one. So all sensor data after the call
+        # belong to the same time as the positions and velocities.
+        mujoco.mj_step2(self._model, self._data)
+        mujoco.mj_step1(self._model, self._data)
+
+    def _read(self) -> None:
+        self.position[:], self.velocity[:] = self._q, self._v
+        self.touching = self._unpack(self._sensed, self.imu, self.sole_force)
+
+    def close(self) -> None:
+        """Do nothing. The memory of MuJoCo is released with this object."""
+
+
+def _prepare(spec: Any, free: bool, ground: float | None, friction: float, contact: Contact) -> None:
+    """Complete the model of a URDF with solver settings, floor and sensors.
+
+    Args:
+        spec: model as loaded from the URDF.
+        free: whether the pelvis is free to move.
+        ground: height of the floor in the world [m]. None if there is no floor.
+        friction: coefficient of friction between soles and floor.
+        contact: contact model.
+    """
+    # By default, MuJoCo merges fixed links. The sensor links would lose their names, and a fixed pelvis would lose its mass.
+    spec.compiler.fusestatic = False
+    option = spec.option
+    option.timestep, option.gravity = PERIOD, [0.0, 0.0, -GRAVITY]
+    option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
+    option.cone, option.impratio = mujoco.mjtCone.mjCONE_ELLIPTIC, contact.impratio
+    for joint in spec.joints:
+        joint.solref_limit, joint.solimp_limit = [0.002, 1.0], [0.99, 0.999, 0.001, 0.5, 2.0]
+    if free:
+        spec.body(PELVIS).add_freejoint()
+    shapes = [(pad, spec.body(pad).geoms[0]) for pad in PAD_LINKS]
+    for pad, shape in shapes:
+        shape.name, shape.contype, shape.conaffinity = pad, 1, 0
+    if ground is not None:
+        floor = spec.worldbody.add_geom(
+            name="floor", type=mujoco.mjtGeom.mjGEOM_PLANE, size=[0.0, 0.0, 1.0], pos=[0.0, 0.0, ground]
+        )
+        floor.contype, floor.conaffinity = 0, 1
+        shapes.append(("floor", floor))
+    for _, shape in shapes:
+        shape.friction[0], shape.condim = friction, 3  # MuJoCo uses the larger coefficient of the two shapes
+        shape.solref, shape.solimp[:2] = contact.solref, contact.solimp
+    _add_sensors(spec, ground is not None)
+
+
+def _add_sensors(spec: Any, floor: bool) -> None:
+    link = mujoco.mjtObj.mjOBJ_XBODY
+    for kind, names in (
+        (mujoco.mjtSensor.mjSENS_FRAMEQUAT, (*IMU_LINKS, *FOOT_LINKS)),
+        (mujoco.mjtSensor.mjSENS_FRAMELINVEL, IMU_LINKS),
+        (mujoco.mjtSensor.mjSENS_FRAMEANGVEL, IMU_LINKS),
+    ):
+        for name in names:
+            spec.add_sensor(type=kind, objtype=link, objname=name)
+    if floor:
+        force, net = 1 << int(mujoco.mjtConDataField.mjCONDATA_FORCE), 3  # 3: net force in world axes
+        geom = mujoco.mjtObj.mjOBJ_GEOM
+        for pad in PAD_LINKS:
+            spec.add_sensor(
+                type=mujoco.mjtSensor.mjSENS_CONTACT,
+                objtype=geom, objname="floor", reftype=geom, refname=pad,
+                intprm=[force, net, 1],
+            )  # fmt: skip
+
+
+def _views(data: Any) -> _Sensed:
+    attitudes, imus, pads = len(IMUS) + len(FEET), len(IMUS), len(PAD_LINKS)
+    ends = np.cumsum([4 * attitudes, 3 * imus, 3 * imus])
+    attitude, velocity, rate, force = np.split(data, ends)
+    force = force.reshape(-1, 3) if force.size else np.zeros((pads, 3))
+    return _Sensed(attitude.reshape(-1, 4), velocity.reshape(-1, 3), rate.reshape(-1, 3), force)

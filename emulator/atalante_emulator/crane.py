@@ -1,0 +1,115 @@
+"""Crane of an emulated robot: suspends the robot above the floor until the drives are enabled, then lowers it onto its feet.
+
+The sling is a spring between the hook and the pelvis. It pulls upwards only. While the sling is under tension, the crane also
+keeps the pelvis upright and holds its horizontal position and heading constant. These forces and moments are proportional to the
+tension, up to the weight of the robot. A slack sling exerts no force.
+"""
+
+from __future__ import annotations
+
+from typing import Final
+
+import numpy as np
+
+from atalante_emulator.bodies import GRAVITY, PELVIS, Body
+from atalante_hal.types import PERIOD, SupervisorState, Vector
+
+#: Speed of the hook [m/s].
+SPEED: Final = 0.1
+#: Time in ACTIVE after which the crane lowers the robot [s]. The controller needs this time to reach its start pose.
+DELAY: Final = 0.5
+#: Stiffness and damping of the sling per kg of the robot. Under the weight of the robot, the sling stretches by
+#: GRAVITY / STIFFNESS, 25 mm.
+STIFFNESS: Final = 400.0  # N/m per kg
+DAMPING: Final = 28.0  # N s/m per kg
+#: Stiffness and damping of the pelvis attitude, per kg of the robot, while the tension of the sling equals the weight.
+RIGHTING: Final = 100.0  # Nm/rad per kg
+ATTITUDE_DAMPING: Final = 1.5  # Nm s/rad per kg
+#: Slack of the sling at which lowering ends [m]. The pelvis of a walking robot rises by less, so the sling stays slack.
+SLACK: Final = 0.15
+_ACTIVE: Final = (SupervisorState.ACTIVE, SupervisorState.FULL_ASSIST)
+
+
+class Crane:
+    """Crane of a robot with a free pelvis. Each call advances the crane by one `PERIOD` and returns the wrench on the pelvis.
+
+    Attributes:
+        lowered: Whether the sling is slack and the robot stands alone.
+    """
+
+    def __init__(self, body: Body, *, automatic: bool = True) -> None:
+        """Suspend the robot at its current position. The crane turns the pelvis upright.
+
+        Args:
+            body: robot with a free pelvis.
+            automatic: whether the crane lowers the robot without a call of `lower`, after a total time of `DELAY` in ACTIVE or
+                FULL_ASSIST.
+        """
+        self._body, self._mass, self._automatic = body, body.mass, automatic
+        self._wrench = np.zeros(6)
+        motion = body.motion(PELVIS)
+        self._at, self._heading = motion.position, _yaw(motion.attitude)
+        self._hook = self._top = self._goal = float(motion.position[2]) + GRAVITY / STIFFNESS
+        self._waited = 0
+        self.lowered = False
+
+    def lower(self) -> None:
+        """Lower the hook until the sling is slack."""
+        self._automatic = False
+        self._goal = -np.inf
+
+    def lift(self) -> None:
+        """Lift the robot at its current horizontal position, up to the height at which the constructor suspended it."""
+        self._automatic = False
+        motion = self._body.motion(PELVIS)
+        self._at, self._heading = motion.position, _yaw(motion.attitude)
+        self._hook = max(self._hook, float(motion.position[2]))
+        self._goal, self.lowered = self._top, False
+
+    def __call__(self, hal_state: int) -> Vector:
+        """Advance the crane by one `PERIOD` and return force [N] and moment [Nm] on the pelvis, in world axes, shape (6,).
+
+        Args:
+            hal_state: state of the HAL, a value of `SupervisorState`.
+        """
+        if self._automatic and hal_state in _ACTIVE:
+            self._waited += 1
+            if self._waited * PERIOD >= DELAY:
+                self.lower()
+        if self.lowered:
+            return self._wrench
+        self._hook += float(np.clip(self._goal - self._hook, -SPEED * PERIOD, SPEED * PERIOD))
+        position, attitude, velocity, rate = self._body.motion(PELVIS)
+        stretch = self._hook - position[2]
+        tension = max(0.0, self._mass * (STIFFNESS * stretch - DAMPING * velocity[2])) if stretch > 0.0 else 0.0
+        share = min(1.0, tension / (self._mass * GRAVITY))
+        self._wrench[:2] = share * self._mass * (STIFFNESS * (self._at - position)[:2] - DAMPING * velocity[:2])
+        self._wrench[2] = tension
+        turn = _turn_to_upright(attitude, self._heading)
+        self._wrench[3:] = share * self._mass * (RIGHTING * turn - ATTITUDE_DAMPING * rate)
+        if stretch < -SLACK and self._goal < self._hook:
+            self.lowered = True
+            self._wrench[:] = 0.0
+        return self._wrench
+
+
+def _yaw(attitude: Vector) -> float:
+    x, y, z, w = attitude
+    return float(np.arctan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z)))
+
+
+def _turn_to_upright(attitude: Vector, heading: float) -> Vector:
+    """Return the rotation from an attitude to the upright attitude of a heading, in world axes, shape (3,) [rad].
+
+    The result is 2 sin(angle / 2) along the axis of rotation. For a small angle it is the rotation vector.
+
+    Args:
+        attitude: quaternion xyzw, shape (4,).
+        heading: yaw angle [rad].
+    """
+    s, c = np.sin(0.5 * heading), np.cos(0.5 * heading)
+    x, y, z, w = attitude
+    # Product of the quaternion (0, 0, s, c) and the conjugate of the attitude.
+    vector = np.array([-c * x + s * y, -s * x - c * y, s * w - c * z])
+    scalar = c * w + s * z
+    return 2.0 * vector * (1.0 if scalar >= 0.0 else -1.0)

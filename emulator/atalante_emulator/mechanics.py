@@ -1,0 +1,87 @@
+"""Description of the mechanics of an emulated robot, from which body, crane, wearer and virtual operator are created.
+
+A description can be pickled, so it can be sent to another process.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Final
+
+from atalante_emulator.bodies import ENGINES, FRICTION, Body, hang, make_body
+from atalante_emulator.crane import Crane
+from atalante_emulator.emulator import Emulator, EmulatorParameters
+from atalante_emulator.imu import ImuParameters
+from atalante_emulator.virtual_operator import VirtualOperator
+from atalante_emulator.wearer import LimbParameters, PassiveWearer
+from atalante_hal.robot import JOINTS
+
+#: Nodes of a robot on the ground. The attitudes of the IMUs have errors, because these errors affect a walk.
+GROUND_PARAMETERS: Final = EmulatorParameters(imu=ImuParameters(attitude_error=0.004, heading_drift=5.2e-5))
+
+
+@dataclass(frozen=True)
+class Ground:
+    """Floor, crane and virtual operator of a robot with a free pelvis. The height of the floor is 0."""
+
+    friction: float = FRICTION  # coefficient of friction between soles and floor
+    clearance: float = 0.03  # height of the lowest corner of the suspended soles above the floor [m]
+    operator_force: float = 0.0  # largest force of the virtual operator [N]; 0 if there is no virtual operator
+
+
+@dataclass(frozen=True)
+class Mechanics:
+    """Mechanics of an emulated robot."""
+
+    urdf: str  # text of the URDF, with the wearer's segments if the robot is worn
+    engine: str = ENGINES[0]  # one of `ENGINES`
+    ground: Ground | None = None  # with None, the pelvis is fixed, and there is no floor
+    #: Impedance of a passive wearer. With None, a wearer in the URDF affects the joints only by the masses of the limbs.
+    limbs: LimbParameters | None = None
+    parameters: EmulatorParameters | None = None  # true parameters of the nodes; see `node_parameters` for None
+
+    @property
+    def node_parameters(self) -> EmulatorParameters:
+        """Return the true parameters of the nodes. The default depends on whether there is a floor."""
+        return self.parameters or (GROUND_PARAMETERS if self.ground else EmulatorParameters())
+
+    def make_body(self, pose: Sequence[float] | None = None) -> Body:
+        """Create the body. If there is a floor, the body is suspended above it at the clearance. The caller closes the body.
+
+        Args:
+            pose: initial joint positions, shape (12,) [rad]. With None, all joints are at 0.
+
+        Raises:
+            ValueError: If the engine is unknown, the text is not a URDF, or the pose does not have 12 angles.
+            ModuleNotFoundError: If the engine is not installed.
+        """
+        angles = [0.0] * len(JOINTS) if pose is None else pose
+        if self.ground is None:
+            body = make_body(self.engine, self.urdf)
+        else:
+            body = make_body(self.engine, self.urdf, free=True, ground=0.0, friction=self.ground.friction)
+        try:
+            if self.ground is not None:
+                hang(body, angles, self.ground.clearance)
+            elif pose is not None:
+                body.reset(pose)
+        except ValueError:
+            body.close()
+            raise
+        return body
+
+    def complete(self, emulator: Emulator) -> None:
+        """Add wearer, crane and virtual operator to the emulator, if the description has them.
+
+        Args:
+            emulator: emulator with the body of `make_body`.
+        """
+        if self.limbs is not None:
+            emulator.wearer = PassiveWearer(self.limbs)
+        if self.ground is not None:
+            emulator.crane = Crane(emulator.body)
+            emulator.pelvis_forces.append(emulator.crane)
+            if self.ground.operator_force:
+                emulator.virtual_operator = VirtualOperator(emulator.body, self.ground.operator_force)
+                emulator.pelvis_forces.append(emulator.virtual_operator)

@@ -1,0 +1,49 @@
+"""Passive wearer of the emulated robot: the impedance of relaxed limbs at the joints. The masses of the limbs are in the URDF.
+
+A passive wearer applies no muscle torque. But tendons and soft tissue act like a spring and a damper at each joint.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from atalante_hal.robot import SIDES
+from atalante_hal.types import Vector
+
+
+@dataclass(frozen=True)
+class LimbParameters:
+    """Impedance of relaxed legs. A tuple has one value per leg joint: FH, TH, SH, SK, SA, HA. The values are assumptions."""
+
+    stiffness: tuple[float, ...] = (20.0, 10.0, 20.0, 15.0, 15.0, 5.0)  # Nm/rad
+    damping: tuple[float, ...] = (2.0, 1.0, 2.0, 1.5, 1.0, 0.5)  # Nm s/rad
+    rest: tuple[float, ...] = (0.0, 0.0, -0.2, 0.4, -0.1, 0.0)  # joint angles without torque [rad]
+
+
+class PassiveWearer:
+    """Relaxed legs of a wearer."""
+
+    def __init__(self, parameters: LimbParameters | None = None) -> None:
+        """Create the wearer.
+
+        Args:
+            parameters: impedance of the limbs. With None, the default impedance is used.
+        """
+        parameters = parameters or LimbParameters()
+        both = len(SIDES)
+        self._stiffness = np.array(parameters.stiffness * both)
+        self._damping = np.array(parameters.damping * both)
+        self._offset = self._stiffness * np.array(parameters.rest * both)
+
+    def act(self, position: Vector, velocity: Vector, torque: Vector) -> None:
+        """Compute the torques of the limbs on the joints.
+
+        Args:
+            position: joint positions, shape (12,) [rad].
+            velocity: joint velocities, shape (12,) [rad/s].
+            torque: output for the torques, shape (12,) [Nm].
+        """
+        np.subtract(self._offset, self._stiffness * position, out=torque)
+        torque -= self._damping * velocity

@@ -1,0 +1,78 @@
+"""Disturbances: the bound of their effect against brute force, and the budget of the model errors."""
+
+from __future__ import annotations
+
+import itertools
+import math
+
+import numpy as np
+import pytest
+
+from atalante_control.guide.disturbance import Effect, HandOver, Mismatch, spread
+from tests.control.guide.ideal_leg import controller
+
+LEG = controller("constant").guides[0].prediction.leg
+
+
+def test_spread_is_the_worst_of_all_sign_patterns():
+    rng = np.random.default_rng(0)
+    n = 5
+    pushed = rng.normal(size=(n + 1, 2, 2))
+    pushed[0] = 0.0
+    left, inverse = rng.normal(size=(n, 2, 2)), rng.normal(size=(n, 1, 2, 2))
+    bounds = np.abs(rng.normal(size=(n, 2, 2)))
+    found = spread(Effect(pushed, np.zeros_like(pushed), left), inverse, bounds, n, n)
+    start, end = 1, 4
+    for column in (0, 1):
+        worst = np.zeros(2)
+        for signs in itertools.product((-1.0, 1.0), repeat=2 * (end - start)):
+            pattern = np.reshape(signs, (-1, 2)) * bounds[start:end, :, column]
+            effect = sum(left[end] @ pushed[end - i] @ inverse[i, 0] @ pattern[i - start] for i in range(start, end))
+            worst = np.maximum(worst, np.abs(effect))
+        np.testing.assert_allclose(found[start, end - start, 2 * column : 2 * column + 2], worst)
+
+
+def test_spread_takes_the_worst_posture_and_the_hidden_part():
+    pushed = np.ones((3, 2, 2))
+    hidden = np.full((3, 2, 2), 0.5)
+    inverse = np.stack([np.eye(2), 3.0 * np.eye(2)])[None].repeat(3, axis=0)
+    same = np.eye(2)[None].repeat(3, axis=0)
+    found = spread(Effect(pushed, hidden, same), inverse, np.ones((3, 2, 2)), 1, 2)
+    np.testing.assert_allclose(found[0, 2], 2 * 2 * 3.0 + 6.0 + 3.0)  # three lags add 6 each, the hidden part adds 3
+
+
+def test_budget_contains_friction_inertia_residual_and_the_carried_torque():
+    box, blend = HandOver(0.0, 0.0, (10.0, 5.0)), np.array([1.0, 0.5])
+    none = LEG.budget(Mismatch(0.0, 0.0, (0.0, 0.0)), box, blend)
+    np.testing.assert_array_equal(none[:2], [[10.0, 5.0], [5.0, 2.5]])
+    assert not none[2:].any()
+    light = LEG.budget(Mismatch(0.0, 0.1, (0.0, 0.0)), box, blend) - none
+    np.testing.assert_allclose(light, 0.1 * np.abs(LEG.torque()))
+    rough = LEG.budget(Mismatch(0.2, 0.0, (1.0, 2.0)), box, blend) - none
+    assert (rough >= 0.2 * np.abs(LEG.friction_torque()) + [1.0, 2.0]).all()
+
+
+def test_mobilities_cover_the_guide():
+    box = HandOver()
+    knee = LEG.q[400, 1]
+    found = LEG.mobilities(box, 0.05)[400]
+    np.testing.assert_allclose(found[1], np.linalg.inv(LEG.masses(np.array([knee]))[0]))
+    assert found[0, 0, 0] > found[1, 0, 0] > found[2, 0, 0]
+
+
+def test_masses_are_those_of_the_assisted_inertia():
+    for angle in (0.2, 0.9):
+        m11, m12, m22 = LEG.inertia.block(angle)
+        np.testing.assert_allclose(LEG.masses(np.array(angle)), [[m11, m12], [m12, m22]])
+
+
+@pytest.mark.parametrize("bad", [{"friction": 1.0}, {"inertia": -0.1}, {"residual": (math.inf, 0.0)}])
+def test_an_invalid_mismatch_is_rejected(bad: dict[str, object]):
+    with pytest.raises(ValueError, match="mismatch"):
+        Mismatch(**bad)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("bad", [{"deviation": -1.0}, {"rate": math.nan}, {"torque": (-1.0, 0.0)}])
+def test_an_invalid_hand_over_box_is_rejected(bad: dict[str, object]):
+    with pytest.raises(ValueError, match="hand-over"):
+        HandOver(**bad)  # type: ignore[arg-type]

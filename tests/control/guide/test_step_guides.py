@@ -1,0 +1,71 @@
+"""Guides of a walk: gains, and the filter of a step."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from atalante_control.airwalk.config import AirwalkConfig
+from atalante_control.airwalk.swing_leg import OVERLAP, swing_leg
+from atalante_control.dynamics.gravity import Gravity
+from atalante_control.gait.gait import AIRWALK_GAIT, load_gait
+from atalante_control.guide import step_guides
+from atalante_control.guide.shapes import CONSTANT
+from atalante_control.guide.step_guides import StepGuides, filter_config, policies
+from atalante_control.joint.idealization import AssistedInertia
+from atalante_control.model import ExoskeletonParameters, pinocchio_model, urdf
+from atalante_hal.robot import JOINTS, load_robot
+
+ROBOT, CONFIG = load_robot(), AirwalkConfig()
+GAIT = load_gait(AIRWALK_GAIT, ROBOT)
+MODEL = pinocchio_model(urdf(ExoskeletonParameters(), ROBOT))
+INERTIA = AssistedInertia(MODEL, GAIT.tables().q)
+LEG = swing_leg(CONFIG, GAIT, INERTIA, Gravity(MODEL))
+
+
+def test_stiffness_of_the_policies_is_that_of_the_configuration():
+    found = policies(CONFIG, INERTIA)
+    assert len(found) == len(CONFIG.gentler) + 1
+    for part, policy in zip((*CONFIG.gentler, 1.0), found, strict=True):
+        np.testing.assert_allclose(policy.stiffness, part * np.array(CONFIG.stiffness))
+        assert policy.damping == CONFIG.damping
+
+
+def test_limits_of_the_filter_follow_from_the_limits_of_the_robot():
+    found = filter_config(CONFIG, ROBOT)
+    hip = JOINTS.index("left_SH")
+    assert found.torque_limit == ROBOT.torque_max[hip] - CONFIG.torque_reserve
+    assert found.rate_limit == ROBOT.torque_rate_max[hip] * 1e-3
+    assert found.speed_limit == ROBOT.velocity_max[hip] - CONFIG.speed_reserve
+    assert found.worst_speed_limit == ROBOT.velocity_max[hip] + ROBOT.envelope.velocity_margin
+    weak = ROBOT.torque_max.copy()
+    weak[JOINTS.index("left_SK")] = 100.0
+    assert filter_config(CONFIG, replace(ROBOT, torque_max=weak)).torque_limit == 100.0 - CONFIG.torque_reserve
+
+
+@pytest.mark.parametrize("bad", [{"torque_reserve": -1.0}, {"speed_reserve": math.nan}])
+def test_a_negative_reserve_is_rejected(bad: dict[str, float]):
+    with pytest.raises(ValueError, match="reserve must be finite"):
+        replace(CONFIG, **bad)
+
+
+def test_filter_of_a_step_gets_stiffer_with_the_assistance_factor():
+    blend = np.linspace(1.0, 0.0, 20)
+    guides = StepGuides(CONFIG, ROBOT, CONSTANT, LEG, blend, OVERLAP)
+    chosen = [guides.filters.index(guides.at(xi).guide) for xi in np.linspace(0.0, 1.0, 11).tolist()]
+    assert chosen == sorted(chosen)
+    assert guides.certificate(0.5).certified
+    assert "only the baseline" in guides.certificate(1.0).reason
+
+
+def test_prepared_guides_need_no_computation_when_the_assistance_factor_changes(monkeypatch: pytest.MonkeyPatch):
+    guides = StepGuides(CONFIG, ROBOT, CONSTANT, LEG, np.linspace(1.0, 0.0, 20), OVERLAP)
+    exact = guides.at(0.37)
+    guides.prepare()
+    monkeypatch.setattr(step_guides, "largest_promise", lambda *_: pytest.fail("a promise was computed in the loop"))
+    for percent in range(101):
+        assert guides.at(percent * 100 * 0.0001).guide in guides.filters  # decoded as on the bus
+    assert guides.at(0.37) == exact

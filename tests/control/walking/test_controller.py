@@ -1,0 +1,124 @@
+"""Walking controller on a body without a bus: standing, walking, stopping."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from atalante_control.gait.walk import DEFAULT_WALK, load_walk
+from atalante_control.model import ExoskeletonParameters, Patient, urdf
+from atalante_control.walking.controller import WalkController
+from atalante_control.walking.phases import Phase
+from atalante_emulator.bodies import Body, hang, make_body
+from atalante_emulator.imu import ImuParameters, Imus, ImuSignals
+from atalante_hal.robot import load_robot
+from atalante_hal.types import State, SupervisorState
+
+ROBOT = load_robot()
+PATIENT = Patient(75.0, 1.75)
+WALK = load_walk(DEFAULT_WALK, ROBOT)
+
+
+class Ideal:
+    """Robot without noise and bus. The torques act in the next cycle."""
+
+    def __init__(self, body: Body) -> None:
+        self.body = body
+        self.signals = ImuSignals(np.zeros((4, 4)), np.zeros((4, 3)), np.zeros((4, 3)))
+        self._imus = Imus(ImuParameters(), self.signals)
+        zero, valid = np.zeros(12), np.ones(22, bool)
+        self.state = State(
+            cycle=0,
+            time=0.0,
+            supervisor=SupervisorState.ACTIVE,
+            assistance_factor=1.0,
+            position=zero.copy(),
+            velocity=zero.copy(),
+            torque=zero.copy(),
+            temperature=zero.copy(),
+            drive_state=zero.copy(),
+            imu_quaternion=self.signals.quaternion,
+            imu_gyro=self.signals.gyro,
+            imu_accel=self.signals.accel,
+            foot_force=np.zeros((2, 4, 3)),
+            vibration=np.zeros(8),
+            valid=valid,
+            age=np.zeros(22, np.int64),
+            joints_valid=True,
+        )
+        self._torque = zero.copy()
+
+    def cycle(self, controller: WalkController) -> None:
+        body, state = self.body, self.state
+        self._imus.sample(body.imu)
+        state.position[:], state.velocity[:] = body.position, body.velocity
+        state.foot_force[:] = body.sole_force
+        if state.cycle == 0:
+            controller.reset(state)
+        torque = controller.update(state).torque.copy()
+        body.step(self._torque.tolist())
+        self._torque = np.clip(torque, -ROBOT.torque_max, ROBOT.torque_max)
+        state.cycle += 1
+
+    def upright(self) -> bool:
+        x, y, _, _ = self.body.motion("pelvis").attitude
+        return bool(1.0 - 2.0 * (x * x + y * y) > 0.9)
+
+
+def walked(
+    engine: str, steps: int, *, finish_after: int | None = None, xi: float = 1.0
+) -> tuple[WalkController, list[Phase]]:
+    """Walk until the robot stands again; return the controller and its phases."""
+    controller = WalkController(ROBOT, PATIENT, WALK, steps)
+    body = make_body(engine, urdf(ExoskeletonParameters(), ROBOT, PATIENT), free=True, ground=0.0)
+    try:
+        hang(body, controller.standing_pose.tolist(), 0.0005)
+        robot, phases = Ideal(body), [controller.phase]
+        robot.state.assistance_factor = xi
+        while not controller.done:
+            robot.cycle(controller)
+            if controller.phase is not phases[-1]:
+                phases.append(controller.phase)
+            if finish_after is not None and controller.statistics.steps == finish_after:
+                robot.state.supervisor = SupervisorState.FINISH_STEP
+            assert robot.upright(), f"fell in {controller.phase.name} after {controller.statistics.steps} steps"
+            assert robot.state.cycle < 30_000
+    finally:
+        body.close()
+    return controller, phases
+
+
+@pytest.mark.parametrize("engine", ["pybullet", "mujoco"])
+def test_patient_walks_from_standing_to_standing(engine: str) -> None:
+    controller, phases = walked(engine, 3)
+    assert phases == list(Phase)
+    assert controller.statistics.steps == 3
+    assert controller.statistics.unnoticed <= 1
+    assert controller.steering.distance == pytest.approx(4 * 0.16, abs=0.12)
+    assert abs(controller.steering.lateral) < 0.05
+    assert controller.max_dcm_error < 0.03
+
+
+def test_finish_step_ends_the_walk_with_a_stop_step() -> None:
+    controller, phases = walked("mujoco", 100, finish_after=1)
+    assert phases[-3:] == [Phase.STOP, Phase.BACK, Phase.REST]
+    assert controller.statistics.steps <= 2
+
+
+@pytest.mark.parametrize("xi", [0.0, 0.5])
+def test_swing_leg_stays_inside_the_certified_guide(xi: float) -> None:
+    controller, phases = walked("mujoco", 3, xi=xi)
+    guide = controller.statistics.guide
+    assert phases == list(Phase)
+    assert controller.certificate(xi).certified
+    assert guide.factors == {xi}
+    assert 3 * 600 < guide.cycles < 3 * 850
+    # The joints stay inside although this robot has no friction and the controller compensates friction.
+    assert guide.inside == guide.cycles
+    assert 0.02 < guide.active_fraction < 1.0
+
+
+def test_guide_does_not_act_at_full_assistance() -> None:
+    controller, _ = walked("mujoco", 1)
+    assert controller.statistics.guide.cycles == 0
+    assert not controller.certificate(1.0).certified

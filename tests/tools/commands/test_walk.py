@@ -1,0 +1,132 @@
+"""`atalante walk` through HAL, bus and emulator."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+from click.testing import CliRunner
+from mcap.reader import make_reader
+
+from atalante_emulator.pendant import Operator
+from atalante_tools.cli import cli
+from atalante_tools.session.walk import Dial
+
+
+def run(*arguments: str) -> tuple[int, str, str]:
+    result = CliRunner().invoke(cli, ["walk", *arguments])
+    return result.exit_code, result.stdout, result.stderr
+
+
+@pytest.mark.parametrize("engine", ["pybullet", "mujoco"])
+def test_patient_walks_three_steps_and_stands(engine: str) -> None:
+    code, out, errors = run("--steps", "3", "--engine", engine, "--json")
+    result = json.loads(out)
+    assert (code, result["outcome"], result["steps"], result["fell"]) == (0, "stood", 3, False), errors
+    assert result["engine"] == engine
+    assert abs(result["lateral_m"]) < 0.1
+    assert abs(result["yaw_deg"]) < 5.0
+
+
+def test_passive_wearer_walks_inside_the_certified_guide(tmp_path: Path) -> None:
+    arguments = (
+        "--steps",
+        "3",
+        "--xi",
+        "0.5",
+        "--wearer",
+        "passive",
+        "--engine",
+        "mujoco",
+        "--json",
+        "--out",
+        str(tmp_path / "walk"),
+        "--can-log",
+        str(tmp_path / "walk.log"),
+    )
+    code, out, errors = run(*arguments)
+    result = json.loads(out)
+    assert (code, result["outcome"], result["steps"], result["shape"]) == (0, "stood", 3, "pinched"), errors
+    assert result["certified"]
+    assert result["inside"] == 1.0
+    assert 0.0 < result["max_ratio"] < 1.0
+    assert result["outside_cycles"] == result["hand_overs_exceeded"] == 0
+    assert "pinched: promise at Xi 0.5" in errors
+    summary = json.loads((tmp_path / "walk" / "summary.json").read_text())
+    assert summary["result"] == result
+    assert summary["recording"] == {"files": ["recording.mcap"], "complete": True, "missing_cycles": 0}
+    files = {path.name for path in (tmp_path / "walk").iterdir()}
+    assert files == {"recording.mcap", "summary.json", "trace.npz", "walk.png"}
+    # The log contains at least the sixteen drive, IMU and foot messages of each cycle of the eight seconds and more.
+    assert (tmp_path / "walk.log").read_bytes().count(b"\n") > 16 * 8000
+    with (tmp_path / "walk" / "recording.mcap").open("rb") as recording:
+        counts = make_reader(recording).get_summary().statistics.message_count
+    assert counts > 8 * 100
+
+
+def test_protocol_lowers_the_assistance_step_by_step() -> None:
+    arguments = ("--protocol", "1,1,2", "--xi", "0.5", "--wearer", "passive", "--engine", "mujoco", "--json")
+    code, out, errors = run(*arguments)
+    result = json.loads(out)
+    assert (code, result["outcome"], result["steps"], result["xi"]) == (0, "stood", 4, 0.5), errors
+    assert 0.0 < result["max_ratio"] < 1.0
+    assert result["certified"]
+    assert result["attitude_rms_deg"] < 0.5
+    assert abs(result["true_lateral_m"]) < 0.1
+    assert abs(result["true_yaw_deg"]) < 5.0
+    assert set(result["diagnostics"]) <= {"TORQUE_SATURATED", "OPERATOR_STOP"}
+    assert 0.0 < result["cpu_per_second"] < 10.0
+
+
+def test_dial_falls_linearly_from_full_assistance() -> None:
+    operator = Operator()
+    dial = Dial(operator, (3, 3, 2), 0.2)
+    factors = []
+    for steps in range(8):
+        factors.append(operator.signals.assistance_factor)  # of the step with this index
+        dial.turn(steps)
+    assert factors == [1.0, 1.0, 1.0, 0.8, 0.6, 0.4, 0.2, 0.2]
+
+
+@pytest.mark.parametrize("xi", ["1", "0.5"])
+def test_literal_law_of_the_paper_falls_without_an_operator(xi: str) -> None:
+    code, out, _ = run("--literal", "--steps", "10", "--xi", xi, "--engine", "mujoco", "--json")
+    result = json.loads(out)
+    assert (code, result["outcome"], result["fell"]) == (1, "fell", True)
+    assert result["steps"] < 10
+    assert result["certified"] in ((None,) if xi == "1" else (False,))
+
+
+def test_guide_without_a_promise_is_reported_as_not_certified() -> None:
+    _, out, errors = run("--steps", "1", "--xi", "0.5", "--shape", "snap", "--engine", "mujoco", "--json")
+    assert json.loads(out)["certified"] is False
+    assert "snap: NOT CERTIFIED at Xi 0.5" in errors
+
+
+def test_robot_that_is_pushed_over_ends_with_code_1() -> None:
+    code, out, errors = run("--steps", "3", "--engine", "mujoco", "--push", "1000", "--push-direction", "90", "--json")
+    result = json.loads(out)
+    assert (code, result["outcome"], result["fell"]) == (1, "fell", True)
+    assert "the robot fell" in errors
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (("--shape", "nonsense"), "guide shape (or a file that ends in .toml)"),
+        (("--can-log", "walk.txt"), "walk.txt"),
+        (("--record-rate", "3"), "must be a divisor of 1000"),
+        (("--wearer", "passive", "-i", "socketcan", "-c", "vcan0"), "--wearer passive requires the emulated robot"),
+        (("--mass", "75"), "a patient requires both --mass and --height"),
+        (("--protocol", "1,2", "--xi", "0"), "must be three positive numbers of steps like 112,38,225, got '1,2'"),
+        (("--protocol", "1,2,0"), "must be three positive numbers of steps"),
+        (("--protocol", "1,2,3", "-i", "socketcan", "-c", "vcan0"), "--protocol requires the emulated robot"),
+        (("--push", "50", "-i", "socketcan", "-c", "vcan0"), "--push requires the emulated robot"),
+        (("--step-length", "0.9"), "step length must be 0.05 to 0.4 m, got 0.9 m"),
+    ],
+)
+def test_bad_input_is_answered_with_one_sentence(arguments: tuple[str, ...], message: str) -> None:
+    code, _, errors = run(*arguments)
+    assert code == 2
+    assert message in errors

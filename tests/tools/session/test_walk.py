@@ -1,0 +1,76 @@
+"""Walk on the ground through HAL and bus: FINISH_STEP, and the gaits of a subject."""
+
+from __future__ import annotations
+
+from atalante_control.gait.walk import DEFAULT_WALK, load_walk
+from atalante_control.model import Patient
+from atalante_control.walking.controller import WalkController
+from atalante_control.walking.phases import Phase
+from atalante_emulator.faults import BATTERY, Fault
+from atalante_emulator.mechanics import Ground, Mechanics
+from atalante_emulator.pendant import Operator
+from atalante_hal.robot import load_robot
+from atalante_hal.types import State, SupervisorState
+from atalante_tools.console.options import MUJOCO, Target
+from atalante_tools.session.body import describe
+from atalante_tools.session.rig import open_hal
+
+ROBOT = load_robot()
+PATIENT = Patient(75.0, 1.75)
+
+
+def test_low_supply_in_a_step_ends_in_hold_on_both_feet() -> None:
+    controller = WalkController(ROBOT, PATIENT, load_walk(DEFAULT_WALK, ROBOT), 100)
+    low_supply = Fault("under_voltage", BATTERY, start=7600, volts=40.0)
+    seen: list[tuple[SupervisorState, Phase]] = []
+
+    def held(state: State) -> bool:
+        if not seen or seen[-1] != (state.supervisor, controller.phase):
+            seen.append((state.supervisor, controller.phase))
+        return len(seen) > 3 and state.supervisor is SupervisorState.HOLD
+
+    with open_hal(
+        Target("embedded", "", True, MUJOCO),
+        robot=ROBOT,
+        pose=controller.standing_pose.tolist(),
+        controller_fields=controller.telemetry_fields,
+        mechanics=Mechanics(describe(ROBOT, None, PATIENT), MUJOCO, Ground()),
+        faults=[low_supply],
+    ) as rig:
+        rig.run(controller, until=held)
+        assert rig.emulator is not None
+        x, y, _, _ = rig.emulator.body.motion("pelvis").attitude
+    finishing = [phase for supervisor, phase in seen if supervisor is SupervisorState.FINISH_STEP]
+    assert finishing[0] is Phase.STEP
+    assert finishing[-3:-1] == [Phase.STOP, Phase.BACK] or finishing[-2:] == [Phase.STOP, Phase.BACK]
+    assert seen[-1] == (SupervisorState.HOLD, Phase.REST)
+    assert 1.0 - 2.0 * (x * x + y * y) > 0.99
+
+
+def test_stop_of_the_pendant_in_a_step_ends_the_walk_on_both_feet() -> None:
+    controller = WalkController(ROBOT, PATIENT, load_walk(DEFAULT_WALK, ROBOT), 3)
+    operator = Operator()
+    seen: list[tuple[SupervisorState, Phase]] = []
+
+    def stopped(state: State) -> bool:
+        if controller.halfway and state.supervisor is SupervisorState.ACTIVE:
+            operator.stop()
+        if not seen or seen[-1] != (state.supervisor, controller.phase):
+            seen.append((state.supervisor, controller.phase))
+        return state.supervisor is SupervisorState.HOLD
+
+    with open_hal(
+        Target("embedded", "", True, MUJOCO),
+        robot=ROBOT,
+        pose=controller.standing_pose.tolist(),
+        operator=operator,
+        controller_fields=controller.telemetry_fields,
+        mechanics=Mechanics(describe(ROBOT, None, PATIENT), MUJOCO, Ground()),
+    ) as rig:
+        rig.run(controller, until=stopped)
+        assert rig.emulator is not None
+        x, y, _, _ = rig.emulator.body.motion("pelvis").attitude
+    finishing = [phase for supervisor, phase in seen if supervisor is SupervisorState.FINISH_STEP]
+    assert [phase for phase in finishing if phase is not Phase.REST] == [Phase.STEP, Phase.STOP, Phase.BACK]
+    assert seen[-1] == (SupervisorState.HOLD, Phase.REST)
+    assert 1.0 - 2.0 * (x * x + y * y) > 0.99

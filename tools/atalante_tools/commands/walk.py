@@ -1,0 +1,194 @@
+"""Command `atalante walk`: walks on the ground with a patient in the exoskeleton, on any bus."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import click
+
+from atalante_tools.console.options import (
+    SEED,
+    Between,
+    Target,
+    json_option,
+    length,
+    options_as,
+    patient_options,
+    target_options,
+)
+from atalante_tools.session.law import Law, law_options
+from atalante_tools.session.recording import RECORDING_OPTIONS, RecordingOptions
+from atalante_tools.session.shapes import SHAPE_HELP
+from atalante_tools.session.walk import DEFAULT_PATIENT, DEFAULT_STEP, Push, WalkOptions, walk
+
+if TYPE_CHECKING:
+    from atalante_control.gait.subject import Subject
+    from atalante_control.model import Patient
+
+
+def _protocol(_ctx: click.Context, _param: click.Parameter, text: str | None) -> tuple[int, int, int] | None:
+    """Convert the typed protocol to numbers of steps (option callback).
+
+    Raises:
+        click.BadParameter: If the text is not three positive numbers.
+    """
+    if text is None:
+        return None
+    parts = text.split(",")
+    if len(parts) != 3 or not all(part.isdecimal() and int(part) for part in parts):
+        raise click.BadParameter(f"must be three positive numbers of steps like 112,38,225, got {text!r}")
+    full, transition, partial = map(int, parts)
+    return full, transition, partial
+
+
+@click.command()
+@click.option(
+    "--steps",
+    type=click.IntRange(1),
+    default=20,
+    show_default=True,
+    metavar="N",
+    help="Number of steps between start step and stop step.",
+)
+@click.option(
+    "--xi",
+    type=Between(0.0, 1.0),
+    default=1.0,
+    show_default=True,
+    metavar="X",
+    help="Assistance factor Xi of the periodic steps: 1 is full assistance. Below 1, the swing leg moves in a guide.",
+)
+@click.option(
+    "--shape", default="pinched", show_default=True, metavar="NAME", help=f"Shape of the guide: {SHAPE_HELP}."
+)
+@click.option(
+    "--protocol",
+    callback=_protocol,
+    metavar="A,B,C",
+    help="A steps with full assistance, B steps in which Xi falls to --xi, and C steps with --xi. Replaces --steps.",
+)
+@click.option(
+    "--wearer",
+    type=click.Choice(["none", "passive"]),
+    default="none",
+    show_default=True,
+    help="Limbs of the emulated patient: none (masses only) or passive (the impedance of relaxed legs).",
+)
+@law_options()
+@patient_options(legs=False)
+@click.option(
+    "--step-length",
+    type=length,
+    default=str(DEFAULT_STEP[0]),
+    show_default=True,
+    metavar="M",
+    help="Step length, in m (0.16) or cm (16).",
+)
+@click.option(
+    "--step-duration", type=float, default=DEFAULT_STEP[1], show_default=True, metavar="S", help="Step duration [s]."
+)
+@click.option(
+    "--gait",
+    type=click.Path(path_type=Path, dir_okay=False, exists=True),
+    metavar="FILE",
+    help="File with the start step, the periodic step and the stop step of a walk.  [default: steps computed for the patient]",
+)
+@click.option(
+    "--push",
+    type=Between(0.0, 1000.0),
+    metavar="N",
+    help="Push the pelvis of the emulated robot once, for 0.2 s in the middle of the walk [N].  [default: no push]",
+)
+@click.option(
+    "--push-direction",
+    type=float,
+    default=0.0,
+    show_default=True,
+    metavar="DEG",
+    help="Direction of the push [deg]: 0 is forwards, 90 to the left.",
+)
+@click.option(
+    "--friction",
+    type=Between(0.05, 2.0),
+    default=0.6,
+    show_default=True,
+    metavar="MU",
+    help="Coefficient of friction between soles and floor of the emulated robot.",
+)
+@click.option("--seed", type=SEED, default=0, show_default=True, metavar="N", help="Seed of the emulated sensor noise.")
+@click.option(
+    "--out",
+    type=click.Path(path_type=Path, file_okay=False),
+    metavar="DIR",
+    help="Folder for recording.mcap, summary.json, trace.npz (telemetry of the controller at 100 Hz) and walk.png. Existing "
+    "files are replaced.  [default: no files]",
+)
+@options_as("recording", RecordingOptions, RECORDING_OPTIONS)
+@target_options(embedded=True)
+@json_option
+def command(
+    steps: int,
+    xi: float,
+    shape: str,
+    protocol: tuple[int, int, int] | None,
+    wearer: str,
+    law: Law,
+    patient: Patient | None,
+    step_length: float,
+    step_duration: float,
+    gait: Path | None,
+    push: float | None,
+    push_direction: float,
+    friction: float,
+    seed: int,
+    out: Path | None,
+    recording: RecordingOptions,
+    target: Target,
+    as_json: bool,
+) -> None:
+    """Walk on the ground with a patient, in a real or an emulated robot. The walk starts and ends in standing.
+
+    After the operator has pressed START, a crane lowers the emulated robot onto its feet. The robot shifts its weight, walks,
+    and stops on both feet. Ctrl-C ends the walk with a stop step. A second Ctrl-C ends the command at once. The exit code is 1
+    if the robot falls.
+
+    \b
+    Example: atalante walk --steps 40 --mass 75 --height 1.75
+    """
+    emulated = {"--push": push is not None, "--wearer passive": wearer == "passive", "--protocol": protocol is not None}
+    for option, given in emulated.items():
+        if given and not target.embedded:
+            raise click.UsageError(f"{option} requires the emulated robot of -i embedded")
+    if protocol is not None:
+        steps = sum(protocol)
+    subject = _subject(patient, step_length, step_duration, gait)
+    options = WalkOptions(
+        steps=steps,
+        xi=xi,
+        shape=shape,
+        passive=wearer == "passive",
+        subject=subject,
+        gait=gait,
+        seed=seed,
+        friction=friction,
+        push=None if push is None else Push(push, push_direction),
+        law=law,
+        protocol=protocol,
+        recording=recording,
+        out=out,
+    )
+    walk(target, options, as_json=as_json)
+
+
+def _subject(patient: Patient | None, step_length: float, step_duration: float, gait: Path | None) -> Subject | None:
+    """Return the patient and the step that the user gave. Return None if the walk file determines both."""
+    if patient is None and (gait is not None or (step_length, step_duration) == DEFAULT_STEP):
+        return None
+    from atalante_control.gait.subject import Subject
+    from atalante_control.model import Patient
+
+    try:
+        return Subject(patient or Patient(*DEFAULT_PATIENT), step_length, step_duration)
+    except ValueError as error:
+        raise click.UsageError(str(error)) from error

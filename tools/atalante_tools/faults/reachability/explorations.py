@@ -1,0 +1,261 @@
+"""Explorations of the operator's path: pendant, link to the HAL and HAL, with the properties of each transition.
+
+Two searches cover the same product of states. `stops` measures the time since the operator released the dead-man switch or
+pressed a button that stops. `moves` counts presses of START and changes to a better state. Each search has only its own
+observer, because the product with both observers is larger and proves no more.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from functools import cache
+from itertools import product
+from typing import Final, NamedTuple
+
+from atalante_emulator.pendant import Request
+from atalante_hal.safety.diagnostics import Reaction
+from atalante_hal.safety.state_machine import MOVING
+from atalante_hal.types import SupervisorState
+from atalante_hal.wire.cia402 import DriveState
+from atalante_tools.faults.reachability.hal_steps import (
+    ENERGISING,
+    LOST,
+    NO_START,
+    SILENT,
+    Environment,
+    HalSteps,
+    Inputs,
+    PendantFrame,
+    Reception,
+    Supervision,
+)
+from atalante_tools.faults.reachability.search import Exploration, Transition, explore
+
+_S = SupervisorState
+#: What the operator did: nothing that stops, released the dead-man switch, pressed STOP, pressed HOLD.
+NOTHING, RELEASED, STOPPED, HELD = range(4)
+#: Number of cycles after the release in which the HAL may still enable a drive, because frames of the pendant are missing.
+SILENT_PENDANT: Final = LOST - 1
+#: Ages of frames that are late [cycles]: all ages that the HAL may use, and two that it rejects.
+_LATE: Final = (*range(1, LOST + 1), 6, 16)
+_BUTTONS: Final = (Request.START, Request.STOP, Request.HOLD)
+#: Cycles after the release above which all times are equal.
+_LONG: Final = 6
+STOP_PROPERTY: Final = "no torque command after the dead-man is released, STOP or HOLD"
+MOVE_PROPERTY: Final = "one press of START, one move"
+RESTART_PROPERTY: Final = "no way from HOLD, LOWER or FAULT to ACTIVE without a new START"
+
+
+class Operator(NamedTuple):
+    """Observer of the operator's stop: what stops, and for how many cycles."""
+
+    stop: int = NOTHING
+    cycles: int = 0
+
+
+class Presses(NamedTuple):
+    """Observer of START: number of presses that were received and not used yet, and whether a START is being processed."""
+
+    received: int = 0  # at most two
+    started: bool = False
+
+
+class StopState(NamedTuple):
+    """State of the search `stops`."""
+
+    reception: Reception
+    supervision: Supervision
+    operator: Operator = Operator()
+
+
+class MoveState(NamedTuple):
+    """State of the search `moves`."""
+
+    reception: Reception
+    supervision: Supervision
+    presses: Presses = Presses()
+
+
+class Cycle(NamedTuple):
+    """Inputs of one cycle, for the trace."""
+
+    frames: tuple[PendantFrame, ...]
+    environment: Environment
+    operator: Operator = Operator()
+
+
+class _Decided(NamedTuple):
+    supervision: Supervision
+    energises: bool  # the HAL sends ENABLE OPERATION to a drive
+    entered: bool
+
+
+#: States from which the searches begin: a moving robot, and a HAL after power-on.
+_INITIAL: Final = (
+    (Reception(), Supervision(_S.ACTIVE, NO_START)),
+    (SILENT, Supervision(_S.OFF, NO_START)),
+)
+
+
+class OperatorPath:
+    """Product of pendant, link and HAL."""
+
+    def __init__(self) -> None:
+        self._steps = HalSteps()
+        self._received, self._decided, self._commanded = cache(self._receive), cache(self._decide), cache(self._command)
+
+    def stops(self) -> Exploration[StopState, Cycle]:
+        """Search for a torque command that comes too late after the operator stopped."""
+        return explore([StopState(*state) for state in _INITIAL], self._stop_successors)
+
+    def moves(self) -> Exploration[MoveState, Cycle]:
+        """Search for a change to a better state without its own press of START."""
+        return explore([MoveState(*state) for state in _INITIAL], self._move_successors)
+
+    def _stop_successors(self, state: StopState) -> Iterator[Transition[StopState, Cycle]]:
+        before = state.operator
+        if before.stop == NOTHING:
+            options = [Operator(), Operator(RELEASED), Operator(STOPPED), Operator(HELD)]
+        else:
+            options = [Operator(before.stop, min(before.cycles + 1, _LONG))]
+        for operator in options:
+            for (reception, inputs, _), frames in self._received(state.reception, operator).items():
+                for decided, environment in self._decided(state.supervision, inputs, operator.stop == STOPPED).items():
+                    late = decided.energises and operator.stop != NOTHING and operator.cycles >= SILENT_PENDANT
+                    after = self._steps.without_press(reception) if decided.entered else reception
+                    yield Transition(
+                        Cycle(frames, environment, operator),
+                        StopState(after, decided.supervision, operator),
+                        STOP_PROPERTY if late else "",
+                    )
+
+    def _move_successors(self, state: MoveState) -> Iterator[Transition[MoveState, Cycle]]:
+        before = state.supervision.supervisor
+        for (reception, inputs, pressed), frames in self._received(state.reception, Operator()).items():
+            received = min(state.presses.received + pressed, 2)
+            broken = MOVE_PROPERTY if inputs.started and not received else ""
+            received = max(received - inputs.started, 0)
+            started = state.presses.started or inputs.started
+            for decided, environment in self._decided(state.supervision, inputs, False).items():
+                after = decided.supervision.supervisor
+                wrong = broken
+                if is_move(before, after) and not started:
+                    wrong = RESTART_PROPERTY if before >= _S.HOLD else MOVE_PROPERTY
+                begun = started and not decided.entered and decided.supervision.start != NO_START
+                yield Transition(
+                    Cycle(frames, environment),
+                    MoveState(
+                        self._steps.without_press(reception) if decided.entered else reception,
+                        decided.supervision,
+                        Presses(received, begun),
+                    ),
+                    wrong,
+                )
+
+    def _receive(
+        self, before: Reception, operator: Operator
+    ) -> dict[tuple[Reception, Inputs, bool], tuple[PendantFrame, ...]]:
+        """Return the possible results of the reception, and the frames of each result.
+
+        The third element of a result is True if a press of START was received from the pendant.
+        """
+        results: dict[tuple[Reception, Inputs, bool], tuple[PendantFrame, ...]] = {}
+        for frames in arrivals(before, operator):
+            presses = [
+                frame for frame in frames if not frame.sender and frame.pressed and frame.request == Request.START
+            ]
+            for reception, inputs in self._steps.receive(before, frames):
+                pressed = any(frame.age == reception.age for frame in presses)
+                results.setdefault((reception, inputs, pressed), frames)
+        return results
+
+    def _decide(self, before: Supervision, inputs: Inputs, suspended: bool) -> dict[_Decided, Environment]:
+        """Return the possible decisions of the HAL, and the environment of each decision.
+
+        Args:
+            before: state of the safety monitor.
+            inputs: inputs of the operator.
+            suspended: True if the robot does not walk on the ground, where STOP ends the walk first.
+        """
+        results: dict[_Decided, Environment] = {}
+        for environment in environments(before, suspended):
+            for decision in self._steps.decide(before, inputs, environment):
+                energises, enabling = self._commanded(decision.after, decision.prevented)
+                after = decision.after._replace(enabling=enabling)
+                results.setdefault(_Decided(after, energises, decision.entered), environment)
+        return results
+
+    def _command(self, state: Supervision, prevented: bool) -> tuple[bool, bool]:
+        """Return whether the HAL enables a drive in this state, and whether drives are being enabled afterwards."""
+        sent = [self._steps.command(state, prevented, drive, "torque") for drive in DriveState]
+        return any(word == ENERGISING for word, _ in sent), sent[0][1]
+
+
+def is_move(before: SupervisorState, after: SupervisorState) -> bool:
+    """Return whether a change of the state leads to a better state in which drives can move or faults are acknowledged."""
+    return (after in MOVING and before not in MOVING) or (after < before and before > _S.ACTIVE)
+
+
+def environments(before: Supervision, suspended: bool = False) -> Iterator[Environment]:
+    """Yield all inputs of the safety monitor that do not come from the pendant. Inputs without effect in a state are left out.
+
+    Args:
+        before: state of the safety monitor.
+        suspended: True if the robot does not walk on the ground.
+    """
+    moving = before.supervisor in MOVING
+    for reaction, nodes_ready, enabled in product(Reaction, (True, False), (True, False)):
+        for mine in (False, True) if reaction is Reaction.LOWER else (False,):
+            for walking in (False, True) if moving and not suspended else (False,):
+                for finished in (True, False) if before.supervisor is _S.FINISH_STEP else (True,):
+                    yield Environment(reaction, mine, nodes_ready, enabled, walking, finished)
+
+
+def arrivals(before: Reception, operator: Operator) -> Iterator[tuple[PendantFrame, ...]]:
+    """Yield all frames of the pendant that can arrive in a cycle: in time, lost, doubled, late, damaged, of a second sender.
+
+    The first frame that is yielded is the one of a link without fault.
+
+    Args:
+        before: state of the reception.
+        operator: what the operator did. Frames that were sampled since then report it.
+    """
+    current = [frame for frame in _contents(before, 0) if _agrees(frame, operator)]
+    yield from ((frame,) for frame in current)
+    yield ()
+    for age in _LATE:
+        late = [frame for frame in _contents(before, age) if _agrees(frame, operator)]
+        yield from ((frame,) for frame in late)
+        yield from ((frame, frame) for frame in late[:1])
+        if age == 1 <= before.age:  # a late frame and the current frame arrive together
+            yield from ((first, second) for first in late for second in current)
+    for frame in current:
+        yield frame, frame
+        yield (frame._replace(sender="damaged"),)
+        if frame.pressed:
+            continue  # a second sender is searched only in cycles without a press
+        for request, pressed in ((Request.START, True), (before.own_request, False), (Request.STOP, True)):
+            rogue = PendantFrame(0, True, request, pressed, "rogue")
+            yield frame, rogue
+            yield rogue, frame
+            yield frame, rogue._replace(age=2)
+            yield rogue._replace(age=2), frame
+
+
+def _contents(before: Reception, age: int) -> Iterator[PendantFrame]:
+    for dead_man in (True, False):
+        yield PendantFrame(age, dead_man, before.own_request, False)
+        for request in _BUTTONS:
+            yield PendantFrame(age, dead_man, request, True)
+
+
+def _agrees(frame: PendantFrame, operator: Operator) -> bool:
+    """Return whether the pendant can have sent a frame."""
+    if frame.age > operator.cycles:
+        return True  # sampled before the operator stopped
+    return {
+        NOTHING: True,
+        RELEASED: not frame.dead_man,
+        STOPPED: frame.request == Request.STOP,
+        HELD: frame.request == Request.HOLD,
+    }[operator.stop]

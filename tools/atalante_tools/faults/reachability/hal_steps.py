@@ -1,0 +1,330 @@
+"""One cycle of the HAL as a transition: pendant frames, E2E check, pendant, safety monitor, state machine and commands.
+
+The functions under test run in a real `Hal`. A step writes a state into this HAL, calls its functions with real frames, and
+reads the state back. The other nodes are inputs: they answer or not, their drives are enabled or not, and any diagnostic may
+be active in any cycle.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from functools import cache
+from typing import Final, NamedTuple
+
+import numpy as np
+
+import atalante_dbc
+from atalante_emulator.pendant import Request
+from atalante_hal.hal import Hal
+from atalante_hal.pendant import Pendant
+from atalante_hal.robot import load_robot
+from atalante_hal.safety.diagnostics import Dtc, Finding, Reaction
+from atalante_hal.safety.fault_memory import FaultMemory
+from atalante_hal.safety.safety_monitor import DRIVE_NODES
+from atalante_hal.safety.state_machine import MOVING
+from atalante_hal.types import Command, SupervisorState
+from atalante_hal.wire.cia402 import Controlword, DriveState
+from atalante_hal.wire.e2e import FULL, NOTHING, REQUALIFY, SETTLED, Qualification
+from atalante_hal.wire.frame import Frames, new_frames
+from atalante_hal.wire.process_image import NEVER, TransmitImage
+from atalante_tools.faults.reachability.no_bus import NoBus
+
+#: Age of pendant data that has timed out [cycles]. All larger ages are equal to this age.
+LOST: Final = 5
+#: Cycle number of each step. Counters are relative to it, so its value has no effect.
+_CYCLE: Final = 1001
+_TAG: Final = _CYCLE & 0xFF
+#: RequestCounter of the last accepted frame of the pendant, and of a press of a second sender.
+_PRESSES, _ROGUE_PRESSES = 10, 12
+#: Number of cycles that a START may still take: none, this cycle, and any number above.
+NO_START, LAST_START, START = 0, 1, 2
+START_CYCLES: Final = {NO_START: 0, LAST_START: 1, START: 100}
+#: Qualifications that stand for all that are not trusted, or trusted.
+QUALIFICATIONS: Final = {
+    False: (Qualification(0, 0, False), Qualification(0, REQUALIFY - 1, False)),
+    True: (SETTLED, Qualification(FULL - 4, REQUALIFY, True)),
+}
+#: RequestCounter that `Pendant` evaluated last: none, of the last frame of the pendant, older, of a second sender.
+_NONE, _LATEST, _OLDER, _ROGUE = range(4)
+_EVALUATED: Final = {_NONE: None, _LATEST: _PRESSES, _OLDER: _PRESSES - 1, _ROGUE: _ROGUE_PRESSES}
+
+
+class Reception(NamedTuple):
+    """State of the reception of the pendant."""
+
+    age: int = 0  # age of the last accepted frame [cycles], `LOST` if it has timed out
+    dead_man: bool = True  # dead-man switch of the last accepted frame
+    request: int = Request.START  # `Request` of the last accepted frame
+    evaluated: int = _LATEST  # RequestCounter of the last evaluation
+    rogue: bool = False  # the last accepted frame has the RequestCounter of a second sender
+    stored: bool = False  # a START is stored until the pendant is trusted
+    trusted: bool = True
+    own_request: int = Request.START  # `Request` of the last intact frame of the pendant itself
+
+
+#: Pendant that has timed out. Nothing of its last frame has an effect any more.
+SILENT: Final = Reception(LOST, False, 0, _NONE, trusted=False, own_request=0)
+
+
+class PendantFrame(NamedTuple):
+    """Frame of the pendant that arrives in a cycle."""
+
+    age: int  # cycles since the pendant sampled it
+    dead_man: bool
+    request: int
+    pressed: bool  # whether a button was pressed since the last accepted frame
+    sender: str = ""  # "" for the pendant, "rogue" for a second sender, "damaged" for a frame with a wrong CRC
+
+
+class Inputs(NamedTuple):
+    """Inputs of the operator as the pendant evaluation returns them."""
+
+    dead_man: bool
+    stop: int  # 0 none, 1 STOP, 2 HOLD
+    started: bool
+
+
+class Supervision(NamedTuple):
+    """State of the safety monitor."""
+
+    supervisor: SupervisorState
+    start: int  # `NO_START`, `LAST_START` or `START`
+    enabling: bool = False
+    lowered: bool = False  # whether the drive is being lowered
+
+
+class Environment(NamedTuple):
+    """Inputs of the safety monitor that do not come from the pendant."""
+
+    reaction: Reaction = Reaction.INFO  # reaction of the worst confirmed diagnostic
+    mine: bool = False  # whether this diagnostic is of the drive
+    nodes_ready: bool = True
+    enabled: bool = True  # whether all drives are in OPERATION ENABLED
+    walking: bool = False  # whether the robot walks on the ground
+    finished: bool = True  # whether the walking step is finished
+
+
+class Decision(NamedTuple):
+    """Result of one cycle of the safety monitor."""
+
+    after: Supervision
+    prevented: bool  # a diagnostic prevents that drives are enabled
+    entered: bool  # the supervisor state changed, so a stored START is dropped
+
+
+class _ScriptedPendant(Pendant):
+    """Pendant whose inputs a step has set."""
+
+    def evaluate(self, present: bool, **others: object) -> None:
+        """Keep the inputs.
+
+        Args:
+            present: has no effect.
+            **others: have no effect.
+        """
+
+    def clear_press(self) -> None:
+        """Do nothing."""
+
+
+class HalSteps:
+    """Transitions of one HAL."""
+
+    def __init__(self) -> None:
+        network, robot = atalante_dbc.load(), load_robot()
+        self._hal = Hal(network, robot, NoBus())
+        self._monitor = self._hal._safety_monitor
+        self._image = self._hal._image
+        self._pendant = self._monitor._pendant
+        self._scripted = _ScriptedPendant(self._image)
+        self._row = self._pendant.row
+        self._transmit = TransmitImage([network.message("PENDANT_STATE")])
+        codec = self._transmit.codec
+        self._at = [codec.index("PENDANT_STATE", name) for name in ("DeadMan", "Request", "RequestCounter")]
+        self._buffer = new_frames(8)
+        self._dtc = {reaction: next(d for d in Dtc if d.reaction is reaction) for reaction in Reaction}
+        self._parts = self._hal._parts
+        self._frame = cache(self._sealed)
+        #: `_receive` and `_without_press` with stored results.
+        self.receive, self.without_press = cache(self._receive), cache(self._without_press)
+
+    # -- pendant -----------------------------------------------------------------------------------------------------
+
+    def _receive(self, before: Reception, frames: tuple[PendantFrame, ...]) -> tuple[tuple[Reception, Inputs], ...]:
+        """Return the possible results of a cycle in which frames of the pendant arrive.
+
+        Counters that a state does not contain are set to each value that gives another result, see the tests.
+
+        Args:
+            before: state before the cycle.
+            frames: frames that arrive, in order.
+        """
+        ages = (before.age,) if before.age < LOST else (LOST, 200, NEVER)
+        evidences = (0, FULL - 16) if any(frame.sender == "rogue" for frame in frames) else (0,)
+        return tuple(
+            dict.fromkeys(
+                self._received(before, frames, age, trust, evidence)
+                for age in ages
+                for trust in QUALIFICATIONS[before.trusted]
+                for evidence in evidences
+            )
+        )
+
+    def _received(
+        self, before: Reception, frames: tuple[PendantFrame, ...], age: int, trust: Qualification, evidence: int
+    ) -> tuple[Reception, Inputs]:
+        hal, monitor, image, row, pendant = self._hal, self._monitor, self._image, self._row, self._pendant
+        self._reset()
+        monitor._pendant = pendant
+        hal.state.supervisor = SupervisorState.OFF
+        monitor._heartbeats.all_reported = False
+        accepted = _TAG - 1 - age & 0xFF
+        image._e2e.expected[row] = NOTHING if age == NEVER else accepted + 1 & 0xFF
+        image._e2e.silent[row] = min(age, NEVER)
+        old = self._frame(PendantFrame(0, before.dead_man, before.request, before.rogue, "rogue"), accepted)
+        image.frames[row] = old[0]
+        pendant.signals[:3] = before.dead_man, before.request, _ROGUE_PRESSES if before.rogue else _PRESSES
+        pendant.signals[3:] = 0.0
+        image.age[row] = age
+        pendant._press = _EVALUATED[before.evaluated]
+        pendant._pressed = before.stored
+        monitor._message_monitor.qualification[row] = trust
+        monitor._message_monitor._evidence[row] = evidence
+        for index, frame in enumerate(frames):
+            self._buffer[index] = self._frame(frame, _TAG - frame.age & 0xFF)[0]
+        image.new_cycle()
+        image.accept_each(self._buffer, len(frames), _TAG)
+        self._others_answer()
+        monitor._evaluate(())
+        dead_man, request, presses = pendant.signals[:3].tolist()
+        rogue = presses == _ROGUE_PRESSES
+        latest = _PRESSES if rogue else presses
+        evaluated = {None: _NONE, latest: _LATEST, _ROGUE_PRESSES: _ROGUE}.get(pendant._press, _OLDER)
+        trusted = monitor._message_monitor.is_trusted(row)
+        now = int(image.age[row])
+        if now < LOST:
+            own = [frame.request for frame in frames if not (frame.sender or frame.age)] if rogue else [int(request)]
+            own_request = (before.own_request, *own)[-1]
+            after = Reception(
+                now, dead_man == 1, int(request), evaluated, rogue, pendant._pressed, trusted, own_request
+            )
+        else:
+            after = SILENT._replace(evaluated=evaluated, stored=pendant._pressed, trusted=trusted)
+        stop = 2 if pendant.hold_requested else int(pendant.stop_requested)
+        return after, Inputs(pendant.dead_man, stop, pendant.started)
+
+    def _without_press(self, state: Reception) -> Reception:
+        """Return the state of the reception after a change of the supervisor state.
+
+        Args:
+            state: state before the change.
+        """
+        pendant = self._pendant
+        pendant._press, pendant._pressed = _EVALUATED[state.evaluated], state.stored
+        pendant.clear_press()
+        evaluated = next(key for key, presses in _EVALUATED.items() if presses == pendant._press)
+        return state._replace(evaluated=evaluated, stored=pendant._pressed)
+
+    def _sealed(self, frame: PendantFrame, counter: int) -> Frames:
+        values = self._transmit.values
+        values.fill(0.0)
+        pressed = _ROGUE_PRESSES if frame.sender == "rogue" else _PRESSES + 1
+        values[self._at] = frame.dead_man, frame.request, pressed if frame.pressed else _PRESSES
+        sealed = self._transmit.seal(counter).copy()
+        if frame.sender == "damaged":
+            sealed["data"][0, 3] ^= 1
+        return sealed
+
+    # -- safety monitor ----------------------------------------------------------------------------------------------
+
+    def decide(self, before: Supervision, inputs: Inputs, environment: Environment) -> Iterator[Decision]:
+        """Yield the possible results of the safety monitor in one cycle.
+
+        Args:
+            before: state before the cycle.
+            inputs: inputs of the operator.
+            environment: all other inputs.
+        """
+        hal, monitor, pendant = self._hal, self._monitor, self._scripted
+        self._reset()
+        monitor._pendant = pendant
+        pendant.dead_man, pendant.stop_requested = inputs.dead_man, inputs.stop > 0
+        pendant.hold_requested, pendant.started = inputs.stop == 2, inputs.started
+        self._write(before)
+        monitor.walking = environment.walking
+        monitor.step, monitor._finish = None if environment.finished else 1, (1, _CYCLE + 1)
+        monitor._heartbeats.all_reported = environment.nodes_ready
+        if not environment.enabled:
+            hal.state.drive_state[1] = DriveState.QUICK_STOP_ACTIVE
+        self._others_answer()
+        findings = [
+            Finding(self._dtc[environment.reaction], DRIVE_NODES[0 if environment.mine else 1], 0.0, True, "input")
+        ]
+        monitor._evaluate(findings)
+        left = monitor.start_wanted
+        lowered = DRIVE_NODES[0] in monitor.lowered
+        for start in {NO_START} if not left else {LAST_START, START} if before.start == START else {min(left, START)}:
+            after = Supervision(hal.state.supervisor, start, monitor.enabling, lowered)
+            yield Decision(after, monitor.start_prevented, after.supervisor is not before.supervisor)
+
+    def command(self, state: Supervision, prevented: bool, drive: DriveState, controller: str) -> tuple[int, bool]:
+        """Return the controlword that the HAL sends to the drive, and the new value of `Supervision.enabling`.
+
+        Args:
+            state: state of the safety monitor in this cycle.
+            prevented: whether a diagnostic prevents that drives are enabled.
+            drive: state that the drive reports.
+            controller: "torque", or "raise" if the controller raises an exception.
+        """
+        hal = self._hal
+        self._reset()
+        self._write(state)
+        if prevented:
+            hal._safety_monitor.memory.raise_dtc(_CYCLE, self._dtc[Reaction.HOLD], DRIVE_NODES[1])
+            hal._safety_monitor.memory.close_cycle(_CYCLE)
+        hal.state.drive_state[0] = drive
+        if not hal.moving:
+            hal.hold()
+        elif controller == "raise":
+            hal.fail(ValueError("input"))
+        else:
+            hal.write(Command(np.zeros(12), np.zeros(8)))
+        return int(hal._commands.control[0]), self._monitor.enabling
+
+    def _reset(self) -> None:
+        """Set everything that a state does not contain to its value without a fault."""
+        hal, monitor = self._hal, self._monitor
+        hal.state.cycle = _CYCLE
+        monitor.memory = FaultMemory()
+        monitor._reports.clear()
+        monitor.start_wanted, monitor.enabling, monitor.moving, monitor.walking = 0, False, False, False
+        monitor._ending = monitor._duplicate_found = monitor._ramping = False
+        monitor.lowered.clear()
+        rows = len(self._image.check)
+        monitor._message_monitor.qualification = [SETTLED] * rows
+        monitor._message_monitor._evidence = [0] * rows
+        hal.state.drive_state[:] = DriveState.OPERATION_ENABLED
+        hal.state.torque[:] = 0.0
+        self._parts.motion[:] = 0.0
+        self._image.refused = []
+        self._others_answer()
+
+    def _others_answer(self) -> None:
+        """Give every node except the pendant new data."""
+        image, row = self._image, self._row
+        age, check = int(image.age[row]), int(image.check[row])
+        image.age.fill(0)
+        image.check.fill(0)
+        image.age[row], image.check[row] = age, check
+
+    def _write(self, state: Supervision) -> None:
+        monitor = self._monitor
+        self._hal.state.supervisor = state.supervisor
+        monitor.moving = state.supervisor in MOVING
+        monitor.start_wanted, monitor.enabling = START_CYCLES[state.start], state.enabling
+        if state.lowered:
+            monitor.lowered.add(DRIVE_NODES[0])
+
+
+#: Whether a controlword lets the drive follow the torque of the HAL.
+ENERGISING: Final = int(Controlword.ENABLE_OPERATION)

@@ -1,0 +1,81 @@
+"""Scenario of a counterexample: the inputs of its cycles as operator actions and faults of a walk in lock-step."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Final
+
+from atalante_emulator.faults import Fault
+from atalante_emulator.pendant import Request
+from atalante_hal.safety.diagnostics import Reaction
+from atalante_hal.wire.cia402 import DriveState
+from atalante_tools.faults.reachability.drive_steps import DriveCycle, DriveStep
+from atalante_tools.faults.reachability.explorations import Cycle
+from atalante_tools.faults.reachability.hal_steps import Environment, PendantFrame
+from atalante_tools.faults.scenario import Case, HostFault, OperatorAction, Stimulus
+
+_BUTTON: Final = {Request.START: "start", Request.STOP: "stop", Request.HOLD: "hold"}
+#: Cycles that a run continues after the last input of the counterexample.
+OBSERVED: Final = 20
+
+
+class NotReplayable(ValueError):  # noqa: N818
+    """A counterexample has an input that has no operator action and no fault."""
+
+
+def case_of(cycles: Sequence[Cycle]) -> Case:
+    """Return the scenario of a counterexample that begins with a walking robot.
+
+    Args:
+        cycles: inputs of each cycle.
+
+    Raises:
+        NotReplayable: If an input has no operator action and no fault.
+    """
+    stimuli: list[Stimulus] = []
+    dead_man = True
+    for number, cycle in enumerate(cycles):
+        frames, environment = cycle.frames, cycle.environment
+        if environment.reaction is Reaction.HOLD:
+            stimuli.append(HostFault("raise", number, value="ValueError"))
+        elif environment.reaction is Reaction.INFO and not environment.enabled:
+            stimuli.append(Fault("leave_operation", "LEFT_SK", number, 1, state="QUICK_STOP_ACTIVE"))
+        elif environment != Environment(walking=environment.walking, finished=environment.finished):
+            raise NotReplayable(f"cycle {number + 1}: no fault causes {environment}")
+        if not frames:
+            stimuli.append(Fault("drop", "PENDANT_STATE", number, 1))
+            continue
+        if any(frame.sender or frame.age or frame != frames[0] for frame in frames):
+            raise NotReplayable(f"cycle {number + 1}: no fault causes {frames}")
+        if len(frames) > 1:
+            stimuli.append(Fault("duplicate", "PENDANT_STATE", number, 1))
+        stimuli += _actions(frames[0], dead_man, number)
+        dead_man = frames[0].dead_man
+    return Case("counterexample", tuple(stimuli), observed=OBSERVED)
+
+
+def drive_case_of(trace: Sequence[tuple[DriveCycle, DriveStep]]) -> Case:
+    """Return the scenario of a counterexample of a drive, from the cycle after it was enabled.
+
+    Args:
+        trace: inputs and state of each cycle.
+
+    Raises:
+        NotReplayable: If an input is no loss of a command.
+    """
+    states = [step.drive.state for _, step in trace]
+    enabled = states.index(DriveState.OPERATION_ENABLED)
+    lost = trace[enabled + 1 :]
+    for cycle, _ in lost:
+        if cycle != DriveCycle():
+            raise NotReplayable(f"no fault causes {cycle}")
+    return Case("counterexample", (Fault("drop", "COMMAND_LEFT_LEG", 0, len(lost)),), observed=OBSERVED)
+
+
+def _actions(frame: PendantFrame, dead_man: bool, number: int) -> list[Stimulus]:
+    actions: list[Stimulus] = []
+    if frame.dead_man != dead_man:
+        actions.append(OperatorAction("squeeze" if frame.dead_man else "release", number))
+    if frame.pressed:
+        actions.append(OperatorAction(_BUTTON[Request(frame.request)], number))
+    return actions

@@ -1,0 +1,58 @@
+"""Figures of the exploration: `python -m atalante_tools.faults.reachability.report` prints them as a Markdown table."""
+
+from __future__ import annotations
+
+from typing import Any, Final
+
+from atalante_tools.faults.reachability.drive_steps import (
+    HOLD_PROPERTY,
+    LATCH_PROPERTY,
+    WATCHDOG_PROPERTY,
+    DriveSteps,
+)
+from atalante_tools.faults.reachability.explorations import (
+    MOVE_PROPERTY,
+    RESTART_PROPERTY,
+    STOP_PROPERTY,
+    OperatorPath,
+)
+from atalante_tools.faults.reachability.search import Exploration
+
+#: Name of each search -> properties that it proves.
+SEARCHES: Final = {
+    "moves": (MOVE_PROPERTY, RESTART_PROPERTY),
+    "stops": (STOP_PROPERTY,),
+    "drive": (WATCHDOG_PROPERTY, HOLD_PROPERTY, LATCH_PROPERTY),
+}
+
+
+def search(name: str) -> Exploration[Any, Any]:
+    """Run one search.
+
+    Args:
+        name: key of `SEARCHES`.
+    """
+    match name:
+        case "moves":
+            return OperatorPath().moves()
+        case "stops":
+            return OperatorPath().stops()
+        case _:
+            return DriveSteps().search()
+
+
+def main() -> None:
+    """Print states, transitions and properties of each search, and the inputs of each cycle of a counterexample."""
+    print("| search | states | transitions | properties |\n| --- | --- | --- | --- |")
+    for name, properties in SEARCHES.items():
+        found = search(name)
+        print(f"| {name} | {found.states} | {found.transitions} | {'; '.join(properties)} |")
+        if found.broken:
+            print(f"\nviolated: {found.broken}")
+            for number, (cycle, state) in enumerate(found.trace, 1):
+                print(f"cycle {number}: {cycle}\n  -> {state}")
+            raise SystemExit(1)
+
+
+if __name__ == "__main__":
+    main()

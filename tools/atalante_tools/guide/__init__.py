@@ -1,0 +1,311 @@
+"""Command `atalante guide`: test the promises of the virtual guides with an adversary.
+
+The promise of a guide is a torque at hip and knee. The certificate of the guide states that no push up to this torque moves a
+joint out of the guide. The adversary is a search for a push up to this torque that does move a joint out of the guide.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from atalante_tools.console.options import SEED, Between, OutputFile, json_option, options_as, subject_options
+from atalante_tools.console.outcome import Failed, InvalidUsage
+from atalante_tools.console.terminal import Progress, print_message, show_json, table
+from atalante_tools.session.law import Law, law_options
+from atalante_tools.session.shapes import SHAPE_HELP, SHAPE_NAMES, guide_shapes
+
+if TYPE_CHECKING:
+    from atalante_control.gait.subject import Subject
+    from atalante_tools.guide.promise_check import Checked, Effort, Verdict
+
+#: Names of the conditions, copied from `promise_check.CONDITIONS` because the help must not import the slow controller.
+CONDITION_NAMES = ("model", "friction", "mass", "both", "noise", "loss", "delay")
+#: Assistance factors of a complete check.
+FACTORS = (0.0, 0.25, 0.5, 0.75, 0.9, 0.95, 0.99)
+
+
+@click.group()
+def command() -> None:
+    """Search for pushes that move a joint out of a virtual guide, on an ideal plant and on the emulated robot.
+
+    The promise of a guide is a torque at hip and knee. Pushes up to this torque must leave both joints inside the guide.
+
+    \b
+    Example: atalante guide check --shape constant --xi 0.5 --quick
+             atalante guide random --count 300
+    """
+
+
+@dataclass(frozen=True)
+class CheckOptions:
+    """Options of `atalante guide check`."""
+
+    shapes: tuple[str, ...]  # names or files of the guide shapes; empty means all shapes of the package
+    factors: tuple[float, ...]  # assistance factors; empty means `FACTORS`
+    patients: bool  # whether to check the network gaits of several patients, too
+    conditions: tuple[str, ...]  # names of conditions; empty means all
+    push: tuple[float, float] | None  # largest push at hip and knee [Nm]; None means the promised torques
+    steps: int | None  # steps on the plant per guide; None means the number in `effort`
+    robot_steps: int | None  # steps on the emulated robot per guide; None means the number in `effort`
+    seed: int  # seed of the search and of the noise
+    quick: bool  # whether to use the small number of steps `QUICK`
+    plot: Path | None  # picture file; None means no picture
+    table: Path | None  # Markdown file for the table; None means no file
+    results: Path | None  # file of the results, from which an interrupted check is resumed; None means no file
+    law: Law  # control law of the assisted joints
+
+    def effort(self) -> Effort:
+        """Return the size of the check of each guide."""
+        from atalante_tools.guide.promise_check import COMPLETE, QUICK
+
+        effort = QUICK if self.quick else COMPLETE
+        steps = effort.steps if self.steps is None else self.steps
+        return replace(
+            effort, steps=steps, robot_steps=effort.robot_steps if self.robot_steps is None else self.robot_steps
+        )
+
+    def task(self) -> dict[str, Any]:
+        """Return the values that determine the result of a guide, for the file of the results."""
+        return {
+            "conditions": self.conditions,
+            "effort": asdict(self.effort()),
+            "seed": self.seed,
+            "push": self.push,
+            "law": asdict(self.law),
+        }
+
+
+_CHECK_OPTIONS = [
+    click.option("--shape", "shapes", metavar="NAME|FILE", multiple=True,
+                 help=f"Shape of the guide: {SHAPE_HELP}. Repeat the option for several shapes.  [default: all]"),
+    click.option("--xi", "factors", type=Between(0.0, 1.0), metavar="X", multiple=True,
+                 help="Assistance factor Xi. Repeat the option for several factors.  "
+                      f"[default: {', '.join(f'{xi:g}' for xi in FACTORS)}]"),
+    click.option("--patients", is_flag=True,
+                 help="Also check the network gaits of twelve patients of 58 to 91 kg."),
+    click.option("--condition", "conditions", type=click.Choice(CONDITION_NAMES), multiple=True,
+                 help="Deviation of plant and robot from the model: none (model), friction +-20 %, mass +-10 %, both, encoder "
+                      "noise, 1 % frame loss, 1 ms more delay. Repeat the option for several.  [default: all]"),
+    click.option("--push", type=(Between(0.0, 500.0), Between(0.0, 500.0)), default=None, metavar="HIP KNEE",
+                 help="Largest push at hip and knee [Nm].  [default: the promise of the guide]"),
+    click.option("--steps", type=click.IntRange(1), metavar="N",
+                 help="Steps on the ideal plant per guide.  [default: 1500, with --quick 60]"),
+    click.option("--robot-steps", type=click.IntRange(0), metavar="N",
+                 help="Steps on the emulated robot per guide.  [default: 60; 0 if --quick is given]"),
+    click.option("--seed", type=SEED, default=0, show_default=True, metavar="N", help="Seed of the search and of the noise."),
+    click.option("--quick", is_flag=True, help="Search briefly, on the plant only, and not beyond the promise."),
+    click.option("--plot", type=OutputFile(".png", ".svg", ".pdf"), metavar="FILE",
+                 help="Draw guide, safe backward image and worst step of the last guide."),
+    click.option("--table", type=OutputFile(".md"), metavar="FILE", help="Write the results as a Markdown table."),
+    click.option("--results", type=OutputFile(".jsonl"), metavar="FILE",
+                 help="Append each result to this file. Guides that the file already contains are not checked again, so the same "
+                      "command resumes an interrupted check."),
+]  # fmt: skip
+
+
+@command.command(short_help="Search for the worst push within the promise of a guide.")
+@options_as("options", CheckOptions, [*_CHECK_OPTIONS, law_options(), json_option, subject_options])
+def check(options: CheckOptions, as_json: bool, subject: Subject | None) -> None:
+    """Search for the worst push within the promise of each guide, and print the promise and the worst |e| / q_bound.
+
+    A push acts on hip and knee of the swing leg at the same time. The torque at each joint is at most the promised torque, and
+    its direction may change at any time. The promise is kept if the ratio |e| / q_bound is at most 1. The column "left at" is
+    the smallest multiple of the promise that moved a joint out of the guide. The exit code is 1 if a promise is broken, but with
+    --push it is 0.
+
+    \b
+    Example: atalante guide check --shape constant --xi 0.5 --quick
+             atalante guide check --shape pinched --xi 0.5 --plot worst.png
+             atalante guide check --patients --results all.jsonl --table all.md
+    """
+    if options.plot is not None and options.results is not None:
+        raise InvalidUsage("--plot draws the last guide checked, so it must not be combined with --results")
+    verdicts, last = [], None
+    for verdict, checked in _all_checks(options, subject):
+        verdicts.append(verdict)
+        last = checked
+        if as_json:
+            show_json(asdict(verdict))
+    if not as_json:
+        click.echo(verdicts_table(verdicts))
+    if options.law.literal:
+        print_message(verdicts[0].reason)
+    if options.table is not None:
+        options.table.write_text(markdown_table(verdicts), encoding="utf-8")
+        print_message(f"wrote {options.table}")
+    if options.plot is not None:
+        assert last is not None
+        _draw(last, options.plot)
+    broken = [v for v in verdicts if v.broken and v.certified]
+    if broken and options.push is None:
+        worst = max(broken, key=lambda verdict: verdict.worst_ratio or 0.0)
+        raise Failed(
+            f"all {len(verdicts)} guides must keep their promise, but {len(broken)} did not; worst: {worst.shape} at "
+            f"Xi {worst.xi:g} with |e| / q_bound {worst.worst_ratio:.3f}{f' ({worst.stopped})' if worst.stopped else ''}"
+        )
+
+
+def _all_checks(options: CheckOptions, subject: Subject | None) -> Iterator[tuple[Verdict, Checked | None]]:
+    """Check all guides of the options one after another, and show the current guide in the progress line.
+
+    Yields:
+        Result of each guide. The second element is None if the result is one of an earlier run.
+
+    Raises:
+        Failed: If the file of the results contains other results.
+    """
+    from atalante_hal.robot import load_robot
+    from atalante_tools.guide.promise_check import Task, conditions_of, patients, setup_of
+    from atalante_tools.guide.promise_check import check as check_guide
+    from atalante_tools.guide.results import Results
+
+    robot, shapes = load_robot(), guide_shapes(options.shapes or SHAPE_NAMES.split(", ")).values()
+    task = Task(conditions_of(options.conditions), options.effort(), options.seed, options.push)
+    try:
+        results = Results(options.results, options.task())
+    except ValueError as error:
+        raise Failed(str(error)) from error
+    subjects, factors = [subject, *(patients() if options.patients else [])], options.factors or FACTORS
+    progress, done, total = Progress(), 0, len(subjects) * len(shapes) * len(factors)
+    for patient in subjects:
+        setup = setup_of(patient, robot, options.law.config())
+        for shape in shapes:
+            controller = setup.controller(shape)
+            for xi in factors:
+                done += 1
+                verdict, checked = results.find((setup.gait.name, shape.name, xi)), None
+                if verdict is None:
+                    progress.show(f"guide {done} of {total}: {setup.gait.name}   {shape.name:<11} Xi {xi:g}")
+                    checked = check_guide(setup, controller, xi, task)
+                    verdict = checked.verdict
+                    results.add(verdict)
+                    progress.clear()
+                yield verdict, checked
+
+
+def _draw(checked: Checked, plot: Path) -> None:
+    """Draw the figure.
+
+    Raises:
+        Failed: If matplotlib is not installed.
+    """
+    try:
+        from atalante_tools.guide.figure import draw
+    except ModuleNotFoundError as error:
+        raise Failed(f"a figure needs {error.name}; type: pip install 'atalante-hal[plot]'") from error
+    draw(checked, plot)
+    print_message(f"wrote {plot}")
+
+
+def markdown_table(verdicts: Sequence[Verdict]) -> str:
+    """Return the results of several checks as a Markdown table.
+
+    Args:
+        verdicts: One result per guide.
+    """
+    lines = [
+        "| gait | shape | Xi | promise: hip, knee [Nm] | worst ratio: plant | robot | left at, times the promise | steps |",
+        "|---|---|---|---|---|---|---|---|",
+    ]
+    for v in verdicts:
+        promise = "none" if v.promise_hip_nm is None else f"{v.promise_hip_nm:.1f}, {v.promise_knee_nm:.1f}"
+        plant, on_robot = ("-" if ratio is None else f"{ratio:.2f}" for ratio in (v.plant_ratio, v.robot_ratio))
+        on_robot += " (HOLD)" if v.stopped else ""
+        left_at = "-" if v.left_at is None else f"{v.left_at:.1f}"
+        lines.append(f"| {v.gait} | {v.shape} | {v.xi:g} | {promise} | {plant} | {on_robot} | {left_at} | {v.steps} |")
+    return "\n".join(lines) + "\n"
+
+
+def verdicts_table(verdicts: Sequence[Verdict]) -> str:
+    """Return the results of several checks as a table for the terminal.
+
+    Args:
+        verdicts: One result per guide.
+    """
+    head = [
+        "gait",
+        "shape",
+        "Xi",
+        "certified",
+        "hip Nm",
+        "knee Nm",
+        "worst",
+        "plant",
+        "robot",
+        "left at",
+        "steps",
+        "worst push",
+    ]
+    rows = [
+        [
+            v.gait,
+            v.shape,
+            f"{v.xi:g}",
+            "yes" if v.certified else "NO",
+            *("-" if x is None else f"{x:.2f}" for x in (v.promise_hip_nm, v.promise_knee_nm)),
+            *("-" if x is None else f"{x:.3f}" for x in (v.worst_ratio, v.plant_ratio, v.robot_ratio)),
+            "-" if v.left_at is None else f"{v.left_at:.2f}",
+            str(v.steps),
+            f"{v.worst_push}, {v.worst_condition}" if v.worst_push else "-",
+        ]
+        for v in verdicts
+    ]
+    return table([head, *rows])
+
+
+@command.command(name="random", short_help="Search for pushes that move a joint out of a random guide.")
+@click.option("--count", type=click.IntRange(1), default=300, show_default=True, metavar="N", help="Number of shapes.")
+@click.option(
+    "--first", type=click.IntRange(0), default=0, show_default=True, metavar="N", help="Number of the first shape."
+)
+@click.option(
+    "--steps",
+    type=click.IntRange(1),
+    default=120,
+    show_default=True,
+    metavar="N",
+    help="Steps on the ideal plant per shape.",
+)
+@click.option("--seed", type=SEED, default=0, show_default=True, metavar="N", help="Seed of shapes and search.")
+@json_option
+def random_command(count: int, first: int, steps: int, seed: int, as_json: bool) -> None:
+    """Check random guides. Their shapes are in turn smooth, notched (notches of 2 to 40 ms) and piecewise constant.
+
+    Each guide has a random assistance factor up to 0.95. The adversary searches for the worst push up to the promise of the
+    guide, on the ideal plant. The exit code is 1 if such a push moved a joint out of a certified guide.
+
+    \b
+    Example: atalante guide random --count 300
+             atalante guide random --first 17 --count 1     (repeat the check of one shape)
+    """
+    from atalante_hal.robot import load_robot
+    from atalante_tools.guide.promise_check import Effort, Task, conditions_of, setup_of
+    from atalante_tools.guide.promise_check import check as check_guide
+    from atalante_tools.guide.random_shapes import random_guide
+
+    setup = setup_of(None, load_robot())
+    progress, verdicts = Progress(), []
+    for number in range(first, first + count):
+        shape, xi = random_guide(seed, number)
+        task = Task(conditions_of(()), Effort(steps, robot_steps=0, tightness=False), seed)
+        verdicts.append(check_guide(setup, setup.controller(shape), xi, task).verdict)
+        certified = [v for v in verdicts if v.certified]
+        left = [v for v in certified if v.broken]
+        progress.show(f"shape {number + 1 - first}/{count}   certified {len(certified)}   left {len(left)}")
+        if as_json:
+            show_json(asdict(verdicts[-1]))
+    progress.clear()
+    if not as_json:
+        click.echo(verdicts_table(certified))
+    print_message(f"{count} shapes, {len(certified)} certified; a joint left {len(left)} of the certified guides")
+    if left:
+        worst = max(left, key=lambda v: v.worst_ratio or 0.0)
+        raise Failed(
+            f"no joint may leave a certified guide, but a joint left {len(left)}; worst: {worst.shape} at Xi {worst.xi:.3f} with "
+            f"|e| / q_bound {worst.worst_ratio:.3f}"
+        )

@@ -1,0 +1,365 @@
+"""Steps of the ideal plant under the running controller: `start, push -> |e| / q_bound over the step`.
+
+Each step calls the compiled cycle of the real controller, so the check covers the law that runs on the robot. At the start of a
+step, the torques from before the stance change still act. The plant, the limiter and the drives are those of the module `plant`.
+"""
+
+from __future__ import annotations
+
+import functools
+import math
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from atalante_control.airwalk.controller import AirwalkConfig, AirwalkController
+from atalante_control.airwalk.kernel import Measured, Parts, run
+from atalante_control.gait.gait import PERIOD, Gait, motion
+from atalante_control.guide.kernel import GuideTables
+from atalante_control.guide.shapes import GuideShape
+from atalante_control.joint.pid import RIGHT
+from atalante_control.model import ArticulatedModel, ExoskeletonParameters, pinocchio_model, urdf
+from atalante_hal.compiled import compiled
+from atalante_hal.robot import CELLS, FEET, IMUS, JOINTS, LEG_JOINTS, MOTORS, Robot
+from atalante_hal.types import State, SupervisorState, Vector
+from atalante_tools.guide.plant import HIP, KNEE, Condition, Plant, advance, inverse_dynamics, limited, plant
+
+Pair = tuple[float, float]
+
+#: A step ends early if |e| / q_bound exceeds this value, because the joint is then far outside the guide.
+FAR_OUTSIDE = 8.0
+#: Columns of `Walked.log`.
+LOG = (
+    "e_hip",
+    "e_knee",
+    "ratio_hip",
+    "ratio_knee",
+    "push_hip",
+    "push_knee",
+    "sent_hip",
+    "sent_knee",
+    "rate_hip",
+    "rate_knee",
+)
+#: Number of inputs of the feedback law of a push: e / q_bound of hip and knee, then the rates of e divided by `RATE`.
+FEATURES = 4
+RATE = 0.5  # rad/s
+
+
+class Push(NamedTuple):
+    """Push during one step: in each cycle, the largest push of each joint times the sign of `signs` + `feedback` @ features."""
+
+    signs: Vector  # (cycles + 1, 2)
+    feedback: Vector  # (2, FEATURES)
+
+
+class Start(NamedTuple):
+    """State of the leg at the stance change."""
+
+    deviation: Pair  # rad, q - q_nom of SH and SK
+    rate: Pair  # rad/s, q' - q_nom' of SH and SK
+    carried: Pair  # Nm, torque before the stance change minus the torque that the nominal motion needs
+    ahead: Pair  # rad/s, true minus measured speed of SH and SK, due to the lag of the velocity filter
+
+
+class Goal(NamedTuple):
+    """Desired motion of the plant, and the guide around this motion."""
+
+    q: Vector  # (cycles + 1, 2) rad, q_des
+    qd: Vector  # (cycles + 1, 2) rad/s, q_des'
+    bounds: Vector  # (2, cycles + 1, 2) rad, upper and lower distance to the guide
+
+
+class Walked(NamedTuple):
+    """Result of a step."""
+
+    ratio: float  # largest |e| / q_bound
+    cycle: int  # cycle with the largest ratio
+    joint: int  # joint with the largest ratio |e| / q_bound: 0 for the hip, 1 for the knee
+    log: Vector  # (cycles + 1, len(LOG)), values of each cycle; zero after the end of the step
+
+
+@dataclass(frozen=True)
+class Setup:
+    """Gait, robot and model of a check."""
+
+    robot: Robot
+    gait: Gait
+    config: AirwalkConfig
+    exoskeleton: ExoskeletonParameters
+
+    @functools.cached_property
+    def articulated(self) -> ArticulatedModel:
+        """Return the model of the empty exoskeleton with the pelvis fixed."""
+        return pinocchio_model(urdf(self.exoskeleton, self.robot))
+
+    def controller(self, shape: GuideShape) -> AirwalkController:
+        """Return a controller for a guide shape.
+
+        Args:
+            shape: shape of the guide.
+        """
+        return AirwalkController(self.robot, self.gait, shape, self.config, self.exoskeleton)
+
+    def plant(self, condition: Condition) -> Plant:
+        """Return the ideal plant of the swing leg.
+
+        Args:
+            condition: deviation of the plant from the model.
+        """
+        friction = self.config.friction
+        pair = [LEG_JOINTS.index("SH"), LEG_JOINTS.index("SK")]
+        dry, viscous = np.array(friction.coulomb)[pair], np.array(friction.viscous)[pair]
+        return plant(self.articulated, self.gait, self.robot, (dry, viscous, friction.smoothing), condition)
+
+
+class IdealLeg:
+    """Left leg of the ideal plant, which swings in one guide at one assistance factor."""
+
+    def __init__(self, setup: Setup, controller: AirwalkController, xi: float) -> None:
+        """Sample the nominal motion and the guide.
+
+        Args:
+            setup: gait, robot and model.
+            controller: controller of the guide; each step restarts it.
+            xi: assistance factor in [0, 1].
+        """
+        self._setup, self._controller, self._xi = setup, controller, xi
+        gait = setup.gait
+        coefficients, duration, end = gait.coefficients[[HIP, KNEE]], gait.duration, setup.config.alpha * gait.duration
+        self.cycles = gait.cycles
+        time: Vector = np.arange(self.cycles + 1, dtype=np.float64) * PERIOD
+        phase: Vector = time / duration
+        x: Vector = np.minimum(time / end, 1.0)[:, None]
+        #: q_nom [rad], q_nom' [rad/s] and q_nom'' [rad/s2] of hip and knee, each of shape (cycles + 1, 2).
+        self.nominal: tuple[Vector, Vector, Vector] = motion(coefficients, duration, phase)
+        # The re-centring s is the cubic with given s(0) and s'(0), and s = s' = 0 at `end`.
+        self._s = 1.0 - 3.0 * x**2 + 2.0 * x**3, end * (x - 2.0 * x**2 + x**3)
+        self._sd = (-6.0 * x + 6.0 * x**2) / end, 1.0 - 4.0 * x + 3.0 * x**2
+        self.bounds: Vector = controller.guide_at(xi).shape.bounds(phase, xi)
+        self._mean = gait.tables().q.mean(axis=0)
+        self._row = np.concatenate([self._mean, np.zeros(len(JOINTS))])
+
+    def goal(self, start: Start) -> Goal:
+        """Return the desired motion q_nom + s of a step, and the guide around this motion.
+
+        Args:
+            start: state at the stance change.
+        """
+        (q, qd, _), d, r = self.nominal, np.array(start.deviation), np.array(start.rate)
+        return Goal(q + d * self._s[0] + r * self._s[1], qd + d * self._sd[0] + r * self._sd[1], self.bounds)
+
+    def walk(self, plant: Plant, start: Start, push: Push, box: Pair, noise: Vector) -> Walked:
+        """Walk one step from the stance change to its end.
+
+        Args:
+            plant: constants of the plant.
+            start: state at the stance change.
+            push: push of the step.
+            box: largest push at hip and knee [Nm].
+            noise: noise of the encoders and numbers in [0, 1] for lost frames, shape (cycles + 1, 4); see `noise_of`.
+        """
+        goal = self.goal(start)
+        before = inverse_dynamics(plant, goal.q[0], goal.qd[0], self.nominal[2][0]) + np.array(start.carried)
+        self._change_step(goal.q[0], goal.qd[0], before)
+        log = np.zeros((self.cycles + 1, len(LOG)))
+        leg = np.concatenate([goal.q[0], goal.qd[0] + np.array(start.ahead)])
+        episode = Episode(plant, goal, push, np.array(box), noise, before, self._row, log)
+        controller = self._controller
+        ratio, cycle, joint = _walk()(episode, leg, controller._measured, controller.guide.tables, controller._parts)
+        return Walked(float(ratio), int(cycle), int(joint), log)
+
+    def image(self, start: Start) -> Vector:
+        """Return the largest and the smallest error of each joint in the safe backward image (h >= 0).
+
+        The angle of the other joint and the speeds of both joints are those of the desired motion.
+
+        Args:
+            start: state at the stance change.
+
+        Returns:
+            Largest e and largest -e, shape (2, cycles + 1, 2) [rad]; NaN in the cycles between two samples.
+        """
+        goal, controller = self.goal(start), self._controller
+        self._change_step(goal.q[0], goal.qd[0], np.zeros(2))
+        image = np.full((2, self.cycles + 1, 2), math.nan)
+        _image()(goal, self._row, image, controller._measured, controller.guide.tables, controller._parts)
+        return image
+
+    def _change_step(self, q: Vector, qd: Vector, before: Vector) -> None:
+        """Start a right-stance step of the controller."""
+        position, velocity, torque = self._mean.copy(), np.zeros(len(JOINTS)), np.zeros(len(JOINTS))
+        position[[HIP, KNEE]], velocity[[HIP, KNEE]], torque[[HIP, KNEE]] = q, qd, before
+        state = _state(position, velocity, torque, self._xi)
+        controller = self._controller
+        controller.reset(state)
+        controller._change_step(state, RIGHT)
+
+
+class Episode(NamedTuple):
+    """Inputs of a compiled step."""
+
+    plant: Plant
+    goal: Goal
+    push: Push
+    box: Vector  # (2,) Nm
+    noise: Vector  # (cycles + 1, 4)
+    before: Vector  # (2,) Nm, torque before the stance change
+    other: Vector  # (24,) angles [rad], then speeds [rad/s] of all joints; values of hip and knee are not used
+    log: Vector  # (cycles + 1, len(LOG)), overwritten
+
+
+def noise_of(cycles: int, condition: Condition, generator: np.random.Generator) -> Vector:
+    """Draw encoder noise [rad] (columns 0 and 1) and numbers in [0, 1] that decide about lost frames (columns 2 and 3).
+
+    Args:
+        cycles: cycles of a step.
+        condition: size of the noise.
+        generator: source of the random numbers.
+
+    Returns:
+        Random numbers, shape (cycles + 1, 4).
+    """
+    noise = np.empty((cycles + 1, 4))
+    noise[:, :2] = condition.noise * generator.standard_normal((cycles + 1, 2))
+    noise[:, 2:] = generator.random((cycles + 1, 2))
+    return noise
+
+
+def walk_step(
+    episode: Episode, leg: Vector, measured: Measured, guide: GuideTables, parts: Parts
+) -> tuple[float, int, int]:
+    """Walk one step of the plant.
+
+    Args:
+        episode: inputs, and the log that is written.
+        leg: angles [rad] and speeds [rad/s] of hip and knee, shape (4,), updated.
+        measured: inputs of the controller, overwritten.
+        guide: tables of the guide.
+        parts: parts of the controller.
+
+    Returns:
+        Largest |e| / q_bound, and the cycle and the joint with this ratio.
+    """
+    constants, goal, push, box, noise, before, row, log = episode
+    count, cycles = len(measured.q), len(goal.q) - 1
+    motor, latched, last = before.copy(), before.copy(), before.copy()
+    waiting = np.zeros((constants.delay + 1, 2))
+    for i in range(len(waiting)):
+        waiting[i] = last
+    read, filtered, features = leg[:2].copy(), goal.qd[0].copy(), np.zeros(FEATURES)
+    measured.q[:], measured.qd[:] = row[:count], row[count:]
+    measured.attitudes[:], measured.gyros[:], measured.sent[:] = 0.0, 0.0, 0.0
+    for i in range(len(measured.attitudes)):
+        measured.attitudes[i, 0] = 1.0
+    desired = row.copy()
+    torque, joints = parts.outputs[0].torque, (HIP, KNEE)
+    largest, largest_cycle, largest_joint, ratio = 0.0, 0, 0, 0.0
+    for cycle in range(cycles + 1):
+        for i in range(2):
+            e = leg[i] - goal.q[cycle, i]
+            ratio = e / goal.bounds[i, cycle, 0] if e > 0.0 else e / goal.bounds[i, cycle, 1]
+            features[i], features[2 + i] = ratio, (leg[2 + i] - goal.qd[cycle, i]) / RATE
+            log[cycle, i], log[cycle, 2 + i], log[cycle, 8 + i] = e, ratio, leg[2 + i] - goal.qd[cycle, i]
+            if abs(ratio) > largest:
+                largest, largest_cycle, largest_joint = abs(ratio), cycle, i
+        if largest > FAR_OUTSIDE or not math.isfinite(leg[0]) or not math.isfinite(leg[1]):
+            break
+        for i in range(2):
+            position = leg[i] + noise[cycle, i]
+            if cycle > 0:
+                filtered[i] = constants.keep * filtered[i] + (1.0 - constants.keep) * (position - read[i]) / PERIOD
+            read[i] = position
+            if noise[cycle, 2] >= constants.loss or cycle == 0:
+                measured.q[joints[i]], measured.qd[joints[i]] = position, filtered[i]
+        for i in range(2):
+            desired[joints[i]], desired[count + joints[i]] = goal.q[cycle, i], goal.qd[cycle, i]
+            measured.sent[joints[i]] = last[i]
+        run(cycle, False, desired, measured, guide, parts)
+        for i in range(2):
+            last[i] = limited(constants, i, torque[joints[i]], last[i], measured.qd[joints[i]])
+            level = push.signs[cycle, i]
+            for k in range(FEATURES):
+                level += push.feedback[i, k] * features[k]
+            d = box[i] if level >= 0.0 else -box[i]
+            log[cycle, 4 + i], log[cycle, 6 + i] = d, last[i]
+            motor[i] += constants.tracking * (latched[i] - motor[i])
+        if cycle < cycles:
+            advance(constants, leg, motor[0] + log[cycle, 4], motor[1] + log[cycle, 5])
+        # The command of this cycle is latched at the next SYNC, or later with a delay.
+        waiting[cycle % len(waiting)] = last
+        if noise[cycle, 3] >= constants.loss:
+            latched[:] = waiting[(cycle + 1) % len(waiting)]
+    return largest, largest_cycle, largest_joint
+
+
+def safe_errors(goal: Goal, row: Vector, image: Vector, measured: Measured, guide: GuideTables, parts: Parts) -> None:
+    """Find the largest safe errors at every tenth cycle by bisection, see `IdealLeg.image`.
+
+    Args:
+        goal: desired motion and guide.
+        row: angles [rad], then speeds [rad/s] of all joints, shape (24,); the values of hip and knee are ignored.
+        image: largest safe errors, shape (2, cycles + 1, 2) [rad], written at every tenth cycle.
+        measured: inputs of the controller, overwritten.
+        guide: tables of the guide.
+        parts: parts of the controller.
+    """
+    count, desired, joints = len(measured.q), row.copy(), (HIP, KNEE)
+    measured.q[:], measured.qd[:] = row[:count], row[count:]
+    measured.attitudes[:], measured.gyros[:], measured.sent[:] = 0.0, 0.0, 0.0
+    for i in range(len(measured.attitudes)):
+        measured.attitudes[i, 0] = 1.0
+    for cycle in range(0, len(goal.q), 10):
+        for joint in range(2):
+            for side in range(2):
+                sign, inside, outside = 1.0 - 2.0 * side, 0.0, goal.bounds[joint, cycle, side]
+                for _ in range(10):
+                    middle = 0.5 * (inside + outside)
+                    for i in range(2):
+                        angle, rate = goal.q[cycle, i], goal.qd[cycle, i]
+                        desired[joints[i]], desired[count + joints[i]] = angle, rate
+                        measured.q[joints[i]], measured.qd[joints[i]] = angle, rate
+                    measured.q[joints[joint]] += sign * middle
+                    if run(cycle, False, desired, measured, guide, parts)[1] >= 0.0:
+                        inside = middle
+                    else:
+                        outside = middle
+                image[joint, cycle, side] = inside
+
+
+@functools.cache
+def _image() -> Any:
+    return compiled(safe_errors)
+
+
+@functools.cache
+def _walk() -> Any:
+    return compiled(walk_step)
+
+
+def _state(position: Vector, velocity: Vector, torque: Vector, xi: float) -> State:
+    """Return the fault-free state of the HAL that the controller receives at the stance change."""
+    attitude = np.zeros((len(IMUS), 4))
+    attitude[:, 0] = 1.0
+    zero = np.zeros(len(JOINTS))
+    return State(
+        cycle=0,
+        time=0.0,
+        supervisor=SupervisorState.ACTIVE,
+        assistance_factor=xi,
+        position=position,
+        velocity=velocity,
+        torque=torque,
+        temperature=zero,
+        drive_state=zero,
+        imu_quaternion=attitude,
+        imu_gyro=np.zeros((len(IMUS), 3)),
+        imu_accel=np.zeros((len(IMUS), 3)),
+        foot_force=np.zeros((len(FEET), len(CELLS), 3)),
+        vibration=np.zeros(len(MOTORS)),
+        valid=np.ones(1, np.bool_),
+        age=np.zeros(1, np.int64),
+        joints_valid=True,
+        torque_sent=torque,
+    )

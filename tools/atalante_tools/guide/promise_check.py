@@ -1,0 +1,251 @@
+"""Check of a guide: comparison of its promise with the worst push that the adversary finds. `gait, shape, Xi -> Verdict`.
+
+The largest pushes at hip and knee are exactly the promise. At the start of a step, the leg deviates from the nominal motion. The
+hand-over box (`HandOver`) is the range of the deviations for which the promise holds, and the adversary starts in its centre and
+corners. The adversary first searches on the ideal plant. Then it repeats the worst pushes on the emulated robot, together with
+constant pushes, pumping, feedback and random switching.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Final
+
+import numpy as np
+
+from atalante_control.airwalk.config import AirwalkConfig
+from atalante_control.airwalk.controller import AirwalkController
+from atalante_control.dynamics.gait_network import load_network
+from atalante_control.dynamics.suspended import suspended_gait
+from atalante_control.gait.gait import AIRWALK_GAIT, load_gait
+from atalante_control.gait.subject import Subject
+from atalante_control.guide.certificate import Certificate
+from atalante_control.model import ExoskeletonParameters, Patient
+from atalante_hal.robot import Robot
+from atalante_hal.types import Vector
+from atalante_tools.guide.episode import FEATURES, IdealLeg, Push, Setup, Start
+from atalante_tools.guide.plant import Condition
+from atalante_tools.guide.robot import PushedRobot, RobotWalk
+from atalante_tools.guide.search import DIRECTIONS, Adversary, Tried
+
+Pair = tuple[float, float]
+
+#: Conditions of the plant and of the robot, by name.
+CONDITIONS: Final = {
+    "model": (Condition(),),
+    "friction": (Condition(friction=0.8), Condition(friction=1.2)),
+    "mass": (Condition(mass=0.9), Condition(mass=1.1)),
+    "both": tuple(Condition(friction=f, mass=m) for f, m in itertools.product((0.8, 1.2), (0.9, 1.1))),
+    "noise": (Condition(noise=1e-5),),
+    "loss": (Condition(loss=0.01),),
+    "delay": (Condition(delay=1),),
+}
+#: Patients whose network gaits are checked: mass [kg], height [m], step length [m], step duration [s].
+PATIENTS: Final = (
+    (58.0, 1.62, 0.10, 0.9), (58.0, 1.65, 0.15, 0.9), (61.0, 1.65, 0.15, 0.8), (64.0, 1.70, 0.12, 1.0),
+    (67.0, 1.68, 0.18, 0.9), (70.0, 1.75, 0.15, 0.9), (73.0, 1.70, 0.10, 0.8), (76.0, 1.80, 0.15, 1.0),
+    (80.0, 1.75, 0.18, 0.9), (84.0, 1.80, 0.12, 0.9), (88.0, 1.85, 0.15, 0.9), (91.0, 1.85, 0.15, 0.9),
+)  # fmt: skip
+#: Number of corners of the hand-over box from which steps start.
+_CORNERS: Final = 64
+#: Time by which the measured velocity of a drive lags behind the true velocity: low-pass and half a cycle [s].
+_VELOCITY_LAG: Final = 2.0e-3
+#: Largest multiple of the promise with which the adversary tries to push a joint out of the guide.
+LARGEST_FACTOR: Final = 6.0
+#: Steps for each factor tried in the search for `left_at`, as a share of `Effort.steps`.
+_SHARE: Final = 0.1
+
+
+@dataclass(frozen=True)
+class Effort:
+    """Size of a check."""
+
+    steps: int  # steps on the ideal plant at the promise
+    robot_steps: int  # steps on the emulated robot; 0 means that the robot is not used
+    tightness: bool  # whether to search for `Verdict.left_at`
+
+
+QUICK: Final = Effort(steps=60, robot_steps=0, tightness=False)
+COMPLETE: Final = Effort(steps=1500, robot_steps=60, tightness=True)
+
+
+@dataclass(frozen=True)
+class Task:
+    """Task to check one guide: conditions, size, seed and pushes."""
+
+    conditions: Sequence[Condition]  # conditions of plant and robot
+    effort: Effort
+    seed: int  # seed of the search
+    push: Pair | None = None  # largest push at hip and knee [Nm]; None means the promise
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """Result of a check. The fields up to `left_at` are the JSON keys of `--json`."""
+
+    shape: str
+    xi: float
+    gait: str
+    certified: bool
+    promise_hip_nm: float | None  # largest push at the hip: `Task.push` or the promise [Nm]; None if there is neither
+    promise_knee_nm: float | None  # largest push at the knee: `Task.push` or the promise [Nm]; None if there is neither
+    worst_ratio: float | None  # largest |e| / q_bound of plant and robot; None if nothing was tried
+    steps: int  # number of steps on plant and robot
+    plant_ratio: float | None  # largest |e| / q_bound on the ideal plant
+    robot_ratio: float | None  # largest |e| / q_bound on the emulated robot; None if the robot was not used
+    worst_push: str  # kind of the worst push on the plant
+    worst_condition: str  # deviation of the plant from the model in the worst episode, for example "friction +20 %"
+    stopped: str  # reason why the robot left ACTIVE; empty if it did not
+    #: smallest multiple of the promise that moved a joint out of the guide; None if not found or not searched
+    left_at: float | None
+    reason: str  # reason of the certificate
+
+    @property
+    def broken(self) -> bool:
+        """Return whether a push within the limits moved a joint out of the guide or stopped the robot."""
+        return self.worst_ratio is not None and (self.worst_ratio > 1.0 or bool(self.stopped))
+
+
+@dataclass(frozen=True)
+class Checked:
+    """Verdict with the worst step, for the figure."""
+
+    verdict: Verdict
+    leg: IdealLeg
+    worst: Tried | None
+
+
+def setup_of(subject: Subject | None, robot: Robot, config: AirwalkConfig | None = None) -> Setup:
+    """Return gait, robot and model for the default gait, or for the network gait of a subject.
+
+    Args:
+        subject: patient and step; None means the default gait.
+        robot: limits of the joints.
+        config: parameters of the controller, except `startup`; None means the defaults.
+    """
+    exoskeleton, config = ExoskeletonParameters(), replace(config or AirwalkConfig(), startup=0.1)
+    if subject is None:
+        return Setup(robot, load_gait(AIRWALK_GAIT, robot), config, exoskeleton)
+    exoskeleton = exoskeleton.fitted(subject.patient)
+    gait = suspended_gait(load_network().gait(subject, robot), exoskeleton, robot)
+    return Setup(robot, gait, config, exoskeleton)
+
+
+def patients() -> list[Subject]:
+    """Return the subjects of `PATIENTS`."""
+    return [Subject(Patient(mass, height), length, duration) for mass, height, length, duration in PATIENTS]
+
+
+def promise_of(certificate: Certificate) -> Pair | None:
+    """Return the promised torque at hip and knee [Nm], or None if the certificate has no promise.
+
+    Args:
+        certificate: certificate of the running guide.
+    """
+    bound = certificate.promise
+    return None if bound is None else (bound.hip, bound.knee)
+
+
+def starts_of(config: AirwalkConfig, seed: int) -> list[Start]:
+    """Return states at the stance change: the centre and corners of the hand-over box.
+
+    Args:
+        config: parameters of the controller.
+        seed: seed of the choice of corners.
+    """
+    box, generator, zero = config.hand_over, np.random.default_rng(seed), (0.0, 0.0)
+    torque, lag = box.torque, _VELOCITY_LAG * box.acceleration
+    signs = generator.choice([-1.0, 1.0], (_CORNERS, 8))
+    signs[: 2**4, :4] = list(itertools.product((-1.0, 1.0), repeat=4))
+    return [Start(zero, zero, zero, zero)] + [
+        Start(
+            (a * box.deviation, b * box.deviation),
+            (c * box.rate, d * box.rate),
+            (e * torque[0], f * torque[1]),
+            (g * lag, h * lag),
+        )
+        for a, b, c, d, e, f, g, h in signs.tolist()
+    ]
+
+
+def check(setup: Setup, controller: AirwalkController, xi: float, task: Task) -> Checked:
+    """Check one guide at one assistance factor.
+
+    Args:
+        setup: gait, robot and model.
+        controller: controller of the guide.
+        xi: assistance factor in [0, 1].
+        task: conditions, size and seed of the check.
+    """
+    certificate = controller.certificate(xi)
+    leg, box = IdealLeg(setup, controller, xi), task.push or promise_of(certificate)
+    conditions, effort = task.conditions, task.effort
+    hip, knee = box or (None, None)
+    verdict = Verdict(
+        certificate.shape, xi, setup.gait.name, certificate.certified, hip, knee, None, 0, None, None, "", "", "", None,
+        certificate.reason,
+    )  # fmt: skip
+    if box is None:
+        return Checked(verdict, leg, None)
+    adversary = Adversary(setup, leg, conditions, starts_of(setup.config, task.seed), task.seed)
+    worst = adversary.search(box, effort.steps)
+    walk = RobotWalk((), "")
+    if effort.robot_steps:
+        walk = _on_robot(PushedRobot(setup, controller, xi), box, adversary.tried, task)
+    left_at = None
+    if effort.tightness and worst.ratio <= 1.0:
+        left_at = adversary.leaving_factor(box, LARGEST_FACTOR, max(10, round(_SHARE * effort.steps)))
+    on_robot = None if walk.worst is None else walk.worst.ratio
+    verdict = replace(
+        verdict,
+        worst_ratio=max(worst.ratio, on_robot or 0.0),
+        steps=adversary.steps + len(walk.steps),
+        plant_ratio=worst.ratio,
+        robot_ratio=on_robot,
+        worst_push=worst.kind,
+        worst_condition=str(worst.condition),
+        stopped=walk.stopped,
+        left_at=left_at,
+    )
+    return Checked(verdict, leg, worst)
+
+
+def _on_robot(robot: PushedRobot, box: Pair, found: Sequence[Tried], task: Task) -> RobotWalk:
+    """Walk on the robot in all conditions, with the worst pushes on the plant and with the pushes of `_robot_pushes`."""
+    conditions, seed = task.conditions, task.seed
+    cycles = len(found[0].push.signs)
+    pushes = [one.push for one in found[:6]] + _robot_pushes(cycles, np.random.default_rng(seed))
+    each = -(-task.effort.robot_steps // len(conditions))
+    walks = []
+    for number, condition in enumerate(conditions):
+        first = number * each % len(pushes)  # rotate the list, so that every walk begins with another push
+        walks.append(robot.walk(box, [*pushes[first:], *pushes[:first]], condition, each, seed + number))
+    stopped = next((walk.stopped for walk in walks if walk.stopped), "")
+    return RobotWalk(tuple(step for walk in walks for step in walk.steps), stopped)
+
+
+def _robot_pushes(cycles: int, generator: np.random.Generator) -> list[Push]:
+    """Return the disturbances of a walk: constant torques, torques from feedback of error and rate, and random switching."""
+    none = np.zeros((2, FEATURES))
+    pushes = [Push(np.tile(direction, (cycles, 1)), none) for direction in DIRECTIONS]
+    for joint, other, (error, rate) in itertools.product((0, 1), (-1.0, 1.0), ((0.0, 1.0), (1.0, 1.0))):
+        feedback = np.zeros((2, FEATURES))
+        feedback[:, joint], feedback[:, 2 + joint] = error, rate
+        feedback[1 - joint] *= other
+        pushes.append(Push(np.full((cycles, 2), 1e-6), feedback))
+    for slowest in (15.0, 40.0, 100.0, 250.0):
+        switches = generator.random((cycles, 2)) < 1.0 / slowest
+        signs: Vector = np.where(np.cumsum(switches, axis=0) % 2, -1.0, 1.0)
+        pushes.append(Push(signs, none))
+    return pushes
+
+
+def conditions_of(names: Sequence[str]) -> list[Condition]:
+    """Return the conditions with the given names, or all conditions if there are no names.
+
+    Args:
+        names: keys of `CONDITIONS`.
+    """
+    return [condition for name in names or CONDITIONS for condition in CONDITIONS[name]]

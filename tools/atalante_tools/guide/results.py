@@ -1,0 +1,86 @@
+"""File with the results of a long check, so that the check can be interrupted and resumed: `verdicts <-> JSON lines`.
+
+The first line of the file contains the task: conditions, effort, seed, push and control law. Each further line contains one
+verdict. The file is flushed after each verdict.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+from atalante_tools.guide.promise_check import Verdict
+
+#: Identification of a guide in the file: gait, shape, assistance factor.
+Key = tuple[str, str, float]
+
+
+class Results:
+    """Verdicts of a check, and the file that contains them."""
+
+    def __init__(self, path: Path | None, task: Mapping[str, Any]) -> None:
+        """Read the verdicts of an earlier run. A file that does not exist is created with the first verdict.
+
+        Args:
+            path: JSON-lines file. If None, the verdicts are not stored.
+            task: values that determine a verdict, apart from gait, shape and assistance factor; they must be JSON values.
+
+        Raises:
+            ValueError: If the file contains the results of another task, or a line that is not a verdict.
+        """
+        self._path, self._task = path, json.loads(json.dumps(task))
+        self._known: dict[Key, Verdict] = {}
+        if path is None or not path.exists():
+            return
+        head, *lines = path.read_text(encoding="utf-8").splitlines() or [""]
+        if _decoded(path, 1, head) != self._task:
+            raise ValueError(f"{path} must contain results of the task {json.dumps(self._task)}, got {head}")
+        for number, line in enumerate(lines, 2):
+            try:
+                self._keep(Verdict(**_decoded(path, number, line)))
+            except TypeError as error:
+                raise ValueError(f"line {number} of {path} must be the verdict of a guide, got {line}") from error
+
+    def find(self, key: Key) -> Verdict | None:
+        """Return the verdict of a guide; None if the file does not contain it.
+
+        Args:
+            key: gait, shape and assistance factor.
+        """
+        return self._known.get(key)
+
+    def add(self, verdict: Verdict) -> None:
+        """Store a verdict, and append it to the file.
+
+        Args:
+            verdict: result of one guide.
+        """
+        self._keep(verdict)
+        if self._path is None:
+            return
+        new = not self._path.exists()
+        with self._path.open("a", encoding="utf-8") as file:
+            if new:
+                file.write(json.dumps(self._task) + "\n")
+            file.write(json.dumps(asdict(verdict)) + "\n")
+
+    def _keep(self, verdict: Verdict) -> None:
+        self._known[verdict.gait, verdict.shape, verdict.xi] = verdict
+
+
+def _decoded(path: Path, number: int, line: str) -> Any:
+    """Return the JSON object of a line.
+
+    Raises:
+        ValueError: If the line is not a JSON object.
+    """
+    try:
+        value = json.loads(line)
+    except json.JSONDecodeError:
+        value = None
+    if not isinstance(value, dict):
+        raise ValueError(f"line {number} of {path} must be a JSON object, got {line!r}")
+    return value

@@ -1,0 +1,296 @@
+"""Search for the worst push on the ideal plant: `guide, box -> push with the largest |e| / q_bound`.
+
+The search knows the equation of motion but not the law of the controller. It has three stages:
+
+1. *Guesses.* Constant pushes. Pushes that follow the sign of the error, or of the rate of the error (pumping). Pushes that switch
+   at random. Bang-bang pushes: in a linear loop, the push with the largest effect on one error at one time has the sign of the
+   impulse response at each earlier time. The feedback of the loop is identified from the steps walked so far.
+2. *Beam search*, a dynamic programming with few states: every 40 ms, each kept push is continued in each of the four directions
+   `DIRECTIONS`, and the pushes with the largest predicted deviation are kept.
+3. *Local search.* One of the pushes with the largest |e| / q_bound is changed a little: its switching times, its feedback, the
+   start of the step, or the condition of the plant. The changed push is kept if it is one of the worst pushes so far.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
+from typing import Final, NamedTuple, TypeVar
+
+import numpy as np
+
+from atalante_hal.types import Vector
+from atalante_tools.guide.episode import FEATURES, IdealLeg, Push, Setup, Start, Walked, noise_of
+from atalante_tools.guide.plant import Condition, Plant, dynamics
+
+Pair = tuple[float, float]
+_Choice = TypeVar("_Choice")
+
+#: Directions of a push: signs at hip and knee.
+DIRECTIONS: Final = tuple(itertools.product((1.0, -1.0), repeat=2))
+#: A stage of the beam search has `_STAGE` cycles, and keeps the `_BEAM` pushes with the largest predicted deviation.
+_STAGE, _BEAM = 40, 6
+#: Time that the beam search looks ahead along the rate of the error [s].
+_AHEAD: Final = 0.03
+#: A search with at least this number of steps includes the beam search.
+_WITH_BEAM: Final = 1000
+#: The feedback of the loop is identified from the samples whose |e| / q_bound is larger than this threshold.
+_ACTING: Final = 0.5
+#: Number of pushes that the local search starts from.
+_PARENTS: Final = 6
+
+
+class Tried(NamedTuple):
+    """A step of the plant: its inputs and its result."""
+
+    ratio: float  # largest |e| / q_bound
+    kind: str  # origin of the push
+    start: Start
+    push: Push
+    condition: Condition
+    noise: int  # seed of encoder noise and lost frames
+    walked: Walked
+
+
+@dataclass
+class Adversary:
+    """Search for the worst push in one guide at one assistance factor.
+
+    Attributes:
+        steps: number of steps walked.
+        tried: worst steps so far, the worst first.
+    """
+
+    setup: Setup
+    leg: IdealLeg
+    conditions: Sequence[Condition]
+    starts: Sequence[Start]
+    seed: int
+    steps: int = 0
+    tried: list[Tried] = field(default_factory=list)
+
+    def __post_init__(self) -> None:
+        self._generator = np.random.default_rng(self.seed)
+        self._plants: dict[Condition, Plant] = {c: self.setup.plant(c) for c in self.conditions}
+
+    def search(self, box: Pair, budget: int) -> Tried:
+        """Walk about `budget` steps with pushes up to the limits `box`, and return the worst step.
+
+        Args:
+            box: largest push at hip and knee [Nm].
+            budget: number of steps.
+        """
+        self.tried, end = [], self.steps + budget
+        for kind, push in itertools.islice(self._guesses(), math.ceil(0.4 * budget)):
+            self._try(box, kind, self._any(self.starts), push, self._any(self.conditions), self._number())
+        for joint, sign in itertools.product((0, 1), (1.0, -1.0)):
+            if budget >= _WITH_BEAM and end - self.steps > 0.5 * budget:
+                self._beam(box, joint, sign)
+        while self.steps < end:
+            self._mutate(box)
+        return self.tried[0]
+
+    def leaving_factor(self, box: Pair, largest: float, budget: int) -> float | None:
+        """Return the smallest multiple of `box` with which a push moves a joint out of the guide, accurate to 5 %.
+
+        Return None if no push moves a joint out of the guide at the multiple `largest`.
+
+        Args:
+            box: push at hip and knee [Nm].
+            largest: largest factor tried.
+            budget: number of steps per factor.
+        """
+        inside, outside = 1.0, None
+        factor = 1.25
+        while outside is None:
+            if self._leaves(box, factor, budget):
+                outside = factor
+            elif factor >= largest:
+                return None
+            else:
+                inside, factor = factor, min(largest, 1.3 * factor)
+        while outside / inside > 1.05:
+            factor = (inside * outside) ** 0.5
+            if self._leaves(box, factor, budget):
+                outside = factor
+            else:
+                inside = factor
+        return outside
+
+    def _leaves(self, box: Pair, factor: float, budget: int) -> bool:
+        """Return whether a push up to `factor` times `box` moves a joint out of the guide. Known pushes are tried first."""
+        larger, known, end = (factor * box[0], factor * box[1]), self.tried, self.steps + budget
+        self.tried = []
+        for one in known:
+            if self._try(larger, one.kind, one.start, one.push, one.condition, one.noise).ratio > 1.0:
+                break
+        while self.steps < end and self.tried[0].ratio <= 1.0:
+            self._mutate(larger)
+        return self.tried[0].ratio > 1.0
+
+    # -- one step ----------------------------------------------------------------------------------------------------
+
+    def _try(self, box: Pair, kind: str, start: Start, push: Push, condition: Condition, noise: int) -> Tried:
+        numbers = noise_of(self.leg.cycles, condition, np.random.default_rng(noise))
+        walked = self.leg.walk(self._plants[condition], start, push, box, numbers)
+        self.steps += 1
+        one = Tried(walked.ratio, kind, start, push, condition, noise, walked)
+        # A step with exactly the ratio of a stored step is a repetition of that step.
+        if all(one.ratio != other.ratio for other in self.tried):
+            self.tried.append(one)
+        self.tried.sort(key=lambda other: -other.ratio)
+        del self.tried[4 * _PARENTS :]
+        return one
+
+    def _any(self, choices: Sequence[_Choice]) -> _Choice:
+        return choices[int(self._generator.integers(len(choices)))]
+
+    def _number(self) -> int:
+        return int(self._generator.integers(1 << 32))
+
+    # -- guesses -----------------------------------------------------------------------------------------------------
+
+    def _guesses(self) -> Iterator[tuple[str, Push]]:
+        """Yield pushes of all kinds in turn."""
+        cycles = self.leg.cycles + 1
+        kinds = [self._constant(cycles), self._following(cycles), self._switching(cycles), self._bang_bang(cycles)]
+        while True:
+            for kind in kinds:
+                yield next(kind)
+
+    def _constant(self, cycles: int) -> Iterator[tuple[str, Push]]:
+        for direction in itertools.cycle(DIRECTIONS):
+            yield "constant", Push(np.tile(direction, (cycles, 1)), _no_feedback())
+
+    def _following(self, cycles: int) -> Iterator[tuple[str, Push]]:
+        """Yield pushes with the sign of the error, of the rate of the error, or of random mixtures of all features."""
+        for joint, (error, rate) in itertools.product((0, 1), ((0.0, 1.0), (1.0, 0.0), (1.0, 1.0))):
+            # An opposite push at the other joint can also accelerate this joint, because the mass matrix couples them.
+            for other in (-1.0, 1.0):
+                feedback = np.zeros((2, FEATURES))
+                for i in range(2):
+                    feedback[i, [joint, 2 + joint]] = np.array([error, rate]) * (1.0 if i == joint else other)
+                yield "pumping" if rate else "outwards", Push(np.full((cycles, 2), 1e-6), feedback)
+        while True:
+            feedback = self._generator.standard_normal((2, FEATURES))
+            bias = self._generator.standard_normal(2) * 0.3
+            yield "feedback", Push(np.tile(bias, (cycles, 1)), feedback)
+
+    def _switching(self, cycles: int) -> Iterator[tuple[str, Push]]:
+        """Yield pushes that switch after random times, each joint by itself or both together."""
+        while True:
+            signs, slowest = np.ones((cycles, 2)), float(self._generator.choice([15.0, 40.0, 100.0, 250.0]))
+            together = self._generator.random() < 0.5
+            for joint in range(2):
+                lengths = 5 + self._generator.exponential(slowest, cycles // 5)
+                switches = np.searchsorted(np.cumsum(lengths), np.arange(cycles))
+                signs[:, joint] = 1.0 - 2.0 * (switches % 2)
+            if together:
+                signs[:, 1] = signs[:, 0] * self._generator.choice([-1.0, 1.0])
+            yield "switching", Push(signs * self._generator.choice([-1.0, 1.0]), _no_feedback())
+
+    def _bang_bang(self, cycles: int) -> Iterator[tuple[str, Push]]:
+        """Yield pushes that increase one tracking error at one cycle as much as possible."""
+        while True:
+            joint, sign = int(self._generator.integers(2)), float(self._generator.choice([-1.0, 1.0]))
+            end, share = int(self._generator.integers(30, cycles)), float(self._generator.choice([0.0, 0.3, 0.6, 1.0]))
+            stiffness, damping = self._identified()
+            signs = self._impulse_signs(joint, end, share * stiffness, share * damping)
+            yield (
+                "bang-bang",
+                Push(sign * np.concatenate([signs, np.tile(signs[-1:], (cycles - end, 1))]), _no_feedback()),
+            )
+
+    def _impulse_signs(self, joint: int, end: int, stiffness: Vector, damping: Vector) -> Vector:
+        """Return for each cycle before `end` whether an impulse increases (1) or reduces (-1) the error of a joint at `end`.
+
+        Args:
+            joint: joint with the error: 0 for the hip, 1 for the knee.
+            end: cycle of the error.
+            stiffness: stiffness of the loop, shape (2, 2) [1/s2].
+            damping: damping of the loop, shape (2, 2) [1/s].
+
+        Returns:
+            Signs for an impulse at the hip and at the knee, shape (end, 2).
+        """
+        step = np.block([[np.eye(2), 1e-3 * np.eye(2)], [-1e-3 * stiffness, np.eye(2) - 1e-3 * damping]])
+        gain, signs = np.zeros(4), np.empty((end, 2))
+        gain[joint] = 1.0
+        knees = self.leg.nominal[0][:, 1]
+        plant = self._plants[self.conditions[0]]
+        for cycle in range(end - 1, -1, -1):
+            signs[cycle] = gain[2:] @ _inverse(plant, float(knees[cycle]))
+            gain = gain @ step
+        return np.where(signs >= 0.0, 1.0, -1.0)
+
+    def _identified(self) -> tuple[Vector, Vector]:
+        """Return stiffness [1/s2] and damping [1/s] of the loop near the guide, each (2, 2), from the worst step so far."""
+        if not self.tried:
+            return np.zeros((2, 2)), np.zeros((2, 2))
+        one = self.tried[0]
+        log, goal, plant = one.walked.log, self.leg.goal(one.start), self._plants[one.condition]
+        rows = np.flatnonzero(np.abs(log[:, 2:4]).max(axis=1) > _ACTING)
+        if len(rows) < 40:
+            return np.zeros((2, 2)), np.zeros((2, 2))
+        states, gained = np.hstack([log[rows, :2], log[rows, 8:10], np.ones((len(rows), 1))]), []
+        for row in rows:
+            q, qd = goal.q[row] + log[row, :2], goal.qd[row] + log[row, 8:10]
+            bias = dynamics(plant, q[0], q[1], qd[0], qd[1])[3:]
+            gained.append(_inverse(plant, float(q[1])) @ (log[row, 6:8] - bias) - self.leg.nominal[2][row])
+        fit = np.linalg.lstsq(states, np.array(gained), rcond=None)[0]
+        return -fit[:2].T, -fit[2:4].T
+
+    # -- beam and local search ---------------------------------------------------------------------------------------
+
+    def _beam(self, box: Pair, joint: int, sign: float) -> None:
+        """Search for the push that moves a joint farthest to one side. Each stage chooses a direction of the push."""
+        cycles, start, condition = self.leg.cycles + 1, self._any(self.starts), self._any(self.conditions)
+        noise, kept = self._number(), [np.ones((cycles, 2))]
+        for begin in range(0, cycles, _STAGE):
+            ahead: list[tuple[float, Vector]] = []
+            for signs, direction in itertools.product(kept, DIRECTIONS):
+                longer = signs.copy()
+                longer[begin:] = direction
+                one = self._try(box, "beam", start, Push(longer, _no_feedback()), condition, noise)
+                at = min(begin + _STAGE, cycles - 1)
+                log = one.walked.log[at]
+                ratio, rate = log[2 + joint], log[8 + joint] / self.leg.bounds[joint, at].min()
+                ahead.append((float(sign * (ratio + _AHEAD * rate)), longer))
+            ahead.sort(key=lambda pair: -pair[0])
+            kept = [signs for _, signs in ahead[:_BEAM]]
+
+    def _mutate(self, box: Pair) -> None:
+        """Change one of the worst steps a little, and walk it."""
+        generator, cycles = self._generator, self.leg.cycles + 1
+        parent = self.tried[int(generator.integers(min(_PARENTS, len(self.tried))))]
+        start, push, condition, noise = parent.start, parent.push, parent.condition, parent.noise
+        signs, feedback = push.signs.copy(), push.feedback.copy()
+        change = generator.random()
+        if change < 0.2:
+            start = self._any(self.starts)
+        elif change < 0.35:
+            condition, noise = self._any(self.conditions), self._number()
+        elif feedback.any() and change < 0.7:
+            feedback += 0.3 * generator.standard_normal(feedback.shape)
+        else:
+            if feedback.any():  # replace the feedback by the recorded push
+                signs, feedback = np.where(parent.walked.log[:, 4:6] >= 0.0, 1.0, -1.0), _no_feedback()
+            begin, length = int(generator.integers(cycles)), int(1 + generator.exponential(30.0))
+            joints = [[0], [1], [0, 1]][int(generator.integers(3))]
+            if generator.random() < 0.5:
+                signs[np.ix_(range(begin, min(cycles, begin + length)), joints)] *= -1.0
+            else:
+                signs[:, joints] = np.roll(signs[:, joints], int(generator.integers(-20, 21)), axis=0)
+        self._try(box, parent.kind, start, Push(signs, feedback), condition, noise)
+
+
+def _no_feedback() -> Vector:
+    return np.zeros((2, FEATURES))
+
+
+def _inverse(plant: Plant, knee: float) -> Vector:
+    """Return the inverse of the mass matrix at a knee angle, shape (2, 2)."""
+    m11, m12, m22, _, _ = dynamics(plant, 0.0, knee, 0.0, 0.0)
+    return np.array([[m22, -m12], [-m12, m11]]) / (m11 * m22 - m12 * m12)

@@ -1,0 +1,28 @@
+"""Listening to a bus for some seconds, for the commands that send nothing."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator
+from typing import Final
+
+from atalante_hal.bus import Bus
+from atalante_hal.wire.frame import Frames, new_frames
+from atalante_tools.console.stop_request import StopRequest
+
+#: Longest wait for a frame [s]. After this time, clock and stop request are checked.
+POLL_TIMEOUT: Final = 0.02
+
+
+def received(bus: Bus, seconds: float, stop: StopRequest) -> Iterator[tuple[Frames, int]]:
+    """Yield the receive buffer and the number of new frames at its start, at least every `POLL_TIMEOUT`.
+
+    Args:
+        bus: Bus to listen to.
+        seconds: Listening time [s].
+        stop: Stop request, which ends the listening early.
+    """
+    frames = new_frames(256)
+    end = time.monotonic() + seconds
+    while (now := time.monotonic()) < end and not stop.wanted:
+        yield frames, bus.receive(frames, min(POLL_TIMEOUT, end - now))
