@@ -5,6 +5,7 @@ from __future__ import annotations
 import gc
 import os
 import shutil
+import signal
 import tempfile
 from collections import Counter, defaultdict
 from collections.abc import Callable, Iterator
@@ -30,6 +31,10 @@ from atalante_hal.hal import Hal
 from atalante_hal.robot import Robot, load_robot
 from atalante_hal.types import Command, State, SupervisorState
 from atalante_hal.wire.frame import Frames
+
+# A shell starts background jobs with SIGINT ignored. The tests interrupt programs, and processes inherit this setting.
+if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
+    signal.signal(signal.SIGINT, signal.default_int_handler)
 
 # Examples have no deadline, because the first example may compile functions.
 settings.register_profile("any time", deadline=None)
