@@ -131,18 +131,6 @@ def test_certificates_are_printed_before_the_run(demo):
     assert "the promise includes joint torque and rate limits, delay" in stderr
 
 
-@pytest.mark.parametrize(("factors", "certified"), [({0.5}, True), ({0.5, 0.9}, True), ({0.5, 1.0}, False)])
-def test_the_result_has_the_weakest_certificate_of_all_assistance_factors(factors: set[float], certified: bool):
-    robot = load_robot()
-    controller = AirwalkController(robot, load_gait(AIRWALK_GAIT, robot), SHAPES["constant"])
-    promise = trial._promise(trial._weakest(controller, factors))
-    assert promise["certified"] == certified
-    bound = min(
-        (controller.certificate(xi) for xi in factors), key=lambda c: c.promise.hip if c.promise else 0.0
-    ).promise
-    assert promise["promise_hip_nm"] == (bound.hip if certified and bound else None)
-
-
 def test_the_run_folder_contains_recording_summary_and_figure(demo):
     _, out = demo
     assert {"recording.mcap", "summary.json", "guide_shapes.png"} <= {path.name for path in out.iterdir()}

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import functools
 import os
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import asdict, dataclass, field
 from importlib.metadata import version
@@ -19,7 +19,7 @@ import click
 from atalante_tools.console.options import SEED, Between, Target, json_option, options_as, subject_options
 from atalante_tools.console.stop_request import stop_requested
 from atalante_tools.console.terminal import print_message, show_json
-from atalante_tools.session.certificates import announce
+from atalante_tools.session.certificates import announce, promise_fields, weakest
 from atalante_tools.session.law import Law, law_options
 from atalante_tools.session.recording import (
     RECORDING_OPTIONS,
@@ -188,12 +188,13 @@ def _walk_all(
                     telemetry = start_telemetry(target, outputs, rig.hal, network, gait.hash32, about, telemetry_child)
                     stack.callback(_close, telemetry, walked)
                     report_endpoint = EndpointReport(telemetry)
-                telemetry.begin_run(name, {"shape": name, "xi": options.xi, **_promise(certificates[name])})
+                telemetry.begin_run(name, {"shape": name, "xi": options.xi, **promise_fields(certificates[name])})
                 walk = _Walk(rig, controller, Recorder(rig, telemetry, report_endpoint), name, options.steps)
                 with stop_requested() as stop:
                     statistics = walk.run(stop)
                 factors = controller.statistics.factors or {options.xi}
-                walked.results.append(_result(_weakest(controller, factors), controller, rig.hal, statistics))
+                certificate = weakest(controller.certificate(xi) for xi in factors)
+                walked.results.append(_result(certificate, controller, rig.hal, statistics))
                 if as_json:
                     show_json(asdict(walked.results[-1]))
                 walk.conclude()
@@ -268,22 +269,6 @@ def _controllers(
     return exoskeleton, gait, controllers
 
 
-def _promise(certificate: Certificate) -> dict[str, Any]:
-    """Return the fields `certified`, `promise_hip_nm` and `promise_knee_nm` of `Result` for a certificate."""
-    promise = certificate.promise
-    return {
-        "certified": certificate.certified,
-        "promise_hip_nm": None if promise is None else promise.hip,
-        "promise_knee_nm": None if promise is None else promise.knee,
-    }
-
-
-def _weakest(controller: AirwalkController, factors: Iterable[float]) -> Certificate:
-    """Return the certificate with the smallest promise, among the certificates of all assistance factors of the run."""
-    certificates = [controller.certificate(xi) for xi in factors]
-    return min(certificates, key=lambda c: -1.0 if c.promise is None else c.promise.hip)
-
-
 #: Smallest number of processor cores for HAL, telemetry and embedded robot in three processes.
 _CORES = 3
 
@@ -335,7 +320,7 @@ def _result(certificate: Certificate, controller: AirwalkController, hal: Hal, s
     counted = walking.steps >= 2
     return Result(
         shape=certificate.shape,
-        **_promise(certificate),
+        **promise_fields(certificate),
         steps=walking.steps,
         max_ratio=round(walking.max_ratio, 4) if counted else None,
         inside=round(walking.inside_fraction, 4) if counted else None,

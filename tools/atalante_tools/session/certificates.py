@@ -2,14 +2,37 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection
-from typing import TYPE_CHECKING
+from collections.abc import Collection, Iterable
+from typing import TYPE_CHECKING, Any
 
 from atalante_tools.console.terminal import print_message
 
 if TYPE_CHECKING:
     from atalante_control.guide.certificate import Certificate
     from atalante_control.guide.disturbance import Mismatch
+
+
+def weakest(certificates: Iterable[Certificate]) -> Certificate:
+    """Return the certificate with the smallest promise at the hip. A certificate without a promise is the weakest.
+
+    Args:
+        certificates: Certificates of one guide shape, one for each assistance factor. At least one is needed.
+    """
+    return min(certificates, key=lambda c: -1.0 if c.promise is None else c.promise.hip)
+
+
+def promise_fields(certificate: Certificate | None) -> dict[str, Any]:
+    """Return the fields `certified`, `promise_hip_nm` and `promise_knee_nm` of a result.
+
+    Args:
+        certificate: Certificate of the guide. None if there is no guide; the values are then None.
+    """
+    promise = None if certificate is None else certificate.promise
+    return {
+        "certified": None if certificate is None else certificate.certified,
+        "promise_hip_nm": None if promise is None else promise.hip,
+        "promise_knee_nm": None if promise is None else promise.knee,
+    }
 
 
 def announce(certificates: Collection[Certificate], mismatch: Mismatch, leg: str) -> None:

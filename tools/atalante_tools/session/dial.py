@@ -1,0 +1,37 @@
+"""Assistance dial of a walk in which the assistance factor falls: `completed steps -> assistance factor`."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from atalante_emulator.pendant import Operator
+
+
+class Dial:
+    """Assistance dial of the emulated operator, which changes the assistance factor from step to step."""
+
+    def __init__(self, operator: Operator, protocol: tuple[int, int, int], xi: float) -> None:
+        """Set the dial to full assistance.
+
+        Args:
+            operator: Operator of the emulated pendant.
+            protocol: Numbers of steps with full assistance, in the transition, and with `xi`.
+            xi: Assistance factor at the end.
+        """
+        self._operator, self._set = operator, 1.0
+        self._full, self._transition, _ = protocol
+        self._xi = xi
+        operator.assist(self._set)
+
+    def turn(self, steps: int) -> None:
+        """Turn the dial to the assistance factor of the next step. It acts from the next stance change on.
+
+        Args:
+            steps: Number of completed steps.
+        """
+        share = min(1.0, max(0.0, (steps + 2 - self._full) / (self._transition + 1)))
+        factor = round(1.0 + share * (self._xi - 1.0), 4)
+        if factor != self._set:
+            self._set = factor
+            self._operator.assist(factor)

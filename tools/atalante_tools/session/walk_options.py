@@ -1,0 +1,103 @@
+"""Options of a walk on the ground, and its gaits: `options -> patient, start step, periodic step, stop step`."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Final
+
+from atalante_tools.console.outcome import Failed
+from atalante_tools.console.terminal import print_message
+from atalante_tools.session.law import Law
+from atalante_tools.session.recording import RecordingOptions
+
+if TYPE_CHECKING:
+    from atalante_control.gait.subject import Subject
+    from atalante_control.gait.walk import WalkGaits
+    from atalante_control.model import Patient
+    from atalante_hal.robot import Robot
+
+#: Patient of the walk file of this project: mass [kg] and height [m].
+DEFAULT_PATIENT: Final = (75.0, 1.75)
+#: Step of the walk file of this project: length [m] and duration [s].
+DEFAULT_STEP: Final = (0.16, 0.8)
+
+
+@dataclass(frozen=True)
+class Push:
+    """Push at the pelvis of the emulated robot."""
+
+    force: float  # N
+    direction: float  # deg, 0 forwards, 90 to the left
+    duration: float = 0.2  # s
+
+
+@dataclass(frozen=True)
+class WalkOptions:
+    """Options of a walk."""
+
+    steps: int  # number of steps between start step and stop step
+    xi: float  # assistance factor, 0 to 1
+    shape: str  # name or file of the guide shape
+    passive: bool  # whether the limbs of the emulated patient have the impedance of a passive wearer
+    subject: Subject | None  # patient and step parameters; None means the values in the walk file
+    #: walk file; None means the gait of the network, or the walk file of the project for the default subject
+    gait: Path | None
+    seed: int  # seed of the sensor noise
+    friction: float  # coefficient of friction between soles and floor
+    push: Push | None  # push in the middle of the walk; None means no push
+    law: Law  # control law of the periodic steps
+    #: numbers of steps with full assistance, in the transition to `xi`, and with `xi`; None means that all steps have `xi`
+    protocol: tuple[int, int, int] | None = None
+    #: options of the recording in `out`, of the CAN log and of telemetry. If the user requests none of these three outputs, no
+    #: telemetry process is started
+    recording: RecordingOptions = field(default_factory=RecordingOptions)
+    out: Path | None = None  # folder for summary.json, trace.npz and walk.png; None means no files
+
+
+def gaits_of(options: WalkOptions, robot: Robot) -> tuple[Patient, WalkGaits]:
+    """Return the patient and the gaits of a walk.
+
+    Args:
+        options: Options of the user.
+        robot: Limits of the joints.
+
+    Raises:
+        GaitError: If the walk file is invalid, or if there is no start step or no stop step for the gait.
+        NetworkError: If the subject is outside the range of the network.
+        Failed: If the gait optimisation is needed, but not installed.
+    """
+    from atalante_control.gait.walk import DEFAULT_WALK, check_walk, load_walk
+    from atalante_control.model import Patient
+
+    if options.gait is not None or options.subject is None or _is_default(options.subject):
+        gaits = load_walk(options.gait or DEFAULT_WALK, robot)
+        parameters = gaits.step.parameters
+        if options.subject is not None:
+            return options.subject.patient, gaits
+        try:
+            return Patient(parameters["patient_mass"], parameters["patient_height"]), gaits
+        except KeyError as error:
+            raise Failed(
+                f"the parameters of the step in {options.gait} must contain {error.args[0]}: add --mass and --height"
+            ) from error
+    from atalante_control.dynamics.gait_network import load_network
+
+    step = load_network().gait(options.subject, robot)
+    print_message(f"solving start step and stop step for {options.subject}")
+    from atalante_tools.session.extra import extra
+
+    with extra():
+        from atalante_control.gait_optimization.walk import solve_walk
+
+        gaits = solve_walk(options.subject, step)
+    check_walk(gaits, robot)
+    return options.subject.patient, gaits
+
+
+def _is_default(subject: Subject) -> bool:
+    patient = subject.patient
+    return ((patient.mass, patient.height), (subject.step_length, subject.step_duration)) == (
+        DEFAULT_PATIENT,
+        DEFAULT_STEP,
+    )

@@ -1,0 +1,116 @@
+"""Result of a walk on the ground: `HAL, controller, observation -> WalkResult -> terminal, summary.json`."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import asdict, dataclass
+from importlib.metadata import version
+from typing import TYPE_CHECKING, Any
+
+import click
+
+from atalante_tools.console.terminal import print_message
+from atalante_tools.session.certificates import promise_fields
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+    from atalante_control.guide.certificate import Certificate
+    from atalante_control.guide.statistics import GuideStatistics
+    from atalante_hal.hal import Hal
+    from atalante_hal.telemetry.process import Recording
+    from atalante_tools.session.walk_options import WalkOptions
+    from atalante_tools.session.walk_trace import WalkTrace
+
+
+@dataclass
+class WalkResult:
+    """Result of a walk. The JSON object has the same fields."""
+
+    steps: int  # completed steps of the periodic gait
+    fell: bool
+    outcome: str  # stood, fell, stopped, hold or fault
+    engine: str | None  # None means the real robot
+    xi: float
+    shape: str | None  # guide shape; None at Xi = 1, where there is no guide
+    certified: bool | None  # whether the guide is certified; None at Xi = 1, where there is no guide
+    #: disturbance torque of SH for which the guide is built; None if the guide has no promise
+    promise_hip_nm: float | None
+    #: disturbance torque of SK for which the guide is built; None if the guide has no promise
+    promise_knee_nm: float | None
+    max_ratio: float | None  # largest tracking error as a fraction of the guide; None if no step was guided
+    inside: float | None  # fraction of the guided time with both joints inside the guide; None if no step was guided
+    outside_cycles: int  # guided cycles with a joint outside the guide
+    filter_active: float | None  # fraction of the guided time with the guide filter active; None if no step was guided
+    hand_overs_exceeded: int  # guided steps that started with a larger deviation than the certificate assumes
+    full_assist: bool  # whether the HAL changed to full assistance
+    lateral_m: float  # sideways deviation from the walking line at the last landing, positive to the left
+    yaw_deg: float  # heading of the soles relative to the walking line at the last landing, positive to the left
+    #: true value of `lateral_m` at the end of the walk; None if the robot is real or fell
+    true_lateral_m: float | None
+    true_yaw_deg: float | None  # true value of `yaw_deg` at the end of the walk; None if the robot is real or fell
+    #: root mean square of the angle between the true and the estimated vertical during the walk; None if the robot is real
+    attitude_rms_deg: float | None
+    distance_m: float  # distance along the walking line
+    unnoticed: int  # number of steps in which no landing of the foot was detected
+    max_dcm_error_m: float  # largest error of the divergent component of motion
+    diagnostics: dict[str, int]  # number of occurrences of each diagnostic of the HAL
+    real_time_factor: float
+    cpu_per_second: float  # processor time of this process per second of the run
+
+
+def guide_fields(certificate: Certificate | None, statistics: GuideStatistics) -> dict[str, Any]:
+    """Return the fields of `WalkResult` about the guide."""
+    counted = statistics.cycles > 0
+    return {
+        "shape": None if certificate is None else certificate.shape,
+        **promise_fields(certificate),
+        "max_ratio": round(statistics.max_ratio, 3) if counted else None,
+        "inside": round(statistics.inside_fraction, 6) if counted else None,
+        "outside_cycles": statistics.cycles - statistics.inside,
+        "filter_active": round(statistics.active_fraction, 3) if counted else None,
+        "hand_overs_exceeded": statistics.hand_overs_exceeded,
+    }
+
+
+def diagnostics(hal: Hal) -> dict[str, int]:
+    """Return the number of occurrences of each diagnostic in the events of the HAL."""
+    from atalante_hal.safety.diagnostics import Dtc
+
+    codes, counts = {dtc.value for dtc in Dtc}, dict[str, int]()
+    for event in hal.events:
+        if event.code in codes:
+            counts[event.code] = counts.get(event.code, 0) + event.count
+    return counts
+
+
+def show_result(result: WalkResult) -> None:
+    """Print the result of a walk as one line."""
+    guided = ""
+    if result.max_ratio is not None:
+        certified = "certified" if result.certified else "NOT CERTIFIED"
+        guided = (
+            f"; {result.shape} at Xi {result.xi:g} ({certified}): largest |e|/q_bound {result.max_ratio:.3f}, "
+            f"{result.outside_cycles} ms outside the guide"
+        )
+    click.echo(
+        f"{result.outcome} after {result.steps} steps and {result.distance_m:.2f} m: sideways {result.lateral_m:+.3f} m, "
+        f"heading {result.yaw_deg:+.2f} deg, largest DCM error {1000.0 * result.max_dcm_error_m:.0f} mm, "
+        f"{result.real_time_factor:.2f} times real time{guided}"
+    )
+
+
+def write_result(
+    out: Path, options: WalkOptions, result: WalkResult, trace: WalkTrace, recording: Recording | None
+) -> None:
+    """Write options and result to summary.json, and the trace and its figure, and print the names of the files."""
+    subject, law = None if options.subject is None else str(options.subject), asdict(options.law)
+    given = {key: value for key, value in asdict(options).items() if key not in ("out", "recording", "law")}
+    given = {**given, **law, "subject": subject, "record_rate": options.recording.record_rate}
+    for name, path in (("gait", options.gait), ("telemetry", options.recording.telemetry)):
+        given[name] = None if path is None else str(path)
+    recorded = None if recording is None else asdict(recording)
+    content = {"options": given, "result": asdict(result), "recording": recorded, "version": version("atalante-hal")}
+    (out / "summary.json").write_text(json.dumps(content, indent=2) + "\n")
+    files = [] if recording is None else recording.files
+    print_message(f"in {out}: {', '.join([*files, 'summary.json', *trace.write(out)])}")

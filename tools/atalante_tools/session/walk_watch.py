@@ -1,0 +1,119 @@
+"""End condition of a walk on the ground: `state after each cycle -> progress line, end and outcome of the walk`."""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING, Any, Final
+
+from atalante_tools.console.outcome import Failed
+from atalante_tools.console.terminal import print_message
+
+if TYPE_CHECKING:
+    from atalante_control.walking.controller import WalkController
+    from atalante_hal.types import State
+    from atalante_tools.session.rig import Rig
+    from atalante_tools.session.walk_observation import Observation
+
+#: Time for which a robot that left ACTIVE is observed [cycles], because a HOLD within a step may end in a fall.
+_AFTERMATH: Final = 1500
+
+
+class WalkWatch:
+    """End condition of a walk, called once per cycle. It also prints the progress line.
+
+    Attributes:
+        outcome: How the walk ended: stood, fell, stopped, hold or fault.
+        full_assist: Whether the HAL changed to full assistance.
+    """
+
+    def __init__(self, rig: Rig, controller: WalkController, observation: Observation, stop: Any, steps: int) -> None:
+        """Create the end condition of one walk.
+
+        Args:
+            rig: Rig of the walk.
+            controller: Controller of the walk.
+            observation: Attitude of the robot.
+            stop: Stop request of the process.
+            steps: Number of steps that the user requested.
+        """
+        from atalante_tools.console.terminal import Progress
+
+        self._rig, self._controller, self._observation, self._stop = rig, controller, observation, stop
+        self._steps, self._progress, self._started = steps, Progress(), False
+        self.outcome, self._reason, self._halted = "hold", "", 0
+        self.full_assist = False
+
+    def __call__(self, state: State) -> bool:
+        """Return whether the walk is over. Print the progress line if it is due.
+
+        Args:
+            state: State of the robot after a cycle.
+        """
+        from atalante_hal.types import SupervisorState
+        from atalante_tools.session.rig import waiting_for
+
+        moving = self._rig.hal.moving
+        self.full_assist = self.full_assist or state.supervisor is SupervisorState.FULL_ASSIST
+        if moving and not self._started:
+            self._started = True
+            self._progress.clear()
+            print_message(f"ACTIVE on {self._rig.target}; Ctrl-C ends with a stop step")
+        over = self._observation.check()
+        if over:
+            self.outcome = "fell"
+        elif moving:
+            over = self._controller.done
+            finishing = state.supervisor is SupervisorState.FINISH_STEP
+            if finishing and not self._reason:
+                self._reason = self._rig.hal.reason
+                self._progress.clear()
+                print_message(f"FINISH_STEP: {self._reason}")
+            self.outcome = ("stopped" if self._stop.wanted or finishing else "stood") if over else self.outcome
+        else:
+            fault = state.supervisor is SupervisorState.FAULT
+            self._halted += self._started
+            over = self._halted > _AFTERMATH or (not self._started and (self._stop.wanted or fault))
+            self.outcome = "fault" if fault else self.outcome
+        if not moving and self._started and not self._reason:
+            self._reason = self._rig.hal.reason
+        if over:
+            self._progress.clear()
+            self._reason = self._reason or self._rig.hal.reason
+        elif self._progress.due():
+            self._progress.show(self._describe(state) if moving else waiting_for(self._rig))
+        return over
+
+    def _describe(self, state: State) -> str:
+        controller = self._controller
+        largest = controller.statistics.guide.max_ratio
+        guide = f"   Xi {state.assistance_factor:.2f}   largest |e|/q_bound {largest:.2f}" if largest else ""
+        return (
+            f"{controller.phase.name:<7} step {controller.statistics.steps:3d}/{self._steps}   t {state.time:6.1f} s   "
+            f"{controller.steering.distance:5.2f} m   sideways {controller.steering.lateral:+.2f} m   "
+            f"heading {math.degrees(controller.steering.yaw):+.1f} deg{guide}"
+        )
+
+    def conclude(self) -> None:
+        """End the command with an error unless the robot walked to the end.
+
+        Raises:
+            SystemExit: If a signal ended the walk, with its exit code.
+            FaultLatched: If the robot is in FAULT.
+            Failed: If the robot fell, or left ACTIVE early.
+        """
+        from atalante_hal.safety.start import WALK_ENDS
+        from atalante_tools.console.outcome import FaultLatched
+
+        if self.outcome == "fell":
+            raise Failed(f"the robot fell in step {self._controller.statistics.steps}: {self._reason}")
+        if self._stop.wanted:
+            print_message("stopped, the robot is in HOLD")
+            raise SystemExit(self._stop.exit_code)
+        if self.outcome == "fault":
+            raise FaultLatched(f"the robot is in FAULT: {self._reason}")
+        if self.outcome == "stopped":
+            if self._reason != WALK_ENDS:
+                raise Failed(f"the robot ended the walk early and stands: {self._reason}")
+            print_message("stopped by the operator, the robot stands in HOLD")
+        elif self.outcome != "stood":
+            raise Failed(f"the robot went to HOLD: {self._reason}")
