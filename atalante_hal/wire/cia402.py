@@ -70,14 +70,13 @@ def next_state(state: DriveState, controlword: int, *, latched: bool = False) ->
     Args:
         state: Current state.
         controlword: Received controlword.
-        latched: True if the drive stopped without a command and the HAL has not yet acknowledged the stop with QUICK_STOP.
-            Then the drive ignores ENABLE_OPERATION in QUICK STOP ACTIVE, so that a HAL cannot cancel a stop that it has
-            not detected.
+        latched: True if the drive left OPERATION ENABLED without a command and the HAL has not yet acknowledged this. Then
+            the drive ignores ENABLE_OPERATION, so that a HAL cannot cancel a stop that it has not detected.
 
     Returns:
         The next state.
     """
-    if latched and state is DriveState.QUICK_STOP_ACTIVE and controlword == Controlword.ENABLE_OPERATION:
+    if latched and controlword == Controlword.ENABLE_OPERATION:
         return state
     try:
         return TRANSITIONS.get((state, Controlword(controlword)), state)

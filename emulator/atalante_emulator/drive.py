@@ -93,7 +93,9 @@ class Drives:
         self.parameters = parameters
         self.signals = signals
         self.state = [DriveState.SWITCH_ON_DISABLED] * len(JOINTS)
-        #: Whether each drive is in a local hold that the HAL did not acknowledge with QUICK_STOP yet.
+        #: Whether each drive left OPERATION ENABLED without a command, for example for a local hold, and the HAL did not
+        #: acknowledge this yet: with QUICK_STOP, or with a controlword that changes the state. Until then the drive ignores
+        #: ENABLE_OPERATION.
         self.latched = [False] * len(JOINTS)
         self.emergencies = [] if outbox is None else outbox
         self.errors = Errors(NODES, self.emergencies)
@@ -272,12 +274,14 @@ class Drives:
         self._steady = b""
 
     def leave(self, drive: int, state: DriveState) -> None:
-        """Force a state change without a command, to emulate defective firmware.
+        """Leave the present state without a command, for example because the power stage is locked for a moment.
 
         Args:
             drive: index of the drive.
             state: state to enter.
         """
+        if self.state[drive] is DriveState.OPERATION_ENABLED:
+            self.latched[drive] = state not in (DriveState.OPERATION_ENABLED, *_FAULTY)
         self._enter(drive, state)
         self._states_changed()
 
@@ -338,7 +342,7 @@ class Drives:
         if self.errors.any_persists(drive) and (state is DriveState.FAULT or after is DriveState.OPERATION_ENABLED):
             return False  # the cause of an error persists, so the HAL cannot acknowledge the error
         acknowledged = after is not state and state is DriveState.FAULT
-        if latched and (after is not DriveState.QUICK_STOP_ACTIVE or word == Controlword.QUICK_STOP):
+        if latched and (after is not state or word == Controlword.QUICK_STOP):
             acknowledged = not self.errors.any_persists(drive) or after is not DriveState.QUICK_STOP_ACTIVE
             self.latched[drive] = not acknowledged
         if acknowledged:

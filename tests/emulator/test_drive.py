@@ -564,6 +564,41 @@ class TestErrors:
         assert bench.signals.state[7] == DriveState.SWITCHED_ON
         assert not bench.drives.emergencies
 
+    @pytest.mark.parametrize("left_to", [DriveState.SWITCHED_ON, DriveState.QUICK_STOP_ACTIVE])
+    def test_drive_that_left_operation_alone_ignores_enable_operation(
+        self, bench: DriveBench, left_to: DriveState
+    ) -> None:
+        bench.enable()
+        bench.drives.leave(7, left_to)
+        for word in (Controlword.ENABLE_OPERATION, Controlword.SWITCH_ON, Controlword.ENABLE_OPERATION):
+            bench.word[7] = word
+            for _ in range(5):
+                bench.cycle()
+            assert (bench.drives.state[7], bench.drives.latched[7]) == (left_to, True)
+
+    @pytest.mark.parametrize("word", [Controlword.QUICK_STOP, Controlword.SHUTDOWN, Controlword.DISABLE_VOLTAGE])
+    def test_drive_that_left_operation_alone_is_enabled_after_another_controlword(
+        self, bench: DriveBench, word: Controlword
+    ) -> None:
+        bench.enable()
+        bench.drives.leave(7, DriveState.SWITCHED_ON)
+        bench.word[7] = word
+        bench.cycle()
+        assert not bench.drives.latched[7]
+        bench.enable()
+
+    @pytest.mark.parametrize("left_to", [DriveState.OPERATION_ENABLED, DriveState.FAULT_REACTION_ACTIVE])
+    def test_drive_that_stays_enabled_or_faults_is_not_latched(self, bench: DriveBench, left_to: DriveState) -> None:
+        bench.enable()
+        bench.drives.leave(7, left_to)
+        assert not bench.drives.latched[7]
+
+    def test_drive_that_was_not_enabled_is_not_latched(self, bench: DriveBench) -> None:
+        bench.drives.leave(7, DriveState.SWITCHED_ON)
+        bench.word[:] = Controlword.ENABLE_OPERATION
+        bench.cycle()
+        assert bench.drives.state[7] is DriveState.OPERATION_ENABLED
+
     def test_warning_is_sent_by_every_drive_of_the_leg_and_keeps_it_enabled(self, bench: DriveBench) -> None:
         bench.enable()
         bench.drives.warn(1, emergency.COMMAND_LOST)

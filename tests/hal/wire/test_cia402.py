@@ -43,15 +43,10 @@ def test_other_controlwords_change_no_state():
         assert next_state(state, byte) is moves.get((state, byte), state)
 
 
-def test_latched_hold_is_not_left_by_enable_operation():
-    for byte in range(256):
-        after = next_state(S.QUICK_STOP_ACTIVE, byte, latched=True)
-        assert after is (S.SWITCH_ON_DISABLED if byte == C.DISABLE_VOLTAGE else S.QUICK_STOP_ACTIVE)
-
-
-def test_latching_changes_no_other_state():
-    for state, byte in itertools.product(set(S) - {S.QUICK_STOP_ACTIVE}, range(256)):
-        assert next_state(state, byte, latched=True) is next_state(state, byte)
+def test_latched_drive_ignores_only_enable_operation():
+    for state, byte in itertools.product(S, range(256)):
+        after = next_state(state, byte, latched=True)
+        assert after is (state if byte == C.ENABLE_OPERATION else next_state(state, byte))
 
 
 def test_enable_sequence_reaches_operation_from_every_possible_state():

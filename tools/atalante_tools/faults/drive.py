@@ -6,7 +6,12 @@ from typing import Final
 
 from atalante_emulator.faults import Fault
 from atalante_hal.types import SupervisorState
-from atalante_tools.faults.checks import guide_kept, left_leg_in_local_hold, limit_follows_temperature
+from atalante_tools.faults.checks import (
+    guide_kept,
+    left_leg_in_local_hold,
+    limit_follows_temperature,
+    not_enabled_in_motion,
+)
 from atalante_tools.faults.scenario import Case, HostFault, Scenario
 
 _S = SupervisorState
@@ -166,6 +171,19 @@ SCENARIOS: Final = (
                 detected=300,
                 reacted=450,
             ),
+        ),
+    ),
+    Scenario(
+        "F68",
+        tuple(
+            Case(
+                f"{state}, lost frames: {lost}",
+                (Fault("leave_operation", _KNEE, 0, 1, state=state), Fault("drop", f"{_KNEE}_STATE", 0, lost)),
+                node=_KNEE,
+                checks=(not_enabled_in_motion,),
+            )
+            for state in ("SWITCHED_ON", "QUICK_STOP_ACTIVE")
+            for lost in (1, 3, 4)
         ),
     ),
 )
