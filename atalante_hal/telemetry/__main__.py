@@ -18,6 +18,7 @@ import sys
 from typing import TYPE_CHECKING, Any
 
 from atalante_hal.record_layout import Layout
+from atalante_hal.telemetry.child import EVENTS, FRAMES, RECORDS
 from atalante_hal.telemetry.process import CYCLES_PER_SECOND, TelemetryConfig
 from atalante_hal.telemetry.ring import RingReader
 from atalante_hal.telemetry.service import Service
@@ -192,8 +193,8 @@ def main() -> int:
     fds: dict[str, int] = arguments["rings"]
     config = TelemetryConfig.from_json(arguments["config"])
     with contextlib.ExitStack() as stack:
-        records, events = (stack.enter_context(RingReader(fds[name])) for name in ("records", "events"))
-        frames = stack.enter_context(RingReader(fds["frames"])) if "frames" in fds else None
+        records, events = (stack.enter_context(RingReader(fds[name])) for name in (RECORDS, EVENTS))
+        frames = stack.enter_context(RingReader(fds[FRAMES])) if FRAMES in fds else None
         try:
             outlets = Outlets(config, records, frames, arguments["restarts"], arguments["endpoint"])
         except SinkError as error:

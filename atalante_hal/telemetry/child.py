@@ -22,8 +22,8 @@ from typing import Any
 from atalante_hal.closing import Closing
 from atalante_hal.memory import anonymous_file
 
-#: Names of the rings that a session can have.
-RINGS = ("records", "events", "frames")
+#: Names of the rings that a session can have: cycle records, events, and CAN frames for the CAN log.
+RINGS = RECORDS, EVENTS, FRAMES = "records", "events", "frames"
 
 
 class TelemetryChild(Closing):

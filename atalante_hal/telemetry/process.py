@@ -26,7 +26,7 @@ from atalante_hal.closing import Closing
 from atalante_hal.record_layout import Layout
 from atalante_hal.safety.events import EVENT_BYTES, EVENT_SLOTS, Event, pack
 from atalante_hal.telemetry.access import Access, AccessError
-from atalante_hal.telemetry.child import TelemetryChild
+from atalante_hal.telemetry.child import EVENTS, FRAMES, RECORDS, TelemetryChild
 from atalante_hal.telemetry.frames import FRAME_RECORD, RingTap, Stamps
 from atalante_hal.telemetry.ring import RingWriter
 
@@ -203,11 +203,11 @@ class TelemetryProcess(Closing):
             lossless=lossless and config.recording is not None,
             patience=config.patience,
             meta=meta,
-            fd=files.get("records"),
+            fd=files.get(RECORDS),
         )
         #: Function that copies the record of a cycle, shape (layout.size,), to the ring. It is fastest with a memoryview.
         self.write = self.records.write
-        self.events = RingWriter(EVENT_BYTES, EVENT_SLOTS, fd=files.get("events"))
+        self.events = RingWriter(EVENT_BYTES, EVENT_SLOTS, fd=files.get(EVENTS))
         self.frames: RingWriter | None = None
         if config.can_log is not None:
             frame_meta = {"buses": list(buses), "bus_of": {str(key): bus for key, bus in (bus_of or {}).items()}}
@@ -217,10 +217,10 @@ class TelemetryProcess(Closing):
                 lossless=lossless,
                 patience=config.patience,
                 meta=frame_meta,
-                fd=files.get("frames"),
+                fd=files.get(FRAMES),
             )
-        elif "frames" in files:
-            os.close(files["frames"])
+        elif FRAMES in files:
+            os.close(files[FRAMES])
 
     def start(self, timeout: float = 60.0) -> None:
         """Start the subprocess and wait until it has opened its files and its Zenoh session.
@@ -291,7 +291,7 @@ class TelemetryProcess(Closing):
         Raises:
             TelemetryError: If a file or endpoint cannot be opened, or if the subprocess is not ready in time.
         """
-        rings = {"records": self.records, "events": self.events, "frames": self.frames}
+        rings = {RECORDS: self.records, EVENTS: self.events, FRAMES: self.frames}
         fds = {name: ring.fd for name, ring in rings.items() if ring is not None}
         before = {"restarts": self._restarts, "endpoint": self._last_endpoint}
         self._child, self._early = self._early or TelemetryChild(fds), None

@@ -31,8 +31,8 @@ AIRWALK_GAIT = Path(__file__).parents[1] / "gaits" / "airwalk.json"
 SWAP = np.r_[len(LEG_JOINTS) : len(JOINTS), 0 : len(LEG_JOINTS)]
 SIGN = np.array(MIRROR_SIGN * len(SIDES), dtype=np.float64)
 
-POSITION_JUMP = math.radians(0.1)  # rad, largest accepted jump of a joint angle at the stance change
-VELOCITY_JUMP = 0.05  # rad/s, largest accepted jump of a joint speed at the stance change
+POSITION_JUMP = math.radians(0.1)  # rad, largest accepted jump of a joint angle between two motions
+VELOCITY_JUMP = 0.05  # rad/s, largest accepted jump of a joint speed between two motions
 DURATION_RANGE = (0.3, 3.0)  # s, shortest and longest step
 ROUNDING = 1e-9  # rad, rad/s or Nm, tolerance of the limit checks for rounding errors
 
@@ -305,18 +305,33 @@ def check_gait(
     """
     _check_form(gait, where)
     right, left = gait.tables(), gait.mirrored().tables()
-    for end, start, limit, unit in (
-        (right.q[-1], left.q[0], POSITION_JUMP, "rad"),
-        (right.qd[-1], left.qd[0], VELOCITY_JUMP, "rad/s"),
+    check_jump((right.q[-1], right.qd[-1]), (left.q[0], left.qd[0]), where, "at the stance change")
+    check_step(gait, robot, where, gravity)
+
+
+def check_jump(end: tuple[Vector, Vector], start: tuple[Vector, Vector], where: str, instant: str) -> None:
+    """Raise `GaitError` if a joint angle or a joint speed jumps between the end of a motion and the start of the next motion.
+
+    Args:
+        end: angles [rad] and speeds [rad/s] of the joints at the end of the first motion, each of shape (12,).
+        start: angles [rad] and speeds [rad/s] of the joints at the start of the second motion, each of shape (12,).
+        where: start of the error message, for example the name of the file.
+        instant: words for the error message that state where the motions meet, such as "at the stance change".
+
+    Raises:
+        GaitError: If a jump exceeds `POSITION_JUMP` or `VELOCITY_JUMP`. The message states the joint with the largest jump.
+    """
+    for before, after, limit, unit, scale in (
+        (end[0], start[0], POSITION_JUMP, "deg", math.degrees(1.0)),
+        (end[1], start[1], VELOCITY_JUMP, "rad/s", 1.0),
     ):
-        jump = np.abs(end - start)
+        jump = np.abs(before - after)
         worst = int(jump.argmax())
         if not jump[worst] <= limit:
             raise GaitError(
-                f"{where}: jump of joints.{JOINTS[worst]} at the stance change must be at most {limit:.4g} {unit}, "
-                f"got {jump[worst]:.4g} {unit}"
+                f"{where}: jump of joints.{JOINTS[worst]} {instant} must be at most {scale * limit:.4g} {unit}, "
+                f"got {scale * jump[worst]:.4g} {unit}"
             )
-    check_step(gait, robot, where, gravity)
 
 
 def check_step(

@@ -7,18 +7,16 @@ speeds at the start of the periodic step. It ends at rest, with the weight on th
 
 from __future__ import annotations
 
-import math
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 
 from atalante_control.gait.gait import (
-    POSITION_JUMP,
-    VELOCITY_JUMP,
     Gait,
     GaitError,
     check_gait,
+    check_jump,
     check_step,
     gait_from,
     gait_object,
@@ -103,23 +101,11 @@ def check_walk(walk: WalkGaits, robot: Robot, where: str = "walk") -> None:
     at_rest = np.zeros(len(JOINTS))
     ends: dict[str, tuple[Gait, float]] = {"start": (walk.start, 1.0), "stop": (walk.stop, 0.0)}
     for name, (gait, phase) in ends.items():
-        (q, qd), (q_step, qd_step) = _at(gait, phase), _at(walk.step, phase)
-        _compare(q, q_step, POSITION_JUMP, f"{where}: angle between {name} and step", math.degrees(1.0), "deg")
-        _compare(qd, qd_step, VELOCITY_JUMP, f"{where}: speed between {name} and step", 1.0, "rad/s")
-        resting = _at(gait, 1.0 - phase)[1]
-        _compare(resting, at_rest, VELOCITY_JUMP, f"{where}: speed at rest of {name}", 1.0, "rad/s")
+        check_jump(_at(gait, phase), _at(walk.step, phase), where, f"between {name} and step")
+        resting, speed = _at(gait, 1.0 - phase)
+        check_jump((resting, speed), (resting, at_rest), where, f"between {name} and standing")
 
 
 def _at(gait: Gait, phase: float) -> tuple[Vector, Vector]:
     q, qd, _ = motion(gait.coefficients, gait.duration, np.array([phase]))
     return q[0], qd[0]
-
-
-def _compare(one: Vector, other: Vector, limit: float, what: str, scale: float, unit: str) -> None:
-    jump = np.abs(one - other)
-    worst = int(jump.argmax())
-    if not jump[worst] <= limit:
-        raise GaitError(
-            f"{what} must differ by at most {scale * limit:.3g} {unit}, "
-            f"got {scale * jump[worst]:.3g} {unit} at {JOINTS[worst]}"
-        )

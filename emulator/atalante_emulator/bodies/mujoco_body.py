@@ -126,15 +126,7 @@ class MuJoCoBody:
         self.reset([0.0] * len(JOINTS))
 
     def reset(self, position: Sequence[float], base: Pose | None = None) -> None:
-        """Set the joint positions and the pose of the pelvis, and zero all velocities and the external wrench.
-
-        Args:
-            position: joint positions, shape (12,) [rad].
-            base: pose of the pelvis. With None, the pelvis is upright at the origin. Must be None if the pelvis is fixed.
-
-        Raises:
-            ValueError: If a pose is given and the pelvis is fixed.
-        """
+        """Set joint positions and pelvis pose, see `Body.reset`."""
         if not self._free and base is not None:
             raise ValueError(f"base must be None for a fixed pelvis, got {base}")
         mujoco.mj_resetData(self._model, self._data)

@@ -156,15 +156,7 @@ class PyBulletBody:
         return pybullet.getLinkStates(self._body, links, 1, 1, physicsClientId=self._client)
 
     def reset(self, position: Sequence[float], base: Pose | None = None) -> None:
-        """Set the joint positions and the pose of the pelvis, and zero all velocities and the external wrench.
-
-        Args:
-            position: joint positions, shape (12,) [rad].
-            base: pose of the pelvis. With None, the pelvis is upright at the origin. Must be None if the pelvis is fixed.
-
-        Raises:
-            ValueError: If a pose is given and the pelvis is fixed.
-        """
+        """Set joint positions and pelvis pose, see `Body.reset`."""
         client = {"physicsClientId": self._client}
         if self._free:
             pose = pybullet.multiplyTransforms(*(base or Pose((0.0, 0.0, 0.0))), *self._inertial_in_base)

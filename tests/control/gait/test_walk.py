@@ -44,7 +44,7 @@ def test_missing_step_is_refused(tmp_path: Path, kind: str) -> None:
 def test_step_that_does_not_fit_the_gait_is_refused(kind: str) -> None:
     gait = getattr(WALK, kind)
     moved = replace(gait, coefficients=gait.coefficients + 0.01)
-    with pytest.raises(GaitError, match=f"angle between {kind} and step must differ by at most 0.1 deg"):
+    with pytest.raises(GaitError, match=rf"walk: jump of joints\.\w+ between {kind} and step must be at most 0\.1 deg"):
         check_walk(WALK._replace(**{kind: moved}), ROBOT)
 
 
