@@ -83,68 +83,84 @@ class Certificate:
     margin: float  # fraction of the guide width that remains under the promised disturbance; negative without a promise
 
 
-def limits(guide: GuideFilter, xi: float) -> list[Limit]:
-    """Return the conditions that limit the promise of a guide, sorted from the strictest to the weakest.
+class PromiseLimits:
+    """Conditions that limit the promise of a guide filter. The parts that do not depend on Xi are computed only once."""
 
-    Args:
-        guide: filter with shape, gains and gait; it is not changed.
-        xi: assistance factor in [0, 1].
-    """
-    prediction, config = guide.prediction, guide.config
-    leg, box, start = prediction.leg, prediction.assumptions.hand_over, prediction.start
-    width = guide.widths(xi)
-    _, slopes, curvatures = leg.deadbeat.basis(leg.time)
-    base = np.abs(prediction.torque) + np.abs(prediction.mass).sum(axis=2) * box.largest(curvatures)[:, None]
-    speed = np.abs(leg.qd) + box.largest(slopes)[:, None]
-    steps, horizon = guide.cycles, len(prediction.ahead) - 1
-    narrowest = 1.0 / tail(1.0 / width)
-    room = np.concatenate([width[:horizon], narrowest[horizon:]])
-    found = [
-        _limit(room, start.error, steps, "the guide is too narrow at"),
-        _limit(
-            config.torque_limit - base, start.torque, steps, f"the backup torque reaches {config.torque_limit:g} Nm at"
-        ),
-        _limit(config.speed_limit - speed, start.speed, steps, f"the speed reaches {config.speed_limit:g} rad/s at"),
-        _limit(
-            config.worst_speed_limit - speed,
-            start.worst_speed,
-            steps,
-            f"with errors of the model, the speed reaches {config.worst_speed_limit:g} rad/s at",
-        ),
-        _limit(np.full_like(width, config.rate_limit), start.change, steps, "the backup torque changes too fast at"),
-        _end_of_horizon(guide, width, narrowest),
-    ]
-    return sorted(found, key=lambda limit: limit.scale)
+    def __init__(self, guide: GuideFilter) -> None:
+        """Compute the limits of torque, speed and torque rate.
 
+        Args:
+            guide: filter with shape, gains and gait; it is not changed.
+        """
+        self._guide = guide
+        prediction, config, steps = guide.prediction, guide.config, guide.cycles
+        leg, box, start = prediction.leg, prediction.assumptions.hand_over, prediction.start
+        _, slopes, curvatures = leg.deadbeat.basis(leg.time)
+        torque = np.abs(prediction.torque) + np.abs(prediction.mass).sum(axis=2) * box.largest(curvatures)[:, None]
+        speed = np.abs(leg.qd) + box.largest(slopes)[:, None]
+        self._of_drives = [
+            _limit(
+                config.torque_limit - torque,
+                start.torque,
+                steps,
+                f"the backup torque reaches {config.torque_limit:g} Nm at",
+            ),
+            _limit(
+                config.speed_limit - speed, start.speed, steps, f"the speed reaches {config.speed_limit:g} rad/s at"
+            ),
+            _limit(
+                config.worst_speed_limit - speed,
+                start.worst_speed,
+                steps,
+                f"with errors of the model, the speed reaches {config.worst_speed_limit:g} rad/s at",
+            ),
+            _limit(
+                np.full_like(speed, config.rate_limit), start.change, steps, "the backup torque changes too fast at"
+            ),
+        ]
+        self._horizon = _Horizon(guide)
 
-def largest_promise(guide: GuideFilter, xi: float) -> float:
-    """Return the largest promise as a fraction of the chosen promise; negative or 0 if no promise is possible.
+    def at(self, xi: float) -> list[Limit]:
+        """Return the conditions, sorted from the strictest to the weakest.
 
-    Args:
-        guide: filter with shape, gains and gait; it is not changed.
-        xi: assistance factor in [0, 1].
-    """
-    return limits(guide, xi)[0].scale
+        Args:
+            xi: assistance factor in [0, 1].
+        """
+        guide, horizon = self._guide, self._horizon.cycles
+        width = guide.widths(xi)
+        narrowest = 1.0 / tail(1.0 / width)
+        room = np.concatenate([width[:horizon], narrowest[horizon:]])
+        too_narrow = _limit(room, guide.prediction.start.error, guide.cycles, "the guide is too narrow at")
+        found = [too_narrow, *self._of_drives, self._horizon.limit(width, narrowest)]
+        return sorted(found, key=lambda limit: limit.scale)
 
+    def largest(self, xi: float) -> float:
+        """Return the largest promise as a fraction of the chosen promise; negative or 0 if no promise is possible.
 
-def certify(guide: GuideFilter, xi: float, promise: float) -> Certificate:
-    """Compute the certificate of a guide at an assistance factor.
+        Args:
+            xi: assistance factor in [0, 1].
+        """
+        return self.at(xi)[0].scale
 
-    Args:
-        guide: filter with shape, gains and gait; it is not changed.
-        xi: assistance factor in [0, 1].
-        promise: promise for which the filter is built, as a fraction of the chosen promise.
-    """
-    strictest = limits(guide, xi)[0]
-    chosen = np.array(guide.prediction.assumptions.promise)
-    largest = _pair(strictest.scale * chosen)
-    made = _pair(min(promise, strictest.scale) * chosen)
-    if made is None:
-        text = f"no promise: {strictest.what} even without a disturbance; the robot may leave the guide"
-        return Certificate(guide.shape.name, xi, False, text, None, None, -math.inf)
-    start, width = guide.prediction.start.error, guide.widths(xi)
-    used = ((start[:, :2] + promise * start[:, 2:]) / width)[: guide.cycles + 1]
-    return Certificate(guide.shape.name, xi, True, f"limit: {strictest.what}", made, largest, 1.0 - float(used.max()))
+    def certificate(self, xi: float, promise: float) -> Certificate:
+        """Return the certificate of the guide at an assistance factor.
+
+        Args:
+            xi: assistance factor in [0, 1].
+            promise: promise for which the filter is built, as a fraction of the chosen promise.
+        """
+        guide, strictest = self._guide, self.at(xi)[0]
+        chosen = np.array(guide.prediction.assumptions.promise)
+        largest = _pair(strictest.scale * chosen)
+        made = _pair(min(promise, strictest.scale) * chosen)
+        if made is None:
+            text = f"no promise: {strictest.what} even without a disturbance; the robot may leave the guide"
+            return Certificate(guide.shape.name, xi, False, text, None, None, -math.inf)
+        start, width = guide.prediction.start.error, guide.widths(xi)
+        used = ((start[:, :2] + promise * start[:, 2:]) / width)[: guide.cycles + 1]
+        return Certificate(
+            guide.shape.name, xi, True, f"limit: {strictest.what}", made, largest, 1.0 - float(used.max())
+        )
 
 
 def _pair(torque: Vector) -> JointTorque | None:
@@ -168,45 +184,58 @@ def _limit(room: Vector, reach: Vector, steps: int, what: str) -> Limit:
     return Limit(float(scales[at, joint]), f"{what} {(at + 1) / steps:.2f} T ({_JOINTS[joint]})")
 
 
-def _end_of_horizon(guide: GuideFilter, width: Vector, narrowest: Vector) -> Limit:
-    """Return the largest scale of the promise for which the errors inside the horizon bound the error one cycle beyond it.
+class _Horizon:
+    """Condition at the end of the horizon: the errors inside the horizon bound the error one cycle beyond it.
 
     At the end of the horizon little more than the slowest motion remains. The error one cycle beyond the horizon is therefore
     the error at the end of the horizon times a factor, plus a remainder. The remainder is a combination of the errors at two
     earlier cycles, and any two cycles may be chosen. All these errors are bounded by the width less the effect of the
     disturbances.
 
-    Args:
-        guide: filter with shape, gains and gait.
-        width: distance from q_des to the nearer bound of the guide in each cycle, shape (n, 2) [rad].
-        narrowest: width that the last predicted cycle must keep, shape (n, 2) [rad], see `filter.tail`.
+    Attributes:
+        cycles: number of predicted cycles.
     """
-    prediction = guide.prediction
-    horizon = len(prediction.ahead) - 1
-    starts = np.arange(0, max(1, len(width) - horizon - 1), START_CYCLES)
-    reach = prediction.reach[starts // START_CYCLES]
 
-    def room(lag: int) -> tuple[Vector, Vector]:
-        added = reach[:, min(lag, horizon)]
-        rooms = narrowest if lag == horizon else width
-        return rooms[starts + lag] - added[:, :2], added[:, 2:]
+    def __init__(self, guide: GuideFilter) -> None:
+        prediction = guide.prediction
+        self.cycles, self._step = len(prediction.ahead) - 1, guide.cycles
+        rows = prediction.ahead @ prediction.compress * SIZES
+        beyond = prediction.beyond * SIZES
+        self._factor = (beyond * rows[-1]).sum(axis=1) / (rows[-1] ** 2).sum(axis=1)
+        remainder = beyond - self._factor[:, None] * rows[-1]
+        self._pairs: list[
+            tuple[tuple[int, int], Vector]
+        ] = []  # two earlier cycles, and the weights of the errors there
+        for near, far in ((0.1, 0.3), (0.25, 0.5), (0.4, 0.7)):
+            lags = round(near * self.cycles), round(far * self.cycles)
+            inverse = np.linalg.pinv(np.concatenate([rows[lag] for lag in lags]), rcond=1e-9)
+            self._pairs.append((lags, np.abs(remainder @ inverse).T))
+        self._starts = np.arange(0, max(1, len(prediction.leg.time) - self.cycles - 1), START_CYCLES)
+        self._reach = prediction.reach[self._starts // START_CYCLES]
 
-    (last, last_promise), (end, end_promise) = room(horizon), room(horizon + 1)
-    rows = prediction.ahead @ prediction.compress * SIZES
-    beyond = prediction.beyond * SIZES
-    left = (beyond * rows[-1]).sum(axis=1) / (rows[-1] ** 2).sum(axis=1)
-    remainder = beyond - left[:, None] * rows[-1]
-    found = []
-    for near, far in ((0.1, 0.3), (0.25, 0.5), (0.4, 0.7)):
-        lags = round(near * horizon), round(far * horizon)
-        weights = np.abs(remainder @ np.linalg.pinv(np.concatenate([rows[lag] for lag in lags]), rcond=1e-9)).T
-        rooms, promises = (np.hstack(parts) for parts in zip(*map(room, lags), strict=True))
-        # The promise must meet: left * (last - scale * ...) + (rooms - scale * ...) @ weights <= end - scale * ...
-        have = end - left * last - rooms @ weights
-        need = end_promise - left * last_promise - promises @ weights
-        with np.errstate(divide="ignore"):
-            scales = np.where(need > 0.0, have / np.maximum(need, 1e-12), np.where(have >= 0.0, np.inf, -1.0))
-        found.append(scales.min(axis=1))
-    best = np.max(found, axis=0)
-    at = int(best.argmin())
-    return Limit(float(best[at]), f"the horizon is too short at {at * START_CYCLES / guide.cycles:.2f} T")
+    def limit(self, width: Vector, narrowest: Vector) -> Limit:
+        """Return the largest scale of the promise that meets the condition.
+
+        Args:
+            width: distance from q_des to the nearer bound of the guide in each cycle, shape (n, 2) [rad].
+            narrowest: width that the last predicted cycle must keep, shape (n, 2) [rad], see `filter.tail`.
+        """
+
+        def room(lag: int) -> tuple[Vector, Vector]:
+            added = self._reach[:, min(lag, self.cycles)]
+            rooms = narrowest if lag == self.cycles else width
+            return rooms[self._starts + lag] - added[:, :2], added[:, 2:]
+
+        (last, last_promise), (end, end_promise) = room(self.cycles), room(self.cycles + 1)
+        found = []
+        for lags, weights in self._pairs:
+            rooms, promises = (np.hstack(parts) for parts in zip(*map(room, lags), strict=True))
+            # The promise must meet: factor * (last - scale * ...) + (rooms - scale * ...) @ weights <= end - scale * ...
+            have = end - self._factor * last - rooms @ weights
+            need = end_promise - self._factor * last_promise - promises @ weights
+            with np.errstate(divide="ignore"):
+                scales = np.where(need > 0.0, have / np.maximum(need, 1e-12), np.where(have >= 0.0, np.inf, -1.0))
+            found.append(scales.min(axis=1))
+        best = np.max(found, axis=0)
+        at = int(best.argmin())
+        return Limit(float(best[at]), f"the horizon is too short at {at * START_CYCLES / self._step:.2f} T")

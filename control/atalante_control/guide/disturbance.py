@@ -13,7 +13,7 @@ Each of these torques may have any sign in any cycle. The largest error that the
 .. math:: D(k, n) = \sum_{i=k}^{n-1} \max_{M} |G(n - i) M^{-1}| \, p_i,
 
 with the response G to an acceleration that lasts one cycle, the bound p, and every mass matrix M that the leg can have in
-cycle i inside the guide. `spread` computes this sum for every start cycle k and every number n - k of cycles ahead.
+cycle i inside the guide. `spread` computes this sum for each start cycle k and each number n - k of cycles ahead.
 """
 
 from __future__ import annotations
@@ -23,6 +23,7 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from atalante_control.gait.recentering import Deadbeat
 from atalante_control.joint.idealization import AssistedInertia, Friction
@@ -173,32 +174,47 @@ class Effect(NamedTuple):
     left: Vector
 
 
-def spread(effect: Effect, mobilities: Vector, bounds: Vector, starts: int, lags: int) -> Vector:
-    """Return the largest output that disturbances can cause, for every start cycle and every number of cycles ahead.
+class Grid(NamedTuple):
+    """Predictions for which `spread` reports the largest output."""
+
+    starts: int  # number of start cycles: 0 to starts - 1
+    block: int  # number of consecutive start cycles that share one row of the result
+    lags: NDArray[np.int64]  # (lags,) numbers of cycles ahead, ascending
+
+
+def spread(effect: Effect, mobilities: Vector, bounds: Vector, grid: Grid, ahead: Vector) -> Vector:
+    """Compute the largest output that disturbances can cause, ahead of each start cycle and since the start of the step.
+
+    In both results, columns 0 and 1 are the sums of the absolute effects of the budget on the two outputs, columns 2 and 3 those
+    of the chosen promise.
 
     Args:
         effect: effect of a disturbance on the outputs.
         mobilities: inverse mass matrices of each cycle, shape (n, postures, 2, 2).
         bounds: torque bounds of SH and SK (rows), budget and chosen promise (columns), in each cycle, shape (n, 2, 2) [Nm].
-        starts: number of start cycles; a disturbance begins in one of the cycles 0 to starts - 1.
-        lags: largest number of cycles ahead.
+        grid: start cycles and numbers of cycles ahead of the first result.
+        ahead: shape (blocks, lags, 4). Each element is raised to the largest output of its start cycles, for its number of cycles
+            ahead. Predictions past the end of `bounds` are left out.
 
     Returns:
-        Shape (starts, lags + 1, 4). Columns 0 and 1 are the sums of the absolute effects of the budget on the two outputs,
-        columns 2 and 3 those of the chosen promise. A sum is zero where the predicted cycle is past the end of `bounds`.
+        The largest output in each cycle by the disturbances since cycle 0, without the response `hidden`, shape (n, 4).
     """
     count, postures = len(bounds), mobilities.shape[1]
-    total, result = np.zeros((count, 4)), np.zeros((starts, lags + 1, 4))
+    total, added = np.zeros((count, 4)), np.zeros((grid.starts, 4))
     both = np.zeros((2, 2, 2))  # the responses `pushed` and `hidden` after `lag` cycles
-    for lag in range(min(lags, count - 1) + 1):
+    column = 0
+    for lag in range(count):
+        reported = column < len(grid.lags) and grid.lags[column] == lag
+        starts = min(grid.starts, count - lag) if reported else 0
+        hides = reported and len(effect.hidden) > 0
         both[0] = effect.pushed[lag]
-        if len(effect.hidden):
+        if hides:
             both[1] = effect.hidden[lag]
-        for start in range(count - lag):
-            end = start + lag
-            for r in range(2):
-                h, k = effect.left[end, r, 0], effect.left[end, r, 1]
-                for i in range(2 if start < starts else 1):
+        for i in range(2 if hides else 1):
+            for start in range(count - lag if i == 0 else starts):
+                end = start + lag
+                for r in range(2):
+                    h, k = effect.left[end, r, 0], effect.left[end, r, 1]
                     on_hip, on_knee = h * both[i, 0, 0] + k * both[i, 1, 0], h * both[i, 0, 1] + k * both[i, 1, 1]
                     # The largest effects of the start cycle. A call of another function here would take five times longer.
                     budget = promise = 0.0
@@ -211,6 +227,11 @@ def spread(effect: Effect, mobilities: Vector, bounds: Vector, starts: int, lags
                         total[end, r] += budget
                         total[end, r + 2] += promise
                     else:
-                        result[start, lag, r] = total[end, r] + budget
-                        result[start, lag, r + 2] = total[end, r + 2] + promise
-    return result
+                        added[start, r], added[start, r + 2] = budget, promise
+        for start in range(starts):
+            for r in range(4):
+                output = total[start + lag, r] + added[start, r]
+                ahead[start // grid.block, column, r] = max(ahead[start // grid.block, column, r], output)
+        if reported:
+            column += 1
+    return total

@@ -211,9 +211,13 @@ def narrowest(inverse: Vector, cycles: int) -> Vector:
         inverse: 1 / distance to the guide for each cycle, shape (n, m) [1/rad]; the last row applies to all later cycles.
         cycles: number of cycles, including the first one.
     """
-    padded = np.concatenate([inverse, np.repeat(inverse[-1:], cycles - 1, axis=0)])
-    windows = np.lib.stride_tricks.sliding_window_view(padded, cycles, axis=0)
-    return np.asarray(windows.max(axis=-1))
+    largest = np.concatenate([inverse, np.repeat(inverse[-1:], cycles - 1, axis=0)])
+    covered = 1  # cycles over which `largest` contains the maximum
+    while covered < cycles:
+        shift = min(covered, cycles - covered)
+        largest = np.maximum(largest[:-shift], largest[shift:])
+        covered += shift
+    return largest
 
 
 def _lags(prediction: Prediction) -> Records[Lag]:

@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 
 from atalante_control.guide.backup_policy import STATES, BackupPolicy, SampledLoop, responses
-from atalante_control.guide.disturbance import Effect, HandOver, Leg, Mismatch, spread
+from atalante_control.guide.disturbance import Effect, Grid, HandOver, Leg, Mismatch, spread
 from atalante_control.guide.kernel import COMPRESSED, SLACK_CYCLES, START_CYCLES
 from atalante_hal.compiled import compiled
 from atalante_hal.types import Vector
@@ -129,42 +129,36 @@ class Prediction:
         same = np.broadcast_to(np.eye(2), self.mass.shape).copy()
         nothing = np.zeros((0, 2, 2))
         run = compiled(spread)
+        starts, blocks = self.cycles + 1, -(-(self.cycles + 1) // START_CYCLES)
+        whole = Grid(starts, START_CYCLES, np.arange(horizon + 1))
+        few, none = whole._replace(lags=FEW), whole._replace(lags=FEW[:0])
 
-        def ahead(effect: Effect) -> Vector:
-            return np.asarray(run(effect, mobilities, bounds, self.cycles + 1, horizon))
-
-        def start(effect: Effect) -> Vector:
-            return np.asarray(run(effect, mobilities, bounds, 1, last)[0])
-
-        lag = assumptions.loop.velocity_lag
-        errors, first = [], []
-        for one in family:
-            late = np.ascontiguousarray(one.error[:, :, 2:4])
-            errors.append(ahead(Effect(one.pushed_error, lag * late, same)))
-            first.append(start(Effect(one.pushed_error, nothing, same)))
-            first[-1][:, :2] += np.abs(late).sum(axis=2) * lag * hand_over.acceleration
-        self.reach = _blocks(np.max(errors, axis=0), START_CYCLES)
-        torque, speed = Effect(nominal.pushed_feedback, nothing, self.mass), Effect(nominal.pushed_rate, nothing, same)
         # A leg that is lighter than the model, or a later command, makes the joints faster.
-        late_rates = [np.ascontiguousarray(one.rate[:, :, 2:4]) for one in family]
-        pushed = [
-            ahead(Effect(one.pushed_rate, lag * late, same)) for one, late in zip(family, late_rates, strict=True)
-        ]
-        worst_ahead = np.max(pushed, axis=0)[:, FEW]
-        few = np.stack([ahead(torque)[:, FEW], ahead(speed)[:, FEW]], axis=2)  # (starts, rows, kind, joint and bound)
-        by_bound = few.reshape(*few.shape[:3], 2, 2).swapaxes(2, 3)
-        by_kind = [by_bound.reshape(*few.shape[:2], 8), worst_ahead]
-        self.few_reach = _blocks(np.concatenate(by_kind, axis=2), START_CYCLES)
+        self.reach = np.zeros((blocks, len(whole.lags), 4))
+        few_ahead = np.zeros((3, blocks, len(FEW), 4))  # torque, speed, speed for the worst errors of inertia and delay
+        lag = assumptions.loop.velocity_lag
+        first, first_rates = [], []
+        for one in family:
+            late, late_rate = (np.ascontiguousarray(rows[:, :, 2:4]) for rows in (one.error, one.rate))
+            first.append(run(Effect(one.pushed_error, lag * late, same), mobilities, bounds, whole, self.reach))
+            first[-1][:, :2] += np.abs(late).sum(axis=2) * lag * hand_over.acceleration
+            rate = Effect(one.pushed_rate, lag * late_rate, same)
+            first_rates.append(run(rate, mobilities, bounds, few, few_ahead[2]))
+        torque, speed = Effect(nominal.pushed_feedback, nothing, self.mass), Effect(nominal.pushed_rate, nothing, same)
+        first_torque = run(torque, mobilities, bounds, few, few_ahead[0])
+        first_speed = run(speed, mobilities, bounds, few, few_ahead[1])
+        by_bound = few_ahead[:2].reshape(2, blocks, len(FEW), 2, 2).transpose(1, 2, 3, 0, 4)  # budget and promise first
+        self.few_reach: Vector = np.concatenate([by_bound.reshape(blocks, len(FEW), 8), few_ahead[2]], axis=2)
         self.few_ahead: Vector = np.concatenate([nominal.feedback[FEW], nominal.rate[FEW]], axis=1)
-        worst_speed = np.max([start(Effect(one.pushed_rate, nothing, same)) for one in family], axis=0)
-        torque_reach, speed_reach = start(torque), start(speed)
         rates = [_separated(one.rate[FEW] - nominal.rate[FEW]) for one in family]
         self.few_slack: Vector = np.abs(rates).max(axis=0)
-        change = np.diff(lightest.pushed_feedback, axis=0, prepend=0.0)
         # The torque that is carried over the stance change varies slowly, so it is left out of the change within one cycle.
         bounds[:, :, 0] = leg.budget(assumptions.mismatch, hand_over, np.zeros(0))
-        changes_of_torque = start(Effect(change, nothing, self.mass))
-        self.start = StartReach(np.max(first, axis=0), torque_reach, speed_reach, worst_speed, changes_of_torque)
+        change = Effect(np.diff(lightest.pushed_feedback, axis=0, prepend=0.0), nothing, self.mass)
+        first_change = run(change, mobilities, bounds, none, few_ahead[0])
+        self.start = StartReach(
+            np.max(first, axis=0), first_torque, first_speed, np.max(first_rates, axis=0), first_change
+        )
 
 
 #: Cached tables of the last gaits and gains, ordered from the earliest to the latest use.

@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 from atalante_control.gait.gait import PERIOD
 from atalante_control.guide.backup_policy import BackupPolicy
-from atalante_control.guide.certificate import Certificate, certify, largest_promise
+from atalante_control.guide.certificate import Certificate, PromiseLimits
 from atalante_control.guide.config import StepGuideConfig
 from atalante_control.guide.disturbance import Leg
 from atalante_control.guide.filter import GuideConfig, GuideFilter
@@ -70,6 +70,7 @@ class StepGuides:
             GuideFilter(limits, shape, prediction_of(policy, leg, assumptions, blend, _WIDEST), blend)
             for policy in policies(config, leg.inertia)
         ]
+        self._limits = [PromiseLimits(guide) for guide in self.filters]
         self._choices: dict[float, Choice] = {}
 
     def prepare(self) -> None:
@@ -94,8 +95,8 @@ class StepGuides:
 
     def _choose(self, xi: float) -> Choice:
         best, most = self.filters[0], -math.inf
-        for guide in self.filters:
-            scale = largest_promise(guide, xi)
+        for guide, promise_limits in zip(self.filters, self._limits, strict=True):
+            scale = promise_limits.largest(xi)
             if scale >= 1.0:
                 return Choice(guide, 1.0)
             if scale > most:
@@ -112,7 +113,7 @@ class StepGuides:
         if xi >= 1.0:
             reason = "no promise: at Xi = 1 only the baseline controller drives the joints"
             return Certificate(guide.shape.name, xi, False, reason, None, None, -math.inf)
-        return certify(guide, xi, promise)
+        return self._limits[self.filters.index(guide)].certificate(xi, promise)
 
 
 def filter_config(config: StepGuideConfig, robot: Robot) -> GuideConfig:

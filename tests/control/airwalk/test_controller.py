@@ -18,7 +18,7 @@ import pytest
 from atalante_control.airwalk.controller import AirwalkConfig, AirwalkController
 from atalante_control.dynamics.gravity import Gravity
 from atalante_control.gait.gait import AIRWALK_GAIT, Gait, load_gait
-from atalante_control.guide.certificate import largest_promise
+from atalante_control.guide.certificate import PromiseLimits
 from atalante_control.guide.shapes import SHAPES
 from atalante_control.joint.idealization import Friction
 from atalante_control.joint.pid import AIR_GAINS, LEFT, RIGHT, Pid
@@ -127,7 +127,7 @@ def test_step_uses_the_softest_gains_certified_for_the_promise(shape: str):
     stiffness = [guide.prediction.policy.stiffness for guide in controller.guides]
     assert stiffness == sorted(stiffness)
     for xi in (0.0, 0.5, 0.75, 0.93):
-        scales = [largest_promise(guide, xi) for guide in controller.guides]
+        scales = [PromiseLimits(guide).largest(xi) for guide in controller.guides]
         guide, promise = controller.choice(xi)
         enough = [scale >= 1.0 for scale in scales]
         expected = enough.index(True) if any(enough) else int(np.argmax(scales))

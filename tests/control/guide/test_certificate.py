@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from scipy.optimize import linprog
 
-from atalante_control.guide.certificate import certify, largest_promise, limits
+from atalante_control.guide.certificate import PromiseLimits
 from atalante_control.guide.filter import GuideFilter
 from tests.control.guide.ideal_leg import controller
 
@@ -45,7 +45,7 @@ def test_the_running_filter_is_built_for_the_printed_promise():
             chosen = guide.prediction.assumptions.promise
             assert certificate.promise.hip == pytest.approx(scale * chosen[0], abs=0.01)
             assert certificate.promise.hip <= scale * chosen[0]
-            assert scale <= largest_promise(guide, xi)
+            assert scale <= PromiseLimits(guide).largest(xi)
             assert certificate.margin >= 0.0
 
 
@@ -59,15 +59,15 @@ def test_guide_without_a_promise_states_the_reason():
 
 
 def test_promise_below_the_smallest_is_not_given():
-    guide = controller("constant").guide_at(0.5)
-    assert certify(guide, 0.5, 0.9 / 30.0).promise is None
-    assert certify(guide, 0.5, 1.1 / 30.0).promise is not None
+    limits = PromiseLimits(controller("constant").guide_at(0.5))
+    assert limits.certificate(0.5, 0.9 / 30.0).promise is None
+    assert limits.certificate(0.5, 1.1 / 30.0).promise is not None
 
 
 def test_narrower_guides_promise_less():
     for shape in SHAPES:
-        guide = controller(shape).guides[-1]
-        scales = [largest_promise(guide, xi) for xi in np.linspace(0.0, 1.0, 11).tolist()]
+        limits = PromiseLimits(controller(shape).guides[-1])
+        scales = [limits.largest(xi) for xi in np.linspace(0.0, 1.0, 11).tolist()]
         assert all(narrow <= wide + 1e-9 for wide, narrow in itertools.pairwise(scales))
 
 
@@ -150,6 +150,6 @@ def test_uncompensated_torque_adds_little_to_condition_3(shape: str):
 
 
 def test_the_strictest_condition_comes_first():
-    found = limits(controller("pinched").guides[-1], 0.5)
+    found = PromiseLimits(controller("pinched").guides[-1]).at(0.5)
     assert [limit.scale for limit in found] == sorted(limit.scale for limit in found)
     assert "too narrow" in found[0].what

@@ -8,7 +8,7 @@ import math
 import numpy as np
 import pytest
 
-from atalante_control.guide.disturbance import Effect, HandOver, Mismatch, spread
+from atalante_control.guide.disturbance import Effect, Grid, HandOver, Mismatch, spread
 from tests.control.guide.ideal_leg import controller
 
 LEG = controller("constant").guides[0].prediction.leg
@@ -21,7 +21,10 @@ def test_spread_is_the_worst_of_all_sign_patterns():
     pushed[0] = 0.0
     left, inverse = rng.normal(size=(n, 2, 2)), rng.normal(size=(n, 1, 2, 2))
     bounds = np.abs(rng.normal(size=(n, 2, 2)))
-    found = spread(Effect(pushed, np.zeros_like(pushed), left), inverse, bounds, n, n)
+    ahead = np.zeros((n, n + 1, 4))
+    since_start = spread(
+        Effect(pushed, np.zeros_like(pushed), left), inverse, bounds, Grid(n, 1, np.arange(n + 1)), ahead
+    )
     start, end = 1, 4
     for column in (0, 1):
         worst = np.zeros(2)
@@ -29,7 +32,22 @@ def test_spread_is_the_worst_of_all_sign_patterns():
             pattern = np.reshape(signs, (-1, 2)) * bounds[start:end, :, column]
             effect = sum(left[end] @ pushed[end - i] @ inverse[i, 0] @ pattern[i - start] for i in range(start, end))
             worst = np.maximum(worst, np.abs(effect))
-        np.testing.assert_allclose(found[start, end - start, 2 * column : 2 * column + 2], worst)
+        np.testing.assert_allclose(ahead[start, end - start, 2 * column : 2 * column + 2], worst)
+    np.testing.assert_array_equal(since_start, [ahead[0, lag] for lag in range(n)])
+
+
+def test_spread_raises_each_block_to_the_worst_of_its_start_cycles():
+    rng = np.random.default_rng(1)
+    n, lags = 7, np.array([1, 3])
+    effect = Effect(*rng.normal(size=(2, n, 2, 2)), left=rng.normal(size=(n, 2, 2)))
+    inverse, bounds = rng.normal(size=(n, 2, 2, 2)), np.abs(rng.normal(size=(n, 2, 2)))
+    single, blocks = np.zeros((6, n, 4)), np.full((2, 2, 4), 9.0)
+    spread(effect, inverse, bounds, Grid(6, 1, np.arange(n)), single)
+    spread(effect, inverse, bounds, Grid(6, 3, lags), blocks)
+    worst = single.reshape(2, 3, n, 4).max(axis=1)[:, lags]
+    np.testing.assert_array_equal(blocks, np.maximum(worst, 9.0))
+    assert (worst > 9.0).any()
+    assert (worst < 9.0).any()
 
 
 def test_spread_takes_the_worst_posture_and_the_hidden_part():
@@ -37,8 +55,9 @@ def test_spread_takes_the_worst_posture_and_the_hidden_part():
     hidden = np.full((3, 2, 2), 0.5)
     inverse = np.stack([np.eye(2), 3.0 * np.eye(2)])[None].repeat(3, axis=0)
     same = np.eye(2)[None].repeat(3, axis=0)
-    found = spread(Effect(pushed, hidden, same), inverse, np.ones((3, 2, 2)), 1, 2)
-    np.testing.assert_allclose(found[0, 2], 2 * 2 * 3.0 + 6.0 + 3.0)  # three lags add 6 each, the hidden part adds 3
+    ahead = np.zeros((1, 1, 4))
+    spread(Effect(pushed, hidden, same), inverse, np.ones((3, 2, 2)), Grid(1, 1, np.array([2])), ahead)
+    np.testing.assert_allclose(ahead[0, 0], 2 * 2 * 3.0 + 6.0 + 3.0)  # three lags add 6 each, the hidden part adds 3
 
 
 def test_budget_contains_friction_inertia_residual_and_the_carried_torque():

@@ -12,7 +12,7 @@ from atalante_control.airwalk.config import AirwalkConfig
 from atalante_control.airwalk.swing_leg import OVERLAP, swing_leg
 from atalante_control.dynamics.gravity import Gravity
 from atalante_control.gait.gait import AIRWALK_GAIT, load_gait
-from atalante_control.guide import step_guides
+from atalante_control.guide.certificate import PromiseLimits
 from atalante_control.guide.shapes import CONSTANT
 from atalante_control.guide.step_guides import StepGuides, filter_config, policies
 from atalante_control.joint.idealization import AssistedInertia
@@ -65,7 +65,7 @@ def test_prepared_guides_need_no_computation_when_the_assistance_factor_changes(
     guides = StepGuides(CONFIG, ROBOT, CONSTANT, LEG, np.linspace(1.0, 0.0, 20), OVERLAP)
     exact = guides.at(0.37)
     guides.prepare()
-    monkeypatch.setattr(step_guides, "largest_promise", lambda *_: pytest.fail("a promise was computed in the loop"))
+    monkeypatch.setattr(PromiseLimits, "at", lambda *_: pytest.fail("a promise was computed in the loop"))
     for percent in range(101):
         assert guides.at(percent * 100 * 0.0001).guide in guides.filters  # decoded as on the bus
     assert guides.at(0.37) == exact
