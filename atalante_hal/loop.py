@@ -19,11 +19,11 @@ from atalante_hal.types import PERIOD, Controller, State
 
 #: Number of consecutive late cycles after which the robot goes to HOLD.
 OVERRUNS_TO_HOLD = 3
-#: Largest lateness of a cycle [s]. More (a gap) leads to HOLD. The watchdog of the drives has the same timeout.
+#: Largest lateness of a cycle [s]. A later cycle (a gap) leads to HOLD. The watchdog of the drives has the same timeout.
 GAP_TO_HOLD = 5e-3
 #: Largest time by which the loop may fall behind the monotonic clock within `DRIFT_CYCLES` cycles [s]. More leads to HOLD.
 DRIFT_TO_HOLD = 5e-3
-#: Length of the window in which the delay is measured [cycles].
+#: Length of the window in which the time lost by the loop is measured [cycles].
 DRIFT_CYCLES = 50
 #: Number of bins of the histogram of computing times. Each bin is 1 us wide.
 COST_BINS = 10_000

@@ -46,9 +46,9 @@ class Envelope:
     """Reduction of the torque near the limits of position and velocity, see `limiter`."""
 
     look_ahead: float  # s, prediction time of the joint position at the present velocity
-    #: Distance of the predicted position outside a position limit at which the outward torque is 0 [rad].
+    #: Distance by which the predicted position must exceed a position limit before the outward torque is 0 [rad].
     position_margin: float
-    velocity_margin: float  # rad/s, excess over the velocity limit at which the accelerating torque is 0
+    velocity_margin: float  # rad/s, speed above the velocity limit at which the accelerating torque is 0
 
 
 @dataclass(frozen=True)
@@ -68,8 +68,8 @@ class Sensors:
     velocity_bandwidth: float  # Hz, cut-off frequency of the low-pass of the reported velocity
     #: Largest difference between the attitude of the tibia from the encoders and from the IMUs [rad about each axis].
     attitude_error: float
-    attitude_change: float  # rad, largest change of this difference while an encoder reports a constant position
-    misalignment: float  # rad, addition to `attitude_change` for each rad by which the leg turns meanwhile
+    attitude_change: float  # rad, largest change of the attitude difference during a constant encoder reading
+    misalignment: float  # rad, allowance added to `attitude_change` for each rad by which the leg turns
     quaternion_error: float  # largest difference between the squared norm of a quaternion and 1
     cell_free: float  # N, largest vertical force at which a cell is regarded as unloaded
     cell_twist: float  # N, largest difference between the vertical forces on the two diagonals of a foot's cells

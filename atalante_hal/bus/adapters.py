@@ -28,7 +28,7 @@ SEGMENTS: Final = (
 )
 #: Entries for 1 Mbit/s and 5 Mbit/s in python-can's configuration file, for backends that calculate the bit segments.
 BIT_RATES: Final = (("bitrate", "1000000"), ("data_bitrate", "5000000"))
-#: Source of the facts, if an adapter names no other source.
+#: Default source of the facts about an adapter.
 SOURCES: Final = "sources of python-can 4.6.1"
 NOT_TRIED: Final = "not tried"
 

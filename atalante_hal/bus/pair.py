@@ -91,7 +91,7 @@ class PairBus:
             end = tail + memory.nbytes
             if end > peer._limit:
                 raise BusFull(
-                    f"{self.name}: the queue of {peer.name} is full, {tail // FRAME_BYTES} frames were not received"
+                    f"{self.name} cannot send: the receive queue of {peer.name} is full, with {tail // FRAME_BYTES} frames"
                 )
         peer._queue[tail:end] = memory
         peer._tail = end

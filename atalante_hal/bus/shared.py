@@ -30,9 +30,9 @@ from atalante_hal.bus.batch import Batches
 from atalante_hal.memory import anonymous_file
 from atalante_hal.wire.frame import FRAME_BYTES, Frames
 
-#: Indices of the counters of each end: two of frames, then two of the calls of `step`, which a client requests.
+#: Indices of the counters of each end: frames sent, frames received, calls of `step` requested, calls of `step` completed.
 _SENT, _RECEIVED, _REQUESTED, _COMPLETED = range(4)
-#: Indices of the flags of each end. A flag is 1 while its name describes the state of the end.
+#: Indices of the flags of each end. A flag is 1 while the end is in the named state.
 _SERVING, _SLEEPING, _CLOSED = range(4, 7)
 #: Number of 64-bit header words of each end: one cache line.
 _END_WORDS = 8
@@ -41,7 +41,7 @@ _HEADER_BYTES = mmap.PAGESIZE
 _POLL_TIME = 500e-6
 #: After a wait in which polling found no frame, this number of waits begins without polling. This saves computing time.
 _WAITS_WITHOUT_POLLING = 32
-#: Longest sleep [ms]. After it, the end reads the memory again, because a value may become visible after its wake-up byte.
+#: Longest sleep [ms]. The end then reads the memory again, because a value may become visible after its wake-up byte.
 _SLEEP = 20
 _WAKE_UP = b"\0"
 _REASON_BYTES = 4096
@@ -117,8 +117,8 @@ class SharedBus:
         sent = self._sent + len(frames)
         if (sent - self._peers[_RECEIVED]) * FRAME_BYTES > size:
             raise BusFull(
-                f"{self.name}: the queue of the other end is full, {self._sent - self._peers[_RECEIVED]} frames were not "
-                "received"
+                f"{self.name} cannot send: the receive queue of the other end is full, with "
+                f"{self._sent - self._peers[_RECEIVED]} frames"
             )
         end = offset + memory.nbytes
         if end <= size:

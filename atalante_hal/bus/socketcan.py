@@ -44,7 +44,7 @@ NO_ROOM = (errno.ENOBUFS, errno.EAGAIN)
 
 #: Mask of the used fields of a received header word. The reserved bytes may contain garbage.
 HEADER_FIELDS = np.uint64(0x0000_FFFF_FFFF_FFFF)
-#: FDF flag in a header word. Older kernels do not set it in received CAN FD frames.
+#: FDF flag in a header word. Older kernels leave this flag 0 in received CAN FD frames.
 FDF_IN_HEADER = np.uint64(FLAG_FDF << 40)
 
 IOVEC = np.dtype([("base", "u8"), ("length", "u8")])
@@ -303,7 +303,7 @@ class SocketCanBus:
         return bool(self._socket.getsockname()[0])
 
     def _drop_queued(self) -> None:
-        """Drop the queued frames and the queued error. While the socket contains any of them, `poll` reports it as readable."""
+        """Drop the queued frames and the queued error. Otherwise `poll` would report the socket as readable."""
         for _ in range(DROPPED_BATCHES):
             count = self._recvmmsg(self._file, self._rx_address, self._capacity, socket.MSG_DONTWAIT, None)
             if count > 0:

@@ -24,7 +24,7 @@ from atalante_hal.wire.process_image import NEVER, ReceiveImage
 
 #: Values of the signal NodeState (CiA 301): 0 after the node has started, 5 in normal operation.
 BOOT_UP, OPERATIONAL = 0, 5
-#: Largest `Check` result of a frame with new data. It is a plain integer, because numpy compares integers ten times faster.
+#: Highest `Check` result of a frame with new data. It is an integer, because numpy compares enum members ten times slower.
 _FRESH = int(Check.SOME_LOST)
 
 
@@ -76,8 +76,8 @@ class Heartbeats:
         #: Diagnostic and error code of the active emergency of each node. A cleared emergency is removed.
         self.emergencies: dict[str, tuple[Dtc, int]] = {}
         self._cleared: set[str] = set()  # nodes whose emergency was cleared in this cycle
-        #: Emergencies with the reaction INFO and frames of error passive nodes since the last `evaluate`: node, diagnostic, error
-        #: code or 0.
+        #: Events since the last `evaluate`, as (node, diagnostic, error code): emergencies with the reaction INFO, and
+        #: frames of error passive nodes, whose error code is 0.
         self._notices: list[tuple[str, Dtc, int]] = []
         self._reset: set[str] = set()  # nodes that restarted since the last `evaluate`
         #: Row -> counter that detects two senders of the message, 0 to `FULL`. A row without an entry has the counter 0.

@@ -57,11 +57,11 @@ CONFIRMED = {
 }
 #: Check results that prove a second sender if another intact frame of the message arrived in the same cycle.
 _RIVAL = (Check.CONFLICT, Check.WRONG_SEQUENCE)
-#: Check results of rejected frames that have the correct format and CRC.
+#: Check results of rejected frames with correct format and CRC.
 _INTACT = (*_RIVAL, Check.RANGE, Check.INVALID)
 _FRESH = int(Check.SOME_LOST)
-#: Diagnostic of a disturbance that is tolerated in single cycles, by the check result of the rejected frame. An INVALID frame of
-#: an IMU has another diagnostic, see `MessageMonitor`.
+#: Check result of a rejected frame -> diagnostic. Single rejected frames are tolerated: the diagnostic is raised when a
+#: leaky bucket is full. An INVALID frame of an IMU raises another diagnostic, see `MessageMonitor`.
 _DISTURBANCES = {
     Check.REPEATED: Dtc.E2E_REPEAT_RATE,
     Check.RANGE: Dtc.SIGNAL_RANGE,
@@ -100,7 +100,7 @@ class MessageMonitor:
         #: True for each row with new, intact, trusted and plausible data, shape (rows,).
         self.valid: npt.NDArray[np.bool_] = np.zeros(len(messages), np.bool_)
         self.joints_valid = False
-        #: True if all rows are trusted and all leaky buckets are empty. Then cycles with new data in all rows change no result.
+        #: True if all rows are trusted and all leaky buckets are empty. A cycle with new data in all rows then changes nothing.
         self.settled = False
 
     @property

@@ -240,7 +240,8 @@ class SafetyMonitor:
         if after is not before:
             self._enter(before, after, reasons)
         elif reasons and (after is _S.OFF or Dtc.BUS_DOWN in reasons):
-            # The state stays, but its reason is updated. Example: a lost interface was down, and has been removed since.
+            # The supervisor state does not change, but its reason does. Example: an interface was down and has now been
+            # removed.
             self.reason = memory.text_of(reasons)
         self._update_assistance()
         self._update_lowered()

@@ -39,8 +39,8 @@ class Run:
 
     number: int
     name: str
-    start_ns: int  # log time of its cycle 0
-    first: int  # number of its first record
+    start_ns: int  # log time of cycle 0 of the run [ns]
+    first: int  # number of the first record of the run
 
 
 class Service:
@@ -105,8 +105,8 @@ class Service:
 
     def step(self) -> bool:
         """Process the new contents of the rings, and return whether a ring had any."""
-        # The loop writes the note of a run before the events of the run. Here the events are read before the notes. The note of
-        # the run of each event read is therefore already in the ring.
+        # The loop writes the note of a run before the events of this run. The events are read before the notes here, so the
+        # note that belongs to an event is already in the ring.
         events = [unpack(bytes(event)) for event in self._events.read()]
         records = self._records.read()
         first = self._records.position - len(records)

@@ -61,14 +61,14 @@ _REPEATED, _CONFLICT, _WRONG_SEQUENCE = int(Check.REPEATED), int(Check.CONFLICT)
 _CRC, _LENGTH, _RANGE, _INVALID = int(Check.CRC), int(Check.LENGTH), int(Check.RANGE), int(Check.INVALID)
 #: Values of `Check` for frames without new values: damaged frames and repeats of the accepted frame.
 _NO_NEW_VALUES = frozenset({Check.CRC, Check.LENGTH, Check.REPEATED})
-#: Value in place of a row: the frame is not a message of this process image.
+#: Row number of a frame whose message is not in this process image.
 _FOREIGN = -1
 #: Age of a message that has never been received [cycles].
 NEVER = 1 << 30
 #: Lowest age at which an answer to a SYNC is rejected as replayed [cycles].
 LATEST = 16
-#: Half the period of the alive counter. If the counter of a frame is ahead by this number or more, the frame is an older one,
-#: except after a long gap.
+#: Half the period of the alive counter. A frame whose counter is ahead of the expected counter by this number or more is
+#: regarded as old, except after a long gap.
 _HALF_TURN = 128
 
 

@@ -40,7 +40,8 @@ class _Disturbance:
 
     def __init__(self, fault: Fault, network: Network, seed: str) -> None:
         self.fault = fault
-        # The fault `inject` copies a received frame. So it becomes active one cycle before it sends the first copy.
+        # The fault `inject` copies a received frame. The fault therefore becomes active one cycle before it sends the first
+        # copy.
         self.from_cycle = fault.start - (fault.kind == "inject")
         self.messages = {message.frame_id: message for message in messages_of(fault, network)}
         self.random = random.Random(seed)
@@ -118,7 +119,9 @@ class _Disturbance:
         earlier = self._held.pop(message.frame_id, None)
         if earlier is not None:
             return frame, earlier
-        if cycle + 1 < self.fault.end:  # the fault lasts until the next frame arrives, which can overtake this one
+        if (
+            cycle + 1 < self.fault.end
+        ):  # the fault lasts until the next frame arrives, which can overtake the kept frame
             self._held[message.frame_id] = frame
             return ()
         return (frame,)

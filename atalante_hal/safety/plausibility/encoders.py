@@ -144,7 +144,7 @@ class EncoderChecks:
             joint: index of the joint in JOINTS.
             cycles: time from the joint's last good position to the new position [cycles].
         """
-        if cycles < 1:  # the position is not newer than the last one, because frames became late
+        if cycles < 1:  # a frame was late, so the new position is not newer than the last one
             return
         velocity = float(self._now.velocity[joint])
         moved = float(self._now.position[joint] - self._before.position[joint])
@@ -194,7 +194,7 @@ class EncoderChecks:
         return bool(self._wrong_findings)
 
     def _compared(self, age: Cycles) -> npt.NDArray[np.bool_]:
-        """Return for each joint whether it has a sample that is newer than the last one, shape (12,).
+        """Return for each joint whether its values are newer than at the last velocity check, shape (12,).
 
         Args:
             age: age of the values of each joint [cycles], shape (12,).

@@ -41,15 +41,16 @@ from atalante_hal.wire.process_image import NEVER
 DRIFT_SAMPLES = 4
 #: Number of consecutive samples after which a stuck encoder is reported.
 STANDSTILL_SAMPLES = 2
-#: Drift of the IMUs that the standstill check tolerates per sample [rad]. IMUs without a fault drift less than a tenth of this.
+#: Drift of the IMUs that the standstill check tolerates per sample [rad]. IMUs without a fault drift by less than a tenth of
+#: this limit.
 _IMU_DRIFT = 2e-5
-#: Largest change of the heading between pelvis and tibia IMU that the drift check follows per sample [rad]. A leg has a sample
-#: every 32 cycles, so this is 3e-4 rad/s.
+#: Largest heading drift between pelvis IMU and tibia IMU for which the drift check compensates per sample [rad]. A leg is
+#: sampled every 32 cycles, so the limit is 3e-4 rad/s.
 _HEADING_DRIFT = 1e-5
 _PELVIS = IMUS.index("pelvis")
 _TIBIAE = tuple(IMUS.index(f"{side}_tibia") for side in SIDES)
 _AXES = (("FH",), ("TH",), ("SH", "SK"))
-#: Axis that the headings of the IMUs affect.
+#: Index in `_AXES` of the only axis that a heading drift of the IMUs affects.
 _HEADING = _AXES.index(("TH",))
 #: For each of the first four joints of a leg: index of its axis in `_AXES`.
 _AXIS_OF = (0, 1, 2, 2)
@@ -80,7 +81,7 @@ class Legs:
         self._to_joint: Vector = robot.polarity / robot.gear
         self._attitude_error = robot.sensors.attitude_error
         self._attitude_change, self._misalignment = robot.sensors.attitude_change, robot.sensors.misalignment
-        #: For each leg: drift of the headings since the start, as an error of TH [rad].
+        #: Heading drift of the IMUs of each leg since the start, as an error of the angle of TH [rad].
         self._heading = [0.0 for _ in SIDES]
         self._contradicts = [[0] * len(_AXES) for _ in SIDES]
         self._constant_samples = [constant_samples[hip : hip + len(_AXIS_OF)] for hip in _HIPS]
@@ -228,7 +229,7 @@ def extrapolated(quaternion: list[float], gyro: list[float], time: float) -> lis
 
 
 def _follow_imu_drift(moved: _Comparison, axis: int, change: float) -> _Comparison:
-    """Limit `change` to +-`_IMU_DRIFT`, add it to one error in a copy of `moved`, and return the copy."""
+    """Return a copy of `moved` in which `change`, limited to +-`_IMU_DRIFT`, is added to one error."""
     errors = list(moved.errors)
     errors[axis] += max(-_IMU_DRIFT, min(_IMU_DRIFT, change))
     return moved._replace(errors=(errors[0], errors[1], errors[2]))

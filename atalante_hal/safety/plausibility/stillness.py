@@ -48,7 +48,7 @@ STUCK_CYCLES = 50
 FROZEN_CYCLES = 100
 #: Turn of a shank above a loaded foot that must change the readings of the ankle encoders [rad].
 _TURN = 0.01
-#: Inertia above that of any joint, also of the knee of a leg that carries robot and patient [kg m2].
+#: Upper bound of the inertia about any joint [kg m2], including the knee of a leg that carries robot and patient.
 _INERTIA = 100.0
 #: Cycles with a constant reading after which a joint is at rest. In this time, an unbalanced torque would move it.
 _AT_REST = 3
@@ -114,7 +114,8 @@ class Stillness:
         self._sampled = np.full(size, np.nan)
         self._same = np.empty(size, np.bool_)
         self._repeats = np.full(size, 0)
-        # Limits [samples]. `every` - 1 is subtracted, because the first sample of a standstill may be this many cycles late.
+        # Limits as numbers of samples. `every` - 1 cycles are subtracted, because the first sample of a standstill may be
+        # late by this time.
         limit = np.full(size, _NEVER)
         limit[codec.slice("Position")] = self._to_stuck = (STUCK_CYCLES - every + 1) // every
         limit[codec.slice("Gyro")] = limit[codec.slice("Force")] = to_freeze = (FROZEN_CYCLES - every + 1) // every

@@ -20,7 +20,8 @@ from atalante_hal.safety.plausibility.finding import FOOT_NODES, JOINT_NODES, Cy
 from atalante_hal.wire.e2e import Check
 from atalante_hal.wire.process_image import NEVER
 
-#: If a check cannot run for this time [cycles], its diagnostic is confirmed. The slowest check detects a fault in this time.
+#: Time for which a check may lack usable data [cycles]. After this time its diagnostic is confirmed. The slowest check needs
+#: this time to detect a fault.
 UNCHECKED_CYCLES = 128
 #: Number of encoders per leg that are compared with the IMUs.
 _COMPARED = 4

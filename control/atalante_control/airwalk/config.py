@@ -12,14 +12,14 @@ from atalante_control.joint.pid import AIR_GAINS, PidGains
 
 @dataclass(frozen=True)
 class AirwalkConfig(StepGuideConfig):
-    """Parameters of the airwalk controller. `literal` returns those of the paper.
+    """Parameters of the airwalk controller. `literal` returns the parameter values of the paper.
 
     Raises:
         ValueError: If a parameter is out of range.
     """
 
-    #: Whether the torques of the assisted joints and of the baseline follow the paper literally, see `guide.literal`.
-    #: If so, no guide is certified for a disturbance (it has no promise).
+    #: True: the torques of the assisted joints and of the baseline controller follow the paper literally, see `guide.literal`.
+    #: Then no guide is certified for a disturbance torque.
     literal_law: bool = False
     gains: PidGains = AIR_GAINS
     alpha: float = 0.4  # end of the re-centring, as a fraction of the step duration
@@ -44,10 +44,11 @@ class AirwalkConfig(StepGuideConfig):
         departure from the paper that can be undone is undone here. `docs/reference/paper.md` explains each departure.
         """
         return cls(
-            # Each assisted joint has a law of its own, u_b has the gains of the PID, and the baseline adds no gravity torque.
+            # In the paper, each assisted joint has a separate law, u_b uses the gains of the PID, and the baseline adds no
+            # gravity torque.
             literal_law=True,
             gains=replace(AIR_GAINS, integral_limit=math.inf),
             feedforward=0.0,  # the experiment of the paper in the air had no feedforward
-            gentler=(),  # no softer sets of gains
+            gentler=(),  # the filter has no softer sets of gains to choose from
             blend=0.0,  # torque jumps at stance changes are not compensated
         )

@@ -158,7 +158,10 @@ class AirwalkController:
 
     @property
     def desired(self) -> Vector:
-        """Return q_des [rad], then q_des' [rad/s] of the last cycle of a step, shape (24,). The start motion is not included."""
+        """Return q_des [rad], then q_des' [rad/s] of the last cycle of a step, shape (24,).
+
+        The start motion does not change them.
+        """
         return self._outputs.desired
 
     def guide_at(self, xi: float) -> GuideFilter:
@@ -299,7 +302,10 @@ class AirwalkController:
         step.xi, step.assisted, step.intensity = xi, self._assisting, intensity(xi)
 
     def _start_guide(self, xi: float, deviation: Deviation, joints: tuple[int, int]) -> None:
-        """Start the guide of a step. Count the stance change if its deviation is larger than the certificate assumes."""
+        """Start the guide of a step.
+
+        Count the step in the statistics if its start deviates more than the certificate assumes.
+        """
         hip, knee = joints
         angles = float(deviation.angle[hip]), float(deviation.angle[knee])
         rates = float(deviation.rate[hip]), float(deviation.rate[knee])

@@ -57,7 +57,7 @@ class AirwalkStatistics(GuideStatistics):
     steps: int = 0  # completed right-stance steps
 
     def count(self, cycle: int, ratio: float, h: float, acting: bool) -> None:
-        """Add one cycle to the statistics, as `GuideStatistics.count` does, unless no right-stance step is completed."""
+        """Add one cycle to the statistics if a right-stance step has been completed, see `GuideStatistics.count`."""
         if self.steps:
             super().count(cycle, ratio, h, acting)
 

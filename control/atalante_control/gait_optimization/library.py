@@ -34,7 +34,7 @@ Solve = Callable[[Subject], SolvedGait]
 
 
 class LibraryError(ValueError):
-    """Missing or invalid library, or library with a grid that is not the required one. The message states the file or folder."""
+    """Error of a gait library that is missing, invalid or made for another grid. The message states the file or folder."""
 
 
 @dataclass(frozen=True)

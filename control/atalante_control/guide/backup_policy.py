@@ -126,9 +126,10 @@ class Responses(NamedTuple):
     error: Vector  # (n + 1, 2, 10) predicted error e [rad]
     rate: Vector  # (n + 1, 2, 10) predicted rate e' [rad/s]
     feedback: Vector  # (n + 1, 2, 10) predicted backup acceleration -Kv e - Dv e' [rad/s2]
-    pushed_error: Vector  # (n + 1, 2, 2) predicted error e per rad/s2
-    pushed_rate: Vector  # (n + 1, 2, 2) predicted rate e' per rad/s2
-    pushed_feedback: Vector  # (n + 1, 2, 2) predicted backup acceleration -Kv e - Dv e' per rad/s2
+    pushed_error: Vector  # (n + 1, 2, 2) error e [rad] after a unit acceleration of SH and of SK in the first cycle
+    pushed_rate: Vector  # (n + 1, 2, 2) rate e' [rad/s] after a unit acceleration of SH and of SK in the first cycle
+    #: (n + 1, 2, 2) backup acceleration [rad/s2] after a unit acceleration of SH and of SK in the first cycle
+    pushed_feedback: Vector
 
 
 def responses(policy: BackupPolicy, loop: SampledLoop, mobility: float, cycles: int, delay: int = 1) -> Responses:

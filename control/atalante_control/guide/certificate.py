@@ -65,7 +65,8 @@ class JointTorque:
 class Limit(NamedTuple):
     """Condition that limits a promise."""
 
-    scale: float  # largest promise that meets the condition, as a fraction of the chosen promise; negative if there is no promise
+    #: largest promise that meets the condition, as a fraction of the chosen promise; negative if no promise meets it
+    scale: float
     what: str  # condition in words, for a message
 
 
@@ -170,7 +171,7 @@ def _pair(torque: Vector) -> JointTorque | None:
 
 
 def _limit(room: Vector, reach: Vector, steps: int, what: str) -> Limit:
-    """Return the largest scale for which effect of budget + scale * effect of promise is at most `room` in every cycle.
+    """Return the largest scale for which effect of model errors + scale * effect of promise is at most `room` in every cycle.
 
     Args:
         room: largest permitted effect on SH and SK in each cycle, shape (n, 2).

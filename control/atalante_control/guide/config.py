@@ -28,13 +28,14 @@ class StepGuideConfig:
     promise: Pair = (30.0, 18.0)
     mismatch: Mismatch = field(default_factory=Mismatch)
     hand_over: HandOver = field(default_factory=HandOver)
-    torque_reserve: float = 14.0  # Nm, distance of the largest predicted torque from the torque limit of the robot
-    speed_reserve: float = 0.2  # rad/s, distance of the largest predicted speed from the velocity limit of the robot
-    zeta: float = 0.01  # s, gain of the derivative term lambda_d of the guide filter
-    idealization: float = 1.0  # intensity of u_i in [0, 1] while the gate of the guide is 0
-    feedforward: float = 1.0  # intensity of u_f in [0, 1] while the gate of the guide is 0
-    #: Counter value above which the controller reports that the leg has left the guide, if the guide has a promise. The counter
-    #: rises by 1 in each cycle with h < 0. In each other cycle it falls by 1, but not below 0.
+    torque_reserve: float = 14.0  # Nm, smallest difference between the torque limit of the robot and a predicted torque
+    #: rad/s, smallest difference between the velocity limit of the robot and a predicted speed
+    speed_reserve: float = 0.2
+    zeta: float = 0.01  # s, gain of lambda_d, the part of the gate that damps a decrease of h
+    idealization: float = 1.0  # intensity of the joint idealization u_i in [0, 1] while the gate of the guide is 0
+    feedforward: float = 1.0  # intensity of the feedforward u_f in [0, 1] while the gate of the guide is 0
+    #: Counter value above which the controller reports that the leg has left a guide with a promise. The counter rises by 1 in
+    #: each cycle with h < 0. It falls by 1, but not below 0, in each other cycle.
     outside_cycles: int = 150
     active: float = 0.05  # weight of the backup torque above which the filter is considered active
 

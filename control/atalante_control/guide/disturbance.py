@@ -216,7 +216,7 @@ def spread(effect: Effect, mobilities: Vector, bounds: Vector, grid: Grid, ahead
                 for r in range(2):
                     h, k = effect.left[end, r, 0], effect.left[end, r, 1]
                     on_hip, on_knee = h * both[i, 0, 0] + k * both[i, 1, 0], h * both[i, 0, 1] + k * both[i, 1, 1]
-                    # The largest effects of the start cycle. A call of another function here would take five times longer.
+                    # Find the largest effect over all postures. A function call here would take five times longer.
                     budget = promise = 0.0
                     for m in range(postures):
                         hip = abs(on_hip * mobilities[start, m, 0, 0] + on_knee * mobilities[start, m, 1, 0])

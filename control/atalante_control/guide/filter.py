@@ -61,11 +61,11 @@ class GuideConfig:
     rate_limit: float  # Nm, largest change of the backup torque within one cycle
     speed_limit: float  # rad/s, largest predicted speed of SH and of SK
     worst_speed_limit: float  # rad/s, largest predicted speed for the worst model errors
-    zeta: float = 0.01  # s, gain of the derivative term lambda_d
+    zeta: float = 0.01  # s, gain of lambda_d, the part of the gate that damps a decrease of h
     derivative_time: float = 0.005  # s, time constant of the low-pass filter on dh/dt
     release: float = 0.03  # s, shortest time in which the gate falls from 1 to 0
-    idealization: float = 1.0  # intensity of u_i in [0, 1] while the gate is 0
-    feedforward: float = 0.0  # intensity of u_f in [0, 1] while the gate is 0
+    idealization: float = 1.0  # intensity of the joint idealization u_i in [0, 1] while the gate is 0
+    feedforward: float = 0.0  # intensity of the feedforward u_f in [0, 1] while the gate is 0
 
     def __post_init__(self) -> None:
         for name in ("torque_limit", "rate_limit", "speed_limit", "worst_speed_limit", "release"):
@@ -80,7 +80,7 @@ class GuideConfig:
 
 
 class GuideFilter:
-    """Guide filter of SH and SK for one gait, one shape and one set of gains. By symmetry, it serves both swing legs.
+    """Guide filter of SH and SK for one gait, one shape and one set of gains. By symmetry, the filter serves both swing legs.
 
     Call `start_step` at each stance change, then `tick` once per cycle.
 
@@ -130,7 +130,7 @@ class GuideFilter:
         self._tick = specialised(tick, discarded, 0, LegState(*[0.0] * 10))
 
     def start_step(self, xi: float, deviation: Pair, rate: Pair, promise: float = 1.0) -> None:
-        """Start a step: compute the guide from Xi, and the reference from the deviations.
+        """Start a step: compute the guide from the assistance factor, and the reference from the start deviations.
 
         Args:
             xi: assistance factor of the whole step.
@@ -205,7 +205,7 @@ def tail(inverse: Vector) -> Vector:
 
 
 def narrowest(inverse: Vector, cycles: int) -> Vector:
-    """Return 1 / width of the narrowest guide in each cycle and the following cycles.
+    """Return 1 / width of the guide at the narrowest place within a number of cycles, for each start cycle.
 
     Args:
         inverse: 1 / distance to the guide for each cycle, shape (n, m) [1/rad]; the last row applies to all later cycles.
@@ -221,14 +221,14 @@ def narrowest(inverse: Vector, cycles: int) -> Vector:
 
 
 def _lags(prediction: Prediction) -> Records[Lag]:
-    """Return the prediction for each number of cycles ahead."""
+    """Return the tables of the predicted errors, one for each number of cycles ahead."""
     lags = zeros(Lag, len(prediction.ahead))
     lags["ahead"] = prediction.ahead.swapaxes(1, 2)
     return lags
 
 
 def _blocks(prediction: Prediction) -> Records[Block]:
-    """Return the bounds of the prediction for each block of cycles ahead."""
+    """Return the bounds of the predicted errors, one for each block of cycles ahead."""
     blocks, starts = zeros(Block, len(prediction.slack)), np.arange(0, len(prediction.ahead), SLACK_CYCLES)
     high, low = (extreme.reduceat(prediction.ahead, starts).swapaxes(1, 2) for extreme in (np.maximum, np.minimum))
     blocks["slack"] = prediction.slack.swapaxes(1, 2)
@@ -237,7 +237,7 @@ def _blocks(prediction: Prediction) -> Records[Block]:
 
 
 def _few(prediction: Prediction) -> Records[Few]:
-    """Return the prediction of torque and speed for each number of cycles in `FEW`."""
+    """Return the tables of the predicted torques and speeds, one for each number of cycles in `FEW`."""
     rows = zeros(Few, len(FEW))
     rows["lag"], rows["slack"] = FEW, prediction.few_slack.swapaxes(1, 2)
     rows["ahead"] = prediction.few_ahead.swapaxes(1, 2)

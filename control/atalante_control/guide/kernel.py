@@ -17,14 +17,14 @@ from atalante_hal.types import Vector
 
 Pair = tuple[float, float]
 
-#: Slope of the line that maps torque / limit and speed / limit to the ratio of `largest_ratio`; 1 is mapped to 1.
-#: The gait alone needs a large part of both limits, so the gate must rise only when torque or speed is near its limit.
+#: Slope of the line that converts torque / limit and speed / limit to the ratio of `largest_ratio`. The value 1 stays 1. The
+#: gait alone needs a large part of both limits, so the gate must rise only when torque or speed is near its limit.
 STEEPNESS = 4.0
 #: Number of elements of the compressed state, from which the predicted errors are computed.
 COMPRESSED = 5
 #: Number of consecutive predicted cycles that share one bound of the model errors in `Block.slack`.
 SLACK_CYCLES = 10
-#: Predictions that start in one block of this many cycles share one bound of the disturbances in `GuideTables.reach`.
+#: Length of a block of start cycles. Predictions that start in the same block use the same row of `GuideTables.reach`.
 START_CYCLES = 4
 
 
@@ -40,48 +40,51 @@ class Guard:
     zeta: float  # s, gain of the derivative term lambda_d
     smoothing: float  # weight of the new value in the low-pass filter of dh/dt
     release: float  # largest decrease of the gate per cycle; without this limit the gate could oscillate with the leg
-    idealization: float  # intensity of u_i in [0, 1]
-    feedforward: float  # intensity of u_f in [0, 1]
+    idealization: float  # intensity of the joint idealization u_i in [0, 1]
+    feedforward: float  # intensity of the feedforward u_f in [0, 1]
     promise: float  # disturbance that the filter assumes in this step, as a fraction of `Assumptions.promise`
     xi: float  # assistance factor of the step
     fresh: bool  # true before the first tick of a step
     motor: Annotated[Vector, 2]  # Nm, estimated torques of the motors
     lag: Annotated[Vector, 2]  # rad/s, estimated true velocity minus measured velocity
     state: Annotated[Vector, STATES]  # state of the last tick, see `backup_policy`
-    #: absolute value of each element of `state`; for e', of the difference between true and measured e'
+    #: absolute value of each element of `state`, where true e' minus measured e' replaces true e'
     magnitude: Annotated[Vector, STATES]
-    compression: Annotated[Vector, (COMPRESSED, STATES)]  # state -> compressed state
+    compression: Annotated[Vector, (COMPRESSED, STATES)]  # matrix from the state to the compressed state
     compressed: Annotated[Vector, COMPRESSED]  # compressed state of the last tick
-    few_slack: Annotated[Vector, (STATES, 2)]  # largest `Few.slack` of all rows
-    h: float  # at least 0 inside the safe backward image
+    few_slack: Annotated[Vector, (STATES, 2)]  # largest value of each element of `Few.slack` over all rows
+    h: float  # h of the last tick; the leg is inside the safe backward image if h is at least 0
     rate: float  # 1/s, dh/dt
     gate: float  # weight of the backup torque, lambda + (1 - lambda) lambda_d
     bounds: Annotated[Vector, 4]  # rad, distances from q_des to the guide: upper and lower of SH, upper and lower of SK
 
 
 class Lag:
-    """Prediction of the errors at one number of cycles ahead. A field with a fixed shape makes the compiled loops fast."""
+    """Prediction of the tracking errors for one number of cycles ahead. The fixed shape makes the compiled loops fast."""
 
-    ahead: Annotated[Vector, (COMPRESSED, 2)]  # compressed state -> predicted errors e of SH and SK [rad]
+    #: matrix from the compressed state to the predicted errors e of SH and SK [rad]
+    ahead: Annotated[Vector, (COMPRESSED, 2)]
 
 
 class Block:
-    """Bounds of the prediction for `SLACK_CYCLES` consecutive cycles ahead."""
+    """Bounds of the predicted tracking errors over `SLACK_CYCLES` consecutive cycles ahead."""
 
-    #: largest change of the predicted errors of SH and SK by model errors, per unit of each element of `Guard.magnitude`
+    #: matrix from `Guard.magnitude` to the largest change of the predicted errors of SH and SK that model errors can cause
+    #: [rad]
     slack: Annotated[Vector, (STATES, 2)]
-    middle: Annotated[Vector, (COMPRESSED, 2)]  # middle of the range of `Lag.ahead` in the block
-    spread: Annotated[Vector, (COMPRESSED, 2)]  # largest absolute difference of `Lag.ahead` from `middle` in the block
-    ratio: float  # ratio that no cycle of the block exceeds, at the last tick
+    middle: Annotated[Vector, (COMPRESSED, 2)]  # mean of the largest and the smallest `Lag.ahead` in the block
+    #: half the difference of the largest and the smallest `Lag.ahead` in the block
+    spread: Annotated[Vector, (COMPRESSED, 2)]
+    ratio: float  # upper bound of the predicted error / guide width over all cycles of the block, from the last tick
 
 
 class Few:
-    """Prediction of torque and speed at one number of cycles ahead."""
+    """Prediction of torque and speed for one number of cycles ahead, see `prediction.FEW`."""
 
     lag: int  # number of cycles ahead
-    #: state -> predicted feedback [rad/s2] of SH and SK, predicted e' [rad/s] of SH and SK
+    #: matrix from the state to the predicted backup accelerations [rad/s2] of SH and SK, then to their predicted e' [rad/s]
     ahead: Annotated[Vector, (STATES, 4)]
-    #: largest change of e' ahead by model errors, per unit of each element of `Guard.magnitude`
+    #: matrix from `Guard.magnitude` to the largest change of the predicted e' of SH and SK that model errors can cause [rad/s]
     slack: Annotated[Vector, (STATES, 2)]
 
 
@@ -93,24 +96,28 @@ class GuideTables(NamedTuple):
     lags: Records[Lag]  # (lags,)
     blocks: Records[Block]  # (blocks,)
     few: Records[Few]  # (rows,) in ascending order of `Few.lag`
-    reach: Vector  # (starts, lags, 4) errors [rad] of SH and SK by the budget, then of SH and SK by the chosen promise
-    highest: Vector  # (starts, blocks, 4) largest `reach` of each block
-    #: (starts, rows, 12) torques [Nm] and speeds [rad/s] of SH and SK by the budget, then the same by the chosen promise,
-    #: then worst speeds by the budget and by the chosen promise
+    #: (starts, lags, 4) largest errors of SH and SK due to model errors, then due to the chosen promise [rad]
+    reach: Vector
+    highest: Vector  # (starts, blocks, 4) largest `reach` in each block of cycles ahead
+    #: (starts, rows, 12) largest effects of disturbances. Columns 0 to 3: torques [Nm] and speeds [rad/s] of SH and SK due to
+    #: model errors. Columns 4 to 7: the same quantities due to the chosen promise. Columns 8 to 11: speeds of SH and SK for the
+    #: worst inertia and delay, due to model errors and then due to the chosen promise [rad/s].
     few_reach: Vector
-    step: Vector  # (horizon + 1, COLUMNS) values of each cycle of the step; the constants below are the column numbers
+    step: Vector  # (horizon + 1, COLUMNS) values of each cycle of the step; the column numbers are defined below
 
 
 INVERSE = 0  # columns 0 to 3 of `step`: 1 / distance to the upper and lower bound of SH, then of SK [1/rad]
-REFERENCE = 4  # columns 4 and 5: acceleration of q_des, ahead by the command lag of the sampled loop [rad/s2]
-VELOCITY = 6  # columns 6 and 7: velocity of q_des behind the low-pass of the drives [rad/s]
-BASE = 8  # columns 8 and 9: torque that the leg needs along q_des [Nm]
-MASS = 10  # columns 10 to 12: M11, M12 and M22 along q_des [kg m2]
-SPEED = 13  # columns 13 and 14: velocity of q_des [rad/s]
-#: Column 15: smallest gate. It is 1 at the start of a step, where the filter takes over from the baseline controller.
+REFERENCE = 4  # columns 4 and 5 of `step`: acceleration of q_des [rad/s2], ahead by the command lag of the sampled loop
+VELOCITY = 6  # columns 6 and 7 of `step`: velocity of q_des after the low-pass of the drives [rad/s]
+BASE = 8  # columns 8 and 9 of `step`: torque that moves the leg along q_des [Nm]
+MASS = 10  # columns 10 to 12 of `step`: M11, M12 and M22 along q_des [kg m2]
+SPEED = 13  # columns 13 and 14 of `step`: velocity of q_des [rad/s]
+#: Column 15 of `step`: lower bound of the gate. At the start of a step the bound is 1, because the filter then takes over.
 FLOOR = 15
-TAIL = 16  # columns 16 to 19: as columns 0 to 3, for the narrowest guide in the next `TAIL_CYCLES` cycles [1/rad]
-NEAR = 20  # columns 20 to 23: as columns 0 to 3, for the narrowest guide in this and the next `SLACK_CYCLES` - 1 cycles [1/rad]
+#: Columns 16 to 19 of `step`: as columns 0 to 3, for the narrowest guide in the next `TAIL_CYCLES` cycles [1/rad].
+TAIL = 16
+#: Columns 20 to 23 of `step`: as columns 0 to 3, for the narrowest guide in `SLACK_CYCLES` cycles from this one on [1/rad].
+NEAR = 20
 COLUMNS = 24
 #: Number of cycles after the last predicted cycle in which the guide may become narrower while the free motion decays.
 TAIL_CYCLES = 60
@@ -290,7 +297,7 @@ def _compressed(guard: Guard) -> tuple[float, float, float, float, float]:
 
 
 def bound_blocks(guide: GuideTables, cycle: int, blocks: int) -> int:
-    """Compute `Block.ratio` of each block, and return the number of the block with the largest one.
+    """Compute `Block.ratio` of each block, and return the number of the block with the largest ratio.
 
     In a block, a predicted error differs from `Block.middle` times the compressed state y by at most `Block.spread` times abs(y).
     The disturbances add at most `GuideTables.highest`, and no width is below the one of the columns `NEAR`.
@@ -324,7 +331,7 @@ def bound_blocks(guide: GuideTables, cycle: int, blocks: int) -> int:
 
 
 def _few_ratio(guide: GuideTables, cycle: int, least: float) -> float:
-    """Return the larger of the predicted torque / limit and speed / limit, mapped by the slope `STEEPNESS` (1 is mapped to 1).
+    """Return the larger of the predicted torque / limit and speed / limit, after conversion with the slope `STEEPNESS`.
 
     Args:
         guide: tables of the guide filter.

@@ -35,7 +35,7 @@ _ASSISTED = [LEG_JOINTS.index("SH"), LEG_JOINTS.index("SK")]
 
 
 class Letter:
-    """Constants and state of the literal law. Each pair has a value for SH and a value for SK."""
+    """Constants and state of the control law that follows the paper literally. Each pair has values for SH and SK."""
 
     kp: Annotated[Vector, 2]  # Nm/rad
     kd: Annotated[Vector, 2]  # Nm s/rad
@@ -43,16 +43,16 @@ class Letter:
     coulomb: Annotated[Vector, 2]  # Nm, k_d
     viscous: Annotated[Vector, 2]  # Nm s/rad, k_v
     push: Annotated[Vector, 2]  # Nm, largest absolute value of u_ext
-    zeta: float  # s, gain of lambda_d
-    idealization: float  # intensity of u_i
-    feedforward: float  # intensity of u_f
+    zeta: float  # s, gain of lambda_d, the part of the gate that damps a decrease of h
+    idealization: float  # intensity of the joint idealization u_i
+    feedforward: float  # intensity of the feedforward u_f
     xi: float  # assistance factor of the step
     fresh: bool  # true before the first cycle of a step
     h: Annotated[Vector, 2]  # h of the last cycle
 
 
 class LiteralTables(NamedTuple):
-    """Tables of the literal law. `LiteralGuide` owns them; `assistive_torque` writes to `letters` only."""
+    """Tables of the literal law. `LiteralGuide` owns the tables; `assistive_torque` writes to `letters` only."""
 
     letters: Records[Letter]  # (1,)
     step: Vector  # (cycles + 1, 8) values of each cycle of the step, columns below
@@ -69,9 +69,9 @@ class LiteralConfig:
 
     gains: LegGains  # gains of the baseline PID of the swing leg
     push: Pair  # Nm, largest absolute value of u_ext of SH and SK
-    zeta: float  # s, gain of lambda_d
-    idealization: float  # intensity of u_i, in [0, 1]
-    feedforward: float  # intensity of u_f, in [0, 1]
+    zeta: float  # s, gain of lambda_d, the part of the gate that damps a decrease of h
+    idealization: float  # intensity of the joint idealization u_i, in [0, 1]
+    feedforward: float  # intensity of the feedforward u_f, in [0, 1]
 
 
 class LiteralGuide:
@@ -156,7 +156,7 @@ def assistive_torque(tables: LiteralTables, guard: Guard, cycle: int, leg: LegSt
 
 
 def _guide_torque(tables: LiteralTables, cycle: int, joint: int, e: float, rate: float) -> tuple[float, float, float]:
-    """Return h, the gate and u_v [Nm] of a joint."""
+    """Return h, the gate and the guide torque u_v [Nm] of a joint."""
     letter = tables.letters[0]
     ratio = max(_largest_ratio(tables, cycle, joint, e, rate, 1.0), _largest_ratio(tables, cycle, joint, e, rate, -1.0))
     h = 1.0 - ratio * ratio

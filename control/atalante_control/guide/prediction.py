@@ -22,13 +22,13 @@ Pair = tuple[float, float]
 
 #: Numbers of cycles ahead at which torque and speed are predicted.
 FEW = np.array([1, 2, 3, 4, 6, 8, 11, 15, 20, 27, 36, 48, 64, 85, 113, 150, 200, 250, 300])
-#: Typical magnitude of each element of the state, which is its weight in the compression of the state.
+#: Typical magnitude of each element of the state. The compression of the state weights the elements with these magnitudes.
 SIZES = np.repeat([0.07, 1.0, 1.0, 140.0, 140.0], 2)
 
 
 @dataclass(frozen=True)
 class Assumptions:
-    """Assumptions of a promise: chosen torques, time behaviour of the drives, model errors, deviations at the stance change."""
+    """Assumptions of a promise: promised torques, time behaviour of the drives, model errors, start deviations."""
 
     #: Nm, promised disturbance: largest torques at SH and SK under which the joints must stay inside the guide
     promise: Pair = (30.0, 18.0)
@@ -53,7 +53,7 @@ class Assumptions:
 
 
 class StartReach(NamedTuple):
-    """Largest effect of the disturbances since the start of a step.
+    """Largest effect of the disturbances that began with the start of the step.
 
     The columns are the effect of the budget on SH and SK, then the effect of the chosen promise on SH and SK.
     """
@@ -189,7 +189,7 @@ def prediction_of(policy: BackupPolicy, leg: Leg, assumptions: Assumptions, blen
 
 
 def _separated(rows: Vector) -> Vector:
-    """Return the rows for a state in which the true velocity is replaced by the difference (true - measured velocity)."""
+    """Convert matrices for the state to matrices in which true minus measured velocity replaces the true velocity."""
     result = rows.copy()
     result[..., 4:6] += rows[..., 2:4]
     return result

@@ -38,7 +38,8 @@ class WalkConfig:
     gains: PidGains = WALK_GAINS
     impact: ImpactConfig = field(default_factory=ImpactConfig)
     alpha: float = 0.3  # end of the re-centring, as a fraction of the step duration
-    #: True: baseline controller and assistive torque of the paper in the periodic steps, see `literal`; without a promise
+    #: True: baseline controller and assistive torque follow the paper literally in the periodic steps, see `literal`. The guide
+    #: then has no promise.
     literal_law: bool = False
     #: m/m, gain of the ankle stabiliser: shift of the centre of pressure per error of the divergent component of motion
     stabiliser: float = 2.5
@@ -48,9 +49,10 @@ class WalkConfig:
     reach_speed: Pair = (0.3, 0.03)
     #: s, longest time in which the swing foot moves down after the nominal end of a step. `reach_knee` can end it earlier.
     reach_time: float = 0.2
-    #: rad/s, largest speed of SH and SK in this motion. An almost straight leg could follow `reach_speed` only at higher speeds.
+    #: rad/s, largest speed of SH and SK while a late swing foot moves down. An almost straight leg could follow `reach_speed`
+    #: only at higher speeds.
     reach_rate: float = 2.5
-    reach_knee: float = 0.05  # rad, smallest knee angle in this motion
+    reach_knee: float = 0.05  # rad, smallest knee angle while a late swing foot moves down
     #: Steering gains: TH offset per heading [rad/rad], TH offset per sideways deviation [rad/m], largest TH offset [rad].
     steering: tuple[float, float, float] = STEERING
     #: s, time after the nominal end of a step at which the step ends if no landing is detected
@@ -74,7 +76,7 @@ class WalkConfig:
 
     @classmethod
     def literal(cls) -> WalkConfig:
-        """Return the parameters of the paper to the letter, for comparisons.
+        """Return the parameters with which the periodic steps follow the paper literally, for comparisons.
 
         In the periodic steps, the baseline controller is the PID with re-centring, impact detection and flat foot. It has no
         gravity torque, no feedforward, no ankle stabiliser and no steering. Below Xi = 1, `guide.literal` drives SH and SK of the

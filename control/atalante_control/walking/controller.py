@@ -332,7 +332,7 @@ class WalkController:
         if phase in STEPPING:
             self._impact.start_step()
         # In FINISH_STEP, the HAL changes to HOLD when the step number changes. A HOLD during a step would make the robot fall.
-        # In this state, the step number therefore does not change before the robot stands on both feet.
+        # In FINISH_STEP, the step number therefore does not change before the robot stands on both feet.
         if phase is Phase.REST or (phase in STEPPING and not self._finishing):
             self._command.step = (self._command.step or 0) + 1
         self._command.walking = phase in WALKING
@@ -347,7 +347,10 @@ class WalkController:
         record.phase, record.step, record.stance = phase, self.statistics.steps, self._stance
 
     def _start_guide(self, xi: float) -> None:
-        """Start the guide of a step. Count the stance change if its deviation is larger than the certificate assumes."""
+        """Start the guide of a step.
+
+        Count the step in the statistics if its start deviates more than the certificate assumes.
+        """
         stage, record, statistics = self._stage, self._record, self.statistics.guide
         record.assistance_factor, record.gate, record.h = 1.0, 0.0, 1.0
         record.error[:], record.q_bound[:] = 0.0, 0.0

@@ -55,9 +55,10 @@ class Stage:
     stance: int  # stance leg, 0 left, 1 right
     double: bool  # whether no foot swings, because both feet are on the ground or the robot is suspended
     steering: float  # rad, offset of TH of the swing leg at the end of the step
-    #: rad, joint angles at the start of the phase minus those of the first row
+    #: rad, joint angles at the start of the phase minus the angles in the first row of the phase table
     deviation: Annotated[Vector, len(JOINTS)]
-    rate: Annotated[Vector, len(JOINTS)]  # rad/s, deviation of the speeds from the first row at the start of the phase
+    #: rad/s, joint speeds at the start of the phase minus the speeds in the first row of the phase table
+    rate: Annotated[Vector, len(JOINTS)]
     literal: bool  # True: the law of the paper drives the robot, see `WalkConfig.literal`
     flat: bool  # True: the sole of the swing foot is held level
     #: True: the guide filter drives SH and SK of the swing leg; False at Xi = 1 and in all phases except the periodic step
@@ -94,7 +95,7 @@ class Assistance(NamedTuple):
     guide: GuideTables  # `GuideFilter.tables`
     literal: LiteralTables  # `LiteralGuide.tables`, used instead of the guide if `Stage.literal`
     unmodelled: Vector  # (n + 1, 2) Nm, `SwingLeg.unmodelled`: torque of SH and SK in each cycle of the step
-    fade: Vector  # (m,) factor of `Stage.excess` in each cycle after the nominal end of the step, from 1 to 0
+    fade: Vector  # (m,) factor of `Stage.excess` in each cycle after the nominal end of the step, falling from 1 to 0
 
 
 class Parts(NamedTuple):

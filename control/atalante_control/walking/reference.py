@@ -37,16 +37,16 @@ class PhaseTable(NamedTuple):
     recentring: Vector  # (m, 4) rows of `flat_foot.recentring_rows`
     guided: Vector  # (m, 4) as `recentring`, for SH and SK of the swing leg, which a guide can assist
     reach: Vector  # (2,) rad/s, speeds of SH and SK of the swing leg that lower the swing foot after the last cycle
-    reach_cycles: int  # number of cycles of this motion
+    reach_cycles: int  # number of cycles in which the swing foot is lowered after the last row
 
 
 class Reach(NamedTuple):
     """Downward motion of a swing foot that has not landed at the nominal end of a step."""
 
     speed: float  # m/s, downward speed of the foot
-    rate: float  # rad/s, largest speed of SH and SK; it takes precedence over `speed`
-    time: float  # s, longest duration
-    knee: float  # rad, smallest knee angle
+    rate: float  # rad/s, largest speed of SH and SK, even if the foot then moves more slowly than `speed`
+    time: float  # s, longest duration of the downward motion
+    knee: float  # rad, smallest knee angle during the downward motion
 
 
 def step_table(

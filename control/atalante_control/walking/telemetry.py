@@ -67,7 +67,7 @@ def write_telemetry(
     balance: Balance,
     up: Vector,
 ) -> None:
-    """Write the telemetry of a cycle, except values that are constant in a phase. The controller writes those at a phase start.
+    """Write the telemetry of a cycle. Values that are constant in a phase were written by the controller at the phase start.
 
     Args:
         telemetry: record to write, shape (1,).

@@ -92,7 +92,7 @@ class Body(Protocol):
         """
 
     def push(self, force: Sequence[float], moment: Sequence[float] = (0.0, 0.0, 0.0)) -> None:
-        """Set the external wrench on the pelvis link. It acts in every time step until the next call.
+        """Set the external wrench on the pelvis link. The wrench acts in every time step until the next call.
 
         Args:
             force: force in world axes, shape (3,) [N]. It acts at the centre of mass of the pelvis link, which includes the trunk
@@ -101,7 +101,7 @@ class Body(Protocol):
         """
 
     def motion(self, link: str) -> Motion:
-        """Return the true pose and velocity of a link, for crane, virtual operator and tests. The nodes do not use it.
+        """Return the true pose and velocity of a link, for crane, virtual operator and tests. Emulated nodes do not use them.
 
         Args:
             link: name of the link in the URDF.

@@ -141,7 +141,7 @@ class MuJoCoBody:
         self._read()
 
     def push(self, force: Sequence[float], moment: Sequence[float] = (0.0, 0.0, 0.0)) -> None:
-        """Set the external wrench on the pelvis link. It acts in every time step until the next call.
+        """Set the external wrench on the pelvis link, see `Body.push`.
 
         Args:
             force: force at the centre of mass of the pelvis link, world axes, shape (3,) [N].
@@ -184,8 +184,8 @@ class MuJoCoBody:
             torque: joint torques, shape (12,) [Nm].
         """
         self._torque[:] = torque
-        # Each call runs the second half of a time step, then the first half of the next one. So all sensor data after the call
-        # belong to the same time as the positions and velocities.
+        # Each call runs the second half of a time step, then the first half of the next time step. After the call, all sensor
+        # data therefore belong to the same time as the positions and velocities.
         mujoco.mj_step2(self._model, self._data)
         mujoco.mj_step1(self._model, self._data)
 

@@ -172,7 +172,7 @@ class PyBulletBody:
         self._unpack(joints, links, ())
 
     def push(self, force: Sequence[float], moment: Sequence[float] = (0.0, 0.0, 0.0)) -> None:
-        """Set the external wrench on the pelvis link. It acts in every time step until the next call.
+        """Set the external wrench on the pelvis link, see `Body.push`.
 
         Args:
             force: force at the centre of mass of the pelvis link, world axes, shape (3,) [N].
@@ -241,12 +241,13 @@ class PyBulletBody:
         return pybullet.getJointStates(self._body, self._joints, self._client), self._link_states(links), contacts
 
     def _unpack(self, joints: Any, links: Any, contacts: Any) -> None:
-        # A loop over the joints would take twice as long.
+        # The elements are written out, because a loop over the joints would take twice as long.
         a, b, c, d, e, f, g, h, i, j, k, m = joints
         position = a[0], b[0], c[0], d[0], e[0], f[0], g[0], h[0], i[0], j[0], k[0], m[0]
         velocity = a[1], b[1], c[1], d[1], e[1], f[1], g[1], h[1], i[1], j[1], k[1], m[1]
         _PACK_JOINTS(self._joint_memory, 0, *position, *velocity)
-        for memory, state in zip(self._imu_memory, links, strict=False):  # the feet may follow the IMUs in `links`
+        # `links` contains the links of the IMUs, then the feet if their forces are needed.
+        for memory, state in zip(self._imu_memory, links, strict=False):
             _PACK_LINK(memory, 0, *state[_ATTITUDE], *state[_LINEAR], *state[_ANGULAR])
         if contacts:
             self._add_forces(contacts, links[-len(FEET) :])

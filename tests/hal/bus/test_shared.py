@@ -136,7 +136,7 @@ def test_full_queue_rejects_whole_batches(ends: tuple[SharedBus, SharedBus]) -> 
     for batch in range(20):
         one.send(frames_of(batch, 4))
         one.send(frames_of(100 + batch, 3))
-        with pytest.raises(BusFull, match="the queue of the other end is full, 7 frames were not received") as refusal:
+        with pytest.raises(BusFull, match="the receive queue of the other end is full, with 7 frames") as refusal:
             one.send(frames_of(0, 4))
         assert refusal.value.sent == 0
         block = new_frames(7)

@@ -1,4 +1,4 @@
-"""Exhaustive exploration of the safety functions: all states that any sequence of inputs can reach, and their properties.
+"""Exhaustive searches over all states that the safety functions can reach with any sequence of inputs, and the properties proved.
 
     functions of HAL and drive -> steps (hal_steps, drive_steps) -> breadth-first search (search) -> properties (explorations)
                                                                        counterexample -> scenario (replay)

@@ -1,4 +1,4 @@
-"""One cycle of an emulated drive as a transition, with every behaviour of the HAL and of the link to the drive.
+"""One cycle of an emulated drive, as a transition of an exhaustive search with every input of the HAL and of the link.
 
 The HAL may be silent, frozen, or send any controlword. A frame may be lost, late, damaged, or of a second sender. The step calls
 the functions of a real `Drives`.
@@ -21,14 +21,14 @@ from atalante_tools.faults.reachability.search import Exploration, Transition, e
 
 #: Controlword that CiA 402 does not define.
 UNKNOWN_WORD: Final = 0x55
-#: Errors of the drive: one for each reaction, with and without a cause that persists.
+#: Errors that the search injects, one for each local reaction: error code, and whether the cause of the error persists.
 _ERRORS: Final = (
     (emergency.CURRENT, False),
     (emergency.OVER_TEMPERATURE, True),
     (emergency.UNDER_VOLTAGE, True),
     (emergency.COMMAND_REJECTED, False),
 )
-#: Number of the cycle of each step. It has no effect.
+#: Cycle number that each step uses. Another number would give the same results.
 _CYCLE: Final = 1000
 _POWERED: Final = (DriveState.OPERATION_ENABLED, DriveState.QUICK_STOP_ACTIVE)
 _OFF_WORDS: Final = (Controlword.DISABLE_VOLTAGE, Controlword.SHUTDOWN, Controlword.SWITCH_ON)
@@ -43,17 +43,17 @@ class Drive(NamedTuple):
 
     state: DriveState
     latched: bool
-    missed: int  # age of the last valid command [cycles], at most `WATCHDOG`
-    unsynced: int  # consecutive cycles without SYNC, at most `WATCHDOG`
-    errors: tuple[int, ...]  # errors whose cause persists; errors that ended have no effect except on messages
+    missed: int  # age of the last valid command [cycles]; higher ages are stored as `WATCHDOG`
+    unsynced: int  # number of consecutive cycles without SYNC; higher numbers are stored as `WATCHDOG`
+    errors: tuple[int, ...]  # codes of the errors whose cause persists
 
 
 class DriveObserver(NamedTuple):
-    """Counters of the properties, independent of those of the drive."""
+    """Ages and flag from which the search checks the properties, counted independently of the drive."""
 
     command_age: int = WATCHDOG  # cycles since the last valid command was sent
     sync_age: int = 0  # cycles since the last SYNC
-    unacknowledged: bool = False  # the drive holds, and the HAL has not sent QUICK STOP since
+    unacknowledged: bool = False  # the drive started a local hold, and the HAL has not sent QUICK STOP since then
 
 
 class DriveCycle(NamedTuple):
@@ -63,31 +63,31 @@ class DriveCycle(NamedTuple):
     delay: int = 0  # delay of the command [cycles]
     sync: bool = True
     second_sender: bool = False
-    error: tuple[int, bool] | None = None  # error that begins: code, and whether its cause persists
-    ended: int | None = None  # error whose cause ends
+    error: tuple[int, bool] | None = None  # code of an error that begins in this cycle, and whether its cause persists
+    ended: int | None = None  # code of the error whose cause ends in this cycle
     rest: bool = False  # the joint comes to rest
 
 
 class DriveStep(NamedTuple):
-    """State of the search."""
+    """State of the search: state of the drive, and the values from which its properties are checked."""
 
     drive: Drive
     observer: DriveObserver = DriveObserver()
 
 
 class DriveSteps:
-    """Transitions of one drive. The other drives of the leg receive the same frames."""
+    """Transition function of the left frontal hip drive. All drives of the leg receive the same frames."""
 
     def __init__(self) -> None:
         count = len(JOINTS)
         self._drives = Drives(load_robot(), DriveParameters(), DriveSignals(*np.zeros((5, count))))
         self._drives.sample(np.zeros(count))
-        #: `_step` with stored results.
+        #: `_step` with a cache of all results.
         self.step = cache(self._step)
         self._word, self._target, self._limit = np.zeros((3, count))
 
     def search(self) -> Exploration[DriveStep, DriveCycle]:
-        """Search for a drive that is enabled without commands, loses its power, or leaves its local hold by itself."""
+        """Search for a drive that is enabled without commands, loses power without a cause, or resumes motion by itself."""
         start = Drive(DriveState.SWITCH_ON_DISABLED, False, WATCHDOG, 0, ())
         return explore([DriveStep(start)], self._successors)
 
@@ -152,7 +152,7 @@ class DriveSteps:
 
 def _violation(before: Drive, after: Drive, cycle: DriveCycle, now: DriveObserver) -> str:
     enabled = after.state is DriveState.OPERATION_ENABLED
-    # A command may enable a drive that receives no SYNC. It must hold in the next cycle.
+    # A command may enable a drive while SYNC is missing. The drive must start its local hold in the next cycle.
     if enabled and (
         now.command_age >= WATCHDOG or (now.sync_age >= WATCHDOG and before.state is DriveState.OPERATION_ENABLED)
     ):
@@ -167,7 +167,7 @@ def _violation(before: Drive, after: Drive, cycle: DriveCycle, now: DriveObserve
 
 
 def inputs_of(before: Drive) -> Iterator[DriveCycle]:
-    """Yield all inputs of one cycle. At most one error begins or ends in a cycle.
+    """Yield all combinations of inputs of one cycle. In each cycle, at most one error begins or ends.
 
     Args:
         before: state of the drive.

@@ -1,4 +1,4 @@
-"""Explorations of the operator's path: pendant, link to the HAL and HAL, with the properties of each transition.
+"""Exhaustive searches over pendant, link to the HAL and HAL, which check a property at each transition.
 
 Two searches cover the same product of states. `stops` measures the time since the operator released the dead-man switch or
 pressed a button that stops. `moves` counts presses of START and changes to a better state. Each search has only its own
@@ -32,14 +32,15 @@ from atalante_tools.faults.reachability.hal_steps import (
 from atalante_tools.faults.reachability.search import Exploration, Transition, explore
 
 _S = SupervisorState
-#: What the operator did: nothing that stops, released the dead-man switch, pressed STOP, pressed HOLD.
+#: Actions of the operator: none that stops the robot, release of the dead-man switch, STOP button, HOLD button.
 NOTHING, RELEASED, STOPPED, HELD = range(4)
-#: Number of cycles after the release in which the HAL may still enable a drive, because frames of the pendant are missing.
+#: Number of cycles after the stop action in which the HAL may still enable a drive, because it has not received a new
+#: pendant frame.
 SILENT_PENDANT: Final = LOST - 1
-#: Ages of frames that are late [cycles]: all ages that the HAL may use, and two that it rejects.
+#: Ages of late pendant frames [cycles]: all ages that the HAL accepts, and two ages that the HAL rejects.
 _LATE: Final = (*range(1, LOST + 1), 6, 16)
 _BUTTONS: Final = (Request.START, Request.STOP, Request.HOLD)
-#: Cycles after the release above which all times are equal.
+#: Number of cycles after the stop action above which the search does not distinguish times.
 _LONG: Final = 6
 STOP_PROPERTY: Final = "no torque command after the dead-man is released, STOP or HOLD"
 MOVE_PROPERTY: Final = "one press of START, one move"
@@ -47,16 +48,19 @@ RESTART_PROPERTY: Final = "no way from HOLD, LOWER or FAULT to ACTIVE without a 
 
 
 class Operator(NamedTuple):
-    """Observer of the operator's stop: what stops, and for how many cycles."""
+    """Stop action of the operator, and number of cycles since then.
+
+    The search `stops` checks its property with these values.
+    """
 
     stop: int = NOTHING
     cycles: int = 0
 
 
 class Presses(NamedTuple):
-    """Observer of START: number of presses that were received and not used yet, and whether a START is being processed."""
+    """START presses counted by the search `moves`: presses that changed no state yet, and whether a START is in progress."""
 
-    received: int = 0  # at most two
+    received: int = 0  # number of presses; two stands for two or more
     started: bool = False
 
 
@@ -77,7 +81,7 @@ class MoveState(NamedTuple):
 
 
 class Cycle(NamedTuple):
-    """Inputs of one cycle, for the trace."""
+    """Inputs of one cycle, listed in the trace of a counterexample."""
 
     frames: tuple[PendantFrame, ...]
     environment: Environment
@@ -90,7 +94,7 @@ class _Decided(NamedTuple):
     entered: bool
 
 
-#: States from which the searches begin: a moving robot, and a HAL after power-on.
+#: Initial states of both searches: a moving robot, and a HAL after power-on.
 _INITIAL: Final = (
     (Reception(), Supervision(_S.ACTIVE, NO_START)),
     (SILENT, Supervision(_S.OFF, NO_START)),
@@ -98,18 +102,18 @@ _INITIAL: Final = (
 
 
 class OperatorPath:
-    """Product of pendant, link and HAL."""
+    """Combined transition function of pendant, link and HAL."""
 
     def __init__(self) -> None:
         self._steps = HalSteps()
         self._received, self._decided, self._commanded = cache(self._receive), cache(self._decide), cache(self._command)
 
     def stops(self) -> Exploration[StopState, Cycle]:
-        """Search for a torque command that comes too late after the operator stopped."""
+        """Search for a torque command that the HAL sends too long after a stop action of the operator."""
         return explore([StopState(*state) for state in _INITIAL], self._stop_successors)
 
     def moves(self) -> Exploration[MoveState, Cycle]:
-        """Search for a change to a better state without its own press of START."""
+        """Search for a change to a better state that no press of START has caused."""
         return explore([MoveState(*state) for state in _INITIAL], self._move_successors)
 
     def _stop_successors(self, state: StopState) -> Iterator[Transition[StopState, Cycle]]:
@@ -155,7 +159,7 @@ class OperatorPath:
     def _receive(
         self, before: Reception, operator: Operator
     ) -> dict[tuple[Reception, Inputs, bool], tuple[PendantFrame, ...]]:
-        """Return the possible results of the reception, and the frames of each result.
+        """Return the possible results of receiving pendant frames. Each result is mapped to the frames that cause it.
 
         The third element of a result is True if a press of START was received from the pendant.
         """
@@ -170,7 +174,7 @@ class OperatorPath:
         return results
 
     def _decide(self, before: Supervision, inputs: Inputs, suspended: bool) -> dict[_Decided, Environment]:
-        """Return the possible decisions of the HAL, and the environment of each decision.
+        """Return the possible decisions of the HAL. Each decision is mapped to an environment that causes it.
 
         Args:
             before: state of the safety monitor.
@@ -186,7 +190,7 @@ class OperatorPath:
         return results
 
     def _command(self, state: Supervision, prevented: bool) -> tuple[bool, bool]:
-        """Return whether the HAL enables a drive in this state, and whether drives are being enabled afterwards."""
+        """Return whether the HAL sends ENABLE OPERATION to a drive, and whether the HAL is still enabling drives afterwards."""
         sent = [self._steps.command(state, prevented, drive, "torque") for drive in DriveState]
         return any(word == ENERGISING for word, _ in sent), sent[0][1]
 
@@ -197,7 +201,7 @@ def is_move(before: SupervisorState, after: SupervisorState) -> bool:
 
 
 def environments(before: Supervision, suspended: bool = False) -> Iterator[Environment]:
-    """Yield all inputs of the safety monitor that do not come from the pendant. Inputs without effect in a state are left out.
+    """Yield all inputs of the safety monitor that do not come from the pendant. Inputs without effect are left out.
 
     Args:
         before: state of the safety monitor.
@@ -212,7 +216,7 @@ def environments(before: Supervision, suspended: bool = False) -> Iterator[Envir
 
 
 def arrivals(before: Reception, operator: Operator) -> Iterator[tuple[PendantFrame, ...]]:
-    """Yield all frames of the pendant that can arrive in a cycle: in time, lost, doubled, late, damaged, of a second sender.
+    """Yield all sets of pendant frames that can arrive in a cycle: in time, lost, doubled, late, damaged, of a second sender.
 
     The first frame that is yielded is the one of a link without fault.
 
@@ -233,7 +237,7 @@ def arrivals(before: Reception, operator: Operator) -> Iterator[tuple[PendantFra
         yield frame, frame
         yield (frame._replace(sender="damaged"),)
         if frame.pressed:
-            continue  # a second sender is searched only in cycles without a press
+            continue  # a second sender is combined only with frames that report no press
         for request, pressed in ((Request.START, True), (before.own_request, False), (Request.STOP, True)):
             rogue = PendantFrame(0, True, request, pressed, "rogue")
             yield frame, rogue
@@ -250,9 +254,9 @@ def _contents(before: Reception, age: int) -> Iterator[PendantFrame]:
 
 
 def _agrees(frame: PendantFrame, operator: Operator) -> bool:
-    """Return whether the pendant can have sent a frame."""
+    """Return whether a frame reports what the operator did. Frames from before the action need not report it."""
     if frame.age > operator.cycles:
-        return True  # sampled before the operator stopped
+        return True  # the pendant sampled the frame before the action of the operator
     return {
         NOTHING: True,
         RELEASED: not frame.dead_man,

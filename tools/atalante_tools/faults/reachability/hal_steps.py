@@ -1,4 +1,4 @@
-"""One cycle of the HAL as a transition: pendant frames, E2E check, pendant, safety monitor, state machine and commands.
+"""One cycle of the HAL, as a transition of an exhaustive search: pendant frames, E2E check, safety monitor and commands.
 
 The functions under test run in a real `Hal`. A step writes a state into this HAL, calls its functions with real frames, and
 reads the state back. The other nodes are inputs: they answer or not, their drives are enabled or not, and any diagnostic may
@@ -29,47 +29,51 @@ from atalante_hal.wire.frame import Frames, new_frames
 from atalante_hal.wire.process_image import NEVER, TransmitImage
 from atalante_tools.faults.reachability.no_bus import NoBus
 
-#: Age of pendant data that has timed out [cycles]. All larger ages are equal to this age.
+#: Age at which pendant data times out [cycles]. The search does not distinguish higher ages.
 LOST: Final = 5
-#: Cycle number of each step. Counters are relative to it, so its value has no effect.
+#: Cycle number that each step uses. Another number would give the same results, because all counters are relative to this
+#: number.
 _CYCLE: Final = 1001
 _TAG: Final = _CYCLE & 0xFF
-#: RequestCounter of the last accepted frame of the pendant, and of a press of a second sender.
+#: RequestCounter in the last accepted frame of the pendant, and RequestCounter in a frame with which a second sender reports
+#: a press.
 _PRESSES, _ROGUE_PRESSES = 10, 12
-#: Number of cycles that a START may still take: none, this cycle, and any number above.
+#: Number of cycles for which a START may still be processed: none, this cycle only, or more.
 NO_START, LAST_START, START = 0, 1, 2
 START_CYCLES: Final = {NO_START: 0, LAST_START: 1, START: 100}
-#: Qualifications that stand for all that are not trusted, or trusted.
+#: Qualifications of the pendant that the search tries, for a pendant that is not trusted (False) and for a trusted pendant
+#: (True).
 QUALIFICATIONS: Final = {
     False: (Qualification(0, 0, False), Qualification(0, REQUALIFY - 1, False)),
     True: (SETTLED, Qualification(FULL - 4, REQUALIFY, True)),
 }
-#: RequestCounter that `Pendant` evaluated last: none, of the last frame of the pendant, older, of a second sender.
+#: RequestCounter in the last call of `Pendant.evaluate`: no call yet, counter of the last accepted frame, older counter,
+#: counter of a second sender.
 _NONE, _LATEST, _OLDER, _ROGUE = range(4)
 _EVALUATED: Final = {_NONE: None, _LATEST: _PRESSES, _OLDER: _PRESSES - 1, _ROGUE: _ROGUE_PRESSES}
 
 
 class Reception(NamedTuple):
-    """State of the reception of the pendant."""
+    """Part of the search state: reception of the pendant in the HAL."""
 
-    age: int = 0  # age of the last accepted frame [cycles], `LOST` if it has timed out
+    age: int = 0  # age of the last accepted frame [cycles]; `LOST` after the timeout
     dead_man: bool = True  # dead-man switch of the last accepted frame
     request: int = Request.START  # `Request` of the last accepted frame
-    evaluated: int = _LATEST  # RequestCounter of the last evaluation
+    evaluated: int = _LATEST  # which RequestCounter the last call of `Pendant.evaluate` has read
     rogue: bool = False  # the last accepted frame has the RequestCounter of a second sender
     stored: bool = False  # a START is stored until the pendant is trusted
     trusted: bool = True
     own_request: int = Request.START  # `Request` of the last intact frame of the pendant itself
 
 
-#: Pendant that has timed out. Nothing of its last frame has an effect any more.
+#: Reception after the pendant has timed out. The content of its last frame then has no effect.
 SILENT: Final = Reception(LOST, False, 0, _NONE, trusted=False, own_request=0)
 
 
 class PendantFrame(NamedTuple):
-    """Frame of the pendant that arrives in a cycle."""
+    """Pendant frame that arrives in a cycle."""
 
-    age: int  # cycles since the pendant sampled it
+    age: int  # cycles since the pendant sampled the content of the frame
     dead_man: bool
     request: int
     pressed: bool  # whether a button was pressed since the last accepted frame
@@ -77,7 +81,7 @@ class PendantFrame(NamedTuple):
 
 
 class Inputs(NamedTuple):
-    """Inputs of the operator as the pendant evaluation returns them."""
+    """Inputs of the operator, as computed by `Pendant.evaluate`."""
 
     dead_man: bool
     stop: int  # 0 none, 1 STOP, 2 HOLD
@@ -85,19 +89,19 @@ class Inputs(NamedTuple):
 
 
 class Supervision(NamedTuple):
-    """State of the safety monitor."""
+    """Part of the search state: safety monitor."""
 
     supervisor: SupervisorState
     start: int  # `NO_START`, `LAST_START` or `START`
     enabling: bool = False
-    lowered: bool = False  # whether the drive is being lowered
+    lowered: bool = False  # whether the HAL lowers the joint of the left frontal hip drive
 
 
 class Environment(NamedTuple):
     """Inputs of the safety monitor that do not come from the pendant."""
 
     reaction: Reaction = Reaction.INFO  # reaction of the worst confirmed diagnostic
-    mine: bool = False  # whether this diagnostic is of the drive
+    mine: bool = False  # whether the left frontal hip drive has this diagnostic; otherwise another drive has it
     nodes_ready: bool = True
     enabled: bool = True  # whether all drives are in OPERATION ENABLED
     walking: bool = False  # whether the robot walks on the ground
@@ -108,15 +112,15 @@ class Decision(NamedTuple):
     """Result of one cycle of the safety monitor."""
 
     after: Supervision
-    prevented: bool  # a diagnostic prevents that drives are enabled
-    entered: bool  # the supervisor state changed, so a stored START is dropped
+    prevented: bool  # whether a diagnostic prevents the HAL from enabling drives
+    entered: bool  # whether the supervisor state changed, so that a stored START is dropped
 
 
 class _ScriptedPendant(Pendant):
-    """Pendant whose inputs a step has set."""
+    """Pendant that returns the inputs which the search has set."""
 
     def evaluate(self, present: bool, **others: object) -> None:
-        """Keep the inputs.
+        """Leave the inputs unchanged.
 
         Args:
             present: has no effect.
@@ -128,7 +132,7 @@ class _ScriptedPendant(Pendant):
 
 
 class HalSteps:
-    """Transitions of one HAL."""
+    """Transition function of the HAL."""
 
     def __init__(self) -> None:
         network, robot = atalante_dbc.load(), load_robot()
@@ -145,7 +149,7 @@ class HalSteps:
         self._dtc = {reaction: next(d for d in Dtc if d.reaction is reaction) for reaction in Reaction}
         self._parts = self._hal._parts
         self._frame = cache(self._sealed)
-        #: `_receive` and `_without_press` with stored results.
+        #: `_receive` and `_without_press` with a cache of all results.
         self.receive, self.without_press = cache(self._receive), cache(self._without_press)
 
     # -- pendant -----------------------------------------------------------------------------------------------------
@@ -214,7 +218,7 @@ class HalSteps:
         return after, Inputs(pendant.dead_man, stop, pendant.started)
 
     def _without_press(self, state: Reception) -> Reception:
-        """Return the state of the reception after a change of the supervisor state.
+        """Return the state of the reception after a change of the supervisor state, which drops a stored START.
 
         Args:
             state: state before the change.
@@ -292,7 +296,7 @@ class HalSteps:
         return int(hal._commands.control[0]), self._monitor.enabling
 
     def _reset(self) -> None:
-        """Set everything that a state does not contain to its value without a fault."""
+        """Set all attributes of the HAL that are not part of the search state to their values without a fault."""
         hal, monitor = self._hal, self._monitor
         hal.state.cycle = _CYCLE
         monitor.memory = FaultMemory()
@@ -310,7 +314,7 @@ class HalSteps:
         self._others_answer()
 
     def _others_answer(self) -> None:
-        """Give every node except the pendant new data."""
+        """Mark the data of every node except the pendant as new."""
         image, row = self._image, self._row
         age, check = int(image.age[row]), int(image.check[row])
         image.age.fill(0)
@@ -326,5 +330,5 @@ class HalSteps:
             monitor.lowered.add(DRIVE_NODES[0])
 
 
-#: Whether a controlword lets the drive follow the torque of the HAL.
+#: Controlword with which a drive follows the torque commands of the HAL.
 ENERGISING: Final = int(Controlword.ENABLE_OPERATION)

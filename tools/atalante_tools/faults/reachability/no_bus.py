@@ -1,4 +1,4 @@
-"""Bus without frames of its own: a step gives it the frames to receive."""
+"""Bus of the HAL in the exhaustive searches: `receive` returns the frames that the search has stored in `arriving`."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from atalante_hal.wire.frame import Frames, new_frames
 
 
 class NoBus:
-    """Bus that drops all sent frames, and receives `arriving` once."""
+    """Bus that drops all sent frames. The next call of `receive` returns the frames in `arriving`."""
 
     name = "none"
     dropped = 0
@@ -26,7 +26,7 @@ class NoBus:
         """
 
     def receive(self, frames: Frames, timeout: float = 0.0) -> int:
-        """Receive the arriving frames.
+        """Return the frames in `arriving`, and clear `arriving`.
 
         Args:
             frames: receive buffer, shape (m,).

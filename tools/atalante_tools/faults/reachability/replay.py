@@ -1,4 +1,4 @@
-"""Scenario of a counterexample: the inputs of its cycles as operator actions and faults of a walk in lock-step."""
+"""Conversion of a counterexample to a fault scenario: inputs become operator actions or faults of a walk in lock-step."""
 
 from __future__ import annotations
 
@@ -15,16 +15,16 @@ from atalante_tools.faults.reachability.hal_steps import Environment, PendantFra
 from atalante_tools.faults.scenario import Case, HostFault, OperatorAction, Stimulus
 
 _BUTTON: Final = {Request.START: "start", Request.STOP: "stop", Request.HOLD: "hold"}
-#: Cycles that a run continues after the last input of the counterexample.
+#: Number of cycles for which a run continues after the last input of the counterexample.
 OBSERVED: Final = 20
 
 
 class NotReplayable(ValueError):  # noqa: N818
-    """A counterexample has an input that has no operator action and no fault."""
+    """Error for a counterexample with an input that neither an operator action nor a fault can cause."""
 
 
 def case_of(cycles: Sequence[Cycle]) -> Case:
-    """Return the scenario of a counterexample that begins with a walking robot.
+    """Convert a counterexample that begins with a walking robot to a test case.
 
     Args:
         cycles: inputs of each cycle.
@@ -55,7 +55,7 @@ def case_of(cycles: Sequence[Cycle]) -> Case:
 
 
 def drive_case_of(trace: Sequence[tuple[DriveCycle, DriveStep]]) -> Case:
-    """Return the scenario of a counterexample of a drive, from the cycle after it was enabled.
+    """Convert a counterexample of a drive to a test case, starting with the cycle after the drive was enabled.
 
     Args:
         trace: inputs and state of each cycle.

@@ -1,4 +1,4 @@
-"""Figures of the exploration: `python -m atalante_tools.faults.reachability.report` prints them as a Markdown table."""
+"""Report of the exhaustive searches: `python -m atalante_tools.faults.reachability.report` prints it as a Markdown table."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from atalante_tools.faults.reachability.explorations import (
 )
 from atalante_tools.faults.reachability.search import Exploration
 
-#: Name of each search -> properties that it proves.
+#: Name of each search -> properties that the search proves.
 SEARCHES: Final = {
     "moves": (MOVE_PROPERTY, RESTART_PROPERTY),
     "stops": (STOP_PROPERTY,),
@@ -42,7 +42,7 @@ def search(name: str) -> Exploration[Any, Any]:
 
 
 def main() -> None:
-    """Print states, transitions and properties of each search, and the inputs of each cycle of a counterexample."""
+    """Print the numbers of states and transitions of each search and its properties, or the trace of a counterexample."""
     print("| search | states | transitions | properties |\n| --- | --- | --- | --- |")
     for name, properties in SEARCHES.items():
         found = search(name)

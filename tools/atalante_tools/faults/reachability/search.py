@@ -16,12 +16,12 @@ class Transition(NamedTuple, Generic[S, L]):
 
     label: L  # inputs of the cycle
     state: S  # state after the cycle
-    broken: str  # name of the property that this transition violates; empty: none
+    broken: str  # name of the property that this transition violates; empty if it violates none
 
 
 @dataclass(frozen=True)
 class Exploration(Generic[S, L]):
-    """Result of a search. `trace` has the inputs of each cycle up to the first violation; it is empty if there is none."""
+    """Result of a search. `trace` has the inputs of each cycle up to the first violation; empty without a violation."""
 
     states: int
     transitions: int
@@ -30,7 +30,7 @@ class Exploration(Generic[S, L]):
 
 
 def explore(initial: Iterable[S], successors: Callable[[S], Iterable[Transition[S, L]]]) -> Exploration[S, L]:
-    """Visit all reachable states, or stop at the first violation. The trace to a violation has the fewest possible cycles.
+    """Visit all reachable states, or stop at the first violation. The trace to the violation has the fewest possible cycles.
 
     Args:
         initial: states from which the search begins.
