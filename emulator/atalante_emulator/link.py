@@ -119,9 +119,8 @@ class _Disturbance:
         earlier = self._held.pop(message.frame_id, None)
         if earlier is not None:
             return frame, earlier
-        if (
-            cycle + 1 < self.fault.end
-        ):  # the fault lasts until the next frame arrives, which can overtake the kept frame
+        # If the fault lasts until the next frame arrives, the next frame can overtake this frame.
+        if cycle + 1 < self.fault.end:
             self._held[message.frame_id] = frame
             return ()
         return (frame,)

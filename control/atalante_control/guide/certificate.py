@@ -85,7 +85,7 @@ class Certificate:
 
 
 class PromiseLimits:
-    """Conditions that limit the promise of a guide filter. The parts that do not depend on Xi are computed only once."""
+    """Conditions that limit the promise of a guide filter. The conditions that do not depend on Xi are evaluated only once."""
 
     def __init__(self, guide: GuideFilter) -> None:
         """Compute the limits of torque, speed and torque rate.
@@ -136,7 +136,7 @@ class PromiseLimits:
         return sorted(found, key=lambda limit: limit.scale)
 
     def largest(self, xi: float) -> float:
-        """Return the largest promise as a fraction of the chosen promise; negative or 0 if no promise is possible.
+        """Return the largest possible promise as a fraction of the chosen promise; at most 0 if no promise is possible.
 
         Args:
             xi: assistance factor in [0, 1].
@@ -186,7 +186,7 @@ def _limit(room: Vector, reach: Vector, steps: int, what: str) -> Limit:
 
 
 class _Horizon:
-    """Condition at the end of the horizon: the errors inside the horizon bound the error one cycle beyond it.
+    """Condition at the end of the horizon: the errors within the horizon bound the error in the next cycle.
 
     At the end of the horizon little more than the slowest motion remains. The error one cycle beyond the horizon is therefore
     the error at the end of the horizon times a factor, plus a remainder. The remainder is a combination of the errors at two
@@ -206,7 +206,7 @@ class _Horizon:
         remainder = beyond - self._factor[:, None] * rows[-1]
         self._pairs: list[
             tuple[tuple[int, int], Vector]
-        ] = []  # two earlier cycles, and the weights of the errors there
+        ] = []  # two earlier cycles, and the weights of the errors in these cycles
         for near, far in ((0.1, 0.3), (0.25, 0.5), (0.4, 0.7)):
             lags = round(near * self.cycles), round(far * self.cycles)
             inverse = np.linalg.pinv(np.concatenate([rows[lag] for lag in lags]), rcond=1e-9)

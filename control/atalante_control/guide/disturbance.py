@@ -175,7 +175,7 @@ class Effect(NamedTuple):
 
 
 class Grid(NamedTuple):
-    """Predictions for which `spread` reports the largest output."""
+    """Start cycles and numbers of cycles ahead for which `spread` computes the largest output."""
 
     starts: int  # number of start cycles: 0 to starts - 1
     block: int  # number of consecutive start cycles that share one row of the result
@@ -201,7 +201,7 @@ def spread(effect: Effect, mobilities: Vector, bounds: Vector, grid: Grid, ahead
     """
     count, postures = len(bounds), mobilities.shape[1]
     total, added = np.zeros((count, 4)), np.zeros((grid.starts, 4))
-    both = np.zeros((2, 2, 2))  # the responses `pushed` and `hidden` after `lag` cycles
+    both = np.zeros((2, 2, 2))  # responses `pushed` and `hidden`, `lag` cycles after the disturbance
     column = 0
     for lag in range(count):
         reported = column < len(grid.lags) and grid.lags[column] == lag

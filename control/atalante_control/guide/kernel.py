@@ -69,8 +69,7 @@ class Lag:
 class Block:
     """Bounds of the predicted tracking errors over `SLACK_CYCLES` consecutive cycles ahead."""
 
-    #: matrix from `Guard.magnitude` to the largest change of the predicted errors of SH and SK that model errors can cause
-    #: [rad]
+    #: matrix from `Guard.magnitude` to the largest change of the predicted errors by errors of the model [rad]
     slack: Annotated[Vector, (STATES, 2)]
     middle: Annotated[Vector, (COMPRESSED, 2)]  # mean of the largest and the smallest `Lag.ahead` in the block
     #: half the difference of the largest and the smallest `Lag.ahead` in the block

@@ -53,7 +53,7 @@ class Assumptions:
 
 
 class StartReach(NamedTuple):
-    """Largest effect of the disturbances that began with the start of the step.
+    """Largest effect in each cycle of disturbances that act from the start of the step on.
 
     The columns are the effect of the budget on SH and SK, then the effect of the chosen promise on SH and SK.
     """
@@ -133,9 +133,9 @@ class Prediction:
         whole = Grid(starts, START_CYCLES, np.arange(horizon + 1))
         few, none = whole._replace(lags=FEW), whole._replace(lags=FEW[:0])
 
-        # A leg that is lighter than the model, or a later command, makes the joints faster.
+        # The joints move faster if the leg is lighter than in the model, or if the command arrives later.
         self.reach = np.zeros((blocks, len(whole.lags), 4))
-        few_ahead = np.zeros((3, blocks, len(FEW), 4))  # torque, speed, speed for the worst errors of inertia and delay
+        few_ahead = np.zeros((3, blocks, len(FEW), 4))  # torque, speed, speed for the worst inertia and delay
         lag = assumptions.loop.velocity_lag
         first, first_rates = [], []
         for one in family:
@@ -152,7 +152,7 @@ class Prediction:
         self.few_ahead: Vector = np.concatenate([nominal.feedback[FEW], nominal.rate[FEW]], axis=1)
         rates = [_separated(one.rate[FEW] - nominal.rate[FEW]) for one in family]
         self.few_slack: Vector = np.abs(rates).max(axis=0)
-        # The torque that is carried over the stance change varies slowly, so it is left out of the change within one cycle.
+        # The torque carried over the stance change varies slowly, so its change within one cycle is neglected.
         bounds[:, :, 0] = leg.budget(assumptions.mismatch, hand_over, np.zeros(0))
         change = Effect(np.diff(lightest.pushed_feedback, axis=0, prepend=0.0), nothing, self.mass)
         first_change = run(change, mobilities, bounds, none, few_ahead[0])

@@ -28,8 +28,8 @@ _MIDDLE = math.radians(30.0)
 _ASSISTED = [LEG_JOINTS.index("SH"), LEG_JOINTS.index("SK")]
 #: Largest width of any guide [rad].
 _WIDEST = math.radians(7.5)
-#: If no filter is certified for the chosen promise, the filter with the largest promise is used, and assumes this fraction of
-#: its largest promise. If it assumed the whole largest promise, the gate would be 1 even without a disturbance.
+#: Fraction of its largest promise that a filter assumes if no filter is certified for the chosen promise. With the whole
+#: largest promise, the gate would be 1 even without a disturbance.
 _USED = 0.95
 #: Number of decimal digits of the assistance factor, as on the bus.
 _DIGITS = 4
@@ -74,7 +74,7 @@ class StepGuides:
         self._choices: dict[float, Choice] = {}
 
     def prepare(self) -> None:
-        """Choose and store the filter, and its promised disturbance, for every assistance factor from 0 to 1 in steps of 0.01.
+        """Choose and store the filter and its promise for every assistance factor from 0 to 1, in steps of 0.01.
 
         The computation for one assistance factor takes longer than a cycle. On the wall clock, `prepare` must therefore be called
         before a walk.

@@ -38,8 +38,7 @@ class WalkConfig:
     gains: PidGains = WALK_GAINS
     impact: ImpactConfig = field(default_factory=ImpactConfig)
     alpha: float = 0.3  # end of the re-centring, as a fraction of the step duration
-    #: True: baseline controller and assistive torque follow the paper literally in the periodic steps, see `literal`. The guide
-    #: then has no promise.
+    #: True: the torques of the periodic steps follow the paper literally, see `literal`. The guide then has no promise.
     literal_law: bool = False
     #: m/m, gain of the ankle stabiliser: shift of the centre of pressure per error of the divergent component of motion
     stabiliser: float = 2.5
