@@ -19,7 +19,7 @@ from pathlib import Path
 from atalante_dbc.network import Network
 
 DBC_FILE = Path(__file__).with_name("atalante.dbc")
-#: Source files of the parser and of its result.
+#: Source files that determine the parsed network: parser and data types.
 SOURCES = tuple(Path(__file__).with_name(name) for name in ("parser.py", "attributes.py", "network.py"))
 #: Length of the digest at the start of a cache file [byte].
 _DIGEST = hashlib.sha256().digest_size

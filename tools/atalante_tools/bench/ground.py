@@ -14,9 +14,9 @@ from atalante_hal.robot import load_robot
 from atalante_tools.bench.measure import Block, Effort, Measurement, require
 from atalante_tools.session.body import describe, no_banner
 
-#: Joint angles with level soles under the centre of mass [rad].
+#: Joint angles of a standing pose with level soles below the centre of mass [rad].
 _STANDING: Final = np.array([0.0, 0.0, -0.2, 0.45, -0.25, 0.0] * 2)
-#: Stiffness [Nm/rad] and damping [Nm s/rad] with which the joints hold this pose.
+#: Stiffness [Nm/rad] and damping [Nm s/rad] with which the joints hold the standing pose.
 _KP: Final = np.array([9000, 4000, 6000, 6000, 4000, 2500] * 2)
 _KD: Final = np.array([200, 90, 160, 140, 60, 25] * 2)
 _SETTLED: Final = 500  # number of steps until the robot stands still

@@ -96,7 +96,7 @@ def timed(work: Callable[[], object], repetitions: int) -> Block:
 
 
 def require(condition: object, message: str) -> None:
-    """Raise an error if a condition that every valid benchmark meets is false.
+    """Raise `BenchmarkError` if a condition is false that must hold in every valid benchmark.
 
     Args:
         condition: condition that must be true.

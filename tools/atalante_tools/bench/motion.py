@@ -26,7 +26,7 @@ from atalante_tools.session.rig import Rig, open_hal
 
 #: Largest accepted deviation of a joint from the gait while the robot walks [rad].
 POSE: Final = 0.15
-#: Number of cycles from power-on to the start of the measurement. They suffice for the robot to start walking.
+#: Number of cycles from power-on to the start of the measurement. The robot starts to walk within these cycles.
 _BEFORE_WALKING: Final = 3000
 #: Number of cycles that are timed together as one block.
 _BLOCK: Final = 50

@@ -35,8 +35,8 @@ from atalante_tools.bench.measure import require
 #: Number of cycles after which an alive counter wraps to 0.
 TURN = 256
 #: Number of poses in the recording. The HAL runs its slow checks in every 16th cycle. 15 and 16 have no common factor, so the
-#: slow checks read all poses, one after the other. With 16 poses, they would always read the same pose, and report constant
-#: sensor values as a fault.
+#: slow checks read all poses, one after the other. With 16 poses, the slow checks would always read the same pose, and report
+#: constant sensor values as a fault.
 POSES = 15
 #: Tracking error of the recorded joints [rad], too small to saturate the guide filter.
 ERROR = 0.01

@@ -21,7 +21,7 @@ _Column = TypeVar("_Column", bound=npt.NDArray[Any])
 
 @dataclass(frozen=True)
 class Stream:
-    """Frames of a chunk: n frames of m messages, sorted by message. Within a message, the order is that of the log."""
+    """Frames of a chunk: n frames of m messages, sorted by message. Frames of the same message keep the order of the log."""
 
     rows: Rows  # for each frame, the index of its message in the plan, shape (n,)
     stamps: npt.NDArray[np.int64]  # ns

@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
 #: Largest number of frames that one `receive` call returns.
 _RECEIVE_BUDGET: Final = 128
-#: Longest wait for the state message that answers SYNC [s]. After this time, the command is sent without it.
+#: Longest wait for the state message that answers SYNC [s]. After this time, the tester sends the command anyway.
 _PATIENCE: Final = 0.6e-3
 #: Time to listen for another HAL before the first frame is sent [s].
 _LISTEN: Final = 0.2

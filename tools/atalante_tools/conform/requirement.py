@@ -37,7 +37,7 @@ class Requirement:
 
     id: str
     text: str  # required behaviour of the node
-    how: str  # how it is tested
+    how: str  # how the behaviour is tested
     source: str  # document that contains the requirement
     test: Callable[[NodeTester], Outcome]
 

@@ -20,11 +20,11 @@ _HOLD: Final = SupervisorState.HOLD
 _ACTIVE: Final = SupervisorState.ACTIVE
 _OFF: Final = SupervisorState.OFF
 _BUSES: Final = ("left_leg", "right_leg", "left_sense", "right_sense")
-#: Drive to which the faults of a single drive are applied.
+#: Drive for the faults that affect a single drive.
 _KNEE: Final = "LEFT_SK"
-#: State message of this drive.
+#: State message of the drive `_KNEE`.
 _STATE: Final = "LEFT_SK_STATE"
-#: Message with the command of this drive.
+#: Message with the command of the drive `_KNEE`.
 _COMMAND: Final = "COMMAND_LEFT_LEG"
 _PENDANT: Final = "PENDANT"
 #: Flags of a CAN FD frame from a node that is error passive.

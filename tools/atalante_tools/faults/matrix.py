@@ -32,7 +32,7 @@ class Row:
 
     id: str
     fault: str  # description of the fault
-    noticed_by: str  # check that detects it
+    noticed_by: str  # check that detects the fault
     cycles: str  # time limits as text, such as "1 / 5"; `detected` and `reacted` return the numbers
     behaviour: str  # reaction in words
     state: SupervisorState  # final state of the HAL

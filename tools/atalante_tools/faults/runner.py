@@ -74,7 +74,7 @@ def run_context() -> RunContext:
 
 @functools.cache
 def first_walk_cycle(engine: str = PYBULLET) -> int:
-    """Return the HAL cycle in which the first walking step begins in a run without fault. It is the same in all runs.
+    """Return the HAL cycle in which the first walking step begins in a run without fault. All runs have the same cycle number.
 
     Args:
         engine: physics engine of the emulated robot.

@@ -17,7 +17,7 @@ _KNEE: Final = "LEFT_SK"
 _STILL: Final = "RIGHT_FH"
 _IMUS: Final = tuple(f"IMU_{name.upper()}" for name in IMUS)
 _FEET: Final = tuple(f"FOOT_{name.upper()}" for name in FEET)
-#: Share of doubled frames that is tolerated for ever; a share of more than 0.2 is not.
+#: Share of doubled frames that the HAL tolerates permanently. The HAL does not tolerate a share above 0.2.
 _OFTEN: Final = 0.15
 #: Permanent communication faults that must not prevent the detection of a sensor fault.
 #: The last two faults delay messages that the sensor checks use. A message that is doubled in every cycle is a fault (F63).

@@ -89,18 +89,20 @@ _CHECK_OPTIONS = [
     click.option("--patients", is_flag=True,
                  help="Also check the network gaits of twelve patients of 58 to 91 kg."),
     click.option("--condition", "conditions", type=click.Choice(CONDITION_NAMES), multiple=True,
-                 help="Deviation of plant and robot from the model: none (model), friction +-20 %, mass +-10 %, both, encoder "
-                      "noise, 1 % frame loss, 1 ms more delay. Repeat the option for several.  [default: all]"),
+                 help="Deviation of plant and robot from the model: none (model), friction +-20 %, mass +-10 %, friction and "
+                      "mass (both), encoder noise, 1 % frame loss, 1 ms more delay. Repeat the option for several conditions.  "
+                      "[default: all]"),
     click.option("--push", type=(Between(0.0, 500.0), Between(0.0, 500.0)), default=None, metavar="HIP KNEE",
                  help="Largest push at hip and knee [Nm].  [default: the promise of the guide]"),
     click.option("--steps", type=click.IntRange(1), metavar="N",
                  help="Steps on the ideal plant per guide.  [default: 1500, with --quick 60]"),
     click.option("--robot-steps", type=click.IntRange(0), metavar="N",
-                 help="Steps on the emulated robot per guide.  [default: 60; 0 if --quick is given]"),
+                 help="Steps on the emulated robot per guide.  [default: 60, with --quick 0]"),
     click.option("--seed", type=SEED, default=0, show_default=True, metavar="N", help="Seed of the search and of the noise."),
-    click.option("--quick", is_flag=True, help="Search briefly, on the plant only, and not beyond the promise."),
+    click.option("--quick", is_flag=True,
+                 help="Run a short search: only on the ideal plant, and only pushes up to the promised torques."),
     click.option("--plot", type=OutputFile(".png", ".svg", ".pdf"), metavar="FILE",
-                 help="Draw guide, safe backward image and worst step of the last guide."),
+                 help="Draw the last guide: its bounds, the safe errors (safe backward image) and the worst step."),
     click.option("--table", type=OutputFile(".md"), metavar="FILE", help="Write the results as a Markdown table."),
     click.option("--results", type=OutputFile(".jsonl"), metavar="FILE",
                  help="Append each result to this file. Guides that the file already contains are not checked again, so the same "

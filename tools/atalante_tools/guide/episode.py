@@ -198,16 +198,16 @@ class IdealLeg:
 
 
 class Episode(NamedTuple):
-    """Inputs of a compiled step."""
+    """Inputs of `walk_step`."""
 
     plant: Plant
     goal: Goal
     push: Push
-    box: Vector  # (2,) Nm
-    noise: Vector  # (cycles + 1, 4)
+    box: Vector  # (2,) Nm, largest push at hip and knee
+    noise: Vector  # (cycles + 1, 4) random numbers from `noise_of`
     before: Vector  # (2,) Nm, torque before the stance change
     other: Vector  # (24,) angles [rad], then speeds [rad/s] of all joints; values of hip and knee are not used
-    log: Vector  # (cycles + 1, len(LOG)), overwritten
+    log: Vector  # (cycles + 1, len(LOG)) values of each cycle, overwritten by `walk_step`
 
 
 def noise_of(cycles: int, condition: Condition, generator: np.random.Generator) -> Vector:

@@ -60,11 +60,11 @@ _SHARE: Final = 0.1
 
 @dataclass(frozen=True)
 class Effort:
-    """Size of a check."""
+    """Effort of the check of one guide."""
 
-    steps: int  # steps on the ideal plant at the promise
-    robot_steps: int  # steps on the emulated robot; 0 means that the robot is not used
-    tightness: bool  # whether to search for `Verdict.left_at`
+    steps: int  # steps on the ideal plant with pushes up to the promised torques
+    robot_steps: int  # steps on the emulated robot; 0: the robot is not used
+    tightness: bool  # whether to search for the smallest push that moves a joint out of the guide
 
 
 QUICK: Final = Effort(steps=60, robot_steps=0, tightness=False)
@@ -73,12 +73,12 @@ COMPLETE: Final = Effort(steps=1500, robot_steps=60, tightness=True)
 
 @dataclass(frozen=True)
 class Task:
-    """Task to check one guide: conditions, size, seed and pushes."""
+    """Task to check one guide: conditions, effort, seed and largest push."""
 
     conditions: Sequence[Condition]  # conditions of plant and robot
     effort: Effort
     seed: int  # seed of the search
-    push: Pair | None = None  # largest push at hip and knee [Nm]; None means the promise
+    push: Pair | None = None  # largest push at hip and knee [Nm]; None means the promised torques
 
 
 @dataclass(frozen=True)
@@ -91,16 +91,16 @@ class Verdict:
     certified: bool
     promise_hip_nm: float | None  # largest push at the hip: `Task.push` or the promise [Nm]; None if there is neither
     promise_knee_nm: float | None  # largest push at the knee: `Task.push` or the promise [Nm]; None if there is neither
-    worst_ratio: float | None  # largest |e| / q_bound of plant and robot; None if nothing was tried
+    worst_ratio: float | None  # largest |e| / q_bound of plant and robot; None if no step was walked
     steps: int  # number of steps on plant and robot
     plant_ratio: float | None  # largest |e| / q_bound on the ideal plant
     robot_ratio: float | None  # largest |e| / q_bound on the emulated robot; None if the robot was not used
     worst_push: str  # kind of the worst push on the plant
     worst_condition: str  # deviation of the plant from the model in the worst episode, for example "friction +20 %"
     stopped: str  # reason why the robot left ACTIVE; empty if it did not
-    #: smallest multiple of the promise that moved a joint out of the guide; None if not found or not searched
+    #: smallest multiple of the promise with which a push moved a joint out of the guide; None if not searched or not found
     left_at: float | None
-    reason: str  # reason of the certificate
+    reason: str  # reason that the certificate states
 
     @property
     def broken(self) -> bool:
@@ -213,7 +213,7 @@ def check(setup: Setup, controller: AirwalkController, xi: float, task: Task) ->
 
 
 def _on_robot(robot: PushedRobot, box: Pair, found: Sequence[Tried], task: Task) -> RobotWalk:
-    """Walk on the robot in all conditions, with the worst pushes on the plant and with the pushes of `_robot_pushes`."""
+    """Walk on the robot in all conditions, with the worst pushes found on the plant and with the pushes of `_robot_pushes`."""
     conditions, seed = task.conditions, task.seed
     cycles = len(found[0].push.signs)
     pushes = [one.push for one in found[:6]] + _robot_pushes(cycles, np.random.default_rng(seed))

@@ -31,13 +31,13 @@ from atalante_tools.session.rig import Rig, open_hal
 Pair = tuple[float, float]
 
 _LEG: Final = len(LEG_JOINTS)
-#: Masses of the exoskeleton, which a condition scales.
+#: Masses of the exoskeleton that `Condition.mass` scales.
 _MASSES: Final = (
     "pelvis_mass", "frontal_hip_mass", "transverse_hip_mass", "thigh_mass", "shank_mass", "ankle_mass", "foot_mass",
 )  # fmt: skip
-#: Command messages. A condition with delay delays them, and a condition with frame loss drops some of their frames.
+#: Command messages: `Condition.delay` delays all of their frames, and `Condition.loss` drops some of their frames.
 _COMMANDS: Final = ("COMMAND_LEFT_LEG", "COMMAND_RIGHT_LEG")
-#: State messages of the drives. A condition with frame loss drops some of their frames.
+#: State messages of the drives: `Condition.loss` drops some of their frames.
 _STATES: Final = tuple(f"{joint.upper()}_STATE" for joint in JOINTS)
 
 

@@ -32,7 +32,7 @@ _Choice = TypeVar("_Choice")
 DIRECTIONS: Final = tuple(itertools.product((1.0, -1.0), repeat=2))
 #: A stage of the beam search has `_STAGE` cycles, and keeps the `_BEAM` pushes with the largest predicted deviation.
 _STAGE, _BEAM = 40, 6
-#: Time that the beam search looks ahead along the rate of the error [s].
+#: Time over which the beam search extrapolates an error with its present rate [s].
 _AHEAD: Final = 0.03
 #: A search with at least this number of steps includes the beam search.
 _WITH_BEAM: Final = 1000
@@ -43,7 +43,7 @@ _PARENTS: Final = 6
 
 
 class Tried(NamedTuple):
-    """A step of the plant: its inputs and its result."""
+    """Step of the plant that the search has walked: its inputs and its result."""
 
     ratio: float  # largest |e| / q_bound
     kind: str  # origin of the push
@@ -120,7 +120,10 @@ class Adversary:
         return outside
 
     def _leaves(self, box: Pair, factor: float, budget: int) -> bool:
-        """Return whether a push up to `factor` times `box` moves a joint out of the guide. Known pushes are tried first."""
+        """Return whether a push up to `factor` times `box` moves a joint out of the guide.
+
+        The stored pushes are tried first.
+        """
         larger, known, end = (factor * box[0], factor * box[1]), self.tried, self.steps + budget
         self.tried = []
         for one in known:
@@ -262,7 +265,7 @@ class Adversary:
             kept = [signs for _, signs in ahead[:_BEAM]]
 
     def _mutate(self, box: Pair) -> None:
-        """Change one of the worst steps a little, and walk it."""
+        """Change one of the worst steps a little, and walk the changed step."""
         generator, cycles = self._generator, self.leg.cycles + 1
         parent = self.tried[int(generator.integers(min(_PARENTS, len(self.tried))))]
         start, push, condition, noise = parent.start, parent.push, parent.condition, parent.noise

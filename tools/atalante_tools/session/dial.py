@@ -25,7 +25,7 @@ class Dial:
         operator.assist(self._set)
 
     def turn(self, steps: int) -> None:
-        """Turn the dial to the assistance factor of the next step. It acts from the next stance change on.
+        """Turn the dial to the assistance factor of the next step. The factor acts from the next stance change on.
 
         Args:
             steps: Number of completed steps.

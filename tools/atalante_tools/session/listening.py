@@ -15,7 +15,7 @@ POLL_TIMEOUT: Final = 0.02
 
 
 def received(bus: Bus, seconds: float, stop: StopRequest) -> Iterator[tuple[Frames, int]]:
-    """Yield the receive buffer and the number of new frames at its start, at least every `POLL_TIMEOUT`.
+    """Yield the receive buffer and its number of new frames after each receive call, at least every `POLL_TIMEOUT`.
 
     Args:
         bus: Bus to listen to.

@@ -21,9 +21,9 @@ from atalante_hal.wire.e2e import COUNTER_BYTE, MAX_DELTA, Check
 from atalante_hal.wire.frame import Frames
 from atalante_hal.wire.process_image import ReceiveImage
 
-#: Shortest time for which a new pendant sends before it may stop [cycles]. In this time the older pendant stops sending.
+#: Shortest time for which a new pendant sends before it may stop [cycles]. The older pendant stops sending in this time.
 TAKEOVER_CYCLES: Final = 50
-#: Shortest time for which a pendant sends after a silence before it may stop sending again [cycles].
+#: Shortest time for which a pendant that resumed sending must send before it may stop again [cycles].
 RETRY_CYCLES: Final = 8
 #: Upper limit of the random time that is added to `TAKEOVER_CYCLES` or `RETRY_CYCLES` [cycles].
 DRAW_CYCLES: Final = 50
@@ -59,12 +59,12 @@ class Takeover:
         self._quiet, self._random = quiet, Random(seed)
         self._sending = self.established = established
         self.silent = self.lost = False
-        self._tag = -1  # counter that an answer to the last SYNC contains; -1 before the first SYNC
+        self._tag = -1  # alive counter of an answer to the last SYNC; -1 before the first SYNC
         self._cycle = 0  # number of SYNCs
         self._free_from = 0  # first cycle in which this pendant may stop sending
-        self._quiet_from = 0  # first cycle of the current time without frames of other pendants
-        self._received_at = -MAX_DELTA - 1  # cycle in which the last frame of another pendant was received
-        self._received = 0  # number of consecutive frames of another pendant
+        self._quiet_from = 0  # cycle from which the time without frames of other pendants is counted
+        self._received_at = -MAX_DELTA - 1  # cycle in which the newest frame of another pendant was received
+        self._received = 0  # number of frames of another pendant, with gaps of at most `MAX_DELTA` cycles between them
 
     @property
     def present(self) -> bool:

@@ -77,7 +77,7 @@ def foot_prints(columns: Mapping[str, Vector]) -> list[tuple[int, float, float, 
     """
     prints: list[tuple[int, float, float, float]] = []
     last = np.full((2, 2), math.nan)
-    walking = columns["feet"].any(axis=1)  # before the walk, the line has no origin
+    walking = columns["feet"].any(axis=1)  # False before the walk, where all positions are zero
     for feet, yaw in zip(columns["feet"][walking].reshape(-1, 2, 2), columns["yaw"][walking, 0], strict=True):
         landed = [side for side in (0, 1) if not np.array_equal(feet[side], last[side])]
         prints.extend((side, float(feet[side, 0]), float(feet[side, 1]), float(yaw)) for side in landed)

@@ -139,7 +139,7 @@ class ParquetSink:
 
 
 def _exact(field: Field, values: npt.NDArray[Any]) -> Any:
-    """Return the column `integer`. It has exact decimals if float64 cannot represent all values, otherwise nulls."""
+    """Return the exact values as decimals for the column `integer`, or nulls if float64 represents all values exactly."""
     codes = raw_range(field) if field.kind != "float" else range(0)
     if values.dtype.kind == "f" or not codes or max(-codes[0], codes[-1]) * abs(field.factor) <= _EXACT:
         return pa.nulls(len(values), _DECIMAL)

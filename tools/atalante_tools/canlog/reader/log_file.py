@@ -1,4 +1,4 @@
-"""Log file: its format, and its channels, defects and read position. The log reader updates the last three."""
+"""Log file: format, channels, defects and read position. The log reader updates channels, defects and read position."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from pathlib import Path
 
 from atalante_tools.canlog.reader.chunk import Channels
 
-#: Log formats by file suffix: (whether the format records the direction of frames, whether it records the CAN FD flags).
+#: File suffix -> whether the format records the direction of frames, and whether the format records the CAN FD flags.
 FORMATS = {
     ".log": (True, True),
     ".asc": (True, True),

@@ -150,7 +150,7 @@ class Findings:
             )
 
     def add_whole(self, rule: str, row: int, first: int, last: int, *, shown: float, count: int = 1) -> None:
-        """Add a violation by one message. It lasts from the time stamp `first` to the time stamp `last` [ns]."""
+        """Add one violation by one message, which lasts from the time stamp `first` to the time stamp `last` [ns]."""
         worst = _text(shown, RULE_OF[rule].worst, "")
         self._merge(
             Finding(

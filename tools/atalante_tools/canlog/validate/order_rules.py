@@ -30,7 +30,8 @@ class _Bus:
     stamp: int = 0  # time stamp of the last SYNC frame [ns]
     cycle_of: dict[int, int] = field(default_factory=dict)  # cycle number of the last state frame, by message index
     jump_of: dict[int, int] = field(default_factory=dict)  # cycles between the last two state frames, by message index
-    #: time stamp of a second state frame in one cycle [ns], by message index, if the next cycle is not known yet
+    #: message index -> time stamp of the second state frame in the newest cycle [ns]. The next cycle shows whether this frame
+    #: was received before its SYNC.
     doubtful: dict[int, int] = field(default_factory=dict)
 
 
