@@ -5,7 +5,7 @@ OUT ?= runs
 # The demo and the tests start many processes, so modules must be compiled only once.
 export PYTHONDONTWRITEBYTECODE :=
 
-.PHONY: help demo test test-vcan lowest fuzz coverage mutation lint docs bench messages supervisor-table clean
+.PHONY: help demo test compile test-vcan lowest fuzz coverage mutation lint docs bench messages supervisor-table clean
 
 help: ## list all targets (default)
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "%-18s %s\n", $$1, $$2 }' $(firstword $(MAKEFILE_LIST))
@@ -14,9 +14,16 @@ demo: .venv/installed-all ## walk in the air inside each guide shape, then on th
 	$(BIN)/atalante demo --out $(OUT)/demo
 	$(BIN)/atalante walk --steps 4 --xi 0.5 --wearer passive --out $(OUT)/walk
 
+# Two short runs compile the numeric functions while `lint` runs, so the tests do not compile them in every process.
 # With worksteal, the tests of a file mostly run in one worker, so their shared fixtures are created only once.
-test: .venv/installed-dev lint ## run `lint` and all tests except those that need SocketCAN
+test: .venv/installed-dev ## run `lint` and all tests except those that need SocketCAN
+	$(MAKE) --no-print-directory -j 2 lint compile
 	$(BIN)/python -m pytest -n 2 --dist worksteal
+
+compile: .venv/installed-all
+	@folder=$$(mktemp -d); trap 'rm -rf "$$folder"' EXIT; \
+	  { $(BIN)/atalante demo --shape pinched --steps 1 --out "$$folder/air" && \
+	    $(BIN)/atalante walk --steps 1 --out "$$folder/ground"; } >"$$folder/log" 2>&1 || { cat "$$folder/log"; exit 1; }
 
 test-vcan: .venv/installed-vcan ## run the tests that need SocketCAN, in a virtual machine if this kernel has no SocketCAN
 	PYTHON=$(BIN)/python tests/vcan/run.sh
