@@ -115,7 +115,7 @@ def _callees(function: FunctionType) -> Iterator[tuple[str, FunctionType]]:
 
 
 def _compile_inputs(function: FunctionType) -> Iterator[bytes]:
-    """Yield the bytes that determine the machine code: code, constants, record types, globals and called functions."""
+    """Yield everything that determines the machine code, as bytes: code, constants, record types, globals, called functions."""
     yield function.__qualname__.encode()
     yield function.__code__.co_code + repr(_constants(function.__code__)).encode()
     yield from _records(function.__annotations__, function.__globals__)

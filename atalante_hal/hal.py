@@ -108,7 +108,7 @@ class Hal:
         self._plausibility = Plausibility(self.robot, self._image, PERIOD)
         self.state = parts.state(assistance_factor, len(fast))
         per_turn = self.robot.polarity / self.robot.gear
-        # Positions and velocities on the bus are at the motor. Torques are already at the joint, so their factor is 1.
+        # On the bus, positions and velocities are at the motor. Torques are at the joint, so their factor is 1.
         self._to_joint = np.concatenate([per_turn, per_turn, np.ones(len(JOINTS))])
 
     # -- one cycle ---------------------------------------------------------------------------------------------------

@@ -157,7 +157,7 @@ _KEYS = {
     "encoder_noise": _Key(1, 1e-9, 1e-2, "rad"),
     "breakaway": _Key(1, 0.01, 400.0, "Nm"),
 }
-#: Keys of the tables other than [joints].
+#: Keys of all tables of the robot file except [joints].
 _TABLES = {
     "envelope": {
         "look_ahead": _Key(1, 1e-3, 1.0, "s"),

@@ -97,10 +97,10 @@ class Transceiver:
         self._refused = 0  # consecutive cycles in which the transmit queue was full
         self._full_this_cycle = False
         self._asked = True  # True if the last batch was sent completely
-        self._floods = 0  # consecutive cycles with a flood
+        self._floods = 0  # number of consecutive cycles with too many received frames
         self._error_frames = 0  # number of error frames since the last call of `faults`
-        self._errors = SETTLED  # leaky bucket of cycles with error frames
-        #: Number of error frames since the start, without reports of bus-off.
+        self._errors = SETTLED  # leaky bucket that counts cycles with error frames
+        #: Number of error frames since the start, except frames that report bus-off.
         self.error_frames = 0
         self._bus_off = 0  # error class of the last bus-off frame; 0 after the operator's acknowledgement
         #: True if the bus has no fault, so that `faults` need not be called.

@@ -269,7 +269,7 @@ def refusal(interface: str, *, one_process: bool = False) -> str:
 
 
 def reports_can_fd(interface: str) -> bool:
-    """Return whether the attribute `protocol` of an open python-can bus correctly states that the bus uses CAN FD.
+    """Return whether python-can reports the protocol CAN FD for a bus that was opened for CAN FD.
 
     Args:
         interface: Name of the interface in python-can.

@@ -393,7 +393,7 @@ class Emulator:
         self._sealed = True
 
     def _complete_answer(self, number: int) -> None:
-        """Add the counter that the SYNC requires, and the CRC, to the answer. Keep an answer that was encoded for this SYNC.
+        """Write alive counter and CRC into the answer to a SYNC. Keep an answer that was already encoded for this SYNC.
 
         Args:
             number: cycle number received in SYNC.

@@ -45,7 +45,7 @@ class Lost(NamedTuple):
 
 
 class Motion(NamedTuple):
-    """Arrays of the motor side that the low-pass reads, shape (12,) each."""
+    """Motor positions and velocities that the low-pass reads, shape (12,) each."""
 
     position: Vector  # new positions [rad]
     before: Vector  # positions of the cycle before [rad]
@@ -83,9 +83,9 @@ class EncoderChecks:
         self._keep = math.exp(-2.0 * math.pi * robot.sensors.velocity_bandwidth * period)
         #: Encoder velocities after the low-pass, and reported velocities minus these encoder velocities [rad/s].
         self._filtered, self._deviation = np.zeros((2, len(JOINTS)))
-        self._earlier = np.zeros(len(JOINTS))  # deviation of the last sample [rad/s]
+        self._earlier = np.zeros(len(JOINTS))  # `_deviation` at the last velocity check [rad/s]
         self._no_age = np.zeros(len(JOINTS), np.int64)
-        self._earlier_age: Cycles = np.full(len(JOINTS), NEVER)  # age of the values of each joint at the last sample
+        self._earlier_age: Cycles = np.full(len(JOINTS), NEVER)  # age of the joint values at the last velocity check
         self._twice_allowed = 2.0 * robot.sensors.velocity_error * robot.gear
         self._wrong = [0] * len(JOINTS)
         self._wrong_findings: tuple[Finding, ...] = ()

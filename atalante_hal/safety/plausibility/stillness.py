@@ -52,7 +52,8 @@ _TURN = 0.01
 _INERTIA = 100.0
 #: Cycles with a constant reading after which a joint is at rest. In this time, an unbalanced torque would move it.
 _AT_REST = 3
-#: Turn of a joint with the inertia `_INERTIA` that must change the reading of its encoder [rad]; 20 counts of a motor encoder.
+#: Angle that a joint with the inertia `_INERTIA` cannot turn without changing its encoder reading [rad]; 20 counts of a motor
+#: encoder.
 _DRIVEN = 1e-5
 #: A joint closer to a position limit than this distance is regarded as being at its end stop [rad].
 _AT_STOP = 0.005
@@ -81,11 +82,11 @@ class Drive(NamedTuple):
     """
 
     cycles: Vector  # cycles with a constant reading
-    rest: Vector  # torque at rest [Nm]
+    rest: Vector  # torque while the joint comes to rest [Nm]
     low: Vector  # lowest torque [Nm]
     high: Vector  # highest torque [Nm]
-    momentum: Vector  # angular momentum [Nm s]
-    turn: Vector  # angle [rad]
+    momentum: Vector  # angular momentum that the torque would cause [Nm s]
+    turn: Vector  # angle that the torque would turn the joint by [rad]
 
 
 class Stillness:

@@ -204,9 +204,7 @@ class _Horizon:
         beyond = prediction.beyond * SIZES
         self._factor = (beyond * rows[-1]).sum(axis=1) / (rows[-1] ** 2).sum(axis=1)
         remainder = beyond - self._factor[:, None] * rows[-1]
-        self._pairs: list[
-            tuple[tuple[int, int], Vector]
-        ] = []  # two earlier cycles, and the weights of the errors in these cycles
+        self._pairs: list[tuple[tuple[int, int], Vector]] = []  # two earlier cycles, and the weights of their errors
         for near, far in ((0.1, 0.3), (0.25, 0.5), (0.4, 0.7)):
             lags = round(near * self.cycles), round(far * self.cycles)
             inverse = np.linalg.pinv(np.concatenate([rows[lag] for lag in lags]), rcond=1e-9)
@@ -231,7 +229,8 @@ class _Horizon:
         found = []
         for lags, weights in self._pairs:
             rooms, promises = (np.hstack(parts) for parts in zip(*map(room, lags), strict=True))
-            # The promise must meet: factor * (last - scale * ...) + (rooms - scale * ...) @ weights <= end - scale * ...
+            # Find the largest scale with: factor * (last - scale * last_promise) + (rooms - scale * promises) @ weights <= end
+            # - scale * end_promise.
             have = end - self._factor * last - rooms @ weights
             need = end_promise - self._factor * last_promise - promises @ weights
             with np.errstate(divide="ignore"):

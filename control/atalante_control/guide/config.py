@@ -31,7 +31,7 @@ class StepGuideConfig:
     torque_reserve: float = 14.0  # Nm, smallest difference between the torque limit of the robot and a predicted torque
     #: rad/s, smallest difference between the velocity limit of the robot and a predicted speed
     speed_reserve: float = 0.2
-    zeta: float = 0.01  # s, gain of lambda_d, the part of the gate that damps a decrease of h
+    zeta: float = 0.01  # s, gain of lambda_d, which increases the gate while h decreases
     idealization: float = 1.0  # intensity of the joint idealization u_i in [0, 1] while the gate of the guide is 0
     feedforward: float = 1.0  # intensity of the feedforward u_f in [0, 1] while the gate of the guide is 0
     #: Counter value above which the controller reports that the leg has left a guide with a promise. The counter rises by 1 in

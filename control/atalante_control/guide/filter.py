@@ -61,7 +61,7 @@ class GuideConfig:
     rate_limit: float  # Nm, largest change of the backup torque within one cycle
     speed_limit: float  # rad/s, largest predicted speed of SH and of SK
     worst_speed_limit: float  # rad/s, largest predicted speed for the worst model errors
-    zeta: float = 0.01  # s, gain of lambda_d, the part of the gate that damps a decrease of h
+    zeta: float = 0.01  # s, gain of lambda_d, which increases the gate while h decreases
     derivative_time: float = 0.005  # s, time constant of the low-pass filter on dh/dt
     release: float = 0.03  # s, shortest time in which the gate falls from 1 to 0
     idealization: float = 1.0  # intensity of the joint idealization u_i in [0, 1] while the gate is 0

@@ -37,7 +37,7 @@ class Guard:
     worst_speed_limit: float  # rad/s, largest predicted speed of a joint for the worst model errors
     tracking: float  # share of a commanded torque change that a motor reaches within one cycle
     keep: float  # weight of the old value in the low-pass of the measured velocity
-    zeta: float  # s, gain of the derivative term lambda_d
+    zeta: float  # s, gain of lambda_d, which increases the gate while h decreases
     smoothing: float  # weight of the new value in the low-pass filter of dh/dt
     release: float  # largest decrease of the gate per cycle; without this limit the gate could oscillate with the leg
     idealization: float  # intensity of the joint idealization u_i in [0, 1]
@@ -118,7 +118,7 @@ TAIL = 16
 #: Columns 20 to 23 of `step`: as columns 0 to 3, for the narrowest guide in `SLACK_CYCLES` cycles from this one on [1/rad].
 NEAR = 20
 COLUMNS = 24
-#: Number of cycles after the last predicted cycle in which the guide may become narrower while the free motion decays.
+#: At the last predicted cycle, the bound is the narrowest guide within this number of later cycles.
 TAIL_CYCLES = 60
 
 

@@ -43,7 +43,7 @@ class Letter:
     coulomb: Annotated[Vector, 2]  # Nm, k_d
     viscous: Annotated[Vector, 2]  # Nm s/rad, k_v
     push: Annotated[Vector, 2]  # Nm, largest absolute value of u_ext
-    zeta: float  # s, gain of lambda_d, the part of the gate that damps a decrease of h
+    zeta: float  # s, gain of lambda_d, which increases the gate while h decreases
     idealization: float  # intensity of the joint idealization u_i
     feedforward: float  # intensity of the feedforward u_f
     xi: float  # assistance factor of the step
@@ -69,7 +69,7 @@ class LiteralConfig:
 
     gains: LegGains  # gains of the baseline PID of the swing leg
     push: Pair  # Nm, largest absolute value of u_ext of SH and SK
-    zeta: float  # s, gain of lambda_d, the part of the gate that damps a decrease of h
+    zeta: float  # s, gain of lambda_d, which increases the gate while h decreases
     idealization: float  # intensity of the joint idealization u_i, in [0, 1]
     feedforward: float  # intensity of the feedforward u_f, in [0, 1]
 

@@ -22,8 +22,9 @@ _NO_INTEGRAL = (0.0,) * 6
 WALK_GAINS = PidGains(
     stance=replace(PidGains().stance, ki=_NO_INTEGRAL), swing=replace(PidGains().swing, ki=_NO_INTEGRAL)
 )
-#: Guide on the ground. It is stiffer than in the air, because the leg with the patient is heavier than the empty leg.
-#: The hand-over box (largest deviations at a stance change for which a promise holds) covers the deviations at the landings.
+#: Parameters of the guide on the ground. The guide is stiffer than in the air, because the leg with the patient is heavier than
+#: the empty leg. The hand-over box (largest deviations at a stance change for which a promise holds) covers the deviations at
+#: the landings.
 WALK_GUIDE = StepGuideConfig(stiffness=(4500.0, 3300.0), hand_over=HandOver(deviation=math.radians(1.0), rate=0.3))
 
 

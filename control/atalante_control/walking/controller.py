@@ -416,7 +416,7 @@ def _tables(
 
 
 def _held(table: PhaseTable, row: int, duration: float) -> PhaseTable:
-    """Return the table of a phase that moves from the measured pose to one row of another table and holds this row.
+    """Return the table of a phase that moves the joints from the measured pose to a row of another table, and then holds it.
 
     Args:
         table: table that contains the row.

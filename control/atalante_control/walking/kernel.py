@@ -50,7 +50,7 @@ class Measured(NamedTuple):
 
 
 class Stage:
-    """Data of the current phase. The controller writes them when the phase starts."""
+    """Data of the current phase, written by the controller at the start of the phase."""
 
     stance: int  # stance leg, 0 left, 1 right
     double: bool  # whether no foot swings, because both feet are on the ground or the robot is suspended

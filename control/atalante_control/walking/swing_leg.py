@@ -35,7 +35,7 @@ class SwingLeg(NamedTuple):
     """Swing leg of a step, and the torque that the model of the swing leg leaves out."""
 
     leg: Leg
-    unmodelled: Vector  # (n + 1, 2) Nm, torque w of SH and SK that is added to u_g
+    unmodelled: Vector  # (n + 1, 2) Nm, torque w of SH and SK, added to the gravity torques u_g
 
 
 def swing_leg(

@@ -59,7 +59,7 @@ class Vectors:
         self._order = self._stream_order()
 
     def _stream_order(self) -> npt.NDArray[np.intp]:
-        """Return the stream layout of an image: the index of each byte in the concatenated arrays of `images`."""
+        """Return the byte order of an image in the stream: an index into the concatenated arrays of `images` for each byte."""
         build, codec = self._build, self._codec
         rows = len(build.messages)
         parts = (FRAME_BYTES * rows, FRAME_BYTES * rows, 8 * codec.size, 8 * codec.size, rows)
@@ -117,7 +117,7 @@ class Vectors:
                 }
 
     def _next(self, image: int) -> Vector:
-        """Create the image with the number `image`, and return the signal values before encoding, shape (signals,)."""
+        """Encode the test vectors of image number `image`, and return the signal values before encoding, shape (signals,)."""
         limits = (self._minimum, self._maximum, self._invalid)
         encoded = limits[image] if image < len(limits) else self._random.uniform(self._minimum, self._maximum)
         self._sender.values[:] = encoded

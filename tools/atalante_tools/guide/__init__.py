@@ -1,4 +1,4 @@
-"""Command `atalante guide`: test the promises of the virtual guides with an adversary.
+"""Command `atalante guide`: search for pushes that contradict the promises of the virtual guides.
 
 The promise of a guide is a torque at hip and knee. The certificate of the guide states that no push up to this torque moves a
 joint out of the guide. The adversary is a search for a push up to this torque that does move a joint out of the guide.
@@ -308,6 +308,6 @@ def random_command(count: int, first: int, steps: int, seed: int, as_json: bool)
     if left:
         worst = max(left, key=lambda v: v.worst_ratio or 0.0)
         raise Failed(
-            f"no joint may leave a certified guide, but a joint left {len(left)}; worst: {worst.shape} at Xi {worst.xi:.3f} with "
-            f"|e| / q_bound {worst.worst_ratio:.3f}"
+            f"no joint may leave a certified guide, got {len(left)} guides that a joint left; worst: {worst.shape} at "
+            f"Xi {worst.xi:.3f} with |e| / q_bound {worst.worst_ratio:.3f}"
         )

@@ -295,7 +295,7 @@ def walk_step(
 
 
 def safe_errors(goal: Goal, row: Vector, image: Vector, measured: Measured, guide: GuideTables, parts: Parts) -> None:
-    """Find the largest safe errors at every tenth cycle by bisection, see `IdealLeg.image`.
+    """Find the largest errors with h >= 0 at every tenth cycle by bisection, see `IdealLeg.image`.
 
     Args:
         goal: desired motion and guide.

@@ -1,4 +1,4 @@
-"""Check of a guide: comparison of its promise with the worst push that the adversary finds. `gait, shape, Xi -> Verdict`.
+"""Check of a guide: search for the worst push, and comparison with the promise. `gait, shape, Xi -> Verdict`.
 
 The largest pushes at hip and knee are exactly the promise. At the start of a step, the leg deviates from the nominal motion. The
 hand-over box (`HandOver`) is the range of the deviations for which the promise holds, and the adversary starts in its centre and
@@ -52,9 +52,9 @@ PATIENTS: Final = (
 _CORNERS: Final = 64
 #: Time by which the measured velocity of a drive lags behind the true velocity: low-pass and half a cycle [s].
 _VELOCITY_LAG: Final = 2.0e-3
-#: Largest multiple of the promise with which the adversary tries to push a joint out of the guide.
+#: Largest multiple of the promise up to which the search tries to push a joint out of the guide.
 LARGEST_FACTOR: Final = 6.0
-#: Steps for each factor tried in the search for `left_at`, as a share of `Effort.steps`.
+#: Number of steps for each multiple of the promise in the search for `left_at`, as a share of `Effort.steps`.
 _SHARE: Final = 0.1
 
 

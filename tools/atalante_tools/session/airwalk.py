@@ -181,7 +181,7 @@ def _walk_all(
             with _open(target, options, network, robot, controller, gait.hash32, robot_process, exoskeleton) as rig:
                 robot_process = _start_robot(target, stack) if name != last else None
                 if telemetry is None:
-                    # The certificates are printed only after the bus could be opened.
+                    # The certificates are printed after the bus was opened, because the bus may be missing.
                     certificates = {shape: walking.certificate(options.xi) for shape, walking in controllers.items()}
                     announce(certificates.values(), controller.config.mismatch, "swing leg of the empty exoskeleton")
                     about = {"seed": options.seed, "steps": options.steps, "xi": options.xi, **asdict(options.law)}

@@ -20,9 +20,9 @@ _Command = TypeVar("_Command", bound=Callable[..., Any])
 class Law:
     """Control law of the assisted joints. The field names are keys of summary.json."""
 
-    idealization: float = 1.0  # intensity of u_i while the guide does not act, 0 to 1
-    feedforward: float = 1.0  # intensity of u_f while the guide does not act, 0 to 1
-    literal: bool = False  # whether the law is that of the paper to the letter, without a promise
+    idealization: float = 1.0  # intensity of the joint idealization u_i while the guide does not act, 0 to 1
+    feedforward: float = 1.0  # intensity of the feedforward u_f while the guide does not act, 0 to 1
+    literal: bool = False  # whether the law follows the paper literally, without a promise
 
     def config(self) -> AirwalkConfig:
         """Return the parameters of the airwalk controller."""

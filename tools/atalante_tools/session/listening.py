@@ -1,4 +1,4 @@
-"""Listening to a bus for some seconds, for the commands that send nothing."""
+"""Reception of frames for some seconds, for commands that send nothing."""
 
 from __future__ import annotations
 
