@@ -32,6 +32,7 @@ from atalante_emulator.imu import ImuParameters, Imus, ImuSignals
 from atalante_emulator.link import FaultyBus
 from atalante_emulator.node_faults import NodeFaults
 from atalante_emulator.noise import NOISE_CYCLES, SensorNoise
+from atalante_emulator.patient import ActivePatient
 from atalante_emulator.pendant import Operator, PendantNode
 from atalante_emulator.virtual_operator import VirtualOperator
 from atalante_emulator.wearer import PassiveWearer
@@ -114,7 +115,7 @@ class Emulator:
         self.pelvis_forces: list[Callable[[int], Vector]] = []
         self.crane: Crane | None = None  # crane of a robot on the ground, also an element of `pelvis_forces`
         self.virtual_operator: VirtualOperator | None = None  # also an element of `pelvis_forces`
-        self.wearer: PassiveWearer | None = None  # wearer whose limbs act on the joints
+        self.wearer: PassiveWearer | ActivePatient | None = None  # wearer whose limbs act on the joints
         self._build_images()
         self._bind_commands()
         self._build_nodes(robot, parameters)

@@ -13,6 +13,7 @@ from atalante_emulator.bodies import ENGINES, FRICTION, Body, hang, make_body
 from atalante_emulator.crane import Crane
 from atalante_emulator.emulator import Emulator, EmulatorParameters
 from atalante_emulator.imu import ImuParameters
+from atalante_emulator.patient import ActivePatient, ActiveTask
 from atalante_emulator.virtual_operator import VirtualOperator
 from atalante_emulator.wearer import LimbParameters, PassiveWearer
 from atalante_hal.robot import JOINTS
@@ -39,6 +40,7 @@ class Mechanics:
     ground: Ground | None = None  # with None, the pelvis is fixed, and there is no floor
     #: Impedance of a passive wearer. With None, a wearer in the URDF affects the joints only by the masses of the limbs.
     limbs: LimbParameters | None = None
+    active: ActiveTask | None = None  # task of an active patient on the ground; None if the muscles do nothing
     parameters: EmulatorParameters | None = None  # true parameters of the nodes; see `node_parameters` for None
 
     @property
@@ -77,7 +79,9 @@ class Mechanics:
         Args:
             emulator: emulator with the body of `make_body`.
         """
-        if self.limbs is not None:
+        if self.active is not None:
+            emulator.wearer = ActivePatient(emulator.body, self.active, self.limbs)
+        elif self.limbs is not None:
             emulator.wearer = PassiveWearer(self.limbs)
         if self.ground is not None:
             emulator.crane = Crane(emulator.body)

@@ -19,6 +19,7 @@ COMMANDS = {
     "demo": ("commands.demo", "Run all parts in one command: an emulated robot walks in virtual guides."),
     "airwalk": ("commands.airwalk", "Walk in the air inside one virtual guide, on any bus."),
     "walk": ("commands.walk", "Walk on the ground with a patient, from standing to standing, on any bus."),
+    "trial": ("trial", "Repeat the experiments of the paper with virtual subjects, and write a report."),
     "emulator": ("commands.emulator", "Emulate the robot on a bus, for a HAL in another process."),
     "jog": ("commands.jog", "Move one joint to an angle."),
     "vibrate": ("commands.vibrate", "Run one vibration motor."),

@@ -67,7 +67,7 @@ def gaits_of(options: WalkOptions, robot: Robot) -> tuple[Patient, WalkGaits]:
         NetworkError: If the subject is outside the range of the network.
         Failed: If the gait optimisation is needed, but not installed.
     """
-    from atalante_control.gait.walk import DEFAULT_WALK, check_walk, load_walk
+    from atalante_control.gait.walk import DEFAULT_WALK, load_walk
     from atalante_control.model import Patient
 
     if options.gait is not None or options.subject is None or _is_default(options.subject):
@@ -81,18 +81,35 @@ def gaits_of(options: WalkOptions, robot: Robot) -> tuple[Patient, WalkGaits]:
             raise Failed(
                 f"the parameters of the step in {options.gait} must contain {error.args[0]}: add --mass and --height"
             ) from error
-    from atalante_control.dynamics.gait_network import load_network
+    return options.subject.patient, gaits_of_subject(options.subject, robot)
 
-    step = load_network().gait(options.subject, robot)
-    print_message(f"solving start step and stop step for {options.subject}")
+
+def gaits_of_subject(subject: Subject, robot: Robot) -> WalkGaits:
+    """Return the gaits of a subject: those of the default walk file, or of the network with solved start step and stop step.
+
+    Args:
+        subject: Patient and step.
+        robot: Limits of the joints.
+
+    Raises:
+        GaitError: If there is no start step or no stop step for the gait.
+        NetworkError: If the subject is outside the range of the network.
+        Failed: If the gait optimisation is needed, but not installed.
+    """
+    from atalante_control.dynamics.gait_network import load_network
+    from atalante_control.gait.walk import DEFAULT_WALK, check_walk, load_walk
     from atalante_tools.session.extra import extra
 
+    if _is_default(subject):
+        return load_walk(DEFAULT_WALK, robot)
+    step = load_network().gait(subject, robot)
+    print_message(f"solving start step and stop step for {subject}")
     with extra():
         from atalante_control.gait_optimization.walk import solve_walk
 
-        gaits = solve_walk(options.subject, step)
+        gaits = solve_walk(subject, step)
     check_walk(gaits, robot)
-    return options.subject.patient, gaits
+    return gaits
 
 
 def _is_default(subject: Subject) -> bool:

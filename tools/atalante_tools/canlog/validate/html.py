@@ -14,6 +14,7 @@ from atalante_hal.types import Vector
 from atalante_tools.canlog.validate.report import Report, verdict
 from atalante_tools.canlog.validate.rules import RULES
 from atalante_tools.canlog.validate.timing_rules import BINS, BINS_A_CYCLE
+from atalante_tools.console.html import html_table, page
 
 _WIDTH, _HEIGHT = 760, 200
 _LEFT, _RIGHT, _TOP, _BOTTOM = 64, 28, 24, 36
@@ -22,25 +23,13 @@ _COLOURS = ("#1b6ca8", "#c8553d", "#4f772d", "#7b4b94", "#b08900", "#3d5a6c", "#
 _POINTS = 720  # maximum number of points of a curve, about one point per pixel
 _HISTOGRAMS = 12  # maximum number of interval histograms in the report of a log
 _TIMING = ("cycle-mean", "cycle-jitter", "cycle-gap", "cycle-fast", "timeout", "recovered", "state-late")
-_STYLE = """
-body { font: 14px/1.45 system-ui, sans-serif; margin: 2em auto; max-width: 74em; padding: 0 1em; color: #1c1c1c; }
-h1 { font-size: 1.4em; } h2 { font-size: 1.1em; margin-top: 2em; } h3 { font-size: 1em; margin-bottom: 0.2em; }
-table { border-collapse: collapse; width: 100%; }
-th, td { text-align: left; padding: 0.25em 0.7em 0.25em 0; vertical-align: top; }
-th { border-bottom: 1px solid #888; } td { border-bottom: 1px solid #e2e2e2; } td.number { text-align: right; }
-.bad { color: #a3220f; font-weight: 600; } .good { color: #2d6a1e; font-weight: 600; } .small { color: #555; font-size: 0.9em; }
-svg text { font: 11px system-ui, sans-serif; fill: #333; }
-"""
 
 
 def write_html(results: Sequence[Report], path: Path) -> None:
     """Write the reports of all logs into one HTML file."""
-    parts = ["<!DOCTYPE html><html lang='en'><head><meta charset='utf-8'><title>atalante validate</title>"]
-    parts.append(f"<style>{_STYLE}</style></head><body><h1>CAN log against DBC</h1>")
-    for result in results:
-        parts += _log(result)
-    parts += ["<h2>Rules</h2>", _rules(), "</body></html>\n"]
-    path.write_text("\n".join(parts), encoding="utf-8")
+    parts = [part for result in results for part in _log(result)]
+    parts += ["<h2>Rules</h2>", _rules()]
+    path.write_text(page("atalante validate", "CAN log against DBC", parts), encoding="utf-8")
 
 
 def _log(result: Report) -> list[str]:
@@ -57,15 +46,15 @@ def _log(result: Report) -> list[str]:
             (f.rule, f.message, f.signal, f.node, f.count, f"{f.first_s:.6f}", f"{f.last_s:.6f}", f.worst)
             for f in result.findings
         ]
-        parts += ["<h3>Findings</h3>", _table(head, rows)]
+        parts += ["<h3>Findings</h3>", html_table(head, rows)]
     if result.silenced:
         rows_silenced = [(f.rule, f.message, f.signal, f.count, s.reason) for f, s in result.silenced]
-        parts += ["<h3>Silenced</h3>", _table(("Rule", "Message", "Signal", "Count", "Reason"), rows_silenced)]
+        parts += ["<h3>Silenced</h3>", html_table(("Rule", "Message", "Signal", "Count", "Reason"), rows_silenced)]
     if result.unchecked:
         rows_unchecked = [
             (", ".join(u.rules) or "all", u.reason, len(u.items) or "-", ", ".join(u.items)) for u in result.unchecked
         ]
-        parts += ["<h3>Not checked</h3>", _table(("Rules", "Reason", "Count", "Items"), rows_unchecked)]
+        parts += ["<h3>Not checked</h3>", html_table(("Rules", "Reason", "Count", "Items"), rows_unchecked)]
     if validator.frames:
         parts += ["<h3>Load of each bus over time</h3>", _load_plot(result)]
         parts += ["<h3>Counter gaps over time</h3>", _gap_plot(result)]
@@ -73,21 +62,12 @@ def _log(result: Report) -> list[str]:
     return parts
 
 
-def _table(head: Sequence[str], rows: Sequence[Sequence[object]]) -> str:
-    def cell(value: object) -> str:
-        return f"<td{' class=number' if isinstance(value, int) else ''}>{escape(str(value))}</td>"
-
-    lines = ["<tr>" + "".join(f"<th>{escape(name)}</th>" for name in head) + "</tr>"]
-    lines += ["<tr>" + "".join(map(cell, row)) + "</tr>" for row in rows]
-    return "\n".join(["<table>", *lines, "</table>"])
-
-
 def _rules() -> str:
     rows = [
         (r.id, r.meaning, r.source, ", ".join(f"{name} = {value}" for name, value in r.thresholds.items()))
         for r in RULES
     ]
-    return _table(("Rule", "Meaning", "Source", "Thresholds"), rows)
+    return html_table(("Rule", "Meaning", "Source", "Thresholds"), rows)
 
 
 # -- plots -----------------------------------------------------------------------------------------------------------------

@@ -1,0 +1,115 @@
+"""Metabolism of the emulated patient: `muscle work, muscle torque -> metabolic rate -> O2, CO2 -> measured metabolic rate`.
+
+The muscles of `patient.ActivePatient` have a cost in addition to the rate of quiet standing:
+
+    M = m standing + P+ / positive + P- / negative + activation * |u|
+
+P+ is the power of muscles that shorten, P- the magnitude of the power of muscles that lengthen, |u| the sum of the magnitudes of
+the muscle torques. The respirometer sees oxygen and carbon dioxide after the delay of blood and lungs, with noise. The equation
+of Brockway converts them back to a metabolic rate, as in the experiments of the paper.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+
+from atalante_hal.types import Vector
+
+#: Energy per litre of oxygen and of carbon dioxide [J/l], without the term of urinary nitrogen
+#: (Brockway, "Derivation of formulae used to calculate energy expenditure in man", Hum. Nutr. Clin. Nutr. 41C, 1987).
+OXYGEN: Final = 16_580.0
+CARBON_DIOXIDE: Final = 4_510.0
+#: Period of all series in this module [s].
+SAMPLE: Final = 1.0
+
+
+@dataclass(frozen=True)
+class MetabolismParameters:
+    """Parameters of metabolism and respirometer. Values without a source are assumptions."""
+
+    #: W/kg, quiet standing (first term of the walking equation of Looney et al., Med. Sci. Sports Exerc. 51, 2019)
+    standing: float = 1.44
+    positive: float = 0.25  # efficiency of positive muscle work (Margaria, Int. Z. Angew. Physiol. 25, 1968)
+    negative: float = 1.20  # magnitude of the efficiency of negative muscle work (Margaria 1968)
+    #: W/Nm, cost of a torque without motion: 0.054 times the largest joint speed (Minetti, Alexander, J. Theor. Biol. 186, 1997),
+    #: which is taken as 10 rad/s
+    activation: float = 0.54
+    quotient: float = 0.85  # respiratory exchange ratio, litres of CO2 per litre of O2
+    oxygen_time: float = 30.0  # s, time constant of oxygen uptake after a change of the metabolic rate
+    carbon_dioxide_time: float = 60.0  # s, time constant of carbon dioxide output; body tissue stores the gas
+    noise: float = 0.05  # standard deviation of a sample of the respirometer, as a fraction of the sample
+
+
+def metabolic_rate(
+    positive: Vector, negative: Vector, torque: Vector, mass: float, parameters: MetabolismParameters | None = None
+) -> Vector:
+    """Return the metabolic rate [W] of a person who stands and uses muscles.
+
+    Args:
+        positive: power of shortening muscles, shape (n,) [W].
+        negative: magnitude of the power of lengthening muscles, shape (n,) [W].
+        torque: sum of the magnitudes of the muscle torques, shape (n,) [Nm].
+        mass: mass of the person [kg].
+        parameters: parameters of the metabolism. With None, the defaults are used.
+    """
+    p = parameters or MetabolismParameters()
+    rate: Vector = p.standing * mass + positive / p.positive + negative / p.negative + p.activation * torque
+    return rate
+
+
+def treadmill_rate(speed: float, mass: float) -> float:
+    """Return the metabolic rate [W] of a person who walks on a level treadmill without an exoskeleton.
+
+    This is the equation 1.44 + 1.94 v^0.43 + 0.24 v^4 [W/kg] of Looney et al. (Med. Sci. Sports Exerc. 51, 2019), fitted to
+    measurements of healthy adults. It is not a simulation of the legs.
+
+    Args:
+        speed: walking speed [m/s].
+        mass: mass of the person [kg].
+    """
+    return mass * (1.44 + 1.94 * math.pow(speed, 0.43) + 0.24 * math.pow(speed, 4.0))
+
+
+def gas_exchange(
+    rate: Vector, seed: int | Sequence[int] | None = None, parameters: MetabolismParameters | None = None
+) -> tuple[Vector, Vector]:
+    """Return oxygen uptake and carbon dioxide output as a respirometer measures them, each of shape (n,) [l/s].
+
+    The person is in steady state at the first sample.
+
+    Args:
+        rate: metabolic rate in steps of `SAMPLE`, shape (n,) [W].
+        seed: seed of the noise. With None, there is no noise.
+        parameters: parameters of the metabolism. With None, the defaults are used.
+    """
+    p = parameters or MetabolismParameters()
+    consumed = rate / (OXYGEN + p.quotient * CARBON_DIOXIDE)
+    oxygen, carbon = _lagged(consumed, p.oxygen_time), _lagged(p.quotient * consumed, p.carbon_dioxide_time)
+    if seed is not None:
+        random = np.random.default_rng(seed)
+        oxygen = oxygen * (1.0 + p.noise * random.standard_normal(len(rate)))
+        carbon = carbon * (1.0 + p.noise * random.standard_normal(len(rate)))
+    return oxygen, carbon
+
+
+def brockway(oxygen: Vector, carbon_dioxide: Vector) -> Vector:
+    """Return the metabolic rate [W] by the equation of Brockway (1987).
+
+    Args:
+        oxygen: oxygen uptake, shape (n,) [l/s].
+        carbon_dioxide: carbon dioxide output, shape (n,) [l/s].
+    """
+    return OXYGEN * oxygen + CARBON_DIOXIDE * carbon_dioxide
+
+
+def _lagged(series: Vector, time: float) -> Vector:
+    """Return a series behind a lag of first order that starts in steady state."""
+    keep, lagged = math.exp(-SAMPLE / time), series.copy()
+    for i in range(1, len(series)):
+        lagged[i] = keep * lagged[i - 1] + (1.0 - keep) * series[i]
+    return lagged

@@ -1,0 +1,228 @@
+"""Active patient in the emulated robot: muscles that track the nominal gait at SH and SK of the swing leg.
+
+    joint angles, landings -> perceived error -> feedback with a delay + learned torque -> muscles -> torque, work
+
+The patient lives in the emulator. The HAL and the controller neither read nor command anything in this module. A passive patient
+is `wearer.PassiveWearer` alone: limbs without muscle torque.
+
+From step to step, the learned torque follows u <- f u + g e. This is the law of motor adaptation as a greedy minimisation of
+error and effort: without error, the effort decays (Emken, Benitez, Sideris, Bobrow, Reinkensmeyer, "Motor adaptation as a greedy
+optimization of error and effort", J. Neurophysiol. 97, 2007). The patient has one set of parameters. No parameter depends on the
+trial.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+
+from atalante_emulator.bodies import GRAVITY, Body
+from atalante_emulator.wearer import LimbParameters, PassiveWearer
+from atalante_hal.robot import LEG_JOINTS, SIDES
+from atalante_hal.types import PERIOD, Vector
+
+Pair = tuple[float, float]
+
+_SH, _SK, _LEG = LEG_JOINTS.index("SH"), LEG_JOINTS.index("SK"), len(LEG_JOINTS)
+#: Loads of a foot, as fractions of the weight: a standing foot carries more, a foot in the air less, a landed foot more.
+_STANDING, _AIR, _LANDED = 0.25, 0.02, 0.1
+#: Time for which both feet must stand before the patient expects steps [cycles].
+_READY: Final = 500
+
+
+@dataclass(frozen=True)
+class ActiveParameters:
+    """Parameters of an active patient. A pair has a value for SH and a value for SK. Values without a source are assumptions.
+
+    Raises:
+        ValueError: If a parameter is out of range.
+    """
+
+    gain: Pair = (
+        150.0,
+        80.0,
+    )  # Nm/rad, feedback torque per perceived error: the stiffness of a person who resists a motion
+    damping: Pair = (15.0, 8.0)  # Nm s/rad, feedback torque per rate of the error
+    delay: float = 0.15  # s, voluntary reaction to a felt error (kinaesthetic reaction times are 0.12 to 0.18 s)
+    #: rad, errors up to this angle are not perceived. The sense of joint position has a threshold of one to two degrees at hip
+    #: and knee (Domingo, Lam, J. NeuroEng. Rehabil. 11, 2014).
+    threshold: float = math.radians(1.0)
+    learning: float = (
+        0.1  # g / gain: share of the feedback torque that the patient adds to the next step of the same leg
+    )
+    forgetting: float = 0.95  # f: share of the learned torque that the patient keeps for the next step of the same leg
+    noise: float = 0.1  # standard deviation of the torque as a fraction of the torque (signal-dependent noise)
+    noise_time: float = 0.1  # s, correlation time of the noise
+    activation: float = 0.05  # s, time constant from excitation to torque (Zajac, Crit. Rev. Biomed. Eng. 17, 1989)
+    #: Largest torque as a fraction of mass times gravity times height: maximum voluntary torque of the weaker direction, hip
+    #: flexion and knee flexion (Anderson, Madigan, Nussbaum, J. Biomech. 40, 2007).
+    strength: Pair = (0.113, 0.087)
+    fraction: float = 1.0  # strength of this patient as a fraction of an able-bodied person
+
+    def __post_init__(self) -> None:
+        for name in ("delay", "noise_time", "activation"):
+            if not (math.isfinite(getattr(self, name)) and getattr(self, name) >= PERIOD):
+                raise ValueError(f"{name} must be at least one cycle ({PERIOD} s), got {getattr(self, name)!r}")
+        for name in ("learning", "forgetting", "noise", "fraction"):
+            if not 0.0 <= getattr(self, name) <= 1.0:
+                raise ValueError(f"{name} must be from 0 to 1, got {getattr(self, name)!r}")
+        for name in ("gain", "damping", "strength"):
+            if not all(math.isfinite(value) and value >= 0.0 for value in getattr(self, name)):
+                raise ValueError(f"{name} must be two numbers of at least 0, got {getattr(self, name)!r}")
+
+
+@dataclass(frozen=True)
+class ActiveTask:
+    """Task of an active patient: the person, the motion to track, and the seed of the noise. It can be pickled."""
+
+    mass: float  # kg, of the patient
+    height: float  # m, of the patient
+    #: nominal angles of SH and SK of the swing leg in each cycle of a step, from landing to landing, shape (n + 1, 2) [rad]
+    swing: Sequence[Pair]
+    seed: int = 0
+    parameters: ActiveParameters = ActiveParameters()
+
+
+class ActivePatient:
+    """Legs of an active patient: the limbs of a passive wearer, and muscles at SH and SK of the swing leg.
+
+    The patient feels the joint angles and the load on the feet. A landing starts the next step of the other leg.
+
+    Attributes:
+        muscle: Torques of the muscles in the last cycle, shape (12,) [Nm].
+        strength: Largest magnitudes of the muscle torques of SH and SK [Nm].
+        positive_work: Work of the muscles on the joints (concentric) since the creation [J].
+        negative_work: Magnitude of the work of the joints on the muscles (eccentric) since the creation [J].
+        impulse: Integral of the magnitudes of the muscle torques since the creation [Nm s].
+    """
+
+    def __init__(self, body: Body, task: ActiveTask, limbs: LimbParameters | None = None) -> None:
+        """Create the patient at rest. The patient has learned nothing.
+
+        Args:
+            body: robot with a free pelvis on a floor.
+            task: person and motion.
+            limbs: impedance of the relaxed limbs. With None, the default impedance is used.
+        """
+        parameters = task.parameters
+        self._body, self._limbs, self._p = body, PassiveWearer(limbs), parameters
+        self._nominal = np.array(task.swing, dtype=np.float64)
+        self._rate = np.gradient(self._nominal, PERIOD, axis=0)
+        self._random = np.random.default_rng(task.seed)
+        moment = parameters.fraction * task.mass * GRAVITY * task.height
+        self.strength: Pair = (parameters.strength[0] * moment, parameters.strength[1] * moment)
+        cycles = len(self._nominal)
+        self._delay = round(parameters.delay / PERIOD)
+        self._lag = PERIOD / (parameters.activation + PERIOD)
+        self._learned = np.zeros((len(SIDES), cycles, 2))
+        self._plan = np.zeros((cycles, 2))  # learned torque of the current step, without noise
+        self._wobble = np.ones((cycles, 2))  # factor of the torque in the current step
+        self._error, self._slope = np.zeros((cycles, 2)), np.zeros((cycles, 2))
+        self._swing, self._cycle, self._ready = -1, 0, 0  # no step before the first landing
+        self._air = [False] * len(SIDES)
+        self._weight = body.mass * GRAVITY
+        self.muscle = np.zeros(len(SIDES) * _LEG)
+        self.positive_work = self.negative_work = self.impulse = 0.0
+
+    def act(self, position: Vector, velocity: Vector, torque: Vector) -> None:
+        """Compute the torques of limbs and muscles on the joints.
+
+        Args:
+            position: joint positions, shape (12,) [rad].
+            velocity: joint velocities, shape (12,) [rad/s].
+            torque: output for the torques, shape (12,) [Nm].
+        """
+        self._limbs.act(position, velocity, torque)
+        self._feel_landings()
+        wanted = self._excite(position, velocity)
+        for side in range(len(SIDES)):
+            for k, joint in enumerate((side * _LEG + _SH, side * _LEG + _SK)):
+                goal = wanted[k] if side == self._swing else 0.0
+                tension = float(self.muscle[joint])
+                if tension == 0.0 and goal == 0.0:
+                    continue
+                tension += self._lag * (goal - tension)
+                tension = min(max(tension, -self.strength[k]), self.strength[k])
+                self.muscle[joint] = tension
+                torque[joint] += tension
+                work = PERIOD * tension * float(velocity[joint])
+                self.positive_work += max(work, 0.0)
+                self.negative_work += max(-work, 0.0)
+                self.impulse += PERIOD * abs(tension)
+
+    def _feel_landings(self) -> None:
+        """Start the step of the other leg when a foot lands. Before the first step, wait until both feet have stood."""
+        left, right = self._body.sole_force[:, :, 2].sum(axis=1).tolist() if self._body.touching else (0.0, 0.0)
+        loads = (left / self._weight, right / self._weight)
+        if self._ready < _READY:
+            self._ready = self._ready + 1 if min(loads) > _STANDING else 0
+            return
+        for side, load in enumerate(loads):
+            if load < _AIR:
+                self._air[side] = True
+            elif load > _LANDED and self._air[side]:
+                self._air[side] = False
+                self._begin(1 - side)
+
+    def _begin(self, swing: int) -> None:
+        """Learn from the last step, and begin a step of a leg (0 left, 1 right)."""
+        if self._swing >= 0:
+            self._learn(min(self._cycle, len(self._nominal)))
+        self._swing, self._cycle = swing, 0
+        self._plan = self._learned[swing]
+        self._wobble = 1.0 + self._p.noise * self._noise(len(self._nominal))
+
+    def _learn(self, cycles: int) -> None:
+        """Update the learned torque of the leg that has swung, from the errors of its first cycles."""
+        felt = np.zeros_like(self._error)
+        felt[:cycles] = _perceived(self._error[:cycles], self._p.threshold)
+        self._learned[self._swing] *= self._p.forgetting
+        self._learned[self._swing] += self._p.learning * np.array(self._p.gain) * _smooth(felt)
+
+    def _noise(self, cycles: int) -> Vector:
+        """Return noise with mean 0, standard deviation 1 and the correlation time, shape (cycles, 2)."""
+        keep = math.exp(-PERIOD / self._p.noise_time)
+        window = round(5.0 * self._p.noise_time / PERIOD)
+        kernel = keep ** np.arange(window)
+        kernel /= math.sqrt(float(kernel @ kernel))
+        white = self._random.standard_normal((cycles + window - 1, 2))
+        return np.column_stack([np.convolve(white[:, k], kernel, "valid") for k in range(2)])
+
+    def _excite(self, position: Vector, velocity: Vector) -> Pair:
+        """Return the excitation of SH and SK of the swing leg as torques [Nm], and advance the step by one cycle."""
+        cycle = self._cycle
+        if self._swing < 0 or cycle >= len(self._nominal):
+            return 0.0, 0.0
+        first = self._swing * _LEG
+        for k, joint in enumerate((first + _SH, first + _SK)):
+            self._error[cycle, k] = self._nominal[cycle, k] - position[joint]
+            self._slope[cycle, k] = self._rate[cycle, k] - velocity[joint]
+        self._cycle += 1
+        past = cycle - self._delay
+        wanted = []
+        for k in range(2):
+            goal = float(self._plan[cycle, k])
+            if past >= 0:
+                error = float(self._error[past, k])
+                felt = math.copysign(max(abs(error) - self._p.threshold, 0.0), error)
+                if felt:
+                    goal += self._p.gain[k] * felt + self._p.damping[k] * float(self._slope[past, k])
+            wanted.append(goal * float(self._wobble[cycle, k]))
+        return wanted[0], wanted[1]
+
+
+def _perceived(error: Vector, threshold: float) -> Vector:
+    """Return the part of each error above the threshold, with its sign."""
+    felt: Vector = np.sign(error) * np.maximum(np.abs(error) - threshold, 0.0)
+    return felt
+
+
+def _smooth(profile: Vector) -> Vector:
+    """Return the moving average over 0.1 s of each column, because a person does not learn faster torques."""
+    window = round(0.1 / PERIOD)
+    kernel = np.full(window, 1.0 / window)
+    return np.column_stack([np.convolve(column, kernel, "same") for column in profile.T])

@@ -1,0 +1,175 @@
+"""Findings: each one passes on results that show it and fails on results that do not. The report contains all of them."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from atalante_tools.trial.findings import assist_findings, shape_findings, sweep_findings
+from atalante_tools.trial.plan import SWEEP, ShapeTrial, TreadmillTrial, WalkTrial, fields
+from atalante_tools.trial.report import write_report
+from atalante_tools.trial.run import EDGES
+
+MASSES = (58.0, 62.0, 66.0, 70.0, 75.0, 80.0, 85.0, 91.0)
+VERSIONS = {"atalante-hal": "0.1.0", "source": "0123456789abcdef"}
+Result = dict[str, Any]
+
+
+def shape_result(shape: str, ratio: float) -> Result:
+    curve = [[0.1 * k, 5.0, 4.0, 8.0, 0.0] for k in range(11)]
+    trial = ShapeTrial(shape, 1, 0.5, 0, "mujoco")
+    return {"trial": fields(trial), "versions": VERSIONS, "outcome": "done", "max_ratio": ratio, "curves": [curve]}
+
+
+def walk_result(
+    mass: float, active: bool, xi: float, *, net: float, error: float, outer: float = 0.5, spread: float = 0.3,
+    order: str = "",
+) -> Result:  # fmt: skip
+    trial = WalkTrial(mass, 1.75, active, xi, (1, 1, 1), "constant", 1.0, 1.0, 7, "mujoco", order)
+    histogram = [10] * (len(EDGES) - 1)
+    guide = {"outer": outer, "spread": spread, "histogram": [histogram, histogram]} if xi < 1.0 else None
+    return {
+        "trial": fields(trial), "versions": VERSIONS, "outcome": "stood", "steps": 3, "certified": True,
+        "max_ratio": 0.6 if xi < 1.0 else None, "error_deg": {"full": 0.5, "transition": 0.7, "target": error},
+        "metabolic_w_kg": {"full": 1.44, "transition": 1.44, "target": 1.44 + net}, "muscle_w_kg": net, "guide": guide,
+        "respirometer": {"segment": [0, 1, 2], "rate_w_kg": [1.44, 1.44, 1.44 + net]},
+        "curves": [[[0.1 * k, 5.0, 20.0, 4.0, 21.0, 4.0, 4.0] for k in range(9)]],
+    }  # fmt: skip
+
+
+def study(**changed: dict[str, float]) -> list[Result]:
+    """Return the results of a study that shows all findings of the paper, with other values in some conditions."""
+    values: dict[str, dict[str, float]] = {
+        "passive_full": {"net": 0.0, "error": 0.5},
+        "passive_partial": {"net": 0.001, "error": 2.0, "outer": 0.8, "spread": 0.2},
+        "active_full": {"net": 0.002, "error": 0.5},
+        "active_partial": {"net": 0.1, "error": 1.5, "outer": 0.4, "spread": 0.4},
+    }
+    for name, change in changed.items():
+        values[name].update(change)
+    return [
+        walk_result(mass, name.startswith("active"), 1.0 if name.endswith("full") else 0.5, **value)  # type: ignore[arg-type]
+        for mass in MASSES
+        for name, value in values.items()
+    ]
+
+
+def sweep(slope: float = 0.2, drift: float = 0.0, error_slope: float = 2.0) -> list[Result]:
+    results = [
+        walk_result(75.0, True, xi, net=slope * (1.0 - xi) + drift * k, error=0.5 + error_slope * (1.0 - xi) + 10 * drift * k,
+                    order=f"day1-{k + 1:02d}")
+        for k, xi in enumerate(SWEEP)
+    ]  # fmt: skip
+    rates = {"full": None, "transition": 2.3, "target": 2.41}
+    treadmill = {
+        "trial": fields(TreadmillTrial(75.0, 0.2, 300, 0, "day1")),
+        "versions": VERSIONS,
+        "outcome": "computed",
+    }
+    return [{**treadmill, "metabolic_w_kg": rates}, *results]
+
+
+def verdicts(findings: list[Any]) -> dict[str, bool | None]:
+    return {finding.id: finding.passed for finding in findings}
+
+
+def test_study_that_shows_all_findings_passes() -> None:
+    found = verdicts(assist_findings(study()))
+    assert list(found) == [
+        "assist-contained", "passive-gather", "active-spread", "passive-flat", "active-partial-above",
+        "active-full-near-passive", "active-tracks-better",
+    ]  # fmt: skip
+    assert set(found.values()) == {True}
+
+
+@pytest.mark.parametrize(
+    ("finding", "changed"),
+    [
+        ("passive-gather", {"passive_partial": {"outer": 0.3}}),
+        ("active-spread", {"active_partial": {"spread": 0.1}}),
+        ("passive-flat", {"passive_partial": {"net": 0.05}}),
+        ("passive-flat", {"passive_partial": {"net": -0.05}}),
+        ("active-partial-above", {"active_partial": {"net": 0.0}}),
+        ("active-full-near-passive", {"active_full": {"net": 0.05}}),
+        ("active-tracks-better", {"active_partial": {"error": 2.1}}),
+    ],
+)
+def test_study_without_a_finding_fails_this_finding_alone(finding: str, changed: dict[str, dict[str, float]]) -> None:
+    found = verdicts(assist_findings(study(**changed)))
+    assert [name for name, passed in found.items() if not passed] == [finding]
+
+
+def test_a_joint_outside_or_a_fall_fails_containment() -> None:
+    for change in ({"max_ratio": 1.01}, {"outcome": "fell"}):
+        results = study()
+        results[1].update(change)
+        assert verdicts(assist_findings(results))["assist-contained"] is False
+    assert verdicts(shape_findings([shape_result("constant", 0.5), shape_result("snap", 1.0)])) == {
+        "shapes-contained": True
+    }
+    assert verdicts(shape_findings([shape_result("constant", 0.5), shape_result("snap", 1.1)])) == {
+        "shapes-contained": False
+    }
+
+
+def test_one_subject_of_eight_against_a_finding_is_accepted_two_are_not() -> None:
+    results = study()
+    for wrong, passed in ((0, True), (1, True), (2, False)):
+        for result in results:
+            trial = result["trial"]
+            if trial["mass"] in MASSES[:wrong] and trial["active"] and trial["xi"] == 0.5:
+                result["error_deg"]["target"] = 3.0
+        assert verdicts(assist_findings(results))["active-tracks-better"] is passed  # p = 0.004, 0.035, 0.145
+
+
+def test_sweep_findings_pass_and_fail() -> None:
+    assert set(verdicts(sweep_findings(sweep())).values()) == {True}
+    flat = verdicts(sweep_findings(sweep(slope=0.0)))
+    assert flat["sweep-metabolic-trend"] is False
+    assert flat["sweep-error-trend"] is True
+    falling = verdicts(sweep_findings(sweep(error_slope=-0.2)))
+    assert falling["sweep-error-trend"] is False
+    tired = verdicts(sweep_findings(sweep(slope=0.1, drift=0.05)))
+    assert tired["sweep-metabolic-symmetry"] is False
+    assert tired["sweep-error-symmetry"] is False
+
+
+def test_changing_baseline_fails_its_finding() -> None:
+    results = sweep()
+    results[1]["metabolic_w_kg"]["full"] = 2.0
+    assert verdicts(sweep_findings(results))["sweep-baseline"] is False
+
+
+def test_findings_without_results_have_no_verdict() -> None:
+    for findings in (shape_findings([]), assist_findings([]), sweep_findings([])):
+        assert {finding.passed for finding in findings} == {None}
+
+
+@pytest.mark.parametrize("experiment", ["shapes", "assist", "sweep"])
+def test_report_contains_every_finding_and_requests_nothing(experiment: str, tmp_path: Path) -> None:
+    results, find = {
+        "shapes": ([shape_result("constant", 0.5), shape_result("snap", 1.2)], shape_findings),
+        "assist": (study(active_partial={"net": -0.1}), assist_findings),
+        "sweep": (sweep(drift=0.05), sweep_findings),
+    }[experiment]
+    findings = find(results)
+    path = tmp_path / "report.html"
+    write_report(experiment, results, findings, True, 1, path)
+    text = path.read_text()
+    for finding in findings:
+        row = next(row for row in text.split("<tr>") if f"<td>{finding.id}</td>" in row)
+        assert f">{'pass' if finding.passed else 'FAIL'}</td>" in row
+        assert finding.statistic.split(";")[0].replace("&", "&amp;").replace("'", "&#x27;") in row
+    assert any(finding.passed is False for finding in findings)
+    assert "Short trials" in text
+    assert "1 trials have no result" in text
+    assert "0123456789abcdef" in text
+    assert "seeds" in text
+    assert "engine" in text
+    assert text.count("data:image/png;base64,") == {"shapes": 1, "assist": 4, "sweep": 2}[experiment]
+    sources = re.findall(r"(?:src|href|url)\s*[=(]\s*['\"]?([^'\" >]{1,30})", text)
+    assert all(source.startswith("data:image/png") for source in sources)
+    assert "http" not in re.sub(r"base64,[^']*", "", text)

@@ -1,0 +1,220 @@
+"""Trials: plans, keys, stored results, resumption after a kill, equal numbers on one and two processes, and the command."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+from click.testing import CliRunner
+
+from atalante_control.model import Patient
+from atalante_emulator.metabolism import MetabolismParameters
+from atalante_tools.cli import cli
+from atalante_tools.trial import plan, store
+from atalante_tools.trial.plan import PROTOCOL, SWEEP, Trial, WalkSetting, WalkTrial, assist_trials, key, sweep_trials
+from atalante_tools.trial.run import run_trial
+from atalante_tools.trial.store import compute, path_of, stored
+
+SETTING = WalkSetting((2, 1, 2), "constant", 1.0, 1.0, 3, "mujoco")
+SUBJECT = Patient(75.0, 1.75)
+#: Three short walks of the default subject, whose gaits are in a file.
+TINY: list[Trial] = [
+    SETTING.walk(SUBJECT, active, xi, index)
+    for index, (active, xi) in enumerate([(True, 0.0), (False, 0.5), (True, 1.0)])
+]
+PROGRAM = """
+import sys
+from pathlib import Path
+from atalante_control.model import Patient
+from atalante_tools.trial.plan import WalkSetting
+from atalante_tools.trial.store import compute
+setting, subject = WalkSetting((2, 1, 2), "constant", 1.0, 1.0, 3, "mujoco"), Patient(75.0, 1.75)
+trials = [setting.walk(subject, active, xi, i) for i, (active, xi) in enumerate([(True, 0.0), (False, 0.5), (True, 1.0)])]
+for _ in compute(trials, Path(sys.argv[1])):
+    pass
+"""
+
+
+@pytest.fixture(scope="module")
+def reference(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Folder with the results of `TINY`, computed in this process."""
+    folder = tmp_path_factory.mktemp("reference")
+    assert len(list(compute(TINY, folder))) == len(TINY)
+    return folder
+
+
+def content(folder: Path) -> dict[str, bytes]:
+    return {path.name: path.read_bytes() for path in folder.glob("*.json")}
+
+
+def await_result(folder: Path, process: subprocess.Popen[str]) -> None:
+    deadline = time.monotonic() + 240.0
+    while not list(folder.glob("*.json")):
+        assert process.poll() is None, process.communicate()
+        assert time.monotonic() < deadline
+        time.sleep(0.02)
+
+
+def test_study_has_four_trials_of_eight_subjects() -> None:
+    trials = assist_trials(replace(SETTING, protocol=PROTOCOL))
+    assert len({trial.name for trial in trials}) == len({trial.seed for trial in trials}) == len(trials) == 32
+    walks = [trial for trial in trials if isinstance(trial, WalkTrial)]
+    assert {(t.active, t.xi) for t in walks} == {(False, 1.0), (False, 0.5), (True, 1.0), (True, 0.5)}
+    assert {t.protocol for t in walks} == {(112, 38, 225)}
+    assert [t.mass for t in assist_trials(SETTING, [91.0])] == [91.0] * 4  # type: ignore[union-attr]
+
+
+def test_sweep_goes_down_and_up_again_on_each_day() -> None:
+    trials = sweep_trials(SETTING, SWEEP, 2)
+    assert len({trial.name for trial in trials}) == len({trial.seed for trial in trials}) == len(trials) == 20
+    assert [t.kind for t in trials[:2]] == ["treadmill", "walk"]
+    factors = [t.xi for t in trials[1:10] if isinstance(t, WalkTrial)]
+    assert factors == factors[::-1] == [1.0, 0.75, 0.5, 0.25, 0.0, 0.25, 0.5, 0.75, 1.0]
+
+
+def test_key_depends_on_every_parameter_and_on_the_versions(monkeypatch: pytest.MonkeyPatch) -> None:
+    trial = SETTING.walk(SUBJECT, True, 0.5, 0)
+    changes: list[dict[str, Any]] = [
+        {"mass": 76.0}, {"height": 1.76}, {"active": False}, {"xi": 0.4}, {"protocol": (1, 1, 3)}, {"shape": "pinched"},
+        {"idealization": 0.9}, {"feedforward": 0.9}, {"seed": 1}, {"engine": "pybullet"}, {"order": "day1-01"},
+    ]  # fmt: skip
+    keys = {key(trial), *(key(replace(trial, **change)) for change in changes)}
+    assert len(keys) == 1 + len(changes)
+    assert {name for change in changes for name in change} == {field.name for field in dataclasses.fields(trial)}
+    monkeypatch.setattr(plan, "versions", lambda: {"atalante-hal": "9.9"})
+    assert key(trial) not in keys
+
+
+def test_results_contain_what_the_findings_need(reference: Path) -> None:
+    active, passive, full = (stored(trial, reference) for trial in TINY)
+    assert active is not None
+    assert passive is not None
+    assert full is not None
+    for result in (active, passive, full):
+        assert (result["outcome"], result["steps"]) == ("stood", 5)
+        assert 0.1 < result["error_deg"]["full"] < 2.0
+        assert result["curves"]
+    assert passive["muscle_w_kg"] == 0.0
+    assert active["muscle_w_kg"] > 0.0
+    assert active["error_deg"]["target"] > full["error_deg"]["target"]
+    assert 0.0 < passive["max_ratio"] <= 1.0
+    assert (full["max_ratio"], full["guide"]) == (None, None)
+    assert sum(passive["guide"]["histogram"][0]) > 50
+    rate = passive["respirometer"]["rate_w_kg"]
+    assert sum(rate) / len(rate) == pytest.approx(MetabolismParameters().standing, rel=0.15)
+
+
+def test_two_processes_give_the_same_files_as_one(reference: Path, tmp_path: Path) -> None:
+    assert len(list(compute(TINY, tmp_path, jobs=2))) == len(TINY)
+    assert content(tmp_path) == content(reference)
+
+
+def test_a_killed_run_is_resumed_with_the_same_files(reference: Path, tmp_path: Path) -> None:
+    with subprocess.Popen([sys.executable, "-c", PROGRAM, str(tmp_path)], stderr=subprocess.PIPE, text=True) as process:
+        await_result(tmp_path, process)
+        process.kill()
+    assert process.returncode == -signal.SIGKILL
+    kept = {path: path.stat().st_mtime_ns for path in tmp_path.glob("*.json")}
+    missing = [trial for trial in TINY if stored(trial, tmp_path) is None]
+    assert 0 < len(missing) < len(TINY)
+    assert len(list(compute(missing, tmp_path))) == len(missing)
+    assert content(tmp_path) == content(reference)
+    assert {path: path.stat().st_mtime_ns for path in kept} == kept
+
+
+def test_a_partly_written_file_is_no_result(tmp_path: Path) -> None:
+    path = path_of(TINY[0], tmp_path)
+    path.with_suffix(".123.part").write_text('{"trial"')
+    assert stored(TINY[0], tmp_path) is None
+
+
+def test_result_of_a_worker_with_other_versions_is_rejected(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(store, "_run", lambda trial: {"trial": plan.fields(trial), "versions": {"numpy": "1"}})
+    with pytest.raises(store.Failed, match="versions"):
+        list(compute(TINY[:1], tmp_path))
+    assert not content(tmp_path)
+
+
+def test_treadmill_is_computed_without_a_robot() -> None:
+    trial = sweep_trials(SETTING, SWEEP, 1)[0]
+    result = run_trial(trial)
+    assert result["outcome"] == "computed"
+    assert result["metabolic_w_kg"]["target"] == pytest.approx(2.411, rel=0.02)
+
+
+# -- command ---------------------------------------------------------------------------------------------------------------
+
+
+def test_command_interrupted_by_ctrl_c_keeps_its_results(tmp_path: Path) -> None:
+    program = [sys.executable, "-c", "from atalante_tools.entry import main; main()"]
+    line = [*program, "trial", "sweep", "--quick", "--jobs", "1", "--out", str(tmp_path)]
+    with subprocess.Popen(line, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
+        await_result(tmp_path / "trials", process)  # the treadmill
+        time.sleep(0.5)
+        process.send_signal(signal.SIGINT)
+        out, err = process.communicate(timeout=60)
+    assert process.returncode == 130
+    assert out == ""
+    assert "repeat the command" in err
+    assert "Traceback" not in err
+    assert len(content(tmp_path / "trials")) >= 1
+    assert not (tmp_path / "report.html").exists()
+
+
+def test_command_uses_stored_results_and_writes_the_report(
+    reference: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    ran: list[str] = []
+
+    def run(trial: Trial) -> dict[str, Any]:
+        ran.append(trial.name)
+        like = stored(TINY[0 if isinstance(trial, WalkTrial) and trial.xi < 1.0 else 2], reference)
+        assert like is not None
+        return {**like, "trial": plan.fields(trial)}
+
+    monkeypatch.setattr(store, "_run", run)
+    arguments = ["trial", "assist", "--mass", "75", "--jobs", "1", "--json", "--out", str(tmp_path)]
+    done = CliRunner().invoke(cli, arguments)
+    assert done.exit_code == 0, done.output
+    assert len(ran) == 4
+    lines = [json.loads(line) for line in done.stdout.splitlines()]
+    assert [line["outcome"] for line in lines[:4]] == ["stood"] * 4
+    assert [line["id"] for line in lines[4:]][:2] == ["assist-contained", "passive-gather"]
+    assert "data:image/png" in (tmp_path / "report.html").read_text()
+    (tmp_path / "report.html").unlink()
+    os.remove(next((tmp_path / "trials").glob("*active-xi0.5*.json")))
+    again = CliRunner().invoke(cli, [word for word in arguments if word != "--json"])
+    assert again.exit_code == 0, again.output
+    assert len(ran) == 5  # only the removed one
+    assert "passive-flat" in again.stdout
+    assert (tmp_path / "report.html").exists()
+
+
+def test_a_fall_fails_the_command_and_is_reported(
+    tmp_path: Path, reference: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    like = stored(TINY[0], reference)
+    assert like is not None
+    monkeypatch.setattr(store, "_run", lambda trial: {**like, "trial": plan.fields(trial), "outcome": "fell"})
+    done = CliRunner().invoke(
+        cli, ["trial", "assist", "--quick", "--mass", "75", "--jobs", "1", "--out", str(tmp_path)]
+    )
+    assert done.exit_code == 1
+    assert "4 of 4 trials did not end as planned" in done.stderr
+    assert "fell" in (tmp_path / "report.html").read_text()
+
+
+def test_unknown_subject_is_a_usage_error(tmp_path: Path) -> None:
+    done = CliRunner().invoke(cli, ["trial", "assist", "--mass", "99", "--out", str(tmp_path / "x")])
+    assert done.exit_code == 2
+    assert "58, 62" in done.stderr
+    assert not (tmp_path / "x").exists()

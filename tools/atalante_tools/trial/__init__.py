@@ -1,0 +1,232 @@
+"""Command `atalante trial`: the three experiments of the paper, with virtual subjects on the emulated robot.
+
+experiment -> trials (`plan`) -> results in files (`run`, `store`) -> findings -> report.html
+"""
+
+from __future__ import annotations
+
+import os
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, TypeVar
+
+import click
+
+from atalante_tools.console.options import (
+    MUJOCO,
+    PYBULLET,
+    SEED,
+    Between,
+    json_option,
+    options_as,
+)
+from atalante_tools.console.outcome import Failed
+from atalante_tools.console.stop_request import Stopped, check_stop
+from atalante_tools.console.terminal import Progress, print_message, show_json, table
+
+if TYPE_CHECKING:
+    from atalante_tools.trial.findings import Finding, Result
+    from atalante_tools.trial.plan import Trial
+
+_Command = TypeVar("_Command", bound=Callable[..., Any])
+_BAR = 24  # characters
+
+
+@dataclass(frozen=True)
+class Running:
+    """Options of all experiments."""
+
+    out: Path  # folder of the results and of the report
+    quick: bool  # whether the trials are few and short
+    jobs: int  # number of processes
+    dask: str  # address of a dask scheduler; empty for processes on this computer
+    engine: str  # physics engine
+    seed: int  # seed of the experiment
+
+
+@dataclass(frozen=True)
+class Walking:
+    """Options of the experiments on the ground."""
+
+    shape: str  # guide shape
+    idealization: float
+    feedforward: float
+
+
+def _running(experiment: str) -> Callable[[_Command], _Command]:
+    """Return a decorator that adds the options of all experiments, passed as the argument `running`."""
+    options = [
+        click.option("--out", type=click.Path(path_type=Path, file_okay=False), default=f"runs/{experiment}", show_default=True,
+                     metavar="DIR", help="Folder for report.html and one file per trial. A trial with a valid file is not run "
+                                         "again."),
+        click.option("--quick", is_flag=True, help="Run few and short trials, to try the command."),
+        click.option("--jobs", type=click.IntRange(1), default=os.cpu_count() or 1, show_default="number of cores",
+                     metavar="N", help="Number of parallel processes."),
+        click.option("--dask", default="", metavar="ADDRESS",
+                     help="Run on the workers of this dask scheduler, such as tcp://127.0.0.1:8786."),
+        click.option("--engine", type=click.Choice((MUJOCO, PYBULLET)), default=MUJOCO, show_default=True,
+                     help="Physics engine of the emulated robot. MuJoCo is the faster one on the ground."),
+        click.option("--seed", type=SEED, default=0, show_default=True, metavar="N", help="Seed of all random numbers."),
+        json_option,
+    ]  # fmt: skip
+    return options_as("running", Running, options)
+
+
+def _walking() -> Callable[[_Command], _Command]:
+    """Return a decorator that adds the options of the experiments on the ground, passed as the argument `walking`."""
+    options = [
+        click.option("--shape", type=click.Choice(("constant", "pinched")), default="constant", show_default=True,
+                     help="Shape of the guide. The guide of the paper is constant."),
+        click.option("--idealization", type=Between(0.0, 1.0), default=1.0, show_default=True, metavar="X",
+                     help="Intensity of the joint idealization. With less, the subject must carry more of the leg."),
+        click.option("--feedforward", type=Between(0.0, 1.0), default=1.0, show_default=True, metavar="X",
+                     help="Intensity of the feedforward. With less, the subject must accelerate more of the leg."),
+    ]  # fmt: skip
+    return options_as("walking", Walking, options)
+
+
+@click.group()
+def command() -> None:
+    """Repeat the experiments of the paper with virtual subjects on the emulated robot, and write a report.
+
+    The report, one HTML file, contains tables, figures, and each finding of the paper with its statistic and its verdict. A
+    verdict of FAIL is a result, not an error of the command. Each trial is stored in a file of its own as soon as it has ended.
+    After an interruption, the same command runs only the missing trials.
+
+    \b
+    Example: atalante trial shapes
+             atalante trial assist --jobs 2
+             atalante trial sweep --quick
+    """
+
+
+@command.command(short_help="Walk in the air inside every guide shape.")
+@_running("shapes")
+def shapes(running: Running, as_json: bool) -> None:
+    """Walk in the air inside every guide shape, with the empty exoskeleton and without feedforward."""
+    from atalante_control.guide.shapes import SHAPES
+    from atalante_tools.trial.findings import shape_findings
+    from atalante_tools.trial.plan import PARTIAL, QUICK_SHAPE_STEPS, SHAPE_STEPS, shape_trials
+
+    steps = QUICK_SHAPE_STEPS if running.quick else SHAPE_STEPS
+    _conduct(
+        "shapes",
+        shape_trials(tuple(SHAPES), steps, PARTIAL, running.seed, running.engine),
+        shape_findings,
+        running,
+        as_json,
+    )
+
+
+@command.command(short_help="Compare full and partial assistance, with passive and active subjects.")
+@click.option("--mass", "masses", type=float, multiple=True, metavar="KG",
+              help="Mass of a subject [kg]. Repeat the option for several subjects.  [default: all eight]")  # fmt: skip
+@_walking()
+@_running("assist")
+def assist(masses: tuple[float, ...], walking: Walking, running: Running, as_json: bool) -> None:
+    """Compare full and partial assistance: eight subjects, each passive and active, four walks of five minutes each."""
+    from atalante_control.gait.subject import STUDY_PATIENTS
+    from atalante_tools.trial.findings import assist_findings
+    from atalante_tools.trial.plan import PROTOCOL, QUICK_MASSES, QUICK_PROTOCOL, assist_trials
+
+    known = [patient.mass for patient in STUDY_PATIENTS]
+    if unknown := [mass for mass in masses if mass not in known]:
+        raise click.UsageError(f"--mass must be one of {', '.join(f'{mass:g}' for mass in known)}, got {unknown[0]:g}")
+    if running.quick:
+        masses = masses or QUICK_MASSES
+    trials = assist_trials(_setting(walking, running, QUICK_PROTOCOL if running.quick else PROTOCOL), masses)
+    _conduct("assist", trials, assist_findings, running, as_json)
+
+
+@command.command(short_help="Walk with falling and rising assistance factors.")
+@click.option("--days", type=click.IntRange(1), default=3, show_default=True, metavar="N",
+              help="Number of days. A day is the treadmill and one walk for each assistance factor.")  # fmt: skip
+@_walking()
+@_running("sweep")
+def sweep(days: int, walking: Walking, running: Running, as_json: bool) -> None:
+    """Walk with the assistance factors 1, 0.75, 0.5, 0.25, 0 and back: one active subject, walks of five minutes each."""
+    from atalante_tools.trial.findings import sweep_findings
+    from atalante_tools.trial.plan import PROTOCOL, QUICK_PROTOCOL, QUICK_SWEEP, SWEEP, sweep_trials
+
+    factors, protocol = (QUICK_SWEEP, QUICK_PROTOCOL) if running.quick else (SWEEP, PROTOCOL)
+    trials = sweep_trials(_setting(walking, running, protocol), factors, 1 if running.quick else days)
+    _conduct("sweep", trials, sweep_findings, running, as_json)
+
+
+def _setting(walking: Walking, running: Running, protocol: tuple[int, int, int]) -> Any:
+    from atalante_tools.trial.plan import WalkSetting
+
+    return WalkSetting(protocol, walking.shape, walking.idealization, walking.feedforward, running.seed, running.engine)
+
+
+def _conduct(
+    experiment: str,
+    trials: Sequence[Trial],
+    find: Callable[[Sequence[Result]], list[Finding]],
+    running: Running,
+    as_json: bool,
+) -> None:
+    """Run the missing trials, write the report, and print the findings.
+
+    Raises:
+        Failed: If the robot fell or stopped in a trial.
+    """
+    from atalante_tools.session.run_folder import run_folder
+    from atalante_tools.trial.report import summary, verdict, write_report
+    from atalante_tools.trial.store import stored
+
+    with run_folder(running.out):
+        _run_missing(trials, running)
+        results = [result for trial in trials if (result := stored(trial, running.out / "trials")) is not None]
+        findings = find(results)
+        write_report(
+            experiment, results, findings, running.quick, len(trials) - len(results), running.out / "report.html"
+        )
+    if as_json:
+        for result in results:
+            show_json(summary(result))
+        for finding in findings:
+            show_json(asdict(finding))
+    else:
+        click.echo(table([["finding", "verdict", "statistic"], *([f.id, verdict(f), f.statistic] for f in findings)]))
+    print_message(f"in {running.out}: report.html, {len(results)} results in trials")
+    failed = [result for result in results if result["outcome"] not in ("stood", "done", "computed")]
+    if failed:
+        names = ", ".join(f"{r['trial']['name']} ({r['outcome']})" for r in failed[:3])
+        raise Failed(f"{len(failed)} of {len(results)} trials did not end as planned: {names}")
+
+
+def _run_missing(trials: Sequence[Trial], running: Running) -> None:
+    """Run the trials that have no result, and show a progress bar.
+
+    Raises:
+        Stopped: If a signal arrived. The results so far are in the folder.
+    """
+    from atalante_tools.session.body import require_engine
+    from atalante_tools.trial.store import compute, stored
+
+    folder = running.out / "trials"
+    missing = [trial for trial in trials if stored(trial, folder) is None]
+    if not missing:
+        return
+    if not running.dask:  # on a cluster, the engine is needed only on the workers
+        require_engine(running.engine)
+    where = f"the workers of {running.dask}" if running.dask else f"{running.jobs} processes"
+    print_message(f"{len(missing)} of {len(trials)} trials to run on {where}")
+    progress, begun, done = Progress(), time.monotonic(), 0
+    try:
+        for _ in compute(missing, folder, jobs=min(running.jobs, len(missing)), cluster=running.dask):
+            done += 1
+            check_stop()
+            if progress.due():
+                full = _BAR * done // len(missing)
+                left = (time.monotonic() - begun) / done * (len(missing) - done)
+                progress.show(f"[{'#' * full}{'.' * (_BAR - full)}] {done} of {len(missing)} trials, {left:.0f} s left")
+    except Stopped:
+        progress.clear()
+        print_message(f"stopped, {done} of {len(missing)} trials done; repeat the command to run the others")
+        raise
+    finally:
+        progress.clear()

@@ -1,0 +1,244 @@
+"""Findings of the paper, tested on the results of the trials: `results -> one line per finding, with statistic and verdict`.
+
+The limits in this file were chosen before the trials of the documentation ran. A finding without results has no verdict.
+"""
+
+from __future__ import annotations
+
+import math
+import statistics
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any, Final
+
+Result = dict[str, Any]
+
+#: Two metabolic rates are called equal if their means differ by at most this part of the rate of quiet standing (1.44 W/kg).
+SAME: Final = 0.02
+STANDING: Final = 1.44  # W/kg
+#: Smallest rank correlation with the assistance factor that counts as a trend, and largest asymmetry of the sweep in time.
+TREND, ASYMMETRY = 0.8, 0.25
+#: Largest coefficient of variation of the baseline metabolic rates of a sweep.
+VARIATION: Final = 0.05
+
+
+@dataclass(frozen=True)
+class Finding:
+    """Finding of the paper. The field names are the keys of `--json`."""
+
+    id: str
+    claim: str  # sentence of the paper, in short
+    statistic: str  # measured values and limit
+    passed: bool | None  # None if the results are missing
+
+
+def shape_findings(results: Sequence[Result]) -> list[Finding]:
+    """Return the finding of the first experiment.
+
+    Args:
+        results: results of `shape` trials.
+    """
+    claim = "in every guide shape, the joints stay inside the bounds"
+    ratios = {r["trial"]["shape"]: r["max_ratio"] for r in results if r["outcome"] == "done"}
+    if not ratios:
+        return [Finding("shapes-contained", claim, "no results", None)]
+    worst = max(ratios, key=lambda name: ratios[name])
+    inside = sum(ratio <= 1.0 for ratio in ratios.values())
+    text = f"{inside} of {len(results)} shapes contained; largest |e|/q_bound {ratios[worst]:.2f} ({worst}), limit 1"
+    return [Finding("shapes-contained", claim, text, inside == len(results))]
+
+
+def assist_findings(results: Sequence[Result]) -> list[Finding]:
+    """Return the findings of the second experiment.
+
+    Args:
+        results: results of `walk` trials, four for each subject.
+    """
+    subjects = _by_subject(results)
+    return [
+        _contained("assist-contained", results),
+        _paired(
+            "passive-gather", "passive trajectories gather at the guide more than active ones", subjects,
+            lambda s: s["passive partial"]["guide"]["outer"], lambda s: s["active partial"]["guide"]["outer"],
+            "share of time in the outer half of the guide, passive {a:.2f}, active {b:.2f}",
+        ),
+        _paired(
+            "active-spread", "active trajectories spread over more of the guide than passive ones", subjects,
+            lambda s: s["active partial"]["guide"]["spread"], lambda s: s["passive partial"]["guide"]["spread"],
+            "standard deviation of e/q_bound, active {a:.3f}, passive {b:.3f}",
+        ),
+        _same(
+            "passive-flat", "the metabolic rate of passive subjects is the same with full and with partial assistance",
+            subjects, "passive partial", "passive full",
+        ),
+        _paired(
+            "active-partial-above", "with partial assistance, active subjects have a higher metabolic rate than passive ones",
+            subjects, lambda s: _net(s["active partial"]), lambda s: _net(s["passive partial"]),
+            "exercise minus baseline, active {a:+.4f} W/kg, passive {b:+.4f} W/kg",
+        ),
+        _same(
+            "active-full-near-passive", "with full assistance, active subjects have nearly the metabolic rate of passive ones",
+            subjects, "active full", "passive full",
+        ),
+        _paired(
+            "active-tracks-better", "with partial assistance, active subjects track the gait better than passive ones",
+            subjects, lambda s: s["passive partial"]["error_deg"]["target"],
+            lambda s: s["active partial"]["error_deg"]["target"],
+            "RMS tracking error, passive {a:.3f} deg, active {b:.3f} deg",
+        ),
+    ]  # fmt: skip
+
+
+def sweep_findings(results: Sequence[Result]) -> list[Finding]:
+    """Return the findings of the third experiment.
+
+    Args:
+        results: results of `walk` trials of the sweep; results of `treadmill` trials are ignored.
+    """
+    walks = sorted((r for r in results if _complete(r)), key=lambda r: str(r["trial"]["order"]))
+    rate, error = "the normalised metabolic rate rises as Xi falls", "the tracking error rises as Xi falls"
+    return [
+        _contained("sweep-contained", [r for r in results if r["trial"]["kind"] == "walk"]),
+        _trend("sweep-metabolic-trend", rate, walks, normalised, ".3f"),
+        _trend("sweep-error-trend", error, walks, lambda r: r["error_deg"]["target"], ".2f"),
+        _symmetry("sweep-metabolic-symmetry", "the metabolic rate is symmetric in time about Xi = 0", walks, normalised),
+        _symmetry(
+            "sweep-error-symmetry", "the tracking error is symmetric in time about Xi = 0", walks,
+            lambda r: r["error_deg"]["target"],
+        ),
+        _baseline(walks),
+    ]  # fmt: skip
+
+
+def condition(result: Result) -> str:
+    """Return the condition of a walk: passive or active, full or partial.
+
+    Args:
+        result: result of a walk.
+    """
+    trial = result["trial"]
+    return f"{'active' if trial['active'] else 'passive'} {'full' if trial['xi'] == 1.0 else 'partial'}"
+
+
+def normalised(result: Result) -> float:
+    """Return the metabolic rate of the exercise part, divided by that of the baseline part (full assistance) of the same trial.
+
+    Args:
+        result: result of a walk.
+    """
+    return float(result["metabolic_w_kg"]["target"] / result["metabolic_w_kg"]["full"])
+
+
+def _net(result: Result) -> float:
+    """Return the metabolic rate of the exercise part minus that of the baseline part of the same trial [W/kg]."""
+    return float(result["metabolic_w_kg"]["target"] - result["metabolic_w_kg"]["full"])
+
+
+def _complete(result: Result) -> bool:
+    return bool(result["trial"]["kind"] == "walk" and result["outcome"] == "stood")
+
+
+def _by_subject(results: Sequence[Result]) -> list[dict[str, Result]]:
+    """Return the four results of each subject by their condition. A subject with a missing or failed trial is left out."""
+    subjects: dict[float, dict[str, Result]] = {}
+    for result in results:
+        if _complete(result):
+            subjects.setdefault(result["trial"]["mass"], {})[condition(result)] = result
+    return [subject for _, subject in sorted(subjects.items()) if len(subject) == 4]
+
+
+def _contained(id_: str, results: Sequence[Result]) -> Finding:
+    claim = "in all trials, the trajectories stay inside the guide"
+    ratios = [r["max_ratio"] for r in results if r["max_ratio"] is not None]
+    if not results:
+        return Finding(id_, claim, "no results", None)
+    stood = sum(r["outcome"] == "stood" for r in results)
+    largest = max(ratios, default=0.0)
+    text = f"{stood} of {len(results)} walks ended standing; largest |e|/q_bound {largest:.2f}, limit 1"
+    return Finding(id_, claim, text, stood == len(results) and largest <= 1.0)
+
+
+def _paired(
+    id_: str,
+    claim: str,
+    subjects: Sequence[dict[str, Result]],
+    larger: Callable[[dict[str, Result]], float],
+    smaller: Callable[[dict[str, Result]], float],
+    text: str,
+) -> Finding:
+    """Return a finding that one quantity is larger than another, by a one-sided sign test over the subjects.
+
+    With fewer than five subjects no sign test reaches 5 %. Then the difference must have the claimed sign in every subject.
+    """
+    if not subjects:
+        return Finding(id_, claim, "no results", None)
+    a, b = [larger(s) for s in subjects], [smaller(s) for s in subjects]
+    count, wins = len(subjects), sum(x > y for x, y in zip(a, b, strict=True))
+    probability = sum(math.comb(count, k) for k in range(wins, count + 1)) / 2**count
+    means = text.format(a=statistics.fmean(a), b=statistics.fmean(b))
+    passed = probability < 0.05 if count >= 5 else wins == count
+    return Finding(id_, claim, f"{means}; in {wins} of {count} subjects, sign test p = {probability:.3f}", passed)
+
+
+def _same(id_: str, claim: str, subjects: Sequence[dict[str, Result]], one: str, other: str) -> Finding:
+    if not subjects:
+        return Finding(id_, claim, "no results", None)
+    differences = [_net(s[one]) - _net(s[other]) for s in subjects]
+    mean, limit = statistics.fmean(differences), SAME * STANDING
+    spread = statistics.stdev(differences) if len(differences) > 1 else 0.0
+    text = (
+        f"{one} minus {other}: {mean:+.4f} W/kg, standard deviation {spread:.4f}, {len(subjects)} subjects, "
+        f"limit {limit:.3f} (2 % of standing)"
+    )
+    return Finding(id_, claim, text, abs(mean) <= limit)
+
+
+def _trend(id_: str, claim: str, walks: Sequence[Result], value: Callable[[Result], float], form: str) -> Finding:
+    factors = [r["trial"]["xi"] for r in walks]
+    if len(set(factors)) < 3:
+        return Finding(id_, claim, "no results", None)
+    values = [value(r) for r in walks]
+    means = {
+        xi: statistics.fmean(v for v, x in zip(values, factors, strict=True) if x == xi) for xi in sorted(set(factors))
+    }
+    rho = statistics.correlation(_ranks(factors), _ranks(values)) if len(set(values)) > 1 else 0.0
+    shown = ", ".join(f"Xi {xi:g}: {mean:{form}}" for xi, mean in reversed(means.items()))
+    passed = rho <= -TREND and means[min(means)] > means[max(means)]
+    return Finding(id_, claim, f"{shown}; rank correlation with Xi {rho:+.2f}, limit {-TREND:+.1f}", passed)
+
+
+def _symmetry(id_: str, claim: str, walks: Sequence[Result], value: Callable[[Result], float]) -> Finding:
+    """Return the finding that the k-th trial and the k-th last trial of a day have the same value."""
+    days: dict[str, list[Result]] = {}
+    for walk in walks:
+        days.setdefault(walk["trial"]["order"].split("-")[0], []).append(walk)
+    pairs, values = list[float](), list[float]()
+    for day in days.values():
+        factors = [r["trial"]["xi"] for r in day]
+        if factors == factors[::-1]:  # a day with a missing trial is left out
+            values += [value(r) for r in day]
+            pairs += [abs(value(day[k]) - value(day[-1 - k])) for k in range(len(day) // 2)]
+    if not pairs:
+        return Finding(id_, claim, "no results", None)
+    span = max(values) - min(values)
+    ratio = statistics.fmean(pairs) / span if span else 0.0
+    text = f"mean difference of the way down and the way up: {ratio:.2f} of the range of the sweep, limit {ASYMMETRY:g}"
+    return Finding(id_, claim, text, ratio <= ASYMMETRY)
+
+
+def _baseline(walks: Sequence[Result]) -> Finding:
+    claim = "the baseline metabolic rate is consistent between the trials"
+    rates = [r["metabolic_w_kg"]["full"] for r in walks]
+    if len(rates) < 2:
+        return Finding("sweep-baseline", claim, "no results", None)
+    variation = statistics.stdev(rates) / statistics.fmean(rates)
+    text = (
+        f"mean {statistics.fmean(rates):.3f} W/kg, "
+        f"coefficient of variation {100 * variation:.1f} %, limit {100 * VARIATION:.0f} %"
+    )
+    return Finding("sweep-baseline", claim, text, variation <= VARIATION)
+
+
+def _ranks(values: Sequence[float]) -> list[float]:
+    """Return the rank of each value. Equal values share the mean of their ranks."""
+    return [sum(v < value for v in values) + 0.5 * (sum(v == value for v in values) - 1) for value in values]

@@ -1,0 +1,232 @@
+"""Trials of the three experiments of the paper: `experiment, options -> list of trials`. Each trial has a key.
+
+The key is a hash of the parameters of the trial and of the versions of everything that computes it, so a stored result is used
+again only if a new run would give the same result.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import platform
+import sys
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from functools import cache
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, ClassVar, Final
+
+if TYPE_CHECKING:
+    from atalante_control.model import Patient
+
+#: Numbers of steps of 0.8 s: with full assistance (90 s), in the transition (30 s), with the factor of the trial (180 s).
+PROTOCOL: Final = (112, 38, 225)
+QUICK_PROTOCOL: Final = (3, 2, 5)
+#: Step of all walks: length [m] and duration [s].
+STEP: Final = (0.16, 0.8)
+#: Assistance factor of partial assistance, and those of the sweep in their order.
+PARTIAL: Final = 0.5
+SWEEP: Final = (1.0, 0.75, 0.5, 0.25, 0.0, 0.25, 0.5, 0.75, 1.0)
+QUICK_SWEEP: Final = (1.0, 0.5, 0.0, 0.5, 1.0)
+#: Right-stance steps inside each guide shape.
+SHAPE_STEPS, QUICK_SHAPE_STEPS = 30, 3
+#: Duration of the trial on the treadmill [s].
+TREADMILL_TIME: Final = 300
+#: Subject of the sweep: mass [kg] and height [m].
+SWEEP_SUBJECT: Final = (75.0, 1.75)
+#: Masses of the subjects of `assist --quick` [kg].
+QUICK_MASSES: Final = (58.0, 75.0)
+_PACKAGES: Final = ("numpy", "numba", "pin", "casadi", "pybullet", "mujoco-core")
+
+
+@dataclass(frozen=True)
+class ShapeTrial:
+    """Empty exoskeleton in the air, inside one guide shape, without feedforward."""
+
+    kind: ClassVar[str] = "shape"
+    shape: str
+    steps: int  # right-stance steps
+    xi: float
+    seed: int
+    engine: str
+
+    @property
+    def name(self) -> str:
+        """Return a name that is unique in the experiment."""
+        return f"shape-{self.shape}"
+
+
+@dataclass(frozen=True)
+class WalkTrial:
+    """Walk of a virtual subject on the ground, with the protocol of the paper."""
+
+    kind: ClassVar[str] = "walk"
+    mass: float  # kg, of the subject
+    height: float  # m, of the subject
+    active: bool  # whether the muscles of the subject track the gait
+    xi: float  # assistance factor after the transition
+    protocol: tuple[int, int, int]  # steps with full assistance, in the transition, and with `xi`
+    shape: str  # guide shape
+    idealization: float
+    feedforward: float
+    seed: int
+    engine: str
+    order: str = ""  # day and position of a trial of the sweep
+
+    @property
+    def name(self) -> str:
+        """Return a name that is unique in the experiment."""
+        effort = "active" if self.active else "passive"
+        return f"walk{self.order and '-' + self.order}-{self.mass:g}kg-{effort}-xi{self.xi:g}"
+
+
+@dataclass(frozen=True)
+class TreadmillTrial:
+    """Baseline of the sweep: an equation for level walking without exoskeleton, and the respirometer. No body is simulated."""
+
+    kind: ClassVar[str] = "treadmill"
+    mass: float  # kg, of the subject
+    speed: float  # m/s
+    seconds: int
+    seed: int
+    order: str
+
+    @property
+    def name(self) -> str:
+        """Return a name that is unique in the experiment."""
+        return f"treadmill-{self.order}-{self.mass:g}kg"
+
+
+Trial = ShapeTrial | WalkTrial | TreadmillTrial
+
+
+@dataclass(frozen=True)
+class WalkSetting:
+    """What all walks of an experiment share."""
+
+    protocol: tuple[int, int, int]
+    shape: str
+    idealization: float
+    feedforward: float
+    seed: int  # seed of the experiment; each trial has a seed of its own
+    engine: str
+
+    def walk(self, patient: Patient, active: bool, xi: float, index: int, order: str = "") -> WalkTrial:
+        """Return the trial of a subject.
+
+        Args:
+            patient: mass and height of the subject.
+            active: whether the subject is active.
+            xi: assistance factor after the transition.
+            index: number of the trial in the experiment.
+            order: day and position of a trial of the sweep.
+        """
+        return WalkTrial(
+            patient.mass, patient.height, active, xi, self.protocol, self.shape, self.idealization, self.feedforward,
+            1000 * self.seed + index, self.engine, order,
+        )  # fmt: skip
+
+
+def shape_trials(names: Sequence[str], steps: int, xi: float, seed: int, engine: str) -> list[Trial]:
+    """Return one trial for each guide shape.
+
+    Args:
+        names: names of the shapes.
+        steps: right-stance steps of each trial.
+        xi: assistance factor.
+        seed: seed of the sensor noise.
+        engine: name of the physics engine.
+    """
+    return [ShapeTrial(name, steps, xi, seed, engine) for name in names]
+
+
+def assist_trials(setting: WalkSetting, masses: Sequence[float] = ()) -> list[Trial]:
+    """Return four trials for each subject: passive and active, with full and with partial assistance.
+
+    Args:
+        setting: what all walks share.
+        masses: masses of the subjects [kg]. With none, all eight subjects.
+    """
+    from atalante_control.gait.subject import STUDY_PATIENTS
+
+    trials: list[Trial] = []
+    for number, patient in enumerate(STUDY_PATIENTS):
+        conditions = [(active, xi) for active in (False, True) for xi in (1.0, PARTIAL)]
+        if not masses or patient.mass in masses:
+            trials += [setting.walk(patient, *c, 4 * number + k) for k, c in enumerate(conditions)]
+    return trials
+
+
+def sweep_trials(setting: WalkSetting, factors: Sequence[float], days: int) -> list[Trial]:
+    """Return the trials of the sweep: on each day the treadmill, then one walk of the active subject for each factor.
+
+    Args:
+        setting: what all walks share.
+        factors: assistance factors in their order.
+        days: number of days. Days differ by their seeds alone.
+    """
+    from atalante_control.model import Patient
+
+    patient, trials, speed = Patient(*SWEEP_SUBJECT), list[Trial](), STEP[0] / STEP[1]
+    for day in range(days):
+        first = 100 + 20 * day
+        trials.append(TreadmillTrial(patient.mass, speed, TREADMILL_TIME, 1000 * setting.seed + first, f"day{day + 1}"))
+        trials += [
+            setting.walk(patient, True, xi, first + 1 + k, f"day{day + 1}-{k + 1:02d}") for k, xi in enumerate(factors)
+        ]
+    return trials
+
+
+@cache
+def versions() -> dict[str, str]:
+    """Return the version of Python, of this project, of its source text, and of the packages that compute a trial."""
+    found = {"python": platform.python_version(), "atalante-hal": version("atalante-hal"), "source": _source()}
+    for package in _PACKAGES:
+        try:
+            found[package] = version(package)
+        except PackageNotFoundError:
+            found[package] = "not installed"
+    return {**found, "machine": f"{platform.machine()} {sys.byteorder}"}
+
+
+def key(trial: Trial) -> str:
+    """Return the key of a trial: a hash of its parameters and of all versions.
+
+    Args:
+        trial: trial to identify.
+    """
+    content = {"kind": trial.kind, "parameters": asdict(trial), "versions": versions()}
+    return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()[:16]
+
+
+def _source() -> str:
+    """Return a hash of the source files and data files that a trial uses."""
+    import atalante_control
+    import atalante_dbc
+    import atalante_emulator
+    import atalante_hal
+
+    digest = hashlib.sha256()
+    roots = [
+        Path(next(iter(package.__path__)))
+        for package in (atalante_control, atalante_dbc, atalante_emulator, atalante_hal)
+    ]
+    for root in [*roots, Path(__file__).parent]:
+        for file in sorted(root.rglob("*")):
+            if file.is_file() and file.suffix not in (".pyc", ".md") and file.name not in _REPORTING:
+                digest.update(str(file.relative_to(root)).encode() + b"\0" + file.read_bytes())
+    return digest.hexdigest()[:16]
+
+
+#: Files of this package that do not compute results.
+_REPORTING: Final = ("__init__.py", "findings.py", "figures.py", "report.py", "store.py")
+
+
+def fields(trial: Trial) -> dict[str, Any]:
+    """Return kind, name and parameters of a trial as a JSON object.
+
+    Args:
+        trial: trial to describe.
+    """
+    return {"kind": trial.kind, "name": trial.name, **asdict(trial)}

@@ -1,0 +1,167 @@
+"""Report of an experiment as one HTML file, with embedded images: `results, findings -> tables, figures, report.html`."""
+
+from __future__ import annotations
+
+import base64
+from collections.abc import Callable, Sequence
+from html import escape
+from pathlib import Path
+from typing import Any, Final
+
+from atalante_tools.console.html import html_table, page
+from atalante_tools.console.terminal import print_message
+from atalante_tools.trial.findings import Finding, Result, condition
+
+#: Title of each experiment, and what its numbers mean.
+EXPERIMENTS: Final = {
+    "shapes": (
+        "Guide shapes",
+        "The empty exoskeleton walks in the air, without feedforward, inside each guide shape (first experiment of the paper).",
+    ),
+    "assist": (
+        "Full and partial assistance",
+        "Virtual subjects walk on the ground, passive and active, with full and with partial assistance (second experiment of "
+        "the paper). A passive subject has no muscle torque, so the metabolic rate is that of standing, and it is flat by "
+        "construction. An active subject tracks the gait at hip and knee of the swing leg. Metabolic rates pass through oxygen, "
+        "carbon dioxide and the equation of Brockway.",
+    ),
+    "sweep": (
+        "Assistance factors",
+        "One active virtual subject walks with a falling and then rising assistance factor (third experiment of the paper). Each "
+        "trial starts with a subject who has learned nothing and is not tired, so the symmetry in time tests noise, not "
+        "exhaustion. The treadmill is an equation for level walking at the same speed (Looney et al. 2019). No body is simulated "
+        "for it. The normalised metabolic rate is exercise divided by baseline, without subtraction of the resting rate: with "
+        "full assistance the virtual subject rests, so the difference would be close to zero.",
+    ),
+}  # fmt: skip
+_CERTIFIED: Final = {True: "yes", False: "no", None: "-"}
+_VERDICT: Final = {True: "pass", False: "FAIL", None: "not tested"}
+
+
+def verdict(finding: Finding) -> str:
+    """Return the verdict of a finding as text.
+
+    Args:
+        finding: finding to describe.
+    """
+    return _VERDICT[finding.passed]
+
+
+def write_report(
+    experiment: str, results: Sequence[Result], findings: Sequence[Finding], quick: bool, missing: int, path: Path
+) -> None:
+    """Write the report. Without Matplotlib, it contains no figures.
+
+    Args:
+        experiment: key of `EXPERIMENTS`.
+        results: results of the trials, in their order.
+        findings: findings of the experiment.
+        quick: whether the trials were shortened.
+        missing: number of trials without a result.
+        path: file to write.
+    """
+    title, text = EXPERIMENTS[experiment]
+    parts = [f"<p>{escape(text)}</p>"]
+    if quick:
+        parts.append(
+            "<p class='bad'>Short trials (--quick): few subjects and few steps. "
+            "The findings test the program, not the claims.</p>"
+        )
+    if missing:
+        parts.append(f"<p class='bad'>{missing} trials have no result.</p>")
+    parts += ["<h2>Findings</h2>", _findings(findings), "<h2>Trials</h2>", _trials(results), "<h2>Figures</h2>"]
+    parts += _figures(experiment, results)
+    parts += ["<h2>How it was computed</h2>", _provenance(results)]
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(page(f"atalante trial {experiment}", title, parts), encoding="utf-8")
+
+
+def summary(result: Result) -> dict[str, Any]:
+    """Return a result without its curves and series.
+
+    Args:
+        result: result of a trial.
+    """
+    return {
+        name: value for name, value in result.items() if name not in ("curves", "respirometer", "guide", "versions")
+    }
+
+
+def _findings(findings: Sequence[Finding]) -> str:
+    kinds = {True: "good", False: "bad", None: "small"}
+    rows = "".join(
+        f"<tr><td>{escape(f.id)}</td><td class='{kinds[f.passed]}'>{verdict(f)}</td>"
+        f"<td>{escape(f.claim)}</td><td>{escape(f.statistic)}</td></tr>"
+        for f in findings
+    )
+    return f"<table><tr><th>Finding</th><th>Verdict</th><th>Claim</th><th>Statistic</th></tr>{rows}</table>"
+
+
+def _trials(results: Sequence[Result]) -> str:
+    head = ("Trial", "Outcome", "Steps", "Certified", "Largest |e|/q_bound", "RMS error full [deg]", "RMS error target [deg]",
+            "Baseline [W/kg]", "Exercise [W/kg]", "Muscles alone [W/kg]")  # fmt: skip
+    rows = [
+        (
+            r["trial"]["name"], r["outcome"], r.get("steps", "-"), _CERTIFIED[r.get("certified")],
+            _number(r.get("max_ratio"), 2),
+            *(_number((r.get("error_deg") or {}).get(part), 3) for part in ("full", "target")),
+            *(_number((r.get("metabolic_w_kg") or {}).get(part), 4) for part in ("full", "target")),
+            _number(r.get("muscle_w_kg"), 4),
+        )
+        for r in results
+    ]  # fmt: skip
+    return html_table(head, rows)
+
+
+def _number(value: float | None, digits: int) -> str:
+    return "-" if value is None else f"{value:.{digits}f}"
+
+
+def _provenance(results: Sequence[Result]) -> str:
+    if not results:
+        return "<p>No trial has a result.</p>"
+    versions = {f"{name} {value}" for r in results for name, value in r["versions"].items()}
+    rows = [("versions", ", ".join(sorted(versions)))]
+    for name, meaning in (
+        ("seed", "seeds"), ("engine", "engine"), ("protocol", "steps: full assistance, transition, target"),
+        ("shape", "guide shape"), ("idealization", "idealization"), ("feedforward", "feedforward"),
+    ):  # fmt: skip
+        values = dict.fromkeys(str(r["trial"][name]) for r in results if name in r["trial"])
+        if values:
+            rows.append((meaning, ", ".join(values)))
+    rows.append(("mode", "emulated robot in lock-step (virtual time), HAL and bus in the loop, no virtual operator"))
+    return html_table(("Item", "Value"), rows)
+
+
+def _figures(experiment: str, results: Sequence[Result]) -> list[str]:
+    ended = [r for r in results if r["outcome"] in ("stood", "done", "computed")]
+    if not ended:
+        return ["<p>No trial ended.</p>"]
+    try:
+        from atalante_tools.trial import figures
+    except ModuleNotFoundError as error:
+        print_message(f"no figures: {error.name} is not installed; type `pip install 'atalante-hal[plot]'`")
+        return [f"<p>No figures: {escape(str(error.name))} is not installed.</p>"]
+    walks = [r for r in ended if r["trial"]["kind"] == "walk"]
+    if experiment == "shapes":
+        return [_image("left hip in each guide shape", lambda: figures.shapes(ended))]
+    if not walks:
+        return ["<p>No walk ended standing.</p>"]
+    if experiment == "assist":
+        masses = [r["trial"]["mass"] for r in walks]
+        mass = 75.0 if 75.0 in masses else masses[0]
+        partial = [r for r in walks if condition(r).endswith("partial")] or walks
+        return [
+            _image("metabolic rate over the time of a trial", lambda: figures.scenario(partial[-1])),
+            _image("hip and knee in the four conditions", lambda: figures.joints(walks, mass)),
+            _image("position in the guide", lambda: figures.positions(walks)),
+            _image("metabolic rate and tracking error", lambda: figures.power_and_error(walks)),
+        ]
+    return [
+        _image("metabolic rates and tracking errors in time", lambda: figures.sweep_in_time(ended)),
+        _image("normalised metabolic rate and tracking error", lambda: figures.sweep_trend(walks)),
+    ]
+
+
+def _image(text: str, draw: Callable[[], bytes]) -> str:
+    return f"<p><img alt='{escape(text)}' src='data:image/png;base64,{base64.b64encode(draw()).decode()}'></p>"

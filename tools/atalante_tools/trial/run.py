@@ -1,0 +1,375 @@
+"""Run one trial on the emulated robot: `trial -> rig in lock-step -> result as a JSON object`.
+
+HAL, bus, controller and emulator are those of `atalante airwalk` and `atalante walk`. Equal trials give equal results: time is
+virtual, and all random numbers come from the seed of the trial.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import replace
+from functools import cache
+from typing import Any, Final
+
+import numpy as np
+
+from atalante_control.airwalk.config import AirwalkConfig
+from atalante_control.airwalk.controller import AirwalkController
+from atalante_control.gait.gait import AIRWALK_GAIT, load_gait
+from atalante_control.gait.subject import Subject
+from atalante_control.gait.walk import WalkGaits
+from atalante_control.guide.shapes import SHAPES
+from atalante_control.model import Patient
+from atalante_control.walking.config import WALK_GUIDE, WalkConfig
+from atalante_control.walking.controller import WalkController
+from atalante_control.walking.phases import Phase
+from atalante_emulator.mechanics import Ground, Mechanics
+from atalante_emulator.metabolism import (
+    SAMPLE,
+    MetabolismParameters,
+    brockway,
+    gas_exchange,
+    metabolic_rate,
+    treadmill_rate,
+)
+from atalante_emulator.patient import ActivePatient, ActiveTask
+from atalante_emulator.pendant import Operator
+from atalante_emulator.wearer import LimbParameters
+from atalante_hal.loop import LockStep, run
+from atalante_hal.robot import LEG_JOINTS, load_robot
+from atalante_hal.types import PERIOD, State, SupervisorState, Vector
+from atalante_tools.console.options import EMBEDDED, Target
+from atalante_tools.console.stop_request import check_stop
+from atalante_tools.session.body import describe
+from atalante_tools.session.dial import Dial
+from atalante_tools.session.rig import Rig, open_hal
+from atalante_tools.session.walk_observation import Observation
+from atalante_tools.session.walk_options import gaits_of_subject
+from atalante_tools.trial.plan import STEP, ShapeTrial, TreadmillTrial, Trial, WalkTrial
+
+_SH, _LEG = LEG_JOINTS.index("SH"), len(LEG_JOINTS)
+_RIGHT: Final = 1
+_SAMPLING = 20  # cycles between two samples of the motion
+#: Time for which a robot that left ACTIVE is observed [cycles], because a HOLD within a step may end in a fall.
+_AFTERMATH: Final = 1500
+#: Number of swings of the left leg that a result contains as curves.
+_CURVES: Final = 15
+#: Edges of the histogram of e / q_bound.
+EDGES: Final = tuple(round(-1.0 + 0.05 * k, 2) for k in range(41))
+#: Names of the three parts of the protocol.
+SEGMENTS: Final = ("full", "transition", "target")
+
+
+def run_trial(trial: Trial) -> dict[str, Any]:
+    """Run a trial, and return its result. Other processes call this function, too.
+
+    Args:
+        trial: trial to run.
+    """
+    if isinstance(trial, ShapeTrial):
+        return _shape(trial)
+    return _walk(trial) if isinstance(trial, WalkTrial) else _treadmill(trial)
+
+
+# -- guide shapes ----------------------------------------------------------------------------------------------------------
+
+
+def _shape(trial: ShapeTrial) -> dict[str, Any]:
+    robot = load_robot()
+    gait = load_gait(AIRWALK_GAIT, robot)
+    controller = AirwalkController(robot, gait, SHAPES[trial.shape], AirwalkConfig(feedforward=0.0))
+    target = Target(EMBEDDED, "", lockstep=True, engine=trial.engine)
+    field = _columns(controller.telemetry_fields)
+    samples: list[list[float]] = []
+    with open_hal(
+        target,
+        robot=robot,
+        seed=trial.seed,
+        operator=Operator(),
+        assistance_factor=trial.xi,
+        controller_fields=controller.telemetry_fields,
+        gait_hash=gait.hash32,
+        mechanics=Mechanics(describe(robot), trial.engine),
+    ) as rig:
+
+        def record() -> None:
+            row = controller.telemetry
+            if (
+                rig.hal.state.cycle % _SAMPLING == 0
+                and controller.statistics.steps
+                and row[field["stance"]][0] == _RIGHT
+            ):
+                desired, (upper, lower) = row[field["q_des"]][_SH], row[field["guide"]]
+                if upper > 0.0:
+                    angles = np.degrees([desired + row[field["error"]][0], desired, desired + upper, desired - lower])
+                    samples.append([row[field["step"]][0], round(float(row[field["phase"]][0]), 4), *_rounded(angles)])
+
+        ending = _Ending(rig, lambda: controller.statistics.steps > trial.steps)
+        run(rig.hal, controller, LockStep(), until=ending, record=record)
+        certificate, statistics = controller.certificate(trial.xi), controller.statistics
+    curves: dict[float, list[list[float]]] = {}
+    for step, *sample in samples:
+        curves.setdefault(step, []).append(sample)
+    return {
+        "outcome": ending.outcome,
+        "steps": min(statistics.steps, trial.steps),
+        "certified": certificate.certified,
+        "max_ratio": round(statistics.max_ratio, 4),
+        "inside": round(statistics.inside_fraction, 6),
+        "filter_active": round(statistics.active_fraction, 4),
+        "curves": list(curves.values())[: trial.steps],
+    }
+
+
+# -- walks -----------------------------------------------------------------------------------------------------------------
+
+
+def _walk(trial: WalkTrial) -> dict[str, Any]:
+    robot, patient = load_robot(), Patient(trial.mass, trial.height)
+    gaits = _gaits(Subject(patient, *STEP))
+    guide = replace(WALK_GUIDE, idealization=trial.idealization, feedforward=trial.feedforward)
+    steps = sum(trial.protocol)
+    controller = WalkController(robot, patient, gaits, steps, WalkConfig(guide=guide), shape=SHAPES[trial.shape])
+    operator = Operator()
+    with open_hal(
+        Target(EMBEDDED, "", lockstep=True, engine=trial.engine),
+        robot=robot,
+        seed=trial.seed,
+        pose=controller.standing_pose.tolist(),
+        operator=operator,
+        assistance_factor=1.0,
+        controller_fields=controller.telemetry_fields,
+        gait_hash=gaits.step.hash32,
+        mechanics=Mechanics(
+            describe(robot, None, patient), trial.engine, Ground(), LimbParameters(), active=_task(trial, gaits)
+        ),
+    ) as rig:
+        observation, dial = Observation(rig, controller, None), Dial(operator, trial.protocol, trial.xi)
+        motion, effort = Motion(rig, controller), Effort(rig, controller, trial.protocol)
+
+        def record() -> None:
+            dial.turn(controller.statistics.steps)
+            motion.sample()
+            effort.sample()
+
+        ending = _Ending(rig, lambda: controller.done, observation)
+        run(rig.hal, controller, LockStep(), until=ending, record=record)
+        certified = controller.certificate(trial.xi).certified if trial.xi < 1.0 else None
+        deviation = observation.true_deviation()
+    statistics = controller.statistics
+    counted = statistics.guide.cycles > 0
+    return {
+        "outcome": ending.outcome,
+        "steps": statistics.steps,
+        "certified": certified,
+        "max_ratio": round(statistics.guide.max_ratio, 4) if counted else None,
+        "inside": round(statistics.guide.inside_fraction, 6) if counted else None,
+        **deviation,
+        **motion.result(trial.protocol),
+        **effort.result(trial.mass, trial.seed),
+    }
+
+
+@cache
+def _gaits(subject: Subject) -> WalkGaits:
+    gaits = gaits_of_subject(subject, load_robot())
+    check_stop()  # the optimiser discards the exception of a stop signal
+    return gaits
+
+
+def _task(trial: WalkTrial, gaits: WalkGaits) -> ActiveTask | None:
+    """Return the task of an active subject; None for a passive subject. In the file of a step, the left leg swings."""
+    if not trial.active:
+        return None
+    swing = gaits.step.tables().q[:, _SH : _SH + 2].tolist()
+    return ActiveTask(trial.mass, trial.height, [(hip, knee) for hip, knee in swing], trial.seed)
+
+
+class Motion:
+    """Samples of SH and SK of the swing leg in the periodic steps, until the nominal end of each step."""
+
+    def __init__(self, rig: Rig, controller: WalkController) -> None:
+        """Connect the samples to a run.
+
+        Args:
+            rig: rig of the run.
+            controller: controller of the run.
+        """
+        self._rig, self._controller = rig, controller
+        self._field = _columns(controller.telemetry_fields)
+        self._rows: list[tuple[float, ...]] = []
+
+    def sample(self) -> None:
+        """Store a sample if it is due."""
+        state, controller = self._rig.hal.state, self._controller
+        if state.cycle % _SAMPLING or controller.phase is not Phase.STEP:
+            return
+        row, field = controller.telemetry, self._field
+        elapsed = float(row[field["elapsed"]][0])
+        if elapsed <= STEP[1]:
+            stance = int(row[field["stance"]][0])
+            first = _LEG * (1 - stance) + _SH
+            joints = slice(first, first + 2)
+            self._rows.append(
+                (controller.statistics.steps, elapsed, stance, *state.position[joints].tolist(),
+                 *row[field["q_des"]][joints].tolist(), *row[field["q_bound"]].tolist())
+            )  # fmt: skip
+
+    def result(self, protocol: tuple[int, int, int]) -> dict[str, Any]:
+        """Return tracking errors, position in the guide, and curves of the last swings of the left leg.
+
+        Args:
+            protocol: numbers of steps of the three segments.
+        """
+        rows = np.array(self._rows).reshape(-1, 9)
+        step, stance, error, bound = rows[:, 0], rows[:, 2], rows[:, 3:5] - rows[:, 5:7], rows[:, 7:9]
+        last, errors = 0, {}
+        for name, count in zip(SEGMENTS, protocol, strict=True):
+            part = error[(step >= last) & (step < last + count)]
+            errors[name] = round(math.degrees(math.sqrt(float(np.mean(part**2)))), 4) if len(part) else None
+            last += count
+        guided = (step >= last - protocol[2]) & (bound.min(axis=1, initial=1.0) > 0.0)
+        return {
+            "error_deg": errors,
+            "guide": _position(error[guided] / bound[guided]) if guided.any() else None,
+            "curves": self._curves(rows[(step >= last - protocol[2]) & (stance == _RIGHT)]),
+        }
+
+    def _curves(self, rows: Vector) -> list[list[list[float]]]:
+        """Return phase, measured, desired and guide of SH, then of SK [deg], of each sample of the last steps."""
+        chosen = np.unique(rows[:, 0])[-_CURVES:]
+        return [
+            [[round(row[1] / STEP[1], 4), *_rounded(np.degrees(row[3:]))] for row in rows[rows[:, 0] == step]]
+            for step in chosen
+        ]
+
+
+def _position(ratio: Vector) -> dict[str, Any]:
+    """Return where the joints were in their guides.
+
+    Args:
+        ratio: e / q_bound of SH and SK, shape (n, 2).
+    """
+    return {
+        "outer": round(float(np.mean(np.abs(ratio).max(axis=1) > 0.5)), 4),  # share of the time in the outer half
+        "spread": round(float(ratio.std(axis=0).mean()), 4),  # standard deviation, mean of both joints
+        "histogram": [np.histogram(ratio[:, k], EDGES)[0].tolist() for k in range(2)],
+    }
+
+
+class Effort:
+    """Work of the muscles of the subject in each second of the walk, and the gas exchange that follows from it."""
+
+    def __init__(self, rig: Rig, controller: WalkController, protocol: tuple[int, int, int]) -> None:
+        """Connect the samples to a run.
+
+        Args:
+            rig: rig of the run.
+            controller: controller of the run.
+            protocol: numbers of steps of the three segments.
+        """
+        assert rig.emulator is not None
+        wearer = rig.emulator.wearer
+        self._patient = wearer if isinstance(wearer, ActivePatient) else None
+        self._controller, self._ends = controller, (protocol[0], protocol[0] + protocol[1])
+        self._cycle, self._totals, self._segments = 0, [(0.0, 0.0, 0.0)], list[int]()
+
+    def sample(self) -> None:
+        """Count a cycle of the periodic steps, and store the totals at the end of each second."""
+        if self._controller.phase is not Phase.STEP:
+            return
+        self._cycle += 1
+        if self._cycle % round(SAMPLE / PERIOD):
+            return
+        patient = self._patient
+        self._totals.append(
+            (patient.positive_work, patient.negative_work, patient.impulse) if patient else (0.0, 0.0, 0.0)
+        )
+        self._segments.append(sum(self._controller.statistics.steps >= end for end in self._ends))
+
+    def result(self, mass: float, seed: int) -> dict[str, Any]:
+        """Return metabolic rates of the segments [W/kg], and the series of the respirometer.
+
+        Args:
+            mass: mass of the subject [kg].
+            seed: seed of the trial.
+        """
+        rates = np.diff(np.array(self._totals), axis=0) / SAMPLE
+        return _respiration(metabolic_rate(rates[:, 0], rates[:, 1], rates[:, 2], mass), self._segments, mass, seed)
+
+
+def _respiration(rate: Vector, segments: Sequence[int], mass: float, seed: int) -> dict[str, Any]:
+    """Return what the respirometer measures of a subject who stood before the first sample.
+
+    Args:
+        rate: metabolic rate in each second, shape (n,) [W].
+        segments: number of the segment of each second, shape (n,).
+        mass: mass of the subject [kg].
+        seed: seed of the trial.
+    """
+    rest = MetabolismParameters().standing * mass
+    oxygen, carbon = (series[1:] for series in gas_exchange(np.concatenate([[rest], rate]), [seed, 1]))
+    measured, label = brockway(oxygen, carbon) / mass, np.array(segments)
+    means = {
+        name: round(float(measured[label == k].mean()), 5) if (label == k).any() else None
+        for k, name in enumerate(SEGMENTS)
+    }
+    series = {
+        "segment": label.tolist(),
+        "oxygen_ml_s": _rounded(1e3 * oxygen),
+        "carbon_dioxide_ml_s": _rounded(1e3 * carbon),
+    }
+    return {
+        "metabolic_w_kg": means,
+        "muscle_w_kg": round(float((rate[label == 2] - rest).mean()) / mass, 5) if (label == 2).any() else None,
+        "respirometer": {**series, "rate_w_kg": _rounded(measured)},
+    }
+
+
+def _treadmill(trial: TreadmillTrial) -> dict[str, Any]:
+    rate = np.full(trial.seconds, treadmill_rate(trial.speed, trial.mass))
+    segments = [2 if second >= trial.seconds - 180 else 1 for second in range(trial.seconds)]
+    return {"outcome": "computed", **_respiration(rate, segments, trial.mass, trial.seed)}
+
+
+# -- shared ----------------------------------------------------------------------------------------------------------------
+
+
+class _Ending:
+    """End condition of a trial, called once per cycle."""
+
+    def __init__(self, rig: Rig, done: Any, observation: Observation | None = None) -> None:
+        self._rig, self._done, self._observation = rig, done, observation
+        self._started, self._halted = False, 0
+        self.outcome = "hold"
+
+    def __call__(self, state: State) -> bool:
+        check_stop()
+        if self._observation is not None and self._observation.check():
+            self.outcome = "fell"
+            return True
+        if self._rig.hal.moving:
+            self._started = True
+            if self._done():
+                self.outcome = "stood" if self._observation is not None else "done"
+                return True
+            return False
+        self._halted += self._started
+        if state.supervisor is SupervisorState.FAULT:
+            self.outcome = "fault"
+        return self._halted > _AFTERMATH or (not self._started and self.outcome == "fault")
+
+
+def _columns(fields: Sequence[tuple[str, int]]) -> dict[str, slice]:
+    """Return the columns of each telemetry field by its name."""
+    columns, first = {}, 0
+    for name, width in fields:
+        columns[name] = slice(first, first + width)
+        first += width
+    return columns
+
+
+def _rounded(values: Vector) -> list[float]:
+    rounded: list[float] = np.round(values, 3).tolist()
+    return rounded
