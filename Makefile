@@ -20,7 +20,7 @@ test: .venv/installed-dev ## run `lint` and all tests except those that need Soc
 	$(MAKE) --no-print-directory -j 2 lint compile
 	$(BIN)/python -m pytest -n 2 --dist worksteal
 
-compile: .venv/installed-all
+compile: .venv/installed-all ## compile the numeric functions, which the first run of a command does otherwise
 	@folder=$$(mktemp -d); trap 'rm -rf "$$folder"' EXIT; \
 	  { $(BIN)/atalante demo --shape pinched --steps 1 --out "$$folder/air" && \
 	    $(BIN)/atalante walk --steps 1 --out "$$folder/ground"; } >"$$folder/log" 2>&1 || { cat "$$folder/log"; exit 1; }

@@ -17,23 +17,22 @@ from __future__ import annotations
 import argparse
 import json
 import os
-import re
 import shutil
 import subprocess
 import sys
 import time
+from collections import Counter
 from collections.abc import Iterator, Sequence
 from contextlib import chdir
-from dataclasses import dataclass
 from pathlib import Path
 
 from core import CORE
 from mutmut.mutation.diff_apply import get_diff_for_mutant
+from survivors import Mutant, listed, mutant
 
 HERE = Path(__file__).resolve().parent
 ROOT = HERE.parents[1]
 WORK = ROOT / ".mutation"
-SURVIVORS = HERE / "SURVIVORS.md"
 REQUIRED = 0.95
 
 PACKAGES = ("atalante_hal", "dbc/atalante_dbc", "control/atalante_control", "emulator/atalante_emulator")
@@ -62,19 +61,6 @@ pytest_add_cli_args_test_selection = {tests}
 timeout_constant = 20.0
 timeout_multiplier = 3.0
 """
-
-
-@dataclass(frozen=True)
-class Mutant:
-    """Mutant, identified by its change of the source code. The number that mutmut assigns depends on the other mutants."""
-
-    function: str
-    removed: tuple[str, ...]
-    added: tuple[str, ...]
-
-    def __str__(self) -> str:
-        lines = [f"-{line}" for line in self.removed] + [f"+{line}" for line in self.added]
-        return f"## `{self.function}`\n\n```diff\n" + "\n".join(lines) + "\n```\n"
 
 
 class PartTest:
@@ -164,28 +150,13 @@ class PartTest:
         """Return the mutant that has the given name in mutmut."""
         with chdir(self._work):
             shown = get_diff_for_mutant(name, path=file).splitlines()
-        changed = [line for line in shown if line[:1] in "+-" and not line.startswith(("+++", "---"))]
-        removed, added = (tuple(line[1:].strip() for line in changed if line[0] == sign) for sign in "-+")
         mangled = name.rsplit("__mutmut_", 1)[0].rpartition(".")[2]
         plain = mangled.removeprefix("x").replace("ǁ", ".").strip(".").removeprefix("_")
-        return Mutant(f"{_module(file)}.{plain}", removed, added)
+        return mutant(f"{_module(file)}.{plain}", shown)
 
 
 def _module(file: str) -> str:
     return file.removesuffix(".py").replace("/", ".")
-
-
-_ENTRY = re.compile(r"^## `([^`]+)`\n\n```diff\n(.*?)\n```\n\n(\S.*?)(?=\n## |\Z)", re.DOTALL | re.MULTILINE)
-
-
-def listed(text: str) -> dict[Mutant, str]:
-    """Return the survivors listed in SURVIVORS.md, each with its reason."""
-    found = {}
-    for function, diff, reason in _ENTRY.findall(text):
-        lines = diff.splitlines()
-        removed, added = (tuple(line[1:].strip() for line in lines if line[0] == sign) for sign in "-+")
-        found[Mutant(function, removed, added)] = reason.strip()
-    return found
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -200,7 +171,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         "--children", type=int, default=os.cpu_count() or 1, help="mutants tested in parallel; default: number of cores"
     )
     options = parser.parse_args(arguments)
-    known = listed(SURVIVORS.read_text(encoding="utf-8"))
+    known = listed()
     modules: list[str] = []
     survivors: list[Mutant] = []
     total = 0
@@ -217,14 +188,14 @@ def main(arguments: Sequence[str] | None = None) -> int:
             total += count
             print(f"{module}: {count - len(alive)} of {count} mutants killed", flush=True)
         print(f"{part}: {time.monotonic() - start:.0f} s", flush=True)
-    unlisted = [m for m in survivors if m not in known]
-    killed = [m for m in known if m not in survivors and any(m.function.startswith(f"{module}.") for module in modules)]
-    for mutant in unlisted:
+    expected = Counter(m for m in known if any(m.function.startswith(f"{module}.") for module in modules))
+    unlisted, killed = Counter(survivors) - expected, expected - Counter(survivors)
+    for survivor in unlisted.elements():
         print(
-            f"\nsurvived, but is not in SURVIVORS.md: add a test that kills it, or list it with a reason:\n\n{mutant}"
+            f"\nsurvived, but is not in SURVIVORS.md: add a test that kills it, or list it with a reason:\n\n{survivor}"
         )
-    for mutant in killed:
-        print(f"\nis in SURVIVORS.md, but did not survive: remove it from the list:\n\n{mutant}")
+    for entry in killed.elements():
+        print(f"\nis in SURVIVORS.md, but did not survive: remove it from the list:\n\n{entry}")
     for part in options.without:
         print(f"\n{part} was not tested")
     score = 1.0 - len(survivors) / total
