@@ -22,11 +22,11 @@ from atalante_hal.safety.diagnostics import Dtc, number_of
 from atalante_hal.safety.limiter import Limiter
 from atalante_hal.safety.plausibility import Plausibility
 from atalante_hal.safety.safety_monitor import DRIVE_NODES, SafetyMonitor, Verdict
-from atalante_hal.safety.start import powered
+from atalante_hal.safety.start import powered, words_towards_operation
 from atalante_hal.safety.state_machine import Conditions
 from atalante_hal.transceiver import FrameTap, Transceiver
 from atalante_hal.types import PERIOD, Command, State, SupervisorState, Vector
-from atalante_hal.wire.cia402 import Controlword, DriveState, controlword_towards_operation
+from atalante_hal.wire.cia402 import Controlword, DriveState
 from atalante_hal.wire.process_image import NEVER, ReceiveImage
 
 #: Number of consecutive cycles with a limited torque after which TORQUE_SATURATED is confirmed.
@@ -219,26 +219,28 @@ class Hal:
             and state.supervisor in (_S.READY, _S.HOLD)
             and not safety_monitor.start_prevented
         ):
-            control[:] = [controlword_towards_operation(int(s)) for s in state.drive_state.tolist()]
-            # Command the torque that each drive reports, so that no joint sags before the controller's first torque.
+            control[:] = words_towards_operation(state.drive_state)
             self._follow_drives()
-            self._commands.torque[:] = self._limiter.last
         else:
             safety_monitor.enabling = False
         return self._send_command()
 
     def _follow_drives(self) -> None:
-        """Set the commanded torques to the torques that the drives report.
+        """Let the torques of the limiter follow the torques that the drives report.
 
-        In the first cycle of a start only the torque limit applies. In the later cycles of a start all limits apply. A
-        drive that is off produces no torque, so its command is 0.
+        If all drives produce torque, they get these torques as their commands, so that no joint sags before the controller's
+        first torque. Then all limits apply. Before, only the torque limit applies, and the command is 0: a drive that is off
+        produces no torque, and a drive that holds its position ignores the command.
         """
-        torque = np.where(powered(self.state.drive_state), self.state.torque, 0.0)
-        if self._safety_monitor.enabling:
+        on = powered(self.state.drive_state)
+        torque = np.where(on, self.state.torque, 0.0)
+        if on.all() and self._safety_monitor.enabling:
             self._limiter.apply(torque, self._parts.motion)
         else:
             self._limiter.restart(torque)
             self._safety_monitor.enabling = True
+        if on.all():
+            self._commands.torque[:] = self._limiter.last
 
     def fail(self, error: Exception) -> Vector:
         """Report an exception of the controller or of its command, and send HOLD in the same cycle.

@@ -64,8 +64,7 @@ class SafetyMonitor:
         walking: True while the robot walks on the ground, reported by the controller.
         start_wanted: number of cycles in which a pressed START can still change the state; 0 if no START is being
             processed.
-        enabling: True while drives are being enabled. In this time, drives that are already enabled receive a torque
-            command.
+        enabling: True while drives are being enabled. In this time, the limiter follows the torques that the drives report.
         lowered: DBC names of the drives that cannot hold and are being lowered.
     """
 
@@ -104,6 +103,8 @@ class SafetyMonitor:
         self.walking = False
         self.start_wanted = 0
         self.enabling = False
+        self._stalled = 0  # number of cycles of this start since a drive last changed its state
+        self._states_at_start = b""  # drive states of the last cycle of this start
         self.lowered: set[str] = set()
         #: True if `evaluate` may skip a cycle that has new data, no fault and the same pendant and drive values as before.
         self._steady = False
@@ -321,6 +322,9 @@ class SafetyMonitor:
             self.start_wanted -= 1
         else:
             return
+        states = state.drive_state.tobytes()
+        self._stalled = 0 if self._acknowledged or states != self._states_at_start else self._stalled + 1
+        self._states_at_start = states
         if ended := refusal(self._robot, self._start_request(nodes_ready)):
             self._end_start(ended)
 
@@ -335,6 +339,7 @@ class SafetyMonitor:
             supervisor=state.supervisor,
             pressed=self._acknowledged,
             cycles_left=self.start_wanted,
+            stalled=self._stalled,
             ending=self._ending,
             stop_requested=pendant.stop_requested,
             dead_man=pendant.dead_man,

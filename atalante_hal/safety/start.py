@@ -2,8 +2,10 @@
 
     pendant, diagnostics, nodes, drive state, reported torque -> refusal -> safety monitor, event START_REFUSED or START_FAILED
 
-At a start the HAL first commands the torque that the drives report, so that no joint sags. Without a check of the
-reported torques, the HAL would also command a torque that a drive cannot produce.
+A start has two parts, so that no joint sags. First the HAL enables every drive into a position hold: a drive that is enabled
+earlier than the others gets QUICK STOP until all produce torque (`words_towards_operation`). Then all drives get ENABLE
+OPERATION in the same cycle, and the torque that they report as their command. Without a check of the reported torques, the HAL
+would also command a torque that a drive cannot produce. The start ends if no drive changes its state for `STALLED_CYCLES`.
 """
 
 from __future__ import annotations
@@ -16,10 +18,12 @@ import numpy.typing as npt
 
 from atalante_hal.robot import JOINTS, Robot
 from atalante_hal.types import SupervisorState, Vector
-from atalante_hal.wire.cia402 import DriveState
+from atalante_hal.wire.cia402 import Controlword, DriveState, controlword_towards_operation
 
 #: Longest time after START until all drives must be in OPERATION ENABLED [cycles].
 ENABLE_CYCLES = 200
+#: Longest time of a start without a change of any drive state [cycles]. A command and its answer may each be lost four times.
+STALLED_CYCLES = 10
 #: Prefix of the event text for a refused START.
 REFUSED = "START refused: "
 #: Reason for FINISH_STEP and the HOLD that follows, if the operator requested STOP while the robot walked on the ground.
@@ -52,6 +56,7 @@ class StartRequest(NamedTuple):
     supervisor: SupervisorState  # state of the state machine
     pressed: bool  # True in the cycle in which START is pressed, False in the later cycles of this start
     cycles_left: int  # remaining cycles until all drives must be enabled
+    stalled: int  # number of cycles since a drive last changed its state
     ending: bool  # True if the program is ending
     stop_requested: bool  # True if the operator requests STOP or HOLD
     dead_man: bool  # True if the dead-man is pressed and the pendant has not timed out
@@ -84,8 +89,7 @@ def refusal(robot: Robot, request: StartRequest) -> Refusal | None:
         reason = _stop_reason(request) or (request.diagnostic if request.supervisor is _S.OFF else "")
     else:
         reason = _reason(request)
-        if not (reason or request.cycles_left):
-            text = f"the drives were not enabled within {ENABLE_CYCLES} cycles"
+        if not reason and (text := _failure(request)):
             return Refusal("START_FAILED", "error", text)
     if not reason and request.supervisor in _ENABLING:
         reason = implausible_torque(robot, request.drive_state, request.torque) or ""
@@ -101,6 +105,56 @@ def _reason(request: StartRequest) -> str:
     if request.diagnostic or request.nodes_ready:
         return request.diagnostic
     return missing_text(request.missing)
+
+
+def _failure(request: StartRequest) -> str:
+    """Return why the start failed, with the drives that are not enabled, or an empty text if it may continue."""
+    if not request.cycles_left:
+        within = f"within {ENABLE_CYCLES} cycles"
+    elif request.supervisor in _ENABLING and request.stalled >= STALLED_CYCLES:
+        within = f"and no drive changed its state for {STALLED_CYCLES} cycles"
+    else:
+        return ""
+    return f"the drives were not enabled {within}: {_not_enabled(request.drive_state)}"
+
+
+def _not_enabled(drive_state: Vector) -> str:
+    """Return the drives for which the others wait, see `words_towards_operation`.
+
+    Args:
+        drive_state: values of `DriveState`, shape (12,).
+    """
+    on = powered(drive_state)
+    before = ~(on | (drive_state == DriveState.SWITCHED_ON))
+    late = next((late for late in (before, ~on, drive_state != DriveState.OPERATION_ENABLED) if late.any()), on)
+    return ", ".join(f"{JOINTS[i]} is in {_name(float(drive_state[i]))}" for i in np.flatnonzero(late).tolist())
+
+
+def _name(drive_state: float) -> str:
+    return _NAMES.get(drive_state, f"state {drive_state:g}")
+
+
+def words_towards_operation(drive_state: Vector) -> list[Controlword]:
+    """Return the controlword of each drive on the path to OPERATION ENABLED that lets no joint sag.
+
+    If all drives produce torque, all get ENABLE OPERATION. Until then, a drive with torque gets QUICK STOP and holds its
+    position, and a drive in SWITCHED ON waits for the drives that are not in this state yet.
+
+    Args:
+        drive_state: values of `DriveState`, shape (12,).
+    """
+    on = powered(drive_state)
+    if on.all():
+        return [Controlword.ENABLE_OPERATION] * len(on)
+    waits = not (on | (drive_state == DriveState.SWITCHED_ON)).all()
+    return [
+        Controlword.QUICK_STOP
+        if holds
+        else Controlword.SWITCH_ON
+        if waits and state == DriveState.SWITCHED_ON
+        else controlword_towards_operation(state)
+        for state, holds in zip(drive_state.astype(int).tolist(), on.tolist(), strict=True)
+    ]
 
 
 def _stop_reason(request: StartRequest) -> str:
@@ -165,6 +219,6 @@ def implausible_torque(robot: Robot, drive_state: Vector, torque: Vector) -> str
     if not wrong.size:
         return None
     joint = int(wrong[0])
-    state = _NAMES.get(float(drive_state[joint]), f"state {drive_state[joint]:g}")
+    state = _name(float(drive_state[joint]))
     limit = f"its limit of {robot.torque_max[joint]:.0f} Nm" if on[joint] else f"{idle:g} Nm, because it is not enabled"
     return f"the drive of {JOINTS[joint]} reports {torque[joint]:.0f} Nm in {state}; must be within {limit}"

@@ -97,6 +97,9 @@ class Drives:
         #: acknowledge this yet: with QUICK_STOP, or with a controlword that changes the state. Until then the drive ignores
         #: ENABLE_OPERATION.
         self.latched = [False] * len(JOINTS)
+        #: Delay of each drive between ENABLE_OPERATION and OPERATION ENABLED [cycles].
+        self.enable_delay = [0] * len(JOINTS)
+        self._enabling = [0] * len(JOINTS)  # number of consecutive ENABLE_OPERATION that each drive did not follow yet
         self.emergencies = [] if outbox is None else outbox
         self.errors = Errors(NODES, self.emergencies)
         #: Supply voltage of each drive [V].
@@ -341,6 +344,10 @@ class Drives:
         after = next_state(state, word, latched=latched)
         if self.errors.any_persists(drive) and (state is DriveState.FAULT or after is DriveState.OPERATION_ENABLED):
             return False  # the cause of an error persists, so the HAL cannot acknowledge the error
+        if after is DriveState.OPERATION_ENABLED is not state and self._enabling[drive] < self.enable_delay[drive]:
+            self._enabling[drive] += 1
+            return True  # evaluate the next controlwords even if they are unchanged
+        self._enabling[drive] = 0
         acknowledged = after is not state and state is DriveState.FAULT
         if latched and (after is not state or word == Controlword.QUICK_STOP):
             acknowledged = not self.errors.any_persists(drive) or after is not DriveState.QUICK_STOP_ACTIVE

@@ -147,6 +147,11 @@ NODE_KINDS: Final[Mapping[str, Kind]] = {
         "drive",
         {"state": _choice([state.name for state in DriveState])},
     ),
+    "enable_delay": Kind(
+        "a drive enters OPERATION ENABLED only after more than `by` commands ENABLE_OPERATION in a row",
+        "drive",
+        {"by": _whole(1, 100_000)},
+    ),
     "push": Kind("an external torque acts on a joint", "drive", {"torque": _number(-500.0, 500.0, "Nm")}),
     "torque_weak": Kind(
         "a motor produces only a share of the torque it measures", "drive", {"share": _number(0.0, 1.0)}

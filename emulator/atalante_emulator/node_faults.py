@@ -113,6 +113,9 @@ class NodeFaults:
         elif self._drives.state[drive] in AUTOMATIC:
             self._drives.leave(drive, AUTOMATIC[self._drives.state[drive]])
 
+    def _enable_delay(self, fault: Fault, nodes: Nodes, cycle: int) -> None:
+        self._drives.enable_delay[_drive(nodes)] = fault["by"] if cycle < fault.end else 0
+
     def _reset(self, fault: Fault, nodes: Nodes, cycle: int) -> None:
         """Keep a drive in reset during the fault, and boot the node at the end. Meanwhile `link` drops the frames of the node."""
         (node,) = nodes
@@ -211,6 +214,7 @@ def _drive(nodes: Nodes) -> int:
 _EFFECTS: Final[dict[str, Callable[[NodeFaults, Fault, Nodes, int], None]]] = {
     "emergency": NodeFaults._emergency,
     "leave_operation": NodeFaults._leave_operation,
+    "enable_delay": NodeFaults._enable_delay,
     "reset": NodeFaults._reset,
     "push": NodeFaults._push,
     "torque_weak": NodeFaults._torque_weak,

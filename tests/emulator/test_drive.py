@@ -543,6 +543,22 @@ class TestErrors:
         bench.cycle()
         assert bench.drives.state[7] is DriveState.OPERATION_ENABLED
 
+    @pytest.mark.parametrize("delay", [1, 7])
+    def test_slow_drive_follows_enable_operation_after_its_delay(self, bench: DriveBench, delay: int) -> None:
+        bench.drives.enable_delay[7] = delay
+        for _ in range(2):  # the delay is that of each transition
+            bench.word[:] = Controlword.DISABLE_VOLTAGE
+            bench.cycle()
+            for word in (Controlword.SHUTDOWN, Controlword.SWITCH_ON):
+                bench.word[:] = word
+                bench.cycle()
+            bench.word[:] = Controlword.ENABLE_OPERATION
+            for _ in range(delay):
+                bench.cycle()
+                assert [d for d, s in enumerate(bench.drives.state) if s is DriveState.SWITCHED_ON] == [7]
+            bench.cycle()
+            assert states(bench) == {DriveState.OPERATION_ENABLED}
+
     def test_no_controlword_ends_a_fault_reaction(self, bench: DriveBench) -> None:
         bench.drives.fail(7, 0x2310)
         for word in Controlword:

@@ -126,6 +126,12 @@ class TestDrives:
         assert [row[KNEE] for row in hal.states[BEGIN - 1 :]] == [ENABLED] + [DriveState[state]] * 3
         assert {s for row in hal.states[BEGIN:] for d, s in enumerate(row) if d != KNEE} == {ENABLED}
 
+    def test_slow_drive_is_enabled_later_than_the_others(self, world: Make) -> None:
+        hal, _ = world(Fault("enable_delay", "LEFT_SK", 0, by=5), cycles=40)
+        first = [[row[d] for row in hal.states].index(ENABLED) for d in range(12)]
+        assert set(np.delete(first, KNEE)) == {first[0]}
+        assert first[KNEE] - first[0] == 5
+
     @pytest.mark.parametrize(
         ("state", "after"), [("FAULT_REACTION_ACTIVE", "FAULT"), ("NOT_READY_TO_SWITCH_ON", "SWITCH_ON_DISABLED")]
     )

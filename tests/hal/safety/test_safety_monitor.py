@@ -14,7 +14,7 @@ from atalante_hal.hal import SATURATED_CYCLES
 from atalante_hal.safety.diagnostics import Dtc
 from atalante_hal.safety.limiter import Limited, Limiter
 from atalante_hal.safety.safety_monitor import FINISH_STEP_CYCLES
-from atalante_hal.safety.start import ENABLE_CYCLES, WALK_ENDS
+from atalante_hal.safety.start import ENABLE_CYCLES, STALLED_CYCLES, WALK_ENDS
 from atalante_hal.types import PERIOD, SupervisorState
 from atalante_hal.wire.cia402 import Controlword, DriveState
 from atalante_hal.wire.e2e import crc, data_id_bytes
@@ -341,17 +341,36 @@ def test_joint_that_cannot_hold_is_lowered_and_the_others_hold(rig):
     assert [c for c in rig.codes() if c in S.__members__][-3:] == ["LOWER", "HOLD", "ACTIVE"]
 
 
-def test_start_fails_if_the_drives_are_not_enabled_in_time(make_rig):
+def test_start_without_progress_fails_and_names_the_drive(make_rig):
     rig = make_rig(starts=False)
     rig.until(S.READY)
     set_signal(rig, "LEFT_SK_STATE", "DriveState", DriveState.SWITCH_ON_DISABLED)
     rig.operator.start()
+    rig.run(STALLED_CYCLES)
+    assert "START_FAILED" not in rig.codes()
+    rig.run(10)
+    assert rig.codes().count("START_FAILED") == 1
+    assert rig.hal.reason == (
+        "the drives were not enabled and no drive changed its state for 10 cycles: left_SK is in SWITCH_ON_DISABLED"
+    )
+    assert rig.controlwords() == {Controlword.QUICK_STOP}
+
+
+def test_start_with_a_drive_that_toggles_fails_after_its_longest_time(make_rig):
+    rig = make_rig(starts=False)
+    rig.until(S.READY)
+    at = rig.emulator.signals.index("LEFT_SK_STATE", "DriveState")
+
+    def toggle(cycle: int, values: np.ndarray) -> None:
+        values[at] = (DriveState.SWITCH_ON_DISABLED, DriveState.READY_TO_SWITCH_ON)[cycle % 2]
+
+    rig.emulator.before_send.append(toggle)
+    rig.operator.start()
     rig.run(ENABLE_CYCLES)
     assert "START_FAILED" not in rig.codes()
     rig.run(3)
-    assert "START_FAILED" in rig.codes()
-    assert rig.hal.reason == "the drives were not enabled within 200 cycles"
-    assert rig.controlwords() == {Controlword.QUICK_STOP}
+    assert rig.codes().count("START_FAILED") == 1
+    assert rig.hal.reason.startswith("the drives were not enabled within 200 cycles: left_SK is in ")
 
 
 def test_released_dead_man_ends_the_start(make_rig):

@@ -55,6 +55,7 @@ ENABLING = StartRequest(
     supervisor=S.READY,
     pressed=False,
     cycles_left=100,
+    stalled=0,
     ending=False,
     stop_requested=False,
     dead_man=True,
@@ -68,7 +69,9 @@ PRESSED = ENABLING._replace(pressed=True, cycles_left=200)
 ILL = {"diagnostic": "an encoder is stuck"}
 UNWELL = {"nodes_ready": False, "missing": {"LEFT_SK", "IMU_TORSO"}}
 STOP, RELEASED = "the operator asked to stop", "the dead-man was released or the pendant is lost"
-FAILED = "the drives were not enabled within 200 cycles"
+OFF = ", ".join(f"{joint} is in SWITCH_ON_DISABLED" for joint in JOINTS)
+FAILED = f"the drives were not enabled within 200 cycles: {OFF}"
+STALLED = "the drives were not enabled and no drive changed its state for 10 cycles: "
 TORQUE = "the drive of left_FH reports 3 Nm in SWITCH_ON_DISABLED; must be within 2 Nm, because it is not enabled"
 
 
@@ -87,6 +90,8 @@ def test_entry_text_of_off_names_the_missing_nodes():
         (ENABLING, {**ILL, **UNWELL}, ILL["diagnostic"]),
         (ENABLING, {**UNWELL, "cycles_left": 0}, "no answer or not trusted yet: IMU_TORSO, LEFT_SK"),
         (ENABLING, {"cycles_left": 0, "torque": OFF_TORQUE}, FAILED),
+        (ENABLING, {"stalled": 9}, None),
+        (ENABLING, {"stalled": 10, "stop_requested": True}, STOP),
         (ENABLING, {"torque": OFF_TORQUE}, TORQUE),
         (ENABLING, {"supervisor": S.HOLD, "torque": OFF_TORQUE}, TORQUE),
         (ENABLING, {"supervisor": S.HOLD, **ILL}, ILL["diagnostic"]),
@@ -99,6 +104,7 @@ def test_entry_text_of_off_names_the_missing_nodes():
             for changes, reason in (
                 ({**ILL, **UNWELL, "torque": OFF_TORQUE}, None),
                 ({"cycles_left": 0, **ILL}, FAILED),
+                ({"stalled": 10}, None),
                 ({"dead_man": False}, RELEASED),
                 ({"stop_requested": True}, STOP),
                 ({"ending": True}, "the program is ending"),
@@ -126,6 +132,31 @@ def test_first_matching_reason_refuses_the_start(request_: StartRequest, changes
         assert ended == ("START_FAILED", "error", FAILED)
     else:
         assert ended == ("START_REFUSED", "warning", REFUSED + reason)
+
+
+@pytest.mark.parametrize("supervisor", [S.READY, S.HOLD])
+@pytest.mark.parametrize(
+    ("others", "knee", "named"),
+    [
+        (D.QUICK_STOP_ACTIVE, D.FAULT, "left_SK is in FAULT"),
+        (D.SWITCHED_ON, D.READY_TO_SWITCH_ON, "left_SK is in READY_TO_SWITCH_ON"),
+        (D.OPERATION_ENABLED, D.SWITCHED_ON, "left_SK is in SWITCHED_ON"),
+        (D.OPERATION_ENABLED, 99, "left_SK is in state 99"),
+        (D.OPERATION_ENABLED, D.QUICK_STOP_ACTIVE, "left_SK is in QUICK_STOP_ACTIVE"),
+    ],
+)
+def test_failed_start_names_the_drives_that_were_not_enabled(supervisor: S, others: D, knee: float, named: str):
+    drive_state = np.full(12, float(others))
+    drive_state[JOINTS.index("left_SK")] = knee
+    request = ENABLING._replace(supervisor=supervisor, drive_state=drive_state, stalled=10)
+    assert refusal(ROBOT, request) == ("START_FAILED", "error", STALLED + named)
+
+
+def test_failed_start_from_fault_with_enabled_drives_names_all():
+    drive_state = np.full(12, float(D.OPERATION_ENABLED))
+    ended = refusal(ROBOT, ENABLING._replace(supervisor=S.FAULT, drive_state=drive_state, cycles_left=0))
+    assert ended is not None
+    assert ended.text.count("is in OPERATION_ENABLED") == 12
 
 
 class FalseSignal:

@@ -10,6 +10,7 @@ import math
 from typing import Final
 
 from atalante_hal.robot import JOINTS
+from atalante_hal.safety.start import STALLED_CYCLES
 from atalante_hal.wire.cia402 import Controlword, DriveState
 from atalante_hal.wire.frame import Frames
 from atalante_tools.conform.frames import ReceivedFrame
@@ -44,8 +45,8 @@ ROUTES: Final[dict[DriveState, tuple[Controlword, ...]]] = {
     _S.QUICK_STOP_ACTIVE: (_C.SHUTDOWN, _C.SWITCH_ON, _C.ENABLE_OPERATION, _C.QUICK_STOP),
 }
 
-#: Largest number of cycles that a drive may take for a transition.
-FOLLOW: Final = 50
+#: Largest number of cycles that a drive may take for a transition. The HAL ends a start after this time.
+FOLLOW: Final = STALLED_CYCLES
 #: Number of cycles for which the test repeats a command that must leave the drive state unchanged.
 STAY: Final = 8
 #: Largest number of cycles from a command to the first state frame that shows the effect of the command.

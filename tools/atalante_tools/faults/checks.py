@@ -5,6 +5,8 @@ from __future__ import annotations
 import math
 from typing import Final
 
+import numpy as np
+
 from atalante_hal.robot import JOINTS, LEG_JOINTS
 from atalante_hal.safety.diagnostics import Dtc
 from atalante_hal.types import SupervisorState
@@ -12,6 +14,10 @@ from atalante_hal.wire.cia402 import Controlword, DriveState
 from atalante_tools.faults.observation import Observation
 
 _KNEE: Final = JOINTS.index("left_SK")
+#: Largest permitted motion of a joint while the drives are being enabled [rad].
+_SAG: Final = math.radians(1.0)
+#: Largest number of cycles from START to the event START_FAILED if a drive cannot be enabled.
+_FAILED: Final = 20
 #: Number of cycles without a command after which a drive must hold its position without the HAL (local hold).
 #: This number is not imported from the emulated drive, so that an error in the emulator cannot change the check.
 _WATCHDOG: Final = 5
@@ -109,6 +115,39 @@ def start_is_rejected(run: Observation) -> str | None:
         if Controlword.ENABLE_OPERATION in run.commands.words(cycle):
             return f"a drive was enabled in cycle {cycle}, after {refused.text}"
     return None
+
+
+def nothing_sags(run: Observation) -> str | None:
+    """Check that no joint moves by more than 1 deg between the operator's START after the fault and the state ACTIVE.
+
+    If the robot does not become ACTIVE, the check ends 40 cycles after START.
+
+    Args:
+        run: observation of the run.
+    """
+    assert run.pressed is not None
+    begin = run.pressed - 1
+    moving = [state is SupervisorState.ACTIVE for state in run.states[begin : begin + 40]]
+    end = begin + (moving.index(True) if any(moving) else len(moving))
+    sag = np.abs(run.position[begin:end] - run.position[begin]).max(axis=0)
+    joint = int(sag.argmax())
+    return f"{JOINTS[joint]} moved by {math.degrees(sag[joint]):.2f} deg after START" if sag[joint] > _SAG else None
+
+
+def start_fails_and_names_the_hip(run: Observation) -> str | None:
+    """Check that the start ends soon with an event that names the left sagittal hip, and that the other drives hold.
+
+    Args:
+        run: observation of the run.
+    """
+    assert run.pressed is not None
+    failed = [event for event in run.events if event.code == "START_FAILED" and event.cycle >= run.pressed]
+    if not failed or failed[0].cycle - run.pressed > _FAILED:
+        return f"START_FAILED must come within {_FAILED} cycles, got {[event.cycle - run.pressed for event in failed]}"
+    if not failed[0].text.endswith(": left_SH is in SWITCHED_ON"):
+        return f"START_FAILED must name left_SH, got {failed[0].text!r}"
+    others = np.delete(run.drive_state[failed[0].cycle + 2], JOINTS.index("left_SH"))
+    return None if (others == DriveState.QUICK_STOP_ACTIVE).all() else "a drive did not hold after START_FAILED"
 
 
 def limit_follows_temperature(run: Observation) -> str | None:

@@ -11,14 +11,23 @@ from atalante_tools.faults.checks import (
     left_leg_in_local_hold,
     limit_follows_temperature,
     not_enabled_in_motion,
+    nothing_sags,
+    start_fails_and_names_the_hip,
 )
 from atalante_tools.faults.scenario import Case, HostFault, Scenario
 
 _S = SupervisorState
 _KNEE: Final = "LEFT_SK"
+_HIP: Final = "LEFT_SH"
 _COMMAND: Final = "COMMAND_LEFT_LEG"
 #: A knee that sinks in LOWER or FAULT is at rest after this time [cycles]. Then its drive can be enabled again.
 _LOWERED: Final = 4500
+
+#: Restarts during the walk, after which a drive must be enabled again.
+_RESTARTED: Final = {
+    "one drive restarted": (Fault("reset", _HIP, 0, 3),),
+    "two drives restarted": (Fault("reset", _HIP, 0, 3), Fault("reset", "RIGHT_SK", 0, 3)),
+}
 
 SCENARIOS: Final = (
     Scenario(
@@ -184,6 +193,44 @@ SCENARIOS: Final = (
             )
             for state in ("SWITCHED_ON", "QUICK_STOP_ACTIVE")
             for lost in (1, 3, 4)
+        ),
+    ),
+    Scenario(
+        "F69",
+        (
+            *(
+                Case(
+                    f"{cycles} cycles late, {name}",
+                    (*stimuli, Fault("enable_delay", _HIP, 0, by=cycles)),
+                    node=_HIP,
+                    dtc="NODE_RESET",
+                    checks=(nothing_sags,),
+                )
+                for cycles in (1, 7)
+                for name, stimuli in _RESTARTED.items()
+            ),
+            *(
+                Case(
+                    f"never, {name}",
+                    (*stimuli, Fault("enable_delay", _HIP, 0, by=100_000)),
+                    node=_HIP,
+                    dtc="NODE_RESET",
+                    recovers=False,
+                    checks=(nothing_sags, start_fails_and_names_the_hip),
+                )
+                for name, stimuli in _RESTARTED.items()
+            ),
+            Case(
+                "never, first START",
+                (Fault("enable_delay", _HIP, 0, by=100_000),),
+                phase=None,
+                state=_S.READY,
+                dtc="START_FAILED",
+                detected=300,
+                reacted=300,
+                recovers=False,
+                checks=(nothing_sags, start_fails_and_names_the_hip),
+            ),
         ),
     ),
 )

@@ -302,6 +302,7 @@ class HalSteps:
         monitor.memory = FaultMemory()
         monitor._reports.clear()
         monitor.start_wanted, monitor.enabling, monitor.moving, monitor.walking = 0, False, False, False
+        monitor._stalled = 0  # `LAST_START` stands for every end of a start
         monitor._ending = monitor._duplicate_found = monitor._ramping = False
         monitor.lowered.clear()
         rows = len(self._image.check)
