@@ -124,7 +124,7 @@ class Statistics:
 
     @property
     def real_time_factor(self) -> float:
-        """Return the simulated time divided by the elapsed time. With `WallClock` it is about 1."""
+        """Return the simulated time divided by the elapsed time. With `WallClock`, the result is about 1."""
         return self.cycles * PERIOD / self.wall if self.wall else 0.0
 
     def cost(self, percentile: float) -> float:

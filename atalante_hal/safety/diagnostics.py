@@ -42,7 +42,7 @@ class Dtc(StrEnum):
     severity: Severity
     #: Short description for the operator.
     meaning: str
-    #: Bit of this code in a bit set, as an integer with only this bit set.
+    #: Integer in which only the bit of this code is set. Sums of these integers are bit sets of codes.
     bit: int
 
     def __new__(cls, code: str, reaction: Reaction, severity: Severity, meaning: str) -> Dtc:

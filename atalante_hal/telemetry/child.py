@@ -42,7 +42,7 @@ class TelemetryChild(Closing):
         Args:
             files: Name -> file descriptor of each ring of the session. None: the session does not exist yet.
         """
-        self._files: dict[str, int] = {}  # files that no session has taken over
+        self._files: dict[str, int] = {}  # ring files that no session has taken over yet
         if files is None:
             files = self._files = {name: anonymous_file("atalante-telemetry", 0) for name in RINGS}
         self._unread = b""  # output after the last line that was read

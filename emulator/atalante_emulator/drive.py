@@ -29,7 +29,7 @@ from atalante_hal.robot import JOINTS, LEG_JOINTS, SIDES, Robot
 from atalante_hal.types import PERIOD, Vector
 from atalante_hal.wire.cia402 import AUTOMATIC, Controlword, DriveState, next_state
 
-#: Timeout of the commands, and of SYNC [cycles]. When it is reached, an enabled drive starts its local hold.
+#: Timeout of the commands, and of SYNC [cycles]. At a timeout, an enabled drive starts its local hold.
 WATCHDOG: Final = 5
 #: Period of the temperature update, and of the check whether lowered joints are at rest [cycles].
 SLOW_CYCLES: Final = 100

@@ -236,7 +236,7 @@ class TestCycle:
     def test_answer_is_sent_in_one_batch_before_the_body_moves(
         self, make: Callable[..., Setup], monkeypatch: pytest.MonkeyPatch
     ) -> None:
-        """So a HAL in another process receives the whole batch or nothing, and can compute while the body moves."""
+        """A HAL in another process then receives the whole batch or nothing, and can compute while the body moves."""
         master, emulator = make(operator=Operator())
         master.sync()
         done: list[str] = []

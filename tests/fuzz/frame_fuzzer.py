@@ -195,7 +195,7 @@ def _check_committed(
         # The bytes after the payload are undefined.
         known = {genuine["data"][row, : message.length].tobytes(), before[row, : message.length].tobytes()}
         if payload not in known | intact.get(message.frame_id, set()):
-            raise Finding(f"cycle {tally.cycles}: {message.name} took a frame that is not intact: {payload.hex()}")
+            raise Finding(f"cycle {tally.cycles}: {message.name} accepted a frame that is not intact: {payload.hex()}")
 
 
 # -- the HAL and the emulated robot ------------------------------------------------------------------------------------
@@ -298,7 +298,7 @@ class FuzzedRobot:
             raise Finding(f"cycle {self.tally.cycles}: the body is at {emulator.body.position}")
         for end in self.ends:
             if end.most > RECEIVE_BUDGET:
-                raise Finding(f"cycle {self.tally.cycles}: {end.most} frames were taken at once")
+                raise Finding(f"cycle {self.tally.cycles}: {end.most} frames were received in one call")
 
 
 @contextmanager

@@ -74,7 +74,7 @@ class Grid:
         return tuple(map(len, self.axes()))
 
     def subject(self, index: Index) -> Subject:
-        """Return the subject at a point of the grid. Its leg lengths are those of Winter's table.
+        """Return the subject at a point of the grid, with the leg lengths of Winter's table.
 
         Args:
             index: index of the level of each parameter.

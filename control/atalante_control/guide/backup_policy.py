@@ -33,7 +33,7 @@ Pair = tuple[float, float]
 #: Number of elements of the state x: five quantities, each with an element for SH and then an element for SK.
 #: 1. tracking error e [rad]
 #: 2. true rate e' [rad/s]
-#: 3. measured rate e', behind the low-pass of the drives [rad/s]
+#: 3. measured rate e', after the low-pass of the drives [rad/s]
 #: 4. acceleration e'' that the present motor torque causes [rad/s2]
 #: 5. acceleration e'' that the torque of the last command will cause [rad/s2]
 STATES = 10
@@ -79,7 +79,7 @@ class SampledLoop:
 
 @dataclass(frozen=True)
 class BackupPolicy:
-    """Gains of the backup policy of the coupled SH and SK.
+    """Gains of the backup policy, the control law that returns the coupled SH and SK to the desired motion.
 
     Raises:
         ValueError: If a value is not positive and finite, or the mass matrix is not positive definite.

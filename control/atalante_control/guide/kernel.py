@@ -95,18 +95,18 @@ class GuideTables(NamedTuple):
     lags: Records[Lag]  # (lags,)
     blocks: Records[Block]  # (blocks,)
     few: Records[Few]  # (rows,) in ascending order of `Few.lag`
-    #: (starts, lags, 4) largest errors of SH and SK due to model errors, then due to the chosen promise [rad]
+    #: (starts, lags, 4) largest errors of SH and SK due to model errors, then due to the promised torques [rad]
     reach: Vector
     highest: Vector  # (starts, blocks, 4) largest `reach` in each block of cycles ahead
     #: (starts, rows, 12) largest effects of disturbances. Columns 0 to 3: torques [Nm] and speeds [rad/s] of SH and SK due to
-    #: model errors. Columns 4 to 7: the same quantities due to the chosen promise. Columns 8 to 11: speeds of SH and SK for the
+    #: model errors. Columns 4 to 7: the same quantities due to the promised torques. Columns 8 to 11: speeds of SH and SK for the
     #: worst inertia and delay, due to model errors and then due to the chosen promise [rad/s].
     few_reach: Vector
     step: Vector  # (horizon + 1, COLUMNS) values of each cycle of the step; the column numbers are defined below
 
 
 INVERSE = 0  # columns 0 to 3 of `step`: 1 / distance to the upper and lower bound of SH, then of SK [1/rad]
-REFERENCE = 4  # columns 4 and 5 of `step`: acceleration of q_des [rad/s2], ahead by the command lag of the sampled loop
+REFERENCE = 4  # columns 4 and 5 of `step`: acceleration of q_des at the time when a command takes effect [rad/s2]
 VELOCITY = 6  # columns 6 and 7 of `step`: velocity of q_des after the low-pass of the drives [rad/s]
 BASE = 8  # columns 8 and 9 of `step`: torque that moves the leg along q_des [Nm]
 MASS = 10  # columns 10 to 12 of `step`: M11, M12 and M22 along q_des [kg m2]

@@ -42,7 +42,7 @@ class Letter:
     inertia: Annotated[Vector, 2]  # kg m2, J
     coulomb: Annotated[Vector, 2]  # Nm, k_d
     viscous: Annotated[Vector, 2]  # Nm s/rad, k_v
-    push: Annotated[Vector, 2]  # Nm, largest absolute value of u_ext
+    push: Annotated[Vector, 2]  # Nm, largest absolute value of the external torque u_ext
     zeta: float  # s, gain of lambda_d, which increases the gate while h decreases
     idealization: float  # intensity of the joint idealization u_i
     feedforward: float  # intensity of the feedforward u_f
@@ -55,12 +55,12 @@ class LiteralTables(NamedTuple):
     """Tables of the literal law. `LiteralGuide` owns the tables; `assistive_torque` writes to `letters` only."""
 
     letters: Records[Letter]  # (1,)
-    step: Vector  # (cycles + 1, 8) values of each cycle of the step, columns below
+    step: Vector  # (cycles + 1, 8) values of each cycle of the step; the columns are defined below
 
 
 BOUND = 0  # columns 0 to 3 of `step`: distances to the upper and lower bound of SH, then of SK [rad]
-REFERENCE = 4  # columns 4 and 5: q_des'' of SH and SK [rad/s2]
-FEEDFORWARD = 6  # columns 6 and 7: u_f of SH and SK at full intensity [Nm]
+REFERENCE = 4  # columns 4 and 5 of `step`: q_des'' of SH and SK [rad/s2]
+FEEDFORWARD = 6  # columns 6 and 7 of `step`: feedforward u_f of SH and SK at full intensity [Nm]
 
 
 @dataclass(frozen=True)
@@ -68,7 +68,7 @@ class LiteralConfig:
     """Parameters of the literal law."""
 
     gains: LegGains  # gains of the baseline PID of the swing leg
-    push: Pair  # Nm, largest absolute value of u_ext of SH and SK
+    push: Pair  # Nm, largest absolute value of the external torque u_ext of SH and SK
     zeta: float  # s, gain of lambda_d, which increases the gate while h decreases
     idealization: float  # intensity of the joint idealization u_i, in [0, 1]
     feedforward: float  # intensity of the feedforward u_f, in [0, 1]

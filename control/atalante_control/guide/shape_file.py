@@ -21,7 +21,7 @@ from atalante_control.guide.shapes import JOINTS, SHAPES, GuideShape, half_width
 from atalante_hal.types import Vector
 
 FORMAT = "atalante-guide-shape/1"
-LARGEST = 90.0  # deg, largest accepted distance
+LARGEST = 90.0  # deg, largest accepted distance between desired trajectory and guide
 
 _REQUIRED = ("format", "name", "phase", *JOINTS)
 _OPTIONAL = ("summary", "interpolation", "scaling")

@@ -52,7 +52,7 @@ class Reach(NamedTuple):
 def step_table(
     gait: Gait, stance: int, alphas: tuple[float, float], reach: Reach, kinematics: Kinematics, toe_out: float
 ) -> PhaseTable:
-    """Sample a step.
+    """Sample the desired motion of a step in every cycle.
 
     Args:
         gait: right-stance step.

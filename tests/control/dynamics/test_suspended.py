@@ -53,7 +53,7 @@ def test_guides_are_certified_with_the_gaits_of_the_network(
         certificate = AirwalkController(ROBOT, gait, shape, AirwalkConfig(), exoskeleton).certificate(0.5)
         if shape.name == "snap" or (mass_height[0] > 90.0 and step[1] < 0.8):
             # The hand-over box is the range of deviations at a stance change for which a promise must hold. With the heaviest
-            # patient, the largest deviations in it need more torque at the start of the fast step than the drives have.
+            # patient, the largest deviations in the box need more torque at the start of the fast step than the drives have.
             assert not certificate.certified
             assert ("backup torque" if shape.name != "snap" else "no promise") in certificate.reason
             continue

@@ -1,4 +1,4 @@
-"""Guide certificate: promises of the shapes, the conditions of the argument, and the reasons for guides without a promise."""
+"""Guide certificate: promises of the shapes, the conditions of the proof, and the reasons for guides without a promise."""
 
 from __future__ import annotations
 
@@ -99,7 +99,10 @@ def test_the_error_beyond_the_horizon_is_inside_if_the_prediction_is():
 
 
 def uncompensated(guide: GuideFilter) -> np.ndarray:
-    """Return the accelerations along the gait, shape (3, n, 2): by idealization and feedforward, by the first, by the second."""
+    """Return the accelerations along the gait, shape (3, n, 2).
+
+    They are caused by idealization and feedforward together, by idealization alone, and by feedforward alone.
+    """
     prediction = guide.prediction
     mass, qdd = prediction.mass, prediction.leg.qdd
     idealized = np.linalg.solve(mass, prediction.torque[:, :, None])[:, :, 0] - qdd

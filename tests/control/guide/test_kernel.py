@@ -115,7 +115,7 @@ def bounded(cycle: int, seed: int) -> tuple[GuideFilter, float]:
     guide, rng = copied(controller("pinched").guide_at(XI)), np.random.default_rng(seed)
     guide.start_step(XI, (0.0, 0.0), (0.0, 0.0), 0.7)
     guard = guide.tables.guards[0]
-    guard.torque_limit = guard.speed_limit = guard.worst_speed_limit = 1e6  # only the errors count
+    guard.torque_limit = guard.speed_limit = guard.worst_speed_limit = 1e6  # only the errors determine the ratio
     guard.state[:] = rng.normal(size=10) * np.repeat([0.05, 0.8, 0.8, 80.0, 80.0], 2)
     return guide, largest_ratio(guide.tables, cycle)
 

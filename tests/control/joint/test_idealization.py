@@ -69,7 +69,7 @@ def test_velocity_torques_and_mass_give_the_inverse_dynamics():
         m11, m12, m22 = mass(inertia.fit, float(pose[KNEE]))
         tau = np.array([[m11, m12], [m12, m22]]) @ a[[HIP, KNEE]]
         tau += inertia.velocity_torques(float(pose[KNEE]), float(v[HIP]), float(v[KNEE]))
-        # With the other joints at rest, inverse dynamics must give tau for the accelerations of these two.
+        # With the other joints at rest, inverse dynamics must give tau for the accelerations of SH and SK.
         pin_q, pin_v, pin_a = np.empty(12), np.empty(12), np.empty(12)
         pin_q[MODEL.q], pin_v[MODEL.v], pin_a[MODEL.v] = pose, v, a
         data = MODEL.model.createData()

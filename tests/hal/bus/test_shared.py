@@ -40,7 +40,7 @@ def ends() -> Iterator[tuple[SharedBus, SharedBus]]:
 
 
 class Answering:
-    """The other end, in a thread: it echoes frames with a payload below 100 and ignores the others."""
+    """The other end, in a thread: it echoes frames with a payload below 100 and ignores all other frames."""
 
     def __init__(self, bus: SharedBus) -> None:
         self.received: list[list[int]] = []

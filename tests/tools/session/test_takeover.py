@@ -65,7 +65,7 @@ def test_only_consecutive_answers_to_the_present_sync_silence_a_pendant(
 
 
 @pytest.mark.parametrize(("more", "lost"), [(LOST_FRAMES - 1, False), (LOST_FRAMES, True)])
-def test_silent_pendant_stops_for_good_only_if_the_other_continues(more: int, lost: bool) -> None:
+def test_silent_pendant_gives_up_only_if_the_other_pendant_continues(more: int, lost: bool) -> None:
     rule = after(Takeover(established=True), *[(0,)] * (PRESENT_FRAMES + more), *[()] * (QUIET_CYCLES + 1))
     assert rule.lost is lost
     assert rule.sends is not lost

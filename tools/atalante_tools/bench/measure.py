@@ -96,7 +96,7 @@ def timed(work: Callable[[], object], repetitions: int) -> Block:
 
 
 def require(condition: object, message: str) -> None:
-    """Raise `BenchmarkError` if a condition is false that must hold in every valid benchmark.
+    """Raise `BenchmarkError` if a condition for a valid benchmark is false.
 
     Args:
         condition: condition that must be true.

@@ -133,7 +133,10 @@ class Axis:
         return self.tester.states(self.tester.cycle(command))
 
     def follow(self, controlword: Controlword, goal: DriveState, cycles: int = FOLLOW) -> int | None:
-        """Repeat a command until the drive reaches the state `goal`; return the number of cycles, or None if it does not."""
+        """Repeat a command until the drive reaches the state `goal`.
+
+        Return the number of cycles; None if `goal` is not reached.
+        """
         for number in range(1, cycles + 1):
             if any(state_of(frame) == goal for frame in self.send(self.command(controlword))):
                 return number

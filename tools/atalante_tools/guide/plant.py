@@ -72,7 +72,7 @@ class Plant(NamedTuple):
     torque_max: Vector  # (2,) Nm, torque limit of the limiter
     torque_step: Vector  # (2,) Nm, largest change of the command in a cycle
     velocity_max: Vector  # (2,) rad/s, speed above which the limiter reduces the torque
-    velocity_margin: float  # rad/s, range in which the limiter reduces the torque to zero
+    velocity_margin: float  # rad/s, range of speed above `velocity_max` in which the limiter reduces the torque to zero
     delay: int  # additional cycles until a command acts
     loss: float  # probability that the measurement of a cycle is lost, and that the command of a cycle is lost
 

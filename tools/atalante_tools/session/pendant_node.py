@@ -122,7 +122,7 @@ class PendantNode:
         self._tx.values[self._at["AssistanceSet"]] = 1.0
 
     def poll(self, timeout: float = 0.0) -> bool:
-        """Receive the waiting frames. Answer the SYNC if one is among them.
+        """Receive all waiting frames, and answer the last SYNC among them.
 
         Args:
             timeout: Longest wait for the first frame [s].

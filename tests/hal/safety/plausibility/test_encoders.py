@@ -309,7 +309,7 @@ class TestVelocity:
         assert only(robot.checks.findings).node == "LEFT_HA"
 
     def test_velocity_error_needs_three_wrong_comparisons_in_a_row(self):
-        """One wrong sample makes two comparisons wrong: with the sample before it and with the one after it."""
+        """One wrong sample makes two comparisons wrong: with the previous sample and with the next sample."""
         robot = SimulatedRobot(amplitude=0.0)
 
         def wrong(now: Signals) -> None:

@@ -32,7 +32,7 @@ class Decoded:
     """Raw codes of all fields in the frames of a message family, with masks of the invalid values."""
 
     family: Family
-    span: slice  # position of these frames in the stream
+    span: slice  # slice of the stream that contains the frames
     raw: Words  # shape (fields, n)
     bad: dict[int, Mask] = field(default_factory=dict)  # for each field index: mask of the frames with an invalid value
 

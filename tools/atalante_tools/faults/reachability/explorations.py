@@ -43,8 +43,8 @@ _BUTTONS: Final = (Request.START, Request.STOP, Request.HOLD)
 #: Number of cycles after the stop action above which the search does not distinguish times.
 _LONG: Final = 6
 STOP_PROPERTY: Final = "no torque command after the dead-man is released, STOP or HOLD"
-MOVE_PROPERTY: Final = "one press of START, one move"
-RESTART_PROPERTY: Final = "no way from HOLD, LOWER or FAULT to ACTIVE without a new START"
+MOVE_PROPERTY: Final = "each press of START causes at most one change to a better state"
+RESTART_PROPERTY: Final = "no change from HOLD, LOWER or FAULT to ACTIVE without a new START"
 
 
 class Operator(NamedTuple):

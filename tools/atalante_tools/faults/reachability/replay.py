@@ -68,7 +68,7 @@ def drive_case_of(trace: Sequence[tuple[DriveCycle, DriveStep]]) -> Case:
     lost = trace[enabled + 1 :]
     for cycle, _ in lost:
         if cycle != DriveCycle():
-            raise NotReplayable(f"no fault causes {cycle}")
+            raise NotReplayable(f"each input must be a lost command, got {cycle}")
     return Case("counterexample", (Fault("drop", "COMMAND_LEFT_LEG", 0, len(lost)),), observed=OBSERVED)
 
 
