@@ -17,6 +17,7 @@ import re
 import sys
 from collections.abc import Callable, Iterator, Mapping
 from functools import cache
+from importlib.util import find_spec
 from pathlib import Path
 from types import CodeType, FunctionType, ModuleType
 from typing import Any, ParamSpec, TypeVar, cast
@@ -69,9 +70,29 @@ def specialised(function: Callable[P, R], *args: P.args, **kwargs: P.kwargs) -> 
 
 
 @cache
-def _compiled(function: FunctionType) -> Any:
-    import numba
+def _numba() -> Any:
+    """Import numba without scipy.linalg, which takes a tenth of the time until the first cycle of a walk.
 
+    When numba loads its array functions, it imports scipy.linalg to learn whether it contains BLAS. An empty module answers this
+    question, and is then removed. A function that needs BLAS imports scipy.linalg when it is compiled.
+    """
+    blas = "scipy.linalg.cython_blas"
+    if blas in sys.modules or find_spec("scipy") is None:
+        import numba
+
+        return numba
+    sys.modules[blas] = ModuleType(blas)
+    try:
+        import numba
+        import numba.np.arraymath
+    finally:
+        del sys.modules[blas]
+    return numba
+
+
+@cache
+def _compiled(function: FunctionType) -> Any:
+    numba = _numba()
     config: Any = numba.config
     config.CPU_NAME, config.CPU_FEATURES = "generic", ""
     folder = _folder(function)
@@ -94,9 +115,7 @@ def _twin(function: FunctionType) -> FunctionType:
 @cache
 def _callee(function: FunctionType) -> Any:
     """Return the compiled form of a called function. It is compiled once for all its callers."""
-    import numba
-
-    return numba.njit(boundscheck=True)(_twin(function))
+    return _numba().njit(boundscheck=True)(_twin(function))
 
 
 def _names(code: CodeType) -> Iterator[str]:
@@ -144,9 +163,7 @@ def _constants(code: CodeType) -> tuple[Any, ...]:
 
 def _folder(function: FunctionType) -> Path | None:
     """Return the cache folder for the machine code of a function; None if the user's cache is not writable."""
-    import numba
-
-    digest = hashlib.sha256(f"{numba.__version__} {sys.version}".encode())
+    digest = hashlib.sha256(f"{_numba().__version__} {sys.version}".encode())
     for part in _compile_inputs(function):
         digest.update(part + b"\0")
     base = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache", "atalante", "compiled")

@@ -214,3 +214,30 @@ def test_machine_code_is_for_a_generic_cpu() -> None:
     compiled(total)
     assert (numba.config.CPU_NAME, numba.config.CPU_FEATURES) == ("generic", "")
     assert math.isfinite(compiled(total)(np.ones(2), 5.0))
+
+
+WITHOUT_BLAS = """
+import sys
+import numpy as np
+from atalante_hal.compiled import compiled
+def product(a, b):
+    return np.dot(a, b)
+def plain(a):
+    return a[0]
+compiled(plain)(np.eye(2))
+print("scipy.linalg" in sys.modules)
+print(compiled(product)(2.0 * np.eye(2), np.ones((2, 2))).tolist())
+"""
+
+
+def test_blas_is_loaded_only_for_a_function_that_needs_it(tmp_path: Path) -> None:
+    (tmp_path / "script.py").write_text(WITHOUT_BLAS)
+    result = subprocess.run(
+        [sys.executable, "script.py"],
+        cwd=tmp_path,
+        env={"XDG_CACHE_HOME": str(tmp_path), "PATH": "/usr/bin:/bin"},
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    assert result.stdout.split("\n")[:2] == ["False", "[[2.0, 2.0], [2.0, 2.0]]"]
