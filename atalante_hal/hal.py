@@ -226,7 +226,7 @@ class Hal:
         return self._send_command()
 
     def _follow_drives(self) -> None:
-        """Let the torques of the limiter follow the torques that the drives report.
+        """Set the torques in the limiter to the torques that the drives report.
 
         If all drives produce torque, they get these torques as their commands, so that no joint sags before the controller's
         first torque. Then all limits apply. Before, only the torque limit applies, and the command is 0: a drive that is off

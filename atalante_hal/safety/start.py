@@ -22,7 +22,7 @@ from atalante_hal.wire.cia402 import Controlword, DriveState, controlword_toward
 
 #: Longest time after START until all drives must be in OPERATION ENABLED [cycles].
 ENABLE_CYCLES = 200
-#: Longest time of a start without a change of any drive state [cycles]. A command and its answer may each be lost four times.
+#: Longest time of a start in which no drive changes its state [cycles]. A command and its answer may each be lost four times.
 STALLED_CYCLES = 10
 #: Prefix of the event text for a refused START.
 REFUSED = "START refused: "
@@ -108,7 +108,7 @@ def _reason(request: StartRequest) -> str:
 
 
 def _failure(request: StartRequest) -> str:
-    """Return why the start failed, with the drives that are not enabled, or an empty text if it may continue."""
+    """Return why the start failed, with the drives that are not enabled. Return an empty text if the start may continue."""
     if not request.cycles_left:
         within = f"within {ENABLE_CYCLES} cycles"
     elif request.supervisor in _ENABLING and request.stalled >= STALLED_CYCLES:
@@ -119,7 +119,7 @@ def _failure(request: StartRequest) -> str:
 
 
 def _not_enabled(drive_state: Vector) -> str:
-    """Return the drives for which the others wait, see `words_towards_operation`.
+    """Return, as text, the drives for which the other drives wait, see `words_towards_operation`.
 
     Args:
         drive_state: values of `DriveState`, shape (12,).
@@ -135,7 +135,7 @@ def _name(drive_state: float) -> str:
 
 
 def words_towards_operation(drive_state: Vector) -> list[Controlword]:
-    """Return the controlword of each drive on the path to OPERATION ENABLED that lets no joint sag.
+    """Return one controlword per drive, in an order in which the drives reach OPERATION ENABLED and no joint sags.
 
     If all drives produce torque, all get ENABLE OPERATION. Until then, a drive with torque gets QUICK STOP and holds its
     position, and a drive in SWITCHED ON waits for the drives that are not in this state yet.

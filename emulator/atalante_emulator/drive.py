@@ -93,13 +93,14 @@ class Drives:
         self.parameters = parameters
         self.signals = signals
         self.state = [DriveState.SWITCH_ON_DISABLED] * len(JOINTS)
-        #: Whether each drive left OPERATION ENABLED without a command, for example for a local hold, and the HAL did not
-        #: acknowledge this yet: with QUICK_STOP, or with a controlword that changes the state. Until then the drive ignores
+        #: Whether each drive left OPERATION ENABLED without a command, for example for a local hold, and waits for an
+        #: acknowledgement of the HAL: QUICK_STOP, or a controlword that changes the state. Until then the drive ignores
         #: ENABLE_OPERATION.
         self.latched = [False] * len(JOINTS)
-        #: Delay of each drive between ENABLE_OPERATION and OPERATION ENABLED [cycles].
+        #: Delay of each drive from the command ENABLE_OPERATION to the state OPERATION ENABLED [cycles].
         self.enable_delay = [0] * len(JOINTS)
-        self._enabling = [0] * len(JOINTS)  # number of consecutive ENABLE_OPERATION that each drive did not follow yet
+        #: Number of consecutive ENABLE_OPERATION that each drive has not followed yet.
+        self._enabling = [0] * len(JOINTS)
         self.emergencies = [] if outbox is None else outbox
         self.errors = Errors(NODES, self.emergencies)
         #: Supply voltage of each drive [V].

@@ -40,7 +40,7 @@ class Mechanics:
     ground: Ground | None = None  # with None, the pelvis is fixed, and there is no floor
     #: Impedance of a passive wearer. With None, a wearer in the URDF affects the joints only by the masses of the limbs.
     limbs: LimbParameters | None = None
-    active: ActiveTask | None = None  # task of an active patient on the ground; None if the muscles do nothing
+    active: ActiveTask | None = None  # task of an active patient on the ground; None: the patient uses no muscles
     parameters: EmulatorParameters | None = None  # true parameters of the nodes; see `node_parameters` for None
 
     @property

@@ -32,7 +32,8 @@ SAMPLE: Final = 1.0
 class MetabolismParameters:
     """Parameters of metabolism and respirometer. Values without a source are assumptions."""
 
-    #: W/kg, quiet standing (first term of the walking equation of Looney et al., Med. Sci. Sports Exerc. 51, 2019)
+    #: W/kg, metabolic rate of quiet standing (first term of the walking equation of Looney et al., Med. Sci. Sports Exerc. 51,
+    #: 2019)
     standing: float = 1.44
     positive: float = 0.25  # efficiency of positive muscle work (Margaria, Int. Z. Angew. Physiol. 25, 1968)
     negative: float = 1.20  # magnitude of the efficiency of negative muscle work (Margaria 1968)
@@ -108,7 +109,7 @@ def brockway(oxygen: Vector, carbon_dioxide: Vector) -> Vector:
 
 
 def _lagged(series: Vector, time: float) -> Vector:
-    """Return a series behind a lag of first order that starts in steady state."""
+    """Return a series after a first-order lag that starts in steady state."""
     keep, lagged = math.exp(-SAMPLE / time), series.copy()
     for i in range(1, len(series)):
         lagged[i] = keep * lagged[i - 1] + (1.0 - keep) * series[i]

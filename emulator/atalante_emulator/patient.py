@@ -28,7 +28,8 @@ from atalante_hal.types import PERIOD, Vector
 Pair = tuple[float, float]
 
 _SH, _SK, _LEG = LEG_JOINTS.index("SH"), LEG_JOINTS.index("SK"), len(LEG_JOINTS)
-#: Loads of a foot, as fractions of the weight: a standing foot carries more, a foot in the air less, a landed foot more.
+#: Thresholds of the load of a foot, as fractions of the weight: above _STANDING a foot stands, below _AIR it is in the air,
+#: above _LANDED it has landed.
 _STANDING, _AIR, _LANDED = 0.25, 0.02, 0.1
 #: Time for which both feet must stand before the patient expects steps [cycles].
 _READY: Final = 500
@@ -47,7 +48,8 @@ class ActiveParameters:
         80.0,
     )  # Nm/rad, feedback torque per perceived error: the stiffness of a person who resists a motion
     damping: Pair = (15.0, 8.0)  # Nm s/rad, feedback torque per rate of the error
-    delay: float = 0.15  # s, voluntary reaction to a felt error (kinaesthetic reaction times are 0.12 to 0.18 s)
+    #: s, time from an error to the voluntary reaction (kinaesthetic reaction times are 0.12 to 0.18 s)
+    delay: float = 0.15
     #: rad, errors up to this angle are not perceived. The sense of joint position has a threshold of one to two degrees at hip
     #: and knee (Domingo, Lam, J. NeuroEng. Rehabil. 11, 2014).
     threshold: float = math.radians(1.0)
@@ -120,7 +122,7 @@ class ActivePatient:
         self._lag = PERIOD / (parameters.activation + PERIOD)
         self._learned = np.zeros((len(SIDES), cycles, 2))
         self._plan = np.zeros((cycles, 2))  # learned torque of the current step, without noise
-        self._wobble = np.ones((cycles, 2))  # factor of the torque in the current step
+        self._wobble = np.ones((cycles, 2))  # noise factor of the torque in the current step
         self._error, self._slope = np.zeros((cycles, 2)), np.zeros((cycles, 2))
         self._swing, self._cycle, self._ready = -1, 0, 0  # no step before the first landing
         self._air = [False] * len(SIDES)
@@ -155,7 +157,7 @@ class ActivePatient:
                 self.impulse += PERIOD * abs(tension)
 
     def _feel_landings(self) -> None:
-        """Start the step of the other leg when a foot lands. Before the first step, wait until both feet have stood."""
+        """Start the step of the other leg when a foot lands. The first step starts only after both feet have stood."""
         left, right = self._body.sole_force[:, :, 2].sum(axis=1).tolist() if self._body.touching else (0.0, 0.0)
         loads = (left / self._weight, right / self._weight)
         if self._ready < _READY:
@@ -216,13 +218,13 @@ class ActivePatient:
 
 
 def _perceived(error: Vector, threshold: float) -> Vector:
-    """Return the part of each error above the threshold, with its sign."""
+    """Return the part of each error that exceeds the threshold of perception, with the sign of the error."""
     felt: Vector = np.sign(error) * np.maximum(np.abs(error) - threshold, 0.0)
     return felt
 
 
 def _smooth(profile: Vector) -> Vector:
-    """Return the moving average over 0.1 s of each column, because a person does not learn faster torques."""
+    """Return the moving average of each column over 0.1 s, because a person cannot learn faster changes of torque."""
     window = round(0.1 / PERIOD)
     kernel = np.full(window, 1.0 / window)
     return np.column_stack([np.convolve(column, kernel, "same") for column in profile.T])

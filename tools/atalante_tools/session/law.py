@@ -42,19 +42,20 @@ def law_options() -> Callable[[_Command], _Command]:
             show_default=True,
             metavar="X",
             help="Intensity of the joint idealization (gravity, friction, velocity torques) from 0 to 1 while the guide does not "
-            "act. With less, the patient must carry more of the leg.",
+            "act. At a lower intensity, the patient must carry more of the weight of the leg.",
         ),
         click.option(
             "--feedforward",
             type=Between(0.0, 1.0),
             metavar="X",
             help="Intensity of the feedforward (inertia of the leg along the gait) from 0 to 1 while the guide does not act. "
-            "With less, the patient must accelerate more of the leg.  [default: 1; 0 if --literal is given]",
+            "At a lower intensity, the patient must produce more of the torque that accelerates the leg.  "
+            "[default: 1; 0 if --literal is given]",
         ),
         click.option(
             "--literal",
             is_flag=True,
-            help="Use the control law of the paper to the letter, for comparisons. Its guides have no promised torque.",
+            help="Use the control law exactly as the paper prints it, for comparisons. The guides then have no promised torque.",
         ),
     ]
     return options_as("law", _law, options)

@@ -67,7 +67,7 @@ def _running(experiment: str) -> Callable[[_Command], _Command]:
         click.option("--dask", default="", metavar="ADDRESS",
                      help="Run on the workers of this dask scheduler, such as tcp://127.0.0.1:8786."),
         click.option("--engine", type=click.Choice((MUJOCO, PYBULLET)), default=MUJOCO, show_default=True,
-                     help="Physics engine of the emulated robot. MuJoCo is the faster one on the ground."),
+                     help="Physics engine of the emulated robot. MuJoCo is the faster engine on the ground."),
         click.option("--seed", type=SEED, default=0, show_default=True, metavar="N", help="Seed of all random numbers."),
         json_option,
     ]  # fmt: skip
@@ -80,9 +80,11 @@ def _walking() -> Callable[[_Command], _Command]:
         click.option("--shape", type=click.Choice(("constant", "pinched")), default="constant", show_default=True,
                      help="Shape of the guide. The guide of the paper is constant."),
         click.option("--idealization", type=Between(0.0, 1.0), default=1.0, show_default=True, metavar="X",
-                     help="Intensity of the joint idealization. With less, the subject must carry more of the leg."),
+                     help="Intensity of the joint idealization. At a lower intensity, the subject must carry more of the weight of "
+                          "the leg."),
         click.option("--feedforward", type=Between(0.0, 1.0), default=1.0, show_default=True, metavar="X",
-                     help="Intensity of the feedforward. With less, the subject must accelerate more of the leg."),
+                     help="Intensity of the feedforward. At a lower intensity, the subject must produce more of the torque that "
+                          "accelerates the leg."),
     ]  # fmt: skip
     return options_as("walking", Walking, options)
 

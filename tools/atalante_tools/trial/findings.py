@@ -13,10 +13,12 @@ from typing import Any, Final
 
 Result = dict[str, Any]
 
-#: Two metabolic rates are called equal if their means differ by at most this part of the rate of quiet standing (1.44 W/kg).
+#: Two metabolic rates are called equal if their means differ by at most this fraction of the rate of quiet standing (1.44
+#: W/kg).
 SAME: Final = 0.02
-STANDING: Final = 1.44  # W/kg
-#: Smallest rank correlation with the assistance factor that counts as a trend, and largest asymmetry of the sweep in time.
+STANDING: Final = 1.44  # W/kg, metabolic rate of quiet standing
+#: Smallest rank correlation of a quantity with the assistance factor that is called a trend, and largest asymmetry of a sweep
+#: in time.
 TREND, ASYMMETRY = 0.8, 0.25
 #: Largest coefficient of variation of the baseline metabolic rates of a sweep.
 VARIATION: Final = 0.05
@@ -27,7 +29,7 @@ class Finding:
     """Finding of the paper. The field names are the keys of `--json`."""
 
     id: str
-    claim: str  # sentence of the paper, in short
+    claim: str  # statement of the paper in one short sentence
     statistic: str  # measured values and limit
     passed: bool | None  # None if the results are missing
 

@@ -25,7 +25,7 @@ PROTOCOL: Final = (112, 38, 225)
 QUICK_PROTOCOL: Final = (3, 2, 5)
 #: Step of all walks: length [m] and duration [s].
 STEP: Final = (0.16, 0.8)
-#: Assistance factor of partial assistance, and those of the sweep in their order.
+#: Assistance factor of partial assistance, and the assistance factors of the sweep in the order of the trials.
 PARTIAL: Final = 0.5
 SWEEP: Final = (1.0, 0.75, 0.5, 0.25, 0.0, 0.25, 0.5, 0.75, 1.0)
 QUICK_SWEEP: Final = (1.0, 0.5, 0.0, 0.5, 1.0)
@@ -103,13 +103,13 @@ Trial = ShapeTrial | WalkTrial | TreadmillTrial
 
 @dataclass(frozen=True)
 class WalkSetting:
-    """What all walks of an experiment share."""
+    """Settings that all walks of an experiment share."""
 
     protocol: tuple[int, int, int]
     shape: str
     idealization: float
     feedforward: float
-    seed: int  # seed of the experiment; each trial has a seed of its own
+    seed: int  # seed of the experiment, from which the seed of each trial is computed
     engine: str
 
     def walk(self, patient: Patient, active: bool, xi: float, index: int, order: str = "") -> WalkTrial:
@@ -219,7 +219,7 @@ def _source() -> str:
     return digest.hexdigest()[:16]
 
 
-#: Files of this package that do not compute results.
+#: Files of this package that do not affect the results.
 _REPORTING: Final = ("__init__.py", "findings.py", "figures.py", "report.py", "store.py")
 
 

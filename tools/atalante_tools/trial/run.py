@@ -179,7 +179,10 @@ def _gaits(subject: Subject) -> WalkGaits:
 
 
 def _task(trial: WalkTrial, gaits: WalkGaits) -> ActiveTask | None:
-    """Return the task of an active subject; None for a passive subject. In the file of a step, the left leg swings."""
+    """Return the task of an active subject; None for a passive subject.
+
+    The task contains the nominal angles of the swing leg.
+    """
     if not trial.active:
         return None
     swing = gaits.step.tables().q[:, _SH : _SH + 2].tolist()
@@ -246,14 +249,15 @@ class Motion:
 
 
 def _position(ratio: Vector) -> dict[str, Any]:
-    """Return where the joints were in their guides.
+    """Return statistics of the tracking errors as fractions of the guide.
 
     Args:
         ratio: e / q_bound of SH and SK, shape (n, 2).
     """
     return {
-        "outer": round(float(np.mean(np.abs(ratio).max(axis=1) > 0.5)), 4),  # share of the time in the outer half
-        "spread": round(float(ratio.std(axis=0).mean()), 4),  # standard deviation, mean of both joints
+        # share of the time in the outer half of the guide
+        "outer": round(float(np.mean(np.abs(ratio).max(axis=1) > 0.5)), 4),
+        "spread": round(float(ratio.std(axis=0).mean()), 4),  # standard deviation, as the mean of both joints
         "histogram": [np.histogram(ratio[:, k], EDGES)[0].tolist() for k in range(2)],
     }
 
@@ -300,7 +304,7 @@ class Effort:
 
 
 def _respiration(rate: Vector, segments: Sequence[int], mass: float, seed: int) -> dict[str, Any]:
-    """Return what the respirometer measures of a subject who stood before the first sample.
+    """Return the measurements of the respirometer, for a subject who stood before the first sample.
 
     Args:
         rate: metabolic rate in each second, shape (n,) [W].

@@ -77,7 +77,7 @@ def _run(trial: Trial) -> Result:
 
 
 def _write(path: Path, result: Result) -> None:
-    """Write a result to a new file, and give it its name when it is complete and on the disk."""
+    """Write a result to a temporary file, and rename the file when it is complete and on the disk."""
     part = path.with_suffix(f".{os.getpid()}.part")
     with part.open("w") as file:
         json.dump(result, file)
