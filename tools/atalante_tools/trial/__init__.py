@@ -80,8 +80,8 @@ def _walking() -> Callable[[_Command], _Command]:
         click.option("--shape", type=click.Choice(("constant", "pinched")), default="constant", show_default=True,
                      help="Shape of the guide. The guide of the paper is constant."),
         click.option("--idealization", type=Between(0.0, 1.0), default=1.0, show_default=True, metavar="X",
-                     help="Intensity of the joint idealization. At a lower intensity, the subject must carry more of the weight of "
-                          "the leg."),
+                     help="Intensity of the joint idealization. At a lower intensity, the subject must carry more of the weight "
+                          "of the leg."),
         click.option("--feedforward", type=Between(0.0, 1.0), default=1.0, show_default=True, metavar="X",
                      help="Intensity of the feedforward. At a lower intensity, the subject must produce more of the torque that "
                           "accelerates the leg."),
