@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 
-from atalante_tools.trial.findings import assist_findings, shape_findings, sweep_findings
+from atalante_tools.trial.findings import assist_findings, shape_findings, step_variation, sweep_findings
 from atalante_tools.trial.plan import SWEEP, ShapeTrial, TreadmillTrial, WalkTrial, fields
 from atalante_tools.trial.report import write_report
 from atalante_tools.trial.run import EDGES
@@ -26,7 +26,7 @@ def shape_result(shape: str, ratio: float) -> Result:
 
 def walk_result(
     mass: float, active: bool, xi: float, *, net: float, error: float, outer: float = 0.5, spread: float = 0.3,
-    order: str = "",
+    variation: float = 0.1, order: str = "",
 ) -> Result:  # fmt: skip
     trial = WalkTrial(mass, 1.75, active, xi, (1, 1, 1), "constant", 1.0, 1.0, 7, "mujoco", order)
     histogram = [10] * (len(EDGES) - 1)
@@ -36,7 +36,8 @@ def walk_result(
         "max_ratio": 0.6 if xi < 1.0 else None, "error_deg": {"full": 0.5, "transition": 0.7, "target": error},
         "metabolic_w_kg": {"full": 1.44, "transition": 1.44, "target": 1.44 + net}, "muscle_w_kg": net, "guide": guide,
         "respirometer": {"segment": [0, 1, 2], "rate_w_kg": [1.44, 1.44, 1.44 + net]},
-        "curves": [[[0.1 * k, 5.0, 20.0, 4.0, 21.0, 4.0, 4.0] for k in range(9)]],
+        # hip and knee of two steps: measured, desired, bounds
+        "curves": [[[0.1 * k, 5.0 + s, 20.0, 4.0, 21.0, 4.0, 4.0] for k in range(9)] for s in (-variation, variation)],
     }  # fmt: skip
 
 
@@ -46,7 +47,7 @@ def study(**changed: dict[str, float]) -> list[Result]:
         "passive_full": {"net": 0.0, "error": 0.5},
         "passive_partial": {"net": 0.001, "error": 2.0, "outer": 0.8, "spread": 0.2},
         "active_full": {"net": 0.002, "error": 0.5},
-        "active_partial": {"net": 0.1, "error": 1.5, "outer": 0.4, "spread": 0.4},
+        "active_partial": {"net": 0.1, "error": 1.5, "outer": 0.4, "spread": 0.4, "variation": 0.4},
     }
     for name, change in changed.items():
         values[name].update(change)
@@ -79,7 +80,7 @@ def verdicts(findings: list[Any]) -> dict[str, bool | None]:
 def test_study_that_shows_all_findings_passes() -> None:
     found = verdicts(assist_findings(study()))
     assert list(found) == [
-        "assist-contained", "passive-gather", "active-spread", "passive-flat", "active-partial-above",
+        "assist-contained", "passive-gather", "active-spread", "active-vary", "passive-flat", "active-partial-above",
         "active-full-near-passive", "active-tracks-better",
     ]  # fmt: skip
     assert set(found.values()) == {True}
@@ -90,6 +91,7 @@ def test_study_that_shows_all_findings_passes() -> None:
     [
         ("passive-gather", {"passive_partial": {"outer": 0.3}}),
         ("active-spread", {"active_partial": {"spread": 0.1}}),
+        ("active-vary", {"active_partial": {"variation": 0.05}}),
         ("passive-flat", {"passive_partial": {"net": 0.05}}),
         ("passive-flat", {"passive_partial": {"net": -0.05}}),
         ("active-partial-above", {"active_partial": {"net": 0.0}}),
@@ -148,6 +150,11 @@ def test_findings_without_results_have_no_verdict() -> None:
         assert {finding.passed for finding in findings} == {None}
 
 
+def test_variation_of_steps_is_the_mean_standard_deviation_at_equal_phase() -> None:
+    # hip at +-0.4 deg in a guide of 4 deg: standard deviation 0.1; knee without variation
+    assert step_variation(walk_result(75.0, True, 0.5, net=0.0, error=1.0, variation=0.4)) == pytest.approx(0.05)
+
+
 @pytest.mark.parametrize("experiment", ["shapes", "assist", "sweep"])
 def test_report_contains_every_finding_and_requests_nothing(experiment: str, tmp_path: Path) -> None:
     results, find = {
@@ -164,6 +171,9 @@ def test_report_contains_every_finding_and_requests_nothing(experiment: str, tmp
         assert f">{'pass' if finding.passed else 'FAIL'}</td>" in row
         assert finding.statistic.split(";")[0].replace("&", "&amp;").replace("'", "&#x27;") in row
     assert any(finding.passed is False for finding in findings)
+    rows = [line for line in path.with_suffix(".md").read_text().splitlines() if line.startswith("| `")]
+    assert [row.split("`")[1] for row in rows] == [finding.id for finding in findings]
+    assert {len(row.split(" | ")) for row in rows} == {4}
     assert "Short trials" in text
     assert "1 trials have no result" in text
     assert "0123456789abcdef" in text

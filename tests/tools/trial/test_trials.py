@@ -20,7 +20,17 @@ from atalante_control.model import Patient
 from atalante_emulator.metabolism import MetabolismParameters
 from atalante_tools.cli import cli
 from atalante_tools.trial import plan, store
-from atalante_tools.trial.plan import PROTOCOL, SWEEP, Trial, WalkSetting, WalkTrial, assist_trials, key, sweep_trials
+from atalante_tools.trial.plan import (
+    PROTOCOL,
+    SWEEP,
+    Trial,
+    WalkSetting,
+    WalkTrial,
+    assist_trials,
+    key,
+    source_hash,
+    sweep_trials,
+)
 from atalante_tools.trial.run import run_trial
 from atalante_tools.trial.store import compute, path_of, stored
 
@@ -92,6 +102,18 @@ def test_key_depends_on_every_parameter_and_on_the_versions(monkeypatch: pytest.
     assert {name for change in changes for name in change} == {field.name for field in dataclasses.fields(trial)}
     monkeypatch.setattr(plan, "versions", lambda: {"atalante-hal": "9.9"})
     assert key(trial) not in keys
+
+
+def test_source_hash_changes_with_every_file_that_computes(tmp_path: Path) -> None:
+    code, report = tmp_path / "code.py", tmp_path / "report.py"
+    for file in (code, report, tmp_path / "README.md"):
+        file.write_text("1")
+    before = source_hash([tmp_path], [report])
+    report.write_text("2")
+    (tmp_path / "README.md").write_text("2")
+    assert source_hash([tmp_path], [report]) == before
+    code.write_text("2")
+    assert source_hash([tmp_path], [report]) != before
 
 
 def test_results_contain_what_the_findings_need(reference: Path) -> None:

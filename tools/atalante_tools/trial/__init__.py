@@ -59,8 +59,8 @@ def _running(experiment: str) -> Callable[[_Command], _Command]:
     """Return a decorator that adds the options of all experiments, passed as the argument `running`."""
     options = [
         click.option("--out", type=click.Path(path_type=Path, file_okay=False), default=f"runs/{experiment}", show_default=True,
-                     metavar="DIR", help="Folder for report.html and one file per trial. A trial with a valid file is not run "
-                                         "again."),
+                     metavar="DIR", help="Folder for report.html, report.md and one file per trial. A trial with a valid "
+                                         "file is not run again."),
         click.option("--quick", is_flag=True, help="Run few and short trials, to try the command."),
         click.option("--jobs", type=click.IntRange(1), default=os.cpu_count() or 1, show_default="number of cores",
                      metavar="N", help="Number of parallel processes."),
@@ -93,9 +93,9 @@ def _walking() -> Callable[[_Command], _Command]:
 def command() -> None:
     """Repeat the experiments of the paper with virtual subjects on the emulated robot, and write a report.
 
-    The report, one HTML file, contains tables, figures, and each finding of the paper with its statistic and its verdict. A
-    verdict of FAIL is a result, not an error of the command. Each trial is stored in a file of its own as soon as it has ended.
-    After an interruption, the same command runs only the missing trials.
+    The report, one HTML file (and its findings as Markdown), contains tables, figures, and each finding of the paper with its
+    statistic and its verdict. A verdict of FAIL is a result, not an error of the command. Each trial is stored in a file of its
+    own as soon as it has ended. After an interruption, the same command runs only the missing trials.
 
     \b
     Example: atalante trial shapes
@@ -193,7 +193,7 @@ def _conduct(
             show_json(asdict(finding))
     else:
         click.echo(table([["finding", "verdict", "statistic"], *([f.id, verdict(f), f.statistic] for f in findings)]))
-    print_message(f"in {running.out}: report.html, {len(results)} results in trials")
+    print_message(f"in {running.out}: report.html, report.md, {len(results)} results in trials")
     failed = [result for result in results if result["outcome"] not in ("stood", "done", "computed")]
     if failed:
         names = ", ".join(f"{r['trial']['name']} ({r['outcome']})" for r in failed[:3])

@@ -211,7 +211,7 @@ def _label(axes: Any, x: str, y: str) -> None:
         axis.set_xlabel(x)
     for row in axes:
         row[0].set_ylabel(y)
-    axes[0][0].legend(fontsize=7)
+    axes[0][-1].legend(fontsize=7)
 
 
 def _png(figure: Any) -> bytes:

@@ -181,7 +181,9 @@ def sweep_trials(setting: WalkSetting, factors: Sequence[float], days: int) -> l
 @cache
 def versions() -> dict[str, str]:
     """Return the version of Python, of this project, of its source text, and of the packages that compute a trial."""
-    found = {"python": platform.python_version(), "atalante-hal": version("atalante-hal"), "source": _source()}
+    folder = Path(__file__).parent
+    source = source_hash([*_roots(), folder], [folder / name for name in _REPORTING])
+    found = {"python": platform.python_version(), "atalante-hal": version("atalante-hal"), "source": source}
     for package in _PACKAGES:
         try:
             found[package] = version(package)
@@ -200,27 +202,34 @@ def key(trial: Trial) -> str:
     return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()[:16]
 
 
-def _source() -> str:
-    """Return a hash of the source files and data files that a trial uses."""
+#: Files of this package that do not affect the results.
+_REPORTING: Final = ("__init__.py", "findings.py", "figures.py", "report.py", "store.py")
+
+
+def _roots() -> list[Path]:
+    """Return the folders of the packages that a trial uses, without those of the tools."""
     import atalante_control
     import atalante_dbc
     import atalante_emulator
     import atalante_hal
 
+    packages = (atalante_control, atalante_dbc, atalante_emulator, atalante_hal)
+    return [Path(next(iter(package.__path__))) for package in packages]
+
+
+def source_hash(roots: Sequence[Path], ignored: Sequence[Path] = ()) -> str:
+    """Return a hash of source files and data files.
+
+    Args:
+        roots: folders of the files. Byte code and Markdown files do not count.
+        ignored: files that do not count.
+    """
     digest = hashlib.sha256()
-    roots = [
-        Path(next(iter(package.__path__)))
-        for package in (atalante_control, atalante_dbc, atalante_emulator, atalante_hal)
-    ]
-    for root in [*roots, Path(__file__).parent]:
+    for root in roots:
         for file in sorted(root.rglob("*")):
-            if file.is_file() and file.suffix not in (".pyc", ".md") and file.name not in _REPORTING:
+            if file.is_file() and file.suffix not in (".pyc", ".md") and file not in ignored:
                 digest.update(str(file.relative_to(root)).encode() + b"\0" + file.read_bytes())
     return digest.hexdigest()[:16]
-
-
-#: Files of this package that do not affect the results.
-_REPORTING: Final = ("__init__.py", "findings.py", "figures.py", "report.py", "store.py")
 
 
 def fields(trial: Trial) -> dict[str, Any]:

@@ -50,7 +50,7 @@ def verdict(finding: Finding) -> str:
 def write_report(
     experiment: str, results: Sequence[Result], findings: Sequence[Finding], quick: bool, missing: int, path: Path
 ) -> None:
-    """Write the report. Without Matplotlib, it contains no figures.
+    """Write the report, and its findings as Markdown beside it. Without Matplotlib, the report contains no figures.
 
     Args:
         experiment: key of `EXPERIMENTS`.
@@ -71,9 +71,26 @@ def write_report(
         parts.append(f"<p class='bad'>{missing} trials have no result.</p>")
     parts += ["<h2>Findings</h2>", _findings(findings), "<h2>Trials</h2>", _trials(results), "<h2>Figures</h2>"]
     parts += _figures(experiment, results)
-    parts += ["<h2>How it was computed</h2>", _provenance(results)]
+    parts += ["<h2>How it was computed</h2>", html_table(("Item", "Value"), _provenance(results))]
     path.parent.mkdir(parents=True, exist_ok=True)
     path.write_text(page(f"atalante trial {experiment}", title, parts), encoding="utf-8")
+    path.with_suffix(".md").write_text(markdown(results, findings), encoding="utf-8")
+
+
+def markdown(results: Sequence[Result], findings: Sequence[Finding]) -> str:
+    """Return findings and provenance as Markdown.
+
+    Args:
+        results: results of the trials.
+        findings: findings of the experiment.
+    """
+    rows = [(f"`{f.id}`", verdict(f), f.claim, f.statistic.replace("|", "&#124;")) for f in findings]
+    lines = [
+        "| finding | verdict | claim | statistic |",
+        "|---|---|---|---|",
+        *(f"| {' | '.join(row)} |" for row in rows),
+    ]
+    return "\n".join([*lines, "", *(f"- {name}: {value}" for name, value in _provenance(results))]) + "\n"
 
 
 def summary(result: Result) -> dict[str, Any]:
@@ -117,9 +134,8 @@ def _number(value: float | None, digits: int) -> str:
     return "-" if value is None else f"{value:.{digits}f}"
 
 
-def _provenance(results: Sequence[Result]) -> str:
-    if not results:
-        return "<p>No trial has a result.</p>"
+def _provenance(results: Sequence[Result]) -> list[tuple[str, str]]:
+    """Return versions, seeds, engine and modes of the trials, each with its name."""
     versions = {f"{name} {value}" for r in results for name, value in r["versions"].items()}
     rows = [("versions", ", ".join(sorted(versions)))]
     for name, meaning in (
@@ -130,7 +146,7 @@ def _provenance(results: Sequence[Result]) -> str:
         if values:
             rows.append((meaning, ", ".join(values)))
     rows.append(("mode", "emulated robot in lock-step (virtual time), HAL and bus in the loop, no virtual operator"))
-    return html_table(("Item", "Value"), rows)
+    return rows
 
 
 def _figures(experiment: str, results: Sequence[Result]) -> list[str]:
