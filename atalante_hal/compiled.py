@@ -114,7 +114,7 @@ def _twin(function: FunctionType) -> FunctionType:
 
 @cache
 def _callee(function: FunctionType) -> Any:
-    """Return the compiled form of a called function. It is compiled once for all its callers."""
+    """Return the compiled form of a called function. Each function is compiled once for all its callers."""
     return _numba().njit(boundscheck=True)(_twin(function))
 
 

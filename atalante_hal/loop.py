@@ -91,7 +91,7 @@ class Drift:
         self._behind = deque([0.0] * DRIFT_CYCLES, maxlen=DRIFT_CYCLES)
 
     def add(self, late: float) -> float:
-        """Add the lateness of one cycle, and return by how much the loop fell behind the clock within the window.
+        """Add the lateness of one cycle, and return the time that the loop lost within the last `DRIFT_CYCLES` cycles.
 
         Args:
             late: Lateness of the cycle [s], as `Clock.wait` returns it. A lateness above `GAP_TO_HOLD` is not added,

@@ -66,7 +66,8 @@ class Sensors:
 
     velocity_error: float  # rad/s at the joint, largest mean difference between reported velocity and encoder motion
     velocity_bandwidth: float  # Hz, cut-off frequency of the low-pass of the reported velocity
-    #: Largest difference between the attitude of the tibia from the encoders and from the IMUs [rad about each axis].
+    #: Largest difference between the attitudes of the tibia that follow from the encoders and from the IMUs [rad about each
+    #: axis].
     attitude_error: float
     attitude_change: float  # rad, largest change of the attitude difference during a constant encoder reading
     misalignment: float  # rad, allowance added to `attitude_change` for each rad by which the leg turns

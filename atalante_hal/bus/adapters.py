@@ -240,7 +240,7 @@ ADAPTERS: Final = {adapter.name: adapter for adapter in _ADAPTERS}
 
 
 def refusal(interface: str, *, one_process: bool = False) -> str:
-    """Return why an interface cannot connect a HAL with a robot. Return an empty text if it can.
+    """Return why an interface cannot connect a HAL with a robot; an empty text if there is no such reason.
 
     Args:
         interface: Name of the interface in python-can.

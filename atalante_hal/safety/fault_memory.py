@@ -19,7 +19,7 @@ from atalante_hal.safety.events import Event
 
 #: Length of the window after a logged event in which equal events are counted instead of logged [cycles].
 FOLD_CYCLES = 1000
-#: Number of events that the log keeps. They need about 2 MB of memory.
+#: Number of events that the log keeps. These events need about 2 MB of memory.
 EVENTS_KEPT = 4096
 
 

@@ -1,4 +1,4 @@
-"""Limiter: the last stage between the requested torque and the bus. It cannot be switched off.
+"""Limiter: the last stage between the requested torque and the bus. The limiter cannot be switched off.
 
     requested torque -> derated torque limit, envelope of position and velocity -> torque rate -> torque sent
 
@@ -69,7 +69,7 @@ class JointLimits(NamedTuple):
     velocity_max: Vector  # (12,) highest velocity [rad/s]
     look_ahead: float  # prediction time of the position [s]
     position_margin: float  # distance outside a position limit at which the torque is zero [rad]
-    velocity_margin: float  # excess over `velocity_max` at which the torque is zero [rad/s]
+    velocity_margin: float  # speed above `velocity_max` at which the torque is zero [rad/s]
 
 
 class Limiter:

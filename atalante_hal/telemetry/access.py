@@ -42,7 +42,7 @@ class Access:
         if (self.certificate is None) != (self.private_key is None):
             raise AccessError("certificate and private_key must be given together, got only one: give both or none")
         if self.client_ca is not None and self.certificate is None:
-            raise AccessError("client_ca requires certificate and private_key of the publisher: give them, too")
+            raise AccessError("client_ca requires certificate and private_key of the publisher: give all three files")
         for name in _FILES:
             path = getattr(self, name)
             if path is not None and not path.is_file():

@@ -74,7 +74,7 @@ class TelemetryChild(Closing):
 
     @property
     def alive(self) -> bool:
-        """Return whether the subprocess exists, even if it is suspended. Do not call this in every cycle: it is slow."""
+        """Return whether the subprocess exists, even if it is suspended. The call is too slow for every cycle."""
         return self._process.poll() is None
 
     def report(self, timeout: float) -> dict[str, Any] | None:

@@ -32,7 +32,7 @@ from atalante_hal.telemetry.ring import RingWriter
 
 CYCLES_PER_SECOND = 1000
 CYCLE_NS = 1_000_000_000 // CYCLES_PER_SECOND
-#: Gap in log time between two runs in lock-step [ns]. It separates the runs in a plot.
+#: Gap in log time between two runs in lock-step [ns], which separates the runs in a plot.
 RUN_GAP_NS = 1_000_000_000
 
 
@@ -205,7 +205,7 @@ class TelemetryProcess(Closing):
             meta=meta,
             fd=files.get(RECORDS),
         )
-        #: Function that copies the record of a cycle, shape (layout.size,), to the ring. It is fastest with a memoryview.
+        #: Function that copies the record of a cycle, shape (layout.size,), to the ring. A memoryview is copied fastest.
         self.write = self.records.write
         self.events = RingWriter(EVENT_BYTES, EVENT_SLOTS, fd=files.get(EVENTS))
         self.frames: RingWriter | None = None
@@ -408,7 +408,7 @@ class TelemetryProcess(Closing):
 
     @property
     def alive(self) -> bool:
-        """Return whether the subprocess exists, even if it is suspended. This is too slow to be called in every cycle."""
+        """Return whether the subprocess exists, even if it is suspended. The call is too slow for every cycle."""
         return self._child is not None and self._child.alive
 
     @property
@@ -449,7 +449,7 @@ class TelemetryProcess(Closing):
         return summary
 
     def _await_start(self, timeout: float) -> None:
-        """Wait until a start in the background has finished. If it takes too long, kill the subprocess.
+        """Wait until a start in the background has finished. If the start takes too long, kill the subprocess.
 
         Args:
             timeout: Longest wait [s].

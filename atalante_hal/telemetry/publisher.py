@@ -1,4 +1,4 @@
-"""Zenoh publisher, the only telemetry module with a network socket. It sends data and accepts no commands.
+"""Zenoh publisher, the only telemetry module with a network socket. The publisher sends data and accepts no commands.
 
 The session is a Zenoh peer without scouting and gossip. By default it listens on the loopback, and subscribers connect to it.
 Zenoh's access control lets this process publish only its own keys, and the process has no subscription. If a subscriber

@@ -13,7 +13,10 @@ from atalante_hal.wire.frame import Frames
 
 
 class Senders:
-    """Detector of two senders of one message. The emulator runs it only in cycles with missing, rejected or extra frames."""
+    """Detector of two senders of one message.
+
+    The emulator runs the detector only in cycles with missing, rejected or extra frames.
+    """
 
     def __init__(self, message: Message) -> None:
         self._message = message

@@ -59,7 +59,7 @@ class Crane:
         self._goal = -np.inf
 
     def lift(self) -> None:
-        """Lift the robot straight up from its current position to the height at which it was first suspended."""
+        """Lift the robot straight up from its current position, to the height at which the crane suspended the robot first."""
         self._automatic = False
         motion = self._body.motion(PELVIS)
         self._at, self._heading = motion.position, _yaw(motion.attitude)

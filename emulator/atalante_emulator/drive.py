@@ -42,7 +42,7 @@ _FAULTY: Final = (DriveState.FAULT_REACTION_ACTIVE, DriveState.FAULT)
 
 @dataclass(frozen=True)
 class DriveParameters:
-    """True parameters of the emulated drives. The HAL cannot read them."""
+    """True parameters of the emulated drives. The HAL cannot read these parameters."""
 
     motor: MotorParameters = field(default_factory=MotorParameters)
     velocity_bandwidth: float = 80.0  # cut-off frequency of the velocity low-pass [Hz]
@@ -56,7 +56,7 @@ class DriveParameters:
 
 
 class DriveSignals(NamedTuple):
-    """Signals in the state frames of the twelve drives, shape (12,) each. `Drives` updates them."""
+    """Signals in the state frames of the twelve drives, shape (12,) each. `Drives` updates the signals."""
 
     position: Vector  # at the motor [rad]
     velocity: Vector  # at the motor [rad/s]

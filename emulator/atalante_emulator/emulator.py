@@ -58,7 +58,7 @@ _SYNC_SKEW = 200e-6
 
 @dataclass(frozen=True)
 class EmulatorParameters:
-    """True parameters of the emulated nodes. The HAL cannot read them."""
+    """True parameters of the emulated nodes. The HAL cannot read these parameters."""
 
     drive: DriveParameters = field(default_factory=DriveParameters)
     imu: ImuParameters = field(default_factory=ImuParameters)

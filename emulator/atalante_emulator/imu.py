@@ -32,7 +32,7 @@ class ImuParameters:
 
 
 class ImuSignals(NamedTuple):
-    """Signals in the state frames of the IMUs. `Imus.sample` updates them."""
+    """Signals in the state frames of the IMUs. `Imus.sample` updates the signals."""
 
     quaternion: Vector  # attitude, wxyz from sensor to world with w >= 0, shape (4, 4)
     gyro: Vector  # angular rate in the sensor frame, shape (4, 3) [rad/s]

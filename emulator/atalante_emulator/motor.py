@@ -1,4 +1,4 @@
-"""Twelve emulated motors with current loop, friction, brake and winding temperature. They compute the torques on the joints."""
+"""Twelve emulated motors, which compute the torques on the joints: current loop, friction, brake and winding temperature."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ def _advance(velocity: Vector, motors: Vector, tracking: float, friction_speed: 
 
 
 class Motors:
-    """Motors of all joints. They update the arrays of measured torque [Nm at the joint] and winding temperature [degC]."""
+    """Motors of all joints, which update the arrays of measured torque [Nm at the joint] and winding temperature [degC]."""
 
     def __init__(self, robot: Robot, parameters: MotorParameters, torque: Vector, temperature: Vector) -> None:
         both = len(SIDES)

@@ -79,7 +79,7 @@ class ActiveParameters:
 
 @dataclass(frozen=True)
 class ActiveTask:
-    """Task of an active patient: the person, the motion to track, and the seed of the noise. It can be pickled."""
+    """Task of an active patient: the person, the motion to track, and the seed of the noise. The task can be pickled."""
 
     mass: float  # kg, of the patient
     height: float  # m, of the patient
@@ -186,7 +186,7 @@ class ActivePatient:
         self._learned[self._swing] += self._p.learning * np.array(self._p.gain) * _smooth(felt)
 
     def _noise(self, cycles: int) -> Vector:
-        """Return noise with mean 0, standard deviation 1 and the correlation time, shape (cycles, 2)."""
+        """Return noise with mean 0, standard deviation 1 and the correlation time `noise_time`, shape (cycles, 2)."""
         keep = math.exp(-PERIOD / self._p.noise_time)
         window = round(5.0 * self._p.noise_time / PERIOD)
         kernel = keep ** np.arange(window)

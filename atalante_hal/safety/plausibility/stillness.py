@@ -50,7 +50,7 @@ FROZEN_CYCLES = 100
 _TURN = 0.01
 #: Upper bound of the inertia about any joint [kg m2], including the knee of a leg that carries robot and patient.
 _INERTIA = 100.0
-#: Cycles with a constant reading after which a joint is at rest. In this time, an unbalanced torque would move it.
+#: Number of cycles with a constant reading after which a joint is at rest, because an unbalanced torque would have moved it.
 _AT_REST = 3
 #: Angle that a joint with the inertia `_INERTIA` cannot turn without changing its encoder reading [rad]; 20 counts of a motor
 #: encoder.

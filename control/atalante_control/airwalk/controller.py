@@ -61,7 +61,7 @@ _PELVIS = IMUS.index("pelvis")
 
 
 class AirwalkController:
-    """Airwalk controller. It implements `atalante_hal.types.Controller`.
+    """Airwalk controller, which implements `atalante_hal.types.Controller`.
 
     Attributes:
         reference: desired trajectories of both steps.

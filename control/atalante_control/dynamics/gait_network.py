@@ -32,7 +32,7 @@ INPUTS = {"mass": "kg", "height": "m", "step_length": "m", "step_duration": "s"}
 OUTPUTS = len(JOINTS) * (DEGREE + 1)
 LAYERS_MAX = 4
 WIDTH_MAX = 128  # largest number of neurons of a layer
-#: Largest accepted angle jump at the stance change [rad]. It allows for rounding errors in the weights of the last layer.
+#: Largest accepted angle jump at the stance change [rad], due to rounding errors in the weights of the last layer.
 _PERIODICITY_DEFECT = 1e-9
 _ANGLE_MAX = 2.0 * np.pi  # rad, largest accepted absolute value of a control point
 #: Largest accepted deviation of thigh and shank length from Winter's table [m]. The network was fitted with Winter's lengths.

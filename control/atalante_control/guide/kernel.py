@@ -48,7 +48,7 @@ class Guard:
     motor: Annotated[Vector, 2]  # Nm, estimated torques of the motors
     lag: Annotated[Vector, 2]  # rad/s, estimated true velocity minus measured velocity
     state: Annotated[Vector, STATES]  # state of the last tick, see `backup_policy`
-    #: absolute value of each element of `state`, where true e' minus measured e' replaces true e'
+    #: absolute value of each element of `state`; true e' is replaced by true minus measured e'
     magnitude: Annotated[Vector, STATES]
     compression: Annotated[Vector, (COMPRESSED, STATES)]  # matrix from the state to the compressed state
     compressed: Annotated[Vector, COMPRESSED]  # compressed state of the last tick
@@ -88,7 +88,7 @@ class Few:
 
 
 class GuideTables(NamedTuple):
-    """Tables of the guide filter. `GuideFilter` owns them; `tick` writes to `guards` and to `Block.ratio` only."""
+    """Tables of the guide filter. `GuideFilter` owns the tables; `tick` writes to `guards` and to `Block.ratio` only."""
 
     guards: Records[Guard]  # (1,)
     laws: Records[Law]  # (1,) mass matrix and friction
@@ -115,7 +115,7 @@ SPEED = 13  # columns 13 and 14 of `step`: velocity of q_des [rad/s]
 FLOOR = 15
 #: Columns 16 to 19 of `step`: as columns 0 to 3, for the narrowest guide in the next `TAIL_CYCLES` cycles [1/rad].
 TAIL = 16
-#: Columns 20 to 23 of `step`: as columns 0 to 3, for the narrowest guide in `SLACK_CYCLES` cycles from this one on [1/rad].
+#: Columns 20 to 23 of `step`: as columns 0 to 3, for the narrowest guide in the next `SLACK_CYCLES` cycles [1/rad].
 NEAR = 20
 COLUMNS = 24
 #: At the last predicted cycle, the bound is the narrowest guide within this number of later cycles.

@@ -53,7 +53,7 @@ class Assumptions:
 
 
 class StartReach(NamedTuple):
-    """Largest effects in each cycle. The disturbances act since the start of the step.
+    """Largest effects, in each cycle, of disturbances that act from the start of the step on.
 
     The columns are the effect of the budget on SH and SK, then the effect of the chosen promise on SH and SK.
     """

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 
 @dataclass
 class GuideStatistics:
-    """Statistics of the guide. They cover the cycles that were added with `count`."""
+    """Statistics of the guide over the cycles that were added with `count`."""
 
     cycles: int = 0  # counted cycles
     inside: int = 0  # number of counted cycles with both assisted joints inside the guide

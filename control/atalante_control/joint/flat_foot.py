@@ -150,7 +150,7 @@ def recentring_rows(deadbeat: Deadbeat, count: int) -> Vector:
 
 
 class LevelFeet:
-    """Flat-foot targets of the swing ankle. They replace the nominal angles of this ankle.
+    """Flat-foot targets of the swing ankle, which replace the nominal angles of this ankle.
 
     Call `start_step` at each stance change. Then call `write_level_ankle` once per cycle, or `without_imu` while the tibia IMU is
     lost.

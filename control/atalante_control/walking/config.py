@@ -47,7 +47,8 @@ class WalkConfig:
     flat_foot: bool = True  # whether the ankle of the swing leg holds the sole level
     #: m/s, downward speed of the swing foot after the nominal end of a step: normal step, stop step
     reach_speed: Pair = (0.3, 0.03)
-    #: s, longest time in which the swing foot moves down after the nominal end of a step. `reach_knee` can end it earlier.
+    #: s, longest time in which the swing foot moves down after the nominal end of a step. `reach_knee` can end this motion
+    #: earlier.
     reach_time: float = 0.2
     #: rad/s, largest speed of SH and SK while a late swing foot moves down. An almost straight leg could follow `reach_speed`
     #: only at higher speeds.

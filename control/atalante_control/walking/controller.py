@@ -61,7 +61,7 @@ _IMU_AGE = 10  # cycles, largest valid age of an IMU message, equal to the timeo
 
 
 class WalkController:
-    """Walking controller. It implements `atalante_hal.types.Controller`.
+    """Walking controller, which implements `atalante_hal.types.Controller`.
 
     Attributes:
         phase: current phase.

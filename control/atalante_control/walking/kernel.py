@@ -203,7 +203,8 @@ def start(measured: Measured, table: PhaseTable, parts: Parts) -> None:
     stage, n = parts.stages[0], len(measured.q)
     for joint in range(n):
         stage.deviation[joint] = measured.q[joint] - table.rows[0, joint]
-        # With both feet on the ground, the speeds of the landing are ignored: re-centring on them would press the foot down.
+        # With both feet on the ground, the speeds of the landing are ignored, because re-centring on these speeds would press
+        # the foot down.
         stage.rate[joint] = 0.0 if stage.double else measured.qd[joint] - table.rows[0, n + joint]
     swing = 1 - stage.stance
     attitude, gyro = _tibia(swing, measured, parts)

@@ -101,7 +101,7 @@ class Body(Protocol):
         """
 
     def motion(self, link: str) -> Motion:
-        """Return the true pose and velocity of a link, for crane, virtual operator and tests. Emulated nodes do not use them.
+        """Return the true pose and velocity of a link, for crane, virtual operator and tests, not for emulated nodes.
 
         Args:
             link: name of the link in the URDF.

@@ -1,4 +1,4 @@
-"""Command `atalante status`: listens to a bus and prints the state of every node. It sends no frames.
+"""Command `atalante status`: listens to a bus and prints the state of every node, without sending frames.
 
 bus -> Observer -> Report -> tables, or one JSON object
 """

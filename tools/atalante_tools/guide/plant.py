@@ -1,4 +1,4 @@
-r"""Ideal plant for the search of the worst push: hip and knee of one swing leg in the air, with drives, encoders and limiter.
+r"""Ideal plant for the search for the worst push: hip and knee of one swing leg in the air, with drives, encoders, limiter.
 
 `torque command, push -> motion, measurements`. The plant shares no table with the controller. Its equation of motion is
 

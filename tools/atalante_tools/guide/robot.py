@@ -115,7 +115,7 @@ class PushedRobot:
 
 
 class _Hand:
-    """Source of the pushes on both legs, called once per cycle. It also records each finished swing."""
+    """Source of the pushes on both legs, called once per cycle, which also records each finished swing."""
 
     def __init__(
         self,

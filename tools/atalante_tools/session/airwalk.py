@@ -201,7 +201,7 @@ def _walk_all(
 
 
 class _Walk:
-    """Run of the robot inside one guide shape. It writes the telemetry and prints the progress line."""
+    """Run of the robot inside one guide shape, with telemetry and a progress line."""
 
     def __init__(
         self,

@@ -1,4 +1,4 @@
-"""Optional dependencies of the gait optimisation. The controller does not need them."""
+"""Optional dependencies of the gait optimisation. The controller does not need these packages."""
 
 from __future__ import annotations
 

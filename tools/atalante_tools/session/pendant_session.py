@@ -163,7 +163,10 @@ class Session:
         print_message("the dead-man switch is released; type start to press it again, with START")
 
     def _elapsed(self) -> float:
-        """Return the time since the start [s]. After the first answer, it is the number of answered SYNCs times `PERIOD`."""
+        """Return the time since the start [s].
+
+        After the first answer, this time is the number of answered SYNCs times `PERIOD`.
+        """
         return self.node.answered * PERIOD if self.node.answered else self._now() - self._begun
 
     def press_stop(self) -> None:
@@ -228,7 +231,7 @@ class Session:
 
 
 class Keyboard:
-    """Non-blocking reader of the lines that the user types. Without a file descriptor it returns no lines."""
+    """Non-blocking reader of the lines that the user types. Without a file descriptor, the reader returns no lines."""
 
     def __init__(self, file: int | None) -> None:
         self._file = file

@@ -41,7 +41,7 @@ def minimum_jerk(phase: float) -> tuple[float, float]:
 
 
 class PoseHold:
-    """PD controller with gravity compensation. It holds a pose with the hold gains of the robot.
+    """PD controller with gravity compensation, which holds a pose with the hold gains of the robot.
 
     Attributes:
         telemetry: Reference angles, shape (12,) [rad].

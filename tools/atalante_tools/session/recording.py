@@ -28,7 +28,7 @@ _TEND_CYCLES: Final = 250
 
 
 def _record_rate(text: str) -> int:
-    """Convert the recording rate that the user entered to a number [Hz] (option type). It must be a divisor of 1000 Hz.
+    """Convert the recording rate that the user entered to a number [Hz] (option type). The rate must be a divisor of 1000 Hz.
 
     Args:
         text: Rate as the user typed it.
@@ -44,7 +44,7 @@ def _record_rate(text: str) -> int:
 #: Options of a command that records its run: `--record-rate`, `--can-log` and `--telemetry`.
 RECORDING_OPTIONS: Final = [
     click.option("--record-rate", type=_record_rate, default="100", show_default=True, metavar="HZ",
-                 help="Recording rate [Hz]. It must be a divisor of 1000. With 1000, every cycle is recorded."),
+                 help="Recording rate [Hz], a divisor of 1000. With 1000, every cycle is recorded."),
     click.option("--can-log", type=click.Path(path_type=Path, dir_okay=False), metavar="FILE",
                  help="Log every CAN frame to this file. The suffix sets the format: .log, .asc, .blf, .log.gz, .asc.gz.  "
                       "[default: no CAN log]"),
@@ -203,7 +203,7 @@ def close_telemetry(telemetry: TelemetryProcess) -> TelemetrySummary:
 
 
 class EndpointReport:
-    """Printer of the Zenoh endpoint. It prints the endpoint at the start and after each change."""
+    """Printer of the Zenoh endpoint, at the start and after each change of the endpoint."""
 
     def __init__(self, telemetry: TelemetryProcess) -> None:
         """Print the notices of the telemetry and its endpoint.
@@ -249,7 +249,7 @@ class Recorder:
                 hal.tap = telemetry.tap(stamps=lambda: hal.bus.stamps)
 
     def write(self) -> None:
-        """Write the record of a cycle, and new events. Call it once per cycle."""
+        """Write the record of a cycle, and new events. Call this method once per cycle."""
         hal = self._hal
         self._telemetry.write(hal.record)
         if not hal.state.cycle % _TEND_CYCLES:

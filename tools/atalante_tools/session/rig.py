@@ -41,7 +41,7 @@ if TYPE_CHECKING:
 
 #: Timeout of the answers to a SYNC on the wall clock: half a cycle [s].
 PATIENCE: Final = 0.5e-3
-#: Timeout of the answers to a SYNC in lock-step [s]. It is long, because the other process may run on a slow computer.
+#: Timeout of the answers to a SYNC in lock-step [s], long because the other process may run on a slow computer.
 LOCKSTEP_PATIENCE: Final = 2.0
 
 
@@ -224,7 +224,7 @@ def join(network: Network, buses: dict[str, Bus]) -> Bus:
 
 
 class Watch:
-    """End condition of a run, called once per cycle. It also prints a progress line.
+    """End condition of a run, called once per cycle, which also prints a progress line.
 
     A run ends when `done(state)` returns True while the robot is ACTIVE, when a signal arrives, or when the robot is in FAULT. If
     the robot leaves ACTIVE for another state, the run ends too, but with `resumes` it waits for the operator's START instead.

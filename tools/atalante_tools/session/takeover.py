@@ -40,7 +40,7 @@ _INTACT: Final = (Check.OK, Check.SOME_LOST, Check.REPEATED, Check.CONFLICT, Che
 
 
 class Takeover:
-    """Takeover rule of one pendant. It decides whether the pendant answers the last SYNC.
+    """Takeover rule of one pendant, which decides whether the pendant answers the last SYNC.
 
     Attributes:
         established: Whether this pendant was the only pendant that sent at the end of its takeover.

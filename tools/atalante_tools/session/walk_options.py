@@ -85,7 +85,7 @@ def gaits_of(options: WalkOptions, robot: Robot) -> tuple[Patient, WalkGaits]:
 
 
 def gaits_of_subject(subject: Subject, robot: Robot) -> WalkGaits:
-    """Return the gaits of a subject: those of the default walk file, or of the network with solved start step and stop step.
+    """Return the gaits of a subject: from the default walk file, or from the network and the gait solver.
 
     Args:
         subject: Patient and step.

@@ -103,7 +103,7 @@ def show_result(result: WalkResult) -> None:
 def write_result(
     out: Path, options: WalkOptions, result: WalkResult, trace: WalkTrace, recording: Recording | None
 ) -> None:
-    """Write options and result to summary.json, and the trace and its figure, and print the names of the files."""
+    """Write summary.json, the trace and the figure of a walk, and print the names of the files."""
     subject, law = None if options.subject is None else str(options.subject), asdict(options.law)
     given = {key: value for key, value in asdict(options).items() if key not in ("out", "recording", "law")}
     given = {**given, **law, "subject": subject, "record_rate": options.recording.record_rate}

@@ -27,7 +27,7 @@ _BATCH: Final = 128
 
 @dataclass
 class Fault:
-    """Fault of chosen messages. It ends when it has affected `frames` frames of each message, or when `end` is called."""
+    """Fault of chosen messages. A fault ends when it has affected `frames` frames of each message, or when `end` is called."""
 
     kind: str  # drop, delay or corrupt
     messages: tuple[str, ...]  # names of the messages
@@ -54,7 +54,7 @@ class Fault:
 
 
 class FrameFilter(WrappedBus):
-    """Bus that applies faults to frames. Without a fault it passes all frames on.
+    """Bus that applies faults to frames. Without a fault, the bus passes all frames on.
 
     The filter does not change the list of time stamps. If a frame is dropped or delayed, the following stamps no longer match.
 

@@ -175,7 +175,7 @@ class Stepper:
 
 
 class Recording:
-    """`FrameTap` that records all frames between HAL and nodes. It keeps the last `KEPT` frames."""
+    """`FrameTap` that records all frames between HAL and nodes, and keeps the last `KEPT` frames."""
 
     def __init__(self, network: Network) -> None:
         self._network = network

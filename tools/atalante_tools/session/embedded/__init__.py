@@ -51,7 +51,7 @@ class SpawnConfig:
 
 
 class EmbeddedRobot(Closing):
-    """Subprocess with the embedded robot. As a context manager, it closes itself after the block.
+    """Subprocess with the embedded robot. Used as a context manager, this object closes itself after the block.
 
     Create this object early, because the child then imports its modules while the parent prepares the run.
 
