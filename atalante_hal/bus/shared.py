@@ -196,7 +196,7 @@ class SharedBus:
         """
         peers = self._peers
         if not self._until(lambda: peers[_SERVING], timeout):
-            raise BusDown(f"{self.name}: the other end did not start to serve within {timeout:.0f} s")
+            raise BusDown(f"{self.name}: the other end did not call `serve` within {timeout:.0f} s")
 
     def close(self, reason: str = "") -> None:
         """Close this end. The other end can still receive the frames that were sent.

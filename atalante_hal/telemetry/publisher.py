@@ -165,7 +165,7 @@ def configuration(robot: str, listen: str) -> dict[str, Any]:
                     "key_exprs": own,
                 },
                 {
-                    # A subscriber may send its subscription, with any wildcard, and its query for cached events.
+                    # A subscriber may send two things: its subscription, with any wildcard, and its query for cached events.
                     "id": "subscribe and query",
                     "permission": "allow",
                     "flows": ["ingress"],

@@ -46,7 +46,7 @@ _COLUMNS: Final = (
 
 @dataclass(frozen=True)
 class Trial:
-    """One trial."""
+    """One walk of one patient in one engine."""
 
     kind: str  # key of `KINDS`
     engine: str

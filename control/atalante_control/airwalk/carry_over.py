@@ -17,7 +17,7 @@ from atalante_hal.types import Vector
 
 
 class Carry:
-    """State of the carry-over: torque before the stance change, and torque jump to compensate."""
+    """State of the carry-over of the torque: torque before the stance change, and torque jump to compensate."""
 
     pending: bool  # true until the first torque after the stance change is computed
     before: Annotated[Vector, len(JOINTS)]  # Nm, torque before the stance change
@@ -46,11 +46,11 @@ class CarryOver:
 
     @property
     def pending(self) -> bool:
-        """Return whether a carry-over has started, but the first torque after the stance change is still to be computed."""
+        """Return whether a carry-over has started, and the first torque after the stance change is not computed yet."""
         return bool(self.records[0].pending)
 
     def start(self, before: Vector) -> None:
-        """Start the carry-over at a stance change or at the start of the motion.
+        """Start the carry-over of the torque, at a stance change or at the start of the motion.
 
         Args:
             before: torque before the stance change, shape (12,) [Nm]; copied.
@@ -59,7 +59,7 @@ class CarryOver:
         carry.before[:], carry.pending = before, True
 
     def cancel(self) -> None:
-        """Cancel a carry-over whose torque jump is not computed yet."""
+        """Cancel a carry-over of the torque for which the torque jump has not been computed yet."""
         self.records[0].pending = False
 
 

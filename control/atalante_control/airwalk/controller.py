@@ -178,7 +178,7 @@ class AirwalkController:
             self._guides.prepare()
 
     def choice(self, xi: float) -> Choice:
-        """Return the guide filter that is used at an assistance factor, and the promise for which it is built.
+        """Return the guide filter used at an assistance factor, and its promised torques as a fraction of the chosen ones.
 
         Args:
             xi: assistance factor in [0, 1].

@@ -21,7 +21,8 @@ class Telemetry:
     error: Annotated[Vector, 2]  # rad, q - q_des
     q_bound: Annotated[Vector, 2]  # rad, distance from q_des to the upper bound for error > 0, else to the lower bound
     guide: Annotated[Vector, 2]  # rad, distances from q_des to the upper and to the lower bound of the guide of SH
-    h: Annotated[Vector, 2]  # safe backward image function; the same value for both joints
+    #: h of the paper: at least 0 if the backup policy can keep both joints inside; the same value for both joints
+    h: Annotated[Vector, 2]
     gate: Annotated[Vector, 2]  # weight of the backup torque, the same value for both joints; published as `lambda`
     filter_active: Annotated[Vector, 2]  # 1 where the filter is active; the same value for both joints
     step: float  # number of completed right-stance steps
@@ -46,7 +47,7 @@ class Step:
     xi: float  # assistance factor
     assisted: bool  # whether SH and SK of the swing leg get the assistive torque; False at Xi = 1
     intensity: float  # factor of the haptic levels
-    literal: bool  # whether the law of `guide.literal` drives the robot
+    literal: bool  # whether the control law follows the paper literally, see `guide.literal`
     active: float  # weight of the backup torque above which the filter is considered active
 
 

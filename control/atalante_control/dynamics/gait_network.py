@@ -129,7 +129,7 @@ class GaitNetwork:
 
 
 def periodicity() -> Vector:
-    """Return the matrix A for which A c = 0 means that a gait is continuous at the stance change, shape (24, 96).
+    """Return the matrix A with A c = 0 if the gait with the control points c is continuous at the stance change, shape (24, 96).
 
     c is the vector of the control points of all joints, shape (96,). The first 12 rows of A are the conditions on the angles, the
     last 12 rows are the conditions on the slopes.

@@ -50,7 +50,7 @@ from atalante_hal.types import Vector
 Pair = tuple[float, float]
 
 _JOINTS = ("SH", "SK")
-#: Smallest disturbance torque at the hip for which a promise is given [Nm]. Below this torque there is no promise.
+#: Smallest disturbance torque at the hip that is promised [Nm]. A guide that tolerates less has no promise.
 SMALLEST = 1.0
 
 
@@ -63,29 +63,30 @@ class JointTorque:
 
 
 class Limit(NamedTuple):
-    """Condition that limits a promise."""
+    """Condition that limits the disturbance torques which a guide can promise to tolerate."""
 
-    #: largest promise that meets the condition, as a fraction of the chosen promise; negative if no promise meets it
+    #: largest promise under this condition, as a fraction of the chosen promised torques; negative if there is none
     scale: float
     what: str  # condition in words, for a message
 
 
 @dataclass(frozen=True)
 class Certificate:
-    """Result of the certification of a guide."""
+    """Result of the certification of a guide: the disturbance torques that are promised to leave both joints inside."""
 
     shape: str
     xi: float
-    certified: bool  # whether there is a promise
-    reason: str  # sentence that states what limits the promise, or why there is no promise
-    promise: JointTorque | None  # disturbance for which the running filter is built, or None if there is no promise
-    #: largest disturbance for which a filter with these gains could be built, or None if there is no promise
+    certified: bool  # whether the guide has promised torques
+    reason: str  # sentence that states what limits the promised torques, or why there are none
+    promise: JointTorque | None  # promised torques, for which the running filter is built; None if there are none
+    #: largest torques that a filter with these gains could promise; None if there are none
     largest: JointTorque | None
-    margin: float  # fraction of the guide width that remains under the promised disturbance; negative without a promise
+    #: fraction of the guide width that remains under the promised torques; negative without promised torques
+    margin: float
 
 
 class PromiseLimits:
-    """Conditions that limit the promise of a guide filter. The conditions that do not depend on Xi are evaluated only once."""
+    """Conditions that limit the promised torques of a guide filter. Conditions that do not depend on Xi are evaluated once."""
 
     def __init__(self, guide: GuideFilter) -> None:
         """Compute the limits of torque, speed and torque rate.
@@ -136,7 +137,7 @@ class PromiseLimits:
         return sorted(found, key=lambda limit: limit.scale)
 
     def largest(self, xi: float) -> float:
-        """Return the largest possible promise as a fraction of the chosen promise; at most 0 if no promise is possible.
+        """Return the largest possible promise as a fraction of the chosen promised torques; at most 0 if none is possible.
 
         Args:
             xi: assistance factor in [0, 1].
@@ -213,7 +214,7 @@ class _Horizon:
         self._reach = prediction.reach[self._starts // START_CYCLES]
 
     def limit(self, width: Vector, narrowest: Vector) -> Limit:
-        """Return the largest scale of the promise that meets the condition.
+        """Return the largest scale of the promised torques that meets the condition.
 
         Args:
             width: distance from q_des to the nearer bound of the guide in each cycle, shape (n, 2) [rad].

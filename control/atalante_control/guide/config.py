@@ -24,16 +24,16 @@ class StepGuideConfig:
     #: stiffnesses of the softer backup policies as fractions of `stiffness`, ascending
     gentler: tuple[float, ...] = (0.78,)
     damping: Pair = (1.3, 0.85)  # damping ratios of the two modes of the backup policy
-    #: Nm, chosen promise: disturbance torques of SH and SK that the guide tolerates, if possible
+    #: Nm, chosen promised torques: disturbance torques of SH and SK that the guide tolerates, if possible
     promise: Pair = (30.0, 18.0)
     mismatch: Mismatch = field(default_factory=Mismatch)
     hand_over: HandOver = field(default_factory=HandOver)
     torque_reserve: float = 14.0  # Nm, smallest difference between the torque limit of the robot and a predicted torque
     #: rad/s, smallest difference between the velocity limit of the robot and a predicted speed
     speed_reserve: float = 0.2
-    zeta: float = 0.01  # s, gain of lambda_d, which increases the gate while h decreases
-    idealization: float = 1.0  # intensity of the joint idealization u_i in [0, 1] while the gate of the guide is 0
-    feedforward: float = 1.0  # intensity of the feedforward u_f in [0, 1] while the gate of the guide is 0
+    zeta: float = 0.01  # s, gain of lambda_d, which increases the weight of the backup torque while h decreases
+    idealization: float = 1.0  # intensity of the joint idealization u_i in [0, 1] while the backup torque has weight 0
+    feedforward: float = 1.0  # intensity of the feedforward u_f in [0, 1] while the backup torque has weight 0
     #: Counter value above which the controller reports that the leg has left a guide with a promise. The counter rises by 1 in
     #: each cycle with h < 0. It falls by 1, but not below 0, in each other cycle.
     outside_cycles: int = 150

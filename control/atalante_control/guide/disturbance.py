@@ -36,7 +36,7 @@ _POSTURES = 3  # number of knee angles for which the mass matrix is evaluated in
 
 @dataclass(frozen=True)
 class Mismatch:
-    """Largest errors of the model under which a promise holds.
+    """Largest errors of the model under which the promised torques hold.
 
     Raises:
         ValueError: If a value is out of range.
@@ -56,7 +56,7 @@ class Mismatch:
 
 @dataclass(frozen=True)
 class HandOver:
-    """Hand-over box: range of deviations at the start of a step within which a promise holds.
+    """Hand-over box: range of deviations at the start of a step within which the promised torques hold.
 
     Raises:
         ValueError: If a value is negative or not finite.

@@ -61,11 +61,11 @@ class GuideConfig:
     rate_limit: float  # Nm, largest change of the backup torque within one cycle
     speed_limit: float  # rad/s, largest predicted speed of SH and of SK
     worst_speed_limit: float  # rad/s, largest predicted speed for the worst model errors
-    zeta: float = 0.01  # s, gain of lambda_d, which increases the gate while h decreases
+    zeta: float = 0.01  # s, gain of lambda_d, which increases the weight of the backup torque while h decreases
     derivative_time: float = 0.005  # s, time constant of the low-pass filter on dh/dt
-    release: float = 0.03  # s, shortest time in which the gate falls from 1 to 0
-    idealization: float = 1.0  # intensity of the joint idealization u_i in [0, 1] while the gate is 0
-    feedforward: float = 0.0  # intensity of the feedforward u_f in [0, 1] while the gate is 0
+    release: float = 0.03  # s, shortest time in which the weight of the backup torque falls from 1 to 0
+    idealization: float = 1.0  # intensity of the joint idealization u_i in [0, 1] while the backup torque has weight 0
+    feedforward: float = 0.0  # intensity of the feedforward u_f in [0, 1] while the backup torque has weight 0
 
     def __post_init__(self) -> None:
         for name in ("torque_limit", "rate_limit", "speed_limit", "worst_speed_limit", "release"):
@@ -171,11 +171,11 @@ class GuideFilter:
 
     @property
     def state(self) -> Vector:
-        """Return a copy of the state of the sampled loop at the last tick, shape (10,), as defined in `backup_policy`."""
+        """Return a copy of the state of the sampled loop at the last cycle, shape (10,), as defined in `backup_policy`."""
         return self.tables.guards[0].state.copy()
 
     def errors_ahead(self) -> Vector:
-        """Return the tracking errors of SH and SK predicted at the last tick without disturbance, shape (n, 2) [rad]."""
+        """Return the tracking errors of SH and SK predicted at the last cycle without disturbance, shape (n, 2) [rad]."""
         return np.asarray(self.prediction.ahead @ (self.prediction.compress @ self.state))
 
     def uncertainty(self) -> Vector:
@@ -186,12 +186,15 @@ class GuideFilter:
 
     @property
     def h(self) -> float:
-        """Return the value of h at the last tick. h is at least 0 if the state of the leg is in the safe backward image."""
+        """Return h of the last cycle.
+
+        At h >= 0, the backup policy can keep both joints inside the guide (safe backward image).
+        """
         return float(self.tables.guards[0].h)
 
     @property
     def gate(self) -> float:
-        """Return the weight of the backup torque at the last tick."""
+        """Return the weight of the backup torque at the last cycle."""
         return float(self.tables.guards[0].gate)
 
 

@@ -29,7 +29,7 @@ START_CYCLES = 4
 
 
 class Guard:
-    """Constants and state of the filter, and results of the last tick."""
+    """Constants and state of the filter, and results of the last cycle."""
 
     gains: Annotated[Vector, (2, 4)]  # rows SH, SK; Kv [1/s2] in columns 0 and 1, Dv [1/s] in columns 2 and 3
     torque_limit: float  # Nm, largest predicted torque
@@ -39,23 +39,24 @@ class Guard:
     keep: float  # weight of the old value in the low-pass of the measured velocity
     zeta: float  # s, gain of lambda_d, which increases the gate while h decreases
     smoothing: float  # weight of the new value in the low-pass filter of dh/dt
-    release: float  # largest decrease of the gate per cycle; without this limit the gate could oscillate with the leg
+    #: largest decrease of the gate (weight of the backup torque) per cycle, so that the gate does not oscillate
+    release: float
     idealization: float  # intensity of the joint idealization u_i in [0, 1]
     feedforward: float  # intensity of the feedforward u_f in [0, 1]
-    promise: float  # disturbance that the filter assumes in this step, as a fraction of `Assumptions.promise`
+    promise: float  # promised torques that the filter assumes in this step, as a fraction of `Assumptions.promise`
     xi: float  # assistance factor of the step
-    fresh: bool  # true before the first tick of a step
+    fresh: bool  # true before the first cycle of a step
     motor: Annotated[Vector, 2]  # Nm, estimated torques of the motors
     lag: Annotated[Vector, 2]  # rad/s, estimated true velocity minus measured velocity
-    state: Annotated[Vector, STATES]  # state of the last tick, see `backup_policy`
+    state: Annotated[Vector, STATES]  # state of the last cycle, see `backup_policy`
     #: absolute value of each element of `state`; true e' is replaced by true minus measured e'
     magnitude: Annotated[Vector, STATES]
     compression: Annotated[Vector, (COMPRESSED, STATES)]  # matrix from the state to the compressed state
-    compressed: Annotated[Vector, COMPRESSED]  # compressed state of the last tick
+    compressed: Annotated[Vector, COMPRESSED]  # compressed state of the last cycle
     few_slack: Annotated[Vector, (STATES, 2)]  # largest value of each element of `Few.slack` over all rows
-    h: float  # h of the last tick; the leg is inside the safe backward image if h is at least 0
+    h: float  # h of the last cycle; at h >= 0, the backup policy can keep both joints inside the guide
     rate: float  # 1/s, dh/dt
-    gate: float  # weight of the backup torque, lambda + (1 - lambda) lambda_d
+    gate: float  # gate: weight of the backup torque, lambda + (1 - lambda) lambda_d
     bounds: Annotated[Vector, 4]  # rad, distances from q_des to the guide: upper and lower of SH, upper and lower of SK
 
 
@@ -74,7 +75,7 @@ class Block:
     middle: Annotated[Vector, (COMPRESSED, 2)]  # mean of the largest and the smallest `Lag.ahead` in the block
     #: half the difference of the largest and the smallest `Lag.ahead` in the block
     spread: Annotated[Vector, (COMPRESSED, 2)]
-    ratio: float  # upper bound of the predicted error / guide width over all cycles of the block, from the last tick
+    ratio: float  # upper bound of the predicted error / guide width over all cycles of the block, from the last cycle
 
 
 class Few:
@@ -115,7 +116,7 @@ SPEED = 13  # columns 13 and 14 of `step`: velocity of q_des [rad/s]
 FLOOR = 15
 #: Columns 16 to 19 of `step`: as columns 0 to 3, for the narrowest guide in the next `TAIL_CYCLES` cycles [1/rad].
 TAIL = 16
-#: Columns 20 to 23 of `step`: as columns 0 to 3, for the narrowest guide in the next `SLACK_CYCLES` cycles [1/rad].
+#: Columns 20 to 23 of `step`: as columns 0 to 3, for the narrowest guide in `SLACK_CYCLES` cycles from now on [1/rad].
 NEAR = 20
 COLUMNS = 24
 #: At the last predicted cycle, the bound is the narrowest guide within this number of later cycles.

@@ -52,7 +52,7 @@ class Letter:
 
 
 class LiteralTables(NamedTuple):
-    """Tables of the literal law. `LiteralGuide` owns the tables; `assistive_torque` writes to `letters` only."""
+    """Tables of the control law that follows the paper literally. Only `letters` is written in `assistive_torque`."""
 
     letters: Records[Letter]  # (1,)
     step: Vector  # (cycles + 1, 8) values of each cycle of the step; the columns are defined below
@@ -65,7 +65,7 @@ FEEDFORWARD = 6  # columns 6 and 7 of `step`: feedforward u_f of SH and SK at fu
 
 @dataclass(frozen=True)
 class LiteralConfig:
-    """Parameters of the literal law."""
+    """Parameters of the control law that follows the paper literally."""
 
     gains: LegGains  # gains of the baseline PID of the swing leg
     push: Pair  # Nm, largest absolute value of the external torque u_ext of SH and SK
@@ -121,7 +121,7 @@ class LiteralGuide:
 
 
 def no_promise(shape: str, xi: float) -> Certificate:
-    """Return the certificate of a guide under the literal law, which states that there is no promise.
+    """Return the certificate of a guide whose control law follows the paper literally: it has no promised torques.
 
     Args:
         shape: name of the shape.

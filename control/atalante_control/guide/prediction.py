@@ -147,7 +147,8 @@ class Prediction:
         torque, speed = Effect(nominal.pushed_feedback, nothing, self.mass), Effect(nominal.pushed_rate, nothing, same)
         first_torque = run(torque, mobilities, bounds, few, few_ahead[0])
         first_speed = run(speed, mobilities, bounds, few, few_ahead[1])
-        by_bound = few_ahead[:2].reshape(2, blocks, len(FEW), 2, 2).transpose(1, 2, 3, 0, 4)  # budget and promise first
+        # Axes of `by_bound`: start cycle, row, cause (model errors or promised torques), torque or speed, joint.
+        by_bound = few_ahead[:2].reshape(2, blocks, len(FEW), 2, 2).transpose(1, 2, 3, 0, 4)
         self.few_reach: Vector = np.concatenate([by_bound.reshape(blocks, len(FEW), 8), few_ahead[2]], axis=2)
         self.few_ahead: Vector = np.concatenate([nominal.feedback[FEW], nominal.rate[FEW]], axis=1)
         rates = [_separated(one.rate[FEW] - nominal.rate[FEW]) for one in family]

@@ -28,15 +28,15 @@ _MIDDLE = math.radians(30.0)
 _ASSISTED = [LEG_JOINTS.index("SH"), LEG_JOINTS.index("SK")]
 #: Largest width of any guide [rad].
 _WIDEST = math.radians(7.5)
-#: Fraction of its largest promise that a filter assumes if no filter is certified for the chosen promise. With the whole
-#: largest promise, the gate would be 1 even without a disturbance.
+#: Fraction of its largest promised torques that a filter assumes if no filter can promise the chosen torques. With the largest
+#: promised torques, the backup torque would have weight 1 even without a disturbance.
 _USED = 0.95
 #: Number of decimal digits of the assistance factor, as on the bus.
 _DIGITS = 4
 
 
 class Choice(NamedTuple):
-    """Guide filter of a step, and the promise that this filter assumes, as a fraction of the chosen promise."""
+    """Guide filter of a step, and the promised torques of this filter, as a fraction of the chosen promised torques."""
 
     guide: GuideFilter
     promise: float
@@ -74,7 +74,7 @@ class StepGuides:
         self._choices: dict[float, Choice] = {}
 
     def prepare(self) -> None:
-        """Choose and store the filter and its promise for every assistance factor from 0 to 1, in steps of 0.01.
+        """Choose and store the filter and its promised torques for every assistance factor from 0 to 1, in steps of 0.01.
 
         The computation for one assistance factor takes longer than a cycle. On the wall clock, `prepare` must therefore be called
         before a walk.
@@ -83,7 +83,7 @@ class StepGuides:
             self.at(percent / 100)
 
     def at(self, xi: float) -> Choice:
-        """Return the softest filter certified for the chosen promise; if there is none, the filter with the largest promise.
+        """Return the softest filter that promises the chosen torques; if there is none, the filter that promises the most.
 
         Args:
             xi: assistance factor in [0, 1].

@@ -72,7 +72,8 @@ class WalkConfig:
     #: the heavy leg would need more torque than the drives have. The other joints keep `alpha`, because the robot falls if they
     #: are re-centred as slowly as SH and SK.
     guided_alpha: float = 0.5
-    engage: float = 0.02  # s, time at the start of a guided step in which the lower bound of the gate falls from 1 to 0
+    #: s, time at the start of a guided step in which the lower bound of the backup torque's weight falls from 1 to 0
+    engage: float = 0.02
     release: float = 0.03  # s, time after the nominal end of a guided step in which the baseline takes over SH and SK
 
     @classmethod

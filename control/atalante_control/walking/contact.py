@@ -21,7 +21,7 @@ class ImpactConfig:
     impact_force: float = 80.0  # N, smallest vertical force on the swing foot at an impact
     #: N, force below which the swing foot has left the ground; an impact is accepted only afterwards
     release_force: float = 30.0
-    debounce: int = 5  # number of consecutive cycles with at least `impact_force` that are an impact
+    debounce: int = 5  # number of consecutive cycles with at least `impact_force` after which an impact is detected
     earliest: float = 0.5  # fraction of the step duration before which impacts are ignored
 
     def __post_init__(self) -> None:

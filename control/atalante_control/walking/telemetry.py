@@ -36,7 +36,7 @@ class Telemetry:
     assistance_factor: float  # Xi of this step; 1 outside the periodic gait
     error: Annotated[Vector, 2]  # rad, q - q_des of SH and SK of the swing leg, in the last guided cycle
     q_bound: Annotated[Vector, 2]  # rad, distance from q_des to the bound of the guide on the side of the error
-    h: float  # safe backward image function
+    h: float  # h of the paper: at least 0 if the backup policy can keep both joints inside the guide
     gate: float  # weight of the backup torque; published as `lambda`
 
 

@@ -126,7 +126,7 @@ def test_wait_for_an_end_that_never_serves_times_out(ends: tuple[SharedBus, Shar
     begun = time.monotonic()
     assert ours.receive(new_frames(1)) == 0
     assert time.monotonic() - begun >= 0.03
-    with pytest.raises(BusDown, match="the other end did not start to serve within 0 s"):
+    with pytest.raises(BusDown, match="the other end did not call `serve` within 0 s"):
         ours.wait_until_served(0.03)
 
 

@@ -93,7 +93,7 @@ _CHECK_OPTIONS = [
                       "mass (both), encoder noise, 1 % frame loss, 1 ms more delay. Repeat the option for several conditions.  "
                       "[default: all]"),
     click.option("--push", type=(Between(0.0, 500.0), Between(0.0, 500.0)), default=None, metavar="HIP KNEE",
-                 help="Largest push at hip and knee [Nm].  [default: the promise of the guide]"),
+                 help="Largest push at hip and knee [Nm].  [default: the promised torques of the guide]"),
     click.option("--steps", type=click.IntRange(1), metavar="N",
                  help="Steps on the ideal plant per guide.  [default: 1500, with --quick 60]"),
     click.option("--robot-steps", type=click.IntRange(0), metavar="N",
@@ -113,7 +113,7 @@ _CHECK_OPTIONS = [
 @command.command(short_help="Search for the worst push within the promise of a guide.")
 @options_as("options", CheckOptions, [*_CHECK_OPTIONS, law_options(), json_option, subject_options])
 def check(options: CheckOptions, as_json: bool, subject: Subject | None) -> None:
-    """Search for the worst push within the promise of each guide, and print the promise and the worst |e| / q_bound.
+    """Search for the worst push up to the promised torques of each guide, and print the torques and the worst |e| / q_bound.
 
     A push acts on hip and knee of the swing leg at the same time. The torque at each joint is at most the promised torque, and
     its direction may change at any time. The promise is kept if the ratio |e| / q_bound is at most 1. The column "left at" is

@@ -48,13 +48,13 @@ PATIENTS: Final = (
     (67.0, 1.68, 0.18, 0.9), (70.0, 1.75, 0.15, 0.9), (73.0, 1.70, 0.10, 0.8), (76.0, 1.80, 0.15, 1.0),
     (80.0, 1.75, 0.18, 0.9), (84.0, 1.80, 0.12, 0.9), (88.0, 1.85, 0.15, 0.9), (91.0, 1.85, 0.15, 0.9),
 )  # fmt: skip
-#: Number of corners of the hand-over box from which steps start.
+#: Number of corners of the hand-over box (range of start deviations) from which steps start.
 _CORNERS: Final = 64
 #: Time by which the measured velocity of a drive lags behind the true velocity: low-pass and half a cycle [s].
 _VELOCITY_LAG: Final = 2.0e-3
-#: Largest multiple of the promise up to which the search tries to push a joint out of the guide.
+#: Largest multiple of the promised torques up to which the search tries to push a joint out of the guide.
 LARGEST_FACTOR: Final = 6.0
-#: Number of steps for each multiple of the promise in the search for `left_at`, as a share of `Effort.steps`.
+#: Number of steps for each multiple of the promised torques in the search for `left_at`, as a share of `Effort.steps`.
 _SHARE: Final = 0.1
 
 
@@ -98,7 +98,7 @@ class Verdict:
     worst_push: str  # kind of the worst push on the plant
     worst_condition: str  # deviation of the plant from the model in the worst episode, for example "friction +20 %"
     stopped: str  # reason why the robot left ACTIVE; empty if it did not
-    #: smallest multiple of the promise with which a push moved a joint out of the guide; None if not searched or not found
+    #: smallest multiple of the promised torques that moved a joint out of the guide; None if not searched or not found
     left_at: float | None
     reason: str  # reason that the certificate states
 
@@ -149,7 +149,7 @@ def promise_of(certificate: Certificate) -> Pair | None:
 
 
 def starts_of(config: AirwalkConfig, seed: int) -> list[Start]:
-    """Return states at the stance change: the centre and corners of the hand-over box.
+    """Return states at the stance change: the centre and corners of the hand-over box (range of start deviations).
 
     Args:
         config: parameters of the controller.

@@ -13,7 +13,7 @@ if TYPE_CHECKING:
 
 
 def weakest(certificates: Iterable[Certificate]) -> Certificate:
-    """Return the certificate with the smallest promise at the hip. A certificate without a promise is the weakest.
+    """Return the certificate with the smallest promised hip torque. A certificate without promised torques is the weakest.
 
     Args:
         certificates: Certificates of one guide shape, one for each assistance factor. At least one is needed.

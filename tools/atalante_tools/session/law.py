@@ -22,7 +22,7 @@ class Law:
 
     idealization: float = 1.0  # intensity of the joint idealization u_i while the guide does not act, 0 to 1
     feedforward: float = 1.0  # intensity of the feedforward u_f while the guide does not act, 0 to 1
-    literal: bool = False  # whether the law follows the paper literally, without a promise
+    literal: bool = False  # whether the law follows the paper literally; the guides then have no promised torques
 
     def config(self) -> AirwalkConfig:
         """Return the parameters of the airwalk controller."""

@@ -34,9 +34,9 @@ class WalkResult:
     xi: float
     shape: str | None  # guide shape; None at Xi = 1, where there is no guide
     certified: bool | None  # whether the guide is certified; None at Xi = 1, where there is no guide
-    #: disturbance torque of SH for which the guide is built; None if the guide has no promise
+    #: promised torque of SH [Nm]: up to this disturbance, both joints stay inside; None without promised torques
     promise_hip_nm: float | None
-    #: disturbance torque of SK for which the guide is built; None if the guide has no promise
+    #: promised torque of SK [Nm], see `promise_hip_nm`; None without promised torques
     promise_knee_nm: float | None
     max_ratio: float | None  # largest tracking error as a fraction of the guide; None if no step was guided
     inside: float | None  # fraction of the guided time with both joints inside the guide; None if no step was guided

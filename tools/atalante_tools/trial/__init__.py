@@ -144,11 +144,11 @@ def assist(masses: tuple[float, ...], walking: Walking, running: Running, as_jso
 
 @command.command(short_help="Walk with falling and rising assistance factors.")
 @click.option("--days", type=click.IntRange(1), default=3, show_default=True, metavar="N",
-              help="Number of days. A day is the treadmill and one walk for each assistance factor.")  # fmt: skip
+              help="Number of days. A day has one trial on the treadmill and one walk per assistance factor.")  # fmt: skip
 @_walking()
 @_running("sweep")
 def sweep(days: int, walking: Walking, running: Running, as_json: bool) -> None:
-    """Walk with the assistance factors 1, 0.75, 0.5, 0.25, 0 and back: one active subject, walks of five minutes each."""
+    """Walk with the assistance factors from 1 down to 0 and back to 1: one active subject, walks of five minutes each."""
     from atalante_tools.trial.findings import sweep_findings
     from atalante_tools.trial.plan import PROTOCOL, QUICK_PROTOCOL, QUICK_SWEEP, SWEEP, sweep_trials
 
