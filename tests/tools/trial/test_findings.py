@@ -174,6 +174,8 @@ def test_report_contains_every_finding_and_requests_nothing(experiment: str, tmp
     rows = [line for line in path.with_suffix(".md").read_text().splitlines() if line.startswith("| `")]
     assert [row.split("`")[1] for row in rows] == [finding.id for finding in findings]
     assert {len(row.split(" | ")) for row in rows} == {4}
+    for result in results:
+        assert f"| {result['trial']['name']} | {result['outcome']} |" in path.with_suffix(".md").read_text()
     assert "Short trials" in text
     assert "1 trials have no result" in text
     assert "0123456789abcdef" in text

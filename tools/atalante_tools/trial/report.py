@@ -69,7 +69,13 @@ def write_report(
         )
     if missing:
         parts.append(f"<p class='bad'>{missing} trials have no result.</p>")
-    parts += ["<h2>Findings</h2>", _findings(findings), "<h2>Trials</h2>", _trials(results), "<h2>Figures</h2>"]
+    parts += [
+        "<h2>Findings</h2>",
+        _findings(findings),
+        "<h2>Trials</h2>",
+        html_table(*_trials(results)),
+        "<h2>Figures</h2>",
+    ]
     parts += _figures(experiment, results)
     parts += ["<h2>How it was computed</h2>", html_table(("Item", "Value"), _provenance(results))]
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -78,19 +84,26 @@ def write_report(
 
 
 def markdown(results: Sequence[Result], findings: Sequence[Finding]) -> str:
-    """Return findings and provenance as Markdown.
+    """Return findings, trials and provenance as Markdown.
 
     Args:
         results: results of the trials.
         findings: findings of the experiment.
     """
-    rows = [(f"`{f.id}`", verdict(f), f.claim, f.statistic.replace("|", "&#124;")) for f in findings]
+    head = ["finding", "verdict", "claim", "statistic"]
+    tables = [_markdown_table(head, [[f"`{f.id}`", verdict(f), f.claim, f.statistic] for f in findings])]
+    tables.append(_markdown_table(*_trials(results)))
+    tables.append("\n".join(f"- {name}: {value}" for name, value in _provenance(results)))
+    return "\n\n".join(tables) + "\n"
+
+
+def _markdown_table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
     lines = [
-        "| finding | verdict | claim | statistic |",
-        "|---|---|---|---|",
-        *(f"| {' | '.join(row)} |" for row in rows),
+        [cell.replace("|", "&#124;") for cell in head],
+        ["---"] * len(head),
+        *([cell.replace("|", "&#124;") for cell in row] for row in rows),
     ]
-    return "\n".join([*lines, "", *(f"- {name}: {value}" for name, value in _provenance(results))]) + "\n"
+    return "\n".join(f"| {' | '.join(line)} |" for line in lines)
 
 
 def summary(result: Result) -> dict[str, Any]:
@@ -114,20 +127,22 @@ def _findings(findings: Sequence[Finding]) -> str:
     return f"<table><tr><th>Finding</th><th>Verdict</th><th>Claim</th><th>Statistic</th></tr>{rows}</table>"
 
 
-def _trials(results: Sequence[Result]) -> str:
-    head = ("Trial", "Outcome", "Steps", "Certified", "Largest |e|/q_bound", "RMS error full [deg]", "RMS error target [deg]",
-            "Baseline [W/kg]", "Exercise [W/kg]", "Muscles alone [W/kg]")  # fmt: skip
-    rows = [
-        (
-            r["trial"]["name"], r["outcome"], r.get("steps", "-"), _CERTIFIED[r.get("certified")],
-            _number(r.get("max_ratio"), 2),
-            *(_number((r.get("error_deg") or {}).get(part), 3) for part in ("full", "target")),
-            *(_number((r.get("metabolic_w_kg") or {}).get(part), 4) for part in ("full", "target")),
-            _number(r.get("muscle_w_kg"), 4),
-        )
-        for r in results
-    ]  # fmt: skip
-    return html_table(head, rows)
+def _trials(results: Sequence[Result]) -> tuple[list[str], list[list[str]]]:
+    """Return headings and rows of the table of trials. A column without values is left out."""
+    columns: list[tuple[str, Callable[[Result], str]]] = [
+        ("trial", lambda r: r["trial"]["name"]),
+        ("outcome", lambda r: r["outcome"]),
+        ("steps", lambda r: str(r.get("steps", "-"))),
+        ("certified", lambda r: _CERTIFIED[r.get("certified")]),
+        ("largest |e|/q_bound", lambda r: _number(r.get("max_ratio"), 2)),
+        ("RMS error, full [deg]", lambda r: _number(r.get("error_deg", {}).get("full"), 3)),
+        ("RMS error, target [deg]", lambda r: _number(r.get("error_deg", {}).get("target"), 3)),
+        ("baseline [W/kg]", lambda r: _number(r.get("metabolic_w_kg", {}).get("full"), 4)),
+        ("exercise [W/kg]", lambda r: _number(r.get("metabolic_w_kg", {}).get("target"), 4)),
+        ("true exercise above standing [W/kg]", lambda r: _number(r.get("muscle_w_kg"), 4)),
+    ]
+    filled = [(head, cells) for head, value in columns if set(cells := [value(r) for r in results]) != {"-"}]
+    return [head for head, _ in filled], [list(row) for row in zip(*(cells for _, cells in filled), strict=True)]
 
 
 def _number(value: float | None, digits: int) -> str:
