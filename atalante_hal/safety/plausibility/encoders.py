@@ -137,6 +137,14 @@ class EncoderChecks:
         self._jump_of[joint] = moved / self._gear[joint]
         return False
 
+    def tolerated(self, joint: int) -> Dtc | None:
+        """Return the pending diagnostic of a rejected position; None if the diagnostic is confirmed.
+
+        Args:
+            joint: index of the joint in JOINTS.
+        """
+        return Dtc.ENC_JUMP if self.jumps[joint] < JUMPS_TO_CONFIRM else None
+
     def _follow(self, joint: int, cycles: int) -> None:
         """Advance the low-pass of one joint.
 

@@ -62,6 +62,16 @@ class Imus:
         self._confirmed[imu] = not usable and cycles >= IMU_CYCLES
         return usable
 
+    def tolerated(self, imu: int) -> Dtc | None:
+        """Return the pending diagnostic of rejected values; None if a diagnostic of these values is confirmed.
+
+        Args:
+            imu: index of the IMU in IMUS.
+        """
+        if self._confirmed[imu]:
+            return None
+        return Dtc.IMU_SATURATED if imu in self.saturated else Dtc.IMU_INVALID if imu in self.no_attitude else None
+
     def _saturation(self, imu: int) -> float | None:
         """Return the largest reading of a saturated IMU [rad/s or m/s2]; None if no axis is saturated."""
         for readings, end in ((self._now.gyro, self._gyro_end), (self._now.accel, self._accel_end)):

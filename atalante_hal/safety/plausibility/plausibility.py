@@ -4,8 +4,9 @@
     IMUs -> state
 
 Each cycle checks the encoders and the IMUs, and runs at most one slow check. If the new values of a joint or an IMU
-fail a check, they are rejected: the process image keeps the previous values, and the age of these values grows. Each
-check uses only the messages that it needs, and the ages of their values. So a fault of one message does not disable the
+fail a check, they are rejected: the process image keeps the previous values, and the age of these values grows. The
+module `rejections` confirms the diagnostic if more than a fifth of the values of a sensor are rejected. Each check
+uses only the messages that it needs, and the ages of their values. So a fault of one message does not disable the
 checks of other messages.
 """
 
@@ -14,12 +15,13 @@ from __future__ import annotations
 from collections.abc import Callable
 
 from atalante_hal.robot import Robot
-from atalante_hal.safety.diagnostics import Finding
+from atalante_hal.safety.diagnostics import Dtc, Finding
 from atalante_hal.safety.plausibility.encoders import EncoderChecks
 from atalante_hal.safety.plausibility.feet import FootChecks
 from atalante_hal.safety.plausibility.finding import JOINT_NODES, Ages, Rows, signals_of
 from atalante_hal.safety.plausibility.imus import Imus
 from atalante_hal.safety.plausibility.legs import Legs
+from atalante_hal.safety.plausibility.rejections import Rejections
 from atalante_hal.safety.plausibility.stillness import Stillness
 from atalante_hal.safety.plausibility.unchecked import Unchecked
 from atalante_hal.types import Vector
@@ -58,6 +60,7 @@ class Plausibility:
         self._legs = Legs(robot, now, self._stillness.constant_samples, period)
         self._feet = FootChecks(robot, now, FEET)
         self._rows = Rows(codec)
+        self._rejections = Rejections()
         self._unchecked = Unchecked(self._rows, image.check, SLOW)
         self._joint_rows, self._imu_rows = self._rows.joint.tolist(), self._rows.imu.tolist()
         self._foot_ages = [NEVER] * len(self._rows.foot)  # age of the values of each foot at its last check [cycles]
@@ -100,7 +103,7 @@ class Plausibility:
         turn = self._turns[self._cycle % _PERIOD]
         if turn is not None and (turn(None if fresh else self._rows.ages(self._image.age)) or self.findings):
             self._collect()
-        settled = fresh and self._settled and self.findings is self._evaluated
+        settled = fresh and self._settled and self.findings is self._evaluated and not self._rejections.pending
         if settled and self._encoders.within_reach() and self._imus.usable():
             self._encoders.follow()
             if self._stillness.follow():
@@ -127,6 +130,7 @@ class Plausibility:
             self._settled = False
         joint = JOINT_NODES.index(node)
         self._encoders.reference(joint)
+        self._rejections.forget(joint)
         self._measured[self._joint_rows[joint]] = -NEVER
 
     @property
@@ -156,6 +160,7 @@ class Plausibility:
         if self._settled:
             measured.update(dict.fromkeys(measured, cycle - 1))
         checks, ages = image.check.tolist(), image.age.tolist()
+        rejected: dict[int, Dtc] = {}
         for sensor, row in enumerate((*self._joint_rows, *self._imu_rows)):
             if checks[row] > _FRESH:
                 continue
@@ -164,6 +169,11 @@ class Plausibility:
                 measured[row] = at
             else:
                 image.refuse(row)
+                imu = sensor - len(self._joint_rows)
+                dtc = self._encoders.tolerated(sensor) if imu < 0 else self._imus.tolerated(imu)
+                if dtc is not None:
+                    rejected[sensor] = dtc
+        self._rejections.update(rejected)
         self._stillness.check_driven()
         self._settled = all(at == cycle for at in measured.values())
 
@@ -183,7 +193,7 @@ class Plausibility:
         return self._imus.accept(imu, cycles, frozen=imu in self._stillness.imus)
 
     def _collect(self) -> None:
-        findings = (
+        findings: tuple[Finding, ...] = (
             *self._encoders.findings(),
             *self._imus.findings(),
             *self._legs.findings(),
@@ -191,6 +201,10 @@ class Plausibility:
             *self._feet.findings(),
             *self._unchecked.findings(),
         )
+        if often := self._rejections.findings():
+            # The text of a check that has confirmed its diagnostic is more precise.
+            confirmed = {(finding.dtc, finding.node) for finding in findings if finding.confirmed}
+            findings += tuple(finding for finding in often if (finding.dtc, finding.node) not in confirmed)
         if findings != self.findings:
             self.findings = findings
 

@@ -301,6 +301,36 @@ SCENARIOS: Final = (
         ),
     ),
     Scenario(
+        "F70",
+        (
+            # Only the position on the bus jumps. If the encoder jumped, ENC_VELOCITY would report the velocity, too.
+            Case(
+                "every second position of a joint jumps",
+                _every(2, "value", f"{_STILL}_STATE", 40, Position=10.0),
+                node=_STILL,
+            ),
+            *(
+                Case(
+                    f"every second frame of an IMU, {name}",
+                    _every(2, kind, "IMU_PELVIS" + message, 40, **parameters),
+                    state=SupervisorState.FULL_ASSIST,
+                    dtc=dtc,
+                    node="IMU_PELVIS",
+                )
+                for name, kind, message, dtc, parameters in (
+                    ("saturated", "imu_saturated", "", "IMU_SATURATED", {}),
+                    ("without attitude", "value", "_STATE", "IMU_INVALID", {"QuaternionW": 0.0}),
+                )
+            ),
+            Case(
+                "every fifth position of a joint jumps",
+                _every(5, "value", f"{_STILL}_STATE", 60, Position=10.0),
+                state=_ACTIVE,
+                node=_STILL,
+            ),
+        ),
+    ),
+    Scenario(
         "F67",
         (
             Case("one sample", (Fault("value", f"{_KNEE}_STATE", 0, 1, Temperature=130.0),), state=_ACTIVE, node=_KNEE),

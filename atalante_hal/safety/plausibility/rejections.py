@@ -1,0 +1,65 @@
+"""Leaky buckets of rejected values, which detect a sensor whose values are implausible again and again.
+
+Single implausible values of a joint or an IMU are tolerated: the robot uses the previous values. If they persist, the check that
+rejects them confirms its diagnostic. If they alternate with good values, it does not, because each good value ends the fault. So
+a leaky bucket of each sensor counts the tolerated values. It has the size of those of the disturbances of a message (see
+`message_monitor`), and is full if more than a fifth of the values are rejected. Then the diagnostic is confirmed, until 16 values
+in a row are good.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+from atalante_hal.robot import IMUS, JOINTS
+from atalante_hal.safety.diagnostics import Dtc, Finding
+from atalante_hal.safety.plausibility.finding import IMU_NODES, JOINT_NODES
+from atalante_hal.wire.e2e import SETTLED, Qualification, qualify
+
+#: Names and nodes of the sensors whose values can be rejected, by sensor index.
+_SENSORS = (*(f"encoder of {joint}" for joint in JOINTS), *(f"{imu} IMU" for imu in IMUS))
+_NODES = (*JOINT_NODES, *IMU_NODES)
+
+
+class Rejections:
+    """Leaky bucket of each sensor. A sensor is the index of a joint, or the number of joints plus the index of an IMU."""
+
+    def __init__(self) -> None:
+        #: Bucket and last diagnostic of each sensor, by sensor index. A sensor without an entry has an empty bucket.
+        self._buckets: dict[int, tuple[Qualification, Dtc]] = {}
+
+    @property
+    def pending(self) -> bool:
+        """Return whether any bucket is not empty, so that `update` must be called in each cycle."""
+        return bool(self._buckets)
+
+    def update(self, rejected: Mapping[int, Dtc]) -> None:
+        """Update all buckets at the end of a cycle.
+
+        Args:
+            rejected: pending diagnostic of each sensor whose new values were rejected in this cycle, by sensor index.
+        """
+        for sensor, cause in {**{sensor: dtc for sensor, (_, dtc) in self._buckets.items()}, **rejected}.items():
+            before, _ = self._buckets.pop(sensor, (SETTLED, cause))
+            bucket = qualify(before, good=sensor not in rejected)
+            if bucket is not SETTLED:
+                self._buckets[sensor] = bucket, cause
+
+    def forget(self, sensor: int) -> None:
+        """Empty the bucket of a sensor.
+
+        Args:
+            sensor: index of the sensor.
+        """
+        self._buckets.pop(sensor, None)
+
+    def findings(self) -> tuple[Finding, ...]:
+        """Return a finding for each sensor whose values are rejected too often."""
+        return tuple(
+            _often_rejected(sensor, dtc) for sensor, (bucket, dtc) in self._buckets.items() if not bucket.trusted
+        )
+
+
+def _often_rejected(sensor: int, dtc: Dtc) -> Finding:
+    text = f"the values of the {_SENSORS[sensor]} are implausible: more than a fifth of them were rejected"
+    return Finding(dtc, _NODES[sensor], 0.0, True, text)
