@@ -303,7 +303,7 @@ def _all(defects_of: Callable[[list[ReceivedFrame]], list[str]]) -> Callable[[No
         if tester.dropped:
             raise NotTested(f"this computer lost {tester.dropped} frames")
         if not tester.received:
-            raise NotTested("nothing to check")
+            raise NotTested("no frame of the node received")
         defects = defects_of(tester.received)
         named = ", ".join(defects[:_LISTED]) + ", ..." * (len(defects) > _LISTED)
         frames = f"{len(tester.received)} frames"

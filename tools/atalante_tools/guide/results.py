@@ -14,7 +14,7 @@ from typing import Any
 
 from atalante_tools.guide.promise_check import Verdict
 
-#: Identification of a guide in the file: gait, shape, assistance factor.
+#: Values that identify a guide in the file: gait, shape, assistance factor.
 Key = tuple[str, str, float]
 
 

@@ -164,11 +164,11 @@ def _prepare(options: Options) -> tuple[Plan, Project]:
     project = Project() if options.rules_file is None else load_project(options.rules_file)
     if options.node is not None and options.node not in plan.senders:
         raise click.UsageError(
-            f"--node must be a sender in the DBC ({', '.join(plan.senders) or 'it has none'}), got {options.node!r}"
+            f"--node must be a sender in the DBC ({', '.join(plan.senders) or 'the DBC has none'}), got {options.node!r}"
         )
     if unknown := sorted(set(project.channels.values()) - set(plan.buses)):
         raise click.UsageError(
-            f"[channels] must name buses of the DBC ({', '.join(plan.buses) or 'it has none'}), got {unknown[0]!r}"
+            f"[channels] must name buses of the DBC ({', '.join(plan.buses) or 'the DBC has none'}), got {unknown[0]!r}"
         )
     return plan, project
 

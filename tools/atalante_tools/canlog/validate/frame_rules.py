@@ -47,7 +47,7 @@ class FrameRules:
         #: Expected FDF and BRS flags of each message: 0, 1, or `UNKNOWN` if the DBC does not define the flag.
         fd = [UNKNOWN if m.fd is None else int(m.fd) for m in layouts]
         switch = [UNKNOWN if m.bit_rate_switch is None else int(m.bit_rate_switch) for m in layouts]
-        # For a DBC without messages, the additional last element makes the index 0 valid. No message uses this element.
+        # The additional last element makes the index 0 valid for a DBC without messages. No message uses this element.
         self._fd, self._switch = np.array([*fd, UNKNOWN], np.int8), np.array([*switch, UNKNOWN], np.int8)
         self._length, self._sender = np.append(plan.lengths, 0), np.append(plan.sender_of_row, UNKNOWN)
         #: Node that recorded the log; None if not known yet; empty if frames of several nodes are marked as sent.

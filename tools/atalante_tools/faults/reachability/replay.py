@@ -41,12 +41,12 @@ def case_of(cycles: Sequence[Cycle]) -> Case:
         elif environment.reaction is Reaction.INFO and not environment.enabled:
             stimuli.append(Fault("leave_operation", "LEFT_SK", number, 1, state="QUICK_STOP_ACTIVE"))
         elif environment != Environment(walking=environment.walking, finished=environment.finished):
-            raise NotReplayable(f"cycle {number + 1}: no fault causes {environment}")
+            raise NotReplayable(f"cycle {number + 1} cannot be replayed: no fault of the emulator causes {environment}")
         if not frames:
             stimuli.append(Fault("drop", "PENDANT_STATE", number, 1))
             continue
         if any(frame.sender or frame.age or frame != frames[0] for frame in frames):
-            raise NotReplayable(f"cycle {number + 1}: no fault causes {frames}")
+            raise NotReplayable(f"cycle {number + 1} cannot be replayed: no fault of the emulator causes {frames}")
         if len(frames) > 1:
             stimuli.append(Fault("duplicate", "PENDANT_STATE", number, 1))
         stimuli += _actions(frames[0], dead_man, number)
