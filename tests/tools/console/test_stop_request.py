@@ -9,7 +9,7 @@ import threading
 
 import pytest
 
-from atalante_tools.console.stop_request import Stopped, check_stop, ended_by, stop_requested
+from atalante_tools.console.stop_request import Stopped, check_stop, deferred, ended_by, stop_requested
 
 
 @pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
@@ -90,3 +90,28 @@ def test_a_block_with_an_end_callback_is_not_interrupted_by_signals() -> None:
         assert stop.exit_code == 130
     assert ends == [True, True, True]
     check_stop()  # no stop request is pending
+
+
+def test_a_deferred_stop_is_raised_by_the_next_check() -> None:
+    program = """
+import signal
+from atalante_tools.console.stop_request import check_stop, deferred, interruptible
+with interruptible():
+    with deferred():
+        signal.raise_signal(signal.SIGINT)
+        print("before", flush=True)
+        check_stop()
+        print("after")
+"""
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=60, check=False)
+    assert (done.returncode, done.stdout, done.stderr) == (130, "before\n", "")
+
+
+def test_without_a_stop_request_deferred_keeps_the_signal_handlers() -> None:
+    before = signal.signal(signal.SIGINT, signal.SIG_IGN)  # as in a worker process
+    try:
+        with deferred():
+            assert signal.getsignal(signal.SIGINT) is signal.SIG_IGN
+            check_stop()
+    finally:
+        signal.signal(signal.SIGINT, before)

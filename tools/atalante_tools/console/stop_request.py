@@ -166,3 +166,17 @@ def ended_by(end: Callable[[], None]) -> Iterator[StopRequest]:
 
     with _handled(ask) as request:
         yield request
+
+
+@contextmanager
+def deferred() -> Iterator[None]:
+    """Delay the exception `Stopped` inside the block until the next call of `check_stop`.
+
+    Use this block around compiled code, which may replace the exception. Outside of the other blocks of this module, signals keep
+    their handlers, so worker processes still ignore Ctrl-C.
+    """
+    if _request is None:
+        yield
+        return
+    with _handled(lambda _request, _number, _repeated: None):
+        yield

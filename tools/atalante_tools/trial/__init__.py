@@ -23,7 +23,7 @@ from atalante_tools.console.options import (
     options_as,
 )
 from atalante_tools.console.outcome import Failed
-from atalante_tools.console.stop_request import Stopped, check_stop
+from atalante_tools.console.stop_request import check_stop
 from atalante_tools.console.terminal import Progress, print_message, show_json, table
 
 if TYPE_CHECKING:
@@ -226,9 +226,7 @@ def _run_missing(trials: Sequence[Trial], running: Running) -> None:
                 full = _BAR * done // len(missing)
                 left = (time.monotonic() - begun) / done * (len(missing) - done)
                 progress.show(f"[{'#' * full}{'.' * (_BAR - full)}] {done} of {len(missing)} trials, {left:.0f} s left")
-    except Stopped:
-        progress.clear()
-        print_message(f"stopped, {done} of {len(missing)} trials done; repeat the command to run the others")
-        raise
     finally:
         progress.clear()
+        if done < len(missing):
+            print_message(f"{done} of {len(missing)} trials done; repeat the command to run the others")

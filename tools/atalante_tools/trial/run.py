@@ -40,7 +40,7 @@ from atalante_hal.loop import LockStep, run
 from atalante_hal.robot import LEG_JOINTS, load_robot
 from atalante_hal.types import PERIOD, State, SupervisorState, Vector
 from atalante_tools.console.options import EMBEDDED, Target
-from atalante_tools.console.stop_request import check_stop
+from atalante_tools.console.stop_request import check_stop, deferred
 from atalante_tools.session.body import describe
 from atalante_tools.session.dial import Dial
 from atalante_tools.session.rig import Rig, open_hal
@@ -106,7 +106,8 @@ def _shape(trial: ShapeTrial) -> dict[str, Any]:
                     samples.append([row[field["step"]][0], round(float(row[field["phase"]][0]), 4), *_rounded(angles)])
 
         ending = _Ending(rig, lambda: controller.statistics.steps > trial.steps)
-        run(rig.hal, controller, LockStep(), until=ending, record=record)
+        with deferred():
+            run(rig.hal, controller, LockStep(), until=ending, record=record)
         certificate, statistics = controller.certificate(trial.xi), controller.statistics
     curves: dict[float, list[list[float]]] = {}
     for step, *sample in samples:
@@ -154,7 +155,8 @@ def _walk(trial: WalkTrial) -> dict[str, Any]:
             effort.sample()
 
         ending = _Ending(rig, lambda: controller.done, observation)
-        run(rig.hal, controller, LockStep(), until=ending, record=record)
+        with deferred():
+            run(rig.hal, controller, LockStep(), until=ending, record=record)
         certified = controller.certificate(trial.xi).certified if trial.xi < 1.0 else None
         deviation = observation.true_deviation()
     statistics = controller.statistics
