@@ -11,7 +11,7 @@
 set -euo pipefail
 
 channel=vcan0
-uml_packages=(user-mode-linux kmod iproute2 can-utils)
+uml_packages=(user-mode-linux kmod iproute2 can-utils gcc libc6-dev)
 qemu_packages=(qemu-system-x86 linux-image-amd64 kmod iproute2 udev busybox-static can-utils)
 apt_wait=300 # s; another program may hold the lock of dpkg
 uml_boot_limit=60
@@ -157,8 +157,8 @@ boot_uml() {
     # The memory of the guest is a file in /dev/shm, or on the disk if /dev/shm is too small.
     [ "$(df --output=avail -m $memory 2>/dev/null | tail -1 || echo 0)" -gt $((uml_guests * memory_mb + 512)) ] ||
         memory=$folder
-    TMPDIR=$memory timeout -k 10 "$uml_limit" linux.uml mem=${memory_mb}M rootfstype=hostfs rootflags=/ rw \
-        init="$folder/init" con=null con0=fd:0,fd:1 quiet </dev/null > >(exec sed -u "s/^/$(basename "$folder"): /") \
+    TMPDIR=$memory timeout -k 10 "$uml_limit" env LD_PRELOAD="$result/uml_xstate.so" \
+        linux.uml mem=${memory_mb}M rootfstype=hostfs rootflags=/ rw init="$folder/init" con=null con0=fd:0,fd:1 quiet </dev/null > >(exec sed -u "s/^/$(basename "$folder"): /") \
         2>"$folder/kernel.log" &
     guests+=($!)
     { sleep $uml_boot_limit && [ ! -e "$folder/booted" ] && kill "${guests[-1]}"; } >/dev/null 2>&1 &
@@ -173,6 +173,7 @@ in_uml() {
     [ -d /lib/modules ] || as_root mkdir -p /lib/modules # the guest mounts its own modules there
     [ $# = 0 ] || printf -v arguments '%q ' "$@"
     mkdir "$result/claims"
+    "${CC:-cc}" -O2 -shared -fPIC -o "$result/uml_xstate.so" tests/vcan/uml_xstate.c
     say "this kernel has no usable SocketCAN; booting $uml_guests times User-Mode Linux $(linux.uml --version)"
     for number in $(seq "$uml_guests"); do
         boot_uml "$result/guest$number" "$arguments"
