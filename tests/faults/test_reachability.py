@@ -18,7 +18,7 @@ from atalante_hal.types import SupervisorState
 from atalante_hal.wire import cia402
 from atalante_hal.wire.cia402 import DriveState
 from atalante_hal.wire.e2e import FULL, REQUALIFY, Qualification, qualify
-from atalante_tools.faults.reachability import hal_steps, replay
+from atalante_tools.faults.reachability import hal_steps, replay, report
 from atalante_tools.faults.reachability.drive_steps import LATCH_PROPERTY, WATCHDOG_PROPERTY, DriveSteps
 from atalante_tools.faults.reachability.explorations import (
     MOVE_PROPERTY,
@@ -27,6 +27,7 @@ from atalante_tools.faults.reachability.explorations import (
     OperatorPath,
 )
 from atalante_tools.faults.reachability.report import SEARCHES, search
+from atalante_tools.faults.reachability.search import Exploration
 from atalante_tools.faults.runner import observe
 from atalante_tools.faults.verdict import automatic_improvements
 
@@ -42,6 +43,23 @@ def test_no_sequence_of_inputs_breaks_a_property(name: str):
     assert figures
     for stated, counted in zip(figures.groups(), (found.states, found.transitions), strict=True):
         assert counted / 2 < int(stated) < counted * 2  # the page is updated after a large change
+
+
+def test_report_has_one_row_for_each_search(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]):
+    monkeypatch.setattr(report, "search", lambda name: Exploration(2, 3, "", ()))
+    report.main()
+    rows = capsys.readouterr().out.splitlines()
+    assert rows[0] == "| search | states | transitions | properties |"
+    assert [row.split(" | ")[:3] for row in rows[2:]] == [[f"| {name}", "2", "3"] for name in SEARCHES]
+
+
+def test_report_ends_with_the_trace_of_a_violation(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]):
+    violated = Exploration(2, 3, LATCH_PROPERTY, (("press", "READY"), ("release", "ACTIVE")))
+    monkeypatch.setattr(report, "search", lambda name: violated)
+    with pytest.raises(SystemExit, match="1"):
+        report.main()
+    printed = capsys.readouterr().out
+    assert f"violated: {LATCH_PROPERTY}\ncycle 1: press\n  -> READY\ncycle 2: release\n  -> ACTIVE\n" in printed
 
 
 # -- broken on purpose ------------------------------------------------------------------------------------------------

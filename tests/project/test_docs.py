@@ -30,6 +30,7 @@ NOT_RUN = {
     r"^python examples/": "tests/project/test_examples.py runs the examples",
     r"^python -m pytest": "runs tests that are part of this suite",
     r"^atalante airwalk --steps 100": "runs until it is stopped; tests/project/test_examples.py runs it with the subscriber",
+    r"faults\.reachability\.report$": "tests/faults/test_reachability.py runs the same searches and the report",
     r"^atalante gait (library|fit|check)": "takes minutes",
     r"^atalante faults campaign": "takes an hour",
     r"^atalante guide check --patients": "takes hours",
