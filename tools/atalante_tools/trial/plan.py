@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
 #: Numbers of steps of 0.8 s: with full assistance (90 s), in the transition (30 s), with the factor of the trial (180 s).
 PROTOCOL: Final = (112, 38, 225)
-QUICK_PROTOCOL: Final = (3, 2, 5)
+QUICK_PROTOCOL: Final = (2, 1, 3)
 #: Step of all walks: length [m] and duration [s].
 STEP: Final = (0.16, 0.8)
 #: Assistance factor of partial assistance, and the assistance factors of the sweep in the order of the trials.
@@ -30,7 +30,7 @@ PARTIAL: Final = 0.5
 SWEEP: Final = (1.0, 0.75, 0.5, 0.25, 0.0, 0.25, 0.5, 0.75, 1.0)
 QUICK_SWEEP: Final = (1.0, 0.5, 0.0, 0.5, 1.0)
 #: Right-stance steps inside each guide shape.
-SHAPE_STEPS, QUICK_SHAPE_STEPS = 30, 3
+SHAPE_STEPS, QUICK_SHAPE_STEPS = 30, 2
 #: Duration of the trial on the treadmill [s].
 TREADMILL_TIME: Final = 300
 #: Subject of the sweep: mass [kg] and height [m].
