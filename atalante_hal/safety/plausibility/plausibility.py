@@ -202,7 +202,7 @@ class Plausibility:
             *self._unchecked.findings(),
         )
         if often := self._rejections.findings():
-            # The text of a check that has confirmed its diagnostic is more precise.
+            # A confirmed finding of another check describes the fault more precisely: omit the finding about rejected values.
             confirmed = {(finding.dtc, finding.node) for finding in findings if finding.confirmed}
             findings += tuple(finding for finding in often if (finding.dtc, finding.node) not in confirmed)
         if findings != self.findings:

@@ -178,7 +178,9 @@ class AirwalkController:
             self._guides.prepare()
 
     def choice(self, xi: float) -> Choice:
-        """Return the guide filter used at an assistance factor, and its promised torques as a fraction of the chosen ones.
+        """Return the guide filter used at an assistance factor.
+
+        The promised torques of the filter are given as a fraction of the chosen promised torques.
 
         Args:
             xi: assistance factor in [0, 1].

@@ -187,7 +187,7 @@ def _limit(room: Vector, reach: Vector, steps: int, what: str) -> Limit:
 
 
 class _Horizon:
-    """Condition at the end of the horizon: the errors within the horizon bound the error in the next cycle.
+    """Condition on the scale of the promised torques: one cycle after the horizon, the error is still within the guide.
 
     At the end of the horizon little more than the slowest motion remains. The error one cycle beyond the horizon is therefore
     the error at the end of the horizon times a factor, plus a remainder. The remainder is a combination of the errors at two

@@ -119,7 +119,7 @@ TAIL = 16
 #: Columns 20 to 23 of `step`: as columns 0 to 3, for the narrowest guide in `SLACK_CYCLES` cycles from now on [1/rad].
 NEAR = 20
 COLUMNS = 24
-#: At the last predicted cycle, the bound is the narrowest guide within this number of later cycles.
+#: The bound in the last predicted cycle is the narrowest guide in this number of cycles after the last predicted cycle.
 TAIL_CYCLES = 60
 
 
