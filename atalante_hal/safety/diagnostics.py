@@ -115,6 +115,7 @@ class Dtc(StrEnum):
     OVERRUN = "OVERRUN", _R.HOLD, _S.ERROR, "several consecutive cycles are late, or the loop falls behind the clock"
     OPERATOR_STOP = "OPERATOR_STOP", _R.HOLD, _S.INFO, "STOP pressed, dead-man switch released, or pendant timed out"
     SWING_TIMEOUT = "SWING_TIMEOUT", _R.FINISH_STEP, _S.ERROR, "a joint of the swing leg timed out briefly"
+    OVERSPEED = "OVERSPEED", _R.HOLD, _S.ERROR, "a joint moves faster than the limiter permits"
     # Outside the loop.
     RECORD_STOPPED = "RECORD_STOPPED", _R.INFO, _S.WARNING, "the recording ended early"
     TELEMETRY_DOWN = "TELEMETRY_DOWN", _R.INFO, _S.WARNING, "the telemetry process ended"

@@ -6,6 +6,11 @@ the limiter permits is accepted. A value that changed by more is not used. After
 confirmed that the encoder has lost its reference. The encoder is used again when its value jumps back to the expected
 position, or when its drive has restarted (see `reference`). The expected position includes the motion since the jump.
 
+*Overspeed.* A change that is too large is real motion, and no jump, if the encoder already moved at more than half of
+top_speed in the same direction in the cycle before, and if its velocity grew by at most top_speed (`continues`). Such a
+value is used, so that the encoder keeps its reference. After `OVERSPEED_TO_CONFIRM` such values in a row the overspeed is
+confirmed.
+
 *Range.* A joint must be within its position limits, extended by `position_tolerance`.
 
 *Velocity.* The drive reports the encoder velocity after a low-pass with the cut-off frequency `velocity_bandwidth`. The check
@@ -31,6 +36,8 @@ from atalante_hal.wire.process_image import NEVER
 
 #: Number of consecutive jumps after which the diagnostic is confirmed.
 JUMPS_TO_CONFIRM = 5
+#: Number of consecutive values above the top speed after which the overspeed is confirmed. A single one may be a small jump.
+OVERSPEED_TO_CONFIRM = 2
 #: Number of consecutive wrong velocities after which the diagnostic is raised.
 VELOCITY_SAMPLES = 3
 _ALL = b"\1" * len(JOINTS)
@@ -70,6 +77,9 @@ class EncoderChecks:
         self.jumps = [0] * len(JOINTS)
         self._jump_of: dict[int, float] = {}  # size of the last jump of the encoder, by joint index [rad]
         self._lost: dict[int, Lost] = {}
+        #: Velocity [rad/s], and number of consecutive values above the top speed, of each joint that is too fast, by joint index.
+        self.too_fast: dict[int, tuple[float, int]] = {}
+        self._top_speed = robot.top_speed
         #: Position of each joint that is outside its range, by joint index [rad].
         self.outside: dict[int, float] = {}
         self._range = np.array([robot.position_min, robot.position_max])
@@ -83,6 +93,7 @@ class EncoderChecks:
         self._keep = math.exp(-2.0 * math.pi * robot.sensors.velocity_bandwidth * period)
         #: Encoder velocities after the low-pass, and reported velocities minus these encoder velocities [rad/s].
         self._filtered, self._deviation = np.zeros((2, len(JOINTS)))
+        self._speed = np.zeros(len(JOINTS))  # mean velocity of each encoder between its last two good positions [rad/s]
         self._earlier = np.zeros(len(JOINTS))  # `_deviation` at the last velocity check [rad/s]
         self._no_age = np.zeros(len(JOINTS), np.int64)
         self._earlier_age: Cycles = np.full(len(JOINTS), NEVER)  # age of the joint values at the last velocity check
@@ -96,13 +107,13 @@ class EncoderChecks:
         #: Arguments of the function `low_pass`. The array objects are the same in every call.
         self._motion = (
             Motion(now.position, before.position, now.velocity),
-            self._filtered, self._deviation, self._keep, period,
+            self._filtered, self._deviation, self._speed, self._keep, period,
         )  # fmt: skip
         self._low_pass = specialised(low_pass, *self._motion)
 
     def within_reach(self) -> bool:
         """Return whether every joint is in its range and moved by no more than is possible in one cycle."""
-        return not self.outside and self._within_reach(*self._positions)
+        return not (self.outside or self.too_fast) and self._within_reach(*self._positions)
 
     def follow(self) -> None:
         """Advance the low-pass of all joints by one cycle. All joints must have good positions of this and the last cycle."""
@@ -121,6 +132,10 @@ class EncoderChecks:
         moved = abs(now - before)
         # without a previous value `moved` is NaN, and the new value is accepted
         good = not confirmed and not moved > cycles * travel + noise
+        if good:
+            self.too_fast.pop(joint, None)
+        elif not self.jumps[joint] and cycles >= 1:
+            good = self._check_overspeed(joint, (now - before) / (cycles * self._period))
         if not good:
             lost = self._lost[joint] = followed(
                 self._lost.get(joint, Lost(before, 0, before)), now, cycles, travel, noise
@@ -136,6 +151,19 @@ class EncoderChecks:
         self.jumps[joint] += 1
         self._jump_of[joint] = moved / self._gear[joint]
         return False
+
+    def _check_overspeed(self, joint: int, mean: float) -> bool:
+        """Return whether a motion above the top speed is real, and update `too_fast`.
+
+        Args:
+            joint: index of the joint in JOINTS.
+            mean: mean velocity since the last good position [rad/s, motor side].
+        """
+        _, values = self.too_fast.pop(joint, (0.0, 0))
+        real = continues(mean, float(self._speed[joint]), float(self._travel[joint]) / self._period)
+        if real:
+            self.too_fast[joint] = mean * self._polarity[joint] / self._gear[joint], values + 1
+        return real
 
     def tolerated(self, joint: int) -> Dtc | None:
         """Return the pending diagnostic of a rejected position; None if the diagnostic is confirmed.
@@ -158,9 +186,10 @@ class EncoderChecks:
         moved = float(self._now.position[joint] - self._before.position[joint])
         if cycles >= NEVER or math.isnan(moved):  # the previous position is unknown
             self._filtered[joint] = velocity
+            self._speed[joint] = 0.0
         else:
             keep = self._keep**cycles
-            mean = moved / (cycles * self._period)
+            mean = self._speed[joint] = moved / (cycles * self._period)
             self._filtered[joint] = keep * self._filtered[joint] + (1.0 - keep) * mean
         self._deviation[joint] = velocity - self._filtered[joint]
 
@@ -234,10 +263,11 @@ class EncoderChecks:
 
     def findings(self) -> tuple[Finding, ...]:
         """Return the current findings."""
-        if not (self.outside or any(self.jumps)):
+        if not (self.outside or self.too_fast or any(self.jumps)):
             return self._wrong_findings
         jumps = (self._jump(joint) for joint, jumps in enumerate(self.jumps) if jumps)
-        return (*jumps, *map(self._outside, self.outside), *self._wrong_findings)
+        too_fast = (self._overspeed(joint, *found) for joint, found in self.too_fast.items())
+        return (*jumps, *too_fast, *map(self._outside, self.outside), *self._wrong_findings)
 
     def _jump(self, joint: int) -> Finding:
         size, confirmed = self._jump_of[joint], self.jumps[joint] >= JUMPS_TO_CONFIRM
@@ -245,6 +275,11 @@ class EncoderChecks:
         if confirmed:
             text += "; it is not used until it jumps back or its drive restarts"
         return Finding(Dtc.ENC_JUMP, JOINT_NODES[joint], size, confirmed, text)
+
+    def _overspeed(self, joint: int, speed: float, values: int) -> Finding:
+        limit = np.degrees(self._top_speed[joint])
+        text = f"{JOINTS[joint]} moves at {np.degrees(speed):+.0f} deg/s, which must be within {limit:.0f} deg/s"
+        return Finding(Dtc.OVERSPEED, JOINT_NODES[joint], speed, values >= OVERSPEED_TO_CONFIRM, text)
 
     def _outside(self, joint: int) -> Finding:
         angle = self.outside[joint]
@@ -259,6 +294,17 @@ class EncoderChecks:
         at_joint = error / self._gear[joint]
         text = f"the velocity of {JOINTS[joint]} differs from its encoder by {np.degrees(at_joint):+.0f} deg/s"
         return Finding(Dtc.ENC_VELOCITY, JOINT_NODES[joint], at_joint, True, text)
+
+
+def continues(mean: float, speed: float, top_speed: float) -> bool:
+    """Return whether a motion above the top speed continues a fast motion, so that it is real.
+
+    Args:
+        mean: mean velocity since the last good position [rad/s].
+        speed: mean velocity between the last two good positions [rad/s].
+        top_speed: largest velocity that the limiter permits [rad/s].
+    """
+    return speed * mean > 0.0 and 0.5 * top_speed < abs(speed) and abs(mean) <= abs(speed) + top_speed
 
 
 def followed(lost: Lost, now: float, cycles: int, travel: float, noise: float) -> Lost:
@@ -295,17 +341,19 @@ def within_reach(position: Vector, before: Vector, reach: Vector, low: Vector, h
     return True
 
 
-def low_pass(motion: Motion, filtered: Vector, deviation: Vector, keep: float, period: float) -> None:
+def low_pass(motion: Motion, filtered: Vector, deviation: Vector, speed: Vector, keep: float, period: float) -> None:
     """Advance the low-pass of the encoder velocities by one cycle, as the drives do.
 
     Args:
         motion: new and previous positions, and reported velocities.
         filtered: velocities after the low-pass, shape (12,) [rad/s]; updated.
         deviation: receives the reported velocities minus `filtered`, shape (12,) [rad/s].
+        speed: receives the encoder velocities without the low-pass, shape (12,) [rad/s].
         keep: share of the last velocity that the low-pass keeps.
         period: cycle time [s].
     """
     for joint in range(len(filtered)):
         mean = (motion.position[joint] - motion.before[joint]) / period
+        speed[joint] = mean
         filtered[joint] = keep * filtered[joint] + (1.0 - keep) * mean
         deviation[joint] = motion.velocity[joint] - filtered[joint]

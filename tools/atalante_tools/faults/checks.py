@@ -134,6 +134,16 @@ def nothing_sags(run: Observation) -> str | None:
     return f"{JOINTS[joint]} moved by {math.degrees(sag[joint]):.2f} deg after START" if sag[joint] > _SAG else None
 
 
+def encoders_keep_their_reference(run: Observation) -> str | None:
+    """Check that no encoder jump is reported, because then the HAL would not use the encoder until its drive restarts.
+
+    Args:
+        run: observation of the run.
+    """
+    nodes = sorted({event.node for event in run.events if event.code == Dtc.ENC_JUMP})
+    return f"no encoder jumped, but {Dtc.ENC_JUMP} names {', '.join(nodes)}" if nodes else None
+
+
 def start_fails_and_names_the_hip(run: Observation) -> str | None:
     """Check that the start ends soon with an event that names the left sagittal hip, and that the other drives hold.
 

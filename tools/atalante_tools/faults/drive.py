@@ -7,6 +7,7 @@ from typing import Final
 from atalante_emulator.faults import Fault
 from atalante_hal.types import SupervisorState
 from atalante_tools.faults.checks import (
+    encoders_keep_their_reference,
     guide_kept,
     left_leg_in_local_hold,
     limit_follows_temperature,
@@ -231,6 +232,19 @@ SCENARIOS: Final = (
                 recovers=False,
                 checks=(nothing_sags, start_fails_and_names_the_hip),
             ),
+        ),
+    ),
+    # A push accelerates the joint beyond its top speed within 25 cycles.
+    Scenario(
+        "F71",
+        tuple(
+            Case(
+                f"{torque:g} Nm on {node}",
+                (Fault("push", node, 0, 60, torque=torque),),
+                node=node,
+                checks=(encoders_keep_their_reference,),
+            )
+            for node, torque in ((_KNEE, 150.0), ("LEFT_HA", 25.0), ("LEFT_SA", 50.0))
         ),
     ),
 )

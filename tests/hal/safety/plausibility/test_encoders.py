@@ -134,6 +134,65 @@ class TestEncoderJump:
 
     @joints
     @signs
+    def test_motion_that_accelerates_beyond_the_top_speed_is_no_jump(self, joint: int, sign: float):
+        robot, at = SimulatedRobot(amplitude=0.0), float(MIDDLE[joint])
+        seen = []
+        for share in (0.3, 0.6, 0.9, 1.05, 1.3, 1.6, 1.2, 0.9, 0.5):
+            at += sign * share * ROBOT.top_speed[joint] * PERIOD
+            found = robot.cycle(lambda now, at=at: now.position.__setitem__(joint, at * GEAR[joint]))
+            assert robot.now.position[joint] == at * GEAR[joint]
+            assert not any(f.dtc is Dtc.ENC_JUMP for f in found)
+            seen += [f for f in found if f.dtc is Dtc.OVERSPEED]
+        assert [f.confirmed for f in seen] == [False, True, True, True]
+        assert {f.node for f in seen} == {JOINTS[joint].upper()}
+        top = ROBOT.top_speed[joint]
+        assert [f.value / (sign * top) for f in seen] == pytest.approx([1.05, 1.3, 1.6, 1.2])
+        assert seen[1].text == (
+            f"{JOINTS[joint]} moves at {math.degrees(sign * 1.3 * top):+.0f} deg/s, "
+            f"which must be within {math.degrees(top):.0f} deg/s"
+        )
+
+    def test_overspeed_is_measured_over_lost_frames(self):
+        robot, step = SimulatedRobot(amplitude=0.0), ROBOT.top_speed[3] * PERIOD
+        robot.cycle(lambda now: now.position.__setitem__(3, (MIDDLE[3] + 0.9 * step) * GEAR[3]))
+        robot.missing = {row("left_SK")}
+        robot.run(2)
+        robot.missing = set()
+        found = robot.cycle(lambda now: now.position.__setitem__(3, (MIDDLE[3] + (0.9 + 3 * 1.2) * step) * GEAR[3]))
+        finding = next(f for f in found if f.dtc is Dtc.OVERSPEED)
+        assert finding.value == pytest.approx(1.2 * ROBOT.top_speed[3])
+
+    @pytest.mark.parametrize(("before", "after"), [(0.4, 1.1), (-0.9, 1.1), (0.9, 2.0)])
+    def test_sudden_motion_beyond_the_top_speed_is_a_jump(self, before: float, after: float):
+        robot, step = SimulatedRobot(amplitude=0.0), ROBOT.top_speed[3] * PERIOD * GEAR[3]
+        at = MIDDLE[3] * GEAR[3] + before * step
+        robot.cycle(lambda now: now.position.__setitem__(3, at))
+        found = robot.cycle(lambda now: now.position.__setitem__(3, at + after * step))
+        assert {f.dtc for f in found} == {Dtc.ENC_JUMP}
+        assert robot.now.position[3] == at
+
+    def test_jump_during_an_overspeed_ends_the_overspeed(self):
+        robot, step = SimulatedRobot(amplitude=0.0), ROBOT.top_speed[3] * PERIOD * GEAR[3]
+        at = MIDDLE[3] * GEAR[3]
+        for share in (0.9, 1.1, 1.1):
+            at += share * step
+            found = robot.cycle(lambda now, at=at: now.position.__setitem__(3, at))
+        assert {(f.dtc, f.confirmed) for f in found} == {(Dtc.OVERSPEED, True)}
+        found = robot.cycle(lambda now: now.position.__setitem__(3, at + 9.0 * step))
+        assert {(f.dtc, f.confirmed) for f in found} == {(Dtc.ENC_JUMP, False)}
+        found = robot.cycle(lambda now: now.position.__setitem__(3, at + 10.1 * step))
+        assert {(f.dtc, f.confirmed) for f in found} == {(Dtc.ENC_JUMP, False)}
+
+    def test_value_that_is_not_newer_is_no_overspeed(self):
+        robot, step = SimulatedRobot(amplitude=0.0), ROBOT.top_speed[3] * PERIOD * GEAR[3]
+        at = MIDDLE[3] * GEAR[3] + 0.9 * step
+        robot.cycle(lambda now: now.position.__setitem__(3, at))
+        robot.late = {row("left_SK"): 1}
+        found = robot.cycle(lambda now: now.position.__setitem__(3, at + 1.1 * step))
+        assert {f.dtc for f in found} == {Dtc.ENC_JUMP}
+
+    @joints
+    @signs
     def test_encoder_is_used_again_after_jumping_back(self, joint: int, sign: float):
         motion = ROBOT.top_speed[joint] * PERIOD
         for left, used in ((0.0, True), (4.9 * motion, True), (6.1 * motion, False)):
@@ -370,9 +429,9 @@ class TestEncodersAlone:
     @pytest.mark.parametrize("cycles", [1, 3])
     def test_motion_of_exactly_the_reach_is_accepted(self, sign: float, cycles: int):
         for joint in range(12):
-            encoders, now = self.encoders()
             reach = cycles * self.motion[joint] + self.noise[joint]
             for size, good in ((reach, True), (np.nextafter(reach, np.inf), False)):
+                encoders, now = self.encoders()
                 now.position[joint] = sign * size
                 assert encoders.accept(joint, cycles) is good
                 if cycles == 1:
