@@ -223,6 +223,8 @@ class Hal:
             self._follow_drives()
         else:
             safety_monitor.enabling = False
+        if ((control == Controlword.QUICK_STOP) & (state.drive_state == DriveState.OPERATION_ENABLED)).any():
+            safety_monitor.recalled = state.cycle
         return self._send_command()
 
     def _follow_drives(self) -> None:

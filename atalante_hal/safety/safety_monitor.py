@@ -35,6 +35,10 @@ from atalante_hal.wire.process_image import ReceiveImage
 #: Maximum duration of FINISH_STEP [cycles]; longer than the rest of a walking step, a stop step and the shift of the weight back.
 FINISH_STEP_CYCLES = 6000
 
+#: Time after which the drive state shows a QUICK_STOP, or the command was lost [cycles].
+#: The answer takes two cycles, and the frames may be late by four.
+RECALL_CYCLES = 6
+
 #: DBC names of the drives, in joint order.
 DRIVE_NODES = tuple(joint.upper() for joint in JOINTS)
 _ENABLED = np.full(len(JOINTS), float(DriveState.OPERATION_ENABLED)).tobytes()
@@ -65,6 +69,7 @@ class SafetyMonitor:
         start_wanted: number of cycles in which a pressed START can still change the state; 0 if no START is being
             processed.
         enabling: True while drives are being enabled. In this time, the limiter follows the torques that the drives report.
+        recalled: cycle in which QUICK_STOP was last sent to a drive in OPERATION ENABLED.
         lowered: DBC names of the drives that cannot hold and are being lowered.
     """
 
@@ -103,6 +108,7 @@ class SafetyMonitor:
         self.walking = False
         self.start_wanted = 0
         self.enabling = False
+        self.recalled = -RECALL_CYCLES
         self._stalled = 0  # number of cycles of this start since a drive last changed its state
         self._states_at_start = b""  # drive states of the last cycle of this start
         self.lowered: set[str] = set()
@@ -229,7 +235,8 @@ class SafetyMonitor:
         self.conditions = Conditions(
             diagnostics=memory.confirmed,
             nodes_ready=nodes_ready,
-            drives_enabled=state.drive_state.tobytes() == _ENABLED,
+            # A drive in OPERATION ENABLED may not have received a recent QUICK_STOP yet.
+            drives_enabled=state.drive_state.tobytes() == _ENABLED and cycle - self.recalled >= RECALL_CYCLES,
             dead_man=pendant.dead_man,
             stop_requested=(pendant.stop_requested and not walk_end_requested) or self._ending,
             start_wanted=self.start_wanted > 0,

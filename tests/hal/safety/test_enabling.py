@@ -121,6 +121,21 @@ def test_no_joint_sags_while_one_drive_is_slow(place, delay: int):
         assert started.hal.state.supervisor is S.ACTIVE
 
 
+@pytest.mark.parametrize("late", [0, 1])
+@pytest.mark.parametrize("delay", [1, 3])
+def test_robot_stays_active_after_a_slow_drive_and_late_states(late: int, delay: int):
+    """The states of the right leg arrive late, so they still show OPERATION ENABLED after a QUICK STOP was sent."""
+    right = [joint.upper() for joint in JOINTS[6:]]
+    states_late = [Fault("delay", f"{joint}_STATE", 0, by=late) for joint in right] if late else []
+    with robot(None, Fault("enable_delay", "LEFT_SH", 0, by=delay), *states_late) as started:
+        started.until(S.READY)
+        started.start()
+        assert started.hal.state.supervisor is S.ACTIVE
+        for _ in range(50):
+            started.cycle()
+        assert started.hal.state.supervisor is S.ACTIVE, started.hal.reason
+
+
 @places
 def test_no_joint_sags_while_a_restarted_drive_is_slow(place):
     with robot(

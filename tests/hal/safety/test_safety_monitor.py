@@ -13,7 +13,7 @@ from atalante_dbc import Message, load
 from atalante_hal.hal import SATURATED_CYCLES
 from atalante_hal.safety.diagnostics import Dtc
 from atalante_hal.safety.limiter import Limited, Limiter
-from atalante_hal.safety.safety_monitor import FINISH_STEP_CYCLES
+from atalante_hal.safety.safety_monitor import FINISH_STEP_CYCLES, RECALL_CYCLES
 from atalante_hal.safety.start import ENABLE_CYCLES, STALLED_CYCLES, WALK_ENDS
 from atalante_hal.types import PERIOD, SupervisorState
 from atalante_hal.wire.cia402 import Controlword, DriveState
@@ -116,7 +116,7 @@ def test_start_with_enabled_drives_continues_from_their_torque(make_rig):
     rig.emulator.before_send.append(enabled)
     rig.until(S.READY)
     rig.operator.start()
-    rig.until(S.ACTIVE, 5)
+    rig.until(S.ACTIVE, 5 + RECALL_CYCLES)
     first = [v for c in rig.last_commands().values() for k, v in c.items() if k.endswith("TargetTorque")]
     lowest = 50.0 - rig.hal.robot.torque_rate_max * PERIOD
     assert (np.array(first) >= lowest - 0.1).all()

@@ -20,7 +20,7 @@ from atalante_hal.pendant import Pendant
 from atalante_hal.robot import load_robot
 from atalante_hal.safety.diagnostics import Dtc, Finding, Reaction
 from atalante_hal.safety.fault_memory import FaultMemory
-from atalante_hal.safety.safety_monitor import DRIVE_NODES
+from atalante_hal.safety.safety_monitor import DRIVE_NODES, RECALL_CYCLES
 from atalante_hal.safety.state_machine import MOVING
 from atalante_hal.types import Command, SupervisorState
 from atalante_hal.wire.cia402 import Controlword, DriveState
@@ -302,6 +302,7 @@ class HalSteps:
         monitor.memory = FaultMemory()
         monitor._reports.clear()
         monitor.start_wanted, monitor.enabling, monitor.moving, monitor.walking = 0, False, False, False
+        monitor.recalled = -RECALL_CYCLES  # without this check more starts are possible
         monitor._stalled = 0  # `LAST_START` stands for every end of a start
         monitor._ending = monitor._duplicate_found = monitor._ramping = False
         monitor.lowered.clear()
