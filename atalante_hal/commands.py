@@ -117,7 +117,7 @@ class Commands:
         self._image.seal_prepared(self._prepared_hold)
         self._transceiver.send(self._commands)
         self.hold()
-        self._seal(cycle + 1, self._image.counter)  # the next SYNC was not encoded in advance
+        self._seal(cycle + 1, self._image.counter)  # also encodes the next SYNC, as `send` does
         return self._record()
 
     def _seal(self, next_cycle: int, counter: int | None) -> None:

@@ -71,10 +71,12 @@ def specialised(function: Callable[P, R], *args: P.args, **kwargs: P.kwargs) -> 
 
 @cache
 def _numba() -> Any:
-    """Import numba without scipy.linalg, which takes a tenth of the time until the first cycle of a walk.
+    """Import numba without scipy.linalg.
 
-    When numba loads its array functions, it imports scipy.linalg to learn whether it contains BLAS. An empty module answers this
-    question, and is then removed. A function that needs BLAS imports scipy.linalg when it is compiled.
+    Importing scipy.linalg takes a tenth of the time from the start of the program to the first cycle of a walk. When numba loads
+    its array functions, it imports scipy.linalg only to learn whether BLAS is available. An empty module in place of
+    `scipy.linalg.cython_blas` answers this question, and is removed after the import. A function that needs BLAS imports
+    scipy.linalg when it is compiled.
     """
     blas = "scipy.linalg.cython_blas"
     if blas in sys.modules or find_spec("scipy") is None:

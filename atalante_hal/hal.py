@@ -108,7 +108,7 @@ class Hal:
         self._plausibility = Plausibility(self.robot, self._image, PERIOD)
         self.state = parts.state(assistance_factor, len(fast))
         per_turn = self.robot.polarity / self.robot.gear
-        # On the bus, positions and velocities are at the motor. Torques are at the joint, so their factor is 1.
+        # On the bus, positions and velocities are motor-side values. Torques are joint-side values, so their factor is 1.
         self._to_joint = np.concatenate([per_turn, per_turn, np.ones(len(JOINTS))])
 
     # -- one cycle ---------------------------------------------------------------------------------------------------
@@ -230,9 +230,10 @@ class Hal:
     def _follow_drives(self) -> None:
         """Set the torques in the limiter to the torques that the drives report.
 
-        If all drives produce torque, they get these torques as their commands, so that no joint sags before the controller's
-        first torque. Then all limits apply. Before, only the torque limit applies, and the command is 0: a drive that is off
-        produces no torque, and a drive that holds its position ignores the command.
+        While any drive is off, the commands are 0: a drive that is off produces no torque, and a drive that holds its position
+        ignores its command. As soon as all drives produce torque, each drive gets the torque that it reports as its command, so
+        that no joint sags before the controller's first torque. The first call of a start, and every call while a drive is off,
+        apply only the torque limit. All other calls apply all limits.
         """
         on = powered(self.state.drive_state)
         torque = np.where(on, self.state.torque, 0.0)

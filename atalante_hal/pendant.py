@@ -94,8 +94,8 @@ class Pendant:
                 is ignored, and the assistance factor does not change.
             qualifying: True if the pendant is in time but not qualified yet. Then a press of START is stored until the
                 pendant is qualified.
-            new: True if a frame was accepted in this cycle. START is evaluated only then, because the last frame of a cycle with
-                further frames may be of a second sender.
+            new: True if a frame was accepted in this cycle. START is evaluated only in such a cycle. Without a new frame, the
+                signals may still be those of an earlier cycle with further frames, and then may come from a second sender.
             further_frames: Values of the process image for each further valid frame of this cycle, see
                 `ReceiveImage.decode_further_frames`. All frames of the cycle are combined as in `safest`. START is not
                 evaluated in a cycle with further frames.

@@ -45,7 +45,7 @@ class RobotError(ValueError):
 class Envelope:
     """Reduction of the torque near the limits of position and velocity, see `limiter`."""
 
-    look_ahead: float  # s, prediction time of the joint position at the present velocity
+    look_ahead: float  # s, time for which the joint position is predicted, at constant velocity
     #: Distance by which the predicted position must exceed a position limit before the outward torque is 0 [rad].
     position_margin: float
     velocity_margin: float  # rad/s, speed above the velocity limit at which the accelerating torque is 0
@@ -64,12 +64,13 @@ class Derating:
 class Sensors:
     """Tolerances that sensors without a fault meet, and load thresholds of the force cells, see `plausibility`."""
 
-    velocity_error: float  # rad/s at the joint, largest mean difference between reported velocity and encoder motion
+    #: Largest mean difference between the reported velocity and the filtered encoder velocity [rad/s at the joint].
+    velocity_error: float
     velocity_bandwidth: float  # Hz, cut-off frequency of the low-pass of the reported velocity
-    #: Largest difference between the attitudes of the tibia that follow from the encoders and from the IMUs [rad about each
+    #: Largest difference between the tibia attitude computed from the encoders and the one measured by the IMUs [rad about each
     #: axis].
     attitude_error: float
-    attitude_change: float  # rad, largest change of the attitude difference during a constant encoder reading
+    attitude_change: float  # rad, largest change of this difference while an encoder reading is constant
     misalignment: float  # rad, allowance added to `attitude_change` for each rad by which the leg turns
     quaternion_error: float  # largest difference between the squared norm of a quaternion and 1
     cell_free: float  # N, largest vertical force at which a cell is regarded as unloaded
@@ -82,7 +83,7 @@ class Thresholds:
 
     supply_low: float  # V at a drive; below this voltage the battery is nearly empty
     supply_under: float  # V at a drive; below this voltage the drives may soon fail to hold
-    #: Lowest torque limit of a hot drive with which the robot walks, as a share of the limit of the same joint in the other leg.
+    #: Smallest torque limit of a hot drive that permits walking, as a share of the limit of the same joint in the other leg.
     derated_imbalance: float
     full_assist_ramp: float  # s, time for the ramp of the assistance factor from 0 to 1 in FULL_ASSIST
     position_tolerance: float  # rad, distance outside a position limit above which a joint is out of range

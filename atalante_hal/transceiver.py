@@ -20,7 +20,7 @@ from atalante_hal.wire.process_image import ReceiveImage
 
 #: Largest number of frames received in one cycle. About 20 of these frames are cyclic.
 RECEIVE_BUDGET = 128
-#: Number of consecutive cycles with too many received frames or a full transmit queue until the fault is confirmed.
+#: Number of consecutive cycles after which a fault is confirmed: too many received frames, or a full transmit queue.
 PERSISTENT = 5
 #: Time to listen for another HAL before the first SYNC [s].
 LISTEN = 0.2
@@ -156,8 +156,9 @@ class Transceiver:
             count: Number of frames already in `scratch`.
             cycle: Process image of the expected messages. With None, the call does not wait for messages.
             patience: Longest wait for the expected messages [s]. If the last batch, which contains the SYNC, was not sent, the
-                call waits at most 0.1 s. Otherwise each SYNC that none of the missing nodes answered halves the longest wait,
-                down to 0.1 s. So in lock-step, a dead node does not cause the full wait in every cycle before it times out.
+                call waits at most 0.1 s. If no missing node has answered the previous n SYNCs, the call waits at most
+                `patience` / 2^n, or 0.1 s if this is longer. So in lock-step, a dead node does not cause the full wait in every
+                cycle before it times out.
 
         Returns:
             Number of frames now in `scratch`.

@@ -78,7 +78,7 @@ class JoinedBus:
     def down(self) -> str:
         """Return the error message of a lost channel; empty if no channel is lost.
 
-        A lost channel counts as back as soon as a frame was sent or received on it.
+        A lost channel is regarded as restored as soon as a frame was sent or received on it.
         """
         return next(iter(self._down.values()), "")
 

@@ -23,8 +23,8 @@ SETTLE_TIME = 0.1
 class ResilientBus(WrappedBus):
     """Bus that drops sent frames and receives no frames while its link is lost, as with a disconnected cable.
 
-    A lost link counts as back as soon as a frame was sent or received. If one channel of a `JoinedBus` is lost, the other
-    channels continue.
+    A lost link is regarded as restored as soon as a frame was sent or received. If one channel of a `JoinedBus` is lost, the
+    other channels continue.
 
     Args:
         bus: Wrapped bus. `close` closes it, too.

@@ -7,7 +7,7 @@ with a byte through a socket pair. If the other process terminates for any reaso
 end raises `BusDown`. Polling saves time only if the two processes run on different cores.
 
 In lock-step one end is the client and the other end is the server. `receive()` of the client publishes the frames that the
-client sent, and requests one step of the server. It returns the frames that the server sends in this step, if there are any.
+client sent, and requests one step of the server. Then `receive()` returns the frames that the server sends in this step, if any.
 So the sequence of calls and the bytes on the bus are identical to those of a `PairBus`. Only the work that the server does
 after its answer runs in parallel with the client.
 """
@@ -39,9 +39,10 @@ _END_WORDS = 8
 _HEADER_BYTES = mmap.PAGESIZE
 #: Time for which a waiting end polls before it sleeps [s], longer than the computing time of a cycle.
 _POLL_TIME = 500e-6
-#: After a wait in which polling found no frame, this number of waits begins without polling. This saves computing time.
+#: Number of waits without polling that follow a wait in which polling found no frame. They save computing time.
 _WAITS_WITHOUT_POLLING = 32
-#: Longest sleep [ms]. The end then reads the memory again, because a value may become visible after its wake-up byte.
+#: Longest sleep [ms]. After it, the end reads the memory again even without a wake-up byte, because the byte may arrive before
+#: the new value in the memory becomes visible.
 _SLEEP = 20
 _WAKE_UP = b"\0"
 _REASON_BYTES = 4096
@@ -232,7 +233,7 @@ class SharedBus:
         return peers[_SENT] != received
 
     def _wait(self, timeout: float) -> bool:
-        """Wait up to `timeout` [s] for frames and return whether any arrived. The end that runs `serve` does not wait."""
+        """Wait up to `timeout` [s] for frames and return whether any arrived. Do not wait while this end runs `serve`."""
         peers, received = self._peers, self._received
         return timeout > 0.0 and not self._own[_SERVING] and self._until(lambda: peers[_SENT] != received, timeout)
 

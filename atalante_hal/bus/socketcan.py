@@ -292,7 +292,8 @@ class SocketCanBus:
         if code != LINK_DOWN and code not in LINK_REMOVED:
             return None
         self._drop_queued()
-        # An interface goes down before it is removed, and `_drop_queued` may have dropped the error of the removal.
+        # An interface goes down before it is removed. `_drop_queued` may have dropped the later error of the removal, so the
+        # binding of the socket is checked, too.
         if code == LINK_DOWN and self._is_bound():
             return BusDown(f"{self.name} is down: type `ip link set {self.name} up`")
         self._removed = f"{self.name} was removed: plug the adapter in again; the link is opened again when it is up"

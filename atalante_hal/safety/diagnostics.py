@@ -150,7 +150,7 @@ def number_of(bits: int) -> int:
 
 
 def by_number(number: int) -> str | None:
-    """Return code and meaning as text for the number of a code.
+    """Return a text with the code that has a given number, and its meaning.
 
     Args:
         number: position of the code in `Dtc`, counted from 1.

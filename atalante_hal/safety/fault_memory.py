@@ -3,8 +3,8 @@
 `monitors, transceiver, plausibility, loop -> fault memory -> state machine (confirmed codes), telemetry (events)`
 
 If a diagnostic toggles, its first event is logged at once. Repeats within `FOLD_CYCLES` are counted, and then one event with the
-count is logged. So for each diagnostic of a node, at most one event of the pending diagnostic and one event of the confirmed
-diagnostic are logged per second. Every occurrence is counted.
+count is logged. So at most two events per second are logged for one diagnostic of one node: one for the pending diagnostic and
+one for the confirmed diagnostic. Every occurrence is counted.
 """
 
 from __future__ import annotations

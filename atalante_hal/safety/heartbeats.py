@@ -76,8 +76,8 @@ class Heartbeats:
         #: Diagnostic and error code of the active emergency of each node. A cleared emergency is removed.
         self.emergencies: dict[str, tuple[Dtc, int]] = {}
         self._cleared: set[str] = set()  # nodes whose emergency was cleared in this cycle
-        #: Events since the last `evaluate`, as (node, diagnostic, error code): emergencies with the reaction INFO, and
-        #: frames of error passive nodes, whose error code is 0.
+        #: Events since the last `evaluate`, as (node, diagnostic, error code): emergencies with the reaction INFO, and frames
+        #: from error passive nodes. The error code in the entry of such a frame is 0.
         self._notices: list[tuple[str, Dtc, int]] = []
         self._reset: set[str] = set()  # nodes that restarted since the last `evaluate`
         #: Row -> counter that detects two senders of the message, 0 to `FULL`. A row without an entry has the counter 0.

@@ -67,7 +67,7 @@ class JointLimits(NamedTuple):
     position_min: Vector  # (12,) lowest position [rad]
     position_max: Vector  # (12,) highest position [rad]
     velocity_max: Vector  # (12,) highest velocity [rad/s]
-    look_ahead: float  # prediction time of the position [s]
+    look_ahead: float  # time for which the position is predicted, at constant velocity [s]
     position_margin: float  # distance outside a position limit at which the torque is zero [rad]
     velocity_margin: float  # speed above `velocity_max` at which the torque is zero [rad/s]
 
@@ -75,7 +75,7 @@ class JointLimits(NamedTuple):
 class Limiter:
     """Torque limiter of all joints, applied once per cycle.
 
-    A torque within the limits is not changed in any bit.
+    A torque within the limits is passed on bit for bit.
 
     Attributes:
         last: torque sent last, shape (12,) [Nm]; the rate limit is relative to it.

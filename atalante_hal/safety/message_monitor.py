@@ -1,4 +1,4 @@
-"""Decide whether the data of each cyclic message is valid: by its E2E result, its age and the trust in its sender.
+"""Decide whether the data of each cyclic message is valid, from its E2E result, its age and the trust in its sender.
 
     process image -> message monitor -> validity of each message; diagnostics -> fault memory -> state machine
 
@@ -8,9 +8,9 @@ of the frames are lost. A message with a full bucket is no longer trusted. The m
 a row.
 
 The robot tolerates single disturbances of a message: a frame that is received twice, a value outside its range or with the
-invalid code, a sender that is error passive. A leaky bucket of the same size counts each kind of disturbance of each message. It
-is full after 16 disturbed cycles in a row, or if more than a fifth of the cycles are disturbed. Then the diagnostic is confirmed,
-until 16 cycles in a row are undisturbed.
+invalid code, a sender that is error passive. Each message has one leaky bucket for each kind of disturbance. These buckets have
+the same size as the bucket for lost frames. A bucket is full after 16 disturbed cycles in a row, or if more than a fifth of the
+cycles are disturbed. Then the diagnostic is confirmed, until 16 cycles in a row are undisturbed.
 
 Two senders of one message are detected by a second intact frame in the same cycle. The second frame has either the
 alive counter of the accepted frame but other bytes, or an alive counter out of sequence. Four such cycles in a row

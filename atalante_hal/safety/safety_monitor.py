@@ -379,7 +379,8 @@ class SafetyMonitor:
         elif before is not _S.FINISH_STEP:  # FINISH_STEP and the HOLD that follows have the same reason
             self.reason = entry_text(after, self.missing())
         if after is _S.ACTIVE and before not in MOVING:
-            memory.log_repeats(state.cycle, final=True)  # the reason for the next HOLD has an event of its own
+            # End all windows, so that the reason for the next HOLD is logged as a new event.
+            memory.log_repeats(state.cycle, final=True)
         if after is _S.ACTIVE and before not in MOVING and not self.enabling:
             self._limiter.restart(state.torque)
         if after is _S.FINISH_STEP:

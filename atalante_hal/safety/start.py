@@ -2,10 +2,10 @@
 
     pendant, diagnostics, nodes, drive state, reported torque -> refusal -> safety monitor, event START_REFUSED or START_FAILED
 
-A start has two parts, so that no joint sags. First the HAL enables every drive into a position hold: a drive that is enabled
-earlier than the others gets QUICK STOP until all produce torque (`words_towards_operation`). Then all drives get ENABLE
-OPERATION in the same cycle, and the torque that they report as their command. Without a check of the reported torques, the HAL
-would also command a torque that a drive cannot produce. The start ends if no drive changes its state for `STALLED_CYCLES`.
+A start has two parts, so that no joint sags. First every drive is enabled and holds its position: a drive that is enabled earlier
+than the others gets QUICK STOP until all drives produce torque (see `words_towards_operation`). Then all drives get ENABLE
+OPERATION in the same cycle. The torque command of each drive is then the torque that the drive reports. So a START is refused if
+a reported torque is impossible. The start ends if no drive changes its state for `STALLED_CYCLES`.
 """
 
 from __future__ import annotations
@@ -119,7 +119,7 @@ def _failure(request: StartRequest) -> str:
 
 
 def _not_enabled(drive_state: Vector) -> str:
-    """Return, as text, the drives for which the other drives wait, see `words_towards_operation`.
+    """Return a text that names the drives for which the other drives wait, see `words_towards_operation`.
 
     Args:
         drive_state: values of `DriveState`, shape (12,).
@@ -135,10 +135,10 @@ def _name(drive_state: float) -> str:
 
 
 def words_towards_operation(drive_state: Vector) -> list[Controlword]:
-    """Return one controlword per drive, in an order in which the drives reach OPERATION ENABLED and no joint sags.
+    """Return the next controlword of each drive on its path to OPERATION ENABLED, so that no joint sags.
 
-    If all drives produce torque, all get ENABLE OPERATION. Until then, a drive with torque gets QUICK STOP and holds its
-    position, and a drive in SWITCHED ON waits for the drives that are not in this state yet.
+    If all drives produce torque, all get ENABLE OPERATION. Until then, a drive that produces torque gets QUICK STOP and holds
+    its position. A drive in SWITCHED ON waits until every other drive is in SWITCHED ON or produces torque.
 
     Args:
         drive_state: values of `DriveState`, shape (12,).

@@ -51,9 +51,8 @@ def next_state(state: SupervisorState, conditions: Conditions) -> tuple[Supervis
 
     - any state -> FAULT if a diagnostic demands FAULT
     - any state except OFF, READY and FAULT -> LOWER if a diagnostic demands LOWER
-    - ACTIVE, FULL_ASSIST, FINISH_STEP -> the state that the worst diagnostic demands, if this state is worse; in
-      ACTIVE, FULL_ASSIST and FINISH_STEP a released dead-man or any other STOP of the operator raises the diagnostic
-      `OPERATOR_STOP`
+    - ACTIVE, FULL_ASSIST, FINISH_STEP -> the state that the worst diagnostic demands, if this state is worse. In these
+      three states, a released dead-man or `Conditions.stop_requested` adds the diagnostic `OPERATOR_STOP`
     - ACTIVE, FULL_ASSIST -> FINISH_STEP if the operator requests STOP while the robot walks on the ground
     - FINISH_STEP -> HOLD when the step is finished
     - OFF -> READY if every required node is trusted and no diagnostic demands a reaction; otherwise READY -> OFF
@@ -65,8 +64,8 @@ def next_state(state: SupervisorState, conditions: Conditions) -> tuple[Supervis
         conditions: diagnostics and other conditions of this cycle.
 
     Returns:
-        The next state, and the diagnostics with the most severe reaction. The set of diagnostics is empty if the most
-        severe reaction is INFO, or if the end of the walk that the operator requested is more severe.
+        The next state, and the diagnostics with the most severe reaction. The set of diagnostics is empty if this reaction is
+        INFO. It is also empty if the operator requested the end of the walk and this reaction is milder than FINISH_STEP.
     """
     diagnostics = conditions.diagnostics
     if state in MOVING and (conditions.stop_requested or not conditions.dead_man):

@@ -29,8 +29,8 @@ RINGS = RECORDS, EVENTS, FRAMES = "records", "events", "frames"
 class TelemetryChild(Closing):
     """Telemetry subprocess.
 
-    The subprocess inherits the files of the rings. So a subprocess that is started before its session creates these files, still
-    empty, and the session takes them over.
+    The subprocess inherits the files of the rings. If the session does not exist yet, this object creates the files, still
+    empty. The session later takes them over with `take_files`.
 
     Attributes:
         pid: Process id.

@@ -57,7 +57,7 @@ class RingTap:
         """Set the time base to which the stamps of all following frames are relative.
 
         Args:
-            base_ns: Time of stamp 0 [ns]: 0 on the wall clock, the start of the run in virtual time.
+            base_ns: Time of stamp 0 [ns]. On the wall clock this is 0. In virtual time it is the start of the run.
         """
         self.flush()
         self._base[0] = base_ns

@@ -44,9 +44,10 @@ RESTARTS = 3
 _KILLED = 0.1
 #: Time limit for the subprocess to end its Zenoh session, after it has printed its summary [s].
 _SESSION_END = 2.0
-#: Time limit for a restarted subprocess to become ready [s].
+#: Time limit for a subprocess that `tend` restarted to become ready [s].
 _RESTART = 30.0
-#: Time limit for a subprocess to become ready during a run [s]. A subprocess that takes longer is replaced.
+#: Time limit for the first subprocess to become ready, which may happen during a run [s]. If it takes longer, it is ended, and
+#: `tend` starts another subprocess.
 _JOIN = 60.0
 
 
@@ -69,11 +70,12 @@ class TelemetryConfig:
     loop_rate: int = 10  # Hz in robot time, rate of the messages with loop statistics
     recording: Path | None = None  # MCAP file; None if nothing is recorded
     record_rate: int = 100  # Hz in robot time, recording rate of each stream; 1000: every cycle
-    can_log: Path | None = None  # log of every CAN frame, whose suffix determines the format; None if there is no log
+    can_log: Path | None = None  # log file of all CAN frames; the file suffix determines the format; None for no log
     lock_step: bool = False  # True: virtual time, and the loop waits for recorder and CAN log
-    #: capacity of each ring [records]. The ring of cycle records gets one record per cycle, the other rings get fewer on average.
+    #: capacity of the ring of cycle records and of the ring of CAN frames [records]. The first ring gets one record per cycle,
+    #: the second ring gets fewer on average.
     slots: int = 1024
-    patience: float = 5.0  # s, longest wait of the loop for the recorder in lock-step
+    patience: float = 5.0  # s, longest wait of the loop for the recorder or the CAN log in lock-step
     certificate: Path | None = None  # TLS certificate, see `access.Access`
     private_key: Path | None = None  # key of the certificate, see `access.Access`
     client_ca: Path | None = None  # authority that signs the subscriber certificates, see `access.Access`
@@ -181,7 +183,7 @@ class TelemetryProcess(Closing):
         self._runs = 0
         self._closed = False
         self._tap: RingTap | None = None
-        self._early = child  # subprocess for the first start
+        self._early = child  # subprocess that was started early, for the first `start`; None if there is none
         self._child: TelemetryChild | None = None
         self._restarts = 0
         self._faults: list[str] = []  # one sentence for each fault of a subprocess
@@ -361,8 +363,8 @@ class TelemetryProcess(Closing):
 
         Args:
             now: Function that returns the time of a sent frame [ns]; in lock-step the virtual time since the start of the run.
-            stamps: Function that returns the times of the frames received last [ns], such as `lambda: bus.stamps`. If
-                None, received frames also get the time `now()`.
+            stamps: Function that returns the receive times of the last received frames [ns], such as `lambda: bus.stamps`.
+                If None, received frames also get the time `now()`.
 
         Returns:
             Tap for the HAL.

@@ -134,7 +134,7 @@ def configuration(robot: str, listen: str) -> dict[str, Any]:
     Returns:
         Configuration as JSON types, without the settings of `Access`.
     """
-    # the wildcard "**" does not match key parts such as @adv
+    # Events also use keys with the part @adv (advanced publisher). The wildcard "**" does not match this part.
     own = [f"atalante/{robot}/**", f"atalante/{robot}/**/@adv/**"]
     return {
         "mode": "peer",

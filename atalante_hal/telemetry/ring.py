@@ -83,7 +83,7 @@ class _Ring:
 
     @property
     def kept(self) -> int:
-        """Return the number of records that readers have marked as saved with `keep` so far."""
+        """Return the number of records that readers have marked as saved so far, see `keep`."""
         return self._header[_KEPT]
 
     @property
@@ -319,7 +319,7 @@ class RingReader(_Ring, Closing):
         return self._batch[intact - first : count, : self.record_size]
 
     def keep(self, records: int) -> None:
-        """Increase the number of saved records, see `kept`.
+        """Increase the number of saved records that `kept` returns.
 
         Args:
             records: Number of records whose content was saved to disk since the last call.

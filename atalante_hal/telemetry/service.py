@@ -54,7 +54,7 @@ class Service:
         sinks: Each sink for messages, with the number of cycles from one message of a stream to the next.
         loop_every: Number of cycles from one message of loop statistics to the next.
         can_log: Writer of the CAN log; None without a CAN log.
-        recorder: The element of `sinks` that writes the recording; its saved records are counted in the ring.
+        recorder: The element of `sinks` that writes the recording; the header of the ring reports how many records are saved.
     """
 
     def __init__(

@@ -102,6 +102,7 @@ def controlword_towards_operation(state: int) -> Controlword:
         state: Current state of the drive, a value of `DriveState`.
 
     Returns:
-        The controlword. DISABLE_VOLTAGE in NOT READY TO SWITCH ON and FAULT REACTION ACTIVE, which the drive leaves itself.
+        The controlword. In NOT READY TO SWITCH ON and in FAULT REACTION ACTIVE it is DISABLE_VOLTAGE, because the drive leaves
+        these states without a command.
     """
     return TOWARDS_OPERATION.get(state, Controlword.DISABLE_VOLTAGE)

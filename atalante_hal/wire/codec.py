@@ -125,7 +125,9 @@ class Codec:
             raise KeyError(f"there is no signal {message}.{signal}; messages are {', '.join(self.rows)}") from None
 
     def slice(self, group: str) -> slice:
-        """Return the slice of a quantity in the decoded values, in the order of the frame identifiers.
+        """Return the slice of a quantity in the decoded values.
+
+        The elements of the slice are in the order of the frame identifiers.
 
         Args:
             group: name of the quantity, see `group_of`.

@@ -181,7 +181,8 @@ GOOD_CYCLE = 1
 FULL = 64
 #: Number of consecutive good cycles after which a message is trusted. Until then the inputs of a pendant are ignored.
 REQUALIFY = 16
-#: Increase of the counter that detects two senders (see `suspect`) in a cycle with two senders. Four such cycles reach `FULL`.
+#: Increase of the counter that detects two senders (see `suspect`), if a cycle has frames of two senders. Four such cycles reach
+#: `FULL`.
 RIVAL_CYCLE = 16
 
 
@@ -198,7 +199,7 @@ SETTLED = Qualification(0, REQUALIFY, True)
 
 
 def qualify(before: Qualification, *, good: bool, timed_out: bool = False) -> Qualification:
-    """Return the qualification of a message after one more cycle.
+    """Compute the qualification of a message at the end of a cycle.
 
     Args:
         before: qualification after the previous cycle.
@@ -217,7 +218,7 @@ def qualify(before: Qualification, *, good: bool, timed_out: bool = False) -> Qu
 
 
 def suspect(evidence: int, *, rival: bool) -> int:
-    """Return the counter that detects two senders of one message, after one more cycle.
+    """Compute the counter that detects two senders of one message, at the end of a cycle.
 
     Args:
         evidence: counter after the previous cycle, 0 to `FULL`.

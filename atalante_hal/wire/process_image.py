@@ -109,8 +109,8 @@ class ReceiveImage:
         messages: messages of this process image, one per row.
         values: array for the decoded values, shape (codec.size,). By default, a new array of NaN is created.
         restarts: True if a sender may restart at any counter (status, emergencies). In this case the counter leads to a
-            rejection only if a frame repeats the last frame. A frame with the last counter and other bytes is committed, and
-            also listed in `refused` as CONFLICT.
+            rejection only if a frame repeats the last frame. A frame that has the counter of the last frame but
+            other bytes is committed, and also listed in `refused` as CONFLICT.
     """
 
     def __init__(self, messages: Sequence[Message], values: Vector | None = None, *, restarts: bool = False) -> None:
@@ -124,10 +124,10 @@ class ReceiveImage:
         self.crc_errors = 0
         #: Row and `Check` of each frame that was rejected in this cycle.
         self.refused: list[tuple[int, Check]] = []
-        #: Rows with an intact or damaged frame in this cycle whose sender is error passive.
+        #: Rows whose sender is error passive according to a frame of this cycle. The frame may be damaged.
         self.error_passive: list[int] = []
         self._restarts = restarts
-        #: Last frame of each row with correct format, CRC and sequence, shape (rows,).
+        #: For each row, the last frame with correct format, CRC and sequence, shape (rows,).
         self.frames = self.codec.template()
         self._e2e = E2EState(
             headers=as_words(self.frames)[:, 0].astype(np.int64),
@@ -222,7 +222,7 @@ class ReceiveImage:
         return count >= len(self.check) and self._received_in(frames).headers.tobytes() == self._expected_headers
 
     def expected_ages(self) -> dict[int, int]:
-        """Return the age [cycles] of each message that has not timed out according to the DBC, by frame identifier."""
+        """Return the age [cycles] of each message whose age is at most its DBC timeout. The keys are frame identifiers."""
         ages = zip(self.codec.messages, self.age.tolist(), strict=True)
         return {m.frame_id: age for m, age in ages if age <= m.timeout_ms}
 
@@ -256,7 +256,7 @@ class ReceiveImage:
         return True
 
     def accept_each(self, frames: Frames, count: int, tag: int | None = None) -> list[int]:
-        """Check the frames one by one in order of arrival, and commit the good frames. Call `new_cycle` before.
+        """Check the frames one by one in order of arrival, and commit the good frames. Call `new_cycle` first.
 
         A sender that is error passive sets the flag ESI of its frames. Its frames are valid, so this flag is removed from the
         received frames, and the rows are added to `error_passive`.

@@ -82,7 +82,7 @@ class Layout:
     frame_id: int
     extended: bool  # 29-bit identifier
     fd: bool | None  # True for a CAN FD frame; None if unknown
-    bit_rate_switch: bool | None  # True if the payload has the data bit rate; None if unknown
+    bit_rate_switch: bool | None  # True if the payload is sent at the data bit rate; None if unknown
     length: int  # bytes
     sender: str | None
     fields: tuple[Field, ...]

@@ -63,7 +63,7 @@ _load_once = cache(load_cached)
 
 
 def _parse(path: Path) -> Network:
-    from atalante_dbc.parser import parse  # the import of cantools is slow
+    from atalante_dbc.parser import parse  # imported only when needed, because cantools loads slowly
 
     return parse(path)
 

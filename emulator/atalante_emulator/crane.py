@@ -59,7 +59,7 @@ class Crane:
         self._goal = -np.inf
 
     def lift(self) -> None:
-        """Lift the robot straight up from its current position, to the height at which the crane suspended the robot first."""
+        """Lift the robot straight up from its current position, until the hook is at its initial height."""
         self._automatic = False
         motion = self._body.motion(PELVIS)
         self._at, self._heading = motion.position, _yaw(motion.attitude)
@@ -99,7 +99,7 @@ def _yaw(attitude: Vector) -> float:
 
 
 def _turn_to_upright(attitude: Vector, heading: float) -> Vector:
-    """Return the rotation from an attitude to the upright attitude of a heading, in world axes, shape (3,) [rad].
+    """Return the rotation from an attitude to the upright attitude with a given heading, in world axes, shape (3,) [rad].
 
     The result is 2 sin(angle / 2) along the axis of rotation. For a small angle it is the rotation vector.
 

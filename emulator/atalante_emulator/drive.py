@@ -93,13 +93,13 @@ class Drives:
         self.parameters = parameters
         self.signals = signals
         self.state = [DriveState.SWITCH_ON_DISABLED] * len(JOINTS)
-        #: Whether each drive left OPERATION ENABLED without a command, for example for a local hold, and waits for an
-        #: acknowledgement of the HAL: QUICK_STOP, or a controlword that changes the state. Until then the drive ignores
-        #: ENABLE_OPERATION.
+        #: For each drive: True from the time at which the drive leaves OPERATION ENABLED without a command, for example for a
+        #: local hold, until the HAL acknowledges this. In this time the drive ignores ENABLE_OPERATION. The HAL acknowledges with
+        #: QUICK_STOP, or with a controlword that changes the state.
         self.latched = [False] * len(JOINTS)
         #: Delay of each drive from the command ENABLE_OPERATION to the state OPERATION ENABLED [cycles].
         self.enable_delay = [0] * len(JOINTS)
-        #: Number of consecutive ENABLE_OPERATION that each drive has not followed yet.
+        #: For each drive: number of consecutive ENABLE_OPERATION commands that the drive has delayed, see `enable_delay`.
         self._enabling = [0] * len(JOINTS)
         self.emergencies = [] if outbox is None else outbox
         self.errors = Errors(NODES, self.emergencies)

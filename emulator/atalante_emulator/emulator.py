@@ -157,7 +157,8 @@ class Emulator:
         self._rx.values.fill(0.0)  # values until the first command: zero torque, zero vibration, HAL state OFF
         self._scratch = new_frames(_RECEIVE_BUDGET)
         self._scratch_from = [self._scratch[offset:] for offset in range(_RECEIVE_BUDGET)]
-        self._waiting = 0  # number of frames in the scratch buffer whose SYNC has not arrived yet
+        #: Number of frames that were received without SYNC. The scratch buffer keeps them for the next call.
+        self._waiting = 0
 
         self._sync_rows = [self._rx.codec.rows[m.name] for m in syncs]
         self._sync_ids = {m.frame_id for m in syncs}
@@ -168,7 +169,8 @@ class Emulator:
         self._whole = [self._tx.frames]
         #: Index of each leg's SYNC in the list of SYNCs.
         self._leg_syncs = [[m.name for m in syncs].index(f"SYNC_{side.upper()}_LEG") for side in SIDES]
-        self._answered = self._shares  # for each SYNC: answer in the last cycle with a missing, rejected or late frame
+        #: For each SYNC: answer of the last cycle that `_imperfect_cycle` ran, sent if the SYNC arrives late.
+        self._answered = self._shares
         batch = new_frames(_BATCH)
         self._batch = batch.view(np.uint8).data
         self._batch_up_to = [batch[:count] for count in range(_BATCH + 1)]
@@ -256,7 +258,7 @@ class Emulator:
         return self._imperfect_cycle(count)
 
     def _receive_rest(self, count: int) -> int:
-        """Receive frames until all SYNCs of the cycle arrived, or until the timeout `_SYNC_SKEW`.
+        """Receive frames until all SYNCs of the cycle have arrived, or until `_SYNC_SKEW` after the first SYNC.
 
         Args:
             count: frames already in the scratch buffer.
@@ -313,7 +315,7 @@ class Emulator:
         return True
 
     def _commands_in_step(self) -> bool:
-        """Return whether each command was sent in the cycle before its SYNC. Then the two frames have the same alive counter."""
+        """Return whether no command is late. A command and the SYNC of the next cycle have the same alive counter."""
         counters = self._counters
         return all(counters[sync] == counters[command] for sync, command in self._leg_rows)
 

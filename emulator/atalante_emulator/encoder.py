@@ -59,7 +59,7 @@ class Encoders:
         self._counts, self._before = np.zeros((2, len(JOINTS)))
         self._position, self._velocity = position, velocity
         self._sample = compiled(_sample)
-        self.sample(np.zeros(len(JOINTS)))  # this first call compiles the kernel, which takes longer than a cycle
+        self.sample(np.zeros(len(JOINTS)))  # compiles the kernel; the compilation takes longer than a cycle
         self._counts.fill(math.nan)  # no sample yet
 
     def sample(self, position: Vector) -> None:

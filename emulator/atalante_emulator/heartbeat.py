@@ -32,7 +32,7 @@ class Heartbeats:
 
     def __init__(self, network: Network, messages: Sequence[Message]) -> None:
         self._period = max(m.cycle_ms for m in messages)
-        # The periodic status messages are due at intervals of `gap`, so that no cycle contains two of them.
+        # The status messages of two consecutive nodes are due `gap` cycles apart, so that no cycle contains two of them.
         gap = self._period // len(messages)
         self._due: dict[int, _Status] = {}
         self._of: dict[str, _Status] = {}
@@ -47,7 +47,7 @@ class Heartbeats:
             self.set(message.sender, "SupplyVoltage", _SUPPLY_VOLTAGE)
 
     def set(self, node: str, signal: str, value: float) -> None:
-        """Set a signal in the status messages of a node.
+        """Set a signal in the status message of a node.
 
         Args:
             node: name of the node.

@@ -76,7 +76,7 @@ class AttitudeError:
     """
 
     def __init__(self, parameters: ImuParameters, count: int, interval: float, generator: np.random.Generator) -> None:
-        """Start the errors at random values, and the drift of the heading at zero.
+        """Draw the initial errors and the drift rates of the heading. The accumulated drift starts at zero.
 
         Args:
             parameters: size and time constant of the errors.
@@ -115,7 +115,7 @@ class AttitudeError:
 
 
 def _turn(share: float, last: Vector, following: Vector, quaternion: Vector) -> None:
-    """Turn attitudes by small rotations, which change linearly with time.
+    """Turn attitudes by small rotations. The rotation vectors are interpolated linearly over an interval.
 
     Args:
         share: elapsed share of the interval, 0 to 1.

@@ -119,7 +119,7 @@ class _Disturbance:
         earlier = self._held.pop(message.frame_id, None)
         if earlier is not None:
             return frame, earlier
-        # If the fault lasts until the next frame arrives, the next frame can overtake this frame.
+        # Keep this frame back until the next frame was sent, but only if the fault is still active in the next cycle.
         if cycle + 1 < self.fault.end:
             self._held[message.frame_id] = frame
             return ()
@@ -327,9 +327,10 @@ def _cut(frame: Frames, length: int) -> None:
 
 
 def _sealed(frame: Frames, message: Message, *, counter: int | None = None) -> Frames:
-    """Write the alive counter, if it is given, and the CRC with the Data ID of a message into a frame, and return the frame.
+    """Write the CRC into a frame, computed with the Data ID of the message, and return the frame.
 
-    A frame that is too short for an alive counter stays unchanged.
+    If `counter` is given, the function also writes this alive counter. A frame that is too short for an alive counter stays
+    unchanged.
     """
     payload = frame["data"][0]
     length = int(frame["len"][0])

@@ -18,7 +18,7 @@ from atalante_emulator.virtual_operator import VirtualOperator
 from atalante_emulator.wearer import LimbParameters, PassiveWearer
 from atalante_hal.robot import JOINTS
 
-#: Nodes of a robot on the ground. The attitudes of the IMUs have errors, because these errors affect a walk.
+#: Parameters of the nodes of a robot on the ground. The IMUs have attitude errors, because these errors affect a walk.
 GROUND_PARAMETERS: Final = EmulatorParameters(imu=ImuParameters(attitude_error=0.004, heading_drift=5.2e-5))
 
 
@@ -41,7 +41,7 @@ class Mechanics:
     #: Impedance of a passive wearer. With None, a wearer in the URDF affects the joints only by the masses of the limbs.
     limbs: LimbParameters | None = None
     active: ActiveTask | None = None  # task of an active patient on the ground; None: the patient uses no muscles
-    parameters: EmulatorParameters | None = None  # true parameters of the nodes; see `node_parameters` for None
+    parameters: EmulatorParameters | None = None  # parameters of the nodes; None: the default in `node_parameters`
 
     @property
     def node_parameters(self) -> EmulatorParameters:
@@ -49,7 +49,9 @@ class Mechanics:
         return self.parameters or (GROUND_PARAMETERS if self.ground else EmulatorParameters())
 
     def make_body(self, pose: Sequence[float] | None = None) -> Body:
-        """Create the body. If there is a floor, the body is suspended above it at the clearance. The caller closes the body.
+        """Create the body. The caller must close it.
+
+        If there is a floor, the body is suspended, with the soles at the height `ground.clearance` above the floor.
 
         Args:
             pose: initial joint positions, shape (12,) [rad]. With None, all joints are at 0.
@@ -74,7 +76,7 @@ class Mechanics:
         return body
 
     def complete(self, emulator: Emulator) -> None:
-        """Add wearer, crane and virtual operator to the emulator, if the description has them.
+        """Add wearer, crane and virtual operator to the emulator. Skip those that the description does not contain.
 
         Args:
             emulator: emulator with the body of `make_body`.

@@ -5,8 +5,9 @@ The muscles of `patient.ActivePatient` have a cost in addition to the rate of qu
     M = m standing + P+ / positive + P- / negative + activation * |u|
 
 P+ is the power of muscles that shorten, P- the magnitude of the power of muscles that lengthen, |u| the sum of the magnitudes of
-the muscle torques. The respirometer sees oxygen and carbon dioxide after the delay of blood and lungs, with noise. The equation
-of Brockway converts them back to a metabolic rate, as in the experiments of the paper.
+the muscle torques. The oxygen uptake and the carbon dioxide output follow the metabolic rate with first-order lags. The
+respirometer measures both with noise. `brockway` computes the measured metabolic rate from both, as in the experiments of
+Gurriet et al. (RA-L 2020).
 """
 
 from __future__ import annotations
@@ -24,7 +25,7 @@ from atalante_hal.types import Vector
 #: (Brockway, "Derivation of formulae used to calculate energy expenditure in man", Hum. Nutr. Clin. Nutr. 41C, 1987).
 OXYGEN: Final = 16_580.0
 CARBON_DIOXIDE: Final = 4_510.0
-#: Period of all series in this module [s].
+#: Sample period of all time series in this module [s].
 SAMPLE: Final = 1.0
 
 
@@ -37,8 +38,8 @@ class MetabolismParameters:
     standing: float = 1.44
     positive: float = 0.25  # efficiency of positive muscle work (Margaria, Int. Z. Angew. Physiol. 25, 1968)
     negative: float = 1.20  # magnitude of the efficiency of negative muscle work (Margaria 1968)
-    #: W/Nm, cost of a torque without motion: 0.054 times the largest joint speed (Minetti, Alexander, J. Theor. Biol. 186, 1997),
-    #: which is taken as 10 rad/s
+    #: W/Nm, metabolic rate per muscle torque without motion: 0.054 times the largest joint speed (Minetti, Alexander, J. Theor.
+    #: Biol. 186, 1997). The largest joint speed is assumed to be 10 rad/s.
     activation: float = 0.54
     quotient: float = 0.85  # respiratory exchange ratio, litres of CO2 per litre of O2
     oxygen_time: float = 30.0  # s, time constant of oxygen uptake after a change of the metabolic rate
@@ -109,7 +110,7 @@ def brockway(oxygen: Vector, carbon_dioxide: Vector) -> Vector:
 
 
 def _lagged(series: Vector, time: float) -> Vector:
-    """Return a series after a first-order lag that starts in steady state."""
+    """Apply a first-order lag to a time series. The lag starts in steady state at the first value."""
     keep, lagged = math.exp(-SAMPLE / time), series.copy()
     for i in range(1, len(series)):
         lagged[i] = keep * lagged[i - 1] + (1.0 - keep) * series[i]

@@ -1,14 +1,14 @@
-"""Active patient in the emulated robot: muscles that track the nominal gait at SH and SK of the swing leg.
+"""Active patient in the emulated robot: muscles at the sagittal hip (SH) and sagittal knee (SK) track the gait of the swing leg.
 
     joint angles, landings -> perceived error -> feedback with a delay + learned torque -> muscles -> torque, work
 
 The patient lives in the emulator. The HAL and the controller neither read nor command anything in this module. A passive patient
 is `wearer.PassiveWearer` alone: limbs without muscle torque.
 
-From step to step, the learned torque follows u <- f u + g e. This is the law of motor adaptation as a greedy minimisation of
-error and effort: without error, the effort decays (Emken, Benitez, Sideris, Bobrow, Reinkensmeyer, "Motor adaptation as a greedy
-optimization of error and effort", J. Neurophysiol. 97, 2007). The patient has one set of parameters. No parameter depends on the
-trial.
+After each step, the learned torque u is updated with the perceived error e: `u <- f u + g e`. This model describes motor
+adaptation as a greedy minimisation of error and effort: without error, the effort decays (Emken, Benitez, Sideris, Bobrow,
+Reinkensmeyer, "Motor adaptation as a greedy optimization of error and effort", J. Neurophysiol. 97, 2007). The parameters do not
+depend on the trial.
 """
 
 from __future__ import annotations
@@ -28,8 +28,8 @@ from atalante_hal.types import PERIOD, Vector
 Pair = tuple[float, float]
 
 _SH, _SK, _LEG = LEG_JOINTS.index("SH"), LEG_JOINTS.index("SK"), len(LEG_JOINTS)
-#: Thresholds of the load of a foot, as fractions of the weight: above _STANDING a foot stands, below _AIR it is in the air,
-#: above _LANDED it has landed.
+#: Thresholds of the load of a foot, as fractions of the weight. Before the first step, a foot stands if its load is above
+#: `_STANDING`. During the walk, a foot is in the air if its load is below `_AIR`, and then lands if its load is above `_LANDED`.
 _STANDING, _AIR, _LANDED = 0.25, 0.02, 0.1
 #: Time for which both feet must stand before the patient expects steps [cycles].
 _READY: Final = 500
@@ -43,25 +43,22 @@ class ActiveParameters:
         ValueError: If a parameter is out of range.
     """
 
-    gain: Pair = (
-        150.0,
-        80.0,
-    )  # Nm/rad, feedback torque per perceived error: the stiffness of a person who resists a motion
+    #: Nm/rad, feedback torque per perceived error: the stiffness of a person who resists a motion
+    gain: Pair = (150.0, 80.0)
     damping: Pair = (15.0, 8.0)  # Nm s/rad, feedback torque per rate of the error
     #: s, time from an error to the voluntary reaction (kinaesthetic reaction times are 0.12 to 0.18 s)
     delay: float = 0.15
     #: rad, errors up to this angle are not perceived. The sense of joint position has a threshold of one to two degrees at hip
     #: and knee (Domingo, Lam, J. NeuroEng. Rehabil. 11, 2014).
     threshold: float = math.radians(1.0)
-    learning: float = (
-        0.1  # g / gain: share of the feedback torque that the patient adds to the next step of the same leg
-    )
+    #: g / gain: share of `gain` times the perceived error that the patient adds to the torque in the next step of the same leg
+    learning: float = 0.1
     forgetting: float = 0.95  # f: share of the learned torque that the patient keeps for the next step of the same leg
     noise: float = 0.1  # standard deviation of the torque as a fraction of the torque (signal-dependent noise)
     noise_time: float = 0.1  # s, correlation time of the noise
     activation: float = 0.05  # s, time constant from excitation to torque (Zajac, Crit. Rev. Biomed. Eng. 17, 1989)
-    #: Largest torque as a fraction of mass times gravity times height: maximum voluntary torque of the weaker direction, hip
-    #: flexion and knee flexion (Anderson, Madigan, Nussbaum, J. Biomech. 40, 2007).
+    #: Largest torque as a fraction of mass times gravity times height. The values are the maximum voluntary torques of the weaker
+    #: direction of each joint: hip flexion and knee flexion (Anderson, Madigan, Nussbaum, J. Biomech. 40, 2007).
     strength: Pair = (0.113, 0.087)
     fraction: float = 1.0  # strength of this patient as a fraction of an able-bodied person
 
@@ -157,7 +154,7 @@ class ActivePatient:
                 self.impulse += PERIOD * abs(tension)
 
     def _feel_landings(self) -> None:
-        """Start the step of the other leg when a foot lands. The first step starts only after both feet have stood."""
+        """Start the step of the other leg when a foot lands. Before the first step, both feet must stand for `_READY` cycles."""
         left, right = self._body.sole_force[:, :, 2].sum(axis=1).tolist() if self._body.touching else (0.0, 0.0)
         loads = (left / self._weight, right / self._weight)
         if self._ready < _READY:
@@ -179,7 +176,7 @@ class ActivePatient:
         self._wobble = 1.0 + self._p.noise * self._noise(len(self._nominal))
 
     def _learn(self, cycles: int) -> None:
-        """Update the learned torque of the leg that has swung, from the errors of its first cycles."""
+        """Update the learned torque of the last swing leg from the errors in the first `cycles` cycles of its step."""
         felt = np.zeros_like(self._error)
         felt[:cycles] = _perceived(self._error[:cycles], self._p.threshold)
         self._learned[self._swing] *= self._p.forgetting

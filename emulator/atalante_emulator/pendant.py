@@ -39,7 +39,8 @@ class Operator:
     In HOLD the emulated operator does not press START. Call `start()` to end HOLD.
     """
 
-    #: Period of START while the HAL is in READY [cycles]. The first START follows one period after the change to READY.
+    #: Time between two presses of START while the HAL is in READY [cycles]. The first press follows this time after the change
+    #: to READY.
     REACTION = 200
 
     def __init__(self, assistance_factor: float | None = None, *, starts: bool = True) -> None:
@@ -94,7 +95,7 @@ class Operator:
         self.signals = self.signals._replace(dead_man=True)
 
     def receive(self, hal_state: int) -> None:
-        """Read the HAL state of one cycle, and press START after `REACTION` cycles in READY.
+        """Read the HAL state of one cycle, and press START after every `REACTION` consecutive cycles in READY.
 
         Args:
             hal_state: value of the signal `HalState` in SYNC.

@@ -29,8 +29,8 @@ _PAUSE: Final = 200
 class Intervention:
     """Interval in which the virtual operator held the robot."""
 
-    start: int  # number of the cycle of the first force; the first call has number 0
-    end: int  # number of the cycle of the last force
+    start: int  # first cycle with a force; the first call of the operator is cycle 0
+    end: int  # last cycle with a force
     largest: float  # largest force [N]
     impulse: float  # integral of the magnitude of the force [N s]
 

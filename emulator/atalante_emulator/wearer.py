@@ -19,7 +19,7 @@ class LimbParameters:
 
     stiffness: tuple[float, ...] = (20.0, 10.0, 20.0, 15.0, 15.0, 5.0)  # Nm/rad
     damping: tuple[float, ...] = (2.0, 1.0, 2.0, 1.5, 1.0, 0.5)  # Nm s/rad
-    rest: tuple[float, ...] = (0.0, 0.0, -0.2, 0.4, -0.1, 0.0)  # joint angles without torque [rad]
+    rest: tuple[float, ...] = (0.0, 0.0, -0.2, 0.4, -0.1, 0.0)  # joint angles with no stiffness torque [rad]
 
 
 class PassiveWearer:

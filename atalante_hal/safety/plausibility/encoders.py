@@ -209,7 +209,7 @@ class EncoderChecks:
             self.outside[joint] = position * self._polarity[joint] / self._gear[joint]
 
     def check_velocity(self, age: Cycles | None) -> bool:
-        """Compare the reported velocities with the encoder velocities after the same low-pass.
+        """Compare the reported velocities with the encoder velocities. Both have passed the same low-pass.
 
         Args:
             age: age of the values of each joint [cycles], shape (12,). A joint with an age of `NEVER` or more is not

@@ -3,11 +3,13 @@
 *Cell.* A sole is a rigid plate on four equal cells. Its load has three degrees of freedom: the force and two moments. So the two
 diagonals of the cells carry equal vertical forces: FL + RR = FR + RL, also where a cell is pulled. A fault of one cell changes
 the difference by the error of the cell. A difference above `cell_twist` for `CELL_CYCLES` is a fault. The faulty cell is known
-if it is the only cell with load, or the only cell without load. A cell without noise is detected sooner by `stillness`.
+if it is the only cell with load, or the only cell without load. The module `stillness` detects a cell with an exactly constant
+reading sooner.
 
 *Contact.* Walking has no flight phase. So a robot that stood on the ground cannot swing both feet. The check is armed after both
-feet have carried load together for `STANDING_CYCLES`, which does not happen while a crane sets the robot down. It is disarmed if
-the robot has been lifted for `LIFTED_CYCLES`. A robot that was lifted is in HOLD and requires a new START.
+feet have carried load together for `STANDING_CYCLES`. This does not happen while the robot hangs on a crane that sets it down.
+The check is disarmed if the robot has been lifted for `LIFTED_CYCLES`. A robot that was lifted is in HOLD and requires a new
+START.
 """
 
 from __future__ import annotations

@@ -4,17 +4,18 @@ Four joints of a leg lie between the pelvis IMU and the tibia IMU: frontal, tran
 knee (FH, TH, SH, SK). At zero angles their axes are x, z, y and y. So the attitude of the tibia relative to the pelvis
 is Rx(FH) Rz(TH) Ry(SH + SK). The two IMUs give these three angles, and the four encoders must agree with them.
 
-*Drift.* An encoder that drifts at rate d is detected after the time attitude_error / d plus `DRIFT_SAMPLES` samples. A
+*Drift.* An encoder that drifts at the rate `d` [rad/s] is detected `DRIFT_SAMPLES` samples after the time `attitude_error / d`. A
 drift of more than 0.035 rad/s is detected within 1000 cycles, and a slower drift takes longer. Some drifts cannot be
 detected, and some drifting encoders cannot be distinguished. The foot has no IMU, so a drift of SA or HA is not
 detected. Opposite drifts of SH and SK cancel and are not detected, and a drift of SH cannot be distinguished from a
 drift of SK. A drift of an IMU has the same effect as a drift of an encoder. The heading of an IMU without a fault also
-drifts, without a limit, but this affects only TH. The check of TH therefore subtracts the drift of the headings, which it
-follows at `_HEADING_DRIFT` at most. A slower drift of the encoder of TH is not detected.
+drifts, without a limit, but this affects only TH. The check of TH therefore estimates the heading drift and subtracts it. The
+estimate changes by at most `_HEADING_DRIFT` per sample. It also follows a drift of the encoder of TH that is slower than this, so
+such a drift is not detected.
 
 *Standstill.* While the reading of an encoder is constant and its joint is at rest, the difference between encoders and
-IMUs about the axis of the joint is also constant. If the joint moves, this difference changes by the motion of the
-joint. The check uses this change, so that a stuck encoder is detected long before the difference reaches
+IMUs about the axis of the joint is also constant. If the joint moves while its encoder is stuck, this difference changes by
+the motion of the joint. The check uses this change, so that a stuck encoder is detected long before the difference reaches
 `attitude_error`. The threshold also covers the effect of a misaligned IMU (`misalignment`) while the leg turns about
 another axis. If the readings of SH and SK are both constant, both are reported. Unlike the module `stillness`, this
 check needs no torque, so it also covers a joint that other joints move.
@@ -44,8 +45,8 @@ STANDSTILL_SAMPLES = 2
 #: Drift of the IMUs that the standstill check tolerates per sample [rad]. IMUs without a fault drift by less than a tenth of
 #: this limit.
 _IMU_DRIFT = 2e-5
-#: Largest heading drift between pelvis IMU and tibia IMU for which the drift check compensates per sample [rad]. A leg is
-#: sampled every 32 cycles, so the limit is 3e-4 rad/s.
+#: Largest change per sample of the estimated heading drift between pelvis IMU and tibia IMU [rad]. A leg is sampled every 32
+#: cycles, so this is 3e-4 rad/s.
 _HEADING_DRIFT = 1e-5
 _PELVIS = IMUS.index("pelvis")
 _TIBIAE = tuple(IMUS.index(f"{side}_tibia") for side in SIDES)
@@ -81,7 +82,7 @@ class Legs:
         self._to_joint: Vector = robot.polarity / robot.gear
         self._attitude_error = robot.sensors.attitude_error
         self._attitude_change, self._misalignment = robot.sensors.attitude_change, robot.sensors.misalignment
-        #: Heading drift of the IMUs of each leg since the start, as an error of the angle of TH [rad].
+        #: Estimated heading drift between the IMUs of each leg since the start [rad]. It is subtracted from the error of TH.
         self._heading = [0.0 for _ in SIDES]
         self._contradicts = [[0] * len(_AXES) for _ in SIDES]
         self._constant_samples = [constant_samples[hip : hip + len(_AXIS_OF)] for hip in _HIPS]
@@ -229,7 +230,7 @@ def extrapolated(quaternion: list[float], gyro: list[float], time: float) -> lis
 
 
 def _follow_imu_drift(moved: _Comparison, axis: int, change: float) -> _Comparison:
-    """Return a copy of `moved` in which `change`, limited to +-`_IMU_DRIFT`, is added to one error."""
+    """Return a copy of `moved` in which `change`, limited to +-`_IMU_DRIFT`, is added to the error about one axis."""
     errors = list(moved.errors)
     errors[axis] += max(-_IMU_DRIFT, min(_IMU_DRIFT, change))
     return moved._replace(errors=(errors[0], errors[1], errors[2]))

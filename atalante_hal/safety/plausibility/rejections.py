@@ -1,10 +1,10 @@
 """Leaky buckets of rejected values, which detect a sensor whose values are implausible again and again.
 
-Single implausible values of a joint or an IMU are tolerated: the robot uses the previous values. If they persist, the check that
-rejects them confirms its diagnostic. If they alternate with good values, it does not, because each good value ends the fault. So
-a leaky bucket of each sensor counts the tolerated values. It has the size of those of the disturbances of a message (see
-`message_monitor`), and is full if more than a fifth of the values are rejected. Then the diagnostic is confirmed, until 16 values
-in a row are good.
+Single implausible values of a joint or an IMU are tolerated: the robot uses the previous values. If every new value is
+implausible, the check that rejects the values confirms its diagnostic. If good values arrive in between, this check confirms
+nothing, because each good value ends the fault. So each sensor has a leaky bucket that counts its tolerated values. The bucket
+has the same size as the buckets in `message_monitor`. It is full if more than a fifth of the values are rejected. Then the
+diagnostic is confirmed, until 16 values in a row are good.
 """
 
 from __future__ import annotations

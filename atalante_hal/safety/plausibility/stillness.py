@@ -4,18 +4,18 @@ All signals are sampled every few cycles, and consecutive samples with exactly t
 skips each signal that has no new value since the last sample. In addition, each cycle updates a record of each joint
 (`Drive`): the range of its torque since its encoder reading last changed, and the motion that this torque would cause.
 
-*Ankles.* The ankles of a foot on the ground move the whole robot, whose inertia is some thousand times that of the foot. A torque
-that varies fast then does not move them. But the sole is at rest, so an ankle moves when its shank turns. An encoder of an ankle
-with a loaded foot is therefore stuck if its reading is constant while the shank turns by `_TURN`.
+*Torque.* The reading of an encoder may be constant because the joint is at rest. So an encoder is reported as stuck only under
+two conditions. First, the torque of the drive has varied by at least `breakaway` since the reading last changed. `breakaway` is
+more than twice the dry friction of the joint. Second, the joint is not at its end stop, because an end stop holds a joint against
+any torque. A stuck encoder of a joint without torque is not detected here until the joint is driven. The module `legs` detects
+some of these encoders with the IMUs.
 
-The reading of an encoder may be constant because the joint is at rest. An encoder is stuck only under two conditions. First, the
-torque of the drive has varied by at least `breakaway` since the reading last changed. `breakaway` is more than twice the dry
-friction of the joint. Second, the joint is not at its end stop, because an end stop holds a joint against any torque. A stuck
-encoder of a joint without torque is not detected here until the joint is driven. The module `legs` detects some of
-these encoders with the IMUs.
+*Ankles.* The ankles of a foot on the ground move the whole robot, whose inertia is some thousand times that of the foot. A torque
+that varies fast then does not move them. But the sole is at rest, so an ankle moves when its shank turns. For an ankle with a
+loaded foot, the first condition is therefore that the shank has turned by `_TURN` since the reading last changed.
 
 *Large torque.* A controller that drives a joint with a stuck encoder accelerates the joint by a large torque within a few
-cycles. The accepted time of a constant reading is therefore shorter, the larger the torque. A joint whose reading has been
+cycles. So the larger the torque, the sooner a constant reading is reported. A joint whose reading has been
 constant for `_AT_REST` cycles is at rest, so its torque is in balance. From then on, each cycle computes how far the
 torque change beyond `breakaway` would have turned a joint with the inertia `_INERTIA`, which is larger than that of any
 joint. The encoder is stuck if this angle is at least `_DRIVEN`.
@@ -46,7 +46,7 @@ from atalante_hal.wire.process_image import NEVER, ReceiveImage
 STUCK_CYCLES = 50
 #: Longest time from the first repeated reading of a gyro or force cell to its detection as frozen [cycles].
 FROZEN_CYCLES = 100
-#: Turn of a shank above a loaded foot that must change the readings of the ankle encoders [rad].
+#: If a shank turns by this angle above a loaded foot, the readings of the ankle encoders must change [rad].
 _TURN = 0.01
 #: Upper bound of the inertia about any joint [kg m2], including the knee of a leg that carries robot and patient.
 _INERTIA = 100.0
@@ -82,11 +82,11 @@ class Drive(NamedTuple):
     """
 
     cycles: Vector  # cycles with a constant reading
-    rest: Vector  # torque while the joint comes to rest [Nm]
+    rest: Vector  # newest torque of the first `_AT_REST` of these cycles, with which the joint came to rest [Nm]
     low: Vector  # lowest torque [Nm]
     high: Vector  # highest torque [Nm]
     momentum: Vector  # angular momentum that the torque would cause [Nm s]
-    turn: Vector  # angle that the torque would turn the joint by [rad]
+    turn: Vector  # angle by which the torque would turn the joint [rad]
 
 
 class Stillness:

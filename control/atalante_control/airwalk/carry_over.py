@@ -29,7 +29,7 @@ class CarryOver:
     """Carry-over of the torque, which keeps the command continuous at a stance change.
 
     Attributes:
-        records: record of `add_carried`, shape (1,).
+        records: record that `add_carried` reads and updates, shape (1,).
         blend: fraction of the torque jump that is still compensated in each cycle since the stance change. It falls from 1
             towards 0, shape (n,).
     """

@@ -40,12 +40,13 @@ class AirwalkConfig(StepGuideConfig):
     def literal(cls) -> AirwalkConfig:
         """Return the parameters with which the controller follows the paper literally, for comparisons.
 
-        With these parameters no guide has a promise: the certificate states no disturbance that keeps the joints inside. Every
-        departure from the paper that can be undone is undone here. `docs/reference/paper.md` explains each departure.
+        With these parameters no guide has a promise: the certificate states no disturbance torques under which the joints stay
+        inside the guide. Every departure from the paper that can be undone is undone here. `docs/reference/paper.md` explains
+        each departure.
         """
         return cls(
-            # In the paper, each assisted joint has a separate law, u_b uses the gains of the PID, and the baseline adds no
-            # gravity torque.
+            # In the paper, each assisted joint has a separate control law, the backup torque u_b uses the gains of the PID, and
+            # the baseline controller adds no gravity torque.
             literal_law=True,
             gains=replace(AIR_GAINS, integral_limit=math.inf),
             feedforward=0.0,  # the experiment of the paper in the air had no feedforward

@@ -158,9 +158,9 @@ class AirwalkController:
 
     @property
     def desired(self) -> Vector:
-        """Return q_des [rad], then q_des' [rad/s] of the last cycle of a step, shape (24,).
+        """Return q_des [rad], then q_des' [rad/s] of the most recent cycle, shape (24,).
 
-        The start motion does not change them.
+        Cycles of the start motion do not change them.
         """
         return self._outputs.desired
 
@@ -173,14 +173,14 @@ class AirwalkController:
         return self.choice(xi).guide
 
     def prepare(self) -> None:
-        """Compute the guides of all assistance factors before a walk on the wall clock, see `StepGuides.prepare`."""
+        """Compute the guides of all assistance factors, see `StepGuides.prepare`. Call this before a walk on the wall clock."""
         if not self.config.literal_law:
             self._guides.prepare()
 
     def choice(self, xi: float) -> Choice:
-        """Return the guide filter used at an assistance factor.
+        """Return the guide filter that is used at an assistance factor, together with its promised torques.
 
-        The promised torques of the filter are given as a fraction of the chosen promised torques.
+        The promised torques are expressed as a fraction of the chosen promised torques.
 
         Args:
             xi: assistance factor in [0, 1].
@@ -306,7 +306,7 @@ class AirwalkController:
     def _start_guide(self, xi: float, deviation: Deviation, joints: tuple[int, int]) -> None:
         """Start the guide of a step.
 
-        Count the step in the statistics if its start deviates more than the certificate assumes.
+        If the deviation at the start of the step is larger than the certificate assumes, count the step in the statistics.
         """
         hip, knee = joints
         angles = float(deviation.angle[hip]), float(deviation.angle[knee])

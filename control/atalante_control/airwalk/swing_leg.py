@@ -23,7 +23,7 @@ def swing_leg(
     """Return the swing leg along the nominal trajectory of a step and of the first cycles of the next step.
 
     Args:
-        config: end of the re-centring, and friction.
+        config: parameters of the controller; only `alpha` and `friction` are used.
         gait: right-stance step that repeats.
         inertia: mass matrix of SH and SK.
         gravity: gravity of the exoskeleton.

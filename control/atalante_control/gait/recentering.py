@@ -1,8 +1,9 @@
 """Re-centring ("deadbeat" in the paper): a cubic that leads from the pose at a stance change to the nominal trajectory.
 
 `stance change -> (q - q_nom, q' - q_nom') -> s(t) -> q_des(t) = q_nom(t) + s(t)`. The tracking error is exactly zero at the step
-change. After the fraction alpha of the step duration T, the desired trajectory is the nominal trajectory. s is linear:
-s(t) = s(0) c0(t) + s'(0) c1(t). The guide filter can therefore compute the responses to the basis cubics c0 and c1 in advance.
+change. After the fraction alpha of the step duration T, the desired trajectory is the nominal trajectory. s is linear in
+the deviations: `s(t) = s(0) c0(t) + s'(0) c1(t)`. The guide filter can therefore compute the responses to the basis cubics c0
+and c1 in advance.
 
 The paper calls this polynomial a deadbeat. It is a reference trajectory, not a finite-time (deadbeat) control law.
 """

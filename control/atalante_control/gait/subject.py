@@ -10,8 +10,8 @@ from atalante_control.model import Patient
 STEP_LENGTH_RANGE = (0.05, 0.40)  # m, accepted step lengths; some of them have no feasible gait
 STEP_DURATION_RANGE = (0.4, 2.0)  # s, accepted step durations; some of them have no feasible gait
 
-#: Eight patients of the walks in the documentation, within the range of the subjects of the paper: 58 to 91 kg and 1.62 to 1.93
-#: m. The paper gives only this range.
+#: Eight patients for the walks in the documentation. They lie within the range of the subjects of the paper: 58 to 91 kg and
+#: 1.62 to 1.93 m. The paper gives only this range.
 STUDY_PATIENTS = tuple(
     Patient(mass, height)
     for mass, height in (
@@ -25,7 +25,7 @@ class Subject:
     """Patient and step parameters for which a gait is computed.
 
     Raises:
-        ValueError: If the step is out of range, or the duration is not a whole number of cycles.
+        ValueError: If step length or step duration is out of range, or the duration is not a whole number of cycles.
     """
 
     patient: Patient

@@ -106,7 +106,7 @@ def inputs(gait: Gait) -> Vector:
 
 
 def _metric(duration: float) -> Vector:
-    """Return the matrix M with which d' M d is the squared distance of two gaits, for a difference d of control points.
+    """Return the matrix M of the squared distance `d' M d` of two gaits, shape (96, 96).
 
     d is the difference of the control points of the two gaits. The squared distance is the weighted mean of squared
     errors along the step.

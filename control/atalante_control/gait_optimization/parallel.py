@@ -94,7 +94,7 @@ def _without_loky_errors() -> Iterator[None]:
     """Suppress the report of a KeyError in the executor thread of loky.
 
     Before loky ends its processes, it clears the table of pending calls. If the executor thread queues a call at that moment, the
-    call is missing in the table (`add_call_item_to_queue` in loky 3.6). The error has no effect, because all calls are cancelled.
+    call is not in the table (`add_call_item_to_queue` in loky 3.6). The error has no effect, because all calls are cancelled.
     """
     before = threading.excepthook
 

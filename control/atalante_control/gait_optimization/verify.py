@@ -205,7 +205,7 @@ class Verifier:
         ]
 
     def _landing(self, q: Vector) -> list[GaitCheck]:
-        """Return the checks that the left foot is flat on the ground, with the mirrored toe-out of the right foot."""
+        """Return the checks that the left foot is flat on the ground, and that its toe-out mirrors that of the right foot."""
         stance, swing, _ = self._poses(q)
         relative = stance.actInv(swing)
         turned = self._forward() @ self._forward()

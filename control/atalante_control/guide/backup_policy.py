@@ -5,9 +5,10 @@ the responses. The backup torque is
 
 .. math:: u_B = u_i + M(q)(\ddot q_{des} - K_v e - D_v \dot e), \qquad e = q - q_{des},
 
-with the torque :math:`u_i` of gravity, friction and velocity. The acceleration of the desired trajectory is part of the torque,
-so the error has no forced response: :math:`\ddot e = -K_v e - D_v \dot e + M^{-1} d` under a disturbance torque d. The gains
-:math:`K_v = M_0^{-1} \mathrm{diag}(k)` are computed with the mass matrix :math:`M_0` at a knee angle in the middle of the swing.
+where the torque :math:`u_i` compensates gravity, friction, centrifugal and Coriolis torques. The acceleration of the desired
+trajectory is part of the backup torque, so the error has no forced response: :math:`\ddot e = -K_v e - D_v \dot e + M^{-1} d`
+under a disturbance torque d. The gains :math:`K_v = M_0^{-1} \mathrm{diag}(k)` are computed with the mass matrix :math:`M_0` at
+a knee angle in the middle of the swing.
 A constant disturbance d deflects each joint by about d / k. The `stiffness` k is therefore the stiffness of the real joint, and
 not of a mode. The gains :math:`D_v = 2 \zeta \sqrt{K_v}` have the eigenvectors of Kv. The loop therefore consists of two modes,
 one with large and one with small inertia ("heavy" and "light").

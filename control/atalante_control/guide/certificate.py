@@ -2,8 +2,8 @@ r"""Guide certificate: the disturbance torque for which the filter keeps the joi
 
 **The promise.** Both joints stay inside the guide while disturbance torques of at most `hip` Nm act on the sagittal hip (SH) and
 at most `knee` Nm on the sagittal knee (SK), at the same time and in any direction. The friction of the leg may differ from the
-model by 20 %, and the mass and inertia of the leg by 10 %. The loop may have one more cycle of delay. The step may start with any
-deviation inside the hand-over box (`HandOver`). The running filter is built for exactly this promise.
+model by 20 %, and the mass and inertia of the leg by 10 %. The loop may have one more cycle of delay than the model. The step may
+start with any deviation inside the hand-over box (`HandOver`). The running filter is built for exactly this promise.
 
 **Why it holds.** Let r be the largest ratio of error to width in the prediction that starts at the true state of the leg, under
 the backup policy and the worst of these disturbances. Let h = 1 - r^2. Three conditions are sufficient.
@@ -27,11 +27,11 @@ The filter does not know the true state, so it uses bounds. Errors of inertia an
 (`Prediction.slack`), and the measured velocity lags behind the true velocity (part of `Prediction.reach`). So the h of the
 filter is at most the true h, and the gate is at least as large as the proof requires.
 
-All bounds are linear in the promise. The largest promise is therefore a multiple of the chosen promise. The certified promise is
-the smaller of these two. The intensities of idealization and feedforward do not change the promise. The backup torque includes
-both torques completely, so conditions 1 and 2 do not depend on the intensities. The part that is not compensated acts only while
-the gate is below 1, so only condition 3 depends on it. At zero intensities it adds less than 0.2 to 6 g in each shape of the
-package.
+All bounds are linear in the promise. The largest possible promise is therefore a multiple of the chosen promise. The certified
+promise is the smaller one of the largest possible and the chosen promise. It does not depend on the intensities of idealization
+u_i and feedforward u_f. The backup torque includes u_i and u_f completely, so conditions 1 and 2 do not depend on the
+intensities. A torque that is not compensated acts only while the gate is below 1, so it affects only condition 3. At zero
+intensities this torque increases 6 g by less than 0.2 in each shape of the package.
 """
 
 from __future__ import annotations
@@ -76,8 +76,8 @@ class Certificate:
 
     shape: str
     xi: float
-    certified: bool  # whether the guide has promised torques
-    reason: str  # sentence that states what limits the promised torques, or why there are none
+    certified: bool  # whether torques are promised for this guide
+    reason: str  # what limits the promised torques, or why there are none, as a sentence
     promise: JointTorque | None  # promised torques, for which the running filter is built; None if there are none
     #: largest torques that a filter with these gains could promise; None if there are none
     largest: JointTorque | None
@@ -172,12 +172,13 @@ def _pair(torque: Vector) -> JointTorque | None:
 
 
 def _limit(room: Vector, reach: Vector, steps: int, what: str) -> Limit:
-    """Return the largest scale for which effect of model errors + scale * effect of promise is at most `room` in every cycle.
+    """Return the largest scale of the promised torques for which their effect and that of model errors fit into `room`.
 
     Args:
         room: largest permitted effect on SH and SK in each cycle, shape (n, 2).
-        reach: effect of the budget on SH and SK, then effect of the promise on SH and SK, shape (n, 4).
-        steps: number of cycles of a step.
+        reach: columns 0 and 1: effect of model errors on SH and SK; columns 2 and 3: effect of the chosen promised torques on SH
+            and SK, to be multiplied by the scale; shape (n, 4).
+        steps: number of cycles of a step. All of them are checked.
         what: start of the message; joint and phase are appended.
     """
     budget, promise = reach[1 : steps + 1, :2], reach[1 : steps + 1, 2:]
@@ -189,10 +190,9 @@ def _limit(room: Vector, reach: Vector, steps: int, what: str) -> Limit:
 class _Horizon:
     """Condition on the scale of the promised torques: one cycle after the horizon, the error is still within the guide.
 
-    At the end of the horizon little more than the slowest motion remains. The error one cycle beyond the horizon is therefore
-    the error at the end of the horizon times a factor, plus a remainder. The remainder is a combination of the errors at two
-    earlier cycles, and any two cycles may be chosen. All these errors are bounded by the width less the effect of the
-    disturbances.
+    At the end of the horizon, fast motions have decayed. The error one cycle beyond the horizon is therefore the error at the
+    end of the horizon times a factor, plus a remainder. The remainder is a linear combination of the errors in two earlier
+    cycles, and any two cycles may be chosen. Each of these errors is at most the width minus the effect of the disturbances.
 
     Attributes:
         cycles: number of predicted cycles.
@@ -205,7 +205,8 @@ class _Horizon:
         beyond = prediction.beyond * SIZES
         self._factor = (beyond * rows[-1]).sum(axis=1) / (rows[-1] ** 2).sum(axis=1)
         remainder = beyond - self._factor[:, None] * rows[-1]
-        self._pairs: list[tuple[tuple[int, int], Vector]] = []  # two earlier cycles, and the weights of their errors
+        #: two cycles before the end of the horizon, and the weights of their errors
+        self._pairs: list[tuple[tuple[int, int], Vector]] = []
         for near, far in ((0.1, 0.3), (0.25, 0.5), (0.4, 0.7)):
             lags = round(near * self.cycles), round(far * self.cycles)
             inverse = np.linalg.pinv(np.concatenate([rows[lag] for lag in lags]), rcond=1e-9)
@@ -230,8 +231,8 @@ class _Horizon:
         found = []
         for lags, weights in self._pairs:
             rooms, promises = (np.hstack(parts) for parts in zip(*map(room, lags), strict=True))
-            # Find the largest scale with: factor * (last - scale * last_promise) + (rooms - scale * promises) @ weights <= end
-            # - scale * end_promise.
+            # Find the largest scale that satisfies
+            # `factor * (last - scale * last_promise) + (rooms - scale * promises) @ weights <= end - scale * end_promise`.
             have = end - self._factor * last - rooms @ weights
             need = end_promise - self._factor * last_promise - promises @ weights
             with np.errstate(divide="ignore"):

@@ -4,7 +4,7 @@ For each cycle of the step, this module bounds the torques at sagittal hip and k
 bound is the sum of the promise (the disturbance torques of the certificate) and a budget. The budget is the sum of four torques:
 
 - a part of the friction torque, since the friction parameters may be wrong,
-- a part of the torque of inertia, gravity and velocity along the desired trajectory, since the inertia may be wrong,
+- a part of the inertia, gravity, centrifugal and Coriolis torques along the desired trajectory, since the inertia may be wrong,
 - the torque that is carried over the stance change, while it fades out,
 - a constant for errors that have no model: noise, lost frames, lag of the friction compensation, motion of the other joints.
 
@@ -89,7 +89,10 @@ class HandOver:
 
 
 class Leg(NamedTuple):
-    """Swing leg along the nominal trajectory. The rows are cycles, to the end of the overlap; the columns are SH and SK."""
+    """Swing leg along the nominal trajectory of a step and of the first cycles of the next step (overlap).
+
+    The rows are cycles; the columns are SH and SK.
+    """
 
     deadbeat: Deadbeat  # re-centring of the gait
     time: Vector  # (n,) s, since the stance change
@@ -101,10 +104,10 @@ class Leg(NamedTuple):
     friction: Friction  # friction parameters
 
     def masses(self, knee: Vector) -> Vector:
-        """Return the mass matrix at knee angles of any shape, shape (..., 2, 2) [kg m2].
+        """Return the mass matrix for each knee angle, shape (..., 2, 2) [kg m2].
 
         Args:
-            knee: angles of SK [rad].
+            knee: angles of SK, shape (...) [rad].
         """
         basis = np.stack([np.ones_like(knee), np.cos(knee), np.sin(knee)], axis=-1)
         return np.asarray((basis @ self.inertia.fit.T)[..., [[0, 1], [1, 2]]])
@@ -118,14 +121,15 @@ class Leg(NamedTuple):
         """Return the friction torque along the nominal trajectory, shape (n, 2) [Nm].
 
         Args:
-            margin: speed that is added to the absolute value of the velocity [rad/s]; the result is then an absolute value.
+            margin: speed that is added to the absolute value of the velocity [rad/s]. If it is not 0, the result is the absolute
+                value of the friction torque.
         """
         speed = np.abs(self.qd) + margin if margin else self.qd
         coulomb, viscous = (np.array(row[2:4]) for row in (self.friction.coulomb, self.friction.viscous))
         return np.asarray(coulomb * np.tanh(speed / self.friction.smoothing) + viscous * speed)
 
     def torque(self) -> Vector:
-        """Return the torque of gravity, velocity and acceleration along the nominal trajectory, shape (n, 2) [Nm]."""
+        """Return gravity plus centrifugal, Coriolis and inertia torque along the nominal trajectory, shape (n, 2) [Nm]."""
         needed = np.einsum("nij,nj->ni", self.masses(self.q[:, 1]), self.qdd)
         return np.asarray(needed + self.velocity_torque() + self.gravity)
 
@@ -178,26 +182,27 @@ class Grid(NamedTuple):
     """Start cycles and numbers of cycles ahead for which `spread` computes the largest output."""
 
     starts: int  # number of start cycles: 0 to starts - 1
-    block: int  # number of consecutive start cycles that share one row of the result
+    block: int  # number of consecutive start cycles that share one row of the argument `ahead`
     lags: NDArray[np.int64]  # (lags,) numbers of cycles ahead, ascending
 
 
 def spread(effect: Effect, mobilities: Vector, bounds: Vector, grid: Grid, ahead: Vector) -> Vector:
-    """Compute the largest output that disturbances can cause, ahead of each start cycle and since the start of the step.
+    """Compute the largest output that disturbances can cause since each start cycle, and since the start of the step.
 
-    In both results, columns 0 and 1 are the sums of the absolute effects of the budget on the two outputs, columns 2 and 3 those
-    of the chosen promise.
+    The first result is written to `ahead`, the second result is returned. In both results, columns 0 and 1 are the effects of
+    the budget on the two outputs, and columns 2 and 3 are the effects of the chosen promise. Each effect is a sum of absolute
+    values.
 
     Args:
         effect: effect of a disturbance on the outputs.
         mobilities: inverse mass matrices of each cycle, shape (n, postures, 2, 2).
         bounds: torque bounds of SH and SK (rows), budget and chosen promise (columns), in each cycle, shape (n, 2, 2) [Nm].
-        grid: start cycles and numbers of cycles ahead of the first result.
+        grid: start cycles, and numbers of cycles ahead, of the predictions in `ahead`.
         ahead: shape (blocks, lags, 4). Each element is raised to the largest output of its start cycles, for its number of cycles
             ahead. Predictions past the end of `bounds` are left out.
 
     Returns:
-        The largest output in each cycle by the disturbances since cycle 0, without the response `hidden`, shape (n, 4).
+        The largest output in each cycle due to the disturbances since cycle 0, without the response `hidden`, shape (n, 4).
     """
     count, postures = len(bounds), mobilities.shape[1]
     total, added = np.zeros((count, 4)), np.zeros((grid.starts, 4))

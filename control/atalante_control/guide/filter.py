@@ -175,7 +175,7 @@ class GuideFilter:
         return self.tables.guards[0].state.copy()
 
     def errors_ahead(self) -> Vector:
-        """Return the tracking errors of SH and SK predicted at the last cycle without disturbance, shape (n, 2) [rad]."""
+        """Return the tracking errors of SH and SK predicted in the last cycle without disturbance, shape (n, 2) [rad]."""
         return np.asarray(self.prediction.ahead @ (self.prediction.compress @ self.state))
 
     def uncertainty(self) -> Vector:
@@ -215,7 +215,7 @@ def narrowest(inverse: Vector, cycles: int) -> Vector:
         cycles: number of cycles, including the first one.
     """
     largest = np.concatenate([inverse, np.repeat(inverse[-1:], cycles - 1, axis=0)])
-    covered = 1  # cycles over which `largest` contains the maximum
+    covered = 1  # number of cycles over which each row of `largest` is the maximum
     while covered < cycles:
         shift = min(covered, cycles - covered)
         largest = np.maximum(largest[:-shift], largest[shift:])
@@ -267,9 +267,9 @@ def _reference(prediction: Prediction) -> tuple[list[Vector], Vector]:
     """Return the reference of the step without re-centring, and the change of the reference by the re-centring.
 
     Returns:
-        The reference: acceleration (ahead by the command lag), velocity behind the low-pass of the drives, velocity, and torque;
-        each of shape (n, 2). The change for s(0) = 1 rad and for s'(0) = 1 rad/s: acceleration (ahead by the command lag),
-        velocity behind the low-pass, velocity, and acceleration; shape (2, 4, n, 1).
+        The reference: acceleration (ahead by the command lag), velocity after the low-pass of the drives, velocity, and torque;
+        each of shape (n, 2). The change, shape (2, 4, n, 1). Axis 0: change for s(0) = 1 rad, then for s'(0) = 1 rad/s. Axis 1:
+        acceleration (ahead by the command lag), velocity after the low-pass, velocity, acceleration. Axis 2: cycles.
     """
     leg, loop = prediction.leg, prediction.assumptions.loop
     time, lag = leg.time, loop.command_lag

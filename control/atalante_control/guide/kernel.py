@@ -17,8 +17,8 @@ from atalante_hal.types import Vector
 
 Pair = tuple[float, float]
 
-#: Slope of the line that converts torque / limit and speed / limit to the ratio of `largest_ratio`. The value 1 stays 1. The
-#: gait alone needs a large part of both limits, so the gate must rise only when torque or speed is near its limit.
+#: Torque / limit and speed / limit, both denoted x, are converted to the ratio `1 - STEEPNESS * (1 - x)`. The value 1 stays 1.
+#: The gait alone needs a large part of both limits, so the gate must rise only when torque or speed is near its limit.
 STEEPNESS = 4.0
 #: Number of elements of the compressed state, from which the predicted errors are computed.
 COMPRESSED = 5
@@ -56,7 +56,7 @@ class Guard:
     few_slack: Annotated[Vector, (STATES, 2)]  # largest value of each element of `Few.slack` over all rows
     h: float  # h of the last cycle; at h >= 0, the backup policy can keep both joints inside the guide
     rate: float  # 1/s, dh/dt
-    gate: float  # gate: weight of the backup torque, lambda + (1 - lambda) lambda_d
+    gate: float  # gate, the weight of the backup torque: `lambda + (1 - lambda) lambda_d`
     bounds: Annotated[Vector, 4]  # rad, distances from q_des to the guide: upper and lower of SH, upper and lower of SK
 
 
@@ -75,7 +75,7 @@ class Block:
     middle: Annotated[Vector, (COMPRESSED, 2)]  # mean of the largest and the smallest `Lag.ahead` in the block
     #: half the difference of the largest and the smallest `Lag.ahead` in the block
     spread: Annotated[Vector, (COMPRESSED, 2)]
-    ratio: float  # upper bound of the predicted error / guide width over all cycles of the block, from the last cycle
+    ratio: float  # upper bound of predicted error / guide width in the block, computed in the last control cycle
 
 
 class Few:
@@ -226,7 +226,7 @@ def _estimate(guard: Guard, step: Vector, cycle: int, leg: LegState, m: tuple[fl
 
 
 def _acceleration(hip: float, knee: float, m: tuple[float, float, float], row: Vector) -> Pair:
-    """Return the acceleration of the tracking error e under torques u of SH and SK, M^-1 u - q_des'' [rad/s2]."""
+    """Return `M^-1 u - q_des''`, the acceleration of the tracking error e under torques u of SH and SK [rad/s2]."""
     m11, m12, m22 = m
     determinant = m11 * m22 - m12 * m12
     return (m22 * hip - m12 * knee) / determinant - row[REFERENCE], (m11 * knee - m12 * hip) / determinant - row[
@@ -235,7 +235,9 @@ def _acceleration(hip: float, knee: float, m: tuple[float, float, float], row: V
 
 
 def largest_ratio(guide: GuideTables, cycle: int) -> float:
-    """Return the largest predicted ratio of error / width, torque / limit and speed / limit under backup policy and disturbances.
+    """Return the largest of the predicted error / width, torque / limit and speed / limit under the backup policy.
+
+    The effect of the disturbances is included. The last two are converted with the slope `STEEPNESS`.
 
     Args:
         guide: tables of the guide filter; `Guard.state` must contain the state of the current cycle.
@@ -255,7 +257,7 @@ def largest_ratio(guide: GuideTables, cycle: int) -> float:
 
 
 def _error_ratio(guide: GuideTables, cycle: int) -> float:
-    """Return the largest predicted ratio of error / width.
+    """Return the largest predicted error / width.
 
     Most cycles ahead need not be predicted. `bound_blocks` computes a ratio for each block that no cycle of the block exceeds.
     The block with the largest bound is predicted first. A block whose bound is at most the largest ratio found so far cannot
@@ -300,7 +302,7 @@ def bound_blocks(guide: GuideTables, cycle: int, blocks: int) -> int:
     """Compute `Block.ratio` of each block, and return the number of the block with the largest ratio.
 
     In a block, a predicted error differs from `Block.middle` times the compressed state y by at most `Block.spread` times abs(y).
-    The disturbances add at most `GuideTables.highest`, and no width is below the one of the columns `NEAR`.
+    The disturbances add at most `GuideTables.highest`, and no width is below the width in the columns `NEAR`.
 
     Args:
         guide: tables of the guide filter; `Guard.magnitude` and `Guard.compressed` must belong to the current cycle.
@@ -336,7 +338,8 @@ def _few_ratio(guide: GuideTables, cycle: int, least: float) -> float:
     Args:
         guide: tables of the guide filter.
         cycle: cycles since the stance change.
-        least: ratio below which the result need not be exact; the result is then below this ratio, too.
+        least: ratio below which the exact result is not needed. If the exact result is below it, the returned result may be
+            smaller than the exact result.
     """
     guard, step, reach = guide.guards[0], guide.step, guide.few_reach[cycle // START_CYCLES]
     x, size, promise = guard.state, guard.magnitude, guard.promise
@@ -374,7 +377,7 @@ def _few_ratio(guide: GuideTables, cycle: int, least: float) -> float:
 
 
 def gate(h: float, xi: float) -> float:
-    """Return the gate lambda of the paper, (1 + (Xi^10 - 1) h)^3, clamped to [0, 1]; 1 outside the safe backward image.
+    """Return the gate lambda of the paper, `(1 + (Xi^10 - 1) h)^3`, clamped to [0, 1]; 1 outside the safe backward image.
 
     Args:
         h: function that is at least 0 inside the safe backward image, at most 1.
@@ -387,7 +390,7 @@ def gate(h: float, xi: float) -> float:
 
 
 def damped_gate(gate: float, rate: float, zeta: float) -> float:
-    """Return lambda + (1 - lambda) lambda_d, with lambda_d = zeta max(0, -dh/dt) clamped to 1.
+    """Return `lambda + (1 - lambda) lambda_d`, where `lambda_d = zeta max(0, -dh/dt)` is clamped to 1.
 
     Args:
         gate: lambda, in [0, 1]; the result is then in [0, 1] too.

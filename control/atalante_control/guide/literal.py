@@ -1,9 +1,10 @@
 """Assistive torque computed literally as the paper prints it: `measured motion -> u_a = u_i + u_f + u_v` of SH and SK.
 
-This law is for comparisons with the paper. Its guides have no promise: no disturbance is certified to keep the joints inside.
+This law is for comparisons with the paper. Its certificate contains no promised torques: it is not proven that the joints stay
+inside the guide under any disturbance torque.
 Each joint is treated as a separate inertia, J q'' = u_v + u_f + u_ext. The backup torque u_b is the PD part of the baseline PID.
-In each cycle the motion under u_b is integrated to the end of the step twice, for both constant extremes of u_ext. With the
-smallest h of both predictions,
+In each cycle the motion under u_b is integrated to the end of the step twice: with the largest and with the smallest constant
+u_ext. h is the smaller result of the two predictions, and
 
     lambda = (1 + (Xi^10 - 1) h)^3,   lambda_d = -zeta dh/dt,   u_v = (lambda + (1 - lambda) lambda_d) u_b.
 
@@ -35,7 +36,7 @@ _ASSISTED = [LEG_JOINTS.index("SH"), LEG_JOINTS.index("SK")]
 
 
 class Letter:
-    """Constants and state of the control law that follows the paper literally. Each pair has values for SH and SK."""
+    """Constants and state of the control law that follows the paper literally. Each array has values for SH and SK."""
 
     kp: Annotated[Vector, 2]  # Nm/rad
     kd: Annotated[Vector, 2]  # Nm s/rad
@@ -43,7 +44,7 @@ class Letter:
     coulomb: Annotated[Vector, 2]  # Nm, k_d
     viscous: Annotated[Vector, 2]  # Nm s/rad, k_v
     push: Annotated[Vector, 2]  # Nm, largest absolute value of the external torque u_ext
-    zeta: float  # s, gain of lambda_d, which increases the gate while h decreases
+    zeta: float  # s, gain of lambda_d; lambda_d increases the gate (factor of u_b) while h decreases
     idealization: float  # intensity of the joint idealization u_i
     feedforward: float  # intensity of the feedforward u_f
     xi: float  # assistance factor of the step
@@ -52,7 +53,7 @@ class Letter:
 
 
 class LiteralTables(NamedTuple):
-    """Tables of the control law that follows the paper literally. Only `letters` is written in `assistive_torque`."""
+    """Tables of the control law that follows the paper literally. `assistive_torque` changes only `letters`."""
 
     letters: Records[Letter]  # (1,)
     step: Vector  # (cycles + 1, 8) values of each cycle of the step; the columns are defined below
@@ -69,13 +70,13 @@ class LiteralConfig:
 
     gains: LegGains  # gains of the baseline PID of the swing leg
     push: Pair  # Nm, largest absolute value of the external torque u_ext of SH and SK
-    zeta: float  # s, gain of lambda_d, which increases the gate while h decreases
+    zeta: float  # s, gain of lambda_d; lambda_d increases the gate (factor of u_b) while h decreases
     idealization: float  # intensity of the joint idealization u_i, in [0, 1]
     feedforward: float  # intensity of the feedforward u_f, in [0, 1]
 
 
 class LiteralGuide:
-    """Literal law for one gait and one shape. Call `start_step` at each stance change.
+    """Control law that follows the paper literally, for one gait and one guide shape. Call `start_step` at each stance change.
 
     Attributes:
         tables: tables of `assistive_torque`.
@@ -121,7 +122,7 @@ class LiteralGuide:
 
 
 def no_promise(shape: str, xi: float) -> Certificate:
-    """Return the certificate of a guide whose control law follows the paper literally: it has no promised torques.
+    """Return a certificate without promised torques, for a guide whose control law follows the paper literally.
 
     Args:
         shape: name of the shape.
@@ -156,7 +157,7 @@ def assistive_torque(tables: LiteralTables, guard: Guard, cycle: int, leg: LegSt
 
 
 def _guide_torque(tables: LiteralTables, cycle: int, joint: int, e: float, rate: float) -> tuple[float, float, float]:
-    """Return h, the gate and the guide torque u_v [Nm] of a joint."""
+    """Return h, the gate (factor of the backup torque u_b) and the guide torque u_v [Nm] of a joint."""
     letter = tables.letters[0]
     ratio = max(_largest_ratio(tables, cycle, joint, e, rate, 1.0), _largest_ratio(tables, cycle, joint, e, rate, -1.0))
     h = 1.0 - ratio * ratio
@@ -168,7 +169,7 @@ def _guide_torque(tables: LiteralTables, cycle: int, joint: int, e: float, rate:
 
 
 def _largest_ratio(tables: LiteralTables, cycle: int, joint: int, e: float, rate: float, side: float) -> float:
-    """Return the largest |e| / q_bound under the backup policy to the end of the step, with u_ext = `side` times the push."""
+    """Return the largest |e| / q_bound from now to the end of the step, under u_b and the constant u_ext = `side * push`."""
     letter, step = tables.letters[0], tables.step
     kp, kd, inertia = letter.kp[joint], letter.kd[joint], letter.inertia[joint]
     push, worst = side * letter.push[joint], 0.0

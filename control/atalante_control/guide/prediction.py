@@ -22,13 +22,13 @@ Pair = tuple[float, float]
 
 #: Numbers of cycles ahead at which torque and speed are predicted.
 FEW = np.array([1, 2, 3, 4, 6, 8, 11, 15, 20, 27, 36, 48, 64, 85, 113, 150, 200, 250, 300])
-#: Typical magnitude of each element of the state. The compression of the state weights the elements with these magnitudes.
+#: Typical magnitude of each element of the state. These magnitudes are the weights of the elements in `Prediction.compress`.
 SIZES = np.repeat([0.07, 1.0, 1.0, 140.0, 140.0], 2)
 
 
 @dataclass(frozen=True)
 class Assumptions:
-    """Assumptions of a promise: promised torques, time behaviour of the drives, model errors, start deviations."""
+    """Assumptions of a certificate: promised torques, time behaviour of the drives, model errors, start deviations."""
 
     #: Nm, promised disturbance: largest torques at SH and SK under which the joints must stay inside the guide
     promise: Pair = (30.0, 18.0)
@@ -55,7 +55,8 @@ class Assumptions:
 class StartReach(NamedTuple):
     """Largest effects, in each cycle, of disturbances that act from the start of the step on.
 
-    The columns are the effect of the budget on SH and SK, then the effect of the chosen promise on SH and SK.
+    Columns 0 and 1 are the effect of the model errors (`Leg.budget`) on SH and SK. Columns 2 and 3 are the effect of the chosen
+    promised torques on SH and SK.
     """
 
     error: Vector  # (n, 4) rad
@@ -133,9 +134,12 @@ class Prediction:
         whole = Grid(starts, START_CYCLES, np.arange(horizon + 1))
         few, none = whole._replace(lags=FEW), whole._replace(lags=FEW[:0])
 
-        # The joints move faster if the leg is lighter than in the model, or if the command arrives later.
+        # `reach` is the maximum over all members of `family`. A joint moves faster if the leg is lighter than in the model, or if
+        # the command arrives later.
         self.reach = np.zeros((blocks, len(whole.lags), 4))
-        few_ahead = np.zeros((3, blocks, len(FEW), 4))  # torque, speed, speed for the worst inertia and delay
+        # Largest effects of the disturbances. Along axis 0: on the torque, on the speed, on the speed with the worst errors of
+        # inertia and delay.
+        few_ahead = np.zeros((3, blocks, len(FEW), 4))
         lag = assumptions.loop.velocity_lag
         first, first_rates = [], []
         for one in family:
@@ -147,13 +151,14 @@ class Prediction:
         torque, speed = Effect(nominal.pushed_feedback, nothing, self.mass), Effect(nominal.pushed_rate, nothing, same)
         first_torque = run(torque, mobilities, bounds, few, few_ahead[0])
         first_speed = run(speed, mobilities, bounds, few, few_ahead[1])
-        # Axes of `by_bound`: start cycle, row, cause (model errors or promised torques), torque or speed, joint.
+        # Axes of `by_bound`: block of start cycles, element of `FEW`, cause (model errors, promised torques), output (torque,
+        # speed), joint (SH, SK).
         by_bound = few_ahead[:2].reshape(2, blocks, len(FEW), 2, 2).transpose(1, 2, 3, 0, 4)
         self.few_reach: Vector = np.concatenate([by_bound.reshape(blocks, len(FEW), 8), few_ahead[2]], axis=2)
         self.few_ahead: Vector = np.concatenate([nominal.feedback[FEW], nominal.rate[FEW]], axis=1)
         rates = [_separated(one.rate[FEW] - nominal.rate[FEW]) for one in family]
         self.few_slack: Vector = np.abs(rates).max(axis=0)
-        # The torque carried over the stance change varies slowly, so its change within one cycle is neglected.
+        # The torque that is carried over the stance change fades out slowly. Its change within one cycle is neglected.
         bounds[:, :, 0] = leg.budget(assumptions.mismatch, hand_over, np.zeros(0))
         change = Effect(np.diff(lightest.pushed_feedback, axis=0, prepend=0.0), nothing, self.mass)
         first_change = run(change, mobilities, bounds, none, few_ahead[0])
@@ -190,7 +195,7 @@ def prediction_of(policy: BackupPolicy, leg: Leg, assumptions: Assumptions, blen
 
 
 def _separated(rows: Vector) -> Vector:
-    """Convert matrices for the state to matrices in which true minus measured velocity replaces the true velocity."""
+    """Convert matrices for a new form of the state: the true velocities are replaced by true minus measured velocities."""
     result = rows.copy()
     result[..., 4:6] += rows[..., 2:4]
     return result

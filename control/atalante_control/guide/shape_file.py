@@ -93,7 +93,7 @@ def _shape(document: Mapping[str, Any]) -> GuideShape:
 
 
 def _eased(phase: Vector, knots: Vector) -> Vector:
-    """Return the phases at which linear interpolation between the knots gives the half cosine at the given phases."""
+    """Return warped phases. Linear interpolation between the knots at these phases is half-cosine interpolation at `phase`."""
     at = np.clip(np.searchsorted(knots, phase, side="right") - 1, 0, len(knots) - 2)
     length = knots[at + 1] - knots[at]
     return np.asarray(knots[at] + length * (0.5 - 0.5 * np.cos(math.pi * (phase - knots[at]) / length)))

@@ -26,10 +26,10 @@ from atalante_hal.types import Vector
 _MIDDLE = math.radians(30.0)
 #: Indices of SH and SK of the left leg. The limits of the left leg apply to both legs, because both legs have the same limits.
 _ASSISTED = [LEG_JOINTS.index("SH"), LEG_JOINTS.index("SK")]
-#: Largest width of any guide [rad].
+#: Largest half-width of a guide, at assistance factor 0 [rad], see `half_width`.
 _WIDEST = math.radians(7.5)
-#: Fraction of its largest promised torques that a filter assumes if no filter can promise the chosen torques. With the largest
-#: promised torques, the backup torque would have weight 1 even without a disturbance.
+#: If no filter can promise the chosen torques, the selected filter promises this fraction of the largest torques that it can
+#: promise. With fraction 1, the backup torque would have weight 1 even without a disturbance.
 _USED = 0.95
 #: Number of decimal digits of the assistance factor, as on the bus.
 _DIGITS = 4
@@ -59,7 +59,7 @@ class StepGuides:
             robot: limits of the joints.
             shape: shape of the guide.
             leg: swing leg along the nominal trajectory, to the end of the overlap.
-            blend: smallest gate for each cycle since the stance change, shape (m,).
+            blend: smallest allowed weight of the backup torque in each cycle since the stance change, shape (m,).
             overlap: cycles of the leg after the end of the step.
         """
         assumptions = Assumptions(
@@ -76,14 +76,14 @@ class StepGuides:
     def prepare(self) -> None:
         """Choose and store the filter and its promised torques for every assistance factor from 0 to 1, in steps of 0.01.
 
-        The computation for one assistance factor takes longer than a cycle. On the wall clock, `prepare` must therefore be called
+        The computation for one assistance factor takes longer than a cycle. In real time, `prepare` must therefore be called
         before a walk.
         """
         for percent in range(101):
             self.at(percent / 100)
 
     def at(self, xi: float) -> Choice:
-        """Return the softest filter that promises the chosen torques; if there is none, the filter that promises the most.
+        """Return the softest filter that can promise the chosen torques; if there is none, the filter with the largest torques.
 
         Args:
             xi: assistance factor in [0, 1].

@@ -38,7 +38,7 @@ _IMU_AGE = 10  # cycles, largest valid age of an IMU message, equal to the timeo
 
 
 class Ankle:
-    """Data of one ankle: constants, and the deviation from the target at the stance change, which the re-centring removes."""
+    """Constants of one ankle, and its deviation from the targets at the stance change. The re-centring removes this deviation."""
 
     geometry: Annotated[Vector, 4]  # `FlatFoot.geometry`
     offset: float  # rad, added to SA

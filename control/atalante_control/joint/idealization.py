@@ -70,10 +70,10 @@ class Friction:
 
 
 class AssistedInertia:
-    """Mass matrix of sagittal hip and knee (SH, SK) of one leg, as a function of the knee angle in closed form.
+    """Closed-form mass matrix of sagittal hip and knee (SH, SK) of one leg, as a function of the knee angle.
 
-    The block is M(q_SK) = A + B cos q_SK + C sin q_SK. A, B and C follow from three evaluations of Pinocchio's composite rigid
-    body algorithm, with all other joints at their mean angles during the swing.
+    The mass matrix is M(q_SK) = A + B cos q_SK + C sin q_SK. A, B and C follow from three evaluations of Pinocchio's composite
+    rigid body algorithm, with all other joints at their mean angles during the swing.
 
     Attributes:
         inertias: J of SH and SK [kg m2], the largest diagonal elements of M during the swing.

@@ -104,7 +104,7 @@ def observe(attitudes: Records[Attitude], gyro: Vector, accel: Vector, measured:
     )
     for k in range(3):
         velocity[k] += (accel[k] - turning[k] + gravity[k] + 2.0 * w * error[k]) * PERIOD
-    # The second-order series of the rotation keeps the matrix orthogonal, with an error of third order in the angle.
+    # Rotate by the Taylor series up to second order. The matrix stays orthogonal up to an error of third order in the angle.
     for row in range(3):
         a, b, c = rotation[row, 0], rotation[row, 1], rotation[row, 2]
         da, db, dc = b * z - c * y, c * x - a * z, a * y - b * x

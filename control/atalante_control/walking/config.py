@@ -39,7 +39,7 @@ class WalkConfig:
     gains: PidGains = WALK_GAINS
     impact: ImpactConfig = field(default_factory=ImpactConfig)
     alpha: float = 0.3  # end of the re-centring, as a fraction of the step duration
-    #: True: the torques of the periodic steps follow the paper literally, see `literal`. The guide then has no promise.
+    #: True: the torques of the periodic steps follow the paper literally, see `literal`. The guide then has no promised torques.
     literal_law: bool = False
     #: m/m, gain of the ankle stabiliser: shift of the centre of pressure per error of the divergent component of motion
     stabiliser: float = 2.5
@@ -50,8 +50,8 @@ class WalkConfig:
     #: s, longest time in which the swing foot moves down after the nominal end of a step. `reach_knee` can end this motion
     #: earlier.
     reach_time: float = 0.2
-    #: rad/s, largest speed of SH and SK while a late swing foot moves down. An almost straight leg could follow `reach_speed`
-    #: only at higher speeds.
+    #: rad/s, largest speed of SH and SK while a late swing foot moves down. With an almost straight leg, this
+    #: limit makes the foot slower than `reach_speed`.
     reach_rate: float = 2.5
     reach_knee: float = 0.05  # rad, smallest knee angle while a late swing foot moves down
     #: Steering gains: TH offset per heading [rad/rad], TH offset per sideways deviation [rad/m], largest TH offset [rad].
@@ -72,7 +72,7 @@ class WalkConfig:
     #: the heavy leg would need more torque than the drives have. The other joints keep `alpha`, because the robot falls if they
     #: are re-centred as slowly as SH and SK.
     guided_alpha: float = 0.5
-    #: s, time at the start of a guided step in which the lower bound of the backup torque's weight falls from 1 to 0
+    #: s, time after the start of a guided step in which the smallest allowed weight of the backup torque falls from 1 to 0
     engage: float = 0.02
     release: float = 0.03  # s, time after the nominal end of a guided step in which the baseline takes over SH and SK
 

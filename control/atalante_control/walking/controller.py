@@ -231,7 +231,7 @@ class WalkController:
         return float(self._record.max_dcm_error)
 
     def prepare(self) -> None:
-        """Compute the guides of all assistance factors before a walk on the wall clock, see `StepGuides.prepare`."""
+        """Compute the guides of all assistance factors before a walk in real time, see `StepGuides.prepare`."""
         if not self.config.literal_law:
             self._guides.prepare()
 
@@ -318,7 +318,7 @@ class WalkController:
         )
 
     def _begin(self, phase: Phase, cycle: int, xi: float) -> None:
-        """Start a phase: set stance leg and steering, re-centre on the measured motion, and start the guide."""
+        """Start a phase: set stance leg and steering, start the re-centring from the measured motion, and start the guide."""
         before, stage, record = self.phase, self._stage, self._record
         swing = 1 - self._stance
         if before in STEPPING:
@@ -416,7 +416,7 @@ def _tables(
 
 
 def _held(table: PhaseTable, row: int, duration: float) -> PhaseTable:
-    """Return the table of a phase that moves the joints from the measured pose to a row of another table, and then holds it.
+    """Return the table of a phase that moves the joints from the measured pose to the pose in a row of `table`.
 
     Args:
         table: table that contains the row.

@@ -19,7 +19,7 @@ Pair = tuple[float, float]
 class Stabiliser(NamedTuple):
     """Parameters of the ankle stabiliser."""
 
-    gain: float  # shift of the centre of pressure per DCM error, above 1
+    gain: float  # m/m, shift of the centre of pressure per DCM error; the error decays if the gain is above 1
     forward: float  # m, largest shift forwards and backwards
     sideways: float  # m, largest shift to each side
     henke: float  # forward component of the unit Henke axis in the foot frame

@@ -31,7 +31,8 @@ from atalante_hal.types import Vector
 _LEG = len(LEG_JOINTS)
 _TH, _SH, _SK, _SA, _HA = (LEG_JOINTS.index(name) for name in ("TH", "SH", "SK", "SA", "HA"))
 _ANKLES = (_SA, _HA)
-_REACH_RISE = 0.03  # s, time constant of the downward speed of a swing foot after the nominal end of a step
+#: s, time constant with which the downward speed of a swing foot rises after the nominal end of a step
+_REACH_RISE = 0.03
 
 Vector3 = tuple[float, float, float]
 Quaternion = tuple[float, float, float, float]
@@ -81,7 +82,7 @@ class Constants(NamedTuple):
     """Constants of the kernel."""
 
     weight: float  # N, weight of robot and patient
-    keep: float  # weight of the last value in the low-pass of the foot forces
+    keep: float  # factor of the previous value in the low-pass of the foot forces
     standing_gains: float  # N, load of a foot at which the full stance gains are applied while standing
     walking_gains: (
         float  # N, load of the stance foot at which the full stance gains are applied to its ankle while walking
@@ -180,7 +181,7 @@ def sense(measured: Measured, table: PhaseTable, constants: Constants, stabilise
 
 
 def _velocity(point: Vector, sole: Vector, sole_velocity: Vector, gyro: Vector) -> Vector3:
-    """Return the velocity of a point that is fixed to the pelvis, while a sole is at rest, in the axes of the pelvis [m/s].
+    """Return the velocity of a point on the pelvis, in the axes of the pelvis [m/s]. One sole is assumed to be at rest.
 
     Args:
         point: position of the point, shape (3,) [m].
@@ -203,8 +204,8 @@ def start(measured: Measured, table: PhaseTable, parts: Parts) -> None:
     stage, n = parts.stages[0], len(measured.q)
     for joint in range(n):
         stage.deviation[joint] = measured.q[joint] - table.rows[0, joint]
-        # With both feet on the ground, the speeds of the landing are ignored, because re-centring on these speeds would press
-        # the foot down.
+        # In a phase without a swing foot, the measured speeds are ignored. After a landing, a re-centring that starts with the
+        # measured speeds would press the foot down.
         stage.rate[joint] = 0.0 if stage.double else measured.qd[joint] - table.rows[0, n + joint]
     swing = 1 - stage.stance
     attitude, gyro = _tibia(swing, measured, parts)
@@ -336,7 +337,7 @@ def _desired(cycle: int, table: PhaseTable, stage: Stage, desired: Vector) -> in
     desired[leg + _TH] += stage.steering * x**3 * (10.0 - 15.0 * x + 6.0 * x * x)
     desired[n + leg + _TH] += stage.steering * 30.0 * x * x * (1.0 - x) ** 2 / (last * PERIOD)
     if cycle > last:
-        # The speed of the foot rises slowly. A jump would turn a foot that already touches the ground with one corner.
+        # The speed of the foot rises slowly. A sudden rise would turn a foot that already touches the ground with one corner.
         time = min(cycle - last, table.reach_cycles) * PERIOD
         moving = 1.0 - math.exp(-time / _REACH_RISE)
         time -= _REACH_RISE * moving

@@ -71,7 +71,8 @@ def step_table(
         sole = chain.soles[stance]
         upright = _product(about_z(yaw), sole.rotation.T)  # rotation from pelvis to walking frame
         lever = chain.centre[0].position - sole.position
-        # The sole is at rest on the ground, so the twist of the pelvis is the negative twist of the sole in the pelvis frame.
+        # The sole is at rest on the ground. So the velocity of the centre of mass in the world is its velocity relative to the
+        # sole, here in the axes of the pelvis.
         relative = chain.centre[0].velocity - sole.linear - np.cross(sole.angular, lever)
         centre[cycle], speed[cycle] = upright @ lever, upright @ relative
     frequency = math.sqrt(GRAVITY / float(centre[:, 2].mean()))

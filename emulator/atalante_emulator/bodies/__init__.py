@@ -17,7 +17,7 @@ from atalante_hal.types import Vector
 Vector3 = tuple[float, float, float]
 
 GRAVITY: Final = 9.81  # m/s2
-#: Length of a link state. Its elements, in world axes, are quaternion xyzw (4), velocity [m/s] (3), angular velocity [rad/s] (3).
+#: Number of elements of a link state: quaternion xyzw (4), velocity [m/s] (3), angular velocity [rad/s] (3), all in world axes.
 LINK_STATE: Final = 10
 #: Name of the root link.
 PELVIS: Final = "pelvis"
@@ -81,7 +81,7 @@ class Body(Protocol):
         """Total mass of the robot and its wearer [kg]."""
 
     def reset(self, position: Sequence[float], base: Pose | None = None) -> None:
-        """Set the joint positions and the pose of the pelvis, and zero all velocities and the external wrench.
+        """Set the joint positions and the pose of the pelvis. Set all velocities and the external wrench to zero.
 
         Args:
             position: joint positions, shape (12,) [rad].
@@ -101,7 +101,7 @@ class Body(Protocol):
         """
 
     def motion(self, link: str) -> Motion:
-        """Return the true pose and velocity of a link, for crane, virtual operator and tests, not for emulated nodes.
+        """Return the true pose and velocity of a link. Emulated nodes must not use them; crane, virtual operator and tests may.
 
         Args:
             link: name of the link in the URDF.

@@ -15,7 +15,7 @@ from atalante_hal.compiled import compiled
 from atalante_hal.robot import CELLS, FEET, IMUS, JOINTS
 from atalante_hal.types import PERIOD, Vector
 
-_FREE: Final = 7  # elements of the pose of a free pelvis in qpos: position (3), quaternion wxyz (4)
+_FREE: Final = 7  # number of elements of the pose of a free pelvis in qpos: position (3), quaternion wxyz (4)
 #: Warnings after which MuJoCo resets the simulation.
 _DIVERGED: Final = (
     mujoco.mjtWarning.mjWARN_BADQPOS,
@@ -32,7 +32,7 @@ class Contact(NamedTuple):
     """
 
     solref: tuple[float, float] = (0.02, 1.0)  # time constant [s] and damping ratio
-    solimp: tuple[float, float] = (0.99, 0.99)  # impedance at no and at full penetration
+    solimp: tuple[float, float] = (0.99, 0.99)  # impedance without penetration, impedance at full penetration
     impratio: float = 1.0  # ratio of friction to normal impedance
 
 
@@ -122,7 +122,7 @@ class MuJoCoBody:
         self.imu = np.zeros((len(IMUS), LINK_STATE))
         self.sole_force, self.touching = np.zeros((len(FEET), len(CELLS), 3)), False
         self._unpack = compiled(_unpack)
-        # This call also compiles the kernel, because compilation takes longer than a cycle.
+        # This call also compiles the kernel. In the first cycle, the compilation would take too long.
         self.reset([0.0] * len(JOINTS))
 
     def reset(self, position: Sequence[float], base: Pose | None = None) -> None:

@@ -23,8 +23,8 @@ SOLVER_ITERATIONS = 50
 #: Indices of attitude, velocity and angular velocity in the link state tuple of PyBullet.
 _ATTITUDE, _LINEAR, _ANGULAR = 5, 6, 7
 _BASE: Final = -1  # link index of the root link in PyBullet
-#: Length of a contact. Its elements are pad, normal vector (3), normal force, then value and direction (3) of each of the two
-#: friction forces.
+#: Number of elements of a contact: pad, normal vector (3), normal force, then value and direction (3) of each of the two friction
+#: forces.
 _CONTACT: Final = 13
 #: Largest number of contacts in a time step. A sphere has at most one contact with a plane.
 _CONTACTS: Final = len(FEET) * len(CELLS)
@@ -146,13 +146,13 @@ class PyBulletBody:
         client = {"physicsClientId": self._client}
         plane = pybullet.createCollisionShape(pybullet.GEOM_PLANE, **client)
         floor = pybullet.createMultiBody(0.0, plane, basePosition=[0.0, 0.0, height], **client)
-        # The friction of a contact is the product of both coefficients.
+        # The coefficient of friction of a contact is the product of the coefficients of floor and pad.
         pybullet.changeDynamics(floor, _BASE, lateralFriction=1.0, **client)
         for pad in self._pad_of:
             pybullet.changeDynamics(self._body, pad, lateralFriction=friction, **client)
 
     def _link_states(self, links: Sequence[int]) -> Any:
-        # Without the forward kinematics flag, PyBullet returns the poses of the previous time step.
+        # The second flag requests the forward kinematics. Without it, PyBullet returns the poses of the previous time step.
         return pybullet.getLinkStates(self._body, links, 1, 1, physicsClientId=self._client)
 
     def reset(self, position: Sequence[float], base: Pose | None = None) -> None:

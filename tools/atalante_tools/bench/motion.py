@@ -35,7 +35,7 @@ _INTEGRATIONS: Final = 4
 
 
 def filter_tick(effort: Effort) -> Measurement:
-    """Measure one tick of the guide filter; the baseline integrates the same prediction step by step."""
+    """Measure one call of the guide filter; the baseline computes the same prediction by step-by-step integration."""
     guide = walk().guide
     guide.start_step(ASSISTANCE, (ERROR, -ERROR), (ERROR_RATE, ERROR_RATE))
     stepped, leg = SteppedRollout(guide), guide.prediction.leg
@@ -68,9 +68,9 @@ def filter_tick(effort: Effort) -> Measurement:
 
 
 def emulator_tick(effort: Effort) -> Measurement:
-    """Measure one tick of the emulator while the robot walks; the baseline is the time of PyBullet in the same ticks.
+    """Measure one cycle of the emulator while the robot walks; the baseline is the time of PyBullet in the same cycles.
 
-    The whole stack runs during the measurement. Without the stack, PyBullet would need a third less time per tick,
+    The whole stack runs during the measurement. Without the stack, PyBullet would need a third less time per cycle,
     because no other code would use the processor caches.
     """
     now = time.perf_counter
@@ -98,7 +98,7 @@ def emulator_tick(effort: Effort) -> Measurement:
         body.exchange = timed_exchange  # type: ignore[attr-defined]
         bus.step = tick  # type: ignore[attr-defined]
         cycles = stack.walk(effort)
-        # Omit the ticks before the robot walks.
+        # Omit the cycles before the robot walks.
         walked = slice(_BEFORE_WALKING, _BEFORE_WALKING + cycles)
         require(
             len(tick_times[walked]) == len(engine_times[walked]) == cycles,

@@ -1,9 +1,10 @@
 """Step-by-step integration of the tracking errors that the virtual guide predicts with tables.
 
-The integration is the reference that checks the tables, and the baseline of the benchmark `filter_tick`.
+The integration is the reference for a check of the tables, and the baseline of the benchmark `filter_tick`.
 
-This module is not part of the control loop. It integrates the sampled loop under the backup policy cycle by cycle: the command
-of the previous cycle, the motor, the leg, and the low-pass of the measured velocity.
+This module is not part of the control loop. It simulates the control loop with the backup policy (`guide.backup_policy`) as
+controller, cycle by cycle. The simulated loop includes the delay of the command by one cycle, the motor, the leg, and the
+low-pass filter of the measured velocity.
 """
 
 from __future__ import annotations
@@ -19,7 +20,7 @@ class SteppedRollout:
     """Step-by-step integration of the tracking errors that a guide filter predicts."""
 
     def __init__(self, guide: GuideFilter) -> None:
-        """Copy the gains and the time behaviour of the loop.
+        """Copy the gains of the backup policy, and the coefficients of the motor and of the velocity filter.
 
         Args:
             guide: guide filter whose prediction is integrated.
@@ -30,7 +31,7 @@ class SteppedRollout:
         self._cycles = len(guide.prediction.ahead)
 
     def errors(self, state: Vector) -> Vector:
-        """Return the predicted tracking errors of hip and knee in n cycles, without disturbance. Shape (n, 2) [rad].
+        """Return the tracking errors of hip and knee in n cycles from now on, without disturbance. Shape (n, 2) [rad].
 
         Args:
             state: state of the sampled loop, see `backup_policy`, shape (10,).

@@ -1,4 +1,4 @@
-"""Measurement of the time on the bus from a SYNC to the frames that answer the SYNC, with receive timestamps.
+"""Measurement of the time from a SYNC to the frames that answer this SYNC, from their receive timestamps.
 
 frames, stamps -> BusTiming -> Latency of states and commands, per bus
 """
@@ -37,7 +37,7 @@ class Latency:
     median_us: float
     p99_us: float
     max_us: float
-    wire_us: float  # longest total wire time of all these frames of one cycle, computed from the DBC
+    wire_us: float  # largest total transmission time of all frames of this kind in one cycle, computed from the DBC
     budget_us: float
 
     @property

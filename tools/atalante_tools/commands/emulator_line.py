@@ -21,7 +21,7 @@ from atalante_tools.session.takeover import PendantReader, Takeover
 #: The emulated pendant resumes sending if no frame of another pendant is received for this time [cycles].
 #: The time is longer than `QUIET_CYCLES`, so that a pendant in another process resumes first.
 PENDANT_QUIET: Final = 12
-#: Another robot is recognised after this number of consecutive frames of one message.
+#: Number of received frames with increasing counters, all of one emulated message, that prove another robot on the bus.
 ROBOT_FRAMES: Final = 3
 
 

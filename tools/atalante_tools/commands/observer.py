@@ -63,7 +63,7 @@ class Report:
     dead_man: bool | None
     nodes: tuple[NodeReport, ...]
     joints: tuple[JointReport, ...]
-    load: dict[str, tuple[float, float]]  # bus -> measured load, and largest possible load by the DBC, each 0 to 1
+    load: dict[str, tuple[float, float]]  # bus -> measured load, and worst-case load computed from the DBC (0 to 1)
     frames: int
     foreign: int  # number of frames with an identifier that is not in the DBC
     crc_errors: int

@@ -143,7 +143,10 @@ def latches(tester: NodeTester) -> Outcome:
 
 
 def latches_late_commands(tester: NodeTester) -> Outcome:
-    """Test DRIVE-24: commands with a growing delay lead to QUICK STOP ACTIVE, although each loss alone is tolerated."""
+    """Test DRIVE-24: commands whose delay grows step by step lead to QUICK STOP ACTIVE.
+
+    Each step is a pause of `TOLERATED` cycles, which alone has no effect.
+    """
     axis = Axis(tester)
     axis.enable()
     counter, received = tester.command.counter, []

@@ -141,7 +141,7 @@ def reaches_both_ends(tester: NodeTester) -> Outcome:
 
 
 def moves_one_motor(tester: NodeTester) -> Outcome:
-    """Test HAPTICS-04: a commanded level drives the motor of this level and no other motor."""
+    """Test HAPTICS-04: a level commanded for one motor drives only this motor."""
     wrong = []
     names = _motors(tester)
     for index, name in enumerate(names):

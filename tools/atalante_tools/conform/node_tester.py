@@ -72,7 +72,7 @@ class LockStep:
         self._silent = 0
 
     def next_cycle(self, *, sync: bool, listen: Callable[[float], None]) -> None:
-        """Start the next cycle without a wait. Advance the emulated node if no SYNC was sent in the last cycles."""
+        """Start the next cycle without a wait. Advance the emulated node once `WATCHDOG` consecutive cycles have no SYNC."""
         self._silent = 0 if sync else self._silent + 1
         if self._silent >= self._watchdog:
             self._emulator.idle()
@@ -225,7 +225,7 @@ class NodeTester:
         return self.sync.frame(cycle, counter=counter, length=length, classic=classic, flip=flip)
 
     def _send(self, frames: Frames) -> None:
-        # A bus caches the memory address of each array, so all batches of one length share one array.
+        # A bus caches the memory address of each array that it sends. Therefore one array is reused for each number of frames.
         outbox = self._outboxes.setdefault(len(frames), new_frames(len(frames)))
         as_words(outbox)[:] = as_words(frames)
         try:

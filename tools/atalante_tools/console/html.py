@@ -1,4 +1,4 @@
-"""Reports as one HTML file that loads nothing from the network: frame of the page and tables."""
+"""HTML page and tables of a report. The page is a single file and loads nothing from the network."""
 
 from __future__ import annotations
 

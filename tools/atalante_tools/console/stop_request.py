@@ -64,7 +64,7 @@ _request: StopRequest | None = None
 
 
 def check_stop() -> None:
-    """Raise `Stopped` if a stop signal arrived. Call this function after library code that may have discarded the exception.
+    """Raise `Stopped` if a stop signal arrived. Call this function after library code that may have caught `Stopped`.
 
     Raises:
         Stopped: If a signal arrived, with its exit code.

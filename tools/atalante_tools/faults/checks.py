@@ -145,7 +145,7 @@ def encoders_keep_their_reference(run: Observation) -> str | None:
 
 
 def start_fails_and_names_the_hip(run: Observation) -> str | None:
-    """Check that the start ends soon with an event that names the left sagittal hip, and that the other drives hold.
+    """Check that START soon fails with an event that names the left sagittal hip, and that all other drives then hold.
 
     Args:
         run: observation of the run.

@@ -1,4 +1,6 @@
-"""Independent check of all command frames of the HAL, decoded by the bit positions in the DBC, against the limits.
+"""Independent check that all command frames of the HAL respect the limits.
+
+The frames are decoded with the bit positions in the DBC.
 
 This module shares no code with the limiter, the codec and the process image of the HAL, so it can detect errors in
 these modules.
@@ -116,7 +118,9 @@ class Commands:
         return leg.cycle, leg.limit[:, joint % len(LEG_JOINTS)]
 
     def violations(self, robot: Robot) -> list[str]:
-        """Return a sentence per violated limit: identifier, torque, torque limit, torque rate, torque in QUICK STOP.
+        """Return one sentence per foreign identifier, and one sentence per leg for each kind of violation.
+
+        The kinds are a too large torque, torque limit or torque change, and a torque with QUICK STOP.
 
         Args:
             robot: torque limits of the joints.

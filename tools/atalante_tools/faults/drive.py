@@ -157,7 +157,7 @@ SCENARIOS: Final = (
                 checks=(limit_follows_temperature,),
             ),
             Case(
-                "up to 105 degC, 1 K per cycle",  # the drive reduces its torque limit above 90 degC, after 65 cycles
+                "up to 105 degC, 1 K per cycle",  # after 65 cycles, above 90 degC, the drive reduces its torque limit
                 (Fault("heat_ramp", _KNEE, 0, 400, rate=1000.0, up_to=105.0),),
                 node=_KNEE,
                 detected=70,

@@ -42,7 +42,7 @@ CONFIG: Final = AirwalkConfig(startup=0.1)
 ASSISTANCE: Final = 0.5
 #: Number of cycles within which a robot without fault must reach ACTIVE after power-on.
 _START: Final = 600
-#: Cycles between two presses of START after the fault: the first ends the state FAULT, the second the state HOLD.
+#: Cycles between two presses of START after the fault. The first press ends the state FAULT, the second press ends HOLD.
 RECOVERY: Final = 100
 #: The walk is considered restarted after this number of consecutive cycles in ACTIVE.
 RESTARTED: Final = 10
@@ -74,7 +74,7 @@ def run_context() -> RunContext:
 
 @functools.cache
 def first_walk_cycle(engine: str = PYBULLET) -> int:
-    """Return the HAL cycle in which the first walking step begins in a run without fault. All runs have the same cycle number.
+    """Return the HAL cycle in which the first walking step begins without a fault. This cycle is the same in all runs.
 
     Args:
         engine: physics engine of the emulated robot.
@@ -227,7 +227,7 @@ class _Sample(NamedTuple):
 
     @classmethod
     def of(cls, rig: Rig) -> _Sample:
-        """Return the values of the current cycle. Drive states, torques and motion are true values in the emulator."""
+        """Return the values of the current cycle. Drive states, torques and motion come from the emulator."""
         hal, emulator = rig.hal, rig.emulator
         assert emulator is not None
         (hip, knee), (hip_bound, knee_bound) = (hal.record[hal.layout[f"controller.{name}"]] for name in _GUIDE)

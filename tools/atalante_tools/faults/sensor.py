@@ -60,7 +60,7 @@ def _standing(foot: str, cycles: int) -> tuple[Fault, ...]:
 
 
 def _every(cycles: int, kind: str, target: str, count: int, **parameters: float) -> tuple[Fault, ...]:
-    """Return faults of one cycle each, one in every `cycles` cycles.
+    """Return periodic faults. Each fault lasts one cycle, and a fault begins every `cycles` cycles.
 
     Args:
         cycles: interval of the faults [cycles].
@@ -123,7 +123,7 @@ SCENARIOS: Final = (
             ),
             *(
                 Case(f"{1e3 * by:g} mrad for 100 cycles", (Fault("encoder_jump", _STILL, 0, 100, by=by),), node=_STILL)
-                for by in (0.025, -0.025, 0.1, -1.0)  # a joint can move by at most 22.5 mrad in five cycles
+                for by in (0.025, -0.025, 0.1, -1.0)  # every jump exceeds 22.5 mrad, the largest motion in five cycles
             ),
             Case(
                 "25 mrad, permanent",
@@ -303,7 +303,7 @@ SCENARIOS: Final = (
     Scenario(
         "F70",
         (
-            # Only the position on the bus jumps. If the encoder jumped, ENC_VELOCITY would report the velocity, too.
+            # Only the position on the bus jumps. A jump of the encoder itself would also raise the diagnostic ENC_VELOCITY.
             Case(
                 "every second position of a joint jumps",
                 _every(2, "value", f"{_STILL}_STATE", 40, Position=10.0),

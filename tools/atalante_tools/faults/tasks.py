@@ -91,7 +91,7 @@ class EnduranceTask:
     engine: str = PYBULLET
 
     def __call__(self) -> Endurance:
-        """Repeat the case with a shorter and shorter fault until the fault does not stop the walk, and return its duration."""
+        """Repeat the case with shorter and shorter faults until the walk continues. Return the duration of the last fault."""
         case = SCENARIOS[self.id].permanent
         assert case is not None
         case = replace(case, engine=self.engine)

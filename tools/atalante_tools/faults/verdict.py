@@ -1,6 +1,6 @@
-"""Evaluation of a fault run by four checks. Each failed check gives a sentence.
+"""Evaluation of a run with a fault by four checks. A check that fails adds a sentence to the verdict.
 
-    observation + row of the matrix -> verdict
+    observation + row of the fault matrix -> verdict
 
 1. The expected state must be reached within the time limit for the reaction.
 2. The expected diagnostic must be reported within the time limit for the diagnostic.
@@ -48,7 +48,7 @@ class Expectation:
 
         Args:
             case: case of the scenario.
-            row: row of the fault matrix that the scenario proves.
+            row: row of the fault matrix that the scenario tests.
 
         Raises:
             ValueError: If neither the case nor the row defines a time limit in cycles.
@@ -92,7 +92,7 @@ def evaluate(row: Row, case: Case, run: Observation) -> Verdict:
     """Evaluate a run by the four checks of this module and the additional checks of the test case.
 
     Args:
-        row: row of the matrix.
+        row: row of the fault matrix.
         case: case that was run.
         run: observation of the run.
     """
@@ -156,11 +156,11 @@ def limit_violations(run: Observation) -> list[str]:
 
 
 def automatic_improvements(run: Observation, until: int) -> list[str]:
-    """Return a sentence if the state became less severe after the first faulty cycle without an action of the operator.
+    """Return a sentence if the HAL changed to a less severe state by itself after the first faulty cycle.
 
     Args:
         run: observation of the run.
-        until: last cycle to check.
+        until: last cycle to check; the operator must not act before it.
     """
     for cycle in range(run.first + 1, until + 1):
         if run.state(cycle) < run.state(cycle - 1):

@@ -94,7 +94,7 @@ def library(
     print_message(f"{points} gaits in {out}, {points - todo} of them already solved")
     progress, start = Progress(), time.monotonic()
     solve = solve_compiled if machine_code else solve_subject
-    # A signal such as Ctrl-C takes effect after the current solve. Otherwise the optimiser would report a failed gait.
+    # A signal such as Ctrl-C takes effect after the current gait. An interrupted optimiser would report a failed gait.
     with stop_requested() as stop, closing(collection.generate(solve, jobs=jobs, cluster=cluster)) as outcomes:
         for done, (_, solved) in enumerate(outcomes, 1):
             if as_json:

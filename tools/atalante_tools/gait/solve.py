@@ -68,7 +68,7 @@ def solve(
         if progress.due():
             progress.show(f"{subject}: iteration {iteration}, constraints violated by up to {violation:.1e}")
 
-    # A signal such as Ctrl-C takes effect after the solve. Otherwise the optimiser would report a failed gait.
+    # A signal such as Ctrl-C takes effect after the solve. An interrupted optimiser would report a failed gait.
     with stop_requested() as stop:
         solved = optimise(subject, kind=kind, progress=show)
     progress.clear()

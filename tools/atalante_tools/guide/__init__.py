@@ -60,7 +60,7 @@ class CheckOptions:
     law: Law  # control law of the assisted joints
 
     def effort(self) -> Effort:
-        """Return the size of the check of each guide."""
+        """Return the numbers of steps for each guide, and whether to search for the smallest push that leaves the guide."""
         from atalante_tools.guide.promise_check import COMPLETE, QUICK
 
         effort = QUICK if self.quick else COMPLETE
@@ -70,7 +70,7 @@ class CheckOptions:
         )
 
     def task(self) -> dict[str, Any]:
-        """Return the values that determine the result of a guide, for the file of the results."""
+        """Return the options that affect the verdict of each guide. They are stored in the file of the results."""
         return {
             "conditions": self.conditions,
             "effort": asdict(self.effort()),
@@ -156,10 +156,10 @@ def _all_checks(options: CheckOptions, subject: Subject | None) -> Iterator[tupl
     """Check all guides of the options one after another, and show the current guide in the progress line.
 
     Yields:
-        Result of each guide. The second element is None if the result is one of an earlier run.
+        Verdict on a guide, and the check with its worst step. The check is None if the verdict is from an earlier run.
 
     Raises:
-        Failed: If the file of the results contains other results.
+        Failed: If the file of the results belongs to other options, or contains an invalid line.
     """
     from atalante_hal.robot import load_robot
     from atalante_tools.guide.promise_check import Task, conditions_of, patients, setup_of
@@ -191,7 +191,7 @@ def _all_checks(options: CheckOptions, subject: Subject | None) -> Iterator[tupl
 
 
 def _draw(checked: Checked, plot: Path) -> None:
-    """Draw the figure.
+    """Draw the figure of a check.
 
     Raises:
         Failed: If matplotlib is not installed.

@@ -1,7 +1,8 @@
-"""Steps of the ideal plant under the running controller: `start, push -> |e| / q_bound over the step`.
+"""Steps of the ideal plant with the controller of the robot: `start, push -> |e| / q_bound over the step`.
 
-Each step calls the compiled cycle of the real controller, so the check covers the law that runs on the robot. At the start of a
-step, the torques from before the stance change still act. The plant, the limiter and the drives are those of the module `plant`.
+Each step calls the compiled cycle of the real controller, so the check covers the control law that runs on the robot. At the
+start of a step, the torques from before the stance change still act. The plant, the limiter and the drives are those of the
+module `plant`.
 """
 
 from __future__ import annotations
@@ -42,13 +43,14 @@ LOG = (
     "rate_hip",
     "rate_knee",
 )
-#: Number of inputs of the feedback law of a push: e / q_bound of hip and knee, then the rates of e divided by `RATE`.
+#: Number of features that the direction of a push can depend on: e / q_bound of hip and knee, then e' / `RATE` of hip and knee.
 FEATURES = 4
-RATE = 0.5  # rad/s
+#: Speed by which the rates e' are divided in the features [rad/s].
+RATE = 0.5
 
 
 class Push(NamedTuple):
-    """Push during one step: in each cycle, the largest push of each joint times the sign of `signs` + `feedback` @ features."""
+    """Push during one step. Each joint always gets its largest push, with the sign of `signs + feedback @ features`."""
 
     signs: Vector  # (cycles + 1, 2)
     feedback: Vector  # (2, FEATURES)
@@ -68,7 +70,7 @@ class Goal(NamedTuple):
 
     q: Vector  # (cycles + 1, 2) rad, q_des
     qd: Vector  # (cycles + 1, 2) rad/s, q_des'
-    bounds: Vector  # (2, cycles + 1, 2) rad, upper and lower distance to the guide
+    bounds: Vector  # (2, cycles + 1, 2) rad, distance from q_des to the upper and to the lower edge of the guide
 
 
 class Walked(NamedTuple):
@@ -134,7 +136,7 @@ class IdealLeg:
         x: Vector = np.minimum(time / end, 1.0)[:, None]
         #: q_nom [rad], q_nom' [rad/s] and q_nom'' [rad/s2] of hip and knee, each of shape (cycles + 1, 2).
         self.nominal: tuple[Vector, Vector, Vector] = motion(coefficients, duration, phase)
-        # The re-centring s is the cubic with given s(0) and s'(0), and s = s' = 0 at `end`.
+        # The re-centring s(t) is a cubic polynomial with given s(0) and s'(0). At the time `end`, s and s' are zero.
         self._s = 1.0 - 3.0 * x**2 + 2.0 * x**3, end * (x - 2.0 * x**2 + x**3)
         self._sd = (-6.0 * x + 6.0 * x**2) / end, 1.0 - 4.0 * x + 3.0 * x**2
         self.bounds: Vector = controller.guide_at(xi).shape.bounds(phase, xi)
@@ -171,9 +173,10 @@ class IdealLeg:
         return Walked(float(ratio), int(cycle), int(joint), log)
 
     def image(self, start: Start) -> Vector:
-        """Return the largest and the smallest error of each joint in the safe backward image (h >= 0).
+        """Return the largest and the smallest error e of each joint in the safe backward image.
 
-        The angle of the other joint and the speeds of both joints are those of the desired motion.
+        The safe backward image is the set of states with h >= 0, from which the backup policy can keep both joints inside the
+        guide. The angle of the other joint and the speeds of both joints are those of the desired motion.
 
         Args:
             start: state at the stance change.
@@ -287,7 +290,7 @@ def walk_step(
             motor[i] += constants.tracking * (latched[i] - motor[i])
         if cycle < cycles:
             advance(constants, leg, motor[0] + log[cycle, 4], motor[1] + log[cycle, 5])
-        # The command of this cycle is latched at the next SYNC, or later with a delay.
+        # The drives apply the command of this cycle `1 + constants.delay` cycles later.
         waiting[cycle % len(waiting)] = last
         if noise[cycle, 3] >= constants.loss:
             latched[:] = waiting[(cycle + 1) % len(waiting)]
@@ -295,7 +298,7 @@ def walk_step(
 
 
 def safe_errors(goal: Goal, row: Vector, image: Vector, measured: Measured, guide: GuideTables, parts: Parts) -> None:
-    """Find the largest errors with h >= 0 at every tenth cycle by bisection, see `IdealLeg.image`.
+    """Find the largest safe errors (h >= 0) by bisection. Do this at every tenth cycle; see `IdealLeg.image`.
 
     Args:
         goal: desired motion and guide.

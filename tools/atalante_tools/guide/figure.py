@@ -18,10 +18,10 @@ _CENTRE = Start((0.0, 0.0), (0.0, 0.0), (0.0, 0.0), (0.0, 0.0))
 
 
 def draw(checked: Checked, picture: Path) -> None:
-    """Draw angles, guide, safe backward image and push of the worst step over the phase, for hip and knee.
+    """Draw the guide, the safe backward image, and the angles and pushes of the worst step over the phase, for hip and knee.
 
-    The safe backward image is drawn for the speed of the desired motion. From a state in the image, the backup policy keeps the
-    joint inside the guide.
+    From a state in the safe backward image, the backup policy keeps both joints inside the guide. The image is drawn for the
+    speeds of the desired motion.
 
     Args:
         checked: result of a check. If the guide has no promise, only the guide and the safe backward image are drawn.

@@ -62,13 +62,15 @@ class Condition:
 class Plant(NamedTuple):
     """Constants of the plant, for compiled functions. Index 0 is the hip, index 1 the knee."""
 
-    mass: Vector  # (3, 3) kg m2, coefficients of 1, cos q_SK, sin q_SK (columns) of M11, M12, M22 (rows)
-    weight: Vector  # (2, 4) Nm, coefficients of cos q_SH, sin q_SH, cos(q_SH + q_SK), sin(q_SH + q_SK) of the gravity torques
+    mass: Vector  # (3, 3) kg m2, rows: M11, M12, M22; columns: coefficients of 1, cos q_SK, sin q_SK
+    #: (2, 4) Nm, gravity torques; rows: hip, knee; columns: coefficients of cos q_SH, sin q_SH, cos(q_SH + q_SK),
+    #: sin(q_SH + q_SK)
+    weight: Vector
     coulomb: Vector  # (2,) Nm, dry friction
     viscous: Vector  # (2,) Nm s/rad, viscous friction
     friction_speed: float  # rad/s, speed at which dry friction reaches 76 % of its full value
-    tracking: float  # share of the torque deviation that the motor removes in a cycle
-    keep: float  # share of the old value in the velocity filter
+    tracking: float  # share of the difference between command and motor torque that the motor removes in a cycle
+    keep: float  # weight of the old value in the velocity filter, 0 to 1
     torque_max: Vector  # (2,) Nm, torque limit of the limiter
     torque_step: Vector  # (2,) Nm, largest change of the command in a cycle
     velocity_max: Vector  # (2,) rad/s, speed above which the limiter reduces the torque
@@ -119,7 +121,7 @@ def _fitted(articulated: ArticulatedModel, pose: Vector) -> tuple[Vector, Vector
     """Fit `Plant.mass` and `Plant.weight` to the rigid-body dynamics.
 
     Raises:
-        RuntimeError: If the rigid-body dynamics do not have the form of the plant.
+        RuntimeError: If the equation of the plant does not fit the rigid-body dynamics.
     """
     model, into, out_of = articulated
     data, rows = model.createData(), out_of[[HIP, KNEE]]
@@ -145,7 +147,7 @@ def _fitted(articulated: ArticulatedModel, pose: Vector) -> tuple[Vector, Vector
 
 
 def _least_squares(basis: list[list[float]], values: list[Any]) -> tuple[Vector, float]:
-    """Return the coefficients of the basis (columns) for each value (rows), and the largest deviation."""
+    """Fit each column of `values` by the columns of `basis`. Return a row of coefficients per fit, and the largest error."""
     x, y = np.array(basis), np.array(values)
     coefficients: Vector = np.linalg.lstsq(x, y, rcond=None)[0].T.copy()
     return coefficients, float(np.abs(x @ coefficients.T - y).max())

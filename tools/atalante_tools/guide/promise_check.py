@@ -1,9 +1,10 @@
 """Check of a guide: search for the worst push, and comparison with the promise. `gait, shape, Xi -> Verdict`.
 
-The largest pushes at hip and knee are exactly the promise. At the start of a step, the leg deviates from the nominal motion. The
-hand-over box (`HandOver`) is the range of the deviations for which the promise holds, and the adversary starts in its centre and
-corners. The adversary first searches on the ideal plant. Then it repeats the worst pushes on the emulated robot, together with
-constant pushes, pumping, feedback and random switching.
+The promise of a guide is a torque at hip and knee. The search (class `Adversary`) uses pushes up to these torques, unless
+`Task.push` gives other limits. At the start of a step, the leg deviates from the nominal motion. The hand-over box (`HandOver`)
+is the range of start deviations for which the promise holds. The steps of the search start in the centre and in corners of this
+box. The search runs on the ideal plant. Then the worst pushes are repeated on the emulated robot, together with constant pushes,
+pushes that follow the error or its rate, and pushes that switch at random.
 """
 
 from __future__ import annotations
@@ -50,11 +51,11 @@ PATIENTS: Final = (
 )  # fmt: skip
 #: Number of corners of the hand-over box (range of start deviations) from which steps start.
 _CORNERS: Final = 64
-#: Time by which the measured velocity of a drive lags behind the true velocity: low-pass and half a cycle [s].
+#: Time by which the measured velocity of a drive lags behind the true velocity, due to its low-pass filter and half a cycle [s].
 _VELOCITY_LAG: Final = 2.0e-3
-#: Largest multiple of the promised torques up to which the search tries to push a joint out of the guide.
+#: The search for `Verdict.left_at` tries pushes up to this multiple of the promised torques.
 LARGEST_FACTOR: Final = 6.0
-#: Number of steps for each multiple of the promised torques in the search for `left_at`, as a share of `Effort.steps`.
+#: The search for `Verdict.left_at` walks this share of `Effort.steps` for each multiple of the promised torques that it tries.
 _SHARE: Final = 0.1
 
 
@@ -96,11 +97,11 @@ class Verdict:
     plant_ratio: float | None  # largest |e| / q_bound on the ideal plant
     robot_ratio: float | None  # largest |e| / q_bound on the emulated robot; None if the robot was not used
     worst_push: str  # kind of the worst push on the plant
-    worst_condition: str  # deviation of the plant from the model in the worst episode, for example "friction +20 %"
+    worst_condition: str  # deviation of the plant from the model in the worst step, for example "friction +20 %"
     stopped: str  # reason why the robot left ACTIVE; empty if it did not
     #: smallest multiple of the promised torques that moved a joint out of the guide; None if not searched or not found
     left_at: float | None
-    reason: str  # reason that the certificate states
+    reason: str  # what limits the promised torques, or why there are none
 
     @property
     def broken(self) -> bool:
@@ -177,7 +178,7 @@ def check(setup: Setup, controller: AirwalkController, xi: float, task: Task) ->
         setup: gait, robot and model.
         controller: controller of the guide.
         xi: assistance factor in [0, 1].
-        task: conditions, size and seed of the check.
+        task: conditions, effort, seed and largest push.
     """
     certificate = controller.certificate(xi)
     leg, box = IdealLeg(setup, controller, xi), task.push or promise_of(certificate)
@@ -227,7 +228,7 @@ def _on_robot(robot: PushedRobot, box: Pair, found: Sequence[Tried], task: Task)
 
 
 def _robot_pushes(cycles: int, generator: np.random.Generator) -> list[Push]:
-    """Return the disturbances of a walk: constant torques, torques from feedback of error and rate, and random switching."""
+    """Return pushes of three kinds: constant, following the error and its rate, and switching at random."""
     none = np.zeros((2, FEATURES))
     pushes = [Push(np.tile(direction, (cycles, 1)), none) for direction in DIRECTIONS]
     for joint, other, (error, rate) in itertools.product((0, 1), (-1.0, 1.0), ((0.0, 1.0), (1.0, 1.0))):

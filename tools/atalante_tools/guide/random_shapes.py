@@ -12,7 +12,8 @@ from atalante_control.guide.shapes import GuideShape
 from atalante_hal.types import Vector
 
 KINDS: Final = ("smooth", "notched", "piecewise")
-#: `_NARROW` is the smallest and `_WIDE` the largest width of a random shape, as a share of the half-width.
+#: Range of the random widths above and below the desired trajectory, as fractions of `half_width(xi)`. In a notch, the width is
+#: at least `_NARROW` times the width outside the notch.
 _NARROW, _WIDE = 0.15, 1.0
 #: Largest assistance factor of a random guide.
 _LARGEST_FACTOR: Final = 0.95
@@ -49,7 +50,7 @@ def random_guide(seed: int, number: int) -> RandomGuide:
 
 
 def _smooth(generator: np.random.Generator) -> Callable[[Vector], Vector]:
-    """Return a width that is a sum of four sine waves over the phase, scaled to a random range."""
+    """Return a function of the phase: the sum of four sine waves, scaled to a random range."""
     waves = generator.normal(size=4) / np.arange(1, 5), 2.0 * math.pi * generator.random(4)
     low, high = np.sort(generator.uniform(_NARROW, _WIDE, 2))
     samples = _waves(np.linspace(0.0, 1.0, 801), *waves)
@@ -62,7 +63,7 @@ def _waves(phase: Vector, sizes: Vector, shifts: Vector) -> Vector:
 
 
 def _notched(generator: np.random.Generator) -> Callable[[Vector], Vector]:
-    """Return a constant width with one to four notches. Each notch lasts 0.2 to 5 % of the step."""
+    """Return a function of the phase: a constant with one to four notches. Each notch lasts 0.2 to 5 % of the step."""
     width, count = float(generator.uniform(0.5, _WIDE)), int(generator.integers(1, 5))
     centres, lengths = generator.random(count), 0.5 * 10.0 ** generator.uniform(-2.7, -1.3, count)
     depths = generator.uniform(_NARROW, 0.9, count)
@@ -75,7 +76,7 @@ def _notched(generator: np.random.Generator) -> Callable[[Vector], Vector]:
 
 
 def _piecewise(generator: np.random.Generator) -> Callable[[Vector], Vector]:
-    """Return a width that consists of three to twelve constant pieces."""
+    """Return a function of the phase that consists of three to twelve constant pieces."""
     edges = np.sort(generator.random(int(generator.integers(2, 12))))
     widths = generator.uniform(_NARROW, _WIDE, len(edges) + 1)
     return lambda phase: np.asarray(widths[np.searchsorted(edges, phase, side="right")])

@@ -1,4 +1,4 @@
-"""File with the results of a long check, so that the check can be interrupted and resumed: `verdicts <-> JSON lines`.
+"""File with the results of a long check: `verdicts <-> JSON lines`. With this file, an interrupted check can be resumed.
 
 The first line of the file contains the task: conditions, effort, seed, push and control law. Each further line contains one
 verdict. The file is flushed after each verdict.

@@ -2,7 +2,7 @@
 
 The robot walks in PyBullet, through the HAL in lock-step. A push is a real torque on the sagittal hip and knee of both legs.
 The push is added to the torque of the motor. The swing leg gets a push of the adversary. The stance leg gets a push that is
-constant during a step and random between steps, so that this leg begins its next swing with a deviation.
+constant during a step and random from step to step, so that this leg begins its next swing with a deviation.
 """
 
 from __future__ import annotations
@@ -115,7 +115,7 @@ class PushedRobot:
 
 
 class _Hand:
-    """Source of the pushes on both legs, called once per cycle, which also records each finished swing."""
+    """Generator of the pushes on both legs, called once per cycle. It also records each finished swing."""
 
     def __init__(
         self,
@@ -165,9 +165,9 @@ class _Hand:
         self._cycle += 1
 
     def _apply(self, emulator: Emulator, joint: int, push: float) -> None:
-        """Apply a push to a joint, together with the change of friction that the condition requires.
+        """Apply a push to a joint, and the additional friction of the condition.
 
-        The emulated motor keeps its own friction, so the additional friction is applied as an external torque, too.
+        The emulated motor keeps its own friction, so the additional friction is added to the push as an external torque.
         """
         motor, velocity = emulator.drives.parameters.motor, float(emulator.body.velocity[joint])
         of_leg = joint % _LEG
@@ -183,7 +183,7 @@ class _Hand:
 
 
 class EncoderNoise:
-    """Noise of all joint encoders, added to the position signals and, after the filter of the drives, to the velocity signals."""
+    """Noise of all joint encoders. Position signals get the noise, velocity signals get its derivative after the drive filter."""
 
     def __init__(self, emulator: Emulator, gear: Vector, noise: float, seed: int) -> None:
         """Find the signals of the drives.

@@ -1,12 +1,13 @@
-"""Search for the worst push on the ideal plant: `guide, box -> push with the largest |e| / q_bound`.
+"""Search for the worst push on the ideal plant: `guide, limits of the push -> push with the largest |e| / q_bound`.
 
-The search knows the equation of motion but not the law of the controller. It has three stages:
+The search knows the equation of motion but not the control law. It has three stages:
 
 1. *Guesses.* Constant pushes. Pushes that follow the sign of the error, or of the rate of the error (pumping). Pushes that switch
-   at random. Bang-bang pushes: in a linear loop, the push with the largest effect on one error at one time has the sign of the
-   impulse response at each earlier time. The feedback of the loop is identified from the steps walked so far.
-2. *Beam search*, a dynamic programming with few states: every 40 ms, each kept push is continued in each of the four directions
-   `DIRECTIONS`, and the pushes with the largest predicted deviation are kept.
+   at random. Bang-bang pushes, which increase the error of one joint at one time as much as possible: at each earlier time, their
+   sign is the sign of the effect that an impulse at this time has on that error. The effect is computed for a linear loop, whose
+   stiffness and damping are identified from the worst step so far.
+2. *Beam search.* Every 40 ms, each kept push is continued in each of the four `DIRECTIONS`. The pushes with the largest predicted
+   deviation are kept.
 3. *Local search.* One of the pushes with the largest |e| / q_bound is changed a little: its switching times, its feedback, the
    start of the step, or the condition of the plant. The changed push is kept if it is one of the worst pushes so far.
 """
@@ -36,7 +37,7 @@ _STAGE, _BEAM = 40, 6
 _AHEAD: Final = 0.03
 #: A search with at least this number of steps includes the beam search.
 _WITH_BEAM: Final = 1000
-#: The feedback of the loop is identified from the samples whose |e| / q_bound is larger than this threshold.
+#: Stiffness and damping of the loop are identified from the samples whose |e| / q_bound is larger than this threshold.
 _ACTING: Final = 0.5
 #: Number of pushes that the local search starts from.
 _PARENTS: Final = 6
@@ -93,9 +94,9 @@ class Adversary:
         return self.tried[0]
 
     def leaving_factor(self, box: Pair, largest: float, budget: int) -> float | None:
-        """Return the smallest multiple of `box` with which a push moves a joint out of the guide, accurate to 5 %.
+        """Return the smallest multiple of `box` at which a push was found that moves a joint out of the guide, accurate to 5 %.
 
-        Return None if no push moves a joint out of the guide at the multiple `largest`.
+        Return None if no such push was found up to the multiple `largest`.
 
         Args:
             box: push at hip and knee [Nm].
@@ -120,9 +121,9 @@ class Adversary:
         return outside
 
     def _leaves(self, box: Pair, factor: float, budget: int) -> bool:
-        """Return whether a push up to `factor` times `box` moves a joint out of the guide.
+        """Return whether a push was found that is at most `factor` times `box` and moves a joint out of the guide.
 
-        The stored pushes are tried first.
+        The worst pushes so far are tried first.
         """
         larger, known, end = (factor * box[0], factor * box[1]), self.tried, self.steps + budget
         self.tried = []
@@ -170,7 +171,7 @@ class Adversary:
     def _following(self, cycles: int) -> Iterator[tuple[str, Push]]:
         """Yield pushes with the sign of the error, of the rate of the error, or of random mixtures of all features."""
         for joint, (error, rate) in itertools.product((0, 1), ((0.0, 1.0), (1.0, 0.0), (1.0, 1.0))):
-            # An opposite push at the other joint can also accelerate this joint, because the mass matrix couples them.
+            # The mass matrix couples the joints, so the worst push at the other joint may have either direction.
             for other in (-1.0, 1.0):
                 feedback = np.zeros((2, FEATURES))
                 for i in range(2):
@@ -229,7 +230,7 @@ class Adversary:
         return np.where(signs >= 0.0, 1.0, -1.0)
 
     def _identified(self) -> tuple[Vector, Vector]:
-        """Return stiffness [1/s2] and damping [1/s] of the loop near the guide, each (2, 2), from the worst step so far."""
+        """Identify stiffness [1/s2] and damping [1/s] of the closed loop from the worst step so far, each of shape (2, 2)."""
         if not self.tried:
             return np.zeros((2, 2)), np.zeros((2, 2))
         one = self.tried[0]
@@ -248,7 +249,7 @@ class Adversary:
     # -- beam and local search ---------------------------------------------------------------------------------------
 
     def _beam(self, box: Pair, joint: int, sign: float) -> None:
-        """Search for the push that moves a joint farthest to one side. Each stage chooses a direction of the push."""
+        """Search for the push that moves a joint farthest to one side. Each stage tries all directions of the push."""
         cycles, start, condition = self.leg.cycles + 1, self._any(self.starts), self._any(self.conditions)
         noise, kept = self._number(), [np.ones((cycles, 2))]
         for begin in range(0, cycles, _STAGE):

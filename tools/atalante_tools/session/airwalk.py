@@ -181,7 +181,7 @@ def _walk_all(
             with _open(target, options, network, robot, controller, gait.hash32, robot_process, exoskeleton) as rig:
                 robot_process = _start_robot(target, stack) if name != last else None
                 if telemetry is None:
-                    # The certificates are printed after the bus was opened, because the bus may be missing.
+                    # The certificates are printed after the bus was opened: if the bus is missing, only its error is printed.
                     certificates = {shape: walking.certificate(options.xi) for shape, walking in controllers.items()}
                     announce(certificates.values(), controller.config.mismatch, "swing leg of the empty exoskeleton")
                     about = {"seed": options.seed, "steps": options.steps, "xi": options.xi, **asdict(options.law)}
@@ -269,7 +269,7 @@ def _controllers(
     return exoskeleton, gait, controllers
 
 
-#: Smallest number of processor cores for HAL, telemetry and embedded robot in three processes.
+#: Smallest number of processor cores at which the embedded robot gets its own process, beside HAL and telemetry.
 _CORES = 3
 
 
@@ -316,7 +316,7 @@ def _close(telemetry: TelemetryProcess, walked: Walked) -> None:
 
 def _result(certificate: Certificate, controller: AirwalkController, hal: Hal, statistics: Statistics) -> Result:
     walking = controller.statistics
-    # The statistics start after the first step, so after a run of one step they contain only a single cycle.
+    # The statistics start after the first step. After a run of one step they contain a single cycle and are not reported.
     counted = walking.steps >= 2
     return Result(
         shape=certificate.shape,

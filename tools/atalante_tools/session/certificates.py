@@ -36,12 +36,12 @@ def promise_fields(certificate: Certificate | None) -> dict[str, Any]:
 
 
 def announce(certificates: Collection[Certificate], mismatch: Mismatch, leg: str) -> None:
-    """Print the certificate of each guide shape: the disturbance torques for which the running filter is built.
+    """Print the certificate of each guide shape: the promised torques, or the reason why there are none.
 
     Args:
         certificates: Certificates to print.
         mismatch: Errors of the model under which the promises hold.
-        leg: Leg for which the promises are made, in words.
+        leg: Description of the leg for which the promises are made.
     """
     for certificate in certificates:
         name, xi, promise = certificate.shape, certificate.xi, certificate.promise

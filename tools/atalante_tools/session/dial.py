@@ -1,4 +1,4 @@
-"""Assistance dial of a walk in which the assistance factor falls: `completed steps -> assistance factor`."""
+"""Assistance factor that the emulated operator sets during a walk: `completed steps -> assistance factor`."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ if TYPE_CHECKING:
 
 
 class Dial:
-    """Assistance dial of the emulated operator, which changes the assistance factor from step to step."""
+    """Assistance dial of the emulated pendant. The emulated operator reduces the assistance factor from step to step."""
 
     def __init__(self, operator: Operator, protocol: tuple[int, int, int], xi: float) -> None:
         """Set the dial to full assistance.

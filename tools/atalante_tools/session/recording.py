@@ -28,7 +28,7 @@ _TEND_CYCLES: Final = 250
 
 
 def _record_rate(text: str) -> int:
-    """Convert the recording rate that the user entered to a number [Hz] (option type). The rate must be a divisor of 1000 Hz.
+    """Convert the value of `--record-rate` to a number [Hz]. The rate must be a divisor of 1000 Hz.
 
     Args:
         text: Rate as the user typed it.

@@ -224,10 +224,10 @@ def join(network: Network, buses: dict[str, Bus]) -> Bus:
 
 
 class Watch:
-    """End condition of a run, called once per cycle, which also prints a progress line.
+    """End condition of a run, called once per cycle. It also prints a progress line.
 
     A run ends when `done(state)` returns True while the robot is ACTIVE, when a signal arrives, or when the robot is in FAULT. If
-    the robot leaves ACTIVE for another state, the run ends too, but with `resumes` it waits for the operator's START instead.
+    the robot leaves ACTIVE for another state, the run ends, too. With `resumes`, the run waits for START of the operator instead.
     After the run, `conclude` raises an error unless `done` ended the run.
     """
 

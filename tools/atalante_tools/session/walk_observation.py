@@ -21,7 +21,7 @@ _PELVIS: Final = IMUS.index("pelvis")
 
 
 class Observation:
-    """Attitude and path of the robot during the walk, and the push. For an emulated robot, the true values are read.
+    """Attitude and path of the robot during the walk, and the push. The true values of an emulated robot are read from its body.
 
     Attributes:
         fell: Whether the pelvis has leaned by more than `FALLEN`.
@@ -78,7 +78,10 @@ class Observation:
         return {"true_lateral_m": lateral, "true_yaw_deg": yaw}
 
     def _wrench(self, _hal_state: int) -> Vector:
-        """Return the push of this cycle. The push begins when the middle step of the walk reaches phase 0.3."""
+        """Return force [N] and moment [Nm] of the push in this cycle, shape (6,).
+
+        The push begins when the middle step of the walk reaches phase 0.3.
+        """
         import numpy as np
 
         from atalante_hal.types import PERIOD

@@ -19,7 +19,7 @@ _AFTERMATH: Final = 1500
 
 
 class WalkWatch:
-    """End condition of a walk, called once per cycle, which also prints the progress line.
+    """End condition of a walk, called once per cycle. It also prints the progress line.
 
     Attributes:
         outcome: How the walk ended: stood, fell, stopped, hold or fault.

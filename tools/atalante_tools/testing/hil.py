@@ -87,7 +87,7 @@ def emulated_robot(network: Network, robot: Robot, robot_bus: Bus, engine: str) 
     """
     with open_body(
         robot, engine=engine
-    ) as body:  # opened before the imports, because its error names the missing package
+    ) as body:  # before the imports: if the engine is missing, the error of `open_body` names the package
         from atalante_emulator.emulator import Emulator
         from atalante_emulator.pendant import Operator
 

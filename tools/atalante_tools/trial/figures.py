@@ -180,7 +180,10 @@ def sweep_trend(results: Sequence[Result]) -> bytes:
 
 
 def _steps(axis: Any, steps: Sequence[Sequence[Sequence[float]]], columns: Sequence[int]) -> None:
-    """Draw steps over each other: phase, measured, desired, upper edge, lower edge. `columns` selects from these."""
+    """Draw steps over each other. A sample contains phase, measured angle, desired angle, upper and lower edge of the guide.
+
+    The edges are drawn only if `columns` contains their indices.
+    """
     for number, step in enumerate(steps):
         data, last = np.array(step), number == len(steps) - 1
         axis.plot(

@@ -1,7 +1,8 @@
 """Findings of the paper, tested on the results of the trials: `results -> one line per finding, with statistic and verdict`.
 
-The limits in this file were chosen before the trials of the documentation ran. `active-vary` was added after them, because the
-spread over a whole step mostly measures the shape of the mean trajectory. A finding without results has no verdict.
+The limits in this file were chosen before the trials of the documentation ran. The finding `active-vary` was added after these
+trials. It compares steps at equal phase, because the standard deviation over whole steps (`active-spread`) mostly measures the
+shape of the mean trajectory. A finding without results has no verdict.
 """
 
 from __future__ import annotations
@@ -23,8 +24,9 @@ _PHASES: Final = np.linspace(0.1, 0.8, 29)
 #: W/kg).
 SAME: Final = 0.02
 STANDING: Final = 1.44  # W/kg, metabolic rate of quiet standing
-#: Smallest rank correlation of a quantity with the assistance factor that is called a trend, and largest asymmetry of a sweep
-#: in time.
+#: `TREND`: a quantity has a trend if its rank correlation with the assistance factor is at most minus this value.
+#: `ASYMMETRY`: largest mean difference between the k-th trial and the k-th trial from the end of a day, as a fraction of the
+#: range of all values.
 TREND, ASYMMETRY = 0.8, 0.25
 #: Largest coefficient of variation of the baseline metabolic rates of a sweep.
 VARIATION: Final = 0.05
@@ -143,7 +145,7 @@ def normalised(result: Result) -> float:
 
 
 def step_variation(result: Result) -> float:
-    """Return the standard deviation of e / q_bound over the last steps at equal phase, mean over phases and both joints.
+    """Return how much e / q_bound varies from step to step: standard deviation over the last steps, mean of phases and joints.
 
     Args:
         result: result of a guided walk.
@@ -196,7 +198,8 @@ def _paired(
 ) -> Finding:
     """Return a finding that one quantity is larger than another, by a one-sided sign test over the subjects.
 
-    With fewer than five subjects no sign test reaches 5 %. Then the difference must have the claimed sign in every subject.
+    The significance level is 5 %. With fewer than five subjects no sign test reaches this level. Then the difference must have
+    the claimed sign in every subject.
     """
     if not subjects:
         return Finding(id_, claim, "no results", None)
@@ -236,7 +239,7 @@ def _trend(id_: str, claim: str, walks: Sequence[Result], value: Callable[[Resul
 
 
 def _symmetry(id_: str, claim: str, walks: Sequence[Result], value: Callable[[Result], float]) -> Finding:
-    """Return the finding that the k-th trial and the k-th last trial of a day have the same value."""
+    """Return the finding that the k-th trial and the k-th trial from the end of a day have nearly the same value."""
     days: dict[str, list[Result]] = {}
     for walk in walks:
         days.setdefault(walk["trial"]["order"].split("-")[0], []).append(walk)

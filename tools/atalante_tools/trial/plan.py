@@ -83,7 +83,10 @@ class WalkTrial:
 
 @dataclass(frozen=True)
 class TreadmillTrial:
-    """Baseline of the sweep: an equation for level walking without exoskeleton, and the respirometer. No body is simulated."""
+    """Baseline of the sweep: level walking without exoskeleton. No body is simulated.
+
+    An equation gives the metabolic rate. The emulated respirometer measures it.
+    """
 
     kind: ClassVar[str] = "treadmill"
     mass: float  # kg, of the subject
@@ -221,8 +224,8 @@ def source_hash(roots: Sequence[Path], ignored: Sequence[Path] = ()) -> str:
     """Return a hash of source files and data files.
 
     Args:
-        roots: folders of the files. Byte code and Markdown files do not count.
-        ignored: files that do not count.
+        roots: folders of the files. Byte code and Markdown files are ignored.
+        ignored: further files to ignore.
     """
     digest = hashlib.sha256()
     for root in roots:

@@ -195,7 +195,7 @@ class Motion:
     """Samples of SH and SK of the swing leg in the periodic steps, until the nominal end of each step."""
 
     def __init__(self, rig: Rig, controller: WalkController) -> None:
-        """Connect the samples to a run.
+        """Create an empty series of samples.
 
         Args:
             rig: rig of the run.
@@ -242,7 +242,7 @@ class Motion:
         }
 
     def _curves(self, rows: Vector) -> list[list[list[float]]]:
-        """Return phase, measured, desired and guide of SH, then of SK [deg], of each sample of the last steps."""
+        """Return the samples of the last steps: phase, then measured angles, desired angles and q_bound of SH and SK [deg]."""
         chosen = np.unique(rows[:, 0])[-_CURVES:]
         return [
             [[round(row[1] / STEP[1], 4), *_rounded(np.degrees(row[3:]))] for row in rows[rows[:, 0] == step]]
@@ -251,15 +251,15 @@ class Motion:
 
 
 def _position(ratio: Vector) -> dict[str, Any]:
-    """Return statistics of the tracking errors as fractions of the guide.
+    """Return statistics of the position in the guide, e / q_bound.
 
     Args:
         ratio: e / q_bound of SH and SK, shape (n, 2).
     """
     return {
-        # share of the time in the outer half of the guide
+        # share of the time with a joint in the outer half of its guide
         "outer": round(float(np.mean(np.abs(ratio).max(axis=1) > 0.5)), 4),
-        "spread": round(float(ratio.std(axis=0).mean()), 4),  # standard deviation, as the mean of both joints
+        "spread": round(float(ratio.std(axis=0).mean()), 4),  # standard deviation of each joint, mean of both joints
         "histogram": [np.histogram(ratio[:, k], EDGES)[0].tolist() for k in range(2)],
     }
 
@@ -268,7 +268,7 @@ class Effort:
     """Work of the muscles of the subject in each second of the walk, and the gas exchange that follows from it."""
 
     def __init__(self, rig: Rig, controller: WalkController, protocol: tuple[int, int, int]) -> None:
-        """Connect the samples to a run.
+        """Create an empty series of samples.
 
         Args:
             rig: rig of the run.

@@ -42,8 +42,8 @@ _NOT_HEX = 255
 _HEX = np.full(256, _NOT_HEX, np.uint8)
 _HEX[np.frombuffer(b"0123456789", np.uint8)] = np.arange(10)
 _HEX[np.frombuffer(b"ABCDEF", np.uint8)] = _HEX[np.frombuffer(b"abcdef", np.uint8)] = np.arange(10, 16)
-#: Value of two hexadecimal digits, or 0xFFFF if one of the two characters is not a hexadecimal digit.
-#: The index is the little-endian number of the two characters.
+#: Lookup table for two characters: value of two hexadecimal digits; 0xFFFF if one of the characters is not a hexadecimal digit.
+#: The index is the pair of characters as a little-endian 16-bit number.
 _HEX_PAIR = np.full(1 << 16, 0xFFFF, np.uint16)
 _HEX_PAIR.reshape(256, 256)[:] = np.where(
     (_HEX < 16) & (_HEX < 16)[:, None], _HEX.astype(np.uint16) << 4 | _HEX[:, None], 0xFFFF
@@ -143,7 +143,7 @@ class _Lines:
     def _marks(self, regular: npt.NDArray[np.bool_]) -> Positions:
         """Return the position of the first # in each line. Shape (lines,)."""
         found = np.flatnonzero(self.text[self.begin : self.end] == _HASH) + self.begin
-        alone = np.ones(len(found), np.bool_)  # False: the character before is a #, too
+        alone = np.ones(len(found), np.bool_)  # False for the second # of ##
         np.not_equal(found[1:], found[:-1] + 1, out=alone[1:])
         return self._one_per_line(found[alone], regular)
 

@@ -183,7 +183,7 @@ class DriveRules:
         drive.state_stamp = int(stamps[-1])
 
     def _check(self, drive: _Drive, until: int) -> None:
-        """Report a drive that has not responded to the last command before the time stamp `until` [ns]."""
+        """Report the drive if its response to the last command is overdue at the time stamp `until` [ns]."""
         waited = until - drive.since
         if waited > self._limit_ns and must_respond(drive.state, drive.command):
             self._findings.add(
@@ -233,7 +233,7 @@ def _command_fields(plan: Plan, command: str) -> list[_CommandField]:
 
 
 def _drive(row: int, node: str, commands: Sequence[_CommandField]) -> _Drive:
-    """Create a drive with the first command field that its node receives.
+    """Create a drive with the first command field for its node and joint.
 
     Args:
         row: index of the state message in the plan.

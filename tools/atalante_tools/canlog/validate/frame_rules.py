@@ -50,7 +50,7 @@ class FrameRules:
         # The additional last element makes the index 0 valid for a DBC without messages. No message uses this element.
         self._fd, self._switch = np.array([*fd, UNKNOWN], np.int8), np.array([*switch, UNKNOWN], np.int8)
         self._length, self._sender = np.append(plan.lengths, 0), np.append(plan.sender_of_row, UNKNOWN)
-        #: Node that recorded the log; None if not known yet; empty if frames of several nodes are marked as sent.
+        #: Node that recorded the log; None if not known yet; empty if it cannot be determined (see `_RECORDER`).
         self.recorder: str | None = None
         self.direction_seen = False
 
@@ -140,7 +140,7 @@ class FrameRules:
         return fits
 
     def _check_sender(self, chunk: Chunk, rows: Rows) -> None:
-        """Report messages with a wrong direction mark (sent or received).
+        """Report frames with a wrong direction mark (sent or received).
 
         If at least 99 % of the frames marked as sent come from one node, this node is the recorder of the log. Then all
         messages of the recorder must be marked as sent, and all other messages must be marked as received.

@@ -180,7 +180,7 @@ def _load_plot(result: Report) -> str:
 
 
 def _thinned(x: Vector, y: Vector) -> tuple[Vector, Vector]:
-    """Reduce a curve to at most `_POINTS` points, each of which is the maximum of a section of the curve."""
+    """Reduce a curve to at most `_POINTS` points. Each point has the maximum value in its section of the curve."""
     step = math.ceil(len(x) / _POINTS)
     if step == 1:
         return x, y
@@ -205,7 +205,7 @@ def _gap_plot(result: Report) -> str:
 
 
 def _histograms(result: Report) -> list[str]:
-    """Plot interval histograms, first of messages with timing findings, then of messages with the widest spread."""
+    """Plot interval histograms: first of the messages with timing findings, then of the messages with the widest histograms."""
     validator = result.validator
     reported = {f.message for f in result.findings if f.rule in _TIMING}
     rows = [r for r in np.flatnonzero(validator.timing.intervals > 0).tolist() if validator.plan.cycle_ns[r] > 0]

@@ -37,8 +37,8 @@ _SPACING_NS, _LAST = 1000, 0.7
 class _Channel:
     """State of the clock for one channel after the last frame on this channel."""
 
-    #: index in the plan of the SYNC message that gives the cycle number: the SYNC message that was received first on this
-    #: channel; -1 if no SYNC message was received yet
+    #: plan index of the first SYNC message that was received on this channel; -1 if none was received yet. Only this message
+    #: gives the cycle number.
     sync: int = -1
     cycle: int = 0  # cycle number of the last SYNC
     begin: int = 0  # time stamp of the last SYNC in robot time [ns]

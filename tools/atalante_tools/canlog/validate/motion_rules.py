@@ -71,7 +71,7 @@ class MotionRules:
 
 
 class _Velocity:
-    """Rule that compares the mean of a velocity signal in a time window with the change of the position signal.
+    """Rule that compares the mean of the velocity signal in a time window with the mean slope of the position signal.
 
     The tolerance allows for the lag of the velocity filter in the drive.
     """

@@ -198,7 +198,8 @@ class TimingRules:
         """Add all intervals without lost frames to the interval statistics of the messages."""
         bins = np.minimum(np.maximum(share * BINS_A_CYCLE, 0.0), float(BINS - 1)).astype(np.int64)
         bins += (np.arange(len(stream.present)) * BINS).repeat(stream.stops - stream.starts)
-        # The statistics include the intervals of messages without an alive counter (`NO_STEP`).
+        # Leave out the intervals with lost, repeated or rejected frames. Without an alive counter (`NO_STEP`, less than
+        # `REPEATED`), lost frames are not detectable, so these intervals stay in the statistics.
         incomplete = (
             odd[steps[odd] >= REPEATED]
             if rejected_before is None
@@ -260,7 +261,7 @@ class TimingRules:
             return
         first, last = int(self._first[row]), int(self._last[row])
         mean = self._sum[row] / count
-        # A wrong cycle time changes both the mean and the median.
+        # Report only if both the mean and the median deviate, as with a wrong cycle time.
         # A long gap changes only the mean, and the rule cycle-gap reports this gap.
         if (
             count >= self._mean_intervals

@@ -1,7 +1,7 @@
-"""One cycle of an emulated drive, as a transition of an exhaustive search with every input of the HAL and of the link.
+"""One cycle of an emulated drive, as a transition of an exhaustive search.
 
-The HAL may be silent, frozen, or send any controlword. A frame may be lost, late, damaged, or of a second sender. The step calls
-the functions of a real `Drives`.
+The search tries every input from the HAL and from the link. The HAL may be silent, frozen, or send any controlword. A frame may
+be lost, late, damaged, or come from a second sender. Each transition calls the functions of a real `Drives`.
 """
 
 from __future__ import annotations
@@ -49,7 +49,7 @@ class Drive(NamedTuple):
 
 
 class DriveObserver(NamedTuple):
-    """Ages and flag from which the search checks the properties, counted independently of the drive."""
+    """Values with which the search checks the properties. The search counts these values independently of the drive."""
 
     command_age: int = WATCHDOG  # cycles since the last valid command was sent
     sync_age: int = 0  # cycles since the last SYNC
@@ -69,7 +69,7 @@ class DriveCycle(NamedTuple):
 
 
 class DriveStep(NamedTuple):
-    """State of the search: state of the drive, and the values from which its properties are checked."""
+    """State of the search: state of the drive, and the values with which the search checks the properties."""
 
     drive: Drive
     observer: DriveObserver = DriveObserver()

@@ -1,8 +1,8 @@
-"""Exhaustive searches over pendant, link to the HAL and HAL, which check a property at each transition.
+"""Exhaustive searches over the pendant, its link to the HAL, and the HAL. They check safety properties at each transition.
 
-Two searches cover the same product of states. `stops` measures the time since the operator released the dead-man switch or
-pressed a button that stops. `moves` counts presses of START and changes to a better state. Each search has only its own
-observer, because the product with both observers is larger and proves no more.
+There are two searches, and both visit all states of pendant reception and safety monitor. The search `stops` also counts the
+cycles since the operator released the dead-man switch or pressed STOP or HOLD. The search `moves` also counts the presses of
+START that have not changed the state yet. A single search with both counts would visit more states and prove nothing more.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ from atalante_tools.faults.reachability.hal_steps import (
 from atalante_tools.faults.reachability.search import Exploration, Transition, explore
 
 _S = SupervisorState
-#: Actions of the operator: none that stops the robot, release of the dead-man switch, STOP button, HOLD button.
+#: Stop actions of the operator: no stop action, dead-man switch released, STOP pressed, HOLD pressed.
 NOTHING, RELEASED, STOPPED, HELD = range(4)
 #: Number of cycles after the stop action in which the HAL may still enable a drive, because it has not received a new
 #: pendant frame.
@@ -40,7 +40,7 @@ SILENT_PENDANT: Final = LOST - 1
 #: Ages of late pendant frames [cycles]: all ages that the HAL accepts, and two ages that the HAL rejects.
 _LATE: Final = (*range(1, LOST + 1), 6, 16)
 _BUTTONS: Final = (Request.START, Request.STOP, Request.HOLD)
-#: Number of cycles after the stop action above which the search does not distinguish times.
+#: Largest stored number of cycles since the stop action. Larger numbers are stored as this number.
 _LONG: Final = 6
 STOP_PROPERTY: Final = "no torque command after the dead-man is released, STOP or HOLD"
 MOVE_PROPERTY: Final = "each press of START causes at most one change to a better state"
@@ -113,7 +113,7 @@ class OperatorPath:
         return explore([StopState(*state) for state in _INITIAL], self._stop_successors)
 
     def moves(self) -> Exploration[MoveState, Cycle]:
-        """Search for a change to a better state that no press of START has caused."""
+        """Search for a change to a better supervisor state without a press of START as its cause."""
         return explore([MoveState(*state) for state in _INITIAL], self._move_successors)
 
     def _stop_successors(self, state: StopState) -> Iterator[Transition[StopState, Cycle]]:
@@ -196,7 +196,7 @@ class OperatorPath:
 
 
 def is_move(before: SupervisorState, after: SupervisorState) -> bool:
-    """Return whether a change of the state leads to a better state in which drives can move or faults are acknowledged."""
+    """Return whether a state change starts motion, or leads from a state worse than ACTIVE to a better state."""
     return (after in MOVING and before not in MOVING) or (after < before and before > _S.ACTIVE)
 
 
@@ -216,13 +216,14 @@ def environments(before: Supervision, suspended: bool = False) -> Iterator[Envir
 
 
 def arrivals(before: Reception, operator: Operator) -> Iterator[tuple[PendantFrame, ...]]:
-    """Yield all sets of pendant frames that can arrive in a cycle: in time, lost, doubled, late, damaged, of a second sender.
+    """Yield all sets of pendant frames that can arrive in a cycle.
 
-    The first frame that is yielded is the one of a link without fault.
+    Frames arrive in time, lost, doubled, late, damaged, or together with a frame of a second sender. The first set contains one
+    frame that arrives in time.
 
     Args:
         before: state of the reception.
-        operator: what the operator did. Frames that were sampled since then report it.
+        operator: stop action of the operator. Frames that were sampled since this action report the action.
     """
     current = [frame for frame in _contents(before, 0) if _agrees(frame, operator)]
     yield from ((frame,) for frame in current)
@@ -254,7 +255,7 @@ def _contents(before: Reception, age: int) -> Iterator[PendantFrame]:
 
 
 def _agrees(frame: PendantFrame, operator: Operator) -> bool:
-    """Return whether a frame reports what the operator did. Frames from before the action need not report it."""
+    """Return whether a frame is consistent with the operator's stop action. A frame from before the action always is."""
     if frame.age > operator.cycles:
         return True  # the pendant sampled the frame before the action of the operator
     return {

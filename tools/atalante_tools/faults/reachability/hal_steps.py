@@ -35,29 +35,28 @@ LOST: Final = 5
 #: number.
 _CYCLE: Final = 1001
 _TAG: Final = _CYCLE & 0xFF
-#: RequestCounter in the last accepted frame of the pendant, and RequestCounter in a frame with which a second sender reports
-#: a press.
+#: `_PRESSES` is the RequestCounter in the last accepted frame of the pendant.
+#: `_ROGUE_PRESSES` is the RequestCounter in a frame in which a second sender reports a press.
 _PRESSES, _ROGUE_PRESSES = 10, 12
 #: Number of cycles for which a START may still be processed: none, this cycle only, or more.
 NO_START, LAST_START, START = 0, 1, 2
 START_CYCLES: Final = {NO_START: 0, LAST_START: 1, START: 100}
-#: Qualifications of the pendant that the search tries, for a pendant that is not trusted (False) and for a trusted pendant
-#: (True).
+#: Whether the HAL trusts the pendant -> values of the pendant's `Qualification` that the search tries.
 QUALIFICATIONS: Final = {
     False: (Qualification(0, 0, False), Qualification(0, REQUALIFY - 1, False)),
     True: (SETTLED, Qualification(FULL - 4, REQUALIFY, True)),
 }
-#: RequestCounter in the last call of `Pendant.evaluate`: no call yet, counter of the last accepted frame, older counter,
-#: counter of a second sender.
+#: Which RequestCounter the last call of `Pendant.evaluate` has read: none yet, the counter of the last accepted frame, an older
+#: counter, or the counter of a second sender.
 _NONE, _LATEST, _OLDER, _ROGUE = range(4)
 _EVALUATED: Final = {_NONE: None, _LATEST: _PRESSES, _OLDER: _PRESSES - 1, _ROGUE: _ROGUE_PRESSES}
 
 
 class Reception(NamedTuple):
-    """Part of the search state: reception of the pendant in the HAL."""
+    """Part of the search state: what the HAL has received from the pendant."""
 
     age: int = 0  # age of the last accepted frame [cycles]; `LOST` after the timeout
-    dead_man: bool = True  # dead-man switch of the last accepted frame
+    dead_man: bool = True  # whether the dead-man switch is pressed in the last accepted frame
     request: int = Request.START  # `Request` of the last accepted frame
     evaluated: int = _LATEST  # which RequestCounter the last call of `Pendant.evaluate` has read
     rogue: bool = False  # the last accepted frame has the RequestCounter of a second sender
@@ -276,7 +275,7 @@ class HalSteps:
 
         Args:
             state: state of the safety monitor in this cycle.
-            prevented: whether a diagnostic prevents that drives are enabled.
+            prevented: whether a diagnostic prevents the HAL from enabling drives.
             drive: state that the drive reports.
             controller: "torque", or "raise" if the controller raises an exception.
         """
@@ -296,14 +295,14 @@ class HalSteps:
         return int(hal._commands.control[0]), self._monitor.enabling
 
     def _reset(self) -> None:
-        """Set all attributes of the HAL that are not part of the search state to their values without a fault."""
+        """Reset the HAL to values without a fault. The caller then writes the search state into the HAL."""
         hal, monitor = self._hal, self._monitor
         hal.state.cycle = _CYCLE
         monitor.memory = FaultMemory()
         monitor._reports.clear()
         monitor.start_wanted, monitor.enabling, monitor.moving, monitor.walking = 0, False, False, False
         monitor.recalled = -RECALL_CYCLES  # without this check more starts are possible
-        monitor._stalled = 0  # `LAST_START` stands for every end of a start
+        monitor._stalled = 0  # not searched: `LAST_START` covers every way in which a start can end
         monitor._ending = monitor._duplicate_found = monitor._ramping = False
         monitor.lowered.clear()
         rows = len(self._image.check)

@@ -20,7 +20,7 @@ OBSERVED: Final = 20
 
 
 class NotReplayable(ValueError):  # noqa: N818
-    """Error for a counterexample with an input that neither an operator action nor a fault can cause."""
+    """Raised if neither an operator action nor a fault can cause an input of a counterexample."""
 
 
 def case_of(cycles: Sequence[Cycle]) -> Case:

@@ -42,7 +42,10 @@ def search(name: str) -> Exploration[Any, Any]:
 
 
 def main() -> None:
-    """Print the numbers of states and transitions of each search and its properties, or the trace of a counterexample."""
+    """Print one table row per search: number of states, number of transitions, and properties.
+
+    If a search finds a counterexample, print its trace and exit with code 1.
+    """
     print("| search | states | transitions | properties |\n| --- | --- | --- | --- |")
     for name, properties in SEARCHES.items():
         found = search(name)

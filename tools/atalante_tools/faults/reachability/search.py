@@ -21,7 +21,7 @@ class Transition(NamedTuple, Generic[S, L]):
 
 @dataclass(frozen=True)
 class Exploration(Generic[S, L]):
-    """Result of a search. `trace` has the inputs of each cycle up to the first violation; empty without a violation."""
+    """Result of a search. `trace` lists the inputs and state of each cycle up to the first violation, or is empty."""
 
     states: int
     transitions: int
