@@ -72,12 +72,12 @@ def test_reaction_time_is_measured_to_the_first_hold_frame(make_observation: Any
 @pytest.mark.parametrize(
     ("states", "case", "expected"),
     [
-        ([S.ACTIVE] * 15 + [S.HOLD] * 27 + [S.ACTIVE], {}, ["HOLD must come within 5 cycles, got 6"]),
+        ([S.ACTIVE] * 15 + [S.HOLD] * 27 + [S.ACTIVE], {}, ["HOLD must come within 5 cycles of the fault, got 6"]),
         ([S.ACTIVE] * 50, {}, ["no HOLD within 30 cycles"]),
         ([S.HOLD] * 40 + [S.ACTIVE] * 10, {}, ["the robot must be ACTIVE before the fault, got HOLD"]),
         ([S.ACTIVE] * 14 + [S.FAULT] * 30 + [S.ACTIVE], {}, ["the final state must be HOLD, got FAULT"]),
         (HELD, {"state": S.ACTIVE}, ["the robot must stay ACTIVE, got HOLD after 5 cycles"]),
-        ([*HELD[:30], *[S.ACTIVE] * 5, *[S.HOLD] * 10, S.ACTIVE], {}, ["ACTIVE in cycle 31 without the operator"]),
+        ([*HELD[:30], *[S.ACTIVE] * 5, *[S.HOLD] * 10, S.ACTIVE], {}, ["the state must not improve without the operator, but it became ACTIVE in cycle 31"]),
         (HELD[:42], {}, ["the operator's START must lead to ACTIVE, got HOLD"]),
         (HELD, {"recovers": False}, ["the robot must not be ACTIVE after START, because the fault persists"]),
     ],
@@ -93,7 +93,7 @@ def test_wrong_state_fails_with_its_reason(
     [
         (Event(12, "BUS_DOWN", "", node="LEFT_SK"), "no NODE_TIMEOUT; reported codes: BUS_DOWN"),
         (Event(10, "NODE_TIMEOUT", "", node="LEFT_SK"), "no NODE_TIMEOUT; reported codes: none"),
-        (Event(13, "NODE_TIMEOUT", "", node="LEFT_SK"), "NODE_TIMEOUT must come within 2 cycles, got 3"),
+        (Event(13, "NODE_TIMEOUT", "", node="LEFT_SK"), "NODE_TIMEOUT must come within 2 cycles of the fault, got 3"),
         (Event(12, "NODE_TIMEOUT", "", node="LEFT_SH"), "NODE_TIMEOUT must name LEFT_SK, got LEFT_SH"),
     ],
 )

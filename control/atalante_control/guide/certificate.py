@@ -156,7 +156,7 @@ class PromiseLimits:
         largest = _pair(strictest.scale * chosen)
         made = _pair(min(promise, strictest.scale) * chosen)
         if made is None:
-            text = f"no promise: {strictest.what} even without a disturbance; the robot may leave the guide"
+            text = f"no promise of {SMALLEST:g} Nm or more at the hip: {strictest.what}; the robot may leave the guide"
             return Certificate(guide.shape.name, xi, False, text, None, None, -math.inf)
         start, width = guide.prediction.start.error, guide.widths(xi)
         used = ((start[:, :2] + promise * start[:, 2:]) / width)[: guide.cycles + 1]

@@ -199,7 +199,7 @@ def _draw(checked: Checked, plot: Path) -> None:
     try:
         from atalante_tools.guide.figure import draw
     except ModuleNotFoundError as error:
-        raise Failed(f"a figure needs {error.name}; type: pip install 'atalante-hal[plot]'") from error
+        raise Failed(f"a figure needs the package {error.name}; type: pip install 'atalante-hal[plot]'") from error
     draw(checked, plot)
     print_message(f"wrote {plot}")
 
@@ -308,6 +308,6 @@ def random_command(count: int, first: int, steps: int, seed: int, as_json: bool)
     if left:
         worst = max(left, key=lambda v: v.worst_ratio or 0.0)
         raise Failed(
-            f"no joint may leave a certified guide, got {len(left)} guides that a joint left; worst: {worst.shape} at "
+            f"no joint may leave a certified guide, but a joint left {len(left)} of them; worst: {worst.shape} at "
             f"Xi {worst.xi:.3f} with |e| / q_bound {worst.worst_ratio:.3f}"
         )

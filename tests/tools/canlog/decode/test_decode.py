@@ -163,7 +163,7 @@ def test_skipped_frames_of_several_logs_are_counted(tmp_path: Path) -> None:
         "1 frames with an identifier that is not in the DBC",
         "2 frames without data",
         "1 frames shorter than the message in the DBC",
-        "1 lines that are no CAN frame",
+        "1 lines that are not CAN frames",
     ):
         assert sentence in result.stderr
     assert pq.read_metadata(tmp_path / "out.parquet").num_rows == 2 * values

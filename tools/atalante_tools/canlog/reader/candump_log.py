@@ -65,7 +65,7 @@ def _remark(log: LogFile, unreadable: int, example: bytes, last_line: bytes, bro
     if unreadable:
         log.remark(
             "log-unreadable",
-            f"{log.path} has {unreadable} lines that are no CAN frame and were not checked; the first is {_shown(example)}",
+            f"{log.path} has {unreadable} lines that are not CAN frames and were not checked; the first is {_shown(example)}",
             unreadable,
             -1,
         )
