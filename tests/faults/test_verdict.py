@@ -24,6 +24,7 @@ S = SupervisorState
 FIRST, PRESSED = 11, 41
 ROW = Row("F99", "", "", "2 / 5", "", S.HOLD, "NODE_TIMEOUT", ())
 #: ACTIVE, HOLD from the fifth faulty cycle, ACTIVE again after START.
+IMPROVED = "the state must not improve without the operator, but it became ACTIVE in cycle 31"
 HELD = [S.ACTIVE] * 14 + [S.HOLD] * 28 + [S.ACTIVE] * 8
 EXPECTED_EVENTS = (Event(12, "NODE_TIMEOUT", "", node="LEFT_SK"),)
 
@@ -77,7 +78,7 @@ def test_reaction_time_is_measured_to_the_first_hold_frame(make_observation: Any
         ([S.HOLD] * 40 + [S.ACTIVE] * 10, {}, ["the robot must be ACTIVE before the fault, got HOLD"]),
         ([S.ACTIVE] * 14 + [S.FAULT] * 30 + [S.ACTIVE], {}, ["the final state must be HOLD, got FAULT"]),
         (HELD, {"state": S.ACTIVE}, ["the robot must stay ACTIVE, got HOLD after 5 cycles"]),
-        ([*HELD[:30], *[S.ACTIVE] * 5, *[S.HOLD] * 10, S.ACTIVE], {}, ["the state must not improve without the operator, but it became ACTIVE in cycle 31"]),
+        ([*HELD[:30], *[S.ACTIVE] * 5, *[S.HOLD] * 10, S.ACTIVE], {}, [IMPROVED]),
         (HELD[:42], {}, ["the operator's START must lead to ACTIVE, got HOLD"]),
         (HELD, {"recovers": False}, ["the robot must not be ACTIVE after START, because the fault persists"]),
     ],

@@ -244,5 +244,5 @@ def _drift(side: str, joints: tuple[str, ...], error: float) -> Finding:
 
 
 def _stuck(joint: int, change: float) -> Finding:
-    text = f"the encoder of {JOINTS[joint]} had a constant reading while its leg turned by {math.degrees(-change):+.2f} degrees"
+    text = f"the encoder of {JOINTS[joint]} has a constant reading while its leg turned by {math.degrees(-change):+.2f} degrees"
     return Finding(Dtc.ENC_STUCK, JOINT_NODES[joint], -change, True, text)

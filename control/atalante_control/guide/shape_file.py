@@ -69,7 +69,9 @@ def _shape(document: Mapping[str, Any]) -> GuideShape:
         raise ValueError(f"format must be {FORMAT!r}, got {document['format']!r}")
     name, summary = document["name"], document.get("summary", "")
     if not (isinstance(name, str) and _NAME.fullmatch(name)):
-        raise ValueError(f"name must start with a lower-case letter, followed by at most 31 of a-z, 0-9, - and _, got {name!r}")
+        raise ValueError(
+            f"name must start with a lower-case letter, followed by at most 31 of a-z, 0-9, - and _, got {name!r}"
+        )
     if name in SHAPES:
         raise ValueError(f"name must differ from the shapes of this package ({', '.join(SHAPES)}), got {name!r}")
     if not isinstance(summary, str):

@@ -164,7 +164,9 @@ def automatic_improvements(run: Observation, until: int) -> list[str]:
     """
     for cycle in range(run.first + 1, until + 1):
         if run.state(cycle) < run.state(cycle - 1):
-            return [f"the state must not improve without the operator, but it became {run.state(cycle).name} in cycle {cycle}"]
+            return [
+                f"the state must not improve without the operator, but it became {run.state(cycle).name} in cycle {cycle}"
+            ]
     return []
 
 
@@ -179,7 +181,9 @@ def _state(run: Observation, case: Case, expected: Expectation, reaction: int | 
         return [f"no {expected.state.name} within {run.latency(run.last_before_start)} cycles"]
     found = []
     if run.latency(reaction) > expected.reacted:
-        found.append(f"{expected.state.name} must come within {expected.reacted} cycles of the fault, got {run.latency(reaction)}")
+        found.append(
+            f"{expected.state.name} must come within {expected.reacted} cycles of the fault, got {run.latency(reaction)}"
+        )
     if run.state(run.last_before_start) is not expected.state:
         found.append(f"the final state must be {expected.state.name}, got {run.state(run.last_before_start).name}")
     return found
