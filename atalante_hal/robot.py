@@ -86,7 +86,8 @@ class Thresholds:
     #: Smallest torque limit of a hot drive that permits walking, as a share of the limit of the same joint in the other leg.
     derated_imbalance: float
     full_assist_ramp: float  # s, time for the ramp of the assistance factor from 0 to 1 in FULL_ASSIST
-    position_tolerance: float  # rad, distance outside a position limit above which a joint is out of range
+    #: Largest angle outside a position limit that is still accepted [rad]. Beyond it, the joint is out of range.
+    position_tolerance: float
     #: Largest torque that a drive may report while it is off [Nm]. A drive that is on may exceed its limit by this torque.
     idle_torque: float
     surplus_frames: float  # largest number of frames in a cycle, in addition to one frame of each cyclic message

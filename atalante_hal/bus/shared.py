@@ -41,8 +41,8 @@ _HEADER_BYTES = mmap.PAGESIZE
 _POLL_TIME = 500e-6
 #: Number of waits without polling that follow a wait in which polling found no frame. They save computing time.
 _WAITS_WITHOUT_POLLING = 32
-#: Longest sleep [ms]. After it, the end reads the memory again even without a wake-up byte, because the byte may arrive before
-#: the new value in the memory becomes visible.
+#: Longest sleep of a waiting end [ms]. A wake-up byte may arrive before the new value in the memory is visible, without a second
+#: byte after it. So a waiting end reads the memory again after this time.
 _SLEEP = 20
 _WAKE_UP = b"\0"
 _REASON_BYTES = 4096

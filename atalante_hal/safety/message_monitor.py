@@ -36,7 +36,7 @@ from atalante_hal.safety.fault_memory import FaultMemory
 from atalante_hal.wire.e2e import FULL, SETTLED, Check, Qualification, qualify, suspect
 from atalante_hal.wire.process_image import NEVER, ReceiveImage
 
-#: Diagnostic that becomes pending when a message is rejected, by the check result of the message.
+#: Check result of a rejected message -> diagnostic that becomes pending.
 PENDING = {
     Check.REPEATED: Dtc.E2E_REPEATED,
     Check.CONFLICT: Dtc.E2E_REPEATED,  # if only one frame of the message arrived in the cycle; otherwise see `rivals_of`
@@ -238,7 +238,7 @@ def rivals_of(refused: Sequence[tuple[int, Check]], checks: Sequence[int]) -> fr
     """
     intact = Counter(row for row, result in refused if result in _INTACT)
     for row in intact:
-        intact[row] += checks[row] <= _FRESH or checks[row] == Check.IMPLAUSIBLE  # the accepted frame is intact, too
+        intact[row] += checks[row] <= _FRESH or checks[row] == Check.IMPLAUSIBLE  # count the accepted frame of the row
     return frozenset(row for row, result in refused if result in _RIVAL and intact[row] > 1)
 
 

@@ -25,7 +25,7 @@ Words = npt.NDArray[np.int64]
 WORD, SHIFT, MASK, LARGEST, LOW, HIGH, INVALID = range(7)
 #: Row indices of the scales, for the formula value = (code + base) * factor + offset.
 BASE, FACTOR, OFFSET = range(3)
-#: Value of `plan[INVALID, i]` if signal i has no invalid code. The function `encode` returns it if all values were encoded.
+#: In `plan[INVALID, i]`: signal i has no invalid code. As the result of `encode`: all values were encoded.
 NO_CODE = -1
 # Results of `read_row`. INSIDE: all signals are in range. OUTSIDE: a signal is out of range, and none has its invalid code.
 # MARKED_INVALID: a signal is out of range, and a signal has its invalid code.

@@ -52,7 +52,7 @@ class DriveParameters:
     supply: float = 48.0  # nominal supply voltage [V]
     hold_below: float = 40.0  # lowest supply voltage without a local hold [V]
     off_below: float = 20.0  # lowest supply voltage at which the power stage works [V]
-    rest_speed: float = 0.05  # joint speed below which the lowering of a joint has ended [rad/s]
+    rest_speed: float = 0.05  # the controlled lowering of a leg ends when its joint is slower than this [rad/s]
 
 
 class DriveSignals(NamedTuple):

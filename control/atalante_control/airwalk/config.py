@@ -49,7 +49,7 @@ class AirwalkConfig(StepGuideConfig):
             # the baseline controller adds no gravity torque.
             literal_law=True,
             gains=replace(AIR_GAINS, integral_limit=math.inf),
-            feedforward=0.0,  # the experiment of the paper in the air had no feedforward
+            feedforward=0.0,  # the paper used no feedforward in its experiment in the air
             gentler=(),  # the filter has no softer sets of gains to choose from
             blend=0.0,  # torque jumps at stance changes are not compensated
         )

@@ -205,7 +205,7 @@ class _Horizon:
         beyond = prediction.beyond * SIZES
         self._factor = (beyond * rows[-1]).sum(axis=1) / (rows[-1] ** 2).sum(axis=1)
         remainder = beyond - self._factor[:, None] * rows[-1]
-        #: two cycles before the end of the horizon, and the weights of their errors
+        #: pairs of earlier cycles, as numbers of cycles ahead, and the weights of the errors in these cycles
         self._pairs: list[tuple[tuple[int, int], Vector]] = []
         for near, far in ((0.1, 0.3), (0.25, 0.5), (0.4, 0.7)):
             lags = round(near * self.cycles), round(far * self.cycles)

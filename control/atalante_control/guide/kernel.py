@@ -17,7 +17,7 @@ from atalante_hal.types import Vector
 
 Pair = tuple[float, float]
 
-#: Torque / limit and speed / limit, both denoted x, are converted to the ratio `1 - STEEPNESS * (1 - x)`. The value 1 stays 1.
+#: The kernel replaces a share `x = torque / limit` or `x = speed / limit` by `1 - STEEPNESS * (1 - x)`, which is 1 at x = 1, too.
 #: The gait alone needs a large part of both limits, so the gate must rise only when torque or speed is near its limit.
 STEEPNESS = 4.0
 #: Number of elements of the compressed state, from which the predicted errors are computed.

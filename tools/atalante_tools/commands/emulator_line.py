@@ -108,7 +108,7 @@ class Line(ResilientBus):
         return count
 
     def _from_another_robot(self, frames: Frames) -> list[tuple[int, int]]:
-        """Return identifier and counter of each intact frame that belongs to an emulated node other than the pendant."""
+        """Return identifier and counter of each received frame that only this emulator should send, except pendant frames."""
         ids = frames["can_id"].tolist()
         if self._own.keys().isdisjoint(ids):
             return []

@@ -1,4 +1,4 @@
-"""Errors that the DBC loader reports, split into one finding with a line number per error."""
+"""Errors that the DBC loader reports, as a list of findings. Each finding is one error with its line number."""
 
 from __future__ import annotations
 

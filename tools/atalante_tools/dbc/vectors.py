@@ -59,7 +59,7 @@ class Vectors:
         self._order = self._stream_order()
 
     def _stream_order(self) -> npt.NDArray[np.intp]:
-        """Return the order of the bytes of an image in the stream, as indices into the concatenated arrays of `images`."""
+        """Return, for each byte of the stream, its index in the concatenated arrays of one image."""
         build, codec = self._build, self._codec
         rows = len(build.messages)
         parts = (FRAME_BYTES * rows, FRAME_BYTES * rows, 8 * codec.size, 8 * codec.size, rows)

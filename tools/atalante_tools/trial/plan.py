@@ -162,7 +162,7 @@ def assist_trials(setting: WalkSetting, masses: Sequence[float] = ()) -> list[Tr
 
 
 def sweep_trials(setting: WalkSetting, factors: Sequence[float], days: int) -> list[Trial]:
-    """Return the trials of the sweep: on each day the treadmill, then one walk of the active subject for each factor.
+    """Return the trials of the sweep. Each day has a treadmill trial, then one walk of an active subject for each factor.
 
     Args:
         setting: what all walks share.

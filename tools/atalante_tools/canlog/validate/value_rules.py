@@ -119,7 +119,7 @@ class ValueRules:
                 self._check_outside(decoded, stream, index, outside, decoded.codes[index].astype(np.float64))
 
     def _check_limit(self, checks: _FamilyChecks, decoded: Decoded, stream: Stream, index: int) -> None:
-        """Check each value of a field in which at least one raw code is outside the range."""
+        """Report the frames in which the raw code of a signal is outside its range."""
         codec, codes = decoded.family.codec, decoded.codes[index]
         low, high = checks.bounds[index]
         outside = (codes < low) | (codes > high)
