@@ -105,7 +105,7 @@ def _gait(trial: Trial, folder: Path) -> Path:
     from atalante_control.gait.walk import write_walk
     from atalante_control.gait_optimization.walk import solve_walk
     from atalante_hal.robot import load_robot
-    from atalante_tools.session.walk import DEFAULT_STEP
+    from atalante_tools.session.walk_options import DEFAULT_STEP
 
     file = folder / f"gait_{trial.patient.mass:g}kg.json"
     if not file.exists():

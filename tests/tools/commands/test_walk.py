@@ -11,7 +11,7 @@ from mcap.reader import make_reader
 
 from atalante_emulator.pendant import Operator
 from atalante_tools.cli import cli
-from atalante_tools.session.walk import Dial
+from atalante_tools.session.dial import Dial
 
 
 def run(*arguments: str) -> tuple[int, str, str]:

@@ -77,3 +77,14 @@ def test_compilation_notice_is_printed_once(capsys: pytest.CaptureFixture[str]) 
     finally:
         logger.handlers, logger.level = before
     assert capsys.readouterr().err == ("compiling: takes some seconds, only once after an installation or an update\n")
+
+
+def test_bar_shows_the_finished_share_and_the_time_left_when_a_line_is_due() -> None:
+    now, log = [0.0], io.StringIO()
+    progress = Progress(period=1.0, stream=log, now=lambda: now[0])
+    now[0] = 0.5
+    progress.bar(1, 4, "runs")
+    assert log.getvalue() == ""
+    now[0] = 2.0
+    progress.bar(1, 4, "runs")
+    assert log.getvalue() == f"[{'#' * 6}{'.' * 18}] 1 of 4 runs, 6 s left\n"

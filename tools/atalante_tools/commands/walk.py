@@ -20,7 +20,8 @@ from atalante_tools.console.options import (
 from atalante_tools.session.law import Law, law_options
 from atalante_tools.session.recording import RECORDING_OPTIONS, RecordingOptions
 from atalante_tools.session.shapes import SHAPE_HELP
-from atalante_tools.session.walk import DEFAULT_PATIENT, DEFAULT_STEP, Push, WalkOptions, walk
+from atalante_tools.session.walk import walk
+from atalante_tools.session.walk_options import DEFAULT_PATIENT, DEFAULT_STEP, Push, WalkOptions
 
 if TYPE_CHECKING:
     from atalante_control.gait.subject import Subject

@@ -15,6 +15,8 @@ import click
 LIVE: Final = 0.2
 #: Time between two progress lines if stderr is a file or a pipe [s].
 LOGGED: Final = 5.0
+#: Width of the bar of a progress line [characters].
+_BAR: Final = 24
 
 
 def print_message(text: str) -> None:
@@ -80,7 +82,8 @@ class Progress:
         self._live = self._stream.isatty()
         self._now = now
         self._period = period or (LIVE if self._live else LOGGED)
-        self._next = now() + self._period
+        self._begun = now()
+        self._next = self._begun + self._period
         self._width = 0
 
     def due(self) -> bool:
@@ -96,6 +99,19 @@ class Progress:
             self._width = len(text)
         else:
             self._stream.write(text + "\n")
+
+    def bar(self, done: int, total: int, unit: str) -> None:
+        """Print a bar with the finished share of a task and the time that it still needs, if the next line is due.
+
+        Args:
+            done: Number of finished parts, at least 1.
+            total: Number of all parts.
+            unit: What a part is called, in the plural.
+        """
+        if self.due():
+            full = _BAR * done // total
+            left = (self._now() - self._begun) / done * (total - done)
+            self.show(f"[{'#' * full}{'.' * (_BAR - full)}] {done} of {total} {unit}, {left:.0f} s left")
 
     def clear(self) -> None:
         """Erase the progress line on a terminal, before other text is printed."""

@@ -27,8 +27,6 @@ if TYPE_CHECKING:
     from atalante_tools.faults.report import Summary
     from atalante_tools.faults.tasks import Result, Task
 
-_BAR = 24  # characters
-
 
 @click.group()
 def command() -> None:
@@ -169,15 +167,12 @@ def _done(tasks: Sequence[Task], *, engine: str, jobs: int = 1, dask: str = "") 
 
     if not dask:  # on a cluster, the engine is needed only on the workers
         require_engine(engine)
-    progress, begun = Progress(), time.monotonic()
+    progress = Progress()
     try:
         for count, result in enumerate(results(tasks, jobs=jobs, dask=dask), 1):
             yield result
             check_stop()
-            if progress.due():
-                full = _BAR * count // len(tasks)
-                left = (time.monotonic() - begun) / count * (len(tasks) - count)
-                progress.show(f"[{'#' * full}{'.' * (_BAR - full)}] {count} of {len(tasks)} runs, {left:.0f} s left")
+            progress.bar(count, len(tasks), "runs")
     finally:
         progress.clear()
 

@@ -29,15 +29,13 @@ from atalante_tools.session.recording import (
 )
 from atalante_tools.session.run_folder import run_folder
 from atalante_tools.session.walk_observation import Observation
-from atalante_tools.session.walk_options import DEFAULT_PATIENT, DEFAULT_STEP, Push, WalkOptions, gaits_of
+from atalante_tools.session.walk_options import WalkOptions, gaits_of
 from atalante_tools.session.walk_result import WalkResult, diagnostics, guide_fields, show_result, write_result
 from atalante_tools.session.walk_watch import WalkWatch
 
 if TYPE_CHECKING:
     from atalante_control.walking.controller import WalkController
     from atalante_hal.telemetry.child import TelemetryChild
-
-__all__ = ["DEFAULT_PATIENT", "DEFAULT_STEP", "Dial", "Push", "WalkOptions", "WalkResult", "gaits_of", "walk"]
 
 
 def walk(target: Target, options: WalkOptions, *, as_json: bool) -> None:

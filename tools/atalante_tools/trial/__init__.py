@@ -6,7 +6,6 @@ experiment -> trials (`plan`) -> results in files (`run`, `store`) -> findings -
 from __future__ import annotations
 
 import os
-import time
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -31,7 +30,6 @@ if TYPE_CHECKING:
     from atalante_tools.trial.plan import Trial
 
 _Command = TypeVar("_Command", bound=Callable[..., Any])
-_BAR = 24  # characters
 
 
 @dataclass(frozen=True)
@@ -217,15 +215,12 @@ def _run_missing(trials: Sequence[Trial], running: Running) -> None:
         require_engine(running.engine)
     where = f"the workers of {running.dask}" if running.dask else f"{running.jobs} processes"
     print_message(f"{len(missing)} of {len(trials)} trials to run on {where}")
-    progress, begun, done = Progress(), time.monotonic(), 0
+    progress, done = Progress(), 0
     try:
         for _ in compute(missing, folder, jobs=min(running.jobs, len(missing)), cluster=running.dask):
             done += 1
             check_stop()
-            if progress.due():
-                full = _BAR * done // len(missing)
-                left = (time.monotonic() - begun) / done * (len(missing) - done)
-                progress.show(f"[{'#' * full}{'.' * (_BAR - full)}] {done} of {len(missing)} trials, {left:.0f} s left")
+            progress.bar(done, len(missing), "trials")
     finally:
         progress.clear()
         if done < len(missing):
