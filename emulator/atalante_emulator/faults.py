@@ -65,12 +65,17 @@ def _is_number(value: object) -> bool:
     return type(value) in (int, float) and math.isfinite(value)  # type: ignore[arg-type]
 
 
-def _choice(names: Sequence[str]) -> Parameter:
-    return Parameter(f"one of {', '.join(names)}", lambda value: value in names)
+def _choice(names: Sequence[str], *, default: str | None = None) -> Parameter:
+    return Parameter(f"one of {', '.join(names)}", lambda value: value in names, default)
 
 
 _P = _number(0.0, 1.0, default=1.0)
 _MESSAGE = Parameter("the name of a message", lambda value: isinstance(value, str))
+_OTHER = Parameter("the name of another node of the same kind", lambda value: isinstance(value, str))
+#: Name of all force cells of a foot together.
+ALL_CELLS: Final = "all"
+_CELL: Final = (*CELLS, ALL_CELLS)
+_AXES: Final = ("X", "Y", "Z")
 #: Target name for supply faults that affect all drives. No node has this name.
 BATTERY: Final = "battery"
 _SUPPLIED: Final = f"drive or {BATTERY}"
@@ -173,6 +178,7 @@ NODE_KINDS: Final[Mapping[str, Kind]] = {
     "encoder_drift": Kind(
         "the error of an encoder grows", "drive", {"rate": _number(-10.0, 10.0, "rad/s of the joint")}
     ),
+    "encoder_swapped": Kind("two encoders are connected to each other's drive", "drive", {"other": _OTHER}),
     "dbc_hash": Kind(
         "a node reports the hash of another DBC", "node", {"hash": _whole(0, 0xFFFF_FFFF, default=0xDEADBEEF)}
     ),
@@ -188,6 +194,27 @@ SENSOR_KINDS: Final[Mapping[str, Kind]] = {
         "foot",
         {"cell": _choice(CELLS), "force": _number(-3000.0, 3000.0, "N", default=0.0)},
     ),
+    "cell_offset": Kind(
+        "the vertical force of one cell or of all cells of a foot has a constant error",
+        "foot",
+        {"cell": _choice(_CELL, default=ALL_CELLS), "force": _number(-3000.0, 3000.0, "N")},
+    ),
+    "cell_inverted": Kind(
+        "the vertical force of one cell or of all cells of a foot has the wrong sign",
+        "foot",
+        {"cell": _choice(_CELL, default=ALL_CELLS)},
+    ),
+    "imu_inverted": Kind(
+        "gyroscope and accelerometer of an IMU have the wrong sign about one axis, its attitude is correct",
+        "imu",
+        {"axis": _choice(_AXES)},
+    ),
+    "imu_turned": Kind(
+        "an IMU is mounted with a rotation about one of its axes",
+        "imu",
+        {"axis": _choice(_AXES), "degrees": _number(-180.0, 180.0, "deg", default=180.0)},
+    ),
+    "sensor_swapped": Kind("two IMUs or both feet send the values of each other", "imu or foot", {"other": _OTHER}),
 }
 
 KINDS: Final[Mapping[str, Kind]] = {**LINK_KINDS, **NODE_KINDS, **SENSOR_KINDS}
@@ -340,6 +367,13 @@ def nodes_of(fault: Fault, network: Network) -> tuple[str, ...]:
     if BATTERY in wanted:
         targets[BATTERY] = drives
     _check_target(fault, wanted, list(targets))
+    if "other" in dict(fault.parameters):
+        kind = next(node.kind for node in network.nodes if node.name == fault.target)
+        others = [node.name for node in network.of_kind(kind) if node.name != fault.target]
+        if fault["other"] not in others:
+            raise FaultError(
+                f"{fault.kind}: the parameter 'other' must be another {kind}, got {fault['other']!r}; valid: {', '.join(others)}"
+            )
     return targets[fault.target]
 
 

@@ -5,6 +5,7 @@ body -> NodeFaults.begin -> encoders, drives -> true values + noise -> NodeFault
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from typing import Final
 
@@ -13,18 +14,18 @@ import numpy as np
 from atalante_dbc import Network
 from atalante_emulator.drive import NODES, Drives
 from atalante_emulator.emergency import ERROR_RESET, Emergency, register_of
-from atalante_emulator.faults import NODE_KINDS, SENSOR_KINDS, Fault, nodes_of
+from atalante_emulator.faults import ALL_CELLS, NODE_KINDS, SENSOR_KINDS, Fault, nodes_of
 from atalante_emulator.heartbeat import Heartbeats
 from atalante_emulator.supply import HoldUp
-from atalante_hal.robot import Robot
+from atalante_hal.robot import CELLS, Robot
 from atalante_hal.types import PERIOD, Vector
 from atalante_hal.wire.cia402 import AUTOMATIC, DriveState
-from atalante_hal.wire.codec import Codec
+from atalante_hal.wire.codec import Codec, group_of
 
 Nodes = Sequence[str]
 
-#: Names of the measured IMU signals, without the letter of the axis.
-_MEASURED: Final = ("Quaternion", "Gyro", "Accel")
+#: Quantities that IMUs and feet measure.
+_MEASURED: Final = ("Quaternion", "Gyro", "Accel", "Force")
 
 
 class NodeFaults:
@@ -173,6 +174,11 @@ class NodeFaults:
         if cycle < fault.end:
             self._position[_drive(nodes)] += fault["rate"] * (cycle - fault.start) * PERIOD
 
+    def _encoder_swapped(self, fault: Fault, nodes: Nodes, cycle: int) -> None:
+        if cycle < fault.end:
+            pair = [_drive(nodes), NODES.index(fault["other"])]
+            self._position[pair] = self._position[pair[::-1]]
+
     # -- status of a node --------------------------------------------------------------------------------------------
 
     def _dbc_hash(self, fault: Fault, nodes: Nodes, cycle: int) -> None:
@@ -182,11 +188,11 @@ class NodeFaults:
     # -- sensors -----------------------------------------------------------------------------------------------------
 
     def _measured(self, node: str) -> list[int]:
-        """Return the indices of the measured values of an IMU."""
+        """Return the indices of the measured values of an IMU or a foot."""
         return [
             index
             for index, (message, signal) in enumerate(self._codec.signals)
-            if message.sender == node and signal.name.rstrip("WXYZ") in _MEASURED
+            if message.sender == node and group_of(signal.name) in _MEASURED
         ]
 
     def _imu_invalid(self, fault: Fault, node: str, values: Vector) -> None:
@@ -204,6 +210,45 @@ class NodeFaults:
 
     def _cell_stuck(self, fault: Fault, node: str, values: Vector) -> None:
         values[self._codec.index(f"{node}_STATE", f"{fault['cell']}_ForceZ")] = fault["force"]
+
+    def _cells(self, fault: Fault, node: str) -> list[int]:
+        """Return the indices of the vertical forces that a fault affects."""
+        cells = CELLS if fault["cell"] == ALL_CELLS else (fault["cell"],)
+        return [self._codec.index(f"{node}_STATE", f"{cell}_ForceZ") for cell in cells]
+
+    def _cell_offset(self, fault: Fault, node: str, values: Vector) -> None:
+        values[self._cells(fault, node)] += fault["force"]
+
+    def _cell_inverted(self, fault: Fault, node: str, values: Vector) -> None:
+        values[self._cells(fault, node)] *= -1.0
+
+    def _imu_inverted(self, fault: Fault, node: str, values: Vector) -> None:
+        for quantity in ("Gyro", "Accel"):
+            values[self._codec.index(f"{node}_STATE", quantity + fault["axis"])] *= -1.0
+
+    def _imu_turned(self, fault: Fault, node: str, values: Vector) -> None:
+        """Express the readings in the axes of a sensor that is turned in its mount."""
+        indices = self._measured(node)
+        quaternion, gyro, accel = np.split(values[indices], [4, 7])
+        angle, axis = math.radians(fault["degrees"]), np.eye(3)["XYZ".index(fault["axis"])]
+        cosine, sine = math.cos(angle / 2.0), math.sin(angle / 2.0) * axis
+        w, vector = quaternion[0], quaternion[1:]
+        attitude = np.array([w * cosine - vector @ sine, *(w * sine + cosine * vector + np.cross(vector, sine))])
+        values[indices] = np.concatenate(
+            [
+                math.copysign(1.0, attitude[0]) * attitude,
+                *(
+                    math.cos(angle) * seen
+                    + math.sin(angle) * np.cross(seen, axis)
+                    + (1.0 - math.cos(angle)) * (axis @ seen) * axis
+                    for seen in (gyro, accel)
+                ),
+            ]
+        )
+
+    def _sensor_swapped(self, fault: Fault, node: str, values: Vector) -> None:
+        mine, others = self._measured(node), self._measured(fault["other"])
+        values[[*mine, *others]] = values[[*others, *mine]]
 
 
 def _drive(nodes: Nodes) -> int:
@@ -225,6 +270,7 @@ _EFFECTS: Final[dict[str, Callable[[NodeFaults, Fault, Nodes, int], None]]] = {
     "encoder_stuck": NodeFaults._encoder_stuck,
     "encoder_jump": NodeFaults._encoder_jump,
     "encoder_drift": NodeFaults._encoder_drift,
+    "encoder_swapped": NodeFaults._encoder_swapped,
     "dbc_hash": NodeFaults._dbc_hash,
 }
 _SENSOR_EFFECTS: Final[dict[str, Callable[[NodeFaults, Fault, str, Vector], None]]] = {
@@ -232,4 +278,9 @@ _SENSOR_EFFECTS: Final[dict[str, Callable[[NodeFaults, Fault, str, Vector], None
     "imu_saturated": NodeFaults._imu_saturated,
     "imu_frozen": NodeFaults._imu_frozen,
     "cell_stuck": NodeFaults._cell_stuck,
+    "cell_offset": NodeFaults._cell_offset,
+    "cell_inverted": NodeFaults._cell_inverted,
+    "imu_inverted": NodeFaults._imu_inverted,
+    "imu_turned": NodeFaults._imu_turned,
+    "sensor_swapped": NodeFaults._sensor_swapped,
 }

@@ -12,7 +12,7 @@ from atalante_emulator.emulator import Emulator
 from atalante_emulator.faults import Fault, FaultError
 from atalante_emulator.pendant import Operator
 from atalante_hal.bus.pair import PairBus, lockstep_pair
-from atalante_hal.robot import Robot
+from atalante_hal.robot import CELLS, Robot
 from atalante_hal.types import PERIOD
 from atalante_hal.wire.cia402 import DriveState, controlword_towards_operation
 from atalante_hal.wire.frame import Frames, new_frames
@@ -321,6 +321,91 @@ class TestSensors:
         assert abs(hal.value("FOOT_LEFT_STATE", "RL_ForceZ")) < 100.0
 
 
+def forces(hal: PoseHolder, foot: str) -> np.ndarray:
+    """Return the vertical forces on the cells of a foot in the last cycle [N]."""
+    return np.array([hal.value(f"FOOT_{foot}_STATE", f"{cell}_ForceZ") for cell in CELLS])
+
+
+def readings(hal: PoseHolder, imu: str) -> dict[str, np.ndarray]:
+    """Return attitude wxyz, angular velocity [rad/s] and specific force [m/s2] of an IMU in the last cycle."""
+    return {
+        quantity: np.array([hal.value(f"IMU_{imu}_STATE", quantity + axis) for axis in axes])
+        for quantity, axes in (("Quaternion", "WXYZ"), ("Gyro", "XYZ"), ("Accel", "XYZ"))
+    }
+
+
+class TestMiswiredSensors:
+    """The same seed gives the same noise, so a faulty run is compared with a run without a fault."""
+
+    CYCLES = BEGIN + 2
+
+    def both(self, world: Make, fault: Fault) -> tuple[PoseHolder, PoseHolder]:
+        return world(cycles=self.CYCLES)[0], world(fault, cycles=self.CYCLES)[0]
+
+    @pytest.mark.parametrize(("cell", "changed"), [("all", [True] * 4), ("FR", [False, True, False, False])])
+    def test_offset_is_added_to_the_vertical_force(self, world: Make, cell: str, changed: list[bool]) -> None:
+        good, bad = self.both(world, Fault("cell_offset", "FOOT_LEFT", BEGIN, cell=cell, force=-200.0))
+        change = forces(bad, "LEFT") - forces(good, "LEFT")
+        assert change == pytest.approx(np.where(changed, -200.0, 0.0), abs=0.1)
+        assert forces(bad, "RIGHT").tolist() == forces(good, "RIGHT").tolist()
+
+    @pytest.mark.parametrize(("cell", "sign"), [("all", [-1.0] * 4), ("RL", [1.0, 1.0, -1.0, 1.0])])
+    def test_inverted_cell_has_the_opposite_force(self, world: Make, cell: str, sign: list[float]) -> None:
+        good, bad = self.both(world, Fault("cell_inverted", "FOOT_RIGHT", BEGIN, cell=cell))
+        assert forces(bad, "RIGHT") == pytest.approx(forces(good, "RIGHT") * sign, abs=0.1)
+        assert np.abs(forces(good, "RIGHT")).max() > 1.0
+
+    def test_inverted_axis_changes_gyroscope_and_accelerometer_but_not_the_attitude(self, world: Make) -> None:
+        good, bad = (readings(hal, "TORSO") for hal in self.both(world, Fault("imu_inverted", "IMU_TORSO", axis="Z")))
+        assert bad["Quaternion"].tolist() == good["Quaternion"].tolist()
+        for quantity in ("Gyro", "Accel"):
+            assert bad[quantity] == pytest.approx(good[quantity] * [1.0, 1.0, -1.0], abs=0.01)
+        assert bad["Accel"][2] == pytest.approx(-9.81, abs=0.3)
+
+    @pytest.mark.parametrize(
+        ("axis", "degrees", "up"),
+        [("X", 180.0, [0, 0, -1]), ("X", 90.0, [0, 1, 0]), ("Y", 90.0, [-1, 0, 0]), ("Z", -90.0, [0, 0, 1])],
+    )
+    def test_turned_imu_measures_in_its_own_axes(self, world: Make, axis: str, degrees: float, up: list[int]) -> None:
+        hal, _ = world(Fault("imu_turned", "IMU_TORSO", axis=axis, degrees=degrees), cycles=self.CYCLES)
+        seen = readings(hal, "TORSO")
+        w, x, y, z = seen["Quaternion"]
+        vertical = [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)]
+        assert vertical == pytest.approx(up, abs=1e-3)
+        assert seen["Accel"] == pytest.approx(9.81 * np.array(up), abs=0.4)
+        assert 2.0 * np.degrees(np.arccos(w)) == pytest.approx(abs(degrees), abs=0.1)
+        assert w >= 0.0
+
+    @pytest.mark.parametrize("axis", ["X", "Y", "Z"])
+    def test_turn_about_an_axis_keeps_the_readings_of_this_axis(self, world: Make, axis: str) -> None:
+        fault = Fault("imu_turned", "IMU_LEFT_TIBIA", BEGIN, axis=axis)
+        good, bad = (readings(hal, "LEFT_TIBIA") for hal in self.both(world, fault))
+        signs = np.where(np.array(["X", "Y", "Z"]) == axis, 1.0, -1.0)
+        for quantity in ("Gyro", "Accel"):
+            assert bad[quantity] == pytest.approx(good[quantity] * signs, abs=0.01)
+
+    def test_swapped_imus_send_the_values_of_each_other(self, world: Make) -> None:
+        good, bad = self.both(world, Fault("sensor_swapped", "IMU_PELVIS", BEGIN, other="IMU_RIGHT_TIBIA"))
+        for one, other in (("PELVIS", "RIGHT_TIBIA"), ("RIGHT_TIBIA", "PELVIS"), ("TORSO", "TORSO")):
+            for quantity, values in readings(bad, one).items():
+                assert values.tolist() == readings(good, other)[quantity].tolist()
+        assert readings(good, "PELVIS")["Quaternion"].tolist() != readings(good, "RIGHT_TIBIA")["Quaternion"].tolist()
+
+    def test_swapped_feet_send_the_forces_of_each_other(self, world: Make) -> None:
+        good, bad = self.both(world, Fault("sensor_swapped", "FOOT_LEFT", BEGIN, other="FOOT_RIGHT"))
+        assert forces(bad, "LEFT").tolist() == forces(good, "RIGHT").tolist()
+        assert forces(bad, "RIGHT").tolist() == forces(good, "LEFT").tolist()
+
+    def test_swapped_encoders_show_the_position_of_each_other_while_the_fault_lasts(self, world: Make) -> None:
+        hal, _ = world(Fault("encoder_swapped", "LEFT_SH", 0, 3, other="LEFT_SK"), cycles=3)
+        position = hal.joints("Position") / (hal.robot.gear * hal.robot.polarity)
+        expected = np.array(CROUCHED)
+        expected[[2, 3]] = expected[[3, 2]]
+        assert position == pytest.approx(expected, abs=0.01)
+        hal.run(1)
+        assert hal.joints("Position") / (hal.robot.gear * hal.robot.polarity) == pytest.approx(CROUCHED, abs=0.02)
+
+
 def test_dbc_hash_fault_changes_the_hash_of_one_node_while_it_lasts(world: Make, network: Network) -> None:
     hal, _ = world(Fault("dbc_hash", "LEFT_SK", 0, 150, hash=7), cycles=140)
     assert hal.value("LEFT_SK_STATUS", "DbcHash") == 7
@@ -449,6 +534,18 @@ class TestWire:
         (
             Fault("under_voltage", "HAPTICS", volts=1.0),
             "target must be of type drive or battery, got 'HAPTICS'; valid targets: LEFT_FH, .*, battery$",
+        ),
+        (
+            Fault("sensor_swapped", "LEFT_SK", other="FOOT_LEFT"),
+            "target must be of type imu or foot, got 'LEFT_SK'; valid targets: IMU_TORSO, .*, FOOT_RIGHT$",
+        ),
+        (
+            Fault("sensor_swapped", "FOOT_LEFT", other="IMU_TORSO"),
+            "sensor_swapped: the parameter 'other' must be another foot, got 'IMU_TORSO'; valid: FOOT_RIGHT$",
+        ),
+        (
+            Fault("encoder_swapped", "LEFT_SK", other="LEFT_SK"),
+            "encoder_swapped: the parameter 'other' must be another drive, got 'LEFT_SK'; valid: LEFT_FH, .*, RIGHT_HA$",
         ),
         (
             Fault("heartbeat_lost", "left_leg"),
