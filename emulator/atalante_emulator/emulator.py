@@ -113,6 +113,7 @@ class Emulator:
         self.frames_lost = 0  # number of frames lost because the transmit queue of the bus was full
         self.before_send: list[Callable[[int, Vector], None]] = []
         self.pelvis_forces: list[Callable[[int], Vector]] = []
+        self._pushing = False  # whether a wrench acted on the pelvis in the last time step
         self.crane: Crane | None = None  # crane of a robot on the ground, also an element of `pelvis_forces`
         self.virtual_operator: VirtualOperator | None = None  # also an element of `pelvis_forces`
         self.wearer: PassiveWearer | ActivePatient | None = None  # wearer whose limbs act on the joints
@@ -316,8 +317,9 @@ class Emulator:
 
     def _commands_in_step(self) -> bool:
         """Return whether no command is late. A command and the SYNC of the next cycle have the same alive counter."""
-        counters = self._counters
-        return all(counters[sync] == counters[command] for sync, command in self._leg_rows)
+        counters = self._counters.tobytes()
+        (left_sync, left), (right_sync, right) = self._leg_rows
+        return counters[left_sync] == counters[left] and counters[right_sync] == counters[right]
 
     def _check_delays(self) -> None:
         """Measure the delay of each valid new command, and reject commands that are late by `WATCHDOG` cycles or more.
@@ -431,8 +433,11 @@ class Emulator:
             wrench = first(hal_state)
             for force in others:
                 wrench = wrench + force(hal_state)
-            fx, fy, fz, mx, my, mz = wrench.tolist()
-            self.body.push((fx, fy, fz), (mx, my, mz))
+            acting = wrench.tolist()
+            pushing = any(acting)
+            if pushing or self._pushing:
+                self.body.push(acting[:3], acting[3:])
+            self._pushing = pushing
         if self.wearer is not None:
             self.wearer.act(self.body.position, self.body.velocity, self.drives.motors.limb)
         self.body.step(self.drives.drive(self.body.velocity))

@@ -7,6 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from atalante_emulator.bodies.soles import Soles
+from atalante_hal.compiled import specialised
+from atalante_hal.robot import FEET
 from atalante_hal.types import Vector
 
 
@@ -18,13 +20,33 @@ class FootParameters:
     temperature: float = 28.0  # constant temperature of all cells [degC]
 
 
+def _share(plate: Vector, sole_force: Vector, force: Vector) -> None:
+    """Compute the forces of the cells of both feet from the forces on the corners of the soles.
+
+    Args:
+        plate: matrix of each foot, shape (2, 12, 12).
+        sole_force: forces on the corners, shape (2, 4, 3) [N].
+        force: output for the forces of the cells, shape (2, 4, 3) [N].
+    """
+    for foot in range(len(plate)):
+        corners, cells = sole_force[foot].reshape(-1), force[foot].reshape(-1)
+        for row in range(len(cells)):
+            total = 0.0
+            for column in range(len(corners)):
+                total += plate[foot, row, column] * corners[column]
+            cells[row] = total
+
+
 class Feet:
     """Force cells of two feet, four cells per foot. `sample` updates the array of forces, shape (2, 4, 3) [N]."""
 
     def __init__(self, parameters: FootParameters, soles: Soles, force: Vector) -> None:
-        self._force = force.reshape(-1)
+        self._force = force
         self._scale = np.tile(np.array(parameters.noise), force.size // 3)
-        self._plate = soles.plate()
+        both, count = soles.plate(), force.size // len(FEET)
+        self._plate = np.array([both[first : first + count, first : first + count] for first in (0, count)])
+        self._corners = np.zeros_like(force)
+        self._share = specialised(_share, self._plate, self._corners, force)
         self._loaded = True
 
     def sample(self, sole_force: Vector, touching: bool) -> None:
@@ -35,7 +57,8 @@ class Feet:
             touching: whether a corner touched the floor. If False, `sole_force` must be zero.
         """
         if touching:
-            np.dot(self._plate, sole_force.reshape(-1), out=self._force)
+            self._corners[:] = sole_force
+            self._share(self._plate, self._corners, self._force)
         elif self._loaded:
             self._force.fill(0.0)
         self._loaded = touching

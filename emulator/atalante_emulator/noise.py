@@ -20,7 +20,8 @@ class SensorNoise:
     """Noise of all signals for `NOISE_CYCLES` cycles, in the signal order of the codec."""
 
     def __init__(self, seed: int, codec: Codec, drives: Drives, imus: Imus, feet: Feet) -> None:
-        self._noise = noise = np.zeros((NOISE_CYCLES, codec.size))
+        noise = np.zeros((NOISE_CYCLES, codec.size))
+        self._noise_of = list(noise)  # views of the rows
         self._drives, self._imus, self._feet = drives, imus, feet
         self._torque, self._gyro, self._accel, self._force = (
             noise[:, codec.slice(quantity)] for quantity in ("Torque", "Gyro", "Accel", "Force")
@@ -41,7 +42,7 @@ class SensorNoise:
             truth: values without noise, shape (codec.size,).
             values: output for the values with noise, shape (codec.size,).
         """
-        np.add(truth, self._noise[cycle % NOISE_CYCLES], values)
+        np.add(truth, self._noise_of[cycle % NOISE_CYCLES], values)
         if self._attitude.active:
             self._attitude.apply(cycle % NOISE_CYCLES / NOISE_CYCLES, values[self._quaternion].reshape(-1, 4))
 

@@ -131,15 +131,12 @@ class WalkController:
         self._stabiliser = Stabiliser(
             config.stabiliser, *config.shift_limit, flat_feet(exoskeleton)[LEFT].geometry[2], exoskeleton.toe_out
         )
-        self._measured = Measured(
-            np.zeros(_N),
-            np.zeros(_N),
-            np.zeros(3),
-            np.zeros(3),
-            np.zeros(3),
-            np.zeros((len(FEET), len(CELLS), 3)),
-            np.zeros(_N),
-        )
+        force = np.zeros((len(FEET), len(CELLS), 3))
+        #: Copy of the requested torque, used if the state does not contain the torque that was sent.
+        self._sent = np.zeros(_N)
+        self._state: State | None = None  # state whose arrays `_measured_by` contains
+        self._measured = Measured(np.zeros(_N), np.zeros(_N), np.zeros(3), np.zeros(3), np.zeros(3), force, self._sent)
+        self._measured_by = {_PELVIS: self._measured, _TORSO: self._measured}
         stages: Records[Stage] = zeros(Stage, 1)
         sensed: Records[Sensed] = zeros(Sensed, 1)
         balances: Records[Balance] = zeros(Balance, 1)
@@ -167,6 +164,10 @@ class WalkController:
             balances=balances,
             outputs=outputs,
             telemetry=telemetry,
+        )
+        self._carrying = config.loaded * weight  # N, smallest load of each foot that counts as standing on both feet
+        self._settled, self._rest, self._timeout = (
+            round(seconds / PERIOD) for seconds in (config.settle, config.rest, config.landing_timeout)
         )
         self._command = Command(outputs[0].torque, np.zeros(len(MOTORS)))
         self._table = self._tables[Phase.POSTURE, RIGHT]
@@ -257,6 +258,7 @@ class WalkController:
         """
         self._forget(state.cycle)
         self._observer.reset(state.imu_quaternion[_PELVIS].tolist())
+        self._bind(state)
         self._measure(state)
         self._sense(self._measured, self._table, self._constants, self._stabiliser, self._parts)
         self._start(self._measured, self._table, self._parts)
@@ -287,35 +289,45 @@ class WalkController:
         self._watch_guide(cycle)
         return self._command
 
+    def _bind(self, state: State) -> None:
+        """Use the arrays of a state as the measurements of the kernels. A state has the same array objects in every cycle.
+
+        Args:
+            state: measured state of the robot.
+
+        Raises:
+            TypeError: If an array is not a contiguous array of float64, because the kernels do not check the type.
+        """
+        sent = self._sent if state.torque_sent is None else state.torque_sent
+        for imu, position in self._imus.items():
+            gyro, accel = state.imu_gyro[imu], state.imu_accel[imu]
+            measured = Measured(state.position, state.velocity, position, gyro, accel, state.foot_force, sent)
+            for name, array, like in zip(Measured._fields, measured, self._measured, strict=True):
+                if not (array.flags.carray and array.dtype == np.float64 and array.shape == like.shape):
+                    raise TypeError(
+                        f"{name} must be a contiguous array of {like.shape} float64, got {array.shape} {array.dtype}"
+                    )
+            self._measured_by[imu] = measured
+        self._state = state
+
     def _measure(self, state: State) -> None:
-        measured = self._measured
+        """Select the measurements of this cycle: those of the torso IMU if the data of the pelvis IMU is too old."""
+        if state is not self._state:
+            self._bind(state)
         lost = bool(state.imu_rows) and state.age[state.imu_rows[_PELVIS]] > _IMU_AGE
-        imu = _TORSO if lost else _PELVIS
-        measured.q[:], measured.qd[:] = state.position, state.velocity
-        measured.imu[:], measured.gyro[:], measured.accel[:] = (
-            self._imus[imu],
-            state.imu_gyro[imu],
-            state.imu_accel[imu],
-        )
-        measured.force[:] = state.foot_force
-        measured.sent[:] = self._pid.requested if state.torque_sent is None else state.torque_sent
+        self._measured = self._measured_by[_TORSO if lost else _PELVIS]
+        if state.torque_sent is None:
+            self._sent[:] = self._pid.requested
 
     def _facts(self, cycle: int) -> Facts:
-        config, load, weight = self.config, self._load, self._constants.weight
-        self._loaded = self._loaded + 1 if min(load.tolist()) >= config.loaded * weight else 0
-        nominal, landed = len(self._table.rows) - 1, False
-        if self.phase in STEPPING:
-            landed = self._impact.update(float(load[1 - self._stance]), cycle / nominal)
-            self._landed = landed
-        return Facts(
-            elapsed=cycle,
-            nominal=nominal,
-            rest=round(config.rest / PERIOD),
-            timeout=round(config.landing_timeout / PERIOD),
-            landed=landed,
-            loaded=self._loaded >= round(config.settle / PERIOD),
-            stopping=self._stopping or self.statistics.steps + (self.phase is Phase.STEP) >= self._steps_wanted,
-        )
+        phase, nominal, landed = self.phase, len(self._table.rows) - 1, False
+        load = self._load.tolist()
+        self._loaded = self._loaded + 1 if min(load) >= self._carrying else 0
+        if phase in STEPPING:
+            landed = self._landed = self._impact.update(load[1 - self._stance], cycle / nominal)
+        steps = self.statistics.steps + (phase is Phase.STEP)
+        loaded, stopping = self._loaded >= self._settled, self._stopping or steps >= self._steps_wanted
+        return Facts(cycle, nominal, self._rest, self._timeout, landed, loaded, stopping)
 
     def _begin(self, phase: Phase, cycle: int, xi: float) -> None:
         """Start a phase: set stance leg and steering, start the re-centring from the measured motion, and start the guide."""

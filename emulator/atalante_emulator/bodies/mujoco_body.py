@@ -11,7 +11,7 @@ import numpy as np
 from atalante_emulator.bodies import FRICTION, GRAVITY, LINK_STATE, PELVIS, Motion, Pose
 from atalante_emulator.bodies.links import FOOT_LINKS, IMU_LINKS, PAD_LINKS, find
 from atalante_emulator.bodies.soles import into_frame, read_soles, total_mass
-from atalante_hal.compiled import compiled
+from atalante_hal.compiled import specialised
 from atalante_hal.robot import CELLS, FEET, IMUS, JOINTS
 from atalante_hal.types import PERIOD, Vector
 
@@ -37,37 +37,49 @@ class Contact(NamedTuple):
 
 
 class _Sensed(NamedTuple):
-    """Sensor data of MuJoCo. All arrays are views of `sensordata`."""
+    """State and sensor data of MuJoCo. All arrays are views of arrays of MuJoCo."""
 
+    position: Vector  # joint positions, shape (12,) [rad]
+    motion: Vector  # joint velocities, shape (12,) [rad/s]
     attitude: Vector  # quaternion wxyz of the IMU links and the feet, shape (6, 4)
     velocity: Vector  # velocity of the IMU links in the world, shape (4, 3) [m/s]
     rate: Vector  # angular velocity of the IMU links in world axes, shape (4, 3) [rad/s]
     force: Vector  # force of the floor on each corner in world axes, shape (8, 3) [N]
 
 
-def _unpack(sensed: _Sensed, imu: Vector, force: Vector) -> bool:
-    """Convert the sensor data of a time step. Return whether a corner touches the floor.
+class _Read(NamedTuple):
+    """Results of a time step, as the properties of `Body` return them. The body owns the arrays."""
+
+    position: Vector  # shape (12,) [rad]
+    velocity: Vector  # shape (12,) [rad/s]
+    imu: Vector  # link states of the IMUs, shape (4, LINK_STATE)
+    force: Vector  # forces on the corners in the axes of the feet, shape (2, 4, 3) [N]
+
+
+def _unpack(sensed: _Sensed, read: _Read) -> bool:
+    """Convert the state and the sensor data of a time step. Return whether a corner touches the floor.
 
     Args:
-        sensed: sensor data.
-        imu: output for the link states of the IMUs, shape (4, LINK_STATE).
-        force: output for the forces on the corners in the axes of the feet, shape (2, 4, 3) [N].
+        sensed: state and sensor data of MuJoCo.
+        read: output for the results.
     """
-    attitude, velocity, rate, pads = sensed
+    attitude, velocity, rate, pads = sensed.attitude, sensed.velocity, sensed.rate, sensed.force
+    imu, force = read.imu, read.force
+    for joint in range(len(read.position)):
+        read.position[joint], read.velocity[joint] = sensed.position[joint], sensed.motion[joint]
     imus = len(imu)
     for i in range(imus):
         imu[i, 0], imu[i, 1], imu[i, 2], imu[i, 3] = attitude[i, 1], attitude[i, 2], attitude[i, 3], attitude[i, 0]
-        imu[i, 4:7] = velocity[i]
-        imu[i, 7:10] = rate[i]
+        for k in range(3):
+            imu[i, 4 + k], imu[i, 7 + k] = velocity[i, k], rate[i, k]
     touching = False
-    foot_attitude = np.empty(4)
     for foot in range(force.shape[0]):
         row = attitude[imus + foot]
-        foot_attitude[0], foot_attitude[1], foot_attitude[2], foot_attitude[3] = row[1], row[2], row[3], row[0]
+        xyzw = row[1], row[2], row[3], row[0]
         for pad in range(force.shape[1]):
             x, y, z = pads[foot * force.shape[1] + pad]
             touching |= z != 0.0
-            force[foot, pad] = into_frame(foot_attitude, x, y, z)
+            force[foot, pad, 0], force[foot, pad, 1], force[foot, pad, 2] = into_frame(xyzw, x, y, z)
     return touching
 
 
@@ -113,16 +125,17 @@ class MuJoCoBody:
         first = model.jnt_dofadr[model.joint(JOINTS[0]).id]
         assert [model.jnt_dofadr[model.joint(name).id] - first for name in JOINTS] == list(range(len(JOINTS)))
         q = model.jnt_qposadr[model.joint(JOINTS[0]).id]
-        self._q, self._v = data.qpos[q : q + len(JOINTS)], data.qvel[first : first + len(JOINTS)]
+        self._q = data.qpos[q : q + len(JOINTS)]
         self._torque = data.qfrc_applied[first : first + len(JOINTS)]
         pelvis = model.body(PELVIS).id
         self._wrench = data.xfrc_applied[pelvis]
-        self._sensed = _views(data.sensordata)
+        self._sensed = _Sensed(self._q, data.qvel[first : first + len(JOINTS)], *_views(data.sensordata))
         self.position, self.velocity = np.zeros((2, len(JOINTS)))
         self.imu = np.zeros((len(IMUS), LINK_STATE))
         self.sole_force, self.touching = np.zeros((len(FEET), len(CELLS), 3)), False
-        self._unpack = compiled(_unpack)
-        # This call also compiles the kernel. In the first cycle, the compilation would take too long.
+        self._results = _Read(self.position, self.velocity, self.imu, self.sole_force)
+        # Compile the kernel now, because compilation takes longer than a cycle.
+        self._unpack = specialised(_unpack, self._sensed, self._results)
         self.reset([0.0] * len(JOINTS))
 
     def reset(self, position: Sequence[float], base: Pose | None = None) -> None:
@@ -190,8 +203,7 @@ class MuJoCoBody:
         mujoco.mj_step1(self._model, self._data)
 
     def _read(self) -> None:
-        self.position[:], self.velocity[:] = self._q, self._v
-        self.touching = self._unpack(self._sensed, self.imu, self.sole_force)
+        self.touching = self._unpack(self._sensed, self._results)
 
     def close(self) -> None:
         """Do nothing. The memory of MuJoCo is released with this object."""
@@ -252,9 +264,10 @@ def _add_sensors(spec: Any, floor: bool) -> None:
             )  # fmt: skip
 
 
-def _views(data: Any) -> _Sensed:
+def _views(data: Any) -> tuple[Vector, Vector, Vector, Vector]:
+    """Return the last four fields of `_Sensed` as views of the sensor data."""
     attitudes, imus, pads = len(IMUS) + len(FEET), len(IMUS), len(PAD_LINKS)
     ends = np.cumsum([4 * attitudes, 3 * imus, 3 * imus])
     attitude, velocity, rate, force = np.split(data, ends)
     force = force.reshape(-1, 3) if force.size else np.zeros((pads, 3))
-    return _Sensed(attitude.reshape(-1, 4), velocity.reshape(-1, 3), rate.reshape(-1, 3), force)
+    return attitude.reshape(-1, 4), velocity.reshape(-1, 3), rate.reshape(-1, 3), force

@@ -16,6 +16,8 @@ import numpy as np
 from atalante_hal.robot import CELLS, FEET
 from atalante_hal.types import Vector
 
+Quaternion = tuple[float, float, float, float]
+
 
 @dataclass(frozen=True)
 class Soles:
@@ -86,7 +88,7 @@ def total_mass(urdf: str) -> float:
     return sum(float(mass.attrib["value"]) for mass in ET.fromstring(urdf).iterfind("link/inertial/mass"))
 
 
-def into_frame(attitude: Vector, x: float, y: float, z: float) -> tuple[float, float, float]:
+def into_frame(attitude: Vector | Quaternion, x: float, y: float, z: float) -> tuple[float, float, float]:
     """Transform a vector from world axes into the axes of a frame. Compiled kernels call this function.
 
     Args:

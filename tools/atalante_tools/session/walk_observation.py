@@ -16,6 +16,8 @@ if TYPE_CHECKING:
 
 #: The robot has fallen if its pelvis leans by more than this angle [rad].
 FALLEN: Final = math.radians(35.0)
+#: Period of the observation [cycles]. In this time, the pelvis of a falling robot turns by less than 2 degrees.
+PERIOD_CYCLES: Final = 10
 #: Row of the pelvis IMU.
 _PELVIS: Final = IMUS.index("pelvis")
 
@@ -44,7 +46,9 @@ class Observation:
             rig.emulator.pelvis_forces.append(self._wrench)
 
     def check(self) -> bool:
-        """Return whether the robot has fallen."""
+        """Return whether the robot has fallen. The attitude is observed every `PERIOD_CYCLES` cycles."""
+        if self._rig.hal.state.cycle % PERIOD_CYCLES:
+            return self.fell
         emulator = self._rig.emulator
         if emulator is None:
             upright = float(self._controller.vertical[2])

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from typing import TYPE_CHECKING, Any, Final
 
+from atalante_hal.types import SupervisorState
 from atalante_tools.console.outcome import Failed
 from atalante_tools.console.terminal import print_message
 
@@ -16,6 +17,7 @@ if TYPE_CHECKING:
 
 #: Time for which a robot that left ACTIVE is observed [cycles], because a HOLD within a step may end in a fall.
 _AFTERMATH: Final = 1500
+_FULL_ASSIST, _FINISH_STEP, _FAULT = SupervisorState.FULL_ASSIST, SupervisorState.FINISH_STEP, SupervisorState.FAULT
 
 
 class WalkWatch:
@@ -49,11 +51,9 @@ class WalkWatch:
         Args:
             state: State of the robot after a cycle.
         """
-        from atalante_hal.types import SupervisorState
-        from atalante_tools.session.rig import waiting_for
-
         moving = self._rig.hal.moving
-        self.full_assist = self.full_assist or state.supervisor is SupervisorState.FULL_ASSIST
+        if state.supervisor is _FULL_ASSIST:
+            self.full_assist = True
         if moving and not self._started:
             self._started = True
             self._progress.clear()
@@ -62,26 +62,40 @@ class WalkWatch:
         if over:
             self.outcome = "fell"
         elif moving:
-            over = self._controller.done
-            finishing = state.supervisor is SupervisorState.FINISH_STEP
-            if finishing and not self._reason:
-                self._reason = self._rig.hal.reason
-                self._progress.clear()
-                print_message(f"FINISH_STEP: {self._reason}")
-            self.outcome = ("stopped" if self._stop.wanted or finishing else "stood") if over else self.outcome
+            over = self._walks(state)
         else:
-            fault = state.supervisor is SupervisorState.FAULT
-            self._halted += self._started
-            over = self._halted > _AFTERMATH or (not self._started and (self._stop.wanted or fault))
-            self.outcome = "fault" if fault else self.outcome
-        if not moving and self._started and not self._reason:
-            self._reason = self._rig.hal.reason
+            over = self._halts(state)
         if over:
             self._progress.clear()
             self._reason = self._reason or self._rig.hal.reason
         elif self._progress.due():
+            from atalante_tools.session.rig import waiting_for
+
             self._progress.show(self._describe(state) if moving else waiting_for(self._rig))
         return over
+
+    def _walks(self, state: State) -> bool:
+        """Process a cycle in which the torques of the controller are sent. Return whether the walk is over."""
+        over = self._controller.done
+        finishing = state.supervisor is _FINISH_STEP
+        if finishing and not self._reason:
+            self._reason = self._rig.hal.reason
+            self._progress.clear()
+            print_message(f"FINISH_STEP: {self._reason}")
+        if over:
+            self.outcome = "stopped" if self._stop.wanted or finishing else "stood"
+        return over
+
+    def _halts(self, state: State) -> bool:
+        """Process a cycle before START or after the end of the motion. Return whether the walk is over."""
+        fault = state.supervisor is _FAULT
+        if fault:
+            self.outcome = "fault"
+        if not self._started:
+            return bool(self._stop.wanted) or fault
+        self._halted += 1
+        self._reason = self._reason or self._rig.hal.reason
+        return self._halted > _AFTERMATH
 
     def _describe(self, state: State) -> str:
         controller = self._controller
