@@ -7,7 +7,8 @@ The drives are the last safety layer. They react to errors without the HAL, in o
 
 - Local hold. Causes: the last valid command is `WATCHDOG` cycles old, no SYNC for `WATCHDOG` cycles, two senders of one
   command, low supply voltage. The drive stays in QUICK STOP ACTIVE until the HAL acknowledges the hold, and its motor holds the
-  present position of its own encoder.
+  present position of its own encoder. If the encoder jumps during the hold, the setpoint jumps with it, so the joint does not
+  move.
 - Lowering. Causes: over-temperature, over-current, encoder error. The drive cannot hold the joint. It enters FAULT REACTION
   ACTIVE and then FAULT. The power stage is off, and the brake lets the joint sink slowly. The same brake acts in every drive
   whose power stage is off, so the HAL can lower a joint with DISABLE_VOLTAGE.
@@ -51,6 +52,9 @@ class DriveParameters:
     cool_enough: float = 100.0  # highest winding temperature at which an over-temperature error can end [degC]
     supply: float = 48.0  # nominal supply voltage [V]
     hold_below: float = 40.0  # lowest supply voltage without a local hold [V]
+    jump_speed: float = (
+        20.0  # highest plausible joint speed from two samples; a faster change is an encoder error [rad/s]
+    )
     off_below: float = 20.0  # lowest supply voltage at which the power stage works [V]
     rest_speed: float = 0.05  # the controlled lowering of a leg ends when its joint is slower than this [rad/s]
 
@@ -196,7 +200,12 @@ class Drives:
         """Set the torque of drives in a state other than OPERATION ENABLED: hold torque in QUICK STOP ACTIVE, otherwise zero."""
         robot, limit = self._robot, self._own_limit
         # The filtered velocity has too much delay for this loop, so the loop uses the raw encoder difference.
-        hold = robot.hold_kp * (self._hold_at - self.encoders.angle) - robot.hold_kd * self.encoders.speed
+        speed = self.encoders.speed
+        jumped = np.abs(speed) > self.parameters.jump_speed
+        if jumped.any():  # hold the joint where it is, not where the encoder now reports the setpoint
+            self._hold_at[jumped] += speed[jumped] * PERIOD
+            speed[jumped] = 0.0
+        hold = robot.hold_kp * (self._hold_at - self.encoders.angle) - robot.hold_kd * speed
         np.clip(hold, -limit, limit, out=hold)
         wanted[:] = np.where(self._is_enabled, wanted, np.where(self._is_holding, hold, 0.0))
 

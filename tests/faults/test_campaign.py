@@ -21,9 +21,10 @@ from atalante_tools.console.outcome import Failed
 from atalante_tools.faults import campaign, tasks
 from atalante_tools.faults.catalogue import SCENARIOS
 from atalante_tools.faults.matrix import load_matrix
+from atalante_tools.faults.moments import Moment, MomentTask
 from atalante_tools.faults.report import Summary
 from atalante_tools.faults.scenario import Case, HostFault, Scenario
-from atalante_tools.faults.tasks import HORIZON, CaseTask, Endurance, EnduranceTask, PairTask, PairVerdict, plan
+from atalante_tools.faults.tasks import HORIZON, CaseTask, Endurance, EnduranceTask, PairTask, PairVerdict, Scope, plan
 from atalante_tools.faults.verdict import Verdict
 
 OVERRUN = [CaseTask("F44", index) for index in range(len(SCENARIOS["F44"].cases))]
@@ -38,12 +39,16 @@ def by_case(results: Sequence[object]) -> list[object]:
 
 
 def test_plan_contains_every_case_and_every_pair_once() -> None:
-    planned = plan(list(SCENARIOS), endurance=True, pairs=True)
+    planned = plan(list(SCENARIOS), Scope(endurance=True, pairs=True, moments=True, random_pairs=200, seed=0))
     cases = [task for task in planned if isinstance(task, CaseTask)]
     assert len(cases) == len(set(cases)) == sum(len(scenario.cases) for scenario in SCENARIOS.values())
     pairs = {frozenset((task.first, task.second)) for task in planned if isinstance(task, PairTask)}
     count = len(tasks.REPRESENTATIVES)
     assert len(pairs) == count * (count - 1) // 2
+    moments = [task for task in planned if isinstance(task, MomentTask)]
+    single = {(task.moment, *task.cases) for task in moments if len(task.cases) == 1}
+    assert len(single) == len(Moment) * len(cases)
+    assert len([task for task in moments if len(task.cases) == 2]) == 200
     assert {task.id for task in planned if isinstance(task, EnduranceTask)} == {
         s.id for s in SCENARIOS.values() if s.permanent
     }
@@ -164,7 +169,9 @@ def test_invalid_arguments_end_with_exit_code_two(arguments: tuple[str, ...], me
     assert message in result.stderr
 
 
-@pytest.mark.parametrize("arguments", [("run", "F28"), ("campaign", "F28", "--no-endurance", "--jobs=1")])
+@pytest.mark.parametrize(
+    "arguments", [("run", "F28"), ("campaign", "F28", "--no-endurance", "--no-moments", "--jobs=1")]
+)
 def test_missing_pybullet_fails_before_any_case(
     arguments: tuple[str, ...], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
@@ -179,7 +186,7 @@ def test_missing_pybullet_fails_before_any_case(
 def test_campaign_writes_its_report_and_fails_when_a_fault_fails(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    arguments = ("campaign", "F44", "--jobs", "1", "--out", str(tmp_path), "--json")
+    arguments = ("campaign", "F44", "--jobs", "1", "--no-moments", "--out", str(tmp_path), "--json")
     result = atalante(*arguments)
     assert result.exit_code == 0, result.stderr
     assert json.loads(result.stdout)["passed"]
@@ -187,7 +194,7 @@ def test_campaign_writes_its_report_and_fails_when_a_fault_fails(
     monkeypatch.setattr(campaign, "run_task", lambda task: BAD)
     result = atalante(*arguments[:-1], "--no-endurance")
     assert result.exit_code == 1
-    assert "1 of 1 faults and 0 of 0 pairs failed" in result.stderr
+    assert "1 of 1 faults, 0 of 0 pairs and 0 of 0 runs at other moments failed" in result.stderr
 
 
 def test_ctrl_c_ends_a_campaign_and_its_subprocesses(tmp_path: Path) -> None:

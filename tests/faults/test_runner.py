@@ -8,7 +8,8 @@ from atalante_emulator.faults import Fault
 from atalante_hal.robot import JOINTS, Robot
 from atalante_hal.types import SupervisorState
 from atalante_hal.wire.cia402 import Controlword, DriveState
-from atalante_tools.faults.runner import CONFIG, RESTARTED, first_walk_cycle, observe
+from atalante_tools.faults.observation import RESTARTED
+from atalante_tools.faults.runner import CONFIG, milestones, observe
 from atalante_tools.faults.scenario import Case, HostFault, OperatorAction
 from atalante_tools.faults.verdict import limit_violations
 
@@ -18,7 +19,7 @@ KNEE = JOINTS.index("left_SK")
 
 def test_walk_without_a_fault_stays_active_within_every_limit() -> None:
     observation = observe(Case("nothing", (), phase=0.25, observed=300), 1, recovery=False)
-    assert observation.first == first_walk_cycle() + 200
+    assert observation.first == milestones().walk + 200
     assert (observation.over, observation.pressed, observation.last_before_start) == (
         observation.first,
         None,
@@ -26,7 +27,7 @@ def test_walk_without_a_fault_stays_active_within_every_limit() -> None:
     )
     assert observation.last == observation.first + 300
     active = observation.states.index(S.ACTIVE) + 1
-    assert active + round(CONFIG.startup * 1000) == first_walk_cycle()
+    assert active + round(CONFIG.startup * 1000) == milestones().walk
     assert set(observation.states[active - 1 :]) == {S.ACTIVE}
     assert limit_violations(observation) == []
     assert np.ptp(observation.position[observation.first - 1 :, KNEE]) > 0.2
@@ -49,6 +50,7 @@ def test_operator_stops_and_presses_start_after_the_case() -> None:
     assert observation.pressed == observation.first + 20 + 60
     assert {*observation.states[observation.first + 4 : observation.last_before_start]} == {S.HOLD}
     assert [*observation.states[-RESTARTED - 1 :]] == [S.HOLD] + [S.ACTIVE] * RESTARTED
+    assert limit_violations(observation) == []
 
 
 def test_observation_starts_in_the_first_active_cycle_of_a_host_fault() -> None:

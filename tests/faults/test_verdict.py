@@ -16,7 +16,7 @@ from atalante_hal.wire.cia402 import Controlword
 from atalante_hal.wire.process_image import TransmitImage
 from atalante_tools.faults.command_check import Commands, SentFrames
 from atalante_tools.faults.matrix import Row
-from atalante_tools.faults.observation import Observation
+from atalante_tools.faults.observation import RESTARTED, Observation
 from atalante_tools.faults.scenario import Case
 from atalante_tools.faults.verdict import Expectation, Verdict, evaluate
 
@@ -25,7 +25,8 @@ FIRST, PRESSED = 11, 41
 ROW = Row("F99", "", "", "2 / 5", "", S.HOLD, "NODE_TIMEOUT", ())
 #: ACTIVE, HOLD from the fifth faulty cycle, ACTIVE again after START.
 IMPROVED = "the state must not improve without the operator, but it became ACTIVE in cycle 31"
-HELD = [S.ACTIVE] * 14 + [S.HOLD] * 28 + [S.ACTIVE] * 8
+STEP = [S.ACTIVE] * RESTARTED
+HELD = [S.ACTIVE] * 14 + [S.HOLD] * 28 + STEP
 EXPECTED_EVENTS = (Event(12, "NODE_TIMEOUT", "", node="LEFT_SK"),)
 
 
@@ -73,13 +74,14 @@ def test_reaction_time_is_measured_to_the_first_hold_frame(make_observation: Any
 @pytest.mark.parametrize(
     ("states", "case", "expected"),
     [
-        ([S.ACTIVE] * 15 + [S.HOLD] * 27 + [S.ACTIVE], {}, ["HOLD must come within 5 cycles of the fault, got 6"]),
-        ([S.ACTIVE] * 50, {}, ["no HOLD within 30 cycles"]),
-        ([S.HOLD] * 40 + [S.ACTIVE] * 10, {}, ["the robot must be ACTIVE before the fault, got HOLD"]),
-        ([S.ACTIVE] * 14 + [S.FAULT] * 30 + [S.ACTIVE], {}, ["the final state must be HOLD, got FAULT"]),
+        ([S.ACTIVE] * 15 + [S.HOLD] * 27 + STEP, {}, ["HOLD must come within 5 cycles of the fault, got 6"]),
+        ([S.ACTIVE] * 42 + STEP, {}, ["no HOLD within 30 cycles"]),
+        ([S.HOLD] * 40 + STEP, {}, ["the robot must be ACTIVE before the fault, got HOLD"]),
+        ([S.ACTIVE] * 14 + [S.FAULT] * 30 + STEP, {}, ["the final state must be HOLD, got FAULT"]),
         (HELD, {"state": S.ACTIVE}, ["the robot must stay ACTIVE, got HOLD after 5 cycles"]),
-        ([*HELD[:30], *[S.ACTIVE] * 5, *[S.HOLD] * 10, S.ACTIVE], {}, [IMPROVED]),
-        (HELD[:42], {}, ["the operator's START must lead to ACTIVE, got HOLD"]),
+        ([*HELD[:30], *[S.ACTIVE] * 5, *[S.HOLD] * 10, *STEP], {}, [IMPROVED]),
+        (HELD[:42], {}, ["the operator's START must lead to 800 cycles in ACTIVE, got 0, then HOLD"]),
+        (HELD[:-1], {}, ["the operator's START must lead to 800 cycles in ACTIVE, got 799, then ACTIVE"]),
         (HELD, {"recovers": False}, ["the robot must not be ACTIVE after START, because the fault persists"]),
     ],
 )  # fmt: skip

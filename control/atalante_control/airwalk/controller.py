@@ -103,7 +103,7 @@ class AirwalkController:
 
         self.reference = GaitReference(gait, deadbeat, config.ankle_offset)
         nominal = self.reference.nominal
-        self._start_motion = StartMotion(nominal[RIGHT][0], config.startup)
+        self._start_motion = StartMotion(nominal[RIGHT][0], config.startup, robot.velocity_max)
         swinging = [nominal[RIGHT], nominal[LEFT]]  # left leg, right leg
         self._feet = LevelFeet(robot, exoskeleton, articulated, deadbeat, swinging, config.ankle_offset)
         self.pid = Pid(config.gains)

@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import NamedTuple
 
 import numpy as np
@@ -93,19 +94,26 @@ class StartMotion:
     """Quintic trajectory from rest at the measured pose to the first pose and speed of the gait.
 
     Attributes:
-        cycles: duration in cycles.
+        cycles: duration in cycles. It is longer than the configured duration if a joint is so far from the first pose that
+            it would exceed `SPEED_SHARE` of its velocity limit.
     """
 
-    def __init__(self, first: Vector, duration: float) -> None:
-        """Set end pose, end speed and duration.
+    #: Largest speed from the distance to the first pose, as a share of the velocity limit of the joint.
+    SPEED_SHARE = 0.5
+    #: Largest value of the derivative of 10 x^3 - 15 x^4 + 6 x^5 for x from 0 to 1.
+    _STEEPEST = 1.875
+
+    def __init__(self, first: Vector, duration: float, velocity_max: Vector) -> None:
+        """Set end pose, end speed and shortest duration.
 
         Args:
             first: first row (q_nom, q_nom') of the gait, shape (24,) [rad, rad/s].
-            duration: duration of the motion [s].
+            duration: shortest duration of the motion [s].
+            velocity_max: velocity limits of the joints, shape (12,) [rad/s].
         """
-        self.cycles = round(duration / PERIOD)
-        self._first, self._duration = first, duration
+        self._first, self._shortest, self._speed_max = first, duration, self.SPEED_SHARE * velocity_max
         self._pose, self._row = np.zeros(_N), np.zeros(2 * _N)
+        self.cycles = round(duration / PERIOD)
 
     def start(self, position: Vector) -> None:
         """Start the motion at the measured pose.
@@ -114,6 +122,8 @@ class StartMotion:
             position: measured angles, shape (12,) [rad]; copied.
         """
         self._pose[:] = position
+        needed = float(np.max(np.abs(self._first[:_N] - position) / self._speed_max)) * self._STEEPEST
+        self.cycles = max(round(self._shortest / PERIOD), math.ceil(needed / PERIOD))
 
     def row(self, cycle: int) -> Vector:
         """Return q_des [rad], then q_des' [rad/s] of a cycle, shape (24,), overwritten by the next call.
@@ -121,7 +131,7 @@ class StartMotion:
         Args:
             cycle: cycles since `start`, below `cycles`.
         """
-        x, duration, row = cycle / self.cycles, self._duration, self._row
+        x, duration, row = cycle / self.cycles, self.cycles * PERIOD, self._row
         gap, speed = self._first[:_N] - self._pose, self._first[_N:]
         row[:_N] = self._pose + gap * (x**3 * (10.0 - 15.0 * x + 6.0 * x * x))
         row[:_N] += speed * (duration * x**3 * (-4.0 + 7.0 * x - 3.0 * x * x))

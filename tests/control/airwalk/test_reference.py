@@ -62,7 +62,7 @@ def test_left_stance_step_mirrors_the_right_one():
 
 def test_start_motion_leads_from_rest_to_the_first_pose_and_speed():
     first, pose = RNG.normal(size=24), RNG.normal(size=12)
-    motion = StartMotion(first, 0.5)
+    motion = StartMotion(first, 0.5, np.full(12, 100.0))
     assert motion.cycles == 500
     motion.start(pose)
     np.testing.assert_allclose(motion.row(0), [*pose, *np.zeros(12)], atol=1e-15)
@@ -70,3 +70,19 @@ def test_start_motion_leads_from_rest_to_the_first_pose_and_speed():
     rows = np.array([motion.row(cycle).copy() for cycle in range(501)])
     rates = (rows[2:, :12] - rows[:-2, :12]) / 2e-3
     np.testing.assert_allclose(rows[1:-1, 12:], rates, atol=1e-3)
+
+
+def test_start_motion_from_a_distant_pose_takes_longer_so_that_no_joint_exceeds_half_its_velocity_limit():
+    first, limits = np.zeros(24), np.full(12, 4.0)
+    limits[4] = 8.0
+    motion = StartMotion(first, 0.5, limits)
+    for joint in range(12):
+        pose = np.zeros(12)
+        pose[joint] = -1.5
+        motion.start(pose)
+        assert motion.cycles == math.ceil(1.875 * 1.5 / (0.5 * limits[joint]) * 1000)
+        speeds = np.abs([motion.row(cycle)[12:].copy() for cycle in range(motion.cycles + 1)]).max(axis=0)
+        assert 0.499 * limits[joint] < speeds[joint] <= 0.5 * limits[joint] * (1 + 1e-9)
+        np.testing.assert_allclose(motion.row(motion.cycles), first, atol=1e-12)
+    motion.start(np.full(12, 0.01))
+    assert motion.cycles == 500

@@ -111,6 +111,23 @@ def run(id_: str, name: str, engine: str, as_json: bool) -> None:
 )
 @click.option("--pairs/--no-pairs", default=True, show_default=True, help="Also run pairs of faults.")
 @click.option(
+    "--moments/--no-moments",
+    default=True,
+    show_default=True,
+    help="Also inject each fault at power-on, in READY, at START, in the walk, in HOLD and at the restart.",
+)
+@click.option(
+    "--random-pairs",
+    type=click.IntRange(0),
+    default=200,
+    show_default=True,
+    metavar="N",
+    help="Number of random pairs of faults at random moments.",
+)
+@click.option(
+    "--seed", type=click.IntRange(0), default=0, show_default=True, metavar="N", help="Seed of the random pairs."
+)
+@click.option(
     "--endurance/--no-endurance",
     default=True,
     show_default=True,
@@ -127,17 +144,31 @@ def run(id_: str, name: str, engine: str, as_json: bool) -> None:
 @engine_option
 @json_option
 def campaign_(
-    ids: tuple[str, ...], jobs: int, dask: str, pairs: bool, endurance: bool, out: Path, engine: str, as_json: bool
+    ids: tuple[str, ...],
+    jobs: int,
+    dask: str,
+    pairs: bool,
+    moments: bool,
+    random_pairs: int,
+    seed: int,
+    endurance: bool,
+    out: Path,
+    engine: str,
+    as_json: bool,
 ) -> None:
-    """Run all faults, or the faults with the given IDs, and write a report."""
+    """Run all faults, or the faults with the given IDs, and write a report.
+
+    With IDs, no pairs of faults are run.
+    """
     from atalante_tools.faults.catalogue import SCENARIOS
     from atalante_tools.faults.report import Summary
-    from atalante_tools.faults.tasks import plan
+    from atalante_tools.faults.tasks import Scope, plan
 
     chosen = [_row(id_).id for id_ in ids] or list(SCENARIOS)
     if without := [id_ for id_ in chosen if id_ not in SCENARIOS]:
         raise InvalidUsage(f"{without[0]} has only tests and no scenario: `atalante faults list` shows the tests")
-    tasks = plan(chosen, endurance=endurance, pairs=pairs and not ids, engine=engine)
+    scope = Scope(endurance, pairs and not ids, moments, 0 if ids else random_pairs, seed)
+    tasks = plan(chosen, scope, engine)
     out.mkdir(parents=True, exist_ok=True)  # created now, so that an invalid folder is reported before the runs start
     begun = time.monotonic()
     print_message(f"{len(tasks)} runs on {f'the workers of {dask}' if dask else f'{jobs} processes'}")
@@ -203,9 +234,13 @@ def _conclude(summary: Summary) -> None:
     for pair in summary.pairs:
         for failure in pair.failures:
             print_message(f"{pair.first} and {pair.second}: {failure}")
+    for verdict in summary.moments:
+        for failure in verdict.failures:
+            print_message(f"{' and '.join(verdict.faults)}, moment {verdict.moment}: {failure}")
     if not summary.passed:
-        faults, pairs = (
-            sum(not line.passed for line in summary.lines),
-            sum(bool(pair.failures) for pair in summary.pairs),
+        faults = sum(not line.passed for line in summary.lines)
+        pairs, moments = (sum(bool(one.failures) for one in runs) for runs in (summary.pairs, summary.moments))
+        raise Failed(
+            f"{faults} of {len(summary.lines)} faults, {pairs} of {len(summary.pairs)} pairs and {moments} of "
+            f"{len(summary.moments)} runs at other moments failed"
         )
-        raise Failed(f"{faults} of {len(summary.lines)} faults and {pairs} of {len(summary.pairs)} pairs failed")

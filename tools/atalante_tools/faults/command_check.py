@@ -68,6 +68,11 @@ class _Leg:
             for name in ("Controlword", "TargetTorque", "MaxTorque")
         )
 
+    def consecutive(self) -> npt.NDArray[np.bool_]:
+        """Return whether each frame and the next belong to consecutive cycles and enable a drive, shape (n - 1, 6)."""
+        enabled = self.word == Controlword.ENABLE_OPERATION
+        return np.asarray(enabled[1:] & enabled[:-1] & (np.diff(self.cycle) == 1)[:, None])
+
 
 class Commands:
     """Decoded commands of a run, with a check of identifiers, torques, torque limits and torque rates."""
@@ -117,6 +122,16 @@ class Commands:
         leg = self._legs[joint // len(LEG_JOINTS)]
         return leg.cycle, leg.limit[:, joint % len(LEG_JOINTS)]
 
+    def largest_step(self, joint: int) -> float:
+        """Return the largest change of the target torque of a joint between two consecutive cycles that enable its drive [Nm].
+
+        Args:
+            joint: index into JOINTS.
+        """
+        leg, column = self._legs[joint // len(LEG_JOINTS)], joint % len(LEG_JOINTS)
+        steps = np.abs(np.diff(leg.torque[:, column]))[leg.consecutive()[:, column]]
+        return float(steps.max(initial=0.0))
+
     def violations(self, robot: Robot) -> list[str]:
         """Return one sentence per foreign identifier, and one sentence per leg for each kind of violation.
 
@@ -132,8 +147,7 @@ class Commands:
             joints = slice(number * len(LEG_JOINTS), (number + 1) * len(LEG_JOINTS))
             largest, rate = robot.torque_max[joints], robot.torque_rate_max[joints]
             stopped = leg.word == Controlword.QUICK_STOP
-            enabled = leg.word == Controlword.ENABLE_OPERATION
-            both = enabled[1:] & enabled[:-1] & (np.diff(leg.cycle) == 1)[:, None]
+            both = leg.consecutive()
             step = np.abs(np.diff(leg.torque, axis=0))
             for violation, wrong, cycles in (
                 ("a torque above the joint's limit", np.abs(leg.torque) > largest + _RESOLUTION, leg.cycle),

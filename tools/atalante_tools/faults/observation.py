@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Final
 
 import numpy as np
 import numpy.typing as npt
@@ -12,6 +14,18 @@ from atalante_hal.robot import Robot
 from atalante_hal.safety.events import Event
 from atalante_hal.types import SupervisorState, Vector
 from atalante_tools.faults.command_check import Commands
+
+#: Number of consecutive cycles in ACTIVE after which the walk is considered restarted: a whole step of 0.8 s.
+RESTARTED: Final = 800
+
+
+def restarted(states: Sequence[SupervisorState]) -> bool:
+    """Return whether the last `RESTARTED` cycles were all in ACTIVE.
+
+    Args:
+        states: state of the HAL in each cycle.
+    """
+    return len(states) >= RESTARTED and set(states[-RESTARTED:]) == {SupervisorState.ACTIVE}
 
 
 @dataclass(frozen=True)

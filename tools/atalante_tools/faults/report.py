@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from atalante_tools.faults.matrix import load_matrix
+from atalante_tools.faults.moments import Moment, MomentVerdict
 from atalante_tools.faults.tasks import HORIZON, REPRESENTATIVES, Endurance, PairVerdict, Result
 from atalante_tools.faults.verdict import Verdict
 
@@ -49,6 +50,7 @@ class Summary:
     lines: tuple[Line, ...]
     endurance: tuple[Endurance, ...]
     pairs: tuple[PairVerdict, ...]
+    moments: tuple[MomentVerdict, ...]  # single faults and random pairs at all moments
     seconds: float  # duration of the campaign [s]
 
     @classmethod
@@ -66,17 +68,20 @@ class Summary:
                 by_id.setdefault(verdict.id, []).append(verdict)
         lasting = [one for one in every if isinstance(one, Endurance)]
         pairs = [one for one in every if isinstance(one, PairVerdict)]
+        moments = [one for one in every if isinstance(one, MomentVerdict)]
         return cls(
             tuple(line_of(sorted(by_id[id_], key=lambda v: v.case)) for id_ in load_matrix() if id_ in by_id),
             tuple(sorted(lasting, key=lambda one: one.id)),
             tuple(sorted(pairs, key=lambda pair: (pair.first, pair.second))),
+            tuple(sorted(moments, key=lambda one: (list(Moment).index(Moment(one.moment)), one.faults))),
             seconds,
         )
 
     @property
     def passed(self) -> bool:
-        """Return whether every single fault and every pair of faults passed."""
-        return all(line.passed for line in self.lines) and not any(pair.failures for pair in self.pairs)
+        """Return whether all faults, pairs and runs at other moments passed."""
+        failed = [*(pair.failures for pair in self.pairs), *(run.failures for run in self.moments)]
+        return all(line.passed for line in self.lines) and not any(failed)
 
     def write(self, folder: Path) -> None:
         """Write the report as Markdown and JSON, to report.md and report.json.
@@ -126,7 +131,27 @@ class Summary:
             ]
         if self.pairs:
             parts += ["## Pairs of faults", self._pairs()]
+        if self.moments:
+            parts += ["## Faults at all moments", self._moments()]
         return "\n\n".join(parts) + "\n"
+
+    def _moments(self) -> str:
+        """Return a table with the extremes of each moment and fault: a row per moment for all runs, then a row per fault."""
+        single = [run for run in self.moments if len(run.faults) == 1]
+        pairs = [run for run in self.moments if len(run.faults) > 1]
+        groups = [(f"all, {moment}", [run for run in single if run.moment == moment]) for moment in Moment]
+        groups.append(("random pairs", pairs))
+        ids = dict.fromkeys(run.faults[0].split()[0] for run in single)
+        groups += [(id_, [run for run in single if run.faults[0].split()[0] == id_]) for id_ in ids]
+        head = ["Faults", "Runs", "Failed", "Restarted", "Joint speed / limit", "Torque step [Nm]", "Motion in the start [deg]",
+                "Motion in HOLD [deg]"]  # fmt: skip
+        rows = [[name, *_moment_row(runs)] for name, runs in groups if runs]
+        failed = [
+            f"- {' and '.join(run.faults)}, moment {run.moment}: {failure}"
+            for run in self.moments
+            for failure in run.failures
+        ]
+        return "\n\n".join([_table([head, *rows]), *(["\n".join(failed)] if failed else [])])
 
     def _pairs(self) -> str:
         """Return a table of the final states of all fault pairs: a row per first fault, a column per second fault."""
@@ -138,6 +163,16 @@ class Summary:
             rows.append([first, *("" if p is None else f"{'**FAILED** ' if p.failures else ''}{p.state}" for p in row)])
         failed = [f"- {p.first} and {p.second}: {failure}" for p in self.pairs for failure in p.failures]
         return "\n\n".join([_table(rows), *(["\n".join(failed)] if failed else [])])
+
+
+def _moment_row(runs: Sequence[MomentVerdict]) -> list[str]:
+    """Return the number of runs, of failed and of restarted runs, and the largest values with their joints, as text."""
+    extremes = [run.extremes for run in runs if run.extremes is not None]
+    counts = [len(runs), sum(bool(run.failures) for run in runs), sum(run.restarted for run in runs)]
+    worst = [
+        max((getattr(one, name) for one in extremes), default=None) for name in ("speed", "torque_step", "sag", "lost")
+    ]
+    return [*map(str, counts), *("-" if one is None else f"{one.value:.2f} {one.joint}" for one in worst)]
 
 
 def survived(endurance: Endurance) -> str:

@@ -27,7 +27,7 @@ from atalante_hal.types import State, SupervisorState, Vector
 from atalante_tools.console.options import EMBEDDED, PYBULLET, Target
 from atalante_tools.faults.command_check import Commands, SentFrames
 from atalante_tools.faults.disturbed import DisturbedBus, DisturbedClock, DisturbedController, HostFaults
-from atalante_tools.faults.observation import Observation
+from atalante_tools.faults.observation import Observation, restarted
 from atalante_tools.faults.scenario import Case, HostFault, OperatorAction
 from atalante_tools.session.rig import Rig, open_hal
 
@@ -44,8 +44,8 @@ ASSISTANCE: Final = 0.5
 _START: Final = 600
 #: Cycles between two presses of START after the fault. The first press ends the state FAULT, the second press ends HOLD.
 RECOVERY: Final = 100
-#: The walk is considered restarted after this number of consecutive cycles in ACTIVE.
-RESTARTED: Final = 10
+#: Cycles after the second press within which the robot must be ACTIVE.
+_RESTART: Final = 300
 
 
 @dataclass(frozen=True)
@@ -72,9 +72,17 @@ def run_context() -> RunContext:
     return shared
 
 
+class Milestones(NamedTuple):
+    """HAL cycles of a run without a fault. They are the same in all runs."""
+
+    ready: int  # first cycle in READY; the operator presses START in the next cycle
+    active: int  # first cycle in ACTIVE
+    walk: int  # first cycle of the first walking step
+
+
 @functools.cache
-def first_walk_cycle(engine: str = PYBULLET) -> int:
-    """Return the HAL cycle in which the first walking step begins without a fault. This cycle is the same in all runs.
+def milestones(engine: str = PYBULLET) -> Milestones:
+    """Return the milestones of a run without a fault.
 
     Args:
         engine: physics engine of the emulated robot.
@@ -82,11 +90,22 @@ def first_walk_cycle(engine: str = PYBULLET) -> int:
     Raises:
         RuntimeError: If the robot does not become ACTIVE although there is no fault.
     """
-    trial = _Run(Case("nothing", (), engine=engine), begins=1)
+    trial = CaseRun(Case("nothing", (), engine=engine), begins=1)
     trial.execute(lambda state: state.supervisor is SupervisorState.ACTIVE or state.cycle >= _START)
     if trial.states[-1] is not SupervisorState.ACTIVE:
         raise RuntimeError(f"a robot without fault must be ACTIVE within {_START} cycles, got {trial.states[-1].name}")
-    return len(trial.states) + round(CONFIG.startup / PERIOD)
+    active = len(trial.states)
+    return Milestones(trial.states.index(SupervisorState.READY) + 1, active, active + round(CONFIG.startup / PERIOD))
+
+
+def walk_cycle(phase: float, engine: str = PYBULLET) -> int:
+    """Return the HAL cycle with a phase of the first walking step.
+
+    Args:
+        phase: phase of the step, 0 to 1.
+        engine: physics engine of the emulated robot.
+    """
+    return milestones(engine).walk + round(phase * run_context().gait.duration / PERIOD)
 
 
 def observe(case: Case, bound: int, *, recovery: bool = True) -> Observation:
@@ -97,33 +116,41 @@ def observe(case: Case, bound: int, *, recovery: bool = True) -> Observation:
         bound: cycles within which the reaction must occur. A permanent fault lasts `bound + case.observed` cycles.
         recovery: whether the operator presses START twice after the fault, to restart the walk.
     """
-    begins = 1
-    if case.phase is not None:
-        begins = first_walk_cycle(case.engine) + round(case.phase * run_context().gait.duration / PERIOD)
+    begins = 1 if case.phase is None else walk_cycle(case.phase, case.engine)
     start_pressed = begins + max(case.first_faulty + bound, case.ends or 0) + case.observed
-    case_run = _Run(case, begins)
+    case_run = CaseRun(case, begins)
     if recovery:
         case_run.presses[start_pressed].append("start")
         case_run.presses[start_pressed + RECOVERY].append("start")
-    last = start_pressed + 2 * RECOVERY if recovery else start_pressed - 1
-    restarted = [SupervisorState.ACTIVE] * RESTARTED
+    last = start_pressed + RECOVERY + _RESTART if recovery else start_pressed - 1
 
     def over(state: State) -> bool:
-        return state.cycle >= last or (
-            state.cycle >= start_pressed + RESTARTED and case_run.states[-RESTARTED:] == restarted
-        )
+        if not recovery or state.supervisor is not SupervisorState.ACTIVE:
+            return state.cycle >= last
+        return restarted(case_run.states[start_pressed:])
 
     case_run.execute(over)
     return case_run.observation(start_pressed if recovery else None)
 
 
-class _Run:
-    """Run of a case that begins in the HAL cycle `begins`."""
+class CaseRun:
+    """Run of a case that begins in the HAL cycle `begins`.
 
-    def __init__(self, case: Case, begins: int) -> None:
-        self._case, self._begins = case, begins
+    Attributes:
+        states: state of the HAL in each cycle.
+        presses: actions of the operator, by HAL cycle. More actions can be added before `execute`.
+    """
+
+    def __init__(self, case: Case, begins: int, *, starts: bool = True) -> None:
+        """Prepare the run.
+
+        Args:
+            case: faults to inject and actions of the operator.
+            begins: HAL cycle in which the case begins, from 1.
+            starts: whether the operator presses START when the HAL is READY for the first time.
+        """
+        self._case, self._begins, self._starts = case, begins, starts
         self.states: list[SupervisorState] = []
-        #: Actions of the operator, listed by HAL cycle.
         self.presses: defaultdict[int, list[str]] = defaultdict(list)
         for stimulus in case.stimuli:
             if isinstance(stimulus, OperatorAction):
@@ -140,7 +167,7 @@ class _Run:
         self._copied = 0  # number of events that the HAL had reported when they were last copied
 
     def execute(self, until: Callable[[State], bool]) -> None:
-        """Run the HAL and the emulator. The operator presses START when the HAL is READY for the first time.
+        """Run the HAL and the emulator.
 
         Args:
             until: end condition, called with the state after every cycle.
@@ -165,7 +192,7 @@ class _Run:
             hal = rig.hal
             hal.bus = DisturbedBus(hal.bus, self._host_faults)
             self._prepare(1, operator)
-            waiting = True
+            waiting = self._starts
 
             def record() -> None:
                 self.states.append(hal.state.supervisor)

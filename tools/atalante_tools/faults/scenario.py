@@ -9,7 +9,7 @@ value.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Final
 
 from atalante_emulator.faults import Fault
@@ -54,6 +54,19 @@ class OperatorAction:
 
 
 Stimulus = Fault | HostFault | OperatorAction
+
+
+def shifted(stimulus: Stimulus, cycles: int) -> Stimulus:
+    """Return the same fault or action with a later start.
+
+    Args:
+        stimulus: fault or action.
+        cycles: delay of the start [cycles].
+    """
+    start = stimulus.start + cycles
+    return stimulus.starting(start) if isinstance(stimulus, Fault) else replace(stimulus, start=start)
+
+
 #: Additional check of a run. The check returns None if it passes, and a sentence if it fails.
 ObservationCheck = Callable[["Observation"], str | None]
 

@@ -17,14 +17,16 @@ from atalante_emulator.faults import Fault
 from atalante_tools.console.options import PYBULLET
 from atalante_tools.faults.catalogue import SCENARIOS
 from atalante_tools.faults.matrix import load_matrix
+from atalante_tools.faults.moments import MomentTask, MomentVerdict, random_pairs, single_tasks
 from atalante_tools.faults.runner import observe
-from atalante_tools.faults.scenario import Case, Stimulus
+from atalante_tools.faults.scenario import Case, Stimulus, shifted
 from atalante_tools.faults.verdict import (
     WALKING,
     Expectation,
     Verdict,
     automatic_improvements,
     evaluate,
+    exception_sentence,
     limit_violations,
 )
 
@@ -120,13 +122,13 @@ class PairTask:
         expected = [
             Expectation.of(case, matrix[id_]) for case, (id_, _) in zip(cases, (self.first, self.second), strict=True)
         ]
-        stimuli = (*cases[0].stimuli, *(_shifted(stimulus, PAIR_DELAY) for stimulus in cases[1].stimuli))
+        stimuli = (*cases[0].stimuli, *(shifted(stimulus, PAIR_DELAY) for stimulus in cases[1].stimuli))
         bound = max(one.reacted for one in expected) + PAIR_DELAY
         first, second = (f"{id_} {name}" for id_, name in (self.first, self.second))
         try:
             run = observe(Case(f"{first} and {second}", stimuli, engine=self.engine), bound, recovery=False)
         except Exception as error:  # noqa: BLE001 - any exception of the stack is a finding
-            return PairVerdict(first, second, "-", (_crash(error),))
+            return PairVerdict(first, second, "-", (exception_sentence(error),))
         failures = [*limit_violations(run), *automatic_improvements(run, run.last)]
         state, worst = run.state(run.last), max(one.state for one in expected)
         if state < worst:
@@ -136,8 +138,8 @@ class PairTask:
         return PairVerdict(first, second, state.name, tuple(failures))
 
 
-Task = CaseTask | EnduranceTask | PairTask
-Result = Verdict | Endurance | PairVerdict
+Task = CaseTask | EnduranceTask | PairTask | MomentTask
+Result = Verdict | Endurance | PairVerdict | MomentVerdict
 
 
 def run_case(id_: str, case: Case) -> Verdict:
@@ -152,26 +154,39 @@ def run_case(id_: str, case: Case) -> Verdict:
     try:
         run = observe(case, expected.reacted, recovery=not expected.walk_continues)
     except Exception as error:  # noqa: BLE001 - any exception of the stack is a finding
-        return Verdict(id_, case.name, "-", None, expected.reacted, "", (_crash(error),))
+        return Verdict(id_, case.name, "-", None, expected.reacted, "", (exception_sentence(error),))
     return evaluate(row, case, run)
 
 
-def plan(ids: Sequence[str], *, endurance: bool, pairs: bool, engine: str = PYBULLET) -> list[Task]:
+@dataclass(frozen=True)
+class Scope:
+    """Runs of a campaign besides the cases of the fault matrix."""
+
+    endurance: bool  # endurance runs
+    pairs: bool  # the pairs of `REPRESENTATIVES` during a walk
+    moments: bool  # each case at each moment from power-on to the restart
+    random_pairs: int  # number of random pairs of cases at random moments
+    seed: int  # seed of the random pairs
+
+
+def plan(ids: Sequence[str], scope: Scope, engine: str = PYBULLET) -> list[Task]:
     """Return the tasks of a campaign, ordered so that the long tasks come first.
 
     Args:
         ids: IDs of the scenarios.
-        endurance: whether to include endurance runs.
-        pairs: whether to include the pairs of `REPRESENTATIVES`.
+        scope: further runs.
         engine: physics engine of the emulated robot.
     """
     chosen = [SCENARIOS[id_] for id_ in ids]
     tasks: list[Task] = []
-    if endurance:
+    if scope.endurance:
         tasks += [EnduranceTask(scenario.id, engine) for scenario in chosen if scenario.permanent is not None]
     tasks += [CaseTask(scenario.id, index, engine) for scenario in chosen for index in range(len(scenario.cases))]
-    if pairs:
+    if scope.pairs:
         tasks += [PairTask(*pair, engine) for pair in itertools.combinations(REPRESENTATIVES, 2)]
+    if scope.moments:
+        tasks += single_tasks(ids, engine)
+    tasks += random_pairs(scope.random_pairs, scope.seed, engine)
     return tasks
 
 
@@ -210,16 +225,3 @@ def _limited(stimulus: Stimulus, cycles: int) -> Stimulus:
     if isinstance(stimulus, Fault):
         return Fault(stimulus.kind, stimulus.target, stimulus.start, cycles, **dict(stimulus.parameters))
     return replace(stimulus, cycles=cycles)
-
-
-def _shifted(stimulus: Stimulus, cycles: int) -> Stimulus:
-    """Return the same fault or action, but let it start `cycles` cycles later."""
-    return (
-        stimulus.starting(stimulus.start + cycles)
-        if isinstance(stimulus, Fault)
-        else replace(stimulus, start=stimulus.start + cycles)
-    )
-
-
-def _crash(error: Exception) -> str:
-    return f"exception in the run: {type(error).__name__}: {error}"

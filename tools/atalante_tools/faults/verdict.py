@@ -21,7 +21,7 @@ from atalante_hal.safety.events import Event
 from atalante_hal.types import SupervisorState
 from atalante_hal.wire.cia402 import Controlword
 from atalante_tools.faults.matrix import Row
-from atalante_tools.faults.observation import Observation
+from atalante_tools.faults.observation import RESTARTED, Observation, restarted
 from atalante_tools.faults.scenario import Case
 
 _S = SupervisorState
@@ -170,6 +170,15 @@ def automatic_improvements(run: Observation, until: int) -> list[str]:
     return []
 
 
+def exception_sentence(error: Exception) -> str:
+    """Return a sentence for an exception that ended a run.
+
+    Args:
+        error: exception.
+    """
+    return f"exception in the run: {type(error).__name__}: {error}"
+
+
 def _state(run: Observation, case: Case, expected: Expectation, reaction: int | None) -> list[str]:
     if case.phase is not None and run.state(run.first - 1) is not _S.ACTIVE:
         return [f"the robot must be ACTIVE before the fault, got {run.state(run.first - 1).name}"]
@@ -214,9 +223,12 @@ def _recovery(run: Observation, case: Case, expected: Expectation) -> list[str]:
     found = [] if case.phase is None else automatic_improvements(run, run.last_before_start)
     if run.pressed is None:
         return found
-    restarted = _S.ACTIVE in (run.state(cycle) for cycle in range(run.pressed, run.last + 1))
-    if restarted and not case.recovers:
+    after = run.states[run.pressed - 1 :]
+    if not case.recovers and _S.ACTIVE in after:
         found.append("the robot must not be ACTIVE after START, because the fault persists")
-    if not restarted and case.recovers:
-        found.append(f"the operator's START must lead to ACTIVE, got {run.state(run.last).name}")
+    if case.recovers and not restarted(after):
+        active = after.count(_S.ACTIVE)
+        found.append(
+            f"the operator's START must lead to {RESTARTED} cycles in ACTIVE, got {active}, then {after[-1].name}"
+        )
     return found

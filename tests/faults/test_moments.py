@@ -1,0 +1,144 @@
+"""Tests of faults at other moments than the walk: their schedule, their checks, and random pairs."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+
+from atalante_hal.types import SupervisorState
+from atalante_hal.wire.cia402 import Controlword
+from atalante_tools.faults import moments
+from atalante_tools.faults.catalogue import SCENARIOS
+from atalante_tools.faults.moments import Extreme, Extremes, Moment, MomentTask, MomentVerdict, random_pairs, schedule
+from atalante_tools.faults.observation import Observation
+from atalante_tools.faults.report import Summary
+from atalante_tools.faults.runner import CaseRun
+from atalante_tools.faults.scenario import Case
+
+S = SupervisorState
+ENGINE = "pybullet"
+
+
+def index(id_: str, name: str) -> tuple[str, int]:
+    return id_, [case.name for case in SCENARIOS[id_].cases].index(name)
+
+
+NO_FAULT = Case("nothing", ())
+
+
+@pytest.mark.parametrize(
+    ("moment", "state"),
+    [
+        (Moment.BOOT, S.OFF),
+        (Moment.READY, S.READY),
+        (Moment.START, S.READY),
+        (Moment.WALKING, S.ACTIVE),
+        (Moment.HOLD, S.HOLD),
+        (Moment.RESTART, S.HOLD),
+    ],
+)
+def test_fault_begins_in_the_state_of_its_moment(moment: Moment, state: S) -> None:
+    plan = schedule(moment, ENGINE)
+    run = CaseRun(NO_FAULT, plan.begins, starts=False)
+    for cycle in plan.starts:
+        run.presses[cycle].append("start")
+    if plan.stop is not None:
+        run.presses[plan.stop].append("stop")
+    run.execute(lambda now: now.cycle >= plan.begins)
+    assert run.states[-1] is state
+
+
+@pytest.mark.parametrize("moment", Moment)
+def test_silent_drive_at_any_moment_breaks_no_limit(moment: Moment) -> None:
+    verdict = MomentTask(moment, (index("F04", "LEFT_SK"),))()
+    assert verdict.failures == ()
+    assert verdict.extremes is not None
+    assert 0.0 < verdict.extremes.speed.value < 1.2
+    if moment in (Moment.WALKING, Moment.HOLD):
+        assert verdict.state == "HOLD"
+
+
+def test_random_pairs_depend_only_on_the_seed() -> None:
+    one, two, other = (random_pairs(50, seed, ENGINE) for seed in (1, 1, 2))
+    assert one == two != other
+    assert {task.moment for task in one} == set(Moment)
+    assert all(task.cases[0] != task.cases[1] for task in one)
+
+
+def test_pair_of_faults_runs_both() -> None:
+    verdict = MomentTask(Moment.WALKING, (index("F03", "4 frames"), index("F45", "ValueError")), (0, 20))()
+    assert verdict.faults == ("F03 4 frames", "F45 ValueError")
+    assert (verdict.state, verdict.failures) == ("HOLD", ())
+
+
+def patched(monkeypatch: pytest.MonkeyPatch, change: Callable[[Observation], None]) -> MomentVerdict:
+    """Run a case without effect, change its observation, and return the verdict."""
+    observe = moments._observe
+
+    def changed(case: Case, plan: moments.Schedule) -> Observation:
+        run = observe(case, plan)
+        change(run)
+        return run
+
+    monkeypatch.setattr(moments, "_observe", changed)
+    return MomentTask(Moment.READY, (index("F24", "1 frames"),))()
+
+
+def test_sag_during_the_start_fails(monkeypatch: pytest.MonkeyPatch) -> None:
+    def sag(run: Observation) -> None:
+        run.position[schedule(Moment.READY, ENGINE).starts[0] + 3, 4] += np.radians(1.2)
+
+    (failure,) = patched(monkeypatch, sag).failures
+    assert failure.startswith("no joint may move by more than 1 deg during a start, got 1.2")
+    assert failure.endswith("left_SA")
+
+
+def test_fast_joint_fails(monkeypatch: pytest.MonkeyPatch) -> None:
+    def fast(run: Observation) -> None:
+        run.velocity[100, 3] = 1.25 * run.robot.velocity_max[3]
+
+    verdict = patched(monkeypatch, fast)
+    assert verdict.failures == ("a joint was above its velocity limit: left_SK in cycle 101",)
+    assert verdict.extremes is not None
+    assert verdict.extremes.speed == (pytest.approx(1.25), "left_SK")
+
+
+def test_enabling_before_start_fails(monkeypatch: pytest.MonkeyPatch) -> None:
+    def early(run: Observation) -> None:
+        run.commands._legs[0].word[49] = Controlword.ENABLE_OPERATION
+
+    (failure,) = patched(monkeypatch, early).failures
+    assert "ENABLE OPERATION must not be sent before START in cycle" in failure
+
+
+def test_exception_in_a_run_is_a_failure(monkeypatch: pytest.MonkeyPatch) -> None:
+    def crash(run: Observation) -> None:
+        raise RuntimeError("the run failed")
+
+    verdict = patched(monkeypatch, crash)
+    assert (verdict.state, verdict.extremes) == ("-", None)
+    assert verdict.failures == ("exception in the run: RuntimeError: the run failed",)
+
+
+def test_report_shows_the_extremes_of_each_moment_and_fault() -> None:
+    slow, fast = (
+        Extremes(Extreme(v, "left_SK"), Extreme(2.0, "left_SA"), Extreme(0.1, "left_FH"), Extreme(5.0, "left_SH"))
+        for v in (0.5, 1.1)
+    )
+    runs = [
+        MomentVerdict("walking", ("F04 LEFT_SK",), "HOLD", True, slow, ()),
+        MomentVerdict("boot", ("F04 LEFT_SA",), "OFF", False, fast, ("a failure",)),
+        MomentVerdict("hold", ("F04 LEFT_SA", "F03 4 frames"), "HOLD", True, None, ()),
+    ]
+    summary = Summary.of(runs)
+    assert not summary.passed
+    text = summary.markdown()
+    for row in (
+        "| all, boot | 1 | 1 | 0 | 1.10 left_SK | 2.00 left_SA | 0.10 left_FH | 5.00 left_SH |",
+        "| random pairs | 1 | 0 | 1 | - | - | - | - |",
+        "| F04 | 2 | 1 | 1 | 1.10 left_SK |",
+        "- F04 LEFT_SA, moment boot: a failure",
+    ):
+        assert row in text

@@ -1,0 +1,238 @@
+"""Faults at other moments than in the fault matrix: from power-on to the operator's restart, single and in random pairs.
+
+    case of the matrix, moment -> run with a schedule of START and STOP -> safety checks, measured extremes
+
+The fault matrix states the reaction to a fault during a walk. At other moments, and for pairs, no reaction is prescribed for each
+fault. These runs check what must be true for all of them:
+
+- no torque, position, velocity or torque rate beyond its limit;
+- no command that lets a drive produce torque before the operator pressed START;
+- no change to a less severe state without the operator, after the robot has walked;
+- no joint moves by more than `SAG_MAX` between START and the end of the start;
+- no exception.
+"""
+
+from __future__ import annotations
+
+import random
+from collections.abc import Sequence
+from dataclasses import dataclass
+from enum import StrEnum
+from typing import Final, NamedTuple
+
+import numpy as np
+
+from atalante_hal.robot import JOINTS
+from atalante_hal.types import SupervisorState, Vector
+from atalante_hal.wire.cia402 import Controlword
+from atalante_tools.console.options import PYBULLET
+from atalante_tools.faults.catalogue import SCENARIOS
+from atalante_tools.faults.observation import Observation
+from atalante_tools.faults.runner import RECOVERY, CaseRun, milestones, walk_cycle
+from atalante_tools.faults.scenario import MID_SWING, Case, shifted
+from atalante_tools.faults.verdict import WALKING, automatic_improvements, exception_sentence, limit_violations
+
+_S = SupervisorState
+#: Largest accepted motion of a joint between START and ACTIVE, or in the first `_SETTLED` cycles after START [deg].
+SAG_MAX: Final = 1.0
+_SETTLED: Final = 40
+#: Cycles from READY to the operator's START, from STOP to a fault in HOLD, and from STOP to the operator's restart.
+_PAUSE: Final = 50
+_STOPPED: Final = 60
+_RESTART: Final = 200
+#: Longest observation of a fault [cycles]. A permanent fault is observed for this time.
+_LONGEST: Final = 400
+#: Cycles from the end of the observation to the operator's START, and from the second press of START to the end of the run.
+_REST: Final = 60
+_END: Final = 300
+
+
+class Moment(StrEnum):
+    """Moment at which a fault begins."""
+
+    BOOT = "boot"  # in the first cycle of the HAL
+    READY = "ready"  # in READY, before the operator's START
+    START = "start"  # in the cycle after START, while the drives are enabled
+    WALKING = "walking"  # in the first walking step, when the left leg swings fastest
+    HOLD = "hold"  # in HOLD, after the operator's STOP during the walk
+    RESTART = "restart"  # in the cycle after the operator's START that ends this HOLD
+
+
+@dataclass(frozen=True)
+class Schedule:
+    """Times of a run, in HAL cycles."""
+
+    begins: int  # first faulty cycle
+    starts: tuple[int, ...]  # cycles in which the operator presses START, before the end of the fault
+    stop: int | None = None  # cycle in which the operator presses STOP
+
+
+def schedule(moment: Moment, engine: str) -> Schedule:
+    """Return the schedule of a run in which the fault begins at a moment.
+
+    Args:
+        moment: moment at which the fault begins.
+        engine: physics engine of the emulated robot.
+    """
+    ready = milestones(engine).ready
+    if moment in (Moment.BOOT, Moment.READY, Moment.START):
+        start = ready + _PAUSE
+        return Schedule({Moment.BOOT: 1, Moment.READY: ready + _PAUSE // 2, Moment.START: start + 1}[moment], (start,))
+    start, walking = ready + 1, walk_cycle(MID_SWING, engine)
+    if moment is Moment.WALKING:
+        return Schedule(walking, (start,))
+    if moment is Moment.HOLD:
+        return Schedule(walking + _STOPPED, (start,), walking)
+    restart = walking + _RESTART
+    return Schedule(restart + 1, (start, restart), walking)
+
+
+class Extreme(NamedTuple):
+    """Largest value of all joints, and its joint."""
+
+    value: float
+    joint: str
+
+
+@dataclass(frozen=True)
+class Extremes:
+    """Largest values of a run."""
+
+    speed: Extreme  # joint velocity as a share of its limit
+    torque_step: Extreme  # change of the commanded torque in one cycle [Nm]
+    sag: Extreme  # motion between START and the end of the start [deg]
+    lost: Extreme  # motion in HOLD or a more severe state, from its first cycle on [deg]
+
+
+@dataclass(frozen=True)
+class MomentVerdict:
+    """Result of a run with one fault at a moment, or with two faults."""
+
+    moment: str
+    faults: tuple[str, ...]  # "ID name of the case" of each fault
+    state: str  # state of the HAL before the operator's START after the faults
+    restarted: bool  # whether this START led to ACTIVE
+    extremes: Extremes | None  # None if the run raised an exception
+    failures: tuple[str, ...]  # one sentence each
+
+
+@dataclass(frozen=True)
+class MomentTask:
+    """Task to run cases of the fault matrix at a moment. The cases begin `delays` cycles after the moment."""
+
+    moment: Moment
+    cases: tuple[tuple[str, int], ...]  # fault ID, index of the case in its scenario
+    delays: tuple[int, ...] = (0,)  # for each case
+    engine: str = PYBULLET
+
+    def __call__(self) -> MomentVerdict:
+        """Run the cases and check what must be true for all faults at all moments."""
+        chosen = [SCENARIOS[id_].cases[index] for id_, index in self.cases]
+        names = tuple(f"{id_} {case.name}" for (id_, _), case in zip(self.cases, chosen, strict=True))
+        stimuli = tuple(shifted(s, d) for case, d in zip(chosen, self.delays, strict=True) for s in case.stimuli)
+        case = Case(" and ".join(names), stimuli, engine=self.engine, seed=chosen[0].seed)
+        plan = schedule(self.moment, self.engine)
+        try:
+            run = _observe(case, plan)
+        except Exception as error:  # noqa: BLE001 - any exception of the stack is a finding
+            return MomentVerdict(self.moment, names, "-", False, None, (exception_sentence(error),))
+        extremes, before = _extremes(run, plan.starts), run.last_before_start
+        failures = [*limit_violations(run), *_premature(run, plan.starts[0])]
+        if self.moment in (Moment.WALKING, Moment.HOLD):  # at all other moments START improves the state
+            failures += automatic_improvements(run, before)
+        if extremes.sag.value > SAG_MAX:
+            sag = f"{extremes.sag.value:.2f} deg of {extremes.sag.joint}"
+            failures.append(f"no joint may move by more than {SAG_MAX:g} deg during a start, got {sag}")
+        restarted = _S.ACTIVE in run.states[before:]
+        return MomentVerdict(self.moment, names, run.state(before).name, restarted, extremes, tuple(failures))
+
+
+def single_tasks(ids: Sequence[str], engine: str) -> list[MomentTask]:
+    """Return one task per case of the matrix and moment.
+
+    Args:
+        ids: IDs of the scenarios.
+        engine: physics engine of the emulated robot.
+    """
+    return [
+        MomentTask(moment, ((id_, index),), engine=engine)
+        for moment in Moment
+        for id_ in ids
+        for index in range(len(SCENARIOS[id_].cases))
+    ]
+
+
+def random_pairs(count: int, seed: int, engine: str) -> list[MomentTask]:
+    """Return tasks with two random cases of the matrix at a random moment.
+
+    The second case begins 0 to 50 cycles after the first.
+
+    Args:
+        count: number of tasks.
+        seed: seed of the random choice.
+        engine: physics engine of the emulated robot.
+    """
+    draw = random.Random(seed)
+    every = [(id_, index) for id_, scenario in SCENARIOS.items() for index in range(len(scenario.cases))]
+    tasks = []
+    for _ in range(count):
+        first, second = draw.sample(every, 2)
+        tasks.append(MomentTask(draw.choice(list(Moment)), (first, second), (0, draw.randint(0, 50)), engine))
+    return tasks
+
+
+def _observe(case: Case, plan: Schedule) -> Observation:
+    """Run a case with a schedule, then press START twice. Return the observation."""
+    ends = _LONGEST if case.ends is None else min(case.ends, _LONGEST)
+    restart = max(plan.begins + ends, *plan.starts) + _REST
+    case_run = CaseRun(case, plan.begins, starts=False)
+    for cycle in (*plan.starts, restart, restart + RECOVERY):
+        case_run.presses[cycle].append("start")
+    if plan.stop is not None:
+        case_run.presses[plan.stop].append("stop")
+    case_run.execute(lambda state: state.cycle >= restart + RECOVERY + _END)
+    return case_run.observation(restart)
+
+
+def _premature(run: Observation, start: int) -> list[str]:
+    """Return a sentence if a command enabled the operation of a drive before the operator's first START."""
+    for cycle in range(1, min(start, run.last)):
+        if Controlword.ENABLE_OPERATION in run.commands.words(cycle):
+            return [
+                f"ENABLE OPERATION must not be sent before START in cycle {start}, but it was sent in cycle {cycle}"
+            ]
+    return []
+
+
+def _extremes(run: Observation, starts: Sequence[int]) -> Extremes:
+    """Return the largest values of a run.
+
+    Args:
+        run: observation of the run.
+        starts: cycles in which the operator pressed START, before the end of the fault.
+    """
+    count = len(JOINTS)
+    sag, lost, held = np.zeros(count), np.zeros(count), None
+    for start in starts:
+        for cycle in range(start, min(start + _SETTLED, run.last) + 1):
+            if run.state(cycle) in WALKING:
+                break
+            np.maximum(sag, np.abs(run.position[cycle - 1] - run.position[start - 1]), out=sag)
+    walked = False
+    for cycle in range(starts[0], run.last_before_start + 1):
+        if run.state(cycle) in WALKING:
+            walked, held = True, None
+        elif walked:
+            held = run.position[cycle - 1] if held is None else held
+            np.maximum(lost, np.abs(run.position[cycle - 1] - held), out=lost)
+    return Extremes(
+        _worst(np.abs(run.velocity).max(axis=0) / run.robot.velocity_max),
+        _worst(np.array([run.commands.largest_step(joint) for joint in range(count)])),
+        _worst(np.degrees(sag)),
+        _worst(np.degrees(lost)),
+    )
+
+
+def _worst(values: Vector) -> Extreme:
+    joint = int(np.argmax(values))
+    return Extreme(float(values[joint]), JOINTS[joint])
