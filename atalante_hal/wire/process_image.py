@@ -271,8 +271,8 @@ class ReceiveImage:
         """
         self.values_before[:] = self.values
         flags = frames["flags"][:count]
-        passive = np.flatnonzero(flags & _PASSIVE == _PASSIVE)
-        if passive.size:
+        passive = [index for index, flag in enumerate(flags.tolist()) if flag & _PASSIVE == _PASSIVE]
+        if passive:
             flags[passive] ^= FLAG_ESI
             senders = (self.frame_ids.get(can_id) for can_id in frames["can_id"][passive].tolist())
             self.error_passive = [row for row in senders if row is not None]

@@ -33,6 +33,8 @@ class SensorNoise:
         self._bias = imus.draw_bias(self._of_imus)
         self._attitude = imus.attitude_error(NOISE_CYCLES * PERIOD, of_attitude)
         self._quaternion = codec.slice("Quaternion")
+        self._values: Vector | None = None  # output array of the last `add`, and the attitudes in it
+        self._attitudes = np.zeros((0, 4))
 
     def add(self, cycle: int, truth: Vector, values: Vector) -> None:
         """Add the noise of a cycle to the true values.
@@ -44,7 +46,9 @@ class SensorNoise:
         """
         np.add(truth, self._noise_of[cycle % NOISE_CYCLES], values)
         if self._attitude.active:
-            self._attitude.apply(cycle % NOISE_CYCLES / NOISE_CYCLES, values[self._quaternion].reshape(-1, 4))
+            if values is not self._values:
+                self._values, self._attitudes = values, values[self._quaternion].reshape(-1, 4)
+            self._attitude.apply(cycle % NOISE_CYCLES / NOISE_CYCLES, self._attitudes)
 
     def draw(self) -> None:
         """Draw the noise of the next `NOISE_CYCLES` cycles."""

@@ -45,6 +45,7 @@ class AttitudeObserver:
 
     Attributes:
         records: record of `observe`, shape (1,).
+        rotation: rotation matrix from pelvis to world, shape (3, 3), a view of the record that `update` overwrites.
     """
 
     def __init__(self, bandwidth: float = 2.0) -> None:
@@ -55,6 +56,7 @@ class AttitudeObserver:
         """
         self.records: Records[Attitude] = zeros(Attitude, 1)
         self.records[0].bandwidth = bandwidth
+        self.rotation: Vector = self.records[0].rotation
         self._observe = compiled(observe)
         self.reset((1.0, 0.0, 0.0, 0.0))
         self.update(np.zeros(3), np.array([0.0, 0.0, GRAVITY]), (0.0, 0.0, 0.0))
@@ -74,11 +76,6 @@ class AttitudeObserver:
     def update(self, gyro: Vector, accel: Vector, velocity: Vector3) -> None:
         """Advance the attitude by one cycle, as `observe` does."""
         self._observe(self.records, gyro, accel, velocity)
-
-    @property
-    def rotation(self) -> Vector:
-        """Return the rotation matrix from pelvis to world, shape (3, 3), overwritten by `update`."""
-        return self.records[0].rotation
 
 
 def observe(attitudes: Records[Attitude], gyro: Vector, accel: Vector, measured: Vector3) -> None:
