@@ -39,6 +39,7 @@ def command() -> None:
     Example: atalante faults list
              atalante faults run F04
              atalante faults campaign --jobs 2
+             atalante faults false-alarms --cycles 200000
     """
 
 
@@ -93,9 +94,7 @@ def run(id_: str, name: str, engine: str, as_json: bool) -> None:
     _conclude(summary)
 
 
-@command.command("campaign", short_help="Run all faults, single and in pairs, and write a report.")
-@click.argument("ids", metavar="[ID]...", nargs=-1)
-@click.option(
+_jobs_option = click.option(
     "--jobs",
     type=click.IntRange(1),
     default=os.cpu_count() or 1,
@@ -103,12 +102,57 @@ def run(id_: str, name: str, engine: str, as_json: bool) -> None:
     metavar="N",
     help="Number of parallel processes.",
 )
-@click.option(
+_dask_option = click.option(
     "--dask",
     default="",
     metavar="ADDRESS",
     help="Run on the workers of this dask scheduler, such as tcp://127.0.0.1:8786.",
 )
+
+
+@command.command("false-alarms", short_help="Walk without a fault and count the reported diagnostics.")
+@click.option(
+    "--cycles",
+    type=click.IntRange(1),
+    default=3_000_000,
+    show_default=True,
+    metavar="N",
+    help="Number of cycles of 1 ms of all walks together.",
+)
+@_jobs_option
+@_dask_option
+@engine_option
+@json_option
+def false_alarms(cycles: int, jobs: int, dask: str, engine: str, as_json: bool) -> None:
+    """Walk without a fault, in the air and on the ground with a passive wearer, and count the reported diagnostics.
+
+    GUIDE_OUTSIDE and TORQUE_SATURATED are expected: the filter and the limiter report that they act. Every other
+    diagnostic is a false alarm. The exit code is 1 if there is one.
+    """
+    from atalante_tools.faults.false_alarms import Quiet, quiet_tasks
+
+    walks = list(_done(list(quiet_tasks(cycles, engine)), jobs=jobs, dask=dask, engine=engine))
+    walked = sorted((walk for walk in walks if isinstance(walk, Quiet)), key=lambda walk: walk.name)
+    for walk in walked if as_json else ():
+        show_json({**asdict(walk), "alarms": walk.alarms})
+    if not as_json:
+        head = ["walk", "cycles", "state", "diagnostics", "false alarms"]
+        rows = [[w.name, str(w.cycles), w.state, _counts(w.counts), _counts(w.alarms)] for w in walked]
+        click.echo(table([head, *rows]))
+    total, failed = sum(walk.cycles for walk in walked), sum(walk.failed for walk in walked)
+    print_message(f"{len(walked)} walks, {total} cycles, {sum(sum(w.alarms.values()) for w in walked)} false alarms")
+    if failed:
+        raise Failed(f"{failed} of {len(walked)} walks had a false alarm or did not end in ACTIVE")
+
+
+def _counts(counts: dict[str, int]) -> str:
+    return ", ".join(f"{code} {count}" for code, count in sorted(counts.items())) or "-"
+
+
+@command.command("campaign", short_help="Run all faults, single and in pairs, and write a report.")
+@click.argument("ids", metavar="[ID]...", nargs=-1)
+@_jobs_option
+@_dask_option
 @click.option("--pairs/--no-pairs", default=True, show_default=True, help="Also run pairs of faults.")
 @click.option(
     "--moments/--no-moments",

@@ -16,6 +16,7 @@ from typing import Final
 from atalante_emulator.faults import Fault
 from atalante_tools.console.options import PYBULLET
 from atalante_tools.faults.catalogue import SCENARIOS
+from atalante_tools.faults.false_alarms import Quiet, QuietTask
 from atalante_tools.faults.matrix import load_matrix
 from atalante_tools.faults.moments import MomentTask, MomentVerdict, random_pairs, single_tasks
 from atalante_tools.faults.runner import observe
@@ -138,8 +139,8 @@ class PairTask:
         return PairVerdict(first, second, state.name, tuple(failures))
 
 
-Task = CaseTask | EnduranceTask | PairTask | MomentTask
-Result = Verdict | Endurance | PairVerdict | MomentVerdict
+Task = CaseTask | EnduranceTask | PairTask | MomentTask | QuietTask
+Result = Verdict | Endurance | PairVerdict | MomentVerdict | Quiet
 
 
 def run_case(id_: str, case: Case) -> Verdict:

@@ -1,0 +1,53 @@
+"""Tests of walks without a fault: which walks run, and which diagnostics are false alarms."""
+
+from __future__ import annotations
+
+import json
+
+import pytest
+from click.testing import CliRunner
+
+from atalante_tools.cli import cli
+from atalante_tools.faults import campaign, false_alarms
+from atalante_tools.faults.false_alarms import Quiet, QuietTask, quiet_tasks
+
+
+def test_walks_cover_the_requested_cycles_in_the_air_and_on_the_ground() -> None:
+    assert [task.number for task in quiet_tasks(150_000, "mujoco")] == [0, 1, 2]
+
+
+@pytest.mark.parametrize("number", [4, 5])
+def test_walk_without_a_fault_has_no_false_alarm(number: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(false_alarms, "_CYCLES", 8000)
+    monkeypatch.setattr(false_alarms, "_STEPS", 3)
+    quiet = QuietTask(number, "pybullet")()
+    assert (quiet.state, quiet.alarms, quiet.failed) == ("ACTIVE", {}, False)
+    assert quiet.name.startswith(("air, constant, Xi 0.5", "ground, 66 kg, pinched, Xi 0.5")[number % 2])
+    assert quiet.cycles > 5000
+
+
+@pytest.mark.parametrize(
+    ("state", "counts", "failed"),
+    [
+        ("ACTIVE", {"TORQUE_SATURATED": 3, "GUIDE_OUTSIDE": 1, "OPERATOR_STOP": 1}, False),
+        ("ACTIVE", {"TORQUE_SATURATED": 3, "ENC_DRIFT": 2}, True),
+        ("HOLD", {}, True),
+    ],
+)
+def test_other_diagnostics_and_other_states_fail(state: str, counts: dict[str, int], failed: bool) -> None:
+    assert Quiet("a walk", 10, state, counts).failed is failed
+
+
+def test_command_reports_false_alarms(monkeypatch: pytest.MonkeyPatch) -> None:
+    walks = {0: Quiet("first", 10, "ACTIVE", {}), 1: Quiet("second", 20, "ACTIVE", {"ENC_DRIFT": 2})}
+    monkeypatch.setattr(campaign, "run_task", lambda task: walks[task.number])
+    arguments = ["faults", "false-alarms", "--jobs", "1", "--cycles"]
+    result = CliRunner().invoke(cli, [*arguments, "60000"])
+    assert result.exit_code == 0
+    assert "1 walks, 10 cycles, 0 false alarms" in result.stderr
+    result = CliRunner().invoke(cli, [*arguments, "120000"])
+    assert result.exit_code == 1
+    assert "ENC_DRIFT 2" in result.stdout
+    assert "1 of 2 walks had a false alarm" in result.stderr
+    result = CliRunner().invoke(cli, [*arguments, "120000", "--json"])
+    assert [json.loads(line)["alarms"] for line in result.stdout.splitlines()] == [{}, {"ENC_DRIFT": 2}]

@@ -1,0 +1,150 @@
+"""Walks without a fault: every diagnostic that they report, except the expected ones, is a false alarm.
+
+seed -> walk in the air or on the ground -> number of each reported diagnostic
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cache
+from typing import TYPE_CHECKING, Final
+
+from atalante_hal.types import State, SupervisorState
+from atalante_tools.console.options import EMBEDDED, Target
+from atalante_tools.session.walk_result import diagnostics
+
+if TYPE_CHECKING:
+    from collections.abc import Callable, Iterator
+
+    from atalante_control.gait.walk import WalkGaits
+    from atalante_control.model import Patient
+    from atalante_emulator.mechanics import Mechanics
+    from atalante_hal.types import Controller
+
+#: Cycles of a walk in the air. A walk on the ground of `_STEPS` steps has about as many.
+_CYCLES: Final = 60_000
+_STEPS: Final = 75
+#: Step of the walks on the ground: length [m] and duration [s].
+_STEP: Final = (0.16, 0.8)
+#: Diagnostics of a walk without a fault: the filter and the limiter report that they act.
+EXPECTED: Final = frozenset({"GUIDE_OUTSIDE", "TORQUE_SATURATED", "OPERATOR_STOP"})
+_SHAPES: Final = ("constant", "pinched")
+_FACTORS: Final = (1.0, 0.75, 0.5, 0.25, 0.0)
+
+
+@dataclass(frozen=True)
+class Quiet:
+    """Result of a walk without a fault."""
+
+    name: str
+    cycles: int  # cycles from power-on to the end of the walk
+    state: str  # state of the HAL at the end of the walk
+    counts: dict[str, int]  # number of each reported diagnostic
+
+    @property
+    def alarms(self) -> dict[str, int]:
+        """Return the number of each diagnostic that is not expected."""
+        return {code: count for code, count in self.counts.items() if code not in EXPECTED}
+
+    @property
+    def failed(self) -> bool:
+        """Return whether there was a false alarm, or the robot did not walk to the end."""
+        return bool(self.alarms) or self.state != SupervisorState.ACTIVE.name
+
+
+@dataclass(frozen=True)
+class QuietTask:
+    """Task to walk without a fault. The number of the task selects the walk, and is the seed of the sensor noise.
+
+    Every second walk is on the ground, with one of the eight patients of the study as a passive wearer.
+    """
+
+    number: int
+    engine: str
+
+    def __call__(self) -> Quiet:
+        """Walk and return the reported diagnostics."""
+        half = self.number // 2
+        shape, xi = _SHAPES[half % len(_SHAPES)], _FACTORS[half % len(_FACTORS)]
+        return self._on_the_ground(half, xi) if self.number % 2 else self._in_the_air(shape, xi)
+
+    def _in_the_air(self, shape: str, xi: float) -> Quiet:
+        from atalante_control.airwalk.controller import AirwalkConfig, AirwalkController
+        from atalante_control.gait.gait import AIRWALK_GAIT, load_gait
+        from atalante_control.guide.shapes import SHAPES
+        from atalante_emulator.mechanics import Mechanics
+        from atalante_hal.robot import load_robot
+        from atalante_tools.session.body import describe
+
+        robot = load_robot()
+        controller = AirwalkController(robot, load_gait(AIRWALK_GAIT, robot), SHAPES[shape], AirwalkConfig())
+        mechanics, name = Mechanics(describe(robot), self.engine), f"air, {shape}, Xi {xi:g}, seed {self.number}"
+        return self._run(name, controller, xi, mechanics, None, lambda state: state.cycle >= _CYCLES)
+
+    def _on_the_ground(self, half: int, xi: float) -> Quiet:
+        from atalante_control.gait.subject import STUDY_PATIENTS
+        from atalante_control.walking.controller import WalkController
+        from atalante_emulator.mechanics import Ground, Mechanics
+        from atalante_emulator.wearer import LimbParameters
+        from atalante_hal.robot import load_robot
+        from atalante_tools.session.body import describe
+
+        robot, patient = load_robot(), STUDY_PATIENTS[half % len(STUDY_PATIENTS)]
+        controller = WalkController(robot, patient, _gaits(patient), _STEPS)
+        mechanics = Mechanics(describe(robot, None, patient), self.engine, Ground(), LimbParameters())
+        name = f"ground, {patient.mass:g} kg, pinched, Xi {xi:g}, seed {self.number}"
+        pose = controller.standing_pose.tolist()
+        return self._run(name, controller, xi, mechanics, pose, lambda _: controller.done)
+
+    def _run(
+        self,
+        name: str,
+        controller: Controller,
+        xi: float,
+        mechanics: Mechanics,
+        pose: list[float] | None,
+        done: Callable[[State], bool],
+    ) -> Quiet:
+        """Walk until `done`, or until the robot leaves ACTIVE."""
+        from atalante_hal.loop import LockStep, run
+        from atalante_tools.session.rig import open_hal
+
+        ended, active = SupervisorState.OFF, False
+        with open_hal(
+            Target(EMBEDDED, "", lockstep=True, engine=self.engine),
+            seed=self.number,
+            pose=pose,
+            assistance_factor=xi,
+            controller_fields=controller.telemetry_fields,
+            mechanics=mechanics,
+        ) as rig:
+
+            def until(state: State) -> bool:
+                nonlocal ended, active
+                ended, now = state.supervisor, state.supervisor is SupervisorState.ACTIVE
+                left, active = active and not now, now
+                return left or done(state) or state.cycle > 2 * _CYCLES
+
+            statistics = run(rig.hal, controller, LockStep(), until=until)
+            counts = diagnostics(rig.hal)
+        return Quiet(name, statistics.cycles, ended.name, counts)
+
+
+def quiet_tasks(cycles: int, engine: str) -> Iterator[QuietTask]:
+    """Yield tasks that walk for about the given number of cycles in total.
+
+    Args:
+        cycles: number of cycles.
+        engine: physics engine of the emulated robot.
+    """
+    for number in range(-(-cycles // _CYCLES)):
+        yield QuietTask(number, engine)
+
+
+@cache
+def _gaits(patient: Patient) -> WalkGaits:
+    from atalante_control.gait.subject import Subject
+    from atalante_hal.robot import load_robot
+    from atalante_tools.session.walk_options import gaits_of_subject
+
+    return gaits_of_subject(Subject(patient, *_STEP), load_robot())
