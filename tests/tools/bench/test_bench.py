@@ -25,6 +25,8 @@ TARGETS = {
     "filter_tick": 1 / 20,
     "emulator_tick": 2.3,
     "lockstep": 1 / 6,
+    "lockstep_walk_pybullet": 1 / 6,
+    "lockstep_walk_mujoco": 1 / 12,
     "validate_log": 1 / 20,
     "validate_against_mdf": 1.0,
     "network_evaluation": 1.0,

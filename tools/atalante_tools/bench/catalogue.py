@@ -8,6 +8,7 @@ from typing import Final
 
 from atalante_tools.bench import gait_solve, gaits, ground, log_check, motion, startup, wire
 from atalante_tools.bench.measure import Effort, Measurement
+from atalante_tools.console.options import MUJOCO, PYBULLET
 
 _UNITS: Final = {"us": 1e6, "s": 1.0}
 
@@ -88,6 +89,20 @@ BENCHMARKS: Final = (
         "s",
         "real time: one simulated second of the whole stack, suspended",
         1 / 6,
+    ),
+    Benchmark(
+        "lockstep_walk_pybullet",
+        motion.lockstep_walk(PYBULLET),
+        "s",
+        "real time: one simulated second of the whole stack, walking on the ground with a patient in PyBullet",
+        1 / 6,
+    ),
+    Benchmark(
+        "lockstep_walk_mujoco",
+        motion.lockstep_walk(MUJOCO),
+        "s",
+        "real time: one simulated second of the whole stack, walking on the ground with a patient in MuJoCo",
+        1 / 12,
     ),
     Benchmark(
         "validate_log",

@@ -1,10 +1,10 @@
-"""Benchmarks of the guide filter, the emulator, and the whole stack on the suspended robot."""
+"""Benchmarks of the guide filter, the emulator, and the whole stack on the suspended robot and on the ground."""
 
 from __future__ import annotations
 
 import statistics
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from itertools import cycle
@@ -13,23 +13,35 @@ from typing import Any, Final
 import numpy as np
 
 from atalante_control.airwalk.controller import AirwalkController
+from atalante_control.gait.walk import DEFAULT_WALK, load_walk
 from atalante_control.guide.kernel import LegState
 from atalante_control.guide.shapes import CONSTANT
+from atalante_control.model import Patient
+from atalante_control.walking.controller import WalkController
+from atalante_emulator.mechanics import Ground, Mechanics
+from atalante_hal.robot import load_robot
 from atalante_hal.telemetry.ring import RingWriter
 from atalante_hal.types import PERIOD, State, SupervisorState
 from atalante_tools.bench.measure import Effort, Measurement, require, timed
 from atalante_tools.bench.nodes import ASSISTANCE, ERROR, ERROR_RATE, walk
 from atalante_tools.bench.stepped import SteppedRollout
 from atalante_tools.console.options import EMBEDDED, Target
+from atalante_tools.session.body import describe
 from atalante_tools.session.embedded import EmbeddedRobot
 from atalante_tools.session.rig import Rig, open_hal
+from atalante_tools.session.walk_options import DEFAULT_PATIENT, DEFAULT_STEP
 
 #: Largest accepted deviation of a joint from the gait while the robot walks [rad].
 POSE: Final = 0.15
 #: Number of cycles from power-on to the start of the measurement. The robot starts to walk within these cycles.
 _BEFORE_WALKING: Final = 3000
+#: As `_BEFORE_WALKING`, on the ground, where the robot is first lowered and shifts its weight.
+_BEFORE_STEPPING: Final = 8000
+#: Smallest vertical component of the upward axis of the pelvis of a robot that walks.
+_UPRIGHT: Final = 0.95
 #: Number of cycles that are timed together as one block.
 _BLOCK: Final = 50
+_STEPS: Final = 1000  # number of steps that no benchmark reaches
 _TICKS: Final = 40
 _INTEGRATIONS: Final = 4
 
@@ -111,6 +123,34 @@ def lockstep(effort: Effort) -> Measurement:
     """Measure the wall time for one simulated second of HAL, controller, emulator and telemetry ring."""
     with _stack(EmbeddedRobot()) as stack:
         stack.walk(effort)
+    return _against_real_time(stack)
+
+
+def lockstep_walk(engine: str) -> Callable[[Effort], Measurement]:
+    """Return the benchmark of a walk on the ground with a patient: the wall time for one simulated second of the whole stack.
+
+    Args:
+        engine: physics engine of the emulated robot.
+    """
+
+    def run(effort: Effort) -> Measurement:
+        with _walking_stack(engine) as stack:
+            cycles = stack.walk(effort)
+            controller = stack.controller
+            assert isinstance(controller, WalkController)
+            walked, (_, duration) = controller.statistics.steps, DEFAULT_STEP
+            require(
+                walked >= int(cycles * PERIOD / duration),
+                f"the robot must walk a step in {duration} s, got {walked} steps after {cycles * PERIOD} s",
+            )
+            require(controller.vertical[2] > _UPRIGHT, f"the pelvis must be upright, got {controller.vertical[2]:.2f}")
+        return _against_real_time(stack)
+
+    return run
+
+
+def _against_real_time(stack: _Stack) -> Measurement:
+    """Return the median time of the blocks for one simulated second, with real time as the baseline."""
     ordered = [block / (_BLOCK * PERIOD) for block in sorted(stack.blocks)]
     seconds, undisturbed = statistics.median(ordered), ordered[len(ordered) // 10]
     # Another process on the same physical core almost halves the speed, so the remark also reports the fastest blocks.
@@ -120,11 +160,12 @@ def lockstep(effort: Effort) -> Measurement:
 
 @dataclass
 class _Stack:
-    """HAL, controller, emulated suspended robot and telemetry ring, as in `atalante demo`."""
+    """HAL, controller, emulated robot and telemetry ring, as in `atalante demo` and `atalante walk`."""
 
     rig: Rig
-    controller: AirwalkController
+    controller: AirwalkController | WalkController
     ring: RingWriter
+    before: int = _BEFORE_WALKING  # number of cycles before the measurement
     blocks: list[float] = field(default_factory=list)  # wall time of each block of `_BLOCK` cycles [s]
 
     def walk(self, effort: Effort) -> int:
@@ -144,7 +185,7 @@ class _Stack:
         def finished(state: State) -> bool:
             nonlocal count, start
             count += 1
-            walked = count - _BEFORE_WALKING
+            walked = count - self.before
             if walked >= 0 and walked % _BLOCK == 0:
                 end = time.perf_counter()
                 if walked:
@@ -157,8 +198,8 @@ class _Stack:
         hal, ring = self.rig.hal, self.ring
         self.rig.run(self.controller, until=finished, record=lambda: ring.write(hal.record))
         require(
-            ring.written == _BEFORE_WALKING + cycles,
-            f"the ring must have {_BEFORE_WALKING + cycles} records, got {ring.written}",
+            ring.written == self.before + cycles,
+            f"the ring must have {self.before + cycles} records, got {ring.written}",
         )
         frames = hal.record[hal.layout["frames"]][0]
         require(
@@ -202,3 +243,28 @@ def _stack(robot_process: EmbeddedRobot | None) -> Iterator[_Stack]:
         RingWriter(rig.hal.record.nbytes) as ring,
     ):
         yield _Stack(rig, controller, ring)
+
+
+@contextmanager
+def _walking_stack(engine: str) -> Iterator[_Stack]:
+    """Open HAL, walking controller, emulated robot on the ground in a subprocess, and telemetry ring.
+
+    Args:
+        engine: physics engine of the emulated robot.
+    """
+    robot, patient = load_robot(), Patient(*DEFAULT_PATIENT)
+    gaits = load_walk(DEFAULT_WALK, robot)
+    controller = WalkController(robot, patient, gaits, _STEPS)
+    with (
+        open_hal(
+            Target(EMBEDDED, "", lockstep=True, engine=engine),
+            robot=robot,
+            pose=controller.standing_pose.tolist(),
+            controller_fields=controller.telemetry_fields,
+            gait_hash=gaits.step.hash32,
+            robot_process=EmbeddedRobot(engine),
+            mechanics=Mechanics(describe(robot, None, patient), engine, Ground()),
+        ) as rig,
+        RingWriter(rig.hal.record.nbytes) as ring,
+    ):
+        yield _Stack(rig, controller, ring, _BEFORE_STEPPING)
