@@ -18,7 +18,7 @@ from atalante_control.joint.flat_foot import recentring_rows
 from atalante_control.joint.pid import RIGHT
 from atalante_control.model import GRAVITY
 from atalante_control.walking.kinematics import Kinematics
-from atalante_control.walking.rotation import about_z
+from atalante_control.walking.rotation import about_z, cross
 from atalante_control.walking.standing import Shift
 from atalante_hal.robot import LEG_JOINTS
 from atalante_hal.types import Vector
@@ -65,15 +65,18 @@ def step_table(
     table = (gait if stance == RIGHT else gait.mirrored()).tables()
     yaw = -toe_out if stance == RIGHT else toe_out
     centre, speed = np.zeros((2, gait.cycles + 1, 3))
-    upright = about_z(0.0)
+    heading, upright = about_z(yaw), about_z(0.0)
+    # Views of the records that `update` overwrites. Creating a view of a field takes longer than the computation of a cycle.
+    sole, body = kinematics.chain.soles[stance], kinematics.chain.centre[0]
+    rotation, position, linear, angular = sole.rotation, sole.position, sole.linear, sole.angular
+    body_position, body_velocity = body.position, body.velocity
     for cycle, (q, qd) in enumerate(zip(table.q, table.qd, strict=True)):
-        chain = kinematics.update(q, qd)
-        sole = chain.soles[stance]
-        upright = _product(about_z(yaw), sole.rotation.T)  # rotation from pelvis to walking frame
-        lever = chain.centre[0].position - sole.position
+        kinematics.update(q, qd)
+        upright = _product(heading, rotation.T)  # rotation from pelvis to walking frame
+        lever = body_position - position
         # The sole is at rest on the ground. So the velocity of the centre of mass in the world is its velocity relative to the
         # sole, here in the axes of the pelvis.
-        relative = chain.centre[0].velocity - sole.linear - np.cross(sole.angular, lever)
+        relative = body_velocity - linear - np.array(cross(angular, lever))
         centre[cycle], speed[cycle] = upright @ lever, upright @ relative
     frequency = math.sqrt(GRAVITY / float(centre[:, 2].mean()))
     swing = 1 - stance
