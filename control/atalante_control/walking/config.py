@@ -10,6 +10,7 @@ from atalante_control.guide.config import StepGuideConfig
 from atalante_control.guide.disturbance import HandOver
 from atalante_control.joint.pid import PidGains
 from atalante_control.walking.contact import ImpactConfig
+from atalante_control.walking.placement import PlacementConfig
 
 Pair = tuple[float, float]
 
@@ -44,6 +45,7 @@ class WalkConfig:
     #: m/m, gain of the ankle stabiliser: shift of the centre of pressure per error of the divergent component of motion
     stabiliser: float = 2.5
     shift_limit: Pair = (0.12, 0.05)  # m, largest shifts of the centre of pressure: along the walk, sideways
+    placement: PlacementConfig = field(default_factory=PlacementConfig)  # foot placement and step timing
     flat_foot: bool = True  # whether the ankle of the swing leg holds the sole level
     #: m/s, downward speed of the swing foot after the nominal end of a step: normal step, stop step
     reach_speed: Pair = (0.3, 0.03)
@@ -92,6 +94,14 @@ class WalkConfig:
                 raise ValueError(f"{name} must be at least one cycle ({PERIOD} s), got {getattr(self, name)!r}")
         if not 0.0 <= self.stabiliser <= 10.0:
             raise ValueError(f"stabiliser must be a gain from 0 to 10, got {self.stabiliser!r}")
+        placement = self.placement
+        if not 0.0 < placement.slowest <= 1.0 <= placement.fastest < math.inf:
+            raise ValueError(
+                f"placement.slowest must be in (0, 1] and placement.fastest at least 1, got {placement.slowest!r} and "
+                f"{placement.fastest!r}"
+            )
+        if not (math.isfinite(placement.frozen) and placement.frozen >= PERIOD):
+            raise ValueError(f"placement.frozen must be at least one cycle ({PERIOD} s), got {placement.frozen!r}")
         for name, part in (("loaded", self.loaded), ("full_gains[0]", self.full_gains[0])):
             if not 0.0 < part < 0.5:
                 raise ValueError(f"{name} must be in (0, 0.5), as a fraction of the weight, got {part!r}")

@@ -45,6 +45,7 @@ from atalante_control.walking.kernel import (
 )
 from atalante_control.walking.kinematics import Kinematics
 from atalante_control.walking.phases import STEPPING, WALKING, Facts, Phase, next_phase
+from atalante_control.walking.placement import Placement
 from atalante_control.walking.reference import PhaseTable, Reach, shift_tables, step_table
 from atalante_control.walking.standing import Standing
 from atalante_control.walking.steering import Steering
@@ -57,6 +58,7 @@ from atalante_hal.types import Command, State, SupervisorState, Vector
 _N, _LEG = len(JOINTS), len(LEG_JOINTS)
 _SH, _SK = LEG_JOINTS.index("SH"), LEG_JOINTS.index("SK")
 _PELVIS, _TORSO = IMUS.index("pelvis"), IMUS.index("torso")
+_MARGIN = math.radians(1.0)  # rad, distance of a shifted swing leg from the position limits of its joints
 _IMU_AGE = 10  # cycles, largest valid age of an IMU message, equal to the timeout of this message in the DBC
 
 
@@ -127,6 +129,7 @@ class WalkController:
             standing_gains=config.full_gains[0] * weight,
             walking_gains=config.full_gains[1] * weight,
             gains=np.array([[2 * g.kp, 2 * g.kd, np.array(2 * g.ki) * PERIOD] for g in (swing, stance)]),
+            placement=config.placement,
         )
         self._stabiliser = Stabiliser(
             config.stabiliser, *config.shift_limit, flat_feet(exoskeleton)[LEFT].geometry[2], exoskeleton.toe_out
@@ -140,6 +143,9 @@ class WalkController:
         stages: Records[Stage] = zeros(Stage, 1)
         sensed: Records[Sensed] = zeros(Sensed, 1)
         balances: Records[Balance] = zeros(Balance, 1)
+        placements: Records[Placement] = zeros(Placement, 1)
+        placements[0].low[:], placements[0].high[:] = _range(robot, config)
+        self._placement = placements[0]
         outputs: Records[Outputs] = zeros(Outputs, 1)
         telemetry = zeros(Telemetry, 1)
         self.telemetry: Vector = telemetry.view(np.float64)
@@ -162,6 +168,7 @@ class WalkController:
             stages=stages,
             sensed=sensed,
             balances=balances,
+            placements=placements,
             outputs=outputs,
             telemetry=telemetry,
         )
@@ -187,7 +194,7 @@ class WalkController:
         self._stance, self._finishing = RIGHT, False
         self._stage.stance, self._stage.double, self._stage.steering = RIGHT, True, 0.0
         self._assisted, self._outside, self._promised, self._exceeded = False, 0, False, False
-        self._stage.assisted = self._stage.literal = False
+        self._stage.assisted = self._stage.literal = self._stage.placed = False
         self._command.walking = False
         self._command.outside = self._command.guide_left = self._command.hand_over_exceeded = False
         self._load[:] = 0.0
@@ -324,6 +331,8 @@ class WalkController:
         load = self._load.tolist()
         self._loaded = self._loaded + 1 if min(load) >= self._carrying else 0
         if phase in STEPPING:
+            # The phase rate of the step timing changes the position in the table. Without it, this is the cycle.
+            cycle = int(self._placement.clock + self._placement.pace)
             landed = self._landed = self._impact.update(load[1 - self._stance], cycle / nominal)
         steps = self.statistics.steps + (phase is Phase.STEP)
         loaded, stopping = self._loaded >= self._settled, self._stopping or steps >= self._steps_wanted
@@ -353,6 +362,7 @@ class WalkController:
         self.phase, self._since, self._table = phase, cycle, self._tables[phase, self._stance]
         stage.literal = self.config.literal_law and phase is Phase.STEP
         self._assisted = stage.assisted = phase is Phase.STEP and xi < 1.0
+        stage.placed = phase in (Phase.START, Phase.STEP) and not self._assisted and not stage.literal
         self._start(self._measured, self._table, self._parts)
         self._start_guide(min(1.0, max(0.0, xi)))
         record.feet[:], record.yaw = self.steering.feet.reshape(-1), self.steering.yaw
@@ -396,6 +406,13 @@ class WalkController:
             self.statistics.guide.count(cycle, ratio, float(record.h), bool(record.gate > guide.active))
             self._outside = self._outside + 1 if command.outside else max(0, self._outside - 1)
         command.guide_left = self._promised and self._outside > guide.outside_cycles
+
+
+def _range(robot: Robot, config: WalkConfig) -> tuple[Vector, Vector]:
+    """Return the smallest and the largest desired joint angles of a shifted swing foot, shape (12,) each [rad]."""
+    low, high = robot.position_min + _MARGIN, robot.position_max - _MARGIN
+    low[[_SK, _LEG + _SK]] = config.reach_knee
+    return low, high
 
 
 def _fading(duration: float) -> Vector:

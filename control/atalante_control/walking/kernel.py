@@ -22,6 +22,15 @@ from atalante_control.structured import Records
 from atalante_control.walking.attitude import Attitude, observe
 from atalante_control.walking.dcm import Balance, Stabiliser, ankle_torques, dcm, pressure_shift
 from atalante_control.walking.kinematics import Chain, move
+from atalante_control.walking.placement import (
+    Motion,
+    Placement,
+    PlacementConfig,
+    follow,
+    landing,
+    late_landing,
+    shift_foot,
+)
 from atalante_control.walking.reference import PhaseTable
 from atalante_control.walking.rotation import cross, rotated, tilt_quaternion
 from atalante_control.walking.telemetry import Telemetry, write_guide, write_telemetry
@@ -60,6 +69,7 @@ class Stage:
     deviation: Annotated[Vector, len(JOINTS)]
     #: rad/s, joint speeds at the start of the phase minus the speeds in the first row of the phase table
     rate: Annotated[Vector, len(JOINTS)]
+    placed: bool  # True: foot placement and step timing act
     literal: bool  # True: the law of the paper drives the robot, see `WalkConfig.literal`
     flat: bool  # True: the sole of the swing foot is held level
     #: True: the guide filter drives SH and SK of the swing leg; False at Xi = 1 and in all phases except the periodic step
@@ -88,6 +98,7 @@ class Constants(NamedTuple):
         float  # N, load of the stance foot at which the full stance gains are applied to its ankle while walking
     )
     gains: Vector  # (2, 3, 12) gains of swing leg and stance leg: Kp [Nm/rad], Kd [Nm s/rad], Ki times the cycle time [Nm/rad]
+    placement: PlacementConfig  # parameters of foot placement and step timing
 
 
 class Assistance(NamedTuple):
@@ -110,6 +121,7 @@ class Parts(NamedTuple):
     stages: Records[Stage]  # (1,)
     sensed: Records[Sensed]  # (1,)
     balances: Records[Balance]  # (1,)
+    placements: Records[Placement]  # (1,)
     outputs: Records[Outputs]  # (1,) results
     telemetry: Records[Telemetry]  # (1,) telemetry of the cycle
 
@@ -199,9 +211,11 @@ def start(measured: Measured, table: PhaseTable, parts: Parts) -> None:
     Args:
         measured: measurements of the cycle.
         table: table of the new phase.
-        parts: arrays of the parts; `stages` and `ankles` are updated.
+        parts: arrays of the parts; `stages`, `placements` and `ankles` are updated.
     """
-    stage, n = parts.stages[0], len(measured.q)
+    stage, placement, n = parts.stages[0], parts.placements[0], len(measured.q)
+    placement.clock, placement.pace = 0.0, 1.0
+    placement.target[:], placement.offset[:], placement.speed[:], placement.change[:] = 0.0, 0.0, 0.0, 0.0
     for joint in range(n):
         stage.deviation[joint] = measured.q[joint] - table.rows[0, joint]
         # In a phase without a swing foot, the measured speeds are ignored. After a landing, a re-centring that starts with the
@@ -246,8 +260,15 @@ def act(
     """
     stage, sensed, balance, output = parts.stages[0], parts.sensed[0], parts.balances[0], parts.outputs[0]
     desired, torque, n = output.desired, output.torque, len(measured.q)
-    row = _desired(cycle, table, stage, desired)
+    placement = parts.placements[0]
+    if cycle > 0:
+        placement.clock += placement.pace
+    row = _desired(cycle, placement, table, stage, desired)
+    for k in range(2):
+        balance.error[k] = balance.dcm[k] - table.dcm[row, k]
     swing = 1 - stage.stance
+    if stage.placed:
+        _place(cycle, table, constants.placement, stabiliser.gain, parts)
     if stage.flat and not stage.double:
         attitude, gyro = _tibia(swing, measured, parts)
         write_level_ankle(parts.ankles[swing], table.recentring, cycle, attitude, gyro, desired)
@@ -261,8 +282,6 @@ def act(
         for joint in range(n):
             torque[joint] += output.gravity[joint] + carried * table.feedforward[row, joint]
 
-    for k in range(2):
-        balance.error[k] = balance.dcm[k] - table.dcm[row, k]
     balance.shift[0], balance.shift[1] = pressure_shift(stabiliser, balance.error)
     for side in range(len(SIDES)):
         if (stage.double or side == stage.stance) and not stage.literal:
@@ -309,20 +328,62 @@ def _assist(cycle: int, measured: Measured, assistance: Assistance, parts: Parts
         torque[knee] += assistance.fade[cycle - last] * stage.excess[1]
 
 
-def _desired(cycle: int, table: PhaseTable, stage: Stage, desired: Vector) -> int:
-    """Write q_des and q_des' without the correction for a flat foot, and return the row index in the table.
+def _place(cycle: int, table: PhaseTable, config: PlacementConfig, gain: float, parts: Parts) -> None:
+    """Update the offset of the landing and the phase rate, and shift the desired position of the swing foot.
 
     Args:
         cycle: cycles since the start of the phase.
         table: table of the phase.
+        config: parameters of foot placement and step timing.
+        gain: gain of the ankle stabiliser.
+        parts: arrays of the parts; `placements` and `outputs` are updated.
+    """
+    stage, balance, placement = parts.stages[0], parts.balances[0], parts.placements[0]
+    last, swing = len(table.rows) - 1, 1 - stage.stance
+    remaining, rate, row = (last - placement.clock) * PERIOD, placement.pace, int(min(placement.clock, float(last)))
+    error, side = (balance.error[0], balance.error[1]), -1.0 if swing else 1.0
+    if remaining <= config.frozen:
+        rate = 1.0
+        placement.target[0], placement.target[1] = late_landing(config, error, side)
+    elif cycle * PERIOD >= config.settled:
+        nominal = table.dcm[row, 0], table.dcm[row, 1]
+        final = table.dcm[last, 0], table.dcm[last, 1]
+        motion = Motion(error, nominal, final, table.frequency * remaining, side)
+        placement.target[0], placement.target[1], rate = landing(config, gain, motion)
+    follow(config, placement, rate)
+    if placement.offset[0] == 0.0 and placement.offset[1] == 0.0:
+        return
+    rotation, heading = parts.attitudes[0].rotation, balance.heading
+    c, s = math.cos(heading), math.sin(heading)
+    x = c * placement.offset[0] - s * placement.offset[1]
+    y = s * placement.offset[0] + c * placement.offset[1]
+    shift = (
+        rotation[0, 0] * x + rotation[1, 0] * y,
+        rotation[0, 1] * x + rotation[1, 1] * y,
+        rotation[0, 2] * x + rotation[1, 2] * y,
+    )
+    first = parts.chain.soles[swing].link - _LEG + 1
+    shift_foot(placement, parts.chain.links, first, parts.outputs[0].desired, swing * _LEG, shift)
+
+
+def _desired(cycle: int, placement: Placement, table: PhaseTable, stage: Stage, desired: Vector) -> int:
+    """Write q_des and q_des' without foot placement and flat foot, and return the row index in the table.
+
+    Args:
+        cycle: cycles since the start of the phase.
+        placement: position in the table, and phase rate.
+        table: table of the phase.
         stage: data of the phase.
         desired: q_des [rad], then q_des' [rad/s], shape (24,), overwritten.
     """
-    n, last = len(desired) // 2, len(table.rows) - 1
-    row = min(cycle, last)
+    n, last, clock = len(desired) // 2, len(table.rows) - 1, placement.clock
+    row = int(min(clock, float(last)))
+    part, following = min(clock, float(last)) - row, min(row + 1, last)
+    pace = placement.pace if clock <= last else 0.0
     for joint in range(n):
-        desired[joint] = table.rows[row, joint]
-        desired[n + joint] = table.rows[row, n + joint] if cycle <= last else 0.0
+        angle, rate = table.rows[row, joint], table.rows[row, n + joint]
+        desired[joint] = angle + part * (table.rows[following, joint] - angle)
+        desired[n + joint] = pace * (rate + part * (table.rows[following, n + joint] - rate))
     leg = _LEG * (1 - stage.stance)
     for joint in range(n):
         guided = stage.assisted and (joint == leg + _SH or joint == leg + _SK)
@@ -333,15 +394,15 @@ def _desired(cycle: int, table: PhaseTable, stage: Stage, desired: Vector) -> in
             desired[n + joint] += deviation * cubic[2] + rate * cubic[3]
     if stage.double:
         return row
-    x = row / last
+    x = min(clock / last, 1.0)
     desired[leg + _TH] += stage.steering * x**3 * (10.0 - 15.0 * x + 6.0 * x * x)
-    desired[n + leg + _TH] += stage.steering * 30.0 * x * x * (1.0 - x) ** 2 / (last * PERIOD)
-    if cycle > last:
+    desired[n + leg + _TH] += stage.steering * pace * 30.0 * x * x * (1.0 - x) ** 2 / (last * PERIOD)
+    if clock > last:
         # The speed of the foot rises slowly. A sudden rise would turn a foot that already touches the ground with one corner.
-        time = min(cycle - last, table.reach_cycles) * PERIOD
+        time = min(clock - last, float(table.reach_cycles)) * PERIOD
         moving = 1.0 - math.exp(-time / _REACH_RISE)
         time -= _REACH_RISE * moving
-        moving = moving if cycle - last < table.reach_cycles else 0.0
+        moving = moving if clock - last < table.reach_cycles else 0.0
         for joint, speed in ((_SH, table.reach[0]), (_SK, table.reach[1])):
             desired[leg + joint] += speed * time
             desired[n + leg + joint] += speed * moving

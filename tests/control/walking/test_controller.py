@@ -2,13 +2,18 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 import pytest
 
 from atalante_control.gait.walk import DEFAULT_WALK, load_walk
 from atalante_control.model import ExoskeletonParameters, Patient, urdf
+from atalante_control.walking.config import WalkConfig
 from atalante_control.walking.controller import WalkController
 from atalante_control.walking.phases import Phase
+from atalante_control.walking.placement import PlacementConfig
+from atalante_control.walking.telemetry import TELEMETRY_FIELDS
 from atalante_emulator.bodies import Body, hang, make_body
 from atalante_emulator.imu import ImuParameters, Imus, ImuSignals
 from atalante_hal.robot import load_robot
@@ -97,6 +102,42 @@ def test_patient_walks_from_standing_to_standing(engine: str) -> None:
     assert controller.steering.distance == pytest.approx(4 * 0.16, abs=0.12)
     assert abs(controller.steering.lateral) < 0.05
     assert controller.max_dcm_error < 0.03
+
+
+def elapsed_of(controller: WalkController) -> float:
+    """Return the time since the start of the phase, from the telemetry [s]."""
+    widths = dict(TELEMETRY_FIELDS)
+    names = [*widths]
+    return float(controller.telemetry[sum(widths[name] for name in names[: names.index("elapsed")])])
+
+
+def pushed(dead_zone: float, direction: float, force: float) -> bool:
+    """Push the pelvis for 0.2 s from phase 0.2 of the second step; return whether the robot walks three more steps."""
+    config = WalkConfig(placement=PlacementConfig(dead_zone=dead_zone))
+    controller = WalkController(ROBOT, PATIENT, WALK, 100, config)
+    body = make_body("mujoco", urdf(ExoskeletonParameters(), ROBOT, PATIENT), free=True, ground=0.0)
+    angle, cycles = math.radians(direction), 0
+    try:
+        hang(body, controller.standing_pose.tolist(), 0.0005)
+        robot = Ideal(body)
+        while controller.statistics.steps < 4 and robot.upright():
+            robot.cycle(controller)
+            steps, elapsed = controller.statistics.steps, elapsed_of(controller)
+            if steps == 1 and controller.phase is Phase.STEP and elapsed >= 0.16 and cycles < 200:
+                body.push((force * math.cos(angle), force * math.sin(angle), 0.0))
+                cycles += 1
+                if cycles == 200:
+                    body.push((0.0, 0.0, 0.0))
+            assert robot.state.cycle < 30_000
+        return robot.upright()
+    finally:
+        body.close()
+
+
+@pytest.mark.parametrize(("direction", "force"), [(90.0, 210.0), (270.0, 180.0)], ids=["left", "right"])
+def test_robot_withstands_a_push_only_with_foot_placement_and_step_timing(direction: float, force: float) -> None:
+    assert pushed(PlacementConfig().dead_zone, direction, force)
+    assert not pushed(math.inf, direction, force)
 
 
 def test_finish_step_ends_the_walk_with_a_stop_step() -> None:

@@ -1,0 +1,260 @@
+"""Foot placement and step timing against pushes: `DCM error -> offset of the landing, phase rate -> shifted swing foot`.
+
+DCM is the divergent component of motion (`walking.dcm`). Let e be its error, w the natural frequency, k the gain of the ankle
+stabiliser and L the largest shift of the centre of pressure by the ankle. The ankle changes e by e' = w (e - sat(k e, L)), where
+sat limits k e to L. An error below L decays, and a larger error grows with exp(w t). `predicted` is the solution of this equation
+at the nominal landing.
+
+The predicted error beyond a dead zone is removed in two ways, see `landing`:
+
+- Step timing. In a short step, the lateral DCM moves outwards less than in a long step. The phase rate is the quotient of the
+  nominal time to the landing and the time in which the lateral DCM reaches its nominal value at a landing.
+- Foot placement. The landing is shifted by the error of the DCM at the landing. The DCM is then at its nominal position relative
+  to the new stance foot.
+
+While the predicted error is inside the dead zone, the offset is exactly 0 and the phase rate exactly 1.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Annotated, NamedTuple
+
+from atalante_control.gait.gait import PERIOD
+from atalante_control.structured import Records
+from atalante_control.walking.kinematics import Link
+from atalante_control.walking.rotation import cross, rotated
+from atalante_hal.robot import LEG_JOINTS
+from atalante_hal.types import Vector
+
+Pair = tuple[float, float]
+Vector3 = tuple[float, float, float]
+
+_FH, _SH, _SK = (LEG_JOINTS.index(name) for name in ("FH", "SH", "SK"))
+#: Joints of the swing leg that shift the foot.
+_SHIFTING = (_FH, _SH, _SK)
+#: Joints from the pelvis to the ankle.
+_LINKS = LEG_JOINTS.index("SA") + 1
+#: m3, smallest determinant of the Jacobian of the ankle; with a straight leg it is 0, and the foot is not shifted further
+_SINGULAR = 1e-3
+_FASTEST = 3.0  # rad/s, largest desired speed of a joint that shifts the foot
+
+
+class PlacementConfig(NamedTuple):
+    """Parameters of foot placement and step timing."""
+
+    #: m, predicted error of the DCM at the landing up to which nothing changes; with infinity, placement and timing are off
+    dead_zone: float = 0.015
+    forward: float = 0.15  # m, largest offset of a landing forwards and backwards
+    outward: float = 0.16  # m, largest offset of a landing away from the stance foot
+    inward: float = 0.02  # m, largest offset of a landing towards the stance foot
+    slowest: float = 0.5  # smallest phase rate
+    fastest: float = 1.4  # largest phase rate
+    #: s, time since the start of a step before which the error is ignored, because the new stance foot is not yet at rest
+    settled: float = 0.08
+    #: s, time before the nominal landing in which the phase rate returns to 1, see `late_landing` for the offset
+    frozen: float = 0.05
+    #: m, error of the DCM beyond which the ankle stabiliser cannot stop its growth: forward, sideways. The values were measured.
+    #: They are smaller than the limits of the stabiliser, because the PIDs of the stance leg act against the shift.
+    capacity: Pair = (0.10, 0.044)
+    bandwidth: float = 25.0  # rad/s, natural frequency of the critically damped filter of the offset
+    speed: float = 1.2  # m/s, largest speed of the offset
+    acceleration: float = 25.0  # m/s2, largest acceleration of the offset
+    slew: float = 15.0  # 1/s, largest change of the phase rate per time
+
+
+class Placement:
+    """State of foot placement and step timing in the current phase, and working memory of `shift_foot`."""
+
+    clock: float  # cycles, position in the table of the phase
+    pace: float  # phase rate: nominal cycles per cycle
+    target: Annotated[Vector, 2]  # m, requested offset of the landing in the walking frame
+    offset: Annotated[Vector, 2]  # m, present offset of the swing foot in the walking frame
+    speed: Annotated[Vector, 2]  # m/s, speed of the offset
+    change: Annotated[Vector, 3]  # rad, changes of FH, SH and SK of the swing leg
+    low: Annotated[Vector, 12]  # rad, smallest desired angles of the joints
+    high: Annotated[Vector, 12]  # rad, largest desired angles of the joints
+    rotation: Annotated[Vector, (3, 3)]  # rotation matrix from the last link to the pelvis
+    origin: Annotated[Vector, (_LINKS, 3)]  # m, positions of the joints of the swing leg in the pelvis frame
+    axis: Annotated[Vector, (_LINKS, 3)]  # joint axes of the swing leg in the axes of the pelvis
+
+
+class Motion(NamedTuple):
+    """DCM of a step and its prediction to the nominal landing."""
+
+    error: Pair  # m, measured minus nominal DCM in the walking frame
+    nominal: Pair  # m, nominal DCM now
+    final: Pair  # m, nominal DCM at the nominal landing
+    exponent: float  # w t, natural frequency times time to the nominal landing, above 0
+    side: float  # direction from stance foot to swing foot: 1 left, -1 right
+
+
+def predicted(error: float, gain: float, limit: float, exponent: float) -> float:
+    """Return the error of the DCM at the landing with the action of the ankle, the solution of e' = w (e - sat(k e, L)) [m].
+
+    Args:
+        error: present error e [m].
+        gain: gain k of the ankle stabiliser, at least 0. Between 0 and 1, the result is too small for an error that grows beyond
+            L / k.
+        limit: largest shift L of the centre of pressure [m].
+        exponent: w t, natural frequency times time to the landing.
+    """
+    size = abs(error)
+    linear = limit / gain if gain > 0.0 else math.inf  # error up to which the shift is proportional to the error
+    if size > linear:
+        if size >= limit:
+            return math.copysign(limit + (size - limit) * math.exp(exponent), error)
+        saturated = math.log((limit - linear) / (limit - size))
+        if exponent <= saturated:
+            return math.copysign(limit - (limit - size) * math.exp(exponent), error)
+        size, exponent = linear, exponent - saturated
+    return math.copysign(size * math.exp((1.0 - gain) * exponent), error)
+
+
+def beyond(value: float, zone: float) -> float:
+    """Return the part of a value outside the dead zone from -zone to zone.
+
+    Args:
+        value: value.
+        zone: dead zone, at least 0.
+    """
+    return value - min(max(value, -zone), zone)
+
+
+def landing(config: PlacementConfig, gain: float, motion: Motion) -> tuple[float, float, float]:
+    """Return the offset of the landing in the walking frame, forwards and to the left [m], and the phase rate.
+
+    Between now and the landing the centre of pressure c is taken as constant, so that xi(t) = c + (xi - c) exp(w t).
+    The value of c is the one with which the nominal DCM reaches its value at the nominal landing.
+
+    Args:
+        config: parameters.
+        gain: gain of the ankle stabiliser.
+        motion: DCM and its prediction.
+    """
+    growth, side = math.exp(motion.exponent), motion.side
+    x = beyond(predicted(motion.error[0], gain, config.capacity[0], motion.exponent), config.dead_zone)
+    y = beyond(predicted(motion.error[1], gain, config.capacity[1], motion.exponent), config.dead_zone)
+    if x == 0.0 and y == 0.0:
+        return 0.0, 0.0, 1.0
+    # distance sideways that the nominal DCM has moved away from c at the nominal landing, xi(T) - c
+    outward = side * (motion.final[1] - motion.nominal[1]) * growth / (growth - 1.0)
+    rate, distance = 1.0, outward + side * y
+    if y != 0.0 and outward > 0.0:
+        exponent = math.inf if distance <= 0.0 else motion.exponent + math.log(outward / distance)
+        rate = config.fastest
+        if exponent * config.fastest > motion.exponent:
+            rate = max(motion.exponent / exponent, config.slowest)
+    later = math.exp(motion.exponent / rate - motion.exponent)
+    offset_x = x * later
+    offset_y = distance * later - outward
+    return (
+        min(max(offset_x, -config.forward), config.forward),
+        side * min(max(offset_y, -config.inward), config.outward),
+        rate,
+    )
+
+
+def late_landing(config: PlacementConfig, error: Pair, side: float) -> Pair:
+    """Return the offset of a landing that follows immediately, in the walking frame, forwards and to the left [m].
+
+    Args:
+        config: parameters.
+        error: measured minus nominal DCM in the walking frame [m].
+        side: direction from stance foot to swing foot: 1 left, -1 right.
+    """
+    return (
+        min(max(beyond(error[0], 2.0 * config.dead_zone), -config.forward), config.forward),
+        side * min(max(side * beyond(error[1], 2.0 * config.dead_zone), -config.inward), config.outward),
+    )
+
+
+def follow(config: PlacementConfig, placement: Placement, rate: float) -> None:
+    """Move offset and phase rate towards their targets, with limited speed and acceleration.
+
+    Args:
+        config: parameters.
+        placement: state; updated.
+        rate: target of the phase rate.
+    """
+    w, change = config.bandwidth, config.slew * PERIOD
+    for k in range(2):
+        pull = w * w * (placement.target[k] - placement.offset[k]) - 2.0 * w * placement.speed[k]
+        speed = placement.speed[k] + PERIOD * min(max(pull, -config.acceleration), config.acceleration)
+        placement.speed[k] = min(max(speed, -config.speed), config.speed)
+        placement.offset[k] += PERIOD * placement.speed[k]
+    placement.pace += min(max(rate - placement.pace, -change), change)
+
+
+def shift_foot(
+    placement: Placement, links: Records[Link], first: int, desired: Vector, leg: int, shift: Vector3
+) -> None:
+    """Shift the desired position of the ankle of the swing leg, by one Newton step for FH, SH and SK in each cycle.
+
+    The attitude of the foot is not considered, because the ankle holds the sole level.
+
+    Args:
+        placement: state; `change` is updated.
+        links: links of the robot, `Kinematics.chain`.
+        first: index of the first link of the swing leg.
+        desired: q_des [rad], then q_des' [rad/s], shape (24,); the elements of FH, SH and SK of the swing leg are updated.
+        leg: index of the first joint of the swing leg.
+        shift: shift of the ankle in the axes of the pelvis [m].
+    """
+    change, count = placement.change, len(desired) // 2
+    before = _ankle(placement, links, first, desired)
+    for k in range(3):
+        desired[leg + _SHIFTING[k]] += change[k]
+    now = _ankle(placement, links, first, desired)
+    missing = (
+        before[0] + shift[0] - now[0],
+        before[1] + shift[1] - now[1],
+        before[2] + shift[2] - now[2],
+    )
+    a, b, c = _column(placement, now, _FH), _column(placement, now, _SH), _column(placement, now, _SK)
+    bc, ca, ab = cross(b, c), cross(c, a), cross(a, b)
+    determinant = a[0] * bc[0] + a[1] * bc[1] + a[2] * bc[2]
+    if abs(determinant) < _SINGULAR:
+        return
+    for k in range(3):
+        row = bc if k == 0 else ca if k == 1 else ab
+        step = (row[0] * missing[0] + row[1] * missing[1] + row[2] * missing[2]) / determinant
+        joint = leg + _SHIFTING[k]
+        least, most = (-_FASTEST - desired[count + joint]) * PERIOD, (_FASTEST - desired[count + joint]) * PERIOD
+        angle = desired[joint] + min(max(step, min(least, 0.0)), max(most, 0.0))
+        angle = min(max(angle, placement.low[joint]), placement.high[joint])
+        step = angle - desired[joint]
+        desired[joint] = angle
+        desired[count + joint] += step / PERIOD
+        change[k] += step
+
+
+def _ankle(placement: Placement, links: Records[Link], first: int, desired: Vector) -> Vector3:
+    """Return the position of the ankle in the pelvis frame [m]. Write joint positions and axes into `placement`."""
+    rotation, position = placement.rotation, (0.0, 0.0, 0.0)
+    for i in range(3):
+        for j in range(3):
+            rotation[i, j] = 1.0 if i == j else 0.0
+    for i in range(_LINKS):
+        link = links[first + i]
+        arm, turn, angle = rotated(rotation, link.offset), link.turn, desired[link.joint]
+        position = position[0] + arm[0], position[1] + arm[1], position[2] + arm[2]
+        sine, versine = math.sin(angle), 1.0 - math.cos(angle)
+        for row in range(3):
+            x, y, z = rotation[row, 0], rotation[row, 1], rotation[row, 2]
+            for column in range(3):
+                rotation[row, column] = (
+                    x * (turn[0, 0, column] + sine * turn[1, 0, column] + versine * turn[2, 0, column])
+                    + y * (turn[0, 1, column] + sine * turn[1, 1, column] + versine * turn[2, 1, column])
+                    + z * (turn[0, 2, column] + sine * turn[1, 2, column] + versine * turn[2, 2, column])
+                )
+        axis = rotated(rotation, link.axis)
+        for k in range(3):
+            placement.origin[i, k], placement.axis[i, k] = position[k], axis[k]
+    return position
+
+
+def _column(placement: Placement, ankle: Vector3, joint: int) -> Vector3:
+    """Return the velocity of the ankle at a unit speed of a joint of the leg [m]."""
+    origin = placement.origin[joint]
+    return cross(placement.axis[joint], (ankle[0] - origin[0], ankle[1] - origin[1], ankle[2] - origin[2]))
