@@ -9,7 +9,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from atalante_hal.robot import SIDES
+from atalante_hal.compiled import compiled
+from atalante_hal.robot import JOINTS, SIDES
 from atalante_hal.types import Vector
 
 
@@ -20,6 +21,23 @@ class LimbParameters:
     stiffness: tuple[float, ...] = (20.0, 10.0, 20.0, 15.0, 15.0, 5.0)  # Nm/rad
     damping: tuple[float, ...] = (2.0, 1.0, 2.0, 1.5, 1.0, 0.5)  # Nm s/rad
     rest: tuple[float, ...] = (0.0, 0.0, -0.2, 0.4, -0.1, 0.0)  # joint angles with no stiffness torque [rad]
+
+
+def _impedance(
+    offset: Vector, stiffness: Vector, damping: Vector, position: Vector, velocity: Vector, torque: Vector
+) -> None:
+    """Compute the torques of springs and dampers at the joints.
+
+    Args:
+        offset: torque of each spring at joint angle 0, shape (12,) [Nm].
+        stiffness: stiffness of each spring, shape (12,) [Nm/rad].
+        damping: damping of each joint, shape (12,) [Nm s/rad].
+        position: joint positions, shape (12,) [rad].
+        velocity: joint velocities, shape (12,) [rad/s].
+        torque: output for the torques, shape (12,) [Nm].
+    """
+    for joint in range(len(torque)):
+        torque[joint] = offset[joint] - stiffness[joint] * position[joint] - damping[joint] * velocity[joint]
 
 
 class PassiveWearer:
@@ -36,6 +54,9 @@ class PassiveWearer:
         self._stiffness = np.array(parameters.stiffness * both)
         self._damping = np.array(parameters.damping * both)
         self._offset = self._stiffness * np.array(parameters.rest * both)
+        self._impedance = compiled(_impedance)
+        # Compile the kernel now, because compilation takes longer than a cycle.
+        self.act(*np.zeros((3, len(JOINTS))))
 
     def act(self, position: Vector, velocity: Vector, torque: Vector) -> None:
         """Compute the torques of the limbs on the joints.
@@ -45,5 +66,4 @@ class PassiveWearer:
             velocity: joint velocities, shape (12,) [rad/s].
             torque: output for the torques, shape (12,) [Nm].
         """
-        np.subtract(self._offset, self._stiffness * position, out=torque)
-        torque -= self._damping * velocity
+        self._impedance(self._offset, self._stiffness, self._damping, position, velocity, torque)
