@@ -199,8 +199,11 @@ class SafetyMonitor:
         return self._image.crc_errors + self._heartbeats.image.crc_errors
 
     def missing(self) -> set[str]:
-        """Return the nodes that prevent READY: timed out, not trusted yet, without a status message, or with a different DBC."""
-        return self._message_monitor.missing() | self._heartbeats.missing()
+        """Return the nodes that prevent READY.
+
+        They timed out, are not trusted yet, sent no status message, have a different DBC, or were not checked at rest.
+        """
+        return self._message_monitor.missing() | self._heartbeats.missing() | self._plausibility.at_rest.unchecked
 
     def _evaluate(self, bus_faults: Sequence[Finding]) -> None:
         """Raise all diagnostics of this cycle, run the state machine, and apply the reactions."""
@@ -215,7 +218,8 @@ class SafetyMonitor:
         for finding in (*bus_faults, *self._plausibility.findings, *self._reports):
             memory.raise_finding(cycle, finding)
         self._reports.clear()
-        nodes_ready = message_monitor.nodes_ready and self._heartbeats.all_reported
+        checked = not self._plausibility.at_rest.unchecked
+        nodes_ready = message_monitor.nodes_ready and self._heartbeats.all_reported and checked
         self._check_drives(nodes_ready)
         if self._duplicate_found:
             memory.raise_dtc(
@@ -257,6 +261,7 @@ class SafetyMonitor:
             after is before
             and message_monitor.settled
             and self._heartbeats.quiet
+            and checked
             and not (
                 memory.active
                 or self._weak
@@ -366,6 +371,7 @@ class SafetyMonitor:
     def _enter(self, before: SupervisorState, after: SupervisorState, reasons: frozenset[Dtc]) -> None:
         state, memory = self._state, self.memory
         state.supervisor = after
+        self._plausibility.at_rest.enter(after)
         # Remove the START request, because one START may change the state only once.
         self.start_wanted = 0
         self._pendant.clear_press()
