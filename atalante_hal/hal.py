@@ -220,7 +220,10 @@ class Hal:
             and not safety_monitor.start_prevented
         ):
             control[:] = words_towards_operation(state.drive_state)
-            self._follow_drives()
+            if safety_monitor.proof.running:
+                self._test_directions()
+            else:
+                self._follow_drives()
         else:
             safety_monitor.enabling = False
         if ((control == Controlword.QUICK_STOP) & (state.drive_state == DriveState.OPERATION_ENABLED)).any():
@@ -244,6 +247,13 @@ class Hal:
             self._safety_monitor.enabling = True
         if on.all():
             self._commands.torque[:] = self._limiter.last
+
+    def _test_directions(self) -> None:
+        """Send the torques of the test of the directions, after all limits."""
+        proof = self._safety_monitor.proof
+        self._limiter.apply(proof.torque(self.state.position, self.state.velocity), self._parts.motion)
+        proof.sent(self._limiter.last)
+        self._commands.torque[:] = self._limiter.last
 
     def fail(self, error: Exception) -> Vector:
         """Report an exception of the controller or of its command, and send HOLD in the same cycle.

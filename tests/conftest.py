@@ -29,6 +29,7 @@ from atalante_hal.bus.pair import lockstep_pair
 from atalante_hal.bus.wrapped import WrappedBus
 from atalante_hal.hal import Hal
 from atalante_hal.robot import Robot, load_robot
+from atalante_hal.safety.direction import pose_gains
 from atalante_hal.types import Command, State, SupervisorState
 from atalante_hal.wire.frame import Frames
 
@@ -218,7 +219,8 @@ class HoldRig:
 
     def hold_torque(self, *, step: int | None = None, **flags: bool) -> Command:
         robot, state = self.hal.robot, self.hal.state
-        torque = robot.hold_kp * (self._anchor - state.position) - robot.hold_kd * state.velocity
+        stiffness, damping = pose_gains(robot)
+        torque = stiffness * (self._anchor - state.position) - damping * state.velocity
         return Command(torque, np.zeros(8), step=step, **flags)
 
     def codes(self) -> list[str]:

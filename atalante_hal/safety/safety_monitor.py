@@ -18,6 +18,7 @@ from atalante_dbc import Network
 from atalante_hal.pendant import Pendant
 from atalante_hal.robot import JOINTS, Robot
 from atalante_hal.safety.diagnostics import Dtc, Finding, Reaction
+from atalante_hal.safety.direction import DirectionProof
 from atalante_hal.safety.events import Event
 from atalante_hal.safety.fault_memory import FaultMemory
 from atalante_hal.safety.heartbeats import Heartbeats
@@ -70,6 +71,7 @@ class SafetyMonitor:
             processed.
         enabling: True while drives are being enabled. In this time, the limiter follows the torques that the drives report.
         recalled: cycle in which QUICK_STOP was last sent to a drive in OPERATION ENABLED.
+        proof: test of the directions of all joints, which must be over before the state becomes ACTIVE.
         lowered: DBC names of the drives that cannot hold and are being lowered.
     """
 
@@ -109,6 +111,8 @@ class SafetyMonitor:
         self.start_wanted = 0
         self.enabling = False
         self.recalled = -RECALL_CYCLES
+        self.proof = DirectionProof(robot)
+        self._proof_begun = False  # True if the proof has begun in this start
         self._stalled = 0  # number of cycles of this start since a drive last changed its state
         self._states_at_start = b""  # drive states of the last cycle of this start
         self.lowered: set[str] = set()
@@ -199,11 +203,8 @@ class SafetyMonitor:
         return self._image.crc_errors + self._heartbeats.image.crc_errors
 
     def missing(self) -> set[str]:
-        """Return the nodes that prevent READY.
-
-        They timed out, are not trusted yet, sent no status message, have a different DBC, or were not checked at rest.
-        """
-        return self._message_monitor.missing() | self._heartbeats.missing() | self._plausibility.at_rest.unchecked
+        """Return the nodes that prevent READY: timed out, not trusted yet, without a status message, or with a different DBC."""
+        return self._message_monitor.missing() | self._heartbeats.missing()
 
     def _evaluate(self, bus_faults: Sequence[Finding]) -> None:
         """Raise all diagnostics of this cycle, run the state machine, and apply the reactions."""
@@ -214,12 +215,13 @@ class SafetyMonitor:
         self._heartbeats.evaluate(cycle, memory)
         for node in self._heartbeats.booted:
             self._plausibility.reference(node)
+            if node in DRIVE_NODES:
+                self.proof.forget(DRIVE_NODES.index(node))
         self._heartbeats.booted.clear()
         for finding in (*bus_faults, *self._plausibility.findings, *self._reports):
             memory.raise_finding(cycle, finding)
         self._reports.clear()
-        checked = not self._plausibility.at_rest.unchecked
-        nodes_ready = message_monitor.nodes_ready and self._heartbeats.all_reported and checked
+        nodes_ready = message_monitor.nodes_ready and self._heartbeats.all_reported
         self._check_drives(nodes_ready)
         if self._duplicate_found:
             memory.raise_dtc(
@@ -239,8 +241,8 @@ class SafetyMonitor:
         self.conditions = Conditions(
             diagnostics=memory.confirmed,
             nodes_ready=nodes_ready,
-            # A drive in OPERATION ENABLED may not have received a recent QUICK_STOP yet.
-            drives_enabled=state.drive_state.tobytes() == _ENABLED and cycle - self.recalled >= RECALL_CYCLES,
+            drives_enabled=self._all_enabled()
+            and (state.supervisor is _S.FULL_ASSIST or (self._proof_begun and not self.proof.running)),
             dead_man=pendant.dead_man,
             stop_requested=(pendant.stop_requested and not walk_end_requested) or self._ending,
             start_wanted=self.start_wanted > 0,
@@ -261,7 +263,6 @@ class SafetyMonitor:
             after is before
             and message_monitor.settled
             and self._heartbeats.quiet
-            and checked
             and not (
                 memory.active
                 or self._weak
@@ -330,6 +331,8 @@ class SafetyMonitor:
             self._heartbeats.acknowledge(faulty)
             self._acknowledged = True
             self.start_wanted = ENABLE_CYCLES if state.supervisor in _STARTABLE else 0
+            self._proof_begun = False
+            self.proof.failed.clear()
         elif self.start_wanted:
             self.start_wanted -= 1
         else:
@@ -337,8 +340,41 @@ class SafetyMonitor:
         states = state.drive_state.tobytes()
         self._stalled = 0 if self._acknowledged or states != self._states_at_start else self._stalled + 1
         self._states_at_start = states
-        if ended := refusal(self._robot, self._start_request(nodes_ready)):
+        ended = self._prove_directions() or refusal(self._robot, self._start_request(nodes_ready))
+        if ended:
             self._end_start(ended)
+
+    def _all_enabled(self) -> bool:
+        """Return whether all drives are in OPERATION ENABLED, and none may have missed a recent QUICK_STOP."""
+        state = self._state
+        return state.drive_state.tobytes() == _ENABLED and state.cycle - self.recalled >= RECALL_CYCLES
+
+    def _prove_directions(self) -> Refusal | None:
+        """Begin the tests of the directions as soon as all drives are enabled, and evaluate them until they are over.
+
+        Returns:
+            The end of the start if a joint failed; None if the start may continue.
+        """
+        state, proof = self._state, self.proof
+        if not self._all_enabled() or not self.start_wanted or state.supervisor not in (_S.READY, _S.HOLD):
+            self._proof_begun = proof.running = False
+            return None
+        self._stalled = 0
+        if not self._proof_begun:
+            if not self.enabling:  # the HAL sends the torques that the drives report for one cycle
+                return None
+            self._proof_begun = True
+            proof.begin(state.position, self._limiter.last)
+        elif proof.running:
+            if failure := proof.evaluate(state.position, state.foot_force[..., 2].sum(axis=1)):
+                for joint in proof.failed:
+                    finding = Finding(Dtc.TORQUE_DIRECTION, DRIVE_NODES[joint], proof.mobility[joint], True, failure)
+                    self.memory.raise_finding(state.cycle, finding)
+                    self._reports.append(finding)
+                return Refusal("START_FAILED", "error", failure)
+            if not proof.running:
+                self.memory.events.append(Event(state.cycle, "DIRECTIONS_PROVEN", proof.report()))
+        return None
 
     @property
     def start_prevented(self) -> bool:
@@ -364,6 +400,7 @@ class SafetyMonitor:
 
     def _end_start(self, ended: Refusal) -> None:
         self.start_wanted = 0
+        self.proof.running = False
         # Each START of the operator gets its own event; events of several STARTs within one second are not merged.
         self.memory.events.append(Event(self._state.cycle, ended.code, ended.text, ended.severity))
         self.reason = ended.text
@@ -371,7 +408,6 @@ class SafetyMonitor:
     def _enter(self, before: SupervisorState, after: SupervisorState, reasons: frozenset[Dtc]) -> None:
         state, memory = self._state, self.memory
         state.supervisor = after
-        self._plausibility.at_rest.enter(after)
         # Remove the START request, because one START may change the state only once.
         self.start_wanted = 0
         self._pendant.clear_press()
@@ -414,9 +450,12 @@ class SafetyMonitor:
             state.assistance_factor = target
 
     def _update_lowered(self) -> None:
-        """Add drives with a confirmed LOWER diagnostic to `lowered` in LOWER and FAULT; empty `lowered` in other states."""
+        """Set `lowered`: in LOWER and FAULT, add the drives with a confirmed LOWER diagnostic.
+
+        In all other states, `lowered` contains the drives of the joints that failed in the last test of the directions.
+        """
         if self._state.supervisor in (_S.LOWER, _S.FAULT):
             lower = frozenset(dtc for dtc in self.memory.confirmed if dtc.reaction is Reaction.LOWER)
             self.lowered.update(node for node in self.memory.nodes_of(lower) if node in DRIVE_NODES)
         else:
-            self.lowered.clear()
+            self.lowered = {DRIVE_NODES[joint] for joint in self.proof.failed}

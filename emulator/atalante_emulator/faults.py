@@ -159,7 +159,9 @@ NODE_KINDS: Final[Mapping[str, Kind]] = {
     ),
     "push": Kind("an external torque acts on a joint", "drive", {"torque": _number(-500.0, 500.0, "Nm")}),
     "torque_weak": Kind(
-        "a motor produces only a share of the torque it measures", "drive", {"share": _number(0.0, 1.0)}
+        "a motor produces a multiple of the torque it measures; a negative one reverses it",
+        "drive",
+        {"share": _number(-2.0, 2.0)},
     ),
     "over_temperature": Kind("a drive has a given temperature", "drive", {"degrees": _number(-40.0, 214.0, "degC")}),
     "heat_ramp": Kind(

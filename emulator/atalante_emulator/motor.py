@@ -83,7 +83,7 @@ class Motors:
 
         Args:
             motor: index of the motor.
-            strength: ratio, 0 to 1. A motor without fault has 1.
+            strength: ratio. A motor without fault has 1, a reversed motor -1.
         """
         self._motors[_STRENGTH, motor] = strength
 

@@ -570,7 +570,7 @@ def test_fault_with_a_wrong_target_type_is_rejected_with_the_valid_targets(
             "leave_operation: the parameter 'state' must be one of NOT_READY_TO_SWITCH_ON, .*, got 'LIMP'",
         ),
         ("cell_stuck", {"cell": "FLL"}, "cell_stuck: the parameter 'cell' must be one of FL, FR, RL, RR, got 'FLL'"),
-        ("torque_weak", {}, "torque_weak: the parameter 'share' must be a number from 0 to 1, got no value"),
+        ("torque_weak", {}, "torque_weak: the parameter 'share' must be a number from -2 to 2, got no value"),
         ("emergency", {"code": 0}, "emergency: the parameter 'code' must be an integer from 1 to 65535, got 0"),
         (
             "under_voltage",

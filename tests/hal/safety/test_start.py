@@ -198,7 +198,7 @@ def test_torque_of_a_disabled_drive_refuses_the_start(make_rig, joint: int, torq
     assert rig.hal.reason == refusals(rig)[0]
     signal.value = None
     rig.operator.start()
-    assert rig.until(S.ACTIVE, 50).supervisor is S.ACTIVE
+    assert rig.until(S.ACTIVE, 150).supervisor is S.ACTIVE
 
 
 @pytest.mark.parametrize(("torque", "follows"), [(-400.0, False), (60.0, True)])
@@ -245,7 +245,7 @@ def test_torque_of_a_disabled_drive_is_not_the_first_command(make_rig):
     FalseSignal(rig, "left_SK", "Torque").value = 1.5
     rig.until(S.READY)
     rig.operator.start()
-    for _ in range(30):
+    for _ in range(150):
         state = rig.run(1)
         if state.drive_state[3] not in (D.OPERATION_ENABLED, D.QUICK_STOP_ACTIVE):
             assert rig.last_commands()["left"]["SK_TargetTorque"] == pytest.approx(0.0, abs=0.02)
@@ -284,7 +284,7 @@ class TestRange:
         FalseSignal(rig, "left_SA", "Position").more = low * ROBOT.gear[4] * ROBOT.polarity[4]
         rig.until(S.READY)
         rig.operator.start()
-        assert rig.until(S.ACTIVE, 50).supervisor is S.ACTIVE
+        assert rig.until(S.ACTIVE, 150).supervisor is S.ACTIVE
 
     def test_joint_outside_its_range_refuses_the_start_in_hold(self, make_rig):
         rig = make_rig()
@@ -334,7 +334,7 @@ class TestJump:
         signal.more = 0.0
         rig.run(30)
         rig.operator.start()
-        assert rig.until(S.ACTIVE, 50).supervisor is S.ACTIVE
+        assert rig.until(S.ACTIVE, 150).supervisor is S.ACTIVE
 
     def test_start_is_accepted_after_the_drive_restarted(self, make_rig):
         rig, _ = self.jumped(make_rig)
@@ -346,7 +346,7 @@ class TestJump:
         emulator._heartbeats.boot("RIGHT_SA", emulator.cycle)
         rig.run(30)
         rig.operator.start()
-        assert rig.until(S.ACTIVE, 50).supervisor is S.ACTIVE
+        assert rig.until(S.ACTIVE, 150).supervisor is S.ACTIVE
 
 
 def test_start_refused_by_a_diagnostic_enables_no_drive(make_rig):

@@ -17,6 +17,7 @@ from atalante_emulator.pendant import Operator
 from atalante_hal.bus import BusDown
 from atalante_hal.hal import Hal
 from atalante_hal.robot import Robot
+from atalante_hal.safety.direction import pose_gains
 from atalante_hal.types import Command, SupervisorState
 from atalante_hal.wire.cia402 import DriveState
 from atalante_hal.wire.frame import FRAME, FRAME_BYTES, Frames, new_frames
@@ -109,7 +110,8 @@ class World:
         state = hal.read()
         self.states.append(state.supervisor)
         if state.supervisor is ACTIVE:
-            torque = hal.robot.hold_kp * (self.anchor - state.position) - hal.robot.hold_kd * state.velocity
+            stiffness, damping = pose_gains(hal.robot)
+            torque = stiffness * (self.anchor - state.position) - damping * state.velocity
             hal.write(Command(torque, np.zeros(8)))
         else:
             self.anchor = state.position.copy()
@@ -134,7 +136,7 @@ class World:
         node = self.sending()
         assert self.run(200) is READY
         node.press(Request.START)
-        assert self.run(50) is ACTIVE
+        assert self.run(150) is ACTIVE
         return node
 
     def session(self, stop: StopRequest | None = None, keyboard: Keyboard | None = None) -> Session:
@@ -185,7 +187,7 @@ def test_start_needs_a_press_and_the_dead_man(world: World) -> None:
     node.dead_man = True
     assert world.run(50) is READY
     node.press(Request.START)
-    assert world.run(50) is ACTIVE
+    assert world.run(150) is ACTIVE
     assert node.hal is ACTIVE
 
 
@@ -300,7 +302,7 @@ def test_the_emulated_pendant_yields_to_a_pendant_process(make_world: Callable[.
     assert not new.takeover_failed
     assert world.hal.state.supervisor is HOLD
     new.press(Request.START)
-    assert world.run(50) is ACTIVE
+    assert world.run(150) is ACTIVE
 
 
 def replayed(world: World, counter_of: Callable[[int], int], request: Request = Request.NONE) -> Callable[[], None]:
@@ -391,7 +393,7 @@ def test_one_pendant_is_left_and_motion_requires_its_dead_man(world: World, offs
     assert world.run(100) is not ACTIVE or older
     assert left[0].answered == answered + 100
     left[0].press(Request.START)
-    assert world.run(50) is ACTIVE
+    assert world.run(150) is ACTIVE
 
 
 def test_a_short_silence_does_not_end_the_motion(world: World) -> None:
@@ -412,7 +414,7 @@ def test_start_pressed_before_a_silence_has_no_effect_again(world: World) -> Non
     assert world.run(200) is HOLD
     assert not node.displaced
     node.press(Request.START)
-    assert world.run(50) is ACTIVE
+    assert world.run(150) is ACTIVE
 
 
 # -- two robots ------------------------------------------------------------------------------------------------------
@@ -528,7 +530,7 @@ def test_press_of_a_late_pendant_is_accepted_from_its_second_frame(
     node = world.sending()
     assert world.run(frames) is state
     node.press(Request.START)
-    assert world.run(40) is ACTIVE
+    assert world.run(150) is ACTIVE
     node.press(Request.HOLD)
     assert world.run(300) is HOLD
 
@@ -629,7 +631,7 @@ def test_displaced_session_ends_with_a_message(world: World, capsys: pytest.Capt
 
     class TakesOver(Keyboard):
         def lines(self) -> list[str]:
-            if older.node.answered > 2 * TAKEOVER_CYCLES:
+            if older.node.answered > 2 * TAKEOVER_CYCLES + 100:  # the HAL is ACTIVE
                 newer.start_sending()
             return []
 

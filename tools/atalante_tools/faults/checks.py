@@ -160,6 +160,15 @@ def start_fails_and_names_the_hip(run: Observation) -> str | None:
     return None if (others == DriveState.QUICK_STOP_ACTIVE).all() else "a drive did not hold after START_FAILED"
 
 
+def never_active(run: Observation) -> str | None:
+    """Check that the robot was never in ACTIVE.
+
+    Args:
+        run: observation of the run.
+    """
+    return "the robot was in ACTIVE" if SupervisorState.ACTIVE in run.states else None
+
+
 def limit_follows_temperature(run: Observation) -> str | None:
     """Check that the torque limits sent to the left knee drive follow the temperature that this drive reports.
 

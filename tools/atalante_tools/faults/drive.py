@@ -5,12 +5,14 @@ from __future__ import annotations
 from typing import Final
 
 from atalante_emulator.faults import Fault
+from atalante_hal.robot import LEG_JOINTS
 from atalante_hal.types import SupervisorState
 from atalante_tools.faults.checks import (
     encoders_keep_their_reference,
     guide_kept,
     left_leg_in_local_hold,
     limit_follows_temperature,
+    never_active,
     not_enabled_in_motion,
     nothing_sags,
     start_fails_and_names_the_hip,
@@ -29,6 +31,21 @@ _RESTARTED: Final = {
     "one drive restarted": (Fault("reset", _HIP, 0, 3),),
     "two drives restarted": (Fault("reset", _HIP, 0, 3), Fault("reset", "RIGHT_SK", 0, 3)),
 }
+
+
+def _start_with(name: str, node: str, share: float) -> Case:
+    """Return the case of a first START with a motor that produces `share` times the torque it measures."""
+    return Case(
+        name,
+        (Fault("torque_weak", node, 0, share=share),),
+        phase=None,
+        detected=450,
+        reacted=450,
+        node=node,
+        recovers=False,
+        checks=(never_active,),
+    )
+
 
 SCENARIOS: Final = (
     Scenario(
@@ -232,6 +249,13 @@ SCENARIOS: Final = (
                 recovers=False,
                 checks=(nothing_sags, start_fails_and_names_the_hip),
             ),
+        ),
+    ),
+    Scenario(
+        "F72",
+        (
+            *(_start_with(f"LEFT_{joint} reversed", f"LEFT_{joint}", -1.0) for joint in LEG_JOINTS),
+            *(_start_with(f"LEFT_{joint} dead", f"LEFT_{joint}", 0.0) for joint in ("SK", "SA", "HA")),
         ),
     ),
     # A push accelerates the joint beyond its top speed within 25 cycles.

@@ -11,6 +11,7 @@ import numpy as np
 from atalante_control.dynamics.gravity import Gravity
 from atalante_control.model import ExoskeletonParameters, pinocchio_model, urdf
 from atalante_hal.robot import IMUS, JOINTS, MOTORS, Robot
+from atalante_hal.safety.direction import pose_gains
 from atalante_hal.types import PERIOD, Command, State, Vector
 
 _PELVIS: Final = IMUS.index("pelvis")
@@ -41,7 +42,9 @@ def minimum_jerk(phase: float) -> tuple[float, float]:
 
 
 class PoseHold:
-    """PD controller with gravity compensation, which holds a pose with the hold gains of the robot.
+    """PD controller with gravity compensation, which holds a pose with the stiffness of the drives.
+
+    Its damping is that of `pose_gains`, because with the damping of the drives the delay of the HAL makes light joints unstable.
 
     Attributes:
         telemetry: Reference angles, shape (12,) [rad].
@@ -59,7 +62,8 @@ class PoseHold:
             move: Motion of one joint. If None, all joints are held.
             vibration: Level of each vibration motor, shape (8,), 0 to 1. If None, all motors are off.
         """
-        self._robot, self._move = robot, move
+        self._stiffness, self._damping = robot.hold_kp, pose_gains(robot)[1]
+        self._move = move
         self._gravity = Gravity(pinocchio_model(urdf(ExoskeletonParameters(), robot)))
         self._speed = np.zeros_like(robot.hold_kp)
         self._command = Command(np.zeros_like(robot.hold_kp), np.zeros(len(MOTORS)) if vibration is None else vibration)
@@ -95,6 +99,6 @@ class PoseHold:
         w, x, y, z = state.imu_quaternion[_PELVIS].tolist()
         torque = self._command.torque
         torque[:] = self._gravity.torque(state.position, (w, x, y, z))
-        torque += self._robot.hold_kp * (self.telemetry - state.position)
-        torque += self._robot.hold_kd * (self._speed - state.velocity)
+        torque += self._stiffness * (self.telemetry - state.position)
+        torque += self._damping * (self._speed - state.velocity)
         return self._command

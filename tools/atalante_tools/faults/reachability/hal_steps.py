@@ -305,7 +305,10 @@ class HalSteps:
         monitor._stalled = 0  # not searched: `LAST_START` covers every way in which a start can end
         monitor._ending = monitor._duplicate_found = monitor._ramping = False
         monitor.lowered.clear()
-        monitor._plausibility.at_rest.unchecked.clear()
+        # The controlwords during the test of the directions are the same as while other drives are being enabled.
+        monitor.proof.proven.fill(True)
+        monitor.proof.failed.clear()
+        monitor.proof.running = False
         rows = len(self._image.check)
         monitor._message_monitor.qualification = [SETTLED] * rows
         monitor._message_monitor._evidence = [0] * rows

@@ -1,0 +1,254 @@
+"""Proof of direction: before ACTIVE, each joint moves a little, and its encoder must follow the torque.
+
+    all drives enabled -> torque pulse on each joint -> mobility of the joint -> ACTIVE, or START_FAILED
+
+A motor with exchanged phases and a drive with a wrong sign push a joint in the wrong direction. A dead motor does not move it.
+At a start, drive state, position and reported torque do not show these faults. So the HAL adds a torque pulse to the torque that
+holds the pose, and evaluates the motion.
+
+*Pulse.* The pulse has the shape of the second derivative of sin(pi x)^4. So a free inertia moves away and back, and is then at
+rest in its initial position. The pulse moves a joint towards the middle of its range. Its peak is `PEAK` times `breakaway`, which
+exceeds the dry friction. The joints of a group hardly move each other. Both legs are tested at the same time.
+
+*Pose.* A position control with a share of the drive's gains holds the pose, because the drives do not hold it in this time. With
+a wrong sign, this control pushes its joint away. A joint that moves by more than `TRAVEL` ends the start.
+
+*Result.* The mobility of a joint is the inverse of its effective inertia: the least-squares fit of the position by the double
+integral of the sent torque and a polynomial of time. A joint with a mobility of at least `MOBILITY` follows its torque. A
+mobility of at most -`MOBILITY` is a wrong sign. A joint between these limits does not follow its torque. A disturbance may
+spoil a test, so a joint fails only after `TRIALS` tests. If its foot carries load, the joint may be blocked. It then stays
+untested, and the next start tests it again. A joint that passed is not tested again until its drive restarts, because the
+wiring of a motor does not change while its drive is on.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+import numpy.typing as npt
+
+from atalante_hal.robot import JOINTS, LEG_JOINTS, SIDES, Robot
+from atalante_hal.types import PERIOD, Vector
+
+#: Joints of a leg that are tested at the same time, and duration of their pulse [cycles].
+GROUPS = ((("FH", "SH"), 32), (("TH", "SA"), 16), (("SK", "HA"), 16))
+#: Delay from the command of a torque to the first position that shows its effect [cycles].
+LATENCY = 2
+#: Peak of the pulse as a multiple of `Robot.breakaway`, in the order of LEG_JOINTS. FH and SH move a whole leg.
+PEAK = (6.0, 3.0, 6.0, 3.0, 3.0, 3.0)
+#: Gains of the position control as a share of the gains of the drive, stiffness and damping, in the order of LEG_JOINTS.
+#: The HAL has more delay than a drive, so it must hold light joints more softly.
+STIFFNESS = (1.0, 1.0, 1.25, 0.5, 0.25, 0.25)
+DAMPING = (0.5, 0.5, 0.6, 0.25, 0.25, 0.25)
+#: Integral time of the position control, which then carries the weight [s].
+INTEGRAL = 0.03
+#: Largest motion of a joint during the test [rad].
+TRAVEL = math.radians(1.5)
+#: A foot is loaded if its mean force during a test exceeds this share of `cell_free`, which is four times the noise of the mean.
+LOAD = 1.0 / 3.0
+#: Number of tests after which a joint that did not pass has failed.
+TRIALS = 2
+#: Smallest mobility of a joint that follows its torque, in the order of LEG_JOINTS [1/(kg m2)]: about half of the smallest one
+#: that the suspended robot has, straight or with bent legs, empty or with a patient of 110 kg.
+MOBILITY = (0.045, 0.23, 0.075, 0.56, 4.6, 6.8)
+
+
+def pulse(cycle: int, duration: int) -> float:
+    """Return the torque pulse relative to its peak, from -1 to 0.5625; 0 outside the pulse.
+
+    Args:
+        cycle: time since the pulse began [cycles].
+        duration: duration of the pulse [cycles].
+    """
+    if not 0 <= cycle <= duration:
+        return 0.0
+    square = math.sin(math.pi * cycle / duration) ** 2
+    return square * (3.0 - 4.0 * square)
+
+
+def pose_gains(robot: Robot) -> tuple[Vector, Vector]:
+    """Return the gains with which the HAL can hold a pose: stiffness [Nm/rad] and damping [Nm s/rad], shape (12,) each.
+
+    Args:
+        robot: hold gains of the drives.
+    """
+    both = len(SIDES)
+    return robot.hold_kp * np.array(STIFFNESS * both), robot.hold_kd * np.array(DAMPING * both)
+
+
+def mobility_of(torque: Vector, position: Vector) -> Vector:
+    """Return the mobility of each joint, which is the inverse of its effective inertia.
+
+    Args:
+        torque: torque sent in each cycle, shape (n, joints) [Nm].
+        position: position in each cycle, measured before the torque was sent, shape (n, joints) [rad].
+
+    Returns:
+        Mobility, shape (joints,) [1/(kg m2)]; 0 for a joint whose torque did not change.
+    """
+    count = len(position)
+    acting = np.zeros_like(torque)
+    acting[LATENCY:] = torque[:-LATENCY] - torque[0]
+    response = np.cumsum(np.cumsum(acting, axis=0), axis=0) * PERIOD**2
+    free = np.linalg.qr(np.vander(np.linspace(-1.0, 1.0, count), 4))[0]  # motion without a change of the torque
+    response -= free @ (free.T @ response)
+    power = (response**2).sum(axis=0)
+    mobility: Vector = (response * (position - position[0])).sum(axis=0) / np.where(power > 0.0, power, np.inf)
+    return mobility
+
+
+class DirectionProof:
+    """Test of the directions of all joints, in each cycle in which all drives are in OPERATION ENABLED during a start.
+
+    Args:
+        robot: position limits, hold gains and breakaway torques.
+
+    Attributes:
+        proven: True for each joint that passed and whose drive did not restart since then, shape (12,).
+        mobility: last measured mobility of each joint, shape (12,) [1/(kg m2)]; 0 if it was not measured.
+        failed: indices in JOINTS of the joints that failed in this start.
+        running: True from `begin` until all joints are tested, or one has failed.
+    """
+
+    def __init__(self, robot: Robot) -> None:
+        both = len(SIDES)
+        self._peak = np.array(PEAK * both) * robot.breakaway
+        self._middle = 0.5 * (robot.position_min + robot.position_max)
+        self._kp, self._kd = pose_gains(robot)
+        self._least = np.array(MOBILITY * both)
+        self._load = LOAD * robot.sensors.cell_free
+        self.proven: npt.NDArray[np.bool_] = np.zeros(len(JOINTS), np.bool_)
+        self.mobility = np.zeros(len(JOINTS))
+        self.failed: list[int] = []
+        self.running = False
+        self._anchor, self._base, self._sign = np.zeros((3, len(JOINTS)))
+        #: Joints of each test that is still to be done, and duration of its pulse [cycles].
+        self._tests: list[tuple[list[int], int]] = []
+        self._trials = [0] * len(JOINTS)
+        self._position: list[Vector] = []  # position of each cycle of the present test
+        self._force: list[Vector] = []  # vertical force of each foot in each cycle of the present test
+        self._torque: list[Vector] = []  # sent torque of each cycle of the present test
+
+    def begin(self, position: Vector, torque: Vector) -> None:
+        """Begin the tests of all joints that are not proven.
+
+        Args:
+            position: present joint positions, shape (12,) [rad], which the position control holds.
+            torque: torque sent last, shape (12,) [Nm], to which the control adds its torque.
+        """
+        self._anchor[:], self._base[:] = position, torque
+        self._sign[:] = np.where(position < self._middle, 1.0, -1.0)
+        self._trials = [0] * len(JOINTS)
+        self.failed = []
+        self._tests = [
+            (joints, duration)
+            for names, duration in GROUPS
+            if (joints := [j for j in self._unproven() if LEG_JOINTS[j % len(LEG_JOINTS)] in names])
+        ]
+        self._next_test()
+
+    def forget(self, joint: int) -> None:
+        """Discard the result of a joint, because its drive restarted.
+
+        Args:
+            joint: index in JOINTS.
+        """
+        self.proven[joint] = False
+
+    def torque(self, position: Vector, velocity: Vector) -> Vector:
+        """Return the torque of this cycle, shape (12,) [Nm]: position control and pulse.
+
+        Args:
+            position: joint positions, shape (12,) [rad].
+            velocity: joint velocities, shape (12,) [rad/s].
+        """
+        spring = self._kp * (self._anchor - position)
+        self._base += spring * (PERIOD / INTEGRAL)
+        torque = self._base + spring - self._kd * velocity
+        joints, duration = self._tests[0]
+        shape = pulse(len(self._position), duration)
+        torque[joints] += shape * self._sign[joints] * self._peak[joints]
+        self._position.append(position.copy())
+        return torque
+
+    def sent(self, torque: Vector) -> None:
+        """Store the torque that was sent in this cycle, after the limits.
+
+        Args:
+            torque: sent torque, shape (12,) [Nm].
+        """
+        self._torque.append(torque.copy())
+
+    def evaluate(self, position: Vector, force: Vector) -> str:
+        """Evaluate the motion until this cycle.
+
+        Args:
+            position: joint positions, shape (12,) [rad].
+            force: vertical force of each foot, shape (2,) [N].
+
+        Returns:
+            Reason why the start must end, as one sentence; empty if it may continue.
+        """
+        self._force.append(force)
+        travel = np.abs(position - self._anchor)
+        if not travel.max() <= TRAVEL:
+            far = np.flatnonzero(travel > 0.5 * TRAVEL)
+            # A faulty joint moves its lighter neighbours. The weight moves a joint as far as the same joint of the other leg.
+            excess = self._kp * np.abs(travel - np.roll(travel, len(LEG_JOINTS)))
+            joint = int(far[np.argmax(excess[far])])
+            self._fail(far.tolist())
+            moved = f"{math.degrees(travel[joint]):.1f} deg"
+            return f"{JOINTS[joint]} moved by {moved} in the test of its direction; must be within {math.degrees(TRAVEL):.1f} deg"
+        joints, duration = self._tests[0]
+        if len(self._position) <= duration + LATENCY:
+            return ""
+        self.mobility[joints] = mobility_of(np.array(self._torque)[:, joints], np.array(self._position)[:, joints])
+        return self._evaluate_test(joints, duration)
+
+    def _evaluate_test(self, joints: Sequence[int], duration: int) -> str:
+        again: list[int] = []
+        loaded = np.abs(np.mean(self._force, axis=0)) > self._load
+        for joint in joints:
+            mobility, least = self.mobility[joint], self._least[joint]
+            self._trials[joint] += 1
+            if mobility >= least:
+                self.proven[joint] = True
+            elif self._trials[joint] < TRIALS:
+                again.append(joint)
+            elif mobility <= -least or not loaded[joint // len(LEG_JOINTS)]:
+                self.failed.append(joint)
+        if self.failed:
+            self._fail(self.failed)
+            return ", ".join(map(self._failure, self.failed))
+        del self._tests[0]
+        if again:
+            self._tests.insert(0, (again, duration))
+        self._next_test()
+        return ""
+
+    def report(self) -> str:
+        """Return the result of the tests as one sentence, with the effective inertia of each joint."""
+        passed = ", ".join(f"{JOINTS[j]} {1.0 / self.mobility[j]:.2g}" for j in np.flatnonzero(self.proven).tolist())
+        text = f"effective inertia [kg m2]: {passed}"
+        blocked = [JOINTS[j] for j in self._unproven()]
+        return f"{text}; not tested under load: {', '.join(blocked)}" if blocked else text
+
+    def _failure(self, joint: int) -> str:
+        least = self._least[joint]
+        found = "moves against its torque" if self.mobility[joint] <= -least else "does not follow its torque"
+        return f"{JOINTS[joint]} {found} (mobility {self.mobility[joint]:.2g}; must be at least {least:g})"
+
+    def _fail(self, joints: list[int]) -> None:
+        self.failed, self.running = joints, False
+
+    def _next_test(self) -> None:
+        self._position.clear()
+        self._force.clear()
+        self._torque.clear()
+        self.running = bool(self._tests)
+
+    def _unproven(self) -> list[int]:
+        proven: list[int] = np.flatnonzero(~self.proven).tolist()
+        return proven
