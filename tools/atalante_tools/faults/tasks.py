@@ -207,7 +207,7 @@ def run_task(task: Task) -> Result:
 
 def _cycles_until_stop(case: Case, cycles: int) -> int | None:
     """Run a permanent fault for `cycles` cycles; return the cycles until the walk stopped, or None if the walk continued."""
-    limited = replace(case, stimuli=tuple(_limited(stimulus, cycles) for stimulus in case.stimuli))
+    limited = replace(case, stimuli=tuple(limited(stimulus, cycles) for stimulus in case.stimuli))
     run = observe(limited, cycles, recovery=False)
     for cycle in range(run.first, run.last + 1):
         if run.state(cycle) not in WALKING:
@@ -219,7 +219,7 @@ def _case_of(id_: str, name: str) -> Case:
     return next(case for case in SCENARIOS[id_].cases if case.name == name)
 
 
-def _limited(stimulus: Stimulus, cycles: int) -> Stimulus:
+def limited(stimulus: Stimulus, cycles: int) -> Stimulus:
     """Return the fault or action; limit its duration to `cycles` cycles if it is permanent."""
     if stimulus.cycles is not None:
         return stimulus

@@ -1,4 +1,4 @@
-"""Command `atalante trial`: the three experiments of the paper, with virtual subjects on the emulated robot.
+"""Command `atalante trial`: the experiments of the paper with virtual subjects, and faults during walks on the ground.
 
 experiment -> trials (`plan`) -> results in files (`run`, `store`) -> findings -> report.html
 """
@@ -91,6 +91,8 @@ def _walking() -> Callable[[_Command], _Command]:
 def command() -> None:
     """Repeat the experiments of the paper with virtual subjects on the emulated robot, and write a report.
 
+    The experiment `faults` is not in the paper. It injects faults into walks on the ground.
+
     The report, one HTML file (and its findings as Markdown), contains tables, figures, and each finding of the paper with its
     statistic and its verdict. A verdict of FAIL is a result, not an error of the command. Each trial is stored in a file of its
     own as soon as it has ended. After an interruption, the same command runs only the missing trials.
@@ -99,6 +101,7 @@ def command() -> None:
     Example: atalante trial shapes
              atalante trial assist --jobs 2
              atalante trial sweep --quick
+             atalante trial faults F16 F56
     """
 
 
@@ -153,6 +156,28 @@ def sweep(days: int, walking: Walking, running: Running, as_json: bool) -> None:
     factors, protocol = (QUICK_SWEEP, QUICK_PROTOCOL) if running.quick else (SWEEP, PROTOCOL)
     trials = sweep_trials(_setting(walking, running, protocol), factors, 1 if running.quick else days)
     _conduct("sweep", trials, sweep_findings, running, as_json)
+
+
+@command.command(short_help="Inject the faults of the fault matrix into walks on the ground.")
+@click.argument("ids", metavar="[ID]...", nargs=-1)
+@_running("ground-faults")
+def faults(ids: tuple[str, ...], running: Running, as_json: bool) -> None:
+    """Inject each fault, or the faults with the given IDs, into walks on the ground with a passive wearer.
+
+    Each case of the fault matrix begins at nine moments: in double support before the walk, and at eight phases of a step. The
+    report states which walks end in a fall, and why. For permanent faults, it states the longest duration without a fall.
+    """
+    from atalante_tools.console.names import find
+    from atalante_tools.faults.catalogue import SCENARIOS
+    from atalante_tools.trial.fault_findings import fault_findings
+    from atalante_tools.trial.fault_plan import QUICK_IDS, fault_trials
+
+    known = list(SCENARIOS)
+    chosen = [known[find(id_, known, "fault with a scenario")] for id_ in ids] or (QUICK_IDS if running.quick else ())
+    trials = fault_trials(chosen, running.quick, running.seed, running.engine)
+    if without := [id_ for id_ in chosen if id_ not in {trial.id for trial in trials}]:
+        raise click.UsageError(f"{without[0]} begins at power-on, not during a walk")
+    _conduct("faults", trials, fault_findings, running, as_json)
 
 
 def _setting(walking: Walking, running: Running, protocol: tuple[int, int, int]) -> Any:

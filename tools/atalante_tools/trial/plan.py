@@ -17,6 +17,8 @@ from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, Final
 
+from atalante_tools.trial.fault_plan import FaultTrial
+
 if TYPE_CHECKING:
     from atalante_control.model import Patient
 
@@ -101,7 +103,7 @@ class TreadmillTrial:
         return f"treadmill-{self.order}-{self.mass:g}kg"
 
 
-Trial = ShapeTrial | WalkTrial | TreadmillTrial
+Trial = ShapeTrial | WalkTrial | TreadmillTrial | FaultTrial
 
 
 @dataclass(frozen=True)
@@ -206,7 +208,7 @@ def key(trial: Trial) -> str:
 
 
 #: Files of this package that do not affect the results.
-_REPORTING: Final = ("__init__.py", "findings.py", "figures.py", "report.py", "store.py")
+_REPORTING: Final = ("__init__.py", "findings.py", "fault_findings.py", "figures.py", "report.py", "store.py")
 
 
 def _roots() -> list[Path]:

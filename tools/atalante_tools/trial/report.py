@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import base64
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from html import escape
 from pathlib import Path
 from typing import Any, Final
@@ -32,6 +32,12 @@ EXPERIMENTS: Final = {
         "exhaustion. The treadmill is an equation for level walking at the same speed (Looney et al. 2019). No body is simulated "
         "for it. The normalised metabolic rate is exercise divided by baseline, without subtraction of the resting rate: with "
         "full assistance the virtual subject rests, so the difference would be close to zero.",
+    ),
+    "faults": (
+        "Faults during walks on the ground",
+        "Each case of the fault matrix begins at nine moments of a walk with a passive wearer: in double support, during the "
+        "weight shift before the walk, and at eight phases of the second step. A robot has fallen if its pelvis leans by more "
+        "than 35 degrees. The longest duration of a permanent fault without a fall is found by bisection.",
     ),
 }  # fmt: skip
 _CERTIFIED: Final = {True: "yes", False: "no", None: "-"}
@@ -74,9 +80,9 @@ def write_report(
         _findings(findings),
         "<h2>Trials</h2>",
         html_table(*_trials(results)),
-        "<h2>Figures</h2>",
     ]
-    parts += _figures(experiment, results)
+    if experiment != "faults":
+        parts += ["<h2>Figures</h2>", *_figures(experiment, results)]
     parts += ["<h2>How it was computed</h2>", html_table(("Item", "Value"), _provenance(results))]
     path.parent.mkdir(parents=True, exist_ok=True)
     path.write_text(page(f"atalante trial {experiment}", title, parts), encoding="utf-8")
@@ -133,6 +139,18 @@ def _trials(results: Sequence[Result]) -> tuple[list[str], list[list[str]]]:
         ("trial", lambda r: r["trial"]["name"]),
         ("outcome", lambda r: r["outcome"]),
         ("steps", lambda r: str(r.get("steps", "-"))),
+        ("case", lambda r: r["trial"].get("case", "-")),
+        ("falls", lambda r: f"{r['fell']} of {len(r['runs'])}" if "runs" in r else "-"),
+        ("state", lambda r: _distinct(one["state"] for one in r.get("runs", ()))),
+        ("first diagnostic", lambda r: _distinct(one["codes"][0] for one in r.get("runs", ()) if one["codes"])),
+        (
+            "detected [cycles]",
+            lambda r: _distinct(str(one["detected"]) for one in r.get("runs", ()) if one["detected"]),
+        ),
+        (
+            "longest without a fall [cycles]",
+            lambda r: ", ".join("-" if n is None else str(n) for n in r.get("longest") or ()) or "-",
+        ),
         ("certified", lambda r: _CERTIFIED[r.get("certified")]),
         ("largest |e|/q_bound", lambda r: _number(r.get("max_ratio"), 2)),
         ("RMS error, full [deg]", lambda r: _number(r.get("error_deg", {}).get("full"), 3)),
@@ -143,6 +161,10 @@ def _trials(results: Sequence[Result]) -> tuple[list[str], list[list[str]]]:
     ]
     filled = [(head, cells) for head, value in columns if set(cells := [value(r) for r in results]) != {"-"}]
     return [head for head, _ in filled], [list(row) for row in zip(*(cells for _, cells in filled), strict=True)]
+
+
+def _distinct(values: Iterable[str]) -> str:
+    return ", ".join(dict.fromkeys(values)) or "-"
 
 
 def _number(value: float | None, digits: int) -> str:

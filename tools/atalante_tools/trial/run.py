@@ -46,7 +46,7 @@ from atalante_tools.session.dial import Dial
 from atalante_tools.session.rig import Rig, open_hal
 from atalante_tools.session.walk_observation import Observation
 from atalante_tools.session.walk_options import gaits_of_subject
-from atalante_tools.trial.plan import STEP, ShapeTrial, TreadmillTrial, Trial, WalkTrial
+from atalante_tools.trial.plan import STEP, ShapeTrial, TreadmillTrial, WalkTrial
 
 _SH, _LEG = LEG_JOINTS.index("SH"), len(LEG_JOINTS)
 _RIGHT: Final = 1
@@ -61,7 +61,7 @@ EDGES: Final = tuple(round(-1.0 + 0.05 * k, 2) for k in range(41))
 SEGMENTS: Final = ("full", "transition", "target")
 
 
-def run_trial(trial: Trial) -> dict[str, Any]:
+def run_trial(trial: ShapeTrial | WalkTrial | TreadmillTrial) -> dict[str, Any]:
     """Run a trial, and return its result. Other processes call this function, too.
 
     Args:

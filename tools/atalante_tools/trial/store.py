@@ -14,6 +14,7 @@ from typing import Any
 
 from atalante_control.gait_optimization.parallel import FanOutError, fan_out
 from atalante_tools.console.outcome import Failed
+from atalante_tools.trial.fault_plan import FaultTrial
 from atalante_tools.trial.plan import Trial, fields, key, versions
 
 Result = dict[str, Any]
@@ -71,6 +72,10 @@ def compute(
 
 
 def _run(trial: Trial) -> Result:
+    if isinstance(trial, FaultTrial):
+        from atalante_tools.trial.fault_run import run_fault
+
+        return {"trial": fields(trial), "versions": versions(), **run_fault(trial)}
     from atalante_tools.trial.run import run_trial
 
     return {"trial": fields(trial), "versions": versions(), **run_trial(trial)}

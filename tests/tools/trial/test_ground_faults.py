@@ -1,0 +1,111 @@
+"""Experiment `faults`: trials, moments of a walk, durations by bisection, findings, and the command."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+from click.testing import CliRunner
+
+from atalante_hal.safety.events import Event
+from atalante_tools.cli import cli
+from atalante_tools.faults.catalogue import SCENARIOS
+from atalante_tools.faults.matrix import load_matrix
+from atalante_tools.trial.fault_findings import NO_FALL, NO_FALL_IN_DOUBLE_SUPPORT, fault_findings
+from atalante_tools.trial.fault_plan import PERMANENT, fault_trials
+from atalante_tools.trial.fault_run import diagnosed, longest_without
+
+#: Fault whose cases all begin at power-on.
+POWER_ON = "F53"
+
+
+def result(id_: str, **run: Any) -> dict[str, Any]:
+    given = {
+        "moment": 0.5,
+        "outcome": "fell",
+        "state": "HOLD",
+        "codes": ["NODE_TIMEOUT"],
+        "detected": 5,
+        "reason": "lost",
+    }
+    return {"trial": {"id": id_, "case": "a case"}, "runs": [{**given, **run}], "longest": []}
+
+
+def test_trials_have_unique_names_and_a_permanent_case_per_scenario_with_one() -> None:
+    trials = fault_trials((), False, 0, "mujoco")
+    assert len({trial.name for trial in trials}) == len(trials)
+    left_out = set(SCENARIOS) - {trial.id for trial in trials}
+    assert POWER_ON in left_out
+    assert all(case.phase is None for id_ in left_out for case in SCENARIOS[id_].cases)
+    permanent = {trial.id for trial in trials if trial.index == PERMANENT}
+    assert permanent == {id_ for id_, scenario in SCENARIOS.items() if scenario.permanent is not None}
+
+
+@pytest.mark.parametrize("limit", [0, 1, 9, 10, 437, 999])
+def test_bisection_finds_the_longest_duration_without_a_fall(limit: int) -> None:
+    found = longest_without(lambda cycles: cycles > limit, 1000, 10)
+    assert found <= limit < found + 10
+
+
+def test_bisection_returns_the_horizon_if_the_robot_never_falls() -> None:
+    assert longest_without(lambda _: False, 1000, 10) == 1000
+
+
+@pytest.mark.parametrize(
+    ("id_", "run", "passed"),
+    [
+        ("F56", {}, False),
+        ("F56", {"outcome": "hold"}, True),
+        ("F16", {}, True),
+        ("F16", {"moment": None}, False),
+        ("F22", {}, True),
+        ("F22", {"codes": []}, False),
+        ("F22", {"state": "ACTIVE"}, False),
+        ("F22", {"outcome": "exception"}, False),
+    ],
+)
+def test_verdict_of_a_fault(id_: str, run: dict[str, Any], passed: bool) -> None:
+    (finding,) = fault_findings([result(id_, **run)])
+    assert (finding.id, finding.passed) == (id_, passed)
+
+
+def test_finding_states_moment_state_diagnostic_and_reason_of_a_fall() -> None:
+    (finding,) = fault_findings([result("F22") | {"longest": [120]}])
+    assert finding.statistic == (
+        "1 of 1 walks fell; a case: at phase 0.5 (HOLD; NODE_TIMEOUT; lost); "
+        "longest duration without a fall 120 cycles (at phase 0.5)"
+    )
+
+
+def test_expected_diagnostic_is_found_among_information() -> None:
+    events = [
+        Event(10, "START", "", "info"),
+        Event(11, "TORQUE_SATURATED", "", "warning"),
+        Event(12, "EMCY_8130", "", "info"),
+        Event(14, "EMCY_8130", "", "info"),
+    ]
+    assert diagnosed(events, "EMCY_xxxx", 10) == (("TORQUE_SATURATED", "EMCY_8130"), 3)
+    assert diagnosed(events, "", 10) == (("TORQUE_SATURATED",), None)
+
+
+def test_faults_without_fall_are_in_the_matrix() -> None:
+    assert set(load_matrix()) >= NO_FALL | NO_FALL_IN_DOUBLE_SUPPORT
+
+
+def test_fault_at_power_on_is_refused(tmp_path: Path) -> None:
+    outcome = CliRunner().invoke(cli, ["trial", "faults", POWER_ON, "--out", str(tmp_path)])
+    assert outcome.exit_code == 2
+    assert "F53 begins at power-on, not during a walk" in outcome.output
+
+
+def test_command_injects_a_fault_and_writes_the_report(tmp_path: Path) -> None:
+    arguments = ["trial", "faults", "F05", "--quick", "--jobs", "1", "--out", str(tmp_path), "--json"]
+    outcome = CliRunner().invoke(cli, arguments)
+    assert outcome.exit_code == 0, outcome.output
+    trial, finding = (json.loads(line) for line in outcome.stdout.splitlines())
+    assert [run["outcome"] for run in trial["runs"]] == ["stood", "stood"]
+    assert all("E2E_REPEATED" in run["codes"] for run in trial["runs"])
+    assert (finding["id"], finding["passed"]) == ("F05", True)
+    assert "double support" in (tmp_path / "report.html").read_text()

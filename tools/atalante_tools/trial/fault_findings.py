@@ -1,0 +1,93 @@
+"""Findings of the experiment `faults`: `results -> falls of each fault, with moments, reasons and longest durations`."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from itertools import groupby
+from typing import Any, Final
+
+from atalante_tools.faults.matrix import load_matrix
+from atalante_tools.trial.findings import Finding, Result
+
+#: Faults with which the robot must not fall: frames lost, late or doubled, an IMU or a force cell invalid, an exception of the
+#: controller, STOP, and a released or silent pendant.
+NO_FALL: Final = frozenset({"F01", "F02", "F03", "F05", "F06", "F24", "F30", "F31", "F32", "F33", "F45", "F56", "F63"})
+#: Faults with which the robot must not fall if they begin in double support: the bus of the HAL fails.
+NO_FALL_IN_DOUBLE_SUPPORT: Final = frozenset({"F15", "F16"})
+
+
+def fault_findings(results: Sequence[Result]) -> list[Finding]:
+    """Return one finding per fault.
+
+    With a fault of `NO_FALL`, no run may end in a fall. With another fault, each fall must have a diagnostic and a robot that is
+    no longer ACTIVE. With no fault may the HAL raise an exception.
+
+    Args:
+        results: results of `fault` trials.
+    """
+    matrix = load_matrix()
+    return [
+        _finding(id_, matrix[id_].fault, list(group))
+        for id_, group in groupby(results, key=lambda result: str(result["trial"]["id"]))
+    ]
+
+
+def _finding(id_: str, fault: str, results: Sequence[Result]) -> Finding:
+    runs = [(result["trial"]["case"], one) for result in results for one in result["runs"]]
+    falls = [(case, one) for case, one in runs if one["outcome"] == "fell"]
+    failed = [one for case, one in runs if one["outcome"] == "exception" or _wrong_fall(id_, one)]
+    parts = [f"{len(falls)} of {len(runs)} walks fell"]
+    parts += [f"{case}: {_moments(cases)}" for case, cases in _by_case(falls)]
+    parts += [f"longest duration without a fall {_longest(result)}" for result in results if result["longest"]]
+    parts += [f"exception: {one['reason']}" for _, one in runs if one["outcome"] == "exception"]
+    return Finding(id_, f"{fault}: {_claim(id_)}", "; ".join(parts), not failed)
+
+
+def _claim(id_: str) -> str:
+    if id_ in NO_FALL:
+        return "no fall"
+    if id_ in NO_FALL_IN_DOUBLE_SUPPORT:
+        return "no fall in double support, and a diagnostic before each other fall"
+    return "a diagnostic with each fall"
+
+
+def _wrong_fall(id_: str, run: dict[str, Any]) -> bool:
+    """Return whether a run ended in a fall that is not accepted."""
+    if run["outcome"] != "fell":
+        return False
+    required = id_ in NO_FALL or (id_ in NO_FALL_IN_DOUBLE_SUPPORT and run["moment"] is None)
+    return required or not run["codes"] or run["state"] == "ACTIVE"
+
+
+def _by_case(falls: Sequence[tuple[str, dict[str, Any]]]) -> list[tuple[str, list[dict[str, Any]]]]:
+    return [(case, [run for _, run in group]) for case, group in groupby(falls, key=lambda fall: fall[0])]
+
+
+def _moments(falls: Sequence[dict[str, Any]]) -> str:
+    """Return moments, end states, first diagnostics and the reason of falls with one case."""
+    moments = ", ".join(moment_name(run["moment"]) for run in falls)
+    states = ", ".join(dict.fromkeys(run["state"] for run in falls))
+    codes = ", ".join(dict.fromkeys(run["codes"][0] if run["codes"] else "no diagnostic" for run in falls))
+    return f"at {moments} ({states}; {codes}; {falls[0]['reason'] or 'no reason'})"
+
+
+def _longest(result: Result) -> str:
+    """Return the shortest of the longest durations of all moments."""
+    limited = [
+        (cycles, run["moment"])
+        for cycles, run in zip(result["longest"], result["runs"], strict=True)
+        if cycles is not None
+    ]
+    if not limited:
+        return "is not limited"
+    cycles, moment = min(limited, key=lambda one: one[0])
+    return f"{cycles} cycles (at {moment_name(moment)})"
+
+
+def moment_name(moment: float | None) -> str:
+    """Return the name of a moment.
+
+    Args:
+        moment: phase of the step; None means in double support.
+    """
+    return "double support" if moment is None else f"phase {moment:g}"
