@@ -11,6 +11,20 @@ braking. The envelope is not a controller: without braking a joint reaches its e
 `position_margin` outside the position limit. It must withstand the torque that presses a resting joint against it. A gait may
 use the full range.
 
+*Acceleration.* A light joint exceeds its velocity limit before a measured velocity shows it, because the torque changes at a
+finite rate and because a measurement is old. So the envelope also limits the predicted velocity, at which the joint arrives if
+the torque falls from u to zero at `torque_rate_max`. The prediction assumes the measured acceleration, and in addition the
+acceleration that the torque change of the last `DELAY` cycles causes on the smallest inertia of the joint. Let x be the velocity
+v without the low-pass of the drive, and a the change of x in one cycle, divided by the period T. Let o be the torque sent
+`DELAY` cycles ago, and J the smallest inertia. A positive torque is at most U, the largest u >= 0 with
+
+    (a + max(0, u - o) / J) (DELAY T + u / (2 torque_rate_max)) <= max(0, velocity_max - x)
+
+A negative torque has the mirrored limit. On the ground the measured accelerations are small, so the same torques are permitted as
+without this limit. A torque that brakes is limited only if it would accelerate the joint beyond the limit of the opposite
+direction. The prediction treats each joint alone: torques of other joints count only through the measured acceleration. In the
+first cycle after `restart` a and x - v are unknown and assumed to be 0; a is 0 in the second cycle, too.
+
 *Rate.* The torque changes by at most `torque_rate_max`, without exception. If the derating or the envelope reduces the limit
 below the torque of the last cycle, the torque approaches the new limit at this rate.
 
@@ -22,7 +36,8 @@ the resolution of TargetTorque.
 - |u_k| <= torque_max, M_k <= torque_max
 - |u_k - u_(k-1)| <= r + e
 - |u_k| <= max(M_k, |u_(k-1)| - r + e)
-- u_k <= max(F_up M_k, u_(k-1) - r) + e and -u_k <= max(F_down M_k, -u_(k-1) - r) + e, where
+- u_k <= max(min(F_up M_k, U_up), u_(k-1) - r) + e and -u_k <= max(min(F_down M_k, U_down), -u_(k-1) - r) + e, where U_up and
+  U_down are the torques U of both directions, from the motion that the limiter received, and
   F_up = min(S((q + look_ahead v - position_max) / position_margin), S((v - velocity_max) / velocity_margin)),
   F_down = min(S((position_min - q - look_ahead v) / position_margin), S((-v - velocity_max) / velocity_margin)),
   S(x) = 1 - x clipped to [0, 1]
@@ -35,16 +50,21 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Final, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
 from atalante_hal.compiled import specialised
-from atalante_hal.robot import JOINTS, Robot
+from atalante_hal.robot import JOINTS, SIDES, Robot
 from atalante_hal.types import Vector
 
 _COUNT = len(JOINTS)
+#: Number of cycles after which a change of the commanded torque is visible in the measured acceleration.
+DELAY: Final = 3
+#: For each joint of a leg: smallest inertia that a torque on this joint accelerates, while the other joints are free [kg m2].
+#: Lower bound over all poses of the empty exoskeleton, suspended or floating. A gait does not depend on these values.
+SMALLEST_INERTIA: Final = (0.12, 0.14, 0.17, 0.11, 0.038, 0.038)
 #: Results of `limit`: all torques are unchanged, the torque of at least one joint was reduced, an input is not finite.
 _UNCHANGED, _CUT, _NOT_FINITE = range(3)
 
@@ -60,7 +80,7 @@ class Limited:
 class JointLimits(NamedTuple):
     """Constant limits of all joints, for the compiled function `limit`.
 
-    The `Limiter` owns `step`; the `Robot` owns the other arrays.
+    The `Limiter` owns `step` and `inertia`; the `Robot` owns the other arrays.
     """
 
     step: Vector  # (12,) maximum change of the torque in one cycle [Nm]
@@ -70,6 +90,9 @@ class JointLimits(NamedTuple):
     look_ahead: float  # time for which the position is predicted, at constant velocity [s]
     position_margin: float  # distance outside a position limit at which the torque is zero [rad]
     velocity_margin: float  # speed above `velocity_max` at which the torque is zero [rad/s]
+    inertia: Vector  # (12,) smallest inertia [kg m2]
+    period: float  # duration of a cycle [s]
+    filter_lag: float  # delay of the low-pass of the reported velocity [s]
 
 
 class Limiter:
@@ -88,6 +111,7 @@ class Limiter:
     def __init__(self, robot: Robot, period: float) -> None:
         self._torque_max = robot.torque_max
         envelope = robot.envelope
+        keep = math.exp(-2.0 * math.pi * robot.sensors.velocity_bandwidth * period)
         self._limits = JointLimits(
             step=robot.torque_rate_max * period,
             position_min=robot.position_min,
@@ -96,6 +120,9 @@ class Limiter:
             look_ahead=envelope.look_ahead,
             position_margin=envelope.position_margin,
             velocity_margin=envelope.velocity_margin,
+            inertia=np.array(SMALLEST_INERTIA * len(SIDES)),
+            period=period,
+            filter_lag=keep / (1.0 - keep) * period,
         )
         self.limit: Vector = robot.torque_max.copy()
         self.last: Vector = np.zeros(_COUNT)
@@ -103,7 +130,12 @@ class Limiter:
         self.saturated = 0
         # Copies of the inputs, because the compiled code accepts only the array type and layout that it was compiled for.
         self._asked, self._motion = np.zeros(_COUNT), np.zeros((2, _COUNT))
-        self._apply = specialised(limit, self._asked, self._motion, self._limits, self.limit, self.last, self.cut)
+        # Rows: torques sent in the last `DELAY` cycles, newest first; velocity of the last cycle with and without low-pass.
+        self._past = np.zeros((DELAY + 2, _COUNT))
+        self._apply = specialised(
+            limit, self._asked, self._motion, self._limits, self.limit, self.last, self._past, self.cut
+        )
+        self.restart(self.last)
 
     def apply(self, torque: Vector, motion: Vector) -> Limited:
         """Limit a command and store the result in `last`.
@@ -117,7 +149,7 @@ class Limiter:
         """
         self._asked[:] = torque
         self._motion[:] = motion
-        done = self._apply(self._asked, self._motion, self._limits, self.limit, self.last, self.cut)
+        done = self._apply(self._asked, self._motion, self._limits, self.limit, self.last, self._past, self.cut)
         if done == _NOT_FINITE:
             return Limited(finite=False, clamped=False)
         self.saturated = self.saturated + 1 if done == _CUT else 0
@@ -139,6 +171,8 @@ class Limiter:
         """
         finite = np.nan_to_num(torque, nan=0.0, posinf=0.0, neginf=0.0)
         np.clip(finite, -self.limit, self.limit, out=self.last)
+        self._past[:DELAY] = self.last
+        self._past[DELAY:] = math.nan
         self.saturated = 0
         self.cut.fill(False)
 
@@ -152,6 +186,7 @@ def limit(
     limits: JointLimits,
     torque_limit: Vector,
     last: Vector,
+    past: Vector,
     cut: npt.NDArray[np.bool_],
 ) -> int:
     """Limit the torque of all joints: torque limit, envelope and torque rate, as described in the module docstring.
@@ -162,6 +197,8 @@ def limit(
         limits: constant limits of the joints.
         torque_limit: current torque limit, shape (12,) [Nm].
         last: torque sent in the last cycle, shape (12,) [Nm]; overwritten with the torque to be sent in this cycle.
+        past: torques sent in the last `DELAY` cycles, newest first [Nm], then the velocity of the last cycle as reported and
+            without low-pass [rad/s], NaN if unknown. Shape (DELAY + 2, 12); updated.
         cut: True for each joint whose torque differs from the requested torque, shape (12,); overwritten.
 
     Returns:
@@ -181,6 +218,14 @@ def limit(
         too_fast_down = (-velocity - limits.velocity_max[joint]) / limits.velocity_margin
         up = torque_limit[joint] * share(max(too_high, too_fast_up))
         down = torque_limit[joint] * share(max(too_low, too_fast_down))
+        before, fast_before = past[DELAY, joint], past[DELAY + 1, joint]
+        fast = velocity if math.isnan(before) else velocity + limits.filter_lag * (velocity - before) / limits.period
+        acceleration = 0.0 if math.isnan(fast_before) else (fast - fast_before) / limits.period
+        past[DELAY, joint], past[DELAY + 1, joint] = velocity, fast
+        oldest, inertia, fall = past[DELAY - 1, joint], limits.inertia[joint], 0.5 * limits.period / limits.step[joint]
+        delay, fastest = DELAY * limits.period, limits.velocity_max[joint]
+        up = min(up, highest_torque(fastest - fast, acceleration, oldest, inertia, delay, fall))
+        down = min(down, highest_torque(fastest + fast, -acceleration, -oldest, inertia, delay, fall))
         # If the torque limit falls below the torque of the last cycle, the torque decreases at the rate limit.
         lowest, highest = last[joint] - limits.step[joint], last[joint] + limits.step[joint]
         sent = min(max(requested[joint], within(-down, lowest, highest)), within(up, lowest, highest))
@@ -188,7 +233,31 @@ def limit(
         if cut[joint]:
             done = _CUT
         last[joint] = sent
+        for age in range(DELAY - 1, 0, -1):
+            past[age, joint] = past[age - 1, joint]
+        past[0, joint] = sent
     return done
+
+
+def highest_torque(room: float, acceleration: float, oldest: float, inertia: float, delay: float, fall: float) -> float:
+    """Return U, the largest torque in one direction with which the predicted velocity stays within its limit [Nm].
+
+    Args:
+        room: difference between the velocity limit and the velocity [rad/s].
+        acceleration: measured acceleration [rad/s2].
+        oldest: torque sent `DELAY` cycles ago [Nm].
+        inertia: smallest inertia of the joint [kg m2].
+        delay: duration of `DELAY` cycles [s].
+        fall: half of the time in which the torque falls by 1 Nm [s/Nm].
+    """
+    room = max(room, 0.0)
+    known = max(oldest, 0.0)
+    if acceleration * (delay + known * fall) > room:
+        return max((room / acceleration - delay) / fall, 0.0)
+    # Positive root of fall u^2 + (delay + free fall) u + free delay - inertia room = 0.
+    free = inertia * acceleration - oldest
+    root = math.sqrt((delay - free * fall) ** 2 + 4.0 * fall * inertia * room)
+    return max((root - delay - free * fall) / (2.0 * fall), known)
 
 
 def share(beyond: float) -> float:

@@ -17,6 +17,7 @@ from atalante_control.model import (
     urdf,
 )
 from atalante_hal.robot import CELLS, FEET, IMUS, JOINTS, MIRROR_SIGN, load_robot
+from atalante_hal.safety.limiter import SMALLEST_INERTIA
 
 ROBOT = load_robot()
 PARAMETERS = (ExoskeletonParameters(), ExoskeletonParameters(thigh_length=0.45, shank_length=0.36))
@@ -111,6 +112,23 @@ def test_floating_exoskeleton_is_symmetric_about_the_sagittal_plane() -> None:
     assert pinocchio.centerOfMass(model, data, q)[1] == pytest.approx(0.0, abs=1e-15)
     pinocchio.crba(model, data, q)
     assert pinocchio.computeTotalMass(model) == pytest.approx(82.5)
+
+
+@pytest.mark.parametrize("fixed_base", [True, False])
+def test_limiter_assumes_at_most_the_smallest_inertia_of_each_joint(fixed_base: bool) -> None:
+    """The inertia that a torque on one free joint accelerates is 1 over the diagonal element of the inverse mass matrix."""
+    model, q_index, v_index = pinocchio_model(urdf(ExoskeletonParameters(), ROBOT), fixed_base=fixed_base)
+    data, rng, smallest = model.createData(), np.random.default_rng(0), np.full(12, np.inf)
+    for number in range(400):
+        q = pinocchio.neutral(model)
+        inside = rng.uniform(ROBOT.position_min, ROBOT.position_max)
+        q[q_index] = inside if number % 2 else np.where(rng.random(12) < 0.5, ROBOT.position_min, ROBOT.position_max)
+        upper = np.triu(pinocchio.crba(model, data, q))
+        inverse = np.linalg.inv(upper + np.triu(upper, 1).T)
+        smallest = np.minimum(smallest, 1.0 / np.diag(inverse)[v_index])
+    assert (np.array(SMALLEST_INERTIA * 2) <= smallest).all()
+    if not fixed_base:
+        assert (np.array(SMALLEST_INERTIA * 2) >= 0.85 * smallest).all()
 
 
 def test_sensor_frames_have_the_documented_positions() -> None:

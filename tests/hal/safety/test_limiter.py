@@ -11,13 +11,14 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
 from atalante_hal.robot import JOINTS, load_robot
-from atalante_hal.safety.limiter import Limited, Limiter
+from atalante_hal.safety.limiter import DELAY, SMALLEST_INERTIA, Limited, Limiter, highest_torque
 
 ROBOT = load_robot()
 PERIOD = 1e-3
 STEP = ROBOT.torque_rate_max * PERIOD
 MIDDLE = (ROBOT.position_min + ROBOT.position_max) / 2.0
 AT_REST = np.array([MIDDLE, np.zeros(12)])
+INERTIA = np.array(SMALLEST_INERTIA * 2)
 LOOK, PAST, FASTER = ROBOT.envelope.look_ahead, ROBOT.envelope.position_margin, ROBOT.envelope.velocity_margin
 FREE, CUT, REFUSED = Limited(True, False), Limited(True, True), Limited(False, False)
 
@@ -60,11 +61,43 @@ def reach(motion: np.ndarray, limit: np.ndarray) -> tuple[np.ndarray, np.ndarray
     return up * limit, down * limit
 
 
+class Prediction:
+    """Limits U of both directions, computed from the inputs of the limiter by bisection of the inequality in its docstring."""
+
+    def __init__(self, torque: np.ndarray) -> None:
+        self.sent = [torque.copy()] * DELAY
+        self.velocities: list[np.ndarray] = []
+        self.fast: list[np.ndarray] = []
+
+    def reach(self, velocity: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        keep = np.exp(-2.0 * np.pi * ROBOT.sensors.velocity_bandwidth * PERIOD)
+        fast = (velocity - keep * self.velocities[-1]) / (1.0 - keep) if self.velocities else velocity.copy()
+        acceleration = (fast - self.fast[-1]) / PERIOD if self.fast else np.zeros(12)
+        self.velocities.append(velocity.copy())
+        self.fast.append(fast)
+        up, down = (
+            self._largest(sign * self.sent[-DELAY], sign * acceleration, ROBOT.velocity_max - sign * fast)
+            for sign in (1.0, -1.0)
+        )
+        return up, down
+
+    @staticmethod
+    def _largest(oldest: np.ndarray, acceleration: np.ndarray, room: np.ndarray) -> np.ndarray:
+        low, high = np.zeros(12), np.full(12, 1000.0)
+        for _ in range(80):
+            u = 0.5 * (low + high)
+            gained = acceleration + np.maximum(0.0, u - oldest) / INERTIA
+            allowed = gained * (DELAY * PERIOD + u / (2.0 * ROBOT.torque_rate_max)) <= np.maximum(0.0, room)
+            low, high = np.where(allowed, u, low), np.where(allowed, high, u)
+        return low
+
+
 @given(st.lists(st.tuples(commands, motions), min_size=1, max_size=20))
 @example([(np.full(12, 1.7e308), AT_REST), (np.full(12, -1.7e308), AT_REST)])
 def test_every_command_is_limited_as_documented(cycles: list[tuple[np.ndarray, np.ndarray]]):
     limiter = Limiter(ROBOT, PERIOD)
     saturated = 0
+    prediction = Prediction(limiter.last)
     for command, motion in cycles:
         before, copy = limiter.last.copy(), command.copy()
         result = limiter.apply(command, motion)
@@ -74,8 +107,10 @@ def test_every_command_is_limited_as_documented(cycles: list[tuple[np.ndarray, n
             assert result == REFUSED
             assert u.tobytes() == before.tobytes()
             continue
-        tiny = 1e-9
-        up, down = reach(motion, ROBOT.torque_max)
+        tiny = 1e-6
+        predicted = prediction.reach(motion[1])
+        prediction.sent.append(u.copy())
+        up, down = (np.minimum(*both) for both in zip(reach(motion, ROBOT.torque_max), predicted, strict=True))
         assert (np.abs(u) <= ROBOT.torque_max).all()
         assert (np.abs(u - before) <= STEP + tiny).all()
         assert (u <= np.maximum(up, before - STEP) + tiny).all()
@@ -111,12 +146,13 @@ shares = arrays(np.float64, 12, elements=st.floats(-1.0, 1.0))
 def test_command_within_every_limit_is_sent_unchanged(
     torque: np.ndarray, step: np.ndarray, velocity: np.ndarray, position: np.ndarray, derated: np.ndarray
 ):
-    """The torque reaches its derated limit. Position, velocity and torque rate reach at least 99 % of their limits."""
+    """The torque reaches its derated limit. Position, predicted velocity and torque rate reach 99 % of their limits."""
     limiter = Limiter(ROBOT, PERIOD)
     limiter.derate(derated * ROBOT.torque_max)
     requested = torque * limiter.limit
     limiter.restart(requested + 0.99 * step * STEP)
-    speed = velocity * ROBOT.velocity_max
+    fall = ROBOT.torque_max / (2.0 * ROBOT.torque_rate_max)
+    speed = 0.99 * velocity * (ROBOT.velocity_max - STEP / INERTIA * (DELAY * PERIOD + fall))
     half = (ROBOT.position_max - ROBOT.position_min) / 2.0
     ahead = MIDDLE + 0.99 * position * half
     assert limiter.apply(requested, np.array([ahead - LOOK * speed, speed])) == FREE
@@ -130,7 +166,7 @@ def test_command_within_the_limits_is_unchanged_for_1000_cycles():
     rng = np.random.default_rng(0)
     torque = np.zeros(12)
     for _ in range(1000):
-        torque = np.clip(torque + rng.uniform(-0.9, 0.9, 12) * STEP, -ROBOT.torque_max, ROBOT.torque_max)
+        torque = np.clip(torque + rng.uniform(-0.45, 0.45, 12) * STEP, -ROBOT.torque_max, ROBOT.torque_max)
         assert limiter.apply(torque, AT_REST) == FREE
         assert limiter.last.tobytes() == torque.tobytes()
 
@@ -213,10 +249,36 @@ class TestTightThresholds:
             moving(joint, limit + sign * part * PAST),
             moving(joint, MIDDLE[joint], sign * (ROBOT.velocity_max[joint] + part * FASTER)),
         ):
-            limiter = Limiter(ROBOT, PERIOD)
+            limiter = limiter_at(only(joint, sign * ROBOT.torque_max[joint]))
             for _ in range(20):
                 limiter.apply(only(joint, sign * ROBOT.torque_max[joint]), motion)
             assert sign * limiter.last[joint] == pytest.approx(max(0.0, 1.0 - part) * ROBOT.torque_max[joint])
+
+    def test_torque_of_a_free_joint_is_cut_before_the_joint_is_fast(self, joint: int, sign: float):
+        """A joint with 1.5 times the smallest inertia stays below 1.2 times its velocity limit at the full torque request."""
+        limiter, torques, velocity, filtered, highest = limiter_at(np.zeros(12)), [0.0], 0.0, 0.0, 0.0
+        keep = np.exp(-2.0 * np.pi * ROBOT.sensors.velocity_bandwidth * PERIOD)
+        for _ in range(60):
+            before = velocity
+            velocity += torques[-1] / (1.5 * INERTIA[joint]) * PERIOD
+            filtered = keep * filtered + (1.0 - keep) * 0.5 * (velocity + before)
+            highest = max(highest, abs(velocity))
+            limiter.apply(only(joint, sign * 1e3), moving(joint, MIDDLE[joint], filtered))
+            torques.append(float(limiter.last[joint]))
+        assert 0.6 * ROBOT.velocity_max[joint] < highest < 1.2 * ROBOT.velocity_max[joint]
+
+    def test_accelerating_joint_is_cut_and_restart_forgets_the_acceleration(self, joint: int, sign: float):
+        full = only(joint, sign * ROBOT.torque_max[joint])
+        fast, rate = 0.5 * sign * ROBOT.velocity_max[joint], 0.2 * sign * ROBOT.velocity_max[joint]
+        limiter = limiter_at(full)
+        self.expect(limiter, full, moving(joint, MIDDLE[joint], fast - 2.0 * rate), None)
+        self.expect(limiter, full, moving(joint, MIDDLE[joint], fast - rate), joint)
+        limiter.restart(full)
+        self.expect(limiter, full, moving(joint, MIDDLE[joint], fast), None)
+        # The opposite torque brakes the joint.
+        braking = limiter_at(-full)
+        self.expect(braking, -full, moving(joint, MIDDLE[joint], fast - rate), None)
+        self.expect(braking, -full, moving(joint, MIDDLE[joint], fast), None)
 
     def test_braking_torque_is_not_reduced_outside_the_envelope(self, joint: int, sign: float):
         limit = (ROBOT.position_max if sign > 0 else ROBOT.position_min)[joint]
@@ -234,6 +296,25 @@ class TestTightThresholds:
             limiter.apply(only(joint, sign * 1e3), moving(joint, limit + sign * PAST))
             left.append(sign * limiter.last[joint] / STEP[joint])
         assert left == pytest.approx([2.5, 1.5, 0.5, 0.0, 0.0], abs=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("room", "acceleration", "oldest", "expected"),
+    [
+        (1.0, 0.0, 0.0, 20.0),  # 20 / 0.1 * (0.003 + 20 / 1e4) = 1
+        (1.0, 0.0, 50.0, 60.9902),
+        (0.0, 0.0, 50.0, 50.0),
+        (-1.0, 0.0, 50.0, 50.0),
+        (-1.0, -10.0, 50.0, 51.0),  # a deceleration permits a growth that cancels it
+        (-1.0, 1.0, 50.0, 0.0),
+        (1.0, 100.0, 90.0, 70.0),  # 100 * (0.003 + 70 / 1e4) = 1
+        (1.0, 100.0, 70.0, 70.0),
+        (1.0, 1000.0, 90.0, 0.0),
+        (0.3, 0.0, -20.0, 0.0),
+    ],
+)
+def test_highest_torque_has_the_documented_values(room: float, acceleration: float, oldest: float, expected: float):
+    assert highest_torque(room, acceleration, oldest, 0.1, 0.003, 1e-4) == pytest.approx(expected, abs=1e-3)
 
 
 def test_torque_falls_at_the_rate_limit_to_the_derated_limit():

@@ -21,6 +21,8 @@ _FAILED: Final = 20
 #: Number of cycles without a command after which a drive must hold its position without the HAL (local hold).
 #: This number is not imported from the emulated drive, so that an error in the emulator cannot change the check.
 _WATCHDOG: Final = 5
+#: Highest true speed of a joint, as a multiple of its velocity limit.
+_TOO_FAST: Final = 1.2
 _LEFT_LEG: Final = slice(0, len(LEG_JOINTS))
 
 
@@ -142,6 +144,18 @@ def encoders_keep_their_reference(run: Observation) -> str | None:
     """
     nodes = sorted({event.node for event in run.events if event.code == Dtc.ENC_JUMP})
     return f"no encoder jumped, but {Dtc.ENC_JUMP} names {', '.join(nodes)}" if nodes else None
+
+
+def no_joint_is_too_fast(run: Observation) -> str | None:
+    """Check that no joint moves faster than 1.2 times its velocity limit.
+
+    Args:
+        run: observation of the run.
+    """
+    highest = (np.abs(run.velocity) / run.robot.velocity_max).max(axis=0)
+    joint = int(highest.argmax())
+    share = float(highest[joint])
+    return f"{JOINTS[joint]} reached {share:.2f} times its velocity limit" if share > _TOO_FAST else None
 
 
 def start_fails_and_names_the_hip(run: Observation) -> str | None:

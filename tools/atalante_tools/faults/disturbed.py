@@ -17,6 +17,8 @@ from atalante_tools.faults.scenario import HostFault
 
 #: Mask of the joint that the fault `shake` disturbs, shape (12,): 1 for the left hip, 0 for all other joints.
 _HIP: Final = np.array([joint == "left_SH" for joint in JOINTS], np.float64)
+#: Torque request of the fault `full_torque`, above the torque limit of every joint [Nm].
+_TOO_MUCH: Final = 1e3
 
 
 class HostFaults:
@@ -45,7 +47,7 @@ class HostFaults:
 
 
 class DisturbedController:
-    """Controller that injects the faults `raise`, `raise_in_reset`, `request`, `shake` and `shape`."""
+    """Controller that injects the faults `raise`, `raise_in_reset`, `request`, `full_torque`, `shake` and `shape`."""
 
     def __init__(self, controller: Controller, now: HostFaults) -> None:
         self._controller, self._now = controller, now
@@ -73,11 +75,16 @@ class DisturbedController:
         """
         command = self._controller.update(state)
         self._raise(self._now.of("raise"))
-        wrong = self._now.of("request", "shake", "shape")
+        wrong = self._now.of("request", "full_torque", "shake", "shape")
         if wrong is None:
             return command
         if wrong.kind == "shake":
             return Command(command.torque + _HIP * float(wrong.value) * (-1.0) ** state.cycle, command.vibration)
+        if wrong.kind == "full_torque":
+            joint = str(wrong.value).lstrip("-")
+            torque = command.torque.copy()
+            torque[JOINTS.index(joint)] = -_TOO_MUCH if str(wrong.value).startswith("-") else _TOO_MUCH
+            return Command(torque, command.vibration)
         if wrong.kind == "shape":
             return Command(np.zeros(int(wrong.value)), command.vibration)
         return Command(np.full(len(JOINTS), float(wrong.value)), command.vibration)

@@ -6,8 +6,8 @@ import math
 from typing import Final
 
 from atalante_hal.types import SupervisorState
-from atalante_tools.faults.checks import full_queue_is_confirmed
-from atalante_tools.faults.scenario import Case, HostFault, Scenario
+from atalante_tools.faults.checks import full_queue_is_confirmed, no_joint_is_too_fast
+from atalante_tools.faults.scenario import MID_SWING, Case, HostFault, Scenario
 
 _ACTIVE: Final = SupervisorState.ACTIVE
 #: Exceptions that the faulty controller raises.
@@ -48,6 +48,20 @@ SCENARIOS: Final = (
                 Case(f"{value:g} Nm", (HostFault("request", 0, 3, value),), state=_ACTIVE, dtc="")
                 for value in (1e3, -1e300)
             ),
+        ),
+    ),
+    Scenario(
+        "F73",
+        tuple(
+            Case(
+                f"{'-' if sign else '+'}{joint} at {phase:.0%} of a step",
+                (HostFault("full_torque", 0, 60, f"{sign}left_{joint}"),),
+                phase,
+                checks=(no_joint_is_too_fast,),
+            )
+            for joint in ("TH", "SK", "SA", "HA")
+            for sign in ("", "-")
+            for phase in (0.1, MID_SWING, 0.7)
         ),
     ),
     Scenario(

@@ -33,6 +33,7 @@ class HostFault:
     - `slow`: each cycle takes `value` seconds instead of 1 ms.
     - `raise`, `raise_in_reset`: the controller raises the builtin exception named `value`.
     - `request`: the controller requests `value` Nm on every joint.
+    - `full_torque`: the controller requests 1000 Nm on the joint named `value`, or -1000 Nm if the name starts with a minus sign.
     - `shake`: the controller adds a torque on the left hip that alternates between `value` Nm and -`value` Nm.
     - `shape`: the controller returns an array with `value` torques instead of one torque per joint.
     - `bus_down`, `bus_full`: the bus raises an error when the HAL sends frames.
