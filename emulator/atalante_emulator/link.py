@@ -297,9 +297,14 @@ class FaultyBus(WrappedBus):
 
     def _passed(self, frames: Frames, *, from_hal: bool) -> list[Frames]:
         """Apply all active faults to each frame. Return the frames that are sent in this cycle, each of shape (1,)."""
-        passing = [frames[row : row + 1].copy() for row in range(len(frames))]
-        for disturbance in self._active:
-            passing = [after for frame in passing for after in disturbance.frames(frame, self._cycle)]
+        passing: list[Frames] = []
+        for row, can_id in enumerate(frames["can_id"].tolist()):
+            copies, ids = [frames[row : row + 1].copy()], {can_id}
+            for disturbance in self._active:
+                if not ids.isdisjoint(disturbance.messages):
+                    copies = [after for frame in copies for after in disturbance.frames(frame, self._cycle)]
+                    ids = {_id(frame) for frame in copies}
+            passing += copies
         return passing if self.wire.idle else self.wire.carry(passing, from_hal=from_hal)
 
     def _begin_cycle(self) -> None:

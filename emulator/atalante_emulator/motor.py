@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections import deque
 from dataclasses import dataclass
 
 import numpy as np
@@ -23,6 +24,7 @@ class MotorParameters:
     # While the power stage is off, a relay shorts the windings. The motor then brakes the joint with this additional damping.
     brake: tuple[float, ...] = (150.0, 40.0, 125.0, 80.0, 20.0, 8.0)  # Nm s/rad
     current_loop: float = 0.5e-3  # time constant of the torque [s]
+    dead_time: int = 0  # cycles until a new setpoint reaches the current loop
     ambient: float = 25.0  # ambient temperature [degC]
     heating: float = 70.0  # temperature rise after a long time at half the torque limit [K]
     thermal_time: float = 300.0  # time constant of the winding temperature [s]
@@ -33,18 +35,21 @@ class MotorParameters:
 _WANTED, _STRENGTH, _DRY, _DAMPING, _PUSH, _JOINT, _LIMB = range(7)
 
 
-def _advance(velocity: Vector, motors: Vector, tracking: float, friction_speed: float, torque: Vector) -> None:
+def _advance(
+    velocity: Vector, setpoint: Vector, motors: Vector, tracking: float, friction_speed: float, torque: Vector
+) -> None:
     """Advance all motors by one `PERIOD`.
 
     Args:
         velocity: true joint velocities, shape (12,) [rad/s].
+        setpoint: setpoints of the motor torques that reach the current loops, shape (12,) [Nm].
         motors: motor array, shape (7, 12). Its joint torques are updated.
         tracking: share of the torque deviation that the current loop removes per `PERIOD`.
         friction_speed: joint speed at which dry friction reaches 76 % of its full value [rad/s].
         torque: measured motor torques, shape (12,) [Nm]. Updated here.
     """
     for i in range(len(torque)):
-        torque[i] += tracking * (motors[_WANTED, i] - torque[i])
+        torque[i] += tracking * (setpoint[i] - torque[i])
         friction = motors[_DRY, i] * math.tanh(velocity[i] / friction_speed) + motors[_DAMPING, i] * velocity[i]
         motors[_JOINT, i] = motors[_STRENGTH, i] * torque[i] - friction + motors[_PUSH, i] + motors[_LIMB, i]
 
@@ -58,6 +63,9 @@ class Motors:
         self._tracking = 1.0 - math.exp(-PERIOD / parameters.current_loop)
         self._motors = np.zeros((7, len(JOINTS)))
         self.wanted, self._joint = self._motors[_WANTED], self._motors[_JOINT]
+        self._late = deque(
+            np.zeros((parameters.dead_time, len(JOINTS)))
+        )  # setpoints that have not reached the current loop
         #: Torques of the wearer's limbs on the joints, shape (12,) [Nm]. The emulator writes into this array.
         self.limb = self._motors[_LIMB]
         self._viscous = np.array(parameters.viscous * both)
@@ -108,7 +116,11 @@ class Motors:
         Returns:
             Joint torques, shape (12,) [Nm].
         """
-        self._advance(velocity, self._motors, self._tracking, self._parameters.friction_speed, self._torque)
+        setpoint = self.wanted
+        if self._late:
+            self._late.append(setpoint.copy())
+            setpoint = self._late.popleft()
+        self._advance(velocity, setpoint, self._motors, self._tracking, self._parameters.friction_speed, self._torque)
         torque: list[float] = self._joint.tolist()
         return torque
 

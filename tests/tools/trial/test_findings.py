@@ -8,8 +8,15 @@ from typing import Any
 
 import pytest
 
-from atalante_tools.trial.findings import assist_findings, shape_findings, step_variation, sweep_findings
-from atalante_tools.trial.plan import SWEEP, ShapeTrial, TreadmillTrial, WalkTrial, fields
+from atalante_tools.trial.findings import (
+    assist_findings,
+    protocol_findings,
+    robust_findings,
+    shape_findings,
+    step_variation,
+    sweep_findings,
+)
+from atalante_tools.trial.plan import SWEEP, RobustTrial, ShapeTrial, TreadmillTrial, WalkTrial, fields
 from atalante_tools.trial.report import write_report
 from atalante_tools.trial.run import EDGES
 
@@ -185,3 +192,51 @@ def test_report_contains_every_finding_and_requests_nothing(experiment: str, tmp
     sources = re.findall(r"(?:src|href|url)\s*[=(]\s*['\"]?([^'\" >]{1,30})", text)
     assert all(source.startswith("data:image/png") for source in sources)
     assert "http" not in re.sub(r"base64,[^']*", "", text)
+
+
+def robust_result(number: int, outcome: str = "stood", *, safe: bool = True) -> Result:
+    trial = RobustTrial(number, 75.0, 1.75, 1.05, 0.5, 2, 0.01, ((1.0, 90.0),), 100.0, 60, number, "mujoco")
+    return {
+        "trial": fields(trial), "versions": VERSIONS, "outcome": outcome, "steps": 60, "state": "ACTIVE", "safe": safe,
+        "max_dcm_error_m": 0.05, "diagnostics": {}, "true_lateral_m": 0.1,
+    }  # fmt: skip
+
+
+def test_robustness_needs_98_percent_standing_and_a_safe_end_of_the_others() -> None:
+    stood = [robust_result(k) for k in range(98)]
+    held = [robust_result(98 + k, "hold") for k in range(2)]
+    assert verdicts(robust_findings([*stood, *held])) == {"robust-walk": True, "robust-safe": True}
+    assert verdicts(robust_findings([*stood[1:], *held, robust_result(0, "fell")]))["robust-walk"] is False
+    unsafe = robust_findings([*stood, robust_result(99, "fell", safe=False)])
+    assert verdicts(unsafe)["robust-safe"] is False
+    assert "robust-099" in unsafe[1].statistic
+    assert verdicts(robust_findings([])) == {"robust-walk": None, "robust-safe": None}
+
+
+def test_protocol_needs_certified_guides_and_no_alarm() -> None:
+    walks = [
+        {**walk_result(75.0, False, 0.5, net=0.0, error=1.0), "diagnostics": {"TORQUE_SATURATED": 4}} for _ in range(20)
+    ]
+    assert verdicts(protocol_findings(walks)) == {"protocol-contained": True, "protocol-certified": True}
+    walks[0]["certified"] = False
+    assert verdicts(protocol_findings(walks))["protocol-certified"] is True
+    walks[1]["certified"] = False
+    assert verdicts(protocol_findings(walks))["protocol-certified"] is False
+    alarmed = [*walks[2:], {**walks[2], "diagnostics": {"ENC_DRIFT": 1}}]
+    assert verdicts(protocol_findings(alarmed))["protocol-certified"] is False
+    assert verdicts(protocol_findings([{**walks[2], "outcome": "fell"}]))["protocol-contained"] is False
+
+
+@pytest.mark.parametrize("experiment", ["protocol", "robustness"])
+def test_reports_of_walks_contain_every_trial(experiment: str, tmp_path: Path) -> None:
+    if experiment == "robustness":
+        results = [robust_result(1), robust_result(2, "fell")]
+        findings = robust_findings(results)
+    else:
+        results = [{**walk_result(75.0, True, 0.5, net=0.1, error=1.0), "diagnostics": {}}]
+        findings = protocol_findings(results)
+    write_report(experiment, results, findings, False, 0, tmp_path / "report.html")
+    text = (tmp_path / "report.html").read_text()
+    assert all(result["trial"]["name"] in text for result in results)
+    assert all(finding.id in text for finding in findings)
+    assert text.count("data:image/png") == 1

@@ -23,14 +23,18 @@ from atalante_tools.trial import plan, store
 from atalante_tools.trial.plan import (
     PROTOCOL,
     SWEEP,
+    RobustTrial,
     Trial,
     WalkSetting,
     WalkTrial,
     assist_trials,
     key,
+    protocol_trials,
+    robust_trials,
     source_hash,
     sweep_trials,
 )
+from atalante_tools.trial.robustness import robust_walk
 from atalante_tools.trial.run import run_trial
 from atalante_tools.trial.store import compute, path_of, stored
 
@@ -95,6 +99,7 @@ def test_key_depends_on_every_parameter_and_on_the_versions(monkeypatch: pytest.
     changes: list[dict[str, Any]] = [
         {"mass": 76.0}, {"height": 1.76}, {"active": False}, {"xi": 0.4}, {"protocol": (1, 1, 3)}, {"shape": "pinched"},
         {"idealization": 0.9}, {"feedforward": 0.9}, {"seed": 1}, {"engine": "pybullet"}, {"order": "day1-01"},
+        {"literal": True},
     ]  # fmt: skip
     keys = {key(trial), *(key(replace(trial, **change)) for change in changes)}
     assert len(keys) == 1 + len(changes)
@@ -111,7 +116,12 @@ def test_source_hash_changes_with_every_file_that_computes(tmp_path: Path) -> No
     report.write_text("2")
     (tmp_path / "README.md").write_text("2")
     assert source_hash([tmp_path], [report]) == before
+    code.write_text('"""Return a number."""\n\n1  # one\n')
+    assert source_hash([tmp_path], [report]) == before
     code.write_text("2")
+    assert source_hash([tmp_path], [report]) != before
+    code.write_text("1")
+    (tmp_path / "data.toml").write_text("# one")
     assert source_hash([tmp_path], [report]) != before
 
 
@@ -237,3 +247,38 @@ def test_unknown_subject_is_a_usage_error(tmp_path: Path) -> None:
     assert done.exit_code == 2
     assert "58, 62" in done.stderr
     assert not (tmp_path / "x").exists()
+
+
+def test_protocol_has_a_trial_per_subject_condition_and_factor() -> None:
+    trials = protocol_trials(replace(SETTING, literal=True), (0.5, 0.0))
+    assert len({trial.name for trial in trials}) == len({trial.seed for trial in trials}) == len(trials) == 32
+    assert all(isinstance(trial, WalkTrial) and trial.literal for trial in trials)
+
+
+def test_robust_trials_are_drawn_from_the_seed_within_their_ranges() -> None:
+    trials = [t for t in robust_trials(100, 60, 0, "mujoco") if isinstance(t, RobustTrial)]
+    assert trials == robust_trials(100, 60, 0, "mujoco") != robust_trials(100, 60, 1, "mujoco")
+    assert trials[:10] == robust_trials(10, 60, 0, "mujoco")
+    assert {trial.delay for trial in trials} == {0, 1, 2, 3}
+    assert all(0.9 <= t.mass_share <= 1.1 and 0.25 <= t.friction <= 0.8 for t in trials)
+    assert all(len(t.pushes) == 6 and all(0.0 <= time < 48.0 for time, _ in t.pushes) for t in trials)
+    assert len({trial.seed for trial in trials}) == 100
+
+
+def test_robust_walk_is_pushed_and_its_recording_is_readable(tmp_path: Path) -> None:
+    trial = robust_trials(1, 3, 0, "mujoco")[0]
+    assert isinstance(trial, RobustTrial)
+    trial = replace(trial, pushes=((0.4, 90.0),), delay=1, loss=0.001)
+    result = robust_walk(trial, tmp_path / "walk.mcap")
+    assert (result["outcome"], result["steps"], result["safe"], result["pushes"]) == ("stood", 3, True, 1)
+    assert result["max_dcm_error_m"] > 1.5 * robust_walk(replace(trial, force=0.0))["max_dcm_error_m"]
+    assert (tmp_path / "walk.mcap").stat().st_size > 10_000
+
+
+def test_robust_walk_that_falls_ends_in_a_safe_state() -> None:
+    trial = robust_trials(1, 3, 0, "mujoco")[0]
+    assert isinstance(trial, RobustTrial)
+    result = robust_walk(replace(trial, pushes=((0.4, 90.0),), force=2000.0))
+    assert (result["outcome"], result["safe"]) == ("fell", True)
+    assert result["state"] in ("HOLD", "LOWER", "FAULT")
+    assert result["diagnostics"]

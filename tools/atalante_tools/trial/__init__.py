@@ -1,4 +1,4 @@
-"""Command `atalante trial`: the experiments of the paper with virtual subjects, and faults during walks on the ground.
+"""Command `atalante trial`: experiments of the paper, robustness, and faults during walks, with virtual subjects.
 
 experiment -> trials (`plan`) -> results in files (`run`, `store`) -> findings -> report.html
 """
@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
@@ -27,7 +27,7 @@ from atalante_tools.console.terminal import Progress, print_message, show_json, 
 
 if TYPE_CHECKING:
     from atalante_tools.trial.findings import Finding, Result
-    from atalante_tools.trial.plan import Trial
+    from atalante_tools.trial.plan import Trial, WalkSetting
 
 _Command = TypeVar("_Command", bound=Callable[..., Any])
 
@@ -87,6 +87,12 @@ def _walking() -> Callable[[_Command], _Command]:
     return options_as("walking", Walking, options)
 
 
+_mass_option = click.option(
+    "--mass", "masses", type=float, multiple=True, metavar="KG",
+    help="Mass of a subject [kg]. Repeat the option for several subjects.  [default: all eight]",
+)  # fmt: skip
+
+
 @click.group()
 def command() -> None:
     """Repeat the experiments of the paper with virtual subjects on the emulated robot, and write a report.
@@ -102,6 +108,8 @@ def command() -> None:
              atalante trial assist --jobs 2
              atalante trial sweep --quick
              atalante trial faults F16 F56
+             atalante trial protocol --shape pinched --mass 75
+             atalante trial robustness --seeds 10
     """
 
 
@@ -124,19 +132,15 @@ def shapes(running: Running, as_json: bool) -> None:
 
 
 @command.command(short_help="Compare full and partial assistance, with passive and active subjects.")
-@click.option("--mass", "masses", type=float, multiple=True, metavar="KG",
-              help="Mass of a subject [kg]. Repeat the option for several subjects.  [default: all eight]")  # fmt: skip
+@_mass_option
 @_walking()
 @_running("assist")
 def assist(masses: tuple[float, ...], walking: Walking, running: Running, as_json: bool) -> None:
     """Compare full and partial assistance: eight subjects, each passive and active, four walks of five minutes each."""
-    from atalante_control.gait.subject import STUDY_PATIENTS
     from atalante_tools.trial.findings import assist_findings
     from atalante_tools.trial.plan import PROTOCOL, QUICK_MASSES, QUICK_PROTOCOL, assist_trials
 
-    known = [patient.mass for patient in STUDY_PATIENTS]
-    if unknown := [mass for mass in masses if mass not in known]:
-        raise click.UsageError(f"--mass must be one of {', '.join(f'{mass:g}' for mass in known)}, got {unknown[0]:g}")
+    masses = _known(masses)
     if running.quick:
         masses = masses or QUICK_MASSES
     trials = assist_trials(_setting(walking, running, QUICK_PROTOCOL if running.quick else PROTOCOL), masses)
@@ -180,7 +184,80 @@ def faults(ids: tuple[str, ...], running: Running, as_json: bool) -> None:
     _conduct("faults", trials, fault_findings, running, as_json)
 
 
-def _setting(walking: Walking, running: Running, protocol: tuple[int, int, int]) -> Any:
+@command.command(short_help="Walk with full and then partial assistance, with every subject.")
+@_mass_option
+@click.option("--literal", is_flag=True, help="Use the control law of the paper to the letter. It has no promise.")
+@_walking()
+@_running("protocol")
+def protocol(masses: tuple[float, ...], literal: bool, walking: Walking, running: Running, as_json: bool) -> None:
+    """Walk 112 steps with full assistance, 38 in the transition and 225 with Xi = 0.5 or 0.
+
+    Eight subjects walk, each passive and active.
+    """
+    from atalante_tools.trial.findings import protocol_findings
+    from atalante_tools.trial.plan import PROTOCOL, PROTOCOL_FACTORS, QUICK_MASSES, QUICK_PROTOCOL, protocol_trials
+
+    masses = _known(masses)
+    if running.quick:
+        masses = masses or QUICK_MASSES
+    setting = replace(_setting(walking, running, QUICK_PROTOCOL if running.quick else PROTOCOL), literal=literal)
+    _conduct("protocol", protocol_trials(setting, PROTOCOL_FACTORS, masses), protocol_findings, running, as_json)
+
+
+@command.command(short_help="Walk with random errors of model, floor and bus, and with pushes.")
+@click.option("--seeds", type=click.IntRange(1), metavar="N", help="Number of trials.  [default: 100]")
+@click.option(
+    "--steps", type=click.IntRange(1), metavar="N", help="Number of periodic steps of each trial.  [default: 60]"
+)
+@_running("robustness")
+def robustness(seeds: int | None, steps: int | None, running: Running, as_json: bool) -> None:
+    """Walk with full assistance, random patients, errors of the model, friction, late motors, lost frames and pushes.
+
+    Each trial that does not end standing is repeated with a recording, which is in the folder `recordings`.
+    """
+    from atalante_tools.trial.findings import robust_findings
+    from atalante_tools.trial.plan import QUICK_ROBUST, ROBUST, robust_trials
+
+    count, length = QUICK_ROBUST if running.quick else ROBUST
+    trials = robust_trials(seeds or count, steps or length, running.seed, running.engine)
+    try:
+        _conduct("robustness", trials, robust_findings, running, as_json)
+    finally:
+        _record_failures(trials, running)
+
+
+def _record_failures(trials: Sequence[Trial], running: Running) -> None:
+    """Repeat each trial that did not end standing, and record it."""
+    from atalante_tools.trial.plan import RobustTrial
+    from atalante_tools.trial.store import stored
+
+    folder = running.out / "recordings"
+    for trial in trials:
+        result, file = stored(trial, running.out / "trials"), folder / f"{trial.name}.mcap"
+        if isinstance(trial, RobustTrial) and result and result["outcome"] != "stood" and not file.exists():
+            from atalante_tools.trial.robustness import robust_walk
+
+            check_stop()
+            folder.mkdir(parents=True, exist_ok=True)
+            robust_walk(trial, file)
+            print_message(f"{trial.name} ({result['outcome']}): recorded in {file}")
+
+
+def _known(masses: tuple[float, ...]) -> tuple[float, ...]:
+    """Return the masses if each is that of a subject.
+
+    Raises:
+        UsageError: If a mass is not that of a subject.
+    """
+    from atalante_control.gait.subject import STUDY_PATIENTS
+
+    known = [patient.mass for patient in STUDY_PATIENTS]
+    if unknown := [mass for mass in masses if mass not in known]:
+        raise click.UsageError(f"--mass must be one of {', '.join(f'{mass:g}' for mass in known)}, got {unknown[0]:g}")
+    return masses
+
+
+def _setting(walking: Walking, running: Running, protocol: tuple[int, int, int]) -> WalkSetting:
     from atalante_tools.trial.plan import WalkSetting
 
     return WalkSetting(protocol, walking.shape, walking.idealization, walking.feedforward, running.seed, running.engine)

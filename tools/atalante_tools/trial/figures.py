@@ -39,6 +39,25 @@ def shapes(results: Sequence[Result]) -> bytes:
     return _png(figure)
 
 
+def robustness(results: Sequence[Result]) -> bytes:
+    """Draw mass error and friction of each walk, with a filled marker if it ended standing and a cross otherwise.
+
+    Args:
+        results: results of `robust` trials.
+    """
+    figure, axis = plt.subplots(figsize=(6.0, 4.2))
+    for delay in sorted({r["trial"]["delay"] for r in results}):
+        for stood, marker in ((True, "o"), (False, "x")):
+            of = [r["trial"] for r in results if r["trial"]["delay"] == delay and (r["outcome"] == "stood") is stood]
+            if of:
+                label = f"{'stood' if stood else 'did not stand'}, motors {delay} ms late"
+                axis.scatter([t["mass_share"] for t in of], [t["friction"] for t in of], marker=marker, label=label)
+    axis.set_xlabel("true mass / known mass of the patient")
+    axis.set_ylabel("friction")
+    axis.legend(fontsize=7)
+    return _png(figure)
+
+
 def joints(results: Sequence[Result], mass: float) -> bytes:
     """Draw hip and knee of the left leg in the four trials of one subject (figure "active and passive" of the paper).
 

@@ -17,6 +17,8 @@ import numpy as np
 
 Result = dict[str, Any]
 
+#: Diagnostics of a walk without a fault: filter and limiter report that they act, and the program ends the walk.
+NO_FAULT: Final = frozenset({"GUIDE_OUTSIDE", "TORQUE_SATURATED", "OPERATOR_STOP"})
 #: Phases at which steps are compared with each other. Early landings end a step after about 0.9.
 _PHASES: Final = np.linspace(0.1, 0.8, 29)
 
@@ -30,6 +32,10 @@ STANDING: Final = 1.44  # W/kg, metabolic rate of quiet standing
 TREND, ASYMMETRY = 0.8, 0.25
 #: Largest coefficient of variation of the baseline metabolic rates of a sweep.
 VARIATION: Final = 0.05
+
+
+#: Smallest share of guides with a promise, and of robust walks that end standing.
+CERTIFIED, ROBUST = 0.95, 0.98
 
 
 @dataclass(frozen=True)
@@ -125,6 +131,44 @@ def sweep_findings(results: Sequence[Result]) -> list[Finding]:
     ]  # fmt: skip
 
 
+def protocol_findings(results: Sequence[Result]) -> list[Finding]:
+    """Return the findings of the protocol: all walks end standing and inside the guide, and all guides have a promise.
+
+    Args:
+        results: results of `walk` trials.
+    """
+    found = [_contained("protocol-contained", results)]
+    claim = "the guides have a promise, and no fault is reported"
+    certified, alarms = sum(bool(r["certified"]) for r in results), _alarms(results)
+    promised = f"{certified} of {len(results)} guides with a promise, at least {CERTIFIED:.0%} wanted"
+    text = f"{promised}; other diagnostics: {alarms or 'none'}"
+    passed = certified >= CERTIFIED * len(results) and not alarms if results else None
+    return [*found, Finding("protocol-certified", claim, text, passed)]
+
+
+def robust_findings(results: Sequence[Result]) -> list[Finding]:
+    """Return the findings of the robustness.
+
+    Args:
+        results: results of `robust` trials.
+    """
+    count, stood = len(results), sum(r["outcome"] == "stood" for r in results)
+    unsafe = [r["trial"]["name"] for r in results if not r["safe"]]
+    walks = f"{stood} of {count} walks ended standing, at least {ROBUST:.0%} wanted"
+    ends = f"{count - len(unsafe)} of {count} robots stood or were stopped, all wanted" + (": not " if unsafe else "")
+    tested = bool(results)
+    return [
+        Finding(
+            "robust-walk", "the robot walks in spite of errors of model, floor and bus, and of pushes", walks,
+            stood >= ROBUST * count if tested else None,
+        ),
+        Finding(
+            "robust-safe", "a walk that does not end standing ends with the controller stopped and all drives holding or off",
+            ends + ", ".join(unsafe), not unsafe if tested else None,
+        ),
+    ]  # fmt: skip
+
+
 def condition(result: Result) -> str:
     """Return the condition of a walk: passive or active, full or partial.
 
@@ -157,6 +201,16 @@ def step_variation(result: Result) -> float:
         ratio = (measured - desired) / bound
         steps.append([np.interp(_PHASES, phase, joint) for joint in ratio])
     return float(np.std(steps, axis=0).mean())
+
+
+def _alarms(results: Sequence[Result]) -> str:
+    """Return the diagnostics that a walk without a fault must not report, with their numbers."""
+    counts: dict[str, int] = {}
+    for result in results:
+        for code, count in result["diagnostics"].items():
+            if code not in NO_FAULT:
+                counts[code] = counts.get(code, 0) + count
+    return ", ".join(f"{code} {count}" for code, count in sorted(counts.items()))
 
 
 def _net(result: Result) -> float:

@@ -6,9 +6,11 @@ again only if a new run would give the same result.
 
 from __future__ import annotations
 
+import ast
 import hashlib
 import json
 import platform
+import random
 import sys
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
@@ -39,6 +41,18 @@ TREADMILL_TIME: Final = 300
 SWEEP_SUBJECT: Final = (75.0, 1.75)
 #: Masses of the subjects of `assist --quick` [kg].
 QUICK_MASSES: Final = (58.0, 75.0)
+#: Ranges of the random parameters of `robustness`: true mass / known mass, friction, delay [ms].
+MASS_SHARE: Final = (0.9, 1.1)
+FRICTION: Final = (0.25, 0.8)
+DELAY_MAX: Final = 3
+#: Probability of a lost frame, force of a push [N], and number of steps with one push at a random time.
+LOSS: Final = 0.01
+PUSH: Final = 100.0
+PUSH_STEPS: Final = 10
+#: Number of trials and steps of `robustness`.
+ROBUST, QUICK_ROBUST = (100, 60), (2, 4)
+#: Assistance factors of `protocol`.
+PROTOCOL_FACTORS: Final = (0.5, 0.0)
 _PACKAGES: Final = ("numpy", "numba", "pin", "casadi", "pybullet", "mujoco-core")
 
 
@@ -75,12 +89,37 @@ class WalkTrial:
     seed: int
     engine: str
     order: str = ""  # day and position of a trial of the sweep
+    literal: bool = False  # whether the control law is that of the paper to the letter
 
     @property
     def name(self) -> str:
         """Return a name that is unique in the experiment."""
         effort = "active" if self.active else "passive"
         return f"walk{self.order and '-' + self.order}-{self.mass:g}kg-{effort}-xi{self.xi:g}"
+
+
+@dataclass(frozen=True)
+class RobustTrial:
+    """Walk with full assistance of a robot that differs from its model, on a disturbed bus, with pushes."""
+
+    kind: ClassVar[str] = "robust"
+    number: int
+    mass: float  # kg, of the patient as the controller knows it
+    height: float  # m
+    mass_share: float  # true mass of the patient / known mass
+    friction: float  # between soles and floor
+    delay: int  # ms, constant delay of the motor torques
+    loss: float  # probability that a frame is lost, on all buses
+    pushes: tuple[tuple[float, float], ...]  # time since the first periodic step [s] and direction [deg] of each push
+    force: float  # N, of each push
+    steps: int
+    seed: int
+    engine: str
+
+    @property
+    def name(self) -> str:
+        """Return a name that is unique in the experiment."""
+        return f"robust-{self.number:03d}"
 
 
 @dataclass(frozen=True)
@@ -103,7 +142,7 @@ class TreadmillTrial:
         return f"treadmill-{self.order}-{self.mass:g}kg"
 
 
-Trial = ShapeTrial | WalkTrial | TreadmillTrial | FaultTrial
+Trial = ShapeTrial | WalkTrial | TreadmillTrial | RobustTrial | FaultTrial
 
 
 @dataclass(frozen=True)
@@ -116,6 +155,7 @@ class WalkSetting:
     feedforward: float
     seed: int  # seed of the experiment, from which the seed of each trial is computed
     engine: str
+    literal: bool = False
 
     def walk(self, patient: Patient, active: bool, xi: float, index: int, order: str = "") -> WalkTrial:
         """Return the trial of a subject.
@@ -129,7 +169,7 @@ class WalkSetting:
         """
         return WalkTrial(
             patient.mass, patient.height, active, xi, self.protocol, self.shape, self.idealization, self.feedforward,
-            1000 * self.seed + index, self.engine, order,
+            1000 * self.seed + index, self.engine, order, self.literal,
         )  # fmt: skip
 
 
@@ -183,6 +223,54 @@ def sweep_trials(setting: WalkSetting, factors: Sequence[float], days: int) -> l
     return trials
 
 
+def protocol_trials(setting: WalkSetting, factors: Sequence[float], masses: Sequence[float] = ()) -> list[Trial]:
+    """Return a trial for each subject, passive and active, and each assistance factor.
+
+    Args:
+        setting: what all walks share.
+        factors: assistance factors after the transition.
+        masses: masses of the subjects [kg]. With none, all eight subjects.
+    """
+    from atalante_control.gait.subject import STUDY_PATIENTS
+
+    conditions = [(active, xi) for active in (False, True) for xi in factors]
+    return [
+        setting.walk(patient, active, xi, len(conditions) * number + index)
+        for number, patient in enumerate(STUDY_PATIENTS)
+        for index, (active, xi) in enumerate(conditions)
+        if not masses or patient.mass in masses
+    ]
+
+
+def robust_trials(count: int, steps: int, seed: int, engine: str) -> list[Trial]:
+    """Return trials with random patients, mass errors, friction, delay and pushes.
+
+    Args:
+        count: number of trials.
+        steps: periodic steps of each trial.
+        seed: seed of the experiment.
+        engine: name of the physics engine.
+    """
+    from atalante_control.gait.subject import STUDY_PATIENTS
+
+    trials: list[Trial] = []
+    for number in range(count):
+        draw = random.Random(f"{seed}/{number}")
+        patient = draw.choice(STUDY_PATIENTS)
+        slots = max(1, steps // PUSH_STEPS)
+        pushes = tuple(
+            (round((k + 0.7 * draw.random()) * PUSH_STEPS * STEP[1], 3), round(draw.uniform(-180.0, 180.0), 1))
+            for k in range(slots)
+        )
+        trials.append(
+            RobustTrial(
+                number, patient.mass, patient.height, round(draw.uniform(*MASS_SHARE), 4), round(draw.uniform(*FRICTION), 3),
+                draw.randint(0, DELAY_MAX), LOSS, pushes, PUSH, steps, 1000 * seed + number, engine,
+            )
+        )  # fmt: skip
+    return trials
+
+
 @cache
 def versions() -> dict[str, str]:
     """Return the version of Python, of this project, of its source text, and of the packages that compute a trial."""
@@ -223,7 +311,7 @@ def _roots() -> list[Path]:
 
 
 def source_hash(roots: Sequence[Path], ignored: Sequence[Path] = ()) -> str:
-    """Return a hash of source files and data files.
+    """Return a hash of the syntax trees of all Python files, and of all data files.
 
     Args:
         roots: folders of the files. Byte code and Markdown files are ignored.
@@ -233,8 +321,19 @@ def source_hash(roots: Sequence[Path], ignored: Sequence[Path] = ()) -> str:
     for root in roots:
         for file in sorted(root.rglob("*")):
             if file.is_file() and file.suffix not in (".pyc", ".md") and file not in ignored:
-                digest.update(str(file.relative_to(root)).encode() + b"\0" + file.read_bytes())
+                digest.update(str(file.relative_to(root)).encode() + b"\0" + _content(file))
     return digest.hexdigest()[:16]
+
+
+def _content(file: Path) -> bytes:
+    """Return the bytes of a file. For Python, return its syntax tree, because comments and docstrings change no result."""
+    if file.suffix != ".py":
+        return file.read_bytes()
+    tree = ast.parse(file.read_bytes())
+    for node in ast.walk(tree):
+        if isinstance(node, (ast.Module, ast.ClassDef, ast.FunctionDef)) and ast.get_docstring(node) is not None:
+            del node.body[0]
+    return ast.dump(tree).encode()
 
 
 def fields(trial: Trial) -> dict[str, Any]:

@@ -39,6 +39,16 @@ EXPERIMENTS: Final = {
         "weight shift before the walk, and at eight phases of the second step. A robot has fallen if its pelvis leans by more "
         "than 35 degrees. The longest duration of a permanent fault without a fall is found by bisection.",
     ),
+    "protocol": (
+        "Full and then partial assistance",
+        "Virtual subjects walk on the ground with full assistance, then with the assistance factor of the trial. Each walk "
+        "starts and ends in standing.",
+    ),
+    "robustness": (
+        "Robustness",
+        "The emulated robot differs at random from the model of the controller: mass of the patient, friction of the floor, late "
+        "motors. Its buses lose frames, and it is pushed at the pelvis. All parameters of a trial are in its result.",
+    ),
 }  # fmt: skip
 _CERTIFIED: Final = {True: "yes", False: "no", None: "-"}
 _VERDICT: Final = {True: "pass", False: "FAIL", None: "not tested"}
@@ -158,6 +168,13 @@ def _trials(results: Sequence[Result]) -> tuple[list[str], list[list[str]]]:
         ("baseline [W/kg]", lambda r: _number(r.get("metabolic_w_kg", {}).get("full"), 4)),
         ("exercise [W/kg]", lambda r: _number(r.get("metabolic_w_kg", {}).get("target"), 4)),
         ("true exercise above standing [W/kg]", lambda r: _number(r.get("muscle_w_kg"), 4)),
+        ("true sideways [m]", lambda r: _number(r.get("true_lateral_m"), 2)),
+        ("patient [kg]", lambda r: _number(r["trial"]["mass"], 0) if "mass_share" in r["trial"] else "-"),
+        ("true mass / known mass", lambda r: _number(r["trial"].get("mass_share"), 2)),
+        ("friction", lambda r: _number(r["trial"].get("friction"), 2)),
+        ("motor delay [ms]", lambda r: str(r["trial"].get("delay", "-"))),
+        ("state at the end", lambda r: r.get("state", "-")),
+        ("largest DCM error [m]", lambda r: _number(r.get("max_dcm_error_m"), 3)),
     ]
     filled = [(head, cells) for head, value in columns if set(cells := [value(r) for r in results]) != {"-"}]
     return [head for head, _ in filled], [list(row) for row in zip(*(cells for _, cells in filled), strict=True)]
@@ -188,7 +205,7 @@ def _provenance(results: Sequence[Result]) -> list[tuple[str, str]]:
 
 def _figures(experiment: str, results: Sequence[Result]) -> list[str]:
     ended = [r for r in results if r["outcome"] in ("stood", "done", "computed")]
-    if not ended:
+    if not ended and experiment != "robustness":
         return ["<p>No trial ended.</p>"]
     try:
         from atalante_tools.trial import figures
@@ -198,8 +215,12 @@ def _figures(experiment: str, results: Sequence[Result]) -> list[str]:
     walks = [r for r in ended if r["trial"]["kind"] == "walk"]
     if experiment == "shapes":
         return [_image("left hip in each guide shape", lambda: figures.shapes(ended))]
+    if experiment == "robustness":
+        return [_image("outcome of each walk", lambda: figures.robustness(results))]
     if not walks:
         return ["<p>No walk ended standing.</p>"]
+    if experiment == "protocol":
+        return [_image("position in the guide", lambda: figures.positions(walks))]
     if experiment == "assist":
         masses = [r["trial"]["mass"] for r in walks]
         mass = 75.0 if 75.0 in masses else masses[0]

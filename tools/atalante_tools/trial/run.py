@@ -9,7 +9,6 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import replace
-from functools import cache
 from typing import Any, Final
 
 import numpy as np
@@ -38,21 +37,20 @@ from atalante_emulator.pendant import Operator
 from atalante_emulator.wearer import LimbParameters
 from atalante_hal.loop import LockStep, run
 from atalante_hal.robot import LEG_JOINTS, load_robot
-from atalante_hal.types import PERIOD, State, SupervisorState, Vector
-from atalante_tools.console.options import EMBEDDED, Target
-from atalante_tools.console.stop_request import check_stop, deferred
+from atalante_hal.types import PERIOD, Vector
+from atalante_tools.console.stop_request import deferred
 from atalante_tools.session.body import describe
 from atalante_tools.session.dial import Dial
 from atalante_tools.session.rig import Rig, open_hal
 from atalante_tools.session.walk_observation import Observation
-from atalante_tools.session.walk_options import gaits_of_subject
-from atalante_tools.trial.plan import STEP, ShapeTrial, TreadmillTrial, WalkTrial
+from atalante_tools.session.walk_result import diagnostics
+from atalante_tools.trial.lockstep import Ending, solved_gaits, target
+from atalante_tools.trial.plan import STEP, RobustTrial, ShapeTrial, TreadmillTrial, WalkTrial
+from atalante_tools.trial.robustness import robust_walk
 
 _SH, _LEG = LEG_JOINTS.index("SH"), len(LEG_JOINTS)
 _RIGHT: Final = 1
 _SAMPLING = 20  # cycles between two samples of the motion
-#: Time for which a robot that left ACTIVE is observed [cycles], because a HOLD within a step may end in a fall.
-_AFTERMATH: Final = 1500
 #: Number of swings of the left leg that a result contains as curves.
 _CURVES: Final = 15
 #: Edges of the histogram of e / q_bound.
@@ -61,7 +59,7 @@ EDGES: Final = tuple(round(-1.0 + 0.05 * k, 2) for k in range(41))
 SEGMENTS: Final = ("full", "transition", "target")
 
 
-def run_trial(trial: ShapeTrial | WalkTrial | TreadmillTrial) -> dict[str, Any]:
+def run_trial(trial: ShapeTrial | WalkTrial | TreadmillTrial | RobustTrial) -> dict[str, Any]:
     """Run a trial, and return its result. Other processes call this function, too.
 
     Args:
@@ -69,7 +67,9 @@ def run_trial(trial: ShapeTrial | WalkTrial | TreadmillTrial) -> dict[str, Any]:
     """
     if isinstance(trial, ShapeTrial):
         return _shape(trial)
-    return _walk(trial) if isinstance(trial, WalkTrial) else _treadmill(trial)
+    if isinstance(trial, WalkTrial):
+        return _walk(trial)
+    return robust_walk(trial) if isinstance(trial, RobustTrial) else _treadmill(trial)
 
 
 # -- guide shapes ----------------------------------------------------------------------------------------------------------
@@ -79,11 +79,10 @@ def _shape(trial: ShapeTrial) -> dict[str, Any]:
     robot = load_robot()
     gait = load_gait(AIRWALK_GAIT, robot)
     controller = AirwalkController(robot, gait, SHAPES[trial.shape], AirwalkConfig(feedforward=0.0))
-    target = Target(EMBEDDED, "", lockstep=True, engine=trial.engine)
     field = _columns(controller.telemetry_fields)
     samples: list[list[float]] = []
     with open_hal(
-        target,
+        target(trial.engine),
         robot=robot,
         seed=trial.seed,
         operator=Operator(),
@@ -105,7 +104,7 @@ def _shape(trial: ShapeTrial) -> dict[str, Any]:
                     angles = np.degrees([desired + row[field["error"]][0], desired, desired + upper, desired - lower])
                     samples.append([row[field["step"]][0], round(float(row[field["phase"]][0]), 4), *_rounded(angles)])
 
-        ending = _Ending(rig, lambda: controller.statistics.steps > trial.steps)
+        ending = Ending(rig, lambda: controller.statistics.steps > trial.steps)
         with deferred():
             run(rig.hal, controller, LockStep(), until=ending, record=record)
         certificate, statistics = controller.certificate(trial.xi), controller.statistics
@@ -128,13 +127,14 @@ def _shape(trial: ShapeTrial) -> dict[str, Any]:
 
 def _walk(trial: WalkTrial) -> dict[str, Any]:
     robot, patient = load_robot(), Patient(trial.mass, trial.height)
-    gaits = _gaits(Subject(patient, *STEP))
+    gaits = solved_gaits(Subject(patient, *STEP))
     guide = replace(WALK_GUIDE, idealization=trial.idealization, feedforward=trial.feedforward)
     steps = sum(trial.protocol)
-    controller = WalkController(robot, patient, gaits, steps, WalkConfig(guide=guide), shape=SHAPES[trial.shape])
+    config = replace(WalkConfig.literal() if trial.literal else WalkConfig(), guide=guide)
+    controller = WalkController(robot, patient, gaits, steps, config, shape=SHAPES[trial.shape])
     operator = Operator()
     with open_hal(
-        Target(EMBEDDED, "", lockstep=True, engine=trial.engine),
+        target(trial.engine),
         robot=robot,
         seed=trial.seed,
         pose=controller.standing_pose.tolist(),
@@ -154,11 +154,11 @@ def _walk(trial: WalkTrial) -> dict[str, Any]:
             motion.sample()
             effort.sample()
 
-        ending = _Ending(rig, lambda: controller.done, observation)
+        ending = Ending(rig, lambda: controller.done, observation)
         with deferred():
             run(rig.hal, controller, LockStep(), until=ending, record=record)
         certified = controller.certificate(trial.xi).certified if trial.xi < 1.0 else None
-        deviation = observation.true_deviation()
+        deviation, found = observation.true_deviation(), diagnostics(rig.hal)
     statistics = controller.statistics
     counted = statistics.guide.cycles > 0
     return {
@@ -167,17 +167,11 @@ def _walk(trial: WalkTrial) -> dict[str, Any]:
         "certified": certified,
         "max_ratio": round(statistics.guide.max_ratio, 4) if counted else None,
         "inside": round(statistics.guide.inside_fraction, 6) if counted else None,
+        "diagnostics": found,
         **deviation,
         **motion.result(trial.protocol),
         **effort.result(trial.mass, trial.seed),
     }
-
-
-@cache
-def _gaits(subject: Subject) -> WalkGaits:
-    gaits = gaits_of_subject(subject, load_robot())
-    check_stop()  # the optimiser discards the exception of a stop signal
-    return gaits
 
 
 def _task(trial: WalkTrial, gaits: WalkGaits) -> ActiveTask | None:
@@ -340,31 +334,6 @@ def _treadmill(trial: TreadmillTrial) -> dict[str, Any]:
 
 
 # -- shared ----------------------------------------------------------------------------------------------------------------
-
-
-class _Ending:
-    """End condition of a trial, called once per cycle."""
-
-    def __init__(self, rig: Rig, done: Any, observation: Observation | None = None) -> None:
-        self._rig, self._done, self._observation = rig, done, observation
-        self._started, self._halted = False, 0
-        self.outcome = "hold"
-
-    def __call__(self, state: State) -> bool:
-        check_stop()
-        if self._observation is not None and self._observation.check():
-            self.outcome = "fell"
-            return True
-        if self._rig.hal.moving:
-            self._started = True
-            if self._done():
-                self.outcome = "stood" if self._observation is not None else "done"
-                return True
-            return False
-        self._halted += self._started
-        if state.supervisor is SupervisorState.FAULT:
-            self.outcome = "fault"
-        return self._halted > _AFTERMATH or (not self._started and self.outcome == "fault")
 
 
 def _columns(fields: Sequence[tuple[str, int]]) -> dict[str, slice]:

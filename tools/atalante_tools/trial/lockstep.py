@@ -1,0 +1,85 @@
+"""Parts of all trials on the emulated robot: gaits of a subject, target in lock-step, end of a trial."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import cache
+from typing import Final
+
+from atalante_control.gait.subject import Subject
+from atalante_control.gait.walk import WalkGaits
+from atalante_hal.robot import load_robot
+from atalante_hal.types import State, SupervisorState
+from atalante_tools.console.options import EMBEDDED, Target
+from atalante_tools.console.stop_request import check_stop
+from atalante_tools.session.rig import Rig
+from atalante_tools.session.walk_observation import Observation
+from atalante_tools.session.walk_options import gaits_of_subject
+
+#: Time for which a robot that left ACTIVE is observed [cycles], because a HOLD within a step may end in a fall.
+_AFTERMATH: Final = 1500
+
+
+def target(engine: str) -> Target:
+    """Return the target of a trial: an emulated robot in this process, in lock-step.
+
+    Args:
+        engine: name of the physics engine.
+    """
+    return Target(EMBEDDED, "", lockstep=True, engine=engine)
+
+
+@cache
+def solved_gaits(subject: Subject) -> WalkGaits:
+    """Return the gaits of a subject. They are solved once per process.
+
+    Args:
+        subject: patient and step.
+    """
+    gaits = gaits_of_subject(subject, load_robot())
+    check_stop()  # the optimiser discards the exception of a stop signal
+    return gaits
+
+
+class Ending:
+    """End condition of a trial, called once per cycle.
+
+    Attributes:
+        outcome: "stood" or "done" after the last step, "fell", "hold" or "fault".
+    """
+
+    def __init__(self, rig: Rig, done: Callable[[], bool], observation: Observation | None = None) -> None:
+        """Create the end condition.
+
+        Args:
+            rig: rig of the trial.
+            done: function that returns whether the controller has ended the walk.
+            observation: attitude of the robot on the ground; None for a suspended robot.
+        """
+        self._rig, self._done, self._observation = rig, done, observation
+        self._started, self._halted = False, 0
+        self.outcome = "hold"
+
+    def __call__(self, state: State) -> bool:
+        """Return whether the trial is over.
+
+        Args:
+            state: state of the HAL after the cycle.
+
+        Raises:
+            Stopped: If a signal arrived.
+        """
+        check_stop()
+        if self._observation is not None and self._observation.check():
+            self.outcome = "fell"
+            return True
+        if self._rig.hal.moving:
+            self._started = True
+            if self._done():
+                self.outcome = "stood" if self._observation is not None else "done"
+                return True
+            return False
+        self._halted += self._started
+        if state.supervisor is SupervisorState.FAULT:
+            self.outcome = "fault"
+        return self._halted > _AFTERMATH or (not self._started and self.outcome == "fault")

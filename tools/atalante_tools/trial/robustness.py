@@ -1,0 +1,189 @@
+"""Walk of a robot that differs from its model, on a disturbed bus, with pushes: `trial -> rig in lock-step -> result`.
+
+The controller knows the nominal patient. The emulated robot carries a patient with another mass and stands on a floor with random
+friction. Its motors react late, its buses lose frames, and it is pushed at the pelvis.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+
+from atalante_control.gait.subject import Subject
+from atalante_control.model import Patient
+from atalante_control.walking.controller import WalkController
+from atalante_control.walking.phases import Phase
+from atalante_emulator.emulator import EmulatorParameters
+from atalante_emulator.faults import Fault
+from atalante_emulator.mechanics import GROUND_PARAMETERS, Ground, Mechanics
+from atalante_emulator.motor import MotorParameters
+from atalante_hal.loop import LockStep, run
+from atalante_hal.robot import load_robot
+from atalante_hal.types import PERIOD, State, SupervisorState, Vector
+from atalante_hal.wire.cia402 import DriveState
+from atalante_tools.console.stop_request import deferred
+from atalante_tools.session.body import describe
+from atalante_tools.session.recording import EndpointReport, Outputs, Recorder, close_telemetry, start_telemetry
+from atalante_tools.session.rig import Rig, open_hal
+from atalante_tools.session.walk_observation import Observation
+from atalante_tools.session.walk_result import diagnostics
+from atalante_tools.trial.lockstep import Ending, solved_gaits, target
+from atalante_tools.trial.plan import STEP, RobustTrial
+
+#: Duration of a push [s].
+_PUSH: Final = 0.2
+#: Time for which a robot that has fallen is observed [cycles].
+_FALLEN: Final = 1000
+#: First faulty cycle of the bus. Before it, the robot is OFF.
+_BEGINS: Final = 1
+_RATE: Final = 100  # Hz, of a recording
+
+
+def robust_walk(trial: RobustTrial, recording: Path | None = None) -> dict[str, Any]:
+    """Walk, and return the result.
+
+    Args:
+        trial: trial to run.
+        recording: MCAP file for the recording of the walk; None means no recording.
+    """
+    robot, known = load_robot(), Patient(trial.mass, trial.height)
+    true = Patient(trial.mass * trial.mass_share, trial.height)
+    gaits = solved_gaits(Subject(known, *STEP))
+    controller = WalkController(robot, known, gaits, trial.steps)
+    with open_hal(
+        target(trial.engine),
+        robot=robot,
+        seed=trial.seed,
+        pose=controller.standing_pose.tolist(),
+        controller_fields=controller.telemetry_fields,
+        gait_hash=gaits.step.hash32,
+        mechanics=Mechanics(
+            describe(robot, None, true), trial.engine, Ground(friction=trial.friction), parameters=_parameters(trial)
+        ),
+        faults=bus_faults(trial),
+    ) as rig:
+        pushes = Pushes(controller, trial)
+        assert rig.emulator is not None
+        rig.emulator.pelvis_forces.append(pushes.wrench)
+        ending = SafeEnding(rig, controller)
+        telemetry = recorder = None
+        if recording is not None:
+            outputs = Outputs(recording, _RATE, None, {})
+            telemetry = start_telemetry(rig.target, outputs, rig.hal, rig.hal.network, gaits.step.hash32, {}, None)
+            telemetry.begin_run("walk", {"trial": trial.name})
+            recorder = Recorder(rig, telemetry, EndpointReport(telemetry))
+
+        def record() -> None:
+            if recorder is not None:
+                recorder.write()
+
+        with deferred():
+            run(rig.hal, controller, LockStep(), until=ending, record=record)
+        if recorder is not None and telemetry is not None:
+            recorder.report_events()
+            close_telemetry(telemetry)
+        return {
+            "outcome": ending.outcome,
+            "steps": controller.statistics.steps,
+            "state": ending.state.name,
+            "safe": ending.safe,
+            "pushes": pushes.count,
+            "max_dcm_error_m": round(controller.max_dcm_error, 4),
+            "diagnostics": diagnostics(rig.hal),
+            **ending.observation.true_deviation(),
+        }
+
+
+def _parameters(trial: RobustTrial) -> EmulatorParameters:
+    """Return the parameters of the nodes on the ground, with motors that react late."""
+    drive = replace(GROUND_PARAMETERS.drive, motor=MotorParameters(dead_time=trial.delay))
+    return replace(GROUND_PARAMETERS, drive=drive)
+
+
+def bus_faults(trial: RobustTrial) -> list[Fault]:
+    """Return the faults of the bus: random loss of frames on all buses, in both directions.
+
+    Args:
+        trial: trial with the probability of a loss.
+    """
+    import atalante_dbc
+
+    return [Fault("drop", bus, _BEGINS, None, p=trial.loss) for bus in atalante_dbc.load().buses]
+
+
+class Pushes:
+    """Pushes at the pelvis.
+
+    Attributes:
+        count: number of pushes that have begun.
+    """
+
+    def __init__(self, controller: WalkController, trial: RobustTrial) -> None:
+        """Prepare the pushes.
+
+        Args:
+            controller: controller of the walk. The time of the pushes counts from its first periodic step.
+            trial: trial with times, directions and force.
+        """
+        self._controller, self._force, self._pushes = controller, trial.force, trial.pushes
+        self._cycles = self.count = 0
+
+    def wrench(self, _hal_state: int) -> Vector:
+        """Return force [N] and moment [Nm] in this cycle, shape (6,)."""
+        wrench = np.zeros(6)
+        if self._cycles == 0 and self._controller.phase is not Phase.STEP:
+            return wrench
+        time, self._cycles = self._cycles * PERIOD, self._cycles + 1
+        self.count = sum(begins <= time for begins, _ in self._pushes)
+        if self.count and time - self._pushes[self.count - 1][0] < _PUSH:
+            angle = math.radians(self._pushes[self.count - 1][1])
+            wrench[:2] = self._force * math.cos(angle), self._force * math.sin(angle)
+        return wrench
+
+
+class SafeEnding:
+    """End of a robust walk, called once per cycle. After a fall, the robot is observed further.
+
+    Attributes:
+        outcome: "stood", "fell", "hold" or "fault".
+        observation: attitude of the robot.
+        state: state of the HAL in the last cycle.
+        safe: whether the robot stood at the end, or the HAL stopped the controller and no drive follows a command.
+    """
+
+    def __init__(self, rig: Rig, controller: WalkController) -> None:
+        """Create the end condition.
+
+        Args:
+            rig: rig of the walk.
+            controller: controller of the walk.
+        """
+        self.observation = Observation(rig, controller, None)
+        self._rig, self._ending = rig, Ending(rig, lambda: controller.done, self.observation)
+        self._fallen = 0
+        self.state, self.safe = SupervisorState.OFF, False
+
+    @property
+    def outcome(self) -> str:
+        """Return the outcome of the walk."""
+        return self._ending.outcome
+
+    def __call__(self, state: State) -> bool:
+        """Return whether the walk is over.
+
+        Args:
+            state: state of the HAL after the cycle.
+        """
+        over = self._ending(state)
+        self._fallen += self.outcome == "fell"
+        if over and (self.outcome != "fell" or self._fallen > _FALLEN):
+            assert self._rig.emulator is not None
+            enabled = DriveState.OPERATION_ENABLED in self._rig.emulator.drives.state
+            self.state = state.supervisor
+            self.safe = self.outcome == "stood" or (state.supervisor >= SupervisorState.HOLD and not enabled)
+            return True
+        return False
