@@ -16,8 +16,9 @@ from atalante_hal.types import PERIOD, SupervisorState, Vector
 
 #: Speed of the hook [m/s].
 SPEED: Final = 0.1
-#: Time in ACTIVE after which the crane lowers the robot [s]. The controller needs this time to reach its start pose.
-DELAY: Final = 0.5
+#: Time in ACTIVE after which the crane lowers the robot [s]. The walking controller needs this time to reach its standing pose:
+#: on the floor, friction holds the feet where they land, and a robot that begins to walk with a wrong stance width may fall.
+DELAY: Final = 2.0
 #: Stiffness and damping of the sling per kg of the robot. Under the weight of the robot, the sling stretches by
 #: GRAVITY / STIFFNESS, 25 mm.
 STIFFNESS: Final = 400.0  # N/m per kg
