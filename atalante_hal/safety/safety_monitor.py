@@ -330,9 +330,10 @@ class SafetyMonitor:
             }
             self._heartbeats.acknowledge(faulty)
             self._acknowledged = True
+            if not self.proof.running:  # a further press of START does not restart the test of the directions
+                self._proof_begun = False
+                self.proof.failed.clear()
             self.start_wanted = ENABLE_CYCLES if state.supervisor in _STARTABLE else 0
-            self._proof_begun = False
-            self.proof.failed.clear()
         elif self.start_wanted:
             self.start_wanted -= 1
         else:

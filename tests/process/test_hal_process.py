@@ -33,10 +33,12 @@ from atalante_hal.bus import BusDown
 from atalante_hal.bus.shared import SharedBus, descriptors
 from atalante_hal.loop import GAP_TO_HOLD, WallClock, run
 from atalante_hal.memory import anonymous_file
-from atalante_hal.robot import Robot
+from atalante_hal.robot import Robot, load_robot
+from atalante_hal.safety.direction import pose_gains
 from atalante_hal.types import PERIOD, Command, State, SupervisorState
 from atalante_hal.wire.cia402 import DriveState
 
+ROBOT = load_robot()
 #: Program that loads all modules once. For each line `memory bell`, a child drives the robot on this bus until SIGTERM.
 DRIVER = """
 import json, mmap, os, signal, sys, time
@@ -293,7 +295,8 @@ class PausingController:
         self.updates += 1
         if self.updates == 20:
             self._pause()
-        return Command(2000.0 * (self._pose - state.position) - 80.0 * state.velocity, np.zeros(8))
+        stiffness, damping = pose_gains(ROBOT)
+        return Command(stiffness * (self._pose - state.position) - damping * state.velocity, np.zeros(8))
 
 
 class PausedTime:

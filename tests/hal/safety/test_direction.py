@@ -200,6 +200,16 @@ def test_stop_during_the_test_ends_it_in_the_same_cycle(make_rig, stop: str):
     assert not rig.hal._safety_monitor.proof.proven.any()
 
 
+def test_further_presses_of_start_do_not_restart_the_test(make_rig):
+    rig = make_rig(starts=False)
+    rig.until(S.READY)
+    for _ in range(40):
+        rig.operator.start()
+        if rig.run(5).supervisor is S.ACTIVE:
+            return
+    raise AssertionError("the robot must be ACTIVE although START is pressed every 5 cycles")
+
+
 def test_restart_from_hold_needs_no_new_test(rig):
     rig.until(S.ACTIVE)
     rig.operator.hold()
