@@ -16,7 +16,9 @@ a wrong sign, this control pushes its joint away. A joint that moves by more tha
 *Result.* The mobility of a joint is the inverse of its effective inertia: the least-squares fit of the position by the double
 integral of the sent torque and a polynomial of time. A joint with a mobility of at least `MOBILITY` follows its torque. A
 mobility of at most -`MOBILITY` is a wrong sign. A joint between these limits does not follow its torque. A disturbance may
-spoil a test, so a joint fails only after `TRIALS` tests. If its foot carries load, the joint may be blocked. It then stays
+spoil a test, so a joint fails only after `TRIALS` tests. The legs of a suspended robot whose drives are off sink onto their end
+stops within some seconds, and their weight presses joints onto them. So the pulse of a repeated test is `BOOST` times larger for
+a joint within the position tolerance of its limit. If its foot carries load, the joint may be blocked. It then stays
 untested, and the next start tests it again. A joint that passed is not tested again until its drive restarts, because the
 wiring of a motor does not change while its drive is on.
 """
@@ -48,6 +50,8 @@ INTEGRAL = 0.03
 TRAVEL = math.radians(1.5)
 #: A foot is loaded if its mean force during a test exceeds this share of `cell_free`, which is four times the noise of the mean.
 LOAD = 1.0 / 3.0
+#: Factor of the pulse in a repeated test of a joint near its end stop, because its weight may press it onto the stop.
+BOOST = 6.0
 #: Number of tests after which a joint that did not pass has failed.
 TRIALS = 2
 #: Smallest mobility of a joint that follows its torque, in the order of LEG_JOINTS [1/(kg m2)]: about half of the smallest one
@@ -119,6 +123,8 @@ class DirectionProof:
         self._kp, self._kd = pose_gains(robot)
         self._least = np.array(MOBILITY * both)
         self._load = LOAD * robot.sensors.cell_free
+        stop = robot.thresholds.position_tolerance
+        self._low, self._high = robot.position_min + stop, robot.position_max - stop
         self.proven: npt.NDArray[np.bool_] = np.zeros(len(JOINTS), np.bool_)
         self.mobility = np.zeros(len(JOINTS))
         self.failed: list[int] = []
@@ -169,7 +175,7 @@ class DirectionProof:
         torque = self._base + spring - self._kd * velocity
         joints, duration = self._tests[0]
         shape = pulse(len(self._position), duration)
-        torque[joints] += shape * self._sign[joints] * self._peak[joints]
+        torque[joints] += shape * self._sign[joints] * self._strength(joints)
         self._position.append(position.copy())
         return torque
 
@@ -234,6 +240,12 @@ class DirectionProof:
         text = f"effective inertia [kg m2]: {passed}"
         blocked = [JOINTS[j] for j in self._unproven()]
         return f"{text}; not tested under load: {', '.join(blocked)}" if blocked else text
+
+    def _strength(self, joints: Sequence[int]) -> Vector:
+        """Return the peaks of the pulses of a test, shape (joints,) [Nm]."""
+        pressed = (self._anchor < self._low) | (self._anchor > self._high)
+        repeated = np.array(self._trials) > 0
+        return np.where(pressed & repeated, BOOST, 1.0)[joints] * self._peak[joints]
 
     def _failure(self, joint: int) -> str:
         least = self._least[joint]

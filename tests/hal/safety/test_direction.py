@@ -10,6 +10,7 @@ from atalante_hal.safety.direction import (
     GROUPS,
     LATENCY,
     MOBILITY,
+    PEAK,
     TRAVEL,
     TRIALS,
     DirectionProof,
@@ -62,6 +63,7 @@ class Joints:
         self.proof, self.strength = proof, np.ones(12)
         self.position, self.velocity = MIDDLE.copy(), np.zeros(12)
         self._pending = [np.zeros(12)] * (LATENCY - 1)
+        self.weight = np.zeros(12)  # torque of the weight [Nm]
 
     def run(self, force: np.ndarray = NO_FORCE, cycles: int = 500) -> tuple[str, int]:
         self.proof.begin(self.position, np.zeros(12))
@@ -71,8 +73,11 @@ class Joints:
             torque = self.proof.torque(self.position, self.velocity)
             self.proof.sent(torque)
             self._pending.append(torque)
-            self.velocity = self.velocity + PERIOD * self.strength * self._pending.pop(0) / INERTIA
+            self.velocity = self.velocity + PERIOD * (self.strength * self._pending.pop(0) + self.weight) / INERTIA
             self.position = self.position + PERIOD * self.velocity
+            stopped = (self.position < ROBOT.position_min) | (self.position > ROBOT.position_max)
+            self.position = np.clip(self.position, ROBOT.position_min, ROBOT.position_max)
+            self.velocity[stopped] = 0.0
             if failure := self.proof.evaluate(self.position, force):
                 return failure, cycle
         raise AssertionError("the test of the directions must end")
@@ -127,6 +132,20 @@ def test_joint_that_does_not_move_under_load_stays_untested(joints: Joints):
     assert joints.run(LOADED)[0] == ""
     assert np.flatnonzero(~joints.proof.proven).tolist() == [KNEE, ANKLE]
     assert joints.proof.report().endswith("; not tested under load: left_SK, left_SA")
+
+
+@pytest.mark.parametrize("sign", [-1.0, 1.0])
+def test_joint_that_its_weight_presses_onto_its_end_stop_passes(joints: Joints, sign: float):
+    joints.position[ANKLE] = ROBOT.position_max[ANKLE] if sign > 0.0 else ROBOT.position_min[ANKLE]
+    joints.weight[ANKLE] = sign * 0.6 * PEAK[4] * ROBOT.breakaway[ANKLE]
+    assert joints.run()[0] == ""
+    assert joints.proof.proven.all()
+
+
+def test_dead_joint_at_its_end_stop_fails(joints: Joints):
+    joints.position[ANKLE] = ROBOT.position_max[ANKLE]
+    joints.strength[ANKLE] = 0.0
+    assert joints.run()[0].startswith("left_SA does not follow its torque")
 
 
 def test_large_motion_names_the_joint_that_its_pose_control_holds_most_strongly(joints: Joints):
