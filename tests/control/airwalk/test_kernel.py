@@ -30,7 +30,10 @@ def states(xi: float) -> list[State]:
     zeros = [np.zeros(n) for n in (12, 12, 12)]
     for since in [*range(STARTUP + 12), *range(400, 410), *range(STARTUP + 795, STARTUP + 812)]:
         at = (since - STARTUP) % 800
-        q, qd = tables.q[at] + rng.normal(size=12) * 0.02, tables.qd[at] + rng.normal(size=12) * 0.2
+        # The start motion from the first pose takes no longer than `STARTUP`.
+        first = since == 0
+        q = tables.q[0 if first else at] + rng.normal(size=12) * 0.02 * (not first)
+        qd = tables.qd[at] + rng.normal(size=12) * 0.2
         tilted = attitude + rng.normal(size=(4, 4)) * 0.05
         tilted /= np.linalg.norm(tilted, axis=1, keepdims=True)
         sensors = [tilted, rng.normal(size=(4, 3)), np.zeros((4, 3)), np.zeros((2, 4, 3)), np.zeros(8)]
