@@ -1,0 +1,111 @@
+"""Starts of the emulated robot with and without a motor fault: the test of the directions, its end, and its report."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from atalante_hal.robot import JOINTS, load_robot
+from atalante_hal.safety.direction import (
+    GROUPS,
+    LATENCY,
+    TRAVEL,
+)
+from atalante_hal.safety.safety_monitor import DRIVE_NODES
+from atalante_hal.types import SupervisorState
+from atalante_hal.wire.cia402 import Controlword, DriveState
+
+ROBOT = load_robot()
+S, D = SupervisorState, DriveState
+KNEE, ANKLE = JOINTS.index("left_SK"), JOINTS.index("left_SA")
+#: Longest test of the directions if every joint passes at once [cycles].
+ONCE = sum(duration + LATENCY + 1 for _, duration in GROUPS)
+
+
+@pytest.mark.parametrize("joint", range(6), ids=JOINTS[:6])
+def test_start_with_a_reversed_motor_fails_and_names_the_joint(make_rig, joint: int):
+    rig = make_rig(starts=False)
+    rig.emulator.drives.motors.weaken(joint, -1.0)
+    rig.until(S.READY)
+    rig.operator.start()
+    anchor, moved = rig.emulator.body.position.copy(), np.zeros(12)
+    for _ in range(2 * ONCE):
+        rig.run(1)
+        if "START_FAILED" in rig.codes():
+            break
+        np.maximum(moved, np.abs(rig.emulator.body.position - anchor), out=moved)
+    failed = [event for event in rig.hal.events if event.code == "START_FAILED"]
+    assert len(failed) == 1
+    assert failed[0].text.startswith(JOINTS[joint])
+    assert ("TORQUE_DIRECTION", "error") in rig.events_of("TORQUE_DIRECTION")
+    assert moved.max() < 2.0 * TRAVEL
+    rig.run(20)
+    assert rig.hal.state.supervisor is S.READY
+    assert rig.hal.state.drive_state[joint] == D.SWITCH_ON_DISABLED
+    assert D.OPERATION_ENABLED not in rig.hal.state.drive_state.tolist()
+    assert not any(event.code == "ACTIVE" for event in rig.hal.events)
+
+
+@pytest.mark.parametrize("joint", [3, 4, 5], ids=[JOINTS[j] for j in (3, 4, 5)])
+def test_start_with_a_dead_motor_fails(make_rig, joint: int):
+    rig = make_rig()
+    rig.emulator.drives.motors.weaken(joint, 0.0)
+    rig.run(600)
+    assert [event.text.split()[0] for event in rig.hal.events if event.code == "START_FAILED"][:1] == [JOINTS[joint]]
+    assert not any(event.code == "ACTIVE" for event in rig.hal.events)
+
+
+def test_report_of_the_start_has_the_inertia_of_every_joint(rig):
+    rig.until(S.ACTIVE)
+    (proven,) = [event for event in rig.hal.events if event.code == "DIRECTIONS_PROVEN"]
+    assert all(joint in proven.text for joint in JOINTS)
+    assert len(proven.text.encode()) <= 220  # bytes of the text in an event record
+
+
+@pytest.mark.parametrize("stop", ["hold", "release", "stop"])
+def test_stop_during_the_test_ends_it_in_the_same_cycle(make_rig, stop: str):
+    rig = make_rig(starts=False)
+    rig.until(S.READY)
+    rig.operator.start()
+    while not rig.hal._safety_monitor.proof.running:
+        rig.run(1)
+    rig.run(10)
+    assert rig.controlwords() == {Controlword.ENABLE_OPERATION}
+    getattr(rig.operator, stop)()
+    rig.run(2)  # the pendant answers the next SYNC
+    assert rig.controlwords() == {Controlword.QUICK_STOP}
+    rig.run(100)
+    assert rig.hal.state.supervisor is S.READY
+    assert not rig.hal._safety_monitor.proof.proven.any()
+
+
+def test_further_presses_of_start_do_not_restart_the_test(make_rig):
+    rig = make_rig(starts=False)
+    rig.until(S.READY)
+    for _ in range(40):
+        rig.operator.start()
+        if rig.run(5).supervisor is S.ACTIVE:
+            return
+    raise AssertionError("the robot must be ACTIVE although START is pressed every 5 cycles")
+
+
+def test_restart_from_hold_needs_no_new_test(rig):
+    rig.until(S.ACTIVE)
+    rig.operator.hold()
+    rig.until(S.HOLD)
+    rig.run(20)
+    rig.operator.start()
+    rig.until(S.ACTIVE, 20)
+
+
+def test_restarted_drive_is_tested_again(rig):
+    rig.until(S.ACTIVE)
+    rig.operator.hold()
+    rig.until(S.HOLD)
+    rig.emulator._heartbeats.boot(DRIVE_NODES[ANKLE], rig.emulator.cycle)
+    rig.run(30)
+    proven = rig.hal._safety_monitor.proof.proven
+    assert np.flatnonzero(~proven).tolist() == [ANKLE]
+    rig.operator.start()
+    rig.until(S.ACTIVE, 100)
+    assert proven.all()
