@@ -18,6 +18,8 @@ from atalante_tools.session.walk_options import gaits_of_subject
 
 #: Time for which a robot that left ACTIVE is observed [cycles], because a HOLD within a step may end in a fall.
 _AFTERMATH: Final = 1500
+#: Time within which the robot must become ACTIVE [cycles].
+_START: Final = 30_000
 
 
 def target(engine: str) -> Target:
@@ -45,7 +47,7 @@ class Ending:
     """End condition of a trial, called once per cycle.
 
     Attributes:
-        outcome: "stood" or "done" after the last step, "fell", "hold" or "fault".
+        outcome: "stood" or "done" after the last step, "fell", "hold", "fault", or "no start".
     """
 
     def __init__(self, rig: Rig, done: Callable[[], bool], observation: Observation | None = None) -> None:
@@ -80,6 +82,9 @@ class Ending:
                 return True
             return False
         self._halted += self._started
+        if not self._started and state.cycle >= _START:
+            self.outcome = "no start"
+            return True
         if state.supervisor is SupervisorState.FAULT:
             self.outcome = "fault"
         return self._halted > _AFTERMATH or (not self._started and self.outcome == "fault")

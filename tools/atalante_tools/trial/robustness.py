@@ -184,6 +184,7 @@ class SafeEnding:
             assert self._rig.emulator is not None
             enabled = DriveState.OPERATION_ENABLED in self._rig.emulator.drives.state
             self.state = state.supervisor
-            self.safe = self.outcome == "stood" or (state.supervisor >= SupervisorState.HOLD and not enabled)
+            stopped = state.supervisor not in (SupervisorState.ACTIVE, SupervisorState.FULL_ASSIST) and not enabled
+            self.safe = self.outcome == "stood" or stopped
             return True
         return False
