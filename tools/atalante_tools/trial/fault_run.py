@@ -25,6 +25,7 @@ from atalante_hal.robot import load_robot
 from atalante_hal.types import PERIOD, State, SupervisorState
 from atalante_tools.console.options import EMBEDDED, Target
 from atalante_tools.console.stop_request import check_stop, deferred
+from atalante_tools.faults.absence import Absence
 from atalante_tools.faults.catalogue import SCENARIOS
 from atalante_tools.faults.disturbed import DisturbedBus, DisturbedClock, DisturbedController, HostFaults
 from atalante_tools.faults.matrix import load_matrix
@@ -46,8 +47,8 @@ if TYPE_CHECKING:
 _STEPS, _FAULTY_STEP = 2, 1
 #: Cycles from the start of the weight shift to a fault in double support.
 _SHIFTED: Final = 600
-#: Cycles for which a robot that left ACTIVE is observed, because a HOLD within a step may end in a fall.
-_AFTERMATH: Final = 1500
+#: Cycles for which a robot that left ACTIVE is observed. A HOLD within a step may end in a fall after more than 1.5 s.
+_AFTERMATH: Final = 5000
 #: Cycles for which the HAL is observed after a fall.
 _FALLEN: Final = 300
 #: Cycles after which a walk ends in any case. A walk without a fault lasts about 10000 cycles.
@@ -260,6 +261,7 @@ class _Walk:
                     return True
                 return halted > _AFTERMATH or state.cycle > _LONGEST
 
+            assert rig.emulator is not None
+            clock = Absence(DisturbedClock(self._host_faults), rig.emulator)
             with deferred():
-                run(hal, DisturbedController(walk, self._host_faults), DisturbedClock(self._host_faults),
-                    until=over, record=record)  # fmt: skip
+                run(hal, DisturbedController(walk, self._host_faults), clock, until=over, record=record)

@@ -1,0 +1,52 @@
+"""Time of the emulated robot while the HAL sends nothing: `HAL cycle, delay of the loop -> cycles of the robot without SYNC`.
+
+In lock-step, the emulated robot runs one cycle per SYNC. If a fault of the host suppresses the SYNC or delays the loop, the robot
+would stand still. A robot on the ground would then not fall.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from atalante_emulator.drive import WATCHDOG
+from atalante_hal.types import PERIOD
+
+if TYPE_CHECKING:
+    from atalante_emulator.emulator import Emulator
+    from atalante_tools.faults.disturbed import DisturbedClock
+
+
+class Absence:
+    """Clock of the HAL that moves the emulated robot in the time without SYNC."""
+
+    def __init__(self, clock: DisturbedClock, emulator: Emulator) -> None:
+        """Start with equal times of the HAL and the robot.
+
+        Args:
+            clock: clock that injects the delays of the loop.
+            emulator: emulated robot.
+        """
+        self._clock, self._emulator = clock, emulator
+        self._begun = 0  # HAL cycles that have begun
+        self._skipped = 0.0  # time that the loop has lost, because its cycles began more than a period late [s]
+        self._seen = 0  # cycle of the robot at the end of the last call
+        self._alone = 0  # cycles of the robot since the last SYNC
+
+    def wait(self) -> float:
+        """Return the delay of this cycle [s], after the robot has moved until the start of the cycle."""
+        late = self._clock.wait()
+        if self._emulator.cycle > self._seen:
+            self._alone = 0
+        # One nanosecond of tolerance, because the sum of the delays is rounded.
+        due = self._begun + int((self._skipped + late + 1e-9) / PERIOD)
+        while self._emulator.cycle < due:
+            if self._alone < WATCHDOG:
+                self._emulator.run_without_sync()
+            else:
+                self._emulator.idle()
+            self._alone += 1
+        if late > PERIOD:
+            self._skipped += late
+        self._begun += 1
+        self._seen = self._emulator.cycle
+        return late
