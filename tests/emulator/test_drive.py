@@ -261,12 +261,13 @@ def test_position_and_velocity_signals_are_at_the_motor(bench: DriveBench) -> No
 def test_encoder_jump_during_a_hold_moves_the_setpoint_and_not_the_joint(jump: float) -> None:
     bench = DriveBench(SMOOTH)
     bench.enable()
+    bench.move(0.2)
     bench.word[:] = Controlword.QUICK_STOP
     bench.cycle()
-    bench.position[:] = 0.01
+    bench.position[:] = 0.21
     for _ in range(30):
         before = bench.cycle()
-    bench.position[:] = 0.01 + jump
+    bench.position[:] = 0.21 + jump
     peaks = np.max([np.abs(np.array(bench.cycle()) - before) for _ in range(30)], axis=0)
     assert (peaks < 0.1).all()  # the resolution of the encoder
     np.testing.assert_allclose(before, -0.01 * ROBOT.hold_kp, rtol=0.02)

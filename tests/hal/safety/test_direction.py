@@ -7,6 +7,7 @@ import pytest
 
 from atalante_hal.robot import JOINTS, load_robot
 from atalante_hal.safety.direction import (
+    BOOST,
     GROUPS,
     LATENCY,
     MOBILITY,
@@ -15,6 +16,7 @@ from atalante_hal.safety.direction import (
     TRIALS,
     DirectionProof,
     mobility_of,
+    pose_gains,
     pulse,
 )
 from atalante_hal.types import PERIOD
@@ -75,7 +77,7 @@ class Joints:
             stopped = (self.position < ROBOT.position_min) | (self.position > ROBOT.position_max)
             self.position = np.clip(self.position, ROBOT.position_min, ROBOT.position_max)
             self.velocity[stopped] = 0.0
-            if failure := self.proof.evaluate(self.position, force):
+            if failure := self.proof.evaluate(self.position, force if cycle > 2 else NO_FORCE):
                 return failure, cycle
         raise AssertionError("the test of the directions must end")
 
@@ -143,6 +145,81 @@ def test_dead_joint_at_its_end_stop_fails(joints: Joints):
     joints.position[ANKLE] = ROBOT.position_max[ANKLE]
     joints.strength[ANKLE] = 0.0
     assert joints.run()[0].startswith("left_SA does not follow its torque")
+
+
+@pytest.mark.parametrize("force", [10.0, -10.0])
+def test_noise_of_the_feet_is_no_load(joints: Joints, force: float):
+    joints.strength[KNEE] = 0.0
+    assert joints.run(np.full(2, force))[0].startswith("left_SK does not follow its torque")
+
+
+def test_failure_names_every_joint_and_the_report_lists_them_in_order(joints: Joints):
+    joints.strength[[KNEE, KNEE + 6]] = 0.0
+    failure = joints.run()[0]
+    assert failure.count(", ") == 1
+    assert failure.split(", ")[1].startswith("right_SK does not follow its torque")
+    report = joints.proof.report()
+    assert report.startswith("effective inertia [kg m2]: left_FH 8.9, left_TH 1.7, left_SH 5.3, ")
+
+
+def test_new_test_of_the_directions_has_not_begun():
+    proof = DirectionProof(ROBOT)
+    assert proof.running is False
+    assert proof.failed == []
+    assert not proof.proven.any()
+
+
+def test_torque_is_pose_control_and_pulse_towards_the_middle():
+    rng, proof = np.random.default_rng(1), DirectionProof(ROBOT)
+    anchor = MIDDLE + np.tile([0.1, -0.1, -0.1, 0.1], 3)
+    anchor[0] = MIDDLE[0]
+    base, (kp, kd) = rng.normal(size=12), pose_gains(ROBOT)
+    tested = [JOINTS.index(f"{side}_{name}") for side in ("left", "right") for name in ("FH", "SH")]
+    peak = np.zeros(12)
+    peak[tested] = (np.where(anchor < MIDDLE, 1.0, -1.0) * np.array(PEAK * 2) * ROBOT.breakaway)[tested]
+    proof.begin(anchor, base)
+    for cycle in range(32):
+        position, velocity = anchor + 1e-3 * rng.normal(size=12), 0.1 * rng.normal(size=12)
+        spring = kp * (anchor - position)
+        base = base + spring * (PERIOD / 0.03)
+        expected = base + spring - kd * velocity + peak * pulse(cycle, 32)
+        np.testing.assert_allclose(proof.torque(position, velocity), expected, rtol=1e-12, atol=1e-12)
+
+
+def test_only_a_repeated_test_of_a_joint_at_its_limit_has_a_larger_pulse():
+    proof, tolerance = DirectionProof(ROBOT), ROBOT.thresholds.position_tolerance
+    left_fh, left_sh, right_fh, right_sh = (
+        JOINTS.index(name) for name in ("left_FH", "left_SH", "right_FH", "right_SH")
+    )
+    anchor = MIDDLE.copy()
+    anchor[left_fh], anchor[left_sh] = ROBOT.position_min[left_fh], ROBOT.position_max[left_sh]
+    anchor[right_fh], anchor[right_sh] = (
+        ROBOT.position_min[right_fh] + tolerance,
+        ROBOT.position_max[right_sh] - tolerance,
+    )
+    proof.begin(anchor, np.zeros(12))
+    largest = []
+    for _ in range(TRIALS):
+        sums = []
+        for _ in range(32 + LATENCY + 1):
+            torque = proof.torque(anchor, np.zeros(12))
+            proof.sent(torque)
+            sums.append(np.abs(torque))
+            failure = proof.evaluate(anchor, NO_FORCE)
+        largest.append(np.max(sums, axis=0))
+    joints = [left_fh, left_sh, right_fh, right_sh]
+    np.testing.assert_allclose(largest[0][joints], (np.array(PEAK * 2) * ROBOT.breakaway)[joints])
+    np.testing.assert_allclose(largest[1][joints] / largest[0][joints], [BOOST, BOOST, 1.0, 1.0])
+    assert failure.count("does not follow its torque") == 4
+
+
+def test_large_motion_names_the_joint_and_not_a_lighter_one_before_it():
+    proof = DirectionProof(ROBOT)
+    proof.begin(MIDDLE, np.zeros(12))
+    proof.sent(proof.torque(MIDDLE, np.zeros(12)))
+    position = MIDDLE.copy()
+    position[[JOINTS.index("left_TH"), JOINTS.index("left_SH")]] += [0.6 * TRAVEL, 1.1 * TRAVEL]
+    assert proof.evaluate(position, NO_FORCE).startswith("left_SH moved by 1.6 deg")
 
 
 def test_large_motion_names_the_joint_that_its_pose_control_holds_most_strongly(joints: Joints):

@@ -311,6 +311,7 @@ class TestTightThresholds:
         (1.0, 100.0, 70.0, 70.0),
         (1.0, 1000.0, 90.0, 0.0),
         (0.3, 0.0, -20.0, 0.0),
+        (2.0, 10.0, 5.0, 34.8435),  # accelerates, and may accelerate more
     ],
 )
 def test_highest_torque_has_the_documented_values(room: float, acceleration: float, oldest: float, expected: float):
@@ -384,3 +385,7 @@ def test_restart_uses_the_measured_torque_within_the_limits():
     assert limiter.last.tolist() == [0.0, 0.0, 0.0, *[-30.0] * 9]
     limiter.restart(np.full(12, 1e6))
     assert limiter.last.tolist() == [30.0] * 12
+
+
+def test_new_limiter_has_counted_no_cut() -> None:
+    assert Limiter(ROBOT, PERIOD).saturated == 0
