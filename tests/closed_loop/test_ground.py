@@ -36,7 +36,7 @@ class Log:
 @pytest.mark.parametrize("engine", ENGINES)
 def test_robot_set_down_stands_with_its_full_weight(network, robot, engine: str) -> None:
     logs = []
-    for cycles in (3400, 1500):
+    for cycles in (4900, 1500):
         log, hold, weight, before = Log(), PoseHold(robot), [], []
         mechanics = Mechanics(describe(robot, None, PATIENT), engine, Ground(clearance=0.01))
         with open_hal(
@@ -48,7 +48,7 @@ def test_robot_set_down_stands_with_its_full_weight(network, robot, engine: str)
             def over(state: State, cycles=cycles, weight=weight, before=before) -> bool:
                 if state.supervisor is SupervisorState.READY:
                     before.append(state.foot_force[:, :, 2].sum())
-                if state.cycle > 2950:
+                if state.cycle > 4450:
                     weight.append(state.foot_force[:, :, 2].sum())
                 return state.cycle >= cycles
 

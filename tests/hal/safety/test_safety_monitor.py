@@ -117,7 +117,7 @@ def test_start_with_enabled_drives_continues_from_their_torque(make_rig):
     rig.hal._safety_monitor.proof.proven.fill(True)  # the drives are off, so they cannot move their joints
     rig.until(S.READY)
     rig.operator.start()
-    rig.until(S.ACTIVE, 5 + RECALL_CYCLES)
+    rig.until(S.ACTIVE, 10 + RECALL_CYCLES)
     first = [v for c in rig.last_commands().values() for k, v in c.items() if k.endswith("TargetTorque")]
     lowest = 50.0 - rig.hal.robot.torque_rate_max * PERIOD
     assert (np.array(first) >= lowest - 0.1).all()

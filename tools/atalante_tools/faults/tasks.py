@@ -207,8 +207,8 @@ def run_task(task: Task) -> Result:
 
 def _cycles_until_stop(case: Case, cycles: int) -> int | None:
     """Run a permanent fault for `cycles` cycles; return the cycles until the walk stopped, or None if the walk continued."""
-    limited = replace(case, stimuli=tuple(limited(stimulus, cycles) for stimulus in case.stimuli))
-    run = observe(limited, cycles, recovery=False)
+    shortened = replace(case, stimuli=tuple(limited(stimulus, cycles) for stimulus in case.stimuli))
+    run = observe(shortened, cycles, recovery=False)
     for cycle in range(run.first, run.last + 1):
         if run.state(cycle) not in WALKING:
             return cycle - run.first
