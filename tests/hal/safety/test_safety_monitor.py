@@ -114,8 +114,8 @@ def test_start_with_enabled_drives_continues_from_their_torque(make_rig):
         values[signals.slice("Torque")] = 50.0
 
     rig.emulator.before_send.append(enabled)
-    rig.hal._safety_monitor.proof.proven.fill(True)  # the drives are off, so they cannot move their joints
     rig.until(S.READY)
+    rig.hal._safety_monitor.proof.proven.fill(True)  # the drives are off, so they cannot move their joints
     rig.operator.start()
     rig.until(S.ACTIVE, 10 + RECALL_CYCLES)
     first = [v for c in rig.last_commands().values() for k, v in c.items() if k.endswith("TargetTorque")]
