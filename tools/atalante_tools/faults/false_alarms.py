@@ -6,7 +6,6 @@ seed -> walk in the air or on the ground -> number of each reported diagnostic
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import cache
 from typing import TYPE_CHECKING, Final
 
 from atalante_hal.types import State, SupervisorState
@@ -16,16 +15,12 @@ from atalante_tools.session.walk_result import diagnostics
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
 
-    from atalante_control.gait.walk import WalkGaits
-    from atalante_control.model import Patient
     from atalante_emulator.mechanics import Mechanics
     from atalante_hal.types import Controller
 
 #: Cycles of a walk in the air. A walk on the ground of `_STEPS` steps has about as many.
 _CYCLES: Final = 60_000
 _STEPS: Final = 75
-#: Step of the walks on the ground: length [m] and duration [s].
-_STEP: Final = (0.16, 0.8)
 #: Diagnostics of a walk without a fault: the filter and the limiter report that they act.
 EXPECTED: Final = frozenset({"GUIDE_OUTSIDE", "TORQUE_SATURATED", "OPERATOR_STOP"})
 _SHAPES: Final = ("constant", "pinched")
@@ -82,15 +77,16 @@ class QuietTask:
         return self._run(name, controller, xi, mechanics, None, lambda state: state.cycle >= _CYCLES)
 
     def _on_the_ground(self, half: int, xi: float) -> Quiet:
-        from atalante_control.gait.subject import STUDY_PATIENTS
+        from atalante_control.gait.subject import STUDY_PATIENTS, Subject
         from atalante_control.walking.controller import WalkController
         from atalante_emulator.mechanics import Ground, Mechanics
         from atalante_emulator.wearer import LimbParameters
         from atalante_hal.robot import load_robot
         from atalante_tools.session.body import describe
+        from atalante_tools.session.walk_options import DEFAULT_STEP, solved_gaits
 
         robot, patient = load_robot(), STUDY_PATIENTS[half % len(STUDY_PATIENTS)]
-        controller = WalkController(robot, patient, _gaits(patient), _STEPS)
+        controller = WalkController(robot, patient, solved_gaits(Subject(patient, *DEFAULT_STEP)), _STEPS)
         mechanics = Mechanics(describe(robot, None, patient), self.engine, Ground(), LimbParameters())
         name = f"ground, {patient.mass:g} kg, pinched, Xi {xi:g}, seed {self.number}"
         pose = controller.standing_pose.tolist()
@@ -139,12 +135,3 @@ def quiet_tasks(cycles: int, engine: str) -> Iterator[QuietTask]:
     """
     for number in range(-(-cycles // _CYCLES)):
         yield QuietTask(number, engine)
-
-
-@cache
-def _gaits(patient: Patient) -> WalkGaits:
-    from atalante_control.gait.subject import Subject
-    from atalante_hal.robot import load_robot
-    from atalante_tools.session.walk_options import gaits_of_subject
-
-    return gaits_of_subject(Subject(patient, *_STEP), load_robot())

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
@@ -82,6 +83,24 @@ def gaits_of(options: WalkOptions, robot: Robot) -> tuple[Patient, WalkGaits]:
                 f"the parameters of the step in {options.gait} must contain {error.args[0]}: add --mass and --height"
             ) from error
     return options.subject.patient, gaits_of_subject(options.subject, robot)
+
+
+@cache
+def solved_gaits(subject: Subject) -> WalkGaits:
+    """Return the gaits of a subject with the default limits of the joints. They are solved once per process.
+
+    Args:
+        subject: Patient and step.
+
+    Raises:
+        Stopped: If a signal arrived during the optimisation.
+    """
+    from atalante_hal.robot import load_robot
+    from atalante_tools.console.stop_request import check_stop
+
+    gaits = gaits_of_subject(subject, load_robot())
+    check_stop()  # the optimiser discards the exception of a stop signal
+    return gaits
 
 
 def gaits_of_subject(subject: Subject, robot: Robot) -> WalkGaits:

@@ -23,7 +23,6 @@ from atalante_emulator.wearer import LimbParameters
 from atalante_hal.loop import run
 from atalante_hal.robot import load_robot
 from atalante_hal.types import PERIOD, State, SupervisorState
-from atalante_tools.console.options import EMBEDDED, Target
 from atalante_tools.console.stop_request import check_stop, deferred
 from atalante_tools.faults.absence import Absence
 from atalante_tools.faults.catalogue import SCENARIOS
@@ -35,12 +34,12 @@ from atalante_tools.faults.verdict import exception_sentence
 from atalante_tools.session.body import describe
 from atalante_tools.session.rig import open_hal
 from atalante_tools.session.walk_observation import Observation
-from atalante_tools.session.walk_options import gaits_of_subject
+from atalante_tools.session.walk_options import solved_gaits
 from atalante_tools.trial.fault_plan import PERMANENT, FaultTrial
+from atalante_tools.trial.lockstep import target
 from atalante_tools.trial.plan import STEP
 
 if TYPE_CHECKING:
-    from atalante_control.gait.walk import WalkGaits
     from atalante_hal.safety.events import Event
 
 #: Steps of a walk before its stop step, and the step in which the fault begins, from 0.
@@ -64,9 +63,8 @@ class FaultRun:
     moment: float | None  # of `FaultTrial.moments`
     outcome: str  # "stood" (walked to the end), "hold" (stopped upright), "fell" or "exception"
     state: str  # state of the HAL at the end
-    codes: tuple[
-        str, ...
-    ]  # diagnostics since the first faulty cycle, except information, in the order of their first report
+    #: diagnostics since the first faulty cycle, except information, in the order of their first report
+    codes: tuple[str, ...]
     detected: int | None  # cycles from the first faulty cycle to the diagnostic of the fault matrix, both included
     reason: str  # reason of the state, as the HAL states it, or the exception
 
@@ -174,11 +172,6 @@ def _cycles(mass: float, height: float, seed: int, engine: str) -> tuple[int, in
     return walk.begins[Phase.SHIFT, 0], walk.begins[Phase.STEP, _FAULTY_STEP]
 
 
-@cache
-def _gaits(mass: float, height: float) -> WalkGaits:
-    return gaits_of_subject(Subject(Patient(mass, height), *STEP), load_robot())
-
-
 class _Walk:
     """Walk on the ground with faults.
 
@@ -217,10 +210,10 @@ class _Walk:
             engine: physics engine of the emulated robot.
         """
         robot, patient, operator = load_robot(), Patient(mass, height), Operator()
-        gaits = _gaits(mass, height)
+        gaits = solved_gaits(Subject(patient, *STEP))
         walk = WalkController(robot, patient, gaits, _STEPS)
         with open_hal(
-            Target(EMBEDDED, "", lockstep=True, engine=engine),
+            target(engine),
             robot=robot,
             seed=seed,
             pose=walk.standing_pose.tolist(),

@@ -15,10 +15,10 @@ from typing import Any, Final
 
 import numpy as np
 
+from atalante_tools.faults.false_alarms import EXPECTED
+
 Result = dict[str, Any]
 
-#: Diagnostics of a walk without a fault: filter and limiter report that they act, and the program ends the walk.
-NO_FAULT: Final = frozenset({"GUIDE_OUTSIDE", "TORQUE_SATURATED", "OPERATOR_STOP"})
 #: Phases at which steps are compared with each other. Early landings end a step after about 0.9.
 _PHASES: Final = np.linspace(0.1, 0.8, 29)
 
@@ -208,7 +208,7 @@ def _alarms(results: Sequence[Result]) -> str:
     counts: dict[str, int] = {}
     for result in results:
         for code, count in result["diagnostics"].items():
-            if code not in NO_FAULT:
+            if code not in EXPECTED:
                 counts[code] = counts.get(code, 0) + count
     return ", ".join(f"{code} {count}" for code, count in sorted(counts.items()))
 

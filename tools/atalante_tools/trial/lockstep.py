@@ -1,20 +1,15 @@
-"""Parts of all trials on the emulated robot: gaits of a subject, target in lock-step, end of a trial."""
+"""Parts of all trials on the emulated robot: target in lock-step, end of a trial."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from functools import cache
 from typing import Final
 
-from atalante_control.gait.subject import Subject
-from atalante_control.gait.walk import WalkGaits
-from atalante_hal.robot import load_robot
 from atalante_hal.types import State, SupervisorState
 from atalante_tools.console.options import EMBEDDED, Target
 from atalante_tools.console.stop_request import check_stop
 from atalante_tools.session.rig import Rig
 from atalante_tools.session.walk_observation import Observation
-from atalante_tools.session.walk_options import gaits_of_subject
 
 #: Time for which a robot that left ACTIVE is observed [cycles], because a HOLD within a step may end in a fall.
 _AFTERMATH: Final = 1500
@@ -29,18 +24,6 @@ def target(engine: str) -> Target:
         engine: name of the physics engine.
     """
     return Target(EMBEDDED, "", lockstep=True, engine=engine)
-
-
-@cache
-def solved_gaits(subject: Subject) -> WalkGaits:
-    """Return the gaits of a subject. They are solved once per process.
-
-    Args:
-        subject: patient and step.
-    """
-    gaits = gaits_of_subject(subject, load_robot())
-    check_stop()  # the optimiser discards the exception of a stop signal
-    return gaits
 
 
 class Ending:

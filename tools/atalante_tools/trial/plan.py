@@ -193,14 +193,7 @@ def assist_trials(setting: WalkSetting, masses: Sequence[float] = ()) -> list[Tr
         setting: what all walks share.
         masses: masses of the subjects [kg]. With none, all eight subjects.
     """
-    from atalante_control.gait.subject import STUDY_PATIENTS
-
-    trials: list[Trial] = []
-    for number, patient in enumerate(STUDY_PATIENTS):
-        conditions = [(active, xi) for active in (False, True) for xi in (1.0, PARTIAL)]
-        if not masses or patient.mass in masses:
-            trials += [setting.walk(patient, *c, 4 * number + k) for k, c in enumerate(conditions)]
-    return trials
+    return protocol_trials(setting, (1.0, PARTIAL), masses)
 
 
 def sweep_trials(setting: WalkSetting, factors: Sequence[float], days: int) -> list[Trial]:

@@ -43,8 +43,9 @@ from atalante_tools.session.body import describe
 from atalante_tools.session.dial import Dial
 from atalante_tools.session.rig import Rig, open_hal
 from atalante_tools.session.walk_observation import Observation
+from atalante_tools.session.walk_options import solved_gaits
 from atalante_tools.session.walk_result import diagnostics
-from atalante_tools.trial.lockstep import Ending, solved_gaits, target
+from atalante_tools.trial.lockstep import Ending, target
 from atalante_tools.trial.plan import STEP, RobustTrial, ShapeTrial, TreadmillTrial, WalkTrial
 from atalante_tools.trial.robustness import robust_walk
 
