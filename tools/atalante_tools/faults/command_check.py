@@ -98,6 +98,11 @@ class Commands:
         """
         return [int(word) for leg in self._legs for row in leg.word[leg.cycle == cycle] for word in row]
 
+    def first_enabled(self) -> int | None:
+        """Return the first HAL cycle with a command that enables the operation of a drive; None if there is none."""
+        cycles = [leg.cycle[(leg.word == Controlword.ENABLE_OPERATION).any(axis=1)] for leg in self._legs]
+        return min((int(one[0]) for one in cycles if len(one)), default=None)
+
     def torque_of(self, joint: int) -> tuple[npt.NDArray[np.int64], Vector]:
         """Return the HAL cycle and the target torque of every command of a joint.
 

@@ -3,17 +3,22 @@
 from __future__ import annotations
 
 import builtins
+from collections import defaultdict
 from collections.abc import Sequence
-from typing import Final
+from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
+from atalante_emulator.faults import Fault
 from atalante_hal.bus import Bus, BusDown, BusFull
 from atalante_hal.bus.wrapped import WrappedBus
 from atalante_hal.robot import JOINTS
 from atalante_hal.types import PERIOD, Command, Controller, State, Vector
 from atalante_hal.wire.frame import Frames
-from atalante_tools.faults.scenario import HostFault
+from atalante_tools.faults.scenario import HostFault, OperatorAction, Stimulus
+
+if TYPE_CHECKING:
+    from atalante_emulator.pendant import Operator
 
 #: Mask of the joint that the fault `shake` disturbs, shape (12,): 1 for the left hip, 0 for all other joints.
 _HIP: Final = np.array([joint == "left_SH" for joint in JOINTS], np.float64)
@@ -44,6 +49,41 @@ class HostFaults:
                     self.first_active = since + self._begins
                 return fault
         return None
+
+
+class TimedStimuli:
+    """Faults and operator actions of a case that begins in a HAL cycle.
+
+    Attributes:
+        faults: faults of the emulated robot, with their start in its cycles.
+        host_faults: faults of the computer that runs the HAL.
+        presses: actions of the operator, by HAL cycle. More actions can be added.
+    """
+
+    def __init__(self, stimuli: Sequence[Stimulus], begins: int) -> None:
+        """Add the start of the case to the start of each fault and action.
+
+        Args:
+            stimuli: faults and operator actions. Their `start` counts from the start of the case.
+            begins: HAL cycle in which the case begins, from 1.
+        """
+        self.faults = [one.starting(begins - 1 + one.start) for one in stimuli if isinstance(one, Fault)]
+        self.host_faults = HostFaults([one for one in stimuli if isinstance(one, HostFault)], begins)
+        self.presses: defaultdict[int, list[str]] = defaultdict(list)
+        for one in stimuli:
+            if isinstance(one, OperatorAction):
+                self.presses[begins + one.start].append(one.kind)
+
+    def prepare(self, cycle: int, operator: Operator) -> None:
+        """Set the number of the next cycle, and execute the operator actions of the next cycle.
+
+        Args:
+            cycle: number of the next HAL cycle.
+            operator: operator of the emulated pendant.
+        """
+        self.host_faults.cycle = cycle
+        for press in self.presses.get(cycle, ()):
+            getattr(operator, press)()
 
 
 class DisturbedController:

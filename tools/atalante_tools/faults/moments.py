@@ -24,7 +24,6 @@ import numpy as np
 
 from atalante_hal.robot import JOINTS
 from atalante_hal.types import SupervisorState, Vector
-from atalante_hal.wire.cia402 import Controlword
 from atalante_tools.console.options import PYBULLET
 from atalante_tools.faults.catalogue import SCENARIOS
 from atalante_tools.faults.observation import Observation
@@ -196,11 +195,9 @@ def _observe(case: Case, plan: Schedule) -> Observation:
 
 def _premature(run: Observation, start: int) -> list[str]:
     """Return a sentence if a command enabled the operation of a drive before the operator's first START."""
-    for cycle in range(1, min(start, run.last)):
-        if Controlword.ENABLE_OPERATION in run.commands.words(cycle):
-            return [
-                f"ENABLE OPERATION must not be sent before START in cycle {start}, but it was sent in cycle {cycle}"
-            ]
+    first = run.commands.first_enabled()
+    if first is not None and first < start:
+        return [f"ENABLE OPERATION must not be sent before START in cycle {start}, but it was sent in cycle {first}"]
     return []
 
 

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import functools
 import gc
-from collections import defaultdict
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final, NamedTuple
@@ -20,15 +19,14 @@ from atalante_control.airwalk.controller import AirwalkConfig, AirwalkController
 from atalante_control.gait.gait import AIRWALK_GAIT, PERIOD, Gait, load_gait
 from atalante_control.guide.shapes import SHAPES
 from atalante_dbc import Network
-from atalante_emulator.faults import Fault
 from atalante_hal.loop import run
 from atalante_hal.robot import Robot, load_robot
 from atalante_hal.types import State, SupervisorState, Vector
 from atalante_tools.console.options import EMBEDDED, PYBULLET, Target
 from atalante_tools.faults.command_check import Commands, SentFrames
-from atalante_tools.faults.disturbed import DisturbedBus, DisturbedClock, DisturbedController, HostFaults
+from atalante_tools.faults.disturbed import DisturbedBus, DisturbedClock, DisturbedController, TimedStimuli
 from atalante_tools.faults.observation import Observation, restarted
-from atalante_tools.faults.scenario import Case, HostFault, OperatorAction
+from atalante_tools.faults.scenario import Case
 from atalante_tools.session.rig import Rig, open_hal
 
 if TYPE_CHECKING:
@@ -151,16 +149,8 @@ class CaseRun:
         """
         self._case, self._begins, self._starts = case, begins, starts
         self.states: list[SupervisorState] = []
-        self.presses: defaultdict[int, list[str]] = defaultdict(list)
-        for stimulus in case.stimuli:
-            if isinstance(stimulus, OperatorAction):
-                self.presses[begins + stimulus.start].append(stimulus.kind)
-        self._faults = [
-            stimulus.starting(begins - 1 + stimulus.start) for stimulus in case.stimuli if isinstance(stimulus, Fault)
-        ]
-        self._host_faults = HostFaults(
-            [stimulus for stimulus in case.stimuli if isinstance(stimulus, HostFault)], begins
-        )
+        self._stimuli = TimedStimuli(case.stimuli, begins)
+        self.presses = self._stimuli.presses
         self._sent = SentFrames()
         self._samples: list[_Sample] = []
         self._events: list[Event] = []  # events that the HAL reported before its shutdown
@@ -176,7 +166,7 @@ class CaseRun:
 
         shared = run_context()
         operator = Operator(starts=False)
-        controller = DisturbedController(shared.controller, self._host_faults)
+        controller = DisturbedController(shared.controller, self._stimuli.host_faults)
         with open_hal(
             Target(EMBEDDED, "", lockstep=True, engine=self._case.engine),
             network=shared.network,
@@ -187,10 +177,10 @@ class CaseRun:
             assistance_factor=ASSISTANCE,
             controller_fields=controller.telemetry_fields,
             tap=self._sent,
-            faults=self._faults,
+            faults=self._stimuli.faults,
         ) as rig:
             hal = rig.hal
-            hal.bus = DisturbedBus(hal.bus, self._host_faults)
+            hal.bus = DisturbedBus(hal.bus, self._stimuli.host_faults)
             self._prepare(1, operator)
             waiting = self._starts
 
@@ -208,14 +198,13 @@ class CaseRun:
                 self._prepare(state.cycle + 1, operator)
                 return until(state)
 
-            run(hal, controller, DisturbedClock(self._host_faults), until=over, record=record)
+            run(hal, controller, DisturbedClock(self._stimuli.host_faults), until=over, record=record)
             self._messages = hal.messages
 
     def _prepare(self, cycle: int, operator: Operator) -> None:
         """Set the number of the next cycle, and execute the operator actions of the next cycle."""
-        self._host_faults.cycle = self._sent.cycle = cycle
-        for press in self.presses.get(cycle, ()):
-            getattr(operator, press)()
+        self._sent.cycle = cycle
+        self._stimuli.prepare(cycle, operator)
 
     def observation(self, pressed: int | None) -> Observation:
         """Return the record of the run.
@@ -230,7 +219,7 @@ class CaseRun:
         return Observation(
             network=shared.network,
             robot=shared.robot,
-            first=self._host_faults.first_active or self._begins + self._case.first_faulty,
+            first=self._stimuli.host_faults.first_active or self._begins + self._case.first_faulty,
             over=None if ends is None else self._begins + ends,
             pressed=pressed,
             states=tuple(self.states),

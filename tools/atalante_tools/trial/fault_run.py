@@ -6,7 +6,6 @@ A first walk without a fault gives the cycles of the moments. All walks with the
 from __future__ import annotations
 
 import re
-from collections import defaultdict
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import cache
@@ -16,7 +15,6 @@ from atalante_control.gait.subject import Subject
 from atalante_control.model import Patient
 from atalante_control.walking.controller import WalkController
 from atalante_control.walking.phases import Phase
-from atalante_emulator.faults import Fault
 from atalante_emulator.mechanics import Ground, Mechanics
 from atalante_emulator.pendant import Operator
 from atalante_emulator.wearer import LimbParameters
@@ -26,9 +24,9 @@ from atalante_hal.types import PERIOD, State, SupervisorState
 from atalante_tools.console.stop_request import check_stop, deferred
 from atalante_tools.faults.absence import Absence
 from atalante_tools.faults.catalogue import SCENARIOS
-from atalante_tools.faults.disturbed import DisturbedBus, DisturbedClock, DisturbedController, HostFaults
+from atalante_tools.faults.disturbed import DisturbedBus, DisturbedClock, DisturbedController, TimedStimuli
 from atalante_tools.faults.matrix import load_matrix
-from atalante_tools.faults.scenario import Case, HostFault, OperatorAction, Stimulus
+from atalante_tools.faults.scenario import Case, Stimulus
 from atalante_tools.faults.tasks import HORIZON, limited
 from atalante_tools.faults.verdict import exception_sentence
 from atalante_tools.session.body import describe
@@ -190,12 +188,7 @@ class _Walk:
             stimuli: faults and actions of the operator.
             begins: HAL cycle in which the case begins, from 1.
         """
-        self._faults = [one.starting(begins - 1 + one.start) for one in stimuli if isinstance(one, Fault)]
-        self._host_faults = HostFaults([one for one in stimuli if isinstance(one, HostFault)], begins)
-        self._presses: defaultdict[int, list[str]] = defaultdict(list)
-        for one in stimuli:
-            if isinstance(one, OperatorAction):
-                self._presses[begins + one.start].append(one.kind)
+        self._stimuli = TimedStimuli(stimuli, begins)
         self.begins: dict[tuple[Phase, int], int] = {}
         self.events: list[Event] = []
         self.outcome, self.state, self.reason = "hold", SupervisorState.OFF, ""
@@ -222,11 +215,11 @@ class _Walk:
             controller_fields=walk.telemetry_fields,
             gait_hash=gaits.step.hash32,
             mechanics=Mechanics(describe(robot, None, patient), engine, Ground(), LimbParameters()),
-            faults=self._faults,
+            faults=self._stimuli.faults,
         ) as rig:
-            hal, observation = rig.hal, Observation(rig, walk, None)
-            hal.bus = DisturbedBus(hal.bus, self._host_faults)
-            self._host_faults.cycle = 1
+            hal, observation, host_faults = rig.hal, Observation(rig, walk, None), self._stimuli.host_faults
+            hal.bus = DisturbedBus(hal.bus, host_faults)
+            host_faults.cycle = 1
             copied, halted, fallen, started = 0, 0, 0, False
 
             def record() -> None:
@@ -237,9 +230,7 @@ class _Walk:
 
             def over(state: State) -> bool:
                 nonlocal halted, fallen, started
-                self._host_faults.cycle = state.cycle + 1
-                for press in self._presses.get(state.cycle + 1, ()):
-                    getattr(operator, press)()
+                self._stimuli.prepare(state.cycle + 1, operator)
                 self.state = state.supervisor
                 if observation.check():
                     self.outcome = "fell"
@@ -255,6 +246,6 @@ class _Walk:
                 return halted > _AFTERMATH or state.cycle > _LONGEST
 
             assert rig.emulator is not None
-            clock = Absence(DisturbedClock(self._host_faults), rig.emulator)
+            clock = Absence(DisturbedClock(host_faults), rig.emulator)
             with deferred():
-                run(hal, DisturbedController(walk, self._host_faults), clock, until=over, record=record)
+                run(hal, DisturbedController(walk, host_faults), clock, until=over, record=record)
