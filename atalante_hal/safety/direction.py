@@ -201,7 +201,8 @@ class DirectionProof:
         travel = np.abs(position - self._anchor)
         if not travel.max() <= TRAVEL:
             far = np.flatnonzero(travel > 0.5 * TRAVEL)
-            # A faulty joint moves its lighter neighbours. The weight moves a joint as far as the same joint of the other leg.
+            # A faulty joint also moves its lighter neighbours. The weight moves the same joint of both legs equally far, so a
+            # difference between the legs shows the fault.
             excess = self._kp * np.abs(travel - np.roll(travel, len(LEG_JOINTS)))
             joint = int(far[np.argmax(excess[far])])
             self._fail(far.tolist())

@@ -14,7 +14,7 @@ import pinocchio
 
 from atalante_control.model import ArticulatedModel, ExoskeletonParameters
 from atalante_control.structured import Records, zeros
-from atalante_control.walking.rotation import cross, rotated
+from atalante_control.walking.rotation import Vector3, cross, rotated
 from atalante_hal.compiled import compiled
 from atalante_hal.robot import JOINTS, SIDES
 from atalante_hal.types import Vector
@@ -131,6 +131,37 @@ def _links(articulated: ArticulatedModel) -> Records[Link]:
     return links
 
 
+def turn_link(parent: Vector, turn: Vector, angle: float, rotation: Vector) -> None:
+    """Compute the rotation of a link from the rotation of its parent.
+
+    Args:
+        parent: rotation of the parent, shape (3, 3).
+        turn: `Link.turn` of the link, shape (3, 3, 3).
+        angle: joint angle [rad].
+        rotation: output for the rotation of the link, shape (3, 3). It may be the array `parent`.
+    """
+    sine, versine = math.sin(angle), 1.0 - math.cos(angle)
+    first, second, third = (
+        _turn_column(turn, sine, versine, 0),
+        _turn_column(turn, sine, versine, 1),
+        _turn_column(turn, sine, versine, 2),
+    )
+    for row in range(3):
+        x, y, z = parent[row, 0], parent[row, 1], parent[row, 2]
+        rotation[row, 0] = x * first[0] + y * first[1] + z * first[2]
+        rotation[row, 1] = x * second[0] + y * second[1] + z * second[2]
+        rotation[row, 2] = x * third[0] + y * third[1] + z * third[2]
+
+
+def _turn_column(turn: Vector, sine: float, versine: float, column: int) -> Vector3:
+    """Return a column of the rotation of a link relative to its parent."""
+    return (
+        turn[0, 0, column] + sine * turn[1, 0, column] + versine * turn[2, 0, column],
+        turn[0, 1, column] + sine * turn[1, 1, column] + versine * turn[2, 1, column],
+        turn[0, 2, column] + sine * turn[1, 2, column] + versine * turn[2, 2, column],
+    )
+
+
 def move(chain: Chain, position: Vector, velocity: Vector) -> None:
     """Compute the motion of links, soles and centre of mass, and write the results into `chain`.
 
@@ -145,18 +176,8 @@ def move(chain: Chain, position: Vector, velocity: Vector) -> None:
         centre.position[k], centre.velocity[k] = first.mass * first.lever[k], 0.0
     for i in range(1, len(links)):
         link, parent = links[i], links[links[i].parent]
-        angle, turn, rotation = position[link.joint], link.turn, link.rotation
-        sine, versine, rate = math.sin(angle), 1.0 - math.cos(angle), velocity[link.joint]
-        for column in range(3):
-            a, b, c = (
-                turn[0, 0, column] + sine * turn[1, 0, column] + versine * turn[2, 0, column],
-                turn[0, 1, column] + sine * turn[1, 1, column] + versine * turn[2, 1, column],
-                turn[0, 2, column] + sine * turn[1, 2, column] + versine * turn[2, 2, column],
-            )
-            for row in range(3):
-                rotation[row, column] = (
-                    parent.rotation[row, 0] * a + parent.rotation[row, 1] * b + parent.rotation[row, 2] * c
-                )
+        rotation, rate = link.rotation, velocity[link.joint]
+        turn_link(parent.rotation, link.turn, position[link.joint], rotation)
         arm = rotated(parent.rotation, link.offset)
         swept = cross(parent.angular, arm)
         spin = rotated(rotation, link.axis)

@@ -22,7 +22,7 @@ from typing import Annotated, NamedTuple
 
 from atalante_control.gait.gait import PERIOD
 from atalante_control.structured import Records
-from atalante_control.walking.kinematics import Link
+from atalante_control.walking.kinematics import Link, turn_link
 from atalante_control.walking.rotation import cross, rotated
 from atalante_hal.robot import LEG_JOINTS
 from atalante_hal.types import Vector
@@ -237,17 +237,9 @@ def _ankle(placement: Placement, links: Records[Link], first: int, desired: Vect
             rotation[i, j] = 1.0 if i == j else 0.0
     for i in range(_LINKS):
         link = links[first + i]
-        arm, turn, angle = rotated(rotation, link.offset), link.turn, desired[link.joint]
+        arm = rotated(rotation, link.offset)
         position = position[0] + arm[0], position[1] + arm[1], position[2] + arm[2]
-        sine, versine = math.sin(angle), 1.0 - math.cos(angle)
-        for row in range(3):
-            x, y, z = rotation[row, 0], rotation[row, 1], rotation[row, 2]
-            for column in range(3):
-                rotation[row, column] = (
-                    x * (turn[0, 0, column] + sine * turn[1, 0, column] + versine * turn[2, 0, column])
-                    + y * (turn[0, 1, column] + sine * turn[1, 1, column] + versine * turn[2, 1, column])
-                    + z * (turn[0, 2, column] + sine * turn[1, 2, column] + versine * turn[2, 2, column])
-                )
+        turn_link(rotation, link.turn, desired[link.joint], rotation)
         axis = rotated(rotation, link.axis)
         for k in range(3):
             placement.origin[i, k], placement.axis[i, k] = position[k], axis[k]

@@ -5,6 +5,7 @@ from __future__ import annotations
 import functools
 import inspect
 import math
+import os
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -31,6 +32,23 @@ engine_option = click.option(
 )
 #: Option `--json`. JSON objects go to stdout, all other text goes to stderr.
 json_option = click.option("--json", "as_json", is_flag=True, help="Print JSON objects on stdout, one per line.")
+
+#: Option `--jobs`: number of processes on this computer.
+jobs_option = click.option(
+    "--jobs",
+    type=click.IntRange(1),
+    default=os.cpu_count() or 1,
+    show_default="number of cores",
+    metavar="N",
+    help="Number of parallel processes.",
+)
+#: Option `--dask`: address of a dask scheduler; empty for processes on this computer.
+dask_option = click.option(
+    "--dask",
+    default="",
+    metavar="ADDRESS",
+    help="Run on the workers of this dask scheduler, such as tcp://127.0.0.1:8786.",
+)
 
 #: Option type for a seed of random numbers.
 SEED: Final = click.IntRange(min=0)

@@ -6,7 +6,6 @@
 
 from __future__ import annotations
 
-import os
 import time
 from dataclasses import asdict
 from pathlib import Path
@@ -15,7 +14,7 @@ from typing import TYPE_CHECKING
 import click
 
 from atalante_tools.console.names import find
-from atalante_tools.console.options import engine_option, json_option
+from atalante_tools.console.options import dask_option, engine_option, jobs_option, json_option
 from atalante_tools.console.outcome import Failed, InvalidUsage
 from atalante_tools.console.stop_request import check_stop
 from atalante_tools.console.terminal import Progress, print_message, show_json, table
@@ -94,22 +93,6 @@ def run(id_: str, name: str, engine: str, as_json: bool) -> None:
     _conclude(summary)
 
 
-_jobs_option = click.option(
-    "--jobs",
-    type=click.IntRange(1),
-    default=os.cpu_count() or 1,
-    show_default="number of cores",
-    metavar="N",
-    help="Number of parallel processes.",
-)
-_dask_option = click.option(
-    "--dask",
-    default="",
-    metavar="ADDRESS",
-    help="Run on the workers of this dask scheduler, such as tcp://127.0.0.1:8786.",
-)
-
-
 @command.command("false-alarms", short_help="Walk without a fault and count the reported diagnostics.")
 @click.option(
     "--cycles",
@@ -119,8 +102,8 @@ _dask_option = click.option(
     metavar="N",
     help="Number of cycles of 1 ms of all walks together.",
 )
-@_jobs_option
-@_dask_option
+@jobs_option
+@dask_option
 @engine_option
 @json_option
 def false_alarms(cycles: int, jobs: int, dask: str, engine: str, as_json: bool) -> None:
@@ -151,8 +134,8 @@ def _counts(counts: dict[str, int]) -> str:
 
 @command.command("campaign", short_help="Run all faults, single and in pairs, and write a report.")
 @click.argument("ids", metavar="[ID]...", nargs=-1)
-@_jobs_option
-@_dask_option
+@jobs_option
+@dask_option
 @click.option("--pairs/--no-pairs", default=True, show_default=True, help="Also run pairs of faults.")
 @click.option(
     "--moments/--no-moments",

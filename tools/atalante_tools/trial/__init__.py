@@ -5,7 +5,6 @@ experiment -> trials (`plan`) -> results in files (`run`, `store`) -> findings -
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
@@ -18,6 +17,8 @@ from atalante_tools.console.options import (
     PYBULLET,
     SEED,
     Between,
+    dask_option,
+    jobs_option,
     json_option,
     options_as,
 )
@@ -60,10 +61,8 @@ def _running(experiment: str) -> Callable[[_Command], _Command]:
                      metavar="DIR", help="Folder for report.html, report.md and one file per trial. A trial with a valid "
                                          "file is not run again."),
         click.option("--quick", is_flag=True, help="Run few and short trials, to try the command."),
-        click.option("--jobs", type=click.IntRange(1), default=os.cpu_count() or 1, show_default="number of cores",
-                     metavar="N", help="Number of parallel processes."),
-        click.option("--dask", default="", metavar="ADDRESS",
-                     help="Run on the workers of this dask scheduler, such as tcp://127.0.0.1:8786."),
+        jobs_option,
+        dask_option,
         click.option("--engine", type=click.Choice((MUJOCO, PYBULLET)), default=MUJOCO, show_default=True,
                      help="Physics engine of the emulated robot. MuJoCo is the faster engine on the ground."),
         click.option("--seed", type=SEED, default=0, show_default=True, metavar="N", help="Seed of all random numbers."),
@@ -97,7 +96,7 @@ _mass_option = click.option(
 def command() -> None:
     """Repeat the experiments of the paper with virtual subjects on the emulated robot, and write a report.
 
-    The experiment `faults` is not in the paper. It injects faults into walks on the ground.
+    The experiments `protocol`, `robustness` and `faults` are not in the paper.
 
     The report, one HTML file (and its findings as Markdown), contains tables, figures, and each finding of the paper with its
     statistic and its verdict. A verdict of FAIL is a result, not an error of the command. Each trial is stored in a file of its
