@@ -22,6 +22,7 @@ from atalante_hal.bus.resilient import ResilientBus
 from atalante_hal.bus.socketcan import SocketCanBus
 from atalante_hal.hal import Hal
 from atalante_hal.robot import Robot
+from atalante_hal.safety.start import ENABLE_CYCLES
 from atalante_hal.transceiver import RECEIVE_BUDGET
 from atalante_hal.types import SupervisorState
 from atalante_hal.wire.cia402 import DriveState
@@ -77,7 +78,7 @@ class Line:
     def start(self) -> None:
         """Press START, and check that the HAL becomes ACTIVE."""
         self.operator.start()
-        assert self.loop.cycles(100, S.ACTIVE) is S.ACTIVE, self.hal.reason
+        assert self.loop.cycles(ENABLE_CYCLES, S.ACTIVE) is S.ACTIVE, self.hal.reason
 
     def codes(self) -> list[str]:
         return [event.code for event in self.hal.events]

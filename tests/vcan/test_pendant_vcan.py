@@ -11,6 +11,7 @@ from atalante_emulator.emulator import Emulator
 from atalante_hal.bus.socketcan import SocketCanBus
 from atalante_hal.hal import Hal
 from atalante_hal.robot import Robot
+from atalante_hal.safety.start import ENABLE_CYCLES
 from atalante_hal.types import SupervisorState
 from atalante_hal.wire.frame import new_frames
 from atalante_tools.commands.observer import Observer
@@ -41,7 +42,7 @@ def test_a_second_pendant_takes_over_and_holds(vcan: str, network: Network, robo
         cycles = Loop(hal, lambda: listener.accept(block, listening.receive(block), time.monotonic())).cycles
         assert cycles(400, SupervisorState.READY) is SupervisorState.READY, hal.missing()
         first.press(Request.START)
-        assert cycles(60, SupervisorState.ACTIVE) is SupervisorState.ACTIVE, hal.reason
+        assert cycles(ENABLE_CYCLES, SupervisorState.ACTIVE) is SupervisorState.ACTIVE, hal.reason
         second.start_sending()
         assert cycles(70) is SupervisorState.ACTIVE, hal.reason
         assert (first.displaced, second.displaced, second.takeover_failed) == (True, False, False)
