@@ -95,7 +95,7 @@ class Hal:
 
     def _build_images(self, controller_fields: Sequence[tuple[str, int]], assistance_factor: float) -> None:
         received = self.network.received_by("HAL")
-        # The rows of the process image are in the order in which the buses deliver messages, because `accept` is then fast.
+        # `accept` is fast if the rows of the process image are in the order in which the buses deliver the messages.
         fast = [m for bus in self.network.buses for m in received if m.bus == bus and m.cycle_ms == 1]
         #: Names of the messages, in the order of the elements of `State.valid` and `State.age`.
         self.messages = tuple(m.name for m in fast)
@@ -158,7 +158,7 @@ class Hal:
         return state
 
     def _apply(self, verdict: Verdict) -> None:
-        """Apply a verdict of the safety monitor: set the commands and the header of the record.
+        """Apply the safety monitor's verdict on this cycle: set the drive commands and the header of the record.
 
         Args:
             verdict: Verdict of the current cycle.
@@ -231,7 +231,7 @@ class Hal:
         return self._send_command()
 
     def _follow_drives(self) -> None:
-        """Set the torques in the limiter to the torques that the drives report.
+        """Set the start value of the rate limit to the torques that the drives report.
 
         While any drive is off, the commands are 0: a drive that is off produces no torque, and a drive that holds its position
         ignores its command. As soon as all drives produce torque, each drive gets the torque that it reports as its command, so
@@ -249,7 +249,7 @@ class Hal:
             self._commands.torque[:] = self._limiter.last
 
     def _test_directions(self) -> None:
-        """Send the torques of the test of the directions, after all limits."""
+        """Limit and send the torques with which the HAL tests the direction of each joint."""
         proof = self._safety_monitor.proof
         self._limiter.apply(proof.torque(self.state.position, self.state.velocity), self._parts.motion)
         proof.sent(self._limiter.last)

@@ -82,7 +82,7 @@ class Pendant:
         #: Assistance factor Xi in [0, 1]; None if the pendant sets no factor.
         self.assistance_factor: float | None = None
         self._press: float | None = None  # RequestCounter of the last cycle
-        self._pressed = False  # True while a START is stored until the pendant is qualified
+        self._pressed = False  # True while a START is stored, because the pendant is not trusted yet
 
     def evaluate(
         self, present: bool, *, qualifying: bool = False, new: bool = True, further_frames: Sequence[Vector] = ()

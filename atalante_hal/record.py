@@ -16,8 +16,8 @@ from atalante_hal.robot import CELLS, FEET, IMUS, JOINTS, MOTORS
 from atalante_hal.types import State, SupervisorState
 from atalante_hal.wire.codec import Codec, group_of
 
-#: Names of the first fields of the record. Each field is one number. "diagnostics" and "diagnostics_high" have one bit per active
-#: `Dtc`, see `record_layout.split_bits`.
+#: Names of the first fields of the record. Each field is one number.
+#: The fields "diagnostics" and "diagnostics_high" have one bit per active `Dtc`, see `record_layout.split_bits`.
 HEADER_FIELDS = (
     "cycle", "time", "supervisor", "assistance_factor", "cost_us", "lateness_us",
     "overruns", "frames", "crc_errors", "dropped", "diagnostics", "diagnostics_high",

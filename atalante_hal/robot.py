@@ -55,8 +55,8 @@ class Envelope:
 class Derating:
     """Torque limit of a hot drive as a function of its temperature."""
 
-    start: float  # degC, highest temperature at which `torque_max` is allowed
-    end: float  # degC, lowest temperature at which only the share `floor` of `torque_max` is allowed
+    start: float  # degC, up to this drive temperature, the full torque `torque_max` is allowed
+    end: float  # degC, from this drive temperature on, only the share `floor` of `torque_max` is allowed
     floor: float  # share of torque_max, 0 to 1
 
 
@@ -67,10 +67,9 @@ class Sensors:
     #: Largest mean difference between the reported velocity and the filtered encoder velocity [rad/s at the joint].
     velocity_error: float
     velocity_bandwidth: float  # Hz, cut-off frequency of the low-pass of the reported velocity
-    #: Largest difference between the tibia attitude computed from the encoders and the one measured by the IMUs [rad about each
-    #: axis].
+    #: Largest difference between the tibia attitudes from the encoders and from the IMUs, about each axis [rad].
     attitude_error: float
-    attitude_change: float  # rad, largest change of this difference while an encoder reading is constant
+    attitude_change: float  # rad, largest change of the attitude difference while an encoder reading is constant
     misalignment: float  # rad, allowance added to `attitude_change` for each rad by which the leg turns
     quaternion_error: float  # largest difference between the squared norm of a quaternion and 1
     cell_free: float  # N, largest vertical force at which a cell is regarded as unloaded
@@ -83,14 +82,14 @@ class Thresholds:
 
     supply_low: float  # V at a drive; below this voltage the battery is nearly empty
     supply_under: float  # V at a drive; below this voltage the drives may soon fail to hold
-    #: Smallest torque limit of a hot drive that permits walking, as a share of the limit of the same joint in the other leg.
+    #: Smallest ratio of torque limits, hot drive to the same drive of the other leg, with which walking is permitted.
     derated_imbalance: float
     full_assist_ramp: float  # s, time for the ramp of the assistance factor from 0 to 1 in FULL_ASSIST
     #: Largest angle outside a position limit that is still accepted [rad]. Beyond it, the joint is out of range.
     position_tolerance: float
     #: Largest torque that a drive may report while it is off [Nm]. A drive that is on may exceed its limit by this torque.
     idle_torque: float
-    surplus_frames: float  # largest number of frames in a cycle, in addition to one frame of each cyclic message
+    surplus_frames: float  # largest number of frames in a cycle beside the cyclic ones, such as status messages
 
 
 @dataclass(frozen=True)

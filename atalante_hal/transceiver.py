@@ -24,7 +24,7 @@ RECEIVE_BUDGET = 128
 PERSISTENT = 5
 #: Time to listen for another HAL before the first SYNC [s].
 LISTEN = 0.2
-#: Longest wait for answers that are unlikely, because no node has answered so far or the last SYNC was not sent [s].
+#: Longest wait for answers if no node has answered so far or the last SYNC was not sent [s].
 _DOUBTFUL_PATIENCE = 0.1
 #: Class bit of an error frame that reports bus-off (linux/can/error.h).
 ERROR_BUS_OFF = 0x40
@@ -58,7 +58,7 @@ class FrameTap(Protocol):
 
 
 class Outgoing:
-    """Batch of frames that may be sent, with a copy of the headers that were checked.
+    """Batch of frames that this node may send, with a copy of the checked headers.
 
     Args:
         frames: Frames, shape (n,); always the same array.
@@ -171,7 +171,7 @@ class Transceiver:
         except BusError as error:
             self._find(Dtc.BUS_DOWN, True, 0.0, f"the bus {self.bus.name} cannot receive: {error}")
             count = first
-            if cycle is not None:  # in lock-step, a bus that fails immediately would let the cycles run without a pause
+            if cycle is not None:  # pause: with a failing bus, lock-step cycles would run as fast as possible
                 time.sleep(min(patience, _DOUBTFUL_PATIENCE))
         if self.tap is not None:
             self.tap.received(scratch[first:] if first else scratch, count - first)

@@ -73,7 +73,7 @@ class Command:
     step: int | None = None  # number of the walking step; None for a controller that does not walk
     walking: bool = False  # True while the robot walks on the ground; STOP then ends the walk before HOLD
     outside: bool = False  # True if a joint is outside the virtual guide; raises a pending diagnostic
-    #: True if a joint stays outside a guide with a certificate. If `outside` is also True, the robot goes to FULL_ASSIST.
+    #: True if a joint stays outside a guide with a certificate. Together with `outside`, this leads to FULL_ASSIST.
     guide_left: bool = False
     #: True if a step starts with a larger deviation than the guide certificate assumes; raises a pending diagnostic.
     hand_over_exceeded: bool = False

@@ -1,4 +1,4 @@
-"""Facts about the interfaces of python-can: CAN FD support, driver, channel, bit timing, tests with this project.
+"""Table of the interfaces of python-can: CAN FD support, driver, channel, bit timing, and whether this project tested them.
 
     name of an interface -> `Adapter` -> `refusal()`
 
@@ -28,7 +28,7 @@ SEGMENTS: Final = (
 )
 #: Entries for 1 Mbit/s and 5 Mbit/s in python-can's configuration file, for backends that calculate the bit segments.
 BIT_RATES: Final = (("bitrate", "1000000"), ("data_bitrate", "5000000"))
-#: Default source of the facts about an adapter.
+#: Default of `Adapter.source`: where the facts about an adapter come from.
 SOURCES: Final = "sources of python-can 4.6.1"
 NOT_TRIED: Final = "not tried"
 
@@ -254,7 +254,7 @@ def refusal(interface: str, *, one_process: bool = False) -> str:
     if adapter is None:
         import can
 
-        if interface in can.VALID_INTERFACES:  # a plug-in; `PythonCanBus` checks its CAN FD support after opening it
+        if interface in can.VALID_INTERFACES:  # a plug-in of python-can; `PythonCanBus` checks its CAN FD support
             return ""
         known = ", ".join(sorted(can.VALID_INTERFACES))
         return f"there is no CAN interface {interface!r}; use one of {known}"

@@ -27,7 +27,7 @@ class Share(NamedTuple):
 
     link: Bus
     indices: list[int]  # indices of these frames in the batch
-    frames: Frames  # always the same array object, because a bus caches memory views of each array
+    frames: Frames  # send buffer for these frames; always the same array object, because a bus caches memory views of each array
 
 
 class JoinedBus:
@@ -60,8 +60,8 @@ class JoinedBus:
         self._capacity = capacity
         self._batches = Batches()
         self._shares: dict[bytes, list[Share]] = {}
-        self._tails: list[list[Frames]] = []  # receive buffer -> all slices `frames[i:]` of this buffer
-        self._turn = 0  # index of the channel to read first; it rotates, so that no busy channel blocks the rest
+        self._tails: list[list[Frames]] = []  # for each known receive buffer: list of its slices `frames[i:]`
+        self._turn = 0  # index of the channel to read first; changes in each call, so that a busy channel cannot block the others
         self._closed = False
         self._failure: BusError | None = None  # error that a channel raised in the current call of `receive`
         self._down: dict[int, str] = {}  # error message of each lost channel, by `id()` of its bus object

@@ -1,4 +1,4 @@
-"""Embedded bus with two ends in one process, in lock-step.
+"""Embedded bus, which connects the HAL with an emulator in the same process, in lock-step.
 
 The HAL has one end and the emulator has the other end. If the HAL calls `receive()` and no frame is queued for the HAL, the
 HAL's end calls `step`. In this call the emulator receives the frames of the HAL and sends the answers. Both sides run the same
@@ -17,7 +17,7 @@ from atalante_hal.wire.frame import FRAME_BYTES, Frames, new_frames
 
 
 class PairBus:
-    """One end of an embedded bus within one process. Its calls never wait.
+    """One of the two ends of an embedded bus within one process. `send` and `receive` never wait.
 
     Args:
         name: Name of this end.

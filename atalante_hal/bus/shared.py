@@ -39,10 +39,10 @@ _END_WORDS = 8
 _HEADER_BYTES = mmap.PAGESIZE
 #: Time for which a waiting end polls before it sleeps [s], longer than the computing time of a cycle.
 _POLL_TIME = 500e-6
-#: Number of waits without polling that follow a wait in which polling found no frame. They save computing time.
+#: If polling found no frame in one wait, the next waits sleep without polling, to save computing time. Number of these waits.
 _WAITS_WITHOUT_POLLING = 32
-#: Longest sleep of a waiting end [ms]. A wake-up byte may arrive before the new value in the memory is visible, without a second
-#: byte after it. So a waiting end reads the memory again after this time.
+#: Longest sleep of a waiting end [ms]; then the end reads the shared memory again.
+#: This is required, because a wake-up byte may arrive before the new value in the shared memory is visible.
 _SLEEP = 20
 _WAKE_UP = b"\0"
 _REASON_BYTES = 4096
@@ -85,7 +85,7 @@ class SharedBus:
         self._outgoing, self._incoming = queues[end], queues[1 - end]
         self._size = size
         self._sent = self._received = 0
-        self._waits_without_polling = 0  # number of remaining waits without polling
+        self._waits_without_polling = 0  # number of following waits that sleep without polling
         self._closed = False
         self._close_reason = ""  # reason for closing that the other end sent
         self._stamps: Stamps = np.zeros(size // FRAME_BYTES, np.int64)

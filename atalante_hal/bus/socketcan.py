@@ -26,7 +26,7 @@ from atalante_hal.wire.frame import FLAG_FDF, FRAME_BYTES, Frames, as_words, new
 CLASSIC_BYTES = 16  # struct can_frame
 CAN_RAW_ERR_FILTER: Final = 2
 SO_RCVBUFFORCE: Final = 33
-SO_TIMESTAMPNS: Final = 35  # the socket option and its control message have the same number
+SO_TIMESTAMPNS: Final = 35  # number of the socket option, and also of its control message
 SO_RXQ_OVFL: Final = 40
 SIOCGIFFLAGS: Final = 0x8913
 SIOCGIFMTU: Final = 0x8921
@@ -34,7 +34,7 @@ IFF_UP: Final = 1
 #: Classes of error frames to receive (linux/can/error.h): transmit timeout, controller problem, bus-off, controller restarted.
 ERROR_FRAMES = 0x0001 | 0x0004 | 0x0040 | 0x0100
 LINK_DOWN: Final = errno.ENETDOWN
-#: Error codes of calls after the interface was removed. The kernel unbinds the socket, and does not bind it again.
+#: Error codes of a call on the socket of a removed interface. The kernel does not bind the socket again.
 LINK_REMOVED: Final = (errno.ENODEV, errno.ENXIO)
 #: Shortest time between two attempts to open a removed interface again [s].
 REOPEN_PERIOD: Final = 0.1
@@ -42,7 +42,7 @@ REOPEN_PERIOD: Final = 0.1
 DROPPED_BATCHES: Final = 64
 NO_ROOM = (errno.ENOBUFS, errno.EAGAIN)
 
-#: Mask of the used fields of a received header word. The reserved bytes may contain garbage.
+#: Mask of the used fields in the header word of a received frame. The reserved bytes may contain garbage.
 HEADER_FIELDS = np.uint64(0x0000_FFFF_FFFF_FFFF)
 #: FDF flag in a header word. Older kernels leave this flag 0 in received CAN FD frames.
 FDF_IN_HEADER = np.uint64(FLAG_FDF << 40)
@@ -292,8 +292,8 @@ class SocketCanBus:
         if code != LINK_DOWN and code not in LINK_REMOVED:
             return None
         self._drop_queued()
-        # An interface goes down before it is removed. `_drop_queued` may have dropped the later error of the removal, so the
-        # binding of the socket is checked, too.
+        # An interface goes down before it is removed. `_drop_queued` may have dropped the second error, that of the removal.
+        # Therefore the binding of the socket is checked, too.
         if code == LINK_DOWN and self._is_bound():
             return BusDown(f"{self.name} is down: type `ip link set {self.name} up`")
         self._removed = f"{self.name} was removed: plug the adapter in again; the link is opened again when it is up"

@@ -20,7 +20,7 @@ class Reaction(IntEnum):
     FULL_ASSIST = 2  # ramp the assistance factor to 1
     FINISH_STEP = 3  # finish the walking step, then HOLD
     HOLD = 4  # all drives hold their positions
-    LOWER = 5  # lower the affected joint; all other drives hold their positions
+    LOWER = 5  # lower the affected joint slowly; all other drives hold their positions
     FAULT = 6  # latched until the operator acknowledges the fault
 
 
@@ -151,7 +151,7 @@ def number_of(bits: int) -> int:
 
 
 def by_number(number: int) -> str | None:
-    """Return a text with the code that has a given number, and its meaning.
+    """Look up a diagnostic by its number, and return its code and meaning as text.
 
     Args:
         number: position of the code in `Dtc`, counted from 1.
@@ -173,7 +173,7 @@ def dtcs_of(bits: int) -> tuple[Dtc, ...]:
     return tuple(dtc for dtc in Dtc if bits & dtc.bit)
 
 
-#: Diagnostic of each emergency error code (CiA 301, CiA 402-1) that has a specific diagnostic.
+#: Emergency error code (CiA 301, CiA 402-1) -> diagnostic. All other error codes have a diagnostic per group of codes.
 _EMERGENCIES = {
     0x3120: Dtc.UNDER_VOLTAGE,  # mains too low
     0x3220: Dtc.UNDER_VOLTAGE,  # DC link too low
@@ -184,7 +184,7 @@ _EMERGENCIES = {
     0x8250: Dtc.CMD_TIMEOUT,  # RPDO timeout
     0x8700: Dtc.SYNC_LOST,  # SYNC controller
 }
-#: Diagnostic of every other emergency error code, by the highest hexadecimal digit of the code.
+#: Highest hexadecimal digit of an emergency error code -> diagnostic, for codes without a diagnostic of their own.
 _EMERGENCY_CLASSES = {
     0x2: Dtc.EMCY_CURRENT,
     0x3: Dtc.EMCY_VOLTAGE,

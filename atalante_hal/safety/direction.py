@@ -40,22 +40,22 @@ GROUPS = ((("FH", "SH"), 32), (("TH", "SA"), 16), (("SK", "HA"), 16))
 LATENCY = 2
 #: Peak of the pulse as a multiple of `Robot.breakaway`, in the order of LEG_JOINTS. FH and SH move a whole leg.
 PEAK = (6.0, 3.0, 6.0, 3.0, 3.0, 3.0)
-#: Gains of the position control as a share of the gains of the drive, stiffness and damping, in the order of LEG_JOINTS.
-#: The HAL has more delay than a drive, so it must hold light joints more softly.
+#: Stiffness and damping of the HAL's position control in the test, relative to those of a drive, in the order of LEG_JOINTS.
+#: The HAL's position control has more delay than that of a drive, so its gains for light joints must be lower.
 STIFFNESS = (1.0, 1.0, 1.25, 0.5, 0.25, 0.25)
 DAMPING = (0.5, 0.5, 0.6, 0.25, 0.25, 0.25)
-#: Integral time of the position control, which then carries the weight [s].
+#: Integral time of the HAL's position control, which holds the legs during the test [s].
 INTEGRAL = 0.03
 #: Largest motion of a joint during the test [rad].
 TRAVEL = math.radians(1.5)
-#: A foot is loaded if its mean force during a test exceeds this share of `cell_free`, which is four times the noise of the mean.
+#: A foot is loaded if its mean force during a test exceeds `LOAD * cell_free`, which is four times the noise of the mean.
 LOAD = 1.0 / 3.0
-#: Factor of the pulse in a repeated test of a joint near its end stop, because its weight may press it onto the stop.
+#: Factor of the torque pulse in the second test of a joint near its end stop. The leg weight may press the joint onto the stop.
 BOOST = 6.0
-#: Number of tests after which a joint that did not pass has failed.
+#: Number of unsuccessful tests of a joint after which the joint has failed.
 TRIALS = 2
-#: Smallest mobility of a joint that follows its torque, in the order of LEG_JOINTS [1/(kg m2)]: about half of the smallest one
-#: that the suspended robot has, straight or with bent legs, empty or with a patient of 110 kg.
+#: Smallest mobility that proves that a joint follows its torque, in the order of LEG_JOINTS [1/(kg m2)].
+#: It is about half of the smallest mobility of the suspended robot, with straight or bent legs, empty or with 110 kg patient.
 MOBILITY = (0.045, 0.23, 0.075, 0.56, 4.6, 6.8)
 
 
@@ -96,7 +96,8 @@ def mobility_of(torque: Vector, position: Vector) -> Vector:
     acting = np.zeros_like(torque)
     acting[LATENCY:] = torque[:-LATENCY] - torque[0]
     response = np.cumsum(np.cumsum(acting, axis=0), axis=0) * PERIOD**2
-    free = np.linalg.qr(np.vander(np.linspace(-1.0, 1.0, count), 4))[0]  # motion without a change of the torque
+    # Remove the cubic polynomials of time from the response, because a joint may also move without a pulse.
+    free = np.linalg.qr(np.vander(np.linspace(-1.0, 1.0, count), 4))[0]
     response -= free @ (free.T @ response)
     power = (response**2).sum(axis=0)
     mobility: Vector = (response * (position - position[0])).sum(axis=0) / np.where(power > 0.0, power, np.inf)
@@ -104,7 +105,7 @@ def mobility_of(torque: Vector, position: Vector) -> Vector:
 
 
 class DirectionProof:
-    """Test of the directions of all joints, in each cycle in which all drives are in OPERATION ENABLED during a start.
+    """Test of the motor and encoder direction of each joint, done at each start when all drives are in OPERATION ENABLED.
 
     Args:
         robot: position limits, hold gains and breakaway torques.
@@ -133,12 +134,12 @@ class DirectionProof:
         #: Joints of each test that is still to be done, and duration of its pulse [cycles].
         self._tests: list[tuple[list[int], int]] = []
         self._trials = [0] * len(JOINTS)
-        self._position: list[Vector] = []  # position of each cycle of the present test
-        self._force: list[Vector] = []  # vertical force of each foot in each cycle of the present test
-        self._torque: list[Vector] = []  # sent torque of each cycle of the present test
+        self._position: list[Vector] = []  # joint positions in each cycle of the current test
+        self._force: list[Vector] = []  # vertical force of each foot in each cycle of the current test
+        self._torque: list[Vector] = []  # sent torques in each cycle of the current test
 
     def begin(self, position: Vector, torque: Vector) -> None:
-        """Begin the tests of all joints that are not proven.
+        """Begin the tests of all joints whose direction is not proven.
 
         Args:
             position: present joint positions, shape (12,) [rad], which the position control holds.
@@ -188,7 +189,7 @@ class DirectionProof:
         self._torque.append(torque.copy())
 
     def evaluate(self, position: Vector, force: Vector) -> str:
-        """Evaluate the motion until this cycle.
+        """Record this cycle, evaluate the motion of the tested joints, and return why the start must end.
 
         Args:
             position: joint positions, shape (12,) [rad].
@@ -201,8 +202,8 @@ class DirectionProof:
         travel = np.abs(position - self._anchor)
         if not travel.max() <= TRAVEL:
             far = np.flatnonzero(travel > 0.5 * TRAVEL)
-            # A faulty joint also moves its lighter neighbours. The weight moves the same joint of both legs equally far, so a
-            # difference between the legs shows the fault.
+            # A faulty joint also moves its lighter neighbours.
+            # The leg weight moves the same joint of both legs equally far, so a difference between the legs shows the fault.
             excess = self._kp * np.abs(travel - np.roll(travel, len(LEG_JOINTS)))
             joint = int(far[np.argmax(excess[far])])
             self._fail(far.tolist())

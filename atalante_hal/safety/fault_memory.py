@@ -181,7 +181,7 @@ class FaultMemory:
             window.latest, window.repeats = event, window.repeats + 1
 
     def window_over(self, cycle: int) -> bool:
-        """Return whether the window of any event is over. Then `log_repeats` must be called.
+        """Return whether the counting window of any event is over, so that `log_repeats` must be called.
 
         Args:
             cycle: number of the current cycle.

@@ -76,11 +76,11 @@ class Heartbeats:
         #: Diagnostic and error code of the active emergency of each node. A cleared emergency is removed.
         self.emergencies: dict[str, tuple[Dtc, int]] = {}
         self._cleared: set[str] = set()  # nodes whose emergency was cleared in this cycle
-        #: Events since the last `evaluate`, as (node, diagnostic, error code): emergencies with the reaction INFO, and frames
-        #: from error passive nodes. The error code in the entry of such a frame is 0.
+        #: Emergencies with the reaction INFO since the last `evaluate`, as (node, diagnostic, error code).
+        #: Also contains an entry with error code 0 for each frame of an error passive node.
         self._notices: list[tuple[str, Dtc, int]] = []
         self._reset: set[str] = set()  # nodes that restarted since the last `evaluate`
-        #: Row -> counter that detects two senders of the message, 0 to `FULL`. A row without an entry has the counter 0.
+        #: For each row of the process image: counter that detects two senders of the message, 0 to `FULL`. Default 0.
         self._evidence: defaultdict[int, int] = defaultdict(int)
         #: Nodes that sent a boot-up message. The safety monitor empties this set after each use.
         self.booted: set[str] = set()

@@ -62,7 +62,7 @@ from atalante_hal.types import Vector
 _COUNT = len(JOINTS)
 #: Number of cycles after which a change of the commanded torque is visible in the measured acceleration.
 DELAY: Final = 3
-#: For each joint of a leg: smallest inertia that a torque on this joint accelerates, while the other joints are free [kg m2].
+#: Smallest inertia that the torque of a joint accelerates while all other joints are free, in leg joint order [kg m2].
 #: Lower bound over all poses of the empty exoskeleton, suspended or floating. A gait does not depend on these values.
 SMALLEST_INERTIA: Final = (0.12, 0.14, 0.17, 0.11, 0.038, 0.038)
 #: Results of `limit`: all torques are unchanged, the torque of at least one joint was reduced, an input is not finite.
@@ -90,7 +90,7 @@ class JointLimits(NamedTuple):
     look_ahead: float  # time for which the position is predicted, at constant velocity [s]
     position_margin: float  # distance outside a position limit at which the torque is zero [rad]
     velocity_margin: float  # speed above `velocity_max` at which the torque is zero [rad/s]
-    inertia: Vector  # (12,) smallest inertia [kg m2]
+    inertia: Vector  # (12,) smallest effective inertia of each joint [kg m2]
     period: float  # duration of a cycle [s]
     filter_lag: float  # delay of the low-pass of the reported velocity [s]
 
@@ -254,7 +254,7 @@ def highest_torque(room: float, acceleration: float, oldest: float, inertia: flo
     known = max(oldest, 0.0)
     if acceleration * (delay + known * fall) > room:
         return max((room / acceleration - delay) / fall, 0.0)
-    # Positive root of fall u^2 + (delay + free fall) u + free delay - inertia room = 0.
+    # U is the positive root u of  fall * u^2 + (delay + free * fall) * u + free * delay - inertia * room = 0.
     free = inertia * acceleration - oldest
     root = math.sqrt((delay - free * fall) ** 2 + 4.0 * fall * inertia * room)
     return max((root - delay - free * fall) / (2.0 * fall), known)

@@ -36,10 +36,10 @@ from atalante_hal.safety.fault_memory import FaultMemory
 from atalante_hal.wire.e2e import FULL, SETTLED, Check, Qualification, qualify, suspect
 from atalante_hal.wire.process_image import NEVER, ReceiveImage
 
-#: Check result of a rejected message -> diagnostic that becomes pending.
+#: Result of the E2E check of a rejected message -> diagnostic that becomes pending.
 PENDING = {
     Check.REPEATED: Dtc.E2E_REPEATED,
-    Check.CONFLICT: Dtc.E2E_REPEATED,  # if only one frame of the message arrived in the cycle; otherwise see `rivals_of`
+    Check.CONFLICT: Dtc.E2E_REPEATED,  # for a single frame of the message in a cycle; for several frames see `rivals_of`
     Check.WRONG_SEQUENCE: Dtc.E2E_SEQUENCE,
     Check.CRC: Dtc.E2E_CRC,
     Check.LENGTH: Dtc.FRAME_LENGTH,
@@ -60,8 +60,8 @@ _RIVAL = (Check.CONFLICT, Check.WRONG_SEQUENCE)
 #: Check results of rejected frames with correct format and CRC.
 _INTACT = (*_RIVAL, Check.RANGE, Check.INVALID)
 _FRESH = int(Check.SOME_LOST)
-#: Check result of a rejected frame -> diagnostic. Single rejected frames are tolerated: the diagnostic is raised when a
-#: leaky bucket is full. An INVALID frame of an IMU raises another diagnostic, see `MessageMonitor`.
+#: Result of the E2E check of a rejected frame -> diagnostic that is raised when the leaky bucket of the result is full.
+#: An INVALID frame of an IMU raises another diagnostic, see `MessageMonitor`.
 _DISTURBANCES = {
     Check.REPEATED: Dtc.E2E_REPEAT_RATE,
     Check.RANGE: Dtc.SIGNAL_RANGE,
@@ -238,7 +238,7 @@ def rivals_of(refused: Sequence[tuple[int, Check]], checks: Sequence[int]) -> fr
     """
     intact = Counter(row for row, result in refused if result in _INTACT)
     for row in intact:
-        intact[row] += checks[row] <= _FRESH or checks[row] == Check.IMPLAUSIBLE  # count the accepted frame of the row
+        intact[row] += checks[row] <= _FRESH or checks[row] == Check.IMPLAUSIBLE  # the accepted frame also counts
     return frozenset(row for row, result in refused if result in _RIVAL and intact[row] > 1)
 
 

@@ -33,11 +33,11 @@ from atalante_hal.wire.e2e import SETTLED, Check, Qualification, qualify
 from atalante_hal.wire.frame import Frames
 from atalante_hal.wire.process_image import ReceiveImage
 
-#: Maximum duration of FINISH_STEP [cycles]; longer than the rest of a walking step, a stop step and the shift of the weight back.
+#: Maximum duration of FINISH_STEP [cycles]. The rest of a step, a stop step and the weight shift back take less time.
 FINISH_STEP_CYCLES = 6000
 
-#: Time after which the drive state shows a QUICK_STOP, or the command was lost [cycles].
-#: The answer takes two cycles, and the frames may be late by four.
+#: If a drive has not reported QUICK STOP this time after the command QUICK_STOP [cycles], the command was lost.
+#: The answer to a command takes two cycles, and frames may be late by four cycles.
 RECALL_CYCLES = 6
 
 #: DBC names of the drives, in joint order.
@@ -112,15 +112,15 @@ class SafetyMonitor:
         self.enabling = False
         self.recalled = -RECALL_CYCLES
         self.proof = DirectionProof(robot)
-        self._proof_begun = False  # True if the proof has begun in this start
-        self._stalled = 0  # number of cycles of this start since a drive last changed its state
-        self._states_at_start = b""  # drive states of the last cycle of this start
+        self._proof_begun = False  # True if the test of the joint directions has begun in this start
+        self._stalled = 0  # number of cycles during this start in which no drive has changed its state
+        self._states_at_start = b""  # drive states in the previous cycle of this start
         self.lowered: set[str] = set()
         #: True if `evaluate` may skip a cycle that has new data, no fault and the same pendant and drive values as before.
         self._steady = False
         self._reports: list[Finding] = []  # faults that loop and controller reported since the last `evaluate`
         self._acknowledged = False  # True if START was pressed in this cycle
-        #: Leaky bucket of each drive that is far weaker than the same drive of the other leg; no entry: the bucket is empty.
+        #: Leaky bucket of each drive with a far lower torque limit than the same drive of the other leg; no entry: empty bucket.
         self._weak: dict[str, Qualification] = {}
         self._ending = False
         self._duplicate_found = False  # True if another HAL was detected while this HAL was in OFF or READY
@@ -254,8 +254,7 @@ class SafetyMonitor:
         if after is not before:
             self._enter(before, after, reasons)
         elif reasons and (after is _S.OFF or Dtc.BUS_DOWN in reasons):
-            # The supervisor state does not change, but its reason does. Example: an interface was down and has now been
-            # removed.
+            # The supervisor state remains, but its reason changes, for example from "interface down" to "interface removed".
             self.reason = memory.text_of(reasons)
         self._update_assistance()
         self._update_lowered()
@@ -284,7 +283,7 @@ class SafetyMonitor:
             return
         for node, drive in zip(DRIVE_NODES, state.drive_state.tolist(), strict=True):
             if drive in _FAULTY:
-                # If the drive sent an emergency, the reaction depends on the emergency and not on the drive state.
+                # If a drive has sent an emergency, only the emergency determines the reaction.
                 if not self._heartbeats.has_emergency(node) and (nodes_ready or state.supervisor is not _S.OFF):
                     memory.raise_dtc(state.cycle, Dtc.DRIVE_FAULT, node, value=drive)
             elif drive != DriveState.OPERATION_ENABLED and self.moving:
@@ -330,7 +329,7 @@ class SafetyMonitor:
             }
             self._heartbeats.acknowledge(faulty)
             self._acknowledged = True
-            if not self.proof.running:  # a further press of START does not restart the test of the directions
+            if not self.proof.running:  # another press of START does not restart a running direction test
                 self._proof_begun = False
                 self.proof.failed.clear()
             self.start_wanted = ENABLE_CYCLES if state.supervisor in _STARTABLE else 0
@@ -346,7 +345,7 @@ class SafetyMonitor:
             self._end_start(ended)
 
     def _all_enabled(self) -> bool:
-        """Return whether all drives are in OPERATION ENABLED, and none may have missed a recent QUICK_STOP."""
+        """Return whether all drives are in OPERATION ENABLED, and no recent QUICK_STOP can still change their state."""
         state = self._state
         return state.drive_state.tobytes() == _ENABLED and state.cycle - self.recalled >= RECALL_CYCLES
 
@@ -362,7 +361,7 @@ class SafetyMonitor:
             return None
         self._stalled = 0
         if not self._proof_begun:
-            if not self.enabling:  # the HAL sends the torques that the drives report for one cycle
+            if not self.enabling:  # for one cycle, the HAL first sends each drive the torque that the drive reports
                 return None
             self._proof_begun = True
             proof.begin(state.position, self._limiter.last)
@@ -419,10 +418,10 @@ class SafetyMonitor:
             memory.raise_dtc(state.cycle, Dtc.OPERATOR_STOP, "PENDANT", text=text)
         if reasons:
             self.reason = memory.text_of(reasons) or self.reason
-        elif before is not _S.FINISH_STEP:  # FINISH_STEP and the HOLD that follows have the same reason
+        elif before is not _S.FINISH_STEP:  # the HOLD after FINISH_STEP keeps the reason of FINISH_STEP
             self.reason = entry_text(after, self.missing())
         if after is _S.ACTIVE and before not in MOVING:
-            # End all windows, so that the reason for the next HOLD is logged as a new event.
+            # End all counting windows of events, so that the reason for the next HOLD is logged as a new event.
             memory.log_repeats(state.cycle, final=True)
         if after is _S.ACTIVE and before not in MOVING and not self.enabling:
             self._limiter.restart(state.torque)
@@ -451,7 +450,7 @@ class SafetyMonitor:
             state.assistance_factor = target
 
     def _update_lowered(self) -> None:
-        """Set `lowered`: in LOWER and FAULT, add the drives with a confirmed LOWER diagnostic.
+        """Update the set `lowered`: in LOWER and FAULT, add each drive with a confirmed diagnostic whose reaction is LOWER.
 
         In all other states, `lowered` contains the drives of the joints that failed in the last test of the directions.
         """

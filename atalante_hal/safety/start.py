@@ -55,7 +55,7 @@ class StartRequest(NamedTuple):
 
     supervisor: SupervisorState  # state of the state machine
     pressed: bool  # True in the cycle in which START is pressed, False in the later cycles of this start
-    cycles_left: int  # remaining cycles until all drives must be enabled
+    cycles_left: int  # number of cycles left until all drives must be enabled
     stalled: int  # number of cycles since a drive last changed its state
     ending: bool  # True if the program is ending
     stop_requested: bool  # True if the operator requests STOP or HOLD
@@ -119,7 +119,7 @@ def _failure(request: StartRequest) -> str:
 
 
 def _not_enabled(drive_state: Vector) -> str:
-    """Return a text that names the drives for which the other drives wait, see `words_towards_operation`.
+    """Return a text that names the drives that are not enabled and hold up the start, see `words_towards_operation`.
 
     Args:
         drive_state: values of `DriveState`, shape (12,).

@@ -188,7 +188,7 @@ def main() -> int:
     _import_outlets()
     text = sys.stdin.read()
     if not text:
-        return 0  # the session ended before its start
+        return 0  # the control loop ended before it sent the configuration
     arguments = json.loads(text)
     fds: dict[str, int] = arguments["rings"]
     config = TelemetryConfig.from_json(arguments["config"])

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-# Keys of a telemetry file. The value of a key in _TEXTS is a text, in _FILES a path relative to the telemetry file.
+# Keys of a telemetry file. _TEXTS: the value is a text. _FILES: the value is a path relative to the telemetry file.
 _TEXTS, _FILES = ("robot", "listen"), ("certificate", "private_key", "client_ca", "users")
 
 

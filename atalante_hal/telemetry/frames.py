@@ -17,8 +17,8 @@ from atalante_hal.telemetry.ring import RingWriter
 from atalante_hal.wire.frame import FRAME, FRAME_BYTES, Frames
 
 FRAMES_PER_RECORD = 64
-#: Record of the ring. Its first `count` frames are used. The time of a frame is `base_ns` plus its stamp [ns].
-#: `sent` is 1 for a sent frame and 0 for a received frame.
+#: Record of the ring with CAN frames. Its first `count` frames are used. The time of a frame is `base_ns` plus its stamp [ns].
+#: The flag `sent` is 1 for a frame that the HAL sent and 0 for a received frame.
 FRAME_RECORD = np.dtype(
     [
         ("count", "<i8"),

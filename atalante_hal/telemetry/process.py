@@ -46,8 +46,8 @@ _KILLED = 0.1
 _SESSION_END = 2.0
 #: Time limit for a subprocess that `tend` restarted to become ready [s].
 _RESTART = 30.0
-#: Time limit for the first subprocess to become ready, which may happen during a run [s]. If it takes longer, it is ended, and
-#: `tend` starts another subprocess.
+#: Time limit for the first subprocess to become ready, possibly during a run [s].
+#: After this time the subprocess is ended, and `tend` starts another subprocess.
 _JOIN = 60.0
 
 
@@ -72,8 +72,8 @@ class TelemetryConfig:
     record_rate: int = 100  # Hz in robot time, recording rate of each stream; 1000: every cycle
     can_log: Path | None = None  # log file of all CAN frames; the file suffix determines the format; None for no log
     lock_step: bool = False  # True: virtual time, and the loop waits for recorder and CAN log
-    #: capacity of the ring of cycle records and of the ring of CAN frames [records]. The first ring gets one record per cycle,
-    #: the second ring gets fewer on average.
+    #: Capacity of the ring of cycle records and of the ring of CAN frames [records].
+    #: The ring of cycle records gets one record per cycle, the ring of CAN frames gets fewer on average.
     slots: int = 1024
     patience: float = 5.0  # s, longest wait of the loop for the recorder or the CAN log in lock-step
     certificate: Path | None = None  # TLS certificate, see `access.Access`
@@ -190,7 +190,7 @@ class TelemetryProcess(Closing):
         self._recordings: list[str] = []  # names of the files begun so far
         self._last_endpoint: str | None = None  # last endpoint in use; None before the first endpoint was opened
         self._restarting: threading.Thread | None = None  # thread that starts or restarts the subprocess
-        self._progress = (0, 0.0)  # number of records that the subprocess has read, and time of the last change [s]
+        self._progress = (0, 0.0)  # number of records read by the subprocess, and time of its last change [s]
         meta = {
             "layout": layout.to_json(),
             "diagnostics": list(diagnostics),

@@ -74,7 +74,7 @@ class Service:
         self._runs = [Run(0, "", records.meta["start_ns"], 0)]
         self._cycle, self._timestamp = 0, self._runs[0].start_ns  # cycle number and log time [ns] of the last record
         self._lost, self._lost_reported = 0, -math.inf
-        self._recorder, self._saved = recorder, 0  # recorder, and its number of saved messages at the last check
+        self._recorder, self._saved = recorder, 0  # recorder, and number of messages it had saved at the last check
         self._handled = 0  # number of records whose messages have been passed to all sinks
         self._kept = 0  # number of records that the header of the ring reports as saved
         self.notices: list[str] = []  # faults, one sentence each
@@ -104,9 +104,9 @@ class Service:
             self._mark_saved()
 
     def step(self) -> bool:
-        """Process the new contents of the rings, and return whether a ring had any."""
-        # The loop writes the note of a run before the events of this run. The events are read before the notes here, so the
-        # note that belongs to an event is already in the ring.
+        """Process all new records and events of the rings, and return whether there were any."""
+        # The control loop writes the note of a run before the events of this run.
+        # The events are read before the notes, so the note of the run of each event is already in the ring.
         events = [unpack(bytes(event)) for event in self._events.read()]
         records = self._records.read()
         first = self._records.position - len(records)

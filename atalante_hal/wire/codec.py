@@ -20,19 +20,19 @@ from atalante_hal.wire.frame import FLAG_BRS, FLAG_FDF, WORDS, Frames, new_frame
 
 Words = npt.NDArray[np.int64]
 
-# Row indices of the decoding plan. WORD, SHIFT and MASK give the bits of the signal. LARGEST is the largest code that these bits
-# can have. LOW and HIGH are the limits of the DBC range. INVALID is the invalid code.
+# Row indices of the decoding plan. WORD, SHIFT and MASK locate the bits of a signal. LARGEST is the largest code of these bits.
+# LOW and HIGH are the limits of the signal's range in the DBC. INVALID is the code that marks an invalid value.
 WORD, SHIFT, MASK, LARGEST, LOW, HIGH, INVALID = range(7)
-#: Row indices of the scales, for the formula value = (code + base) * factor + offset.
+#: Row indices of the scales in the formula  physical value = (raw code + base) * factor + offset.
 BASE, FACTOR, OFFSET = range(3)
-#: In `plan[INVALID, i]`: signal i has no invalid code. As the result of `encode`: all values were encoded.
+#: Value of `plan[INVALID, i]` if signal i has no invalid code. Also the result of `encode` if all values were encoded.
 NO_CODE = -1
 # Results of `read_row`. INSIDE: all signals are in range. OUTSIDE: a signal is out of range, and none has its invalid code.
 # MARKED_INVALID: a signal is out of range, and a signal has its invalid code.
 INSIDE, OUTSIDE, MARKED_INVALID = range(3)
-#: A float64 is rounded to an integer if this number is added and then subtracted.
+#: Adding and then subtracting this number rounds a float64 to an integer.
 _ROUND = 1.5 * 2.0**52
-_LONGEST = 51  # largest signal length that `_ROUND` supports [bits]
+_LONGEST = 51  # largest signal length that rounding with `_ROUND` supports [bits]
 
 
 class SignalTable(NamedTuple):

@@ -145,7 +145,7 @@ _OK, _SOME_LOST, _REPEATED, _WRONG_SEQUENCE = map(
 
 
 def classify_counter(expected: int, received: int) -> int:
-    """Compare an alive counter with the expected counter. This is the variant of `check_counter` for compiled code.
+    """Compare an alive counter with the expected counter; variant of `check_counter` for compiled code.
 
     Args:
         expected: last accepted counter plus 1, modulo 256, or `NOTHING`.
@@ -172,7 +172,7 @@ def check_counter(last: int | None, received: int) -> Check:
     return Check(classify_counter(NOTHING if last is None else last + 1 & 0xFF, received))
 
 
-# Each message has an error counter (leaky bucket), which rises in cycles without good data and falls in cycles with good data.
+# The error counter (leaky bucket) of a message rises in a cycle without good data and falls in a cycle with good data.
 #: Increase of the error counter in a bad cycle.
 BAD_CYCLE = 4
 #: Decrease of the error counter in a good cycle. The counter rises on average if more than a fifth of the frames are lost.
@@ -181,8 +181,7 @@ GOOD_CYCLE = 1
 FULL = 64
 #: Number of consecutive good cycles after which a message is trusted. Until then the inputs of a pendant are ignored.
 REQUALIFY = 16
-#: Increase of the counter that detects two senders (see `suspect`), if a cycle has frames of two senders. Four such cycles reach
-#: `FULL`.
+#: Increase of the counter that detects two senders (see `suspect`) in a cycle with frames of two senders; a quarter of `FULL`.
 RIVAL_CYCLE = 16
 
 
@@ -194,7 +193,7 @@ class Qualification(NamedTuple):
     trusted: bool = False  # True if the values of the message may be used
 
 
-#: Best qualification: the message is trusted and its error counter is 0. A good cycle does not change this.
+#: Qualification of a message that is trusted and has the error counter 0. A good cycle does not change this qualification.
 SETTLED = Qualification(0, REQUALIFY, True)
 
 
@@ -218,7 +217,7 @@ def qualify(before: Qualification, *, good: bool, timed_out: bool = False) -> Qu
 
 
 def suspect(evidence: int, *, rival: bool) -> int:
-    """Compute the counter that detects two senders of one message, at the end of a cycle.
+    """Return the new value of the counter that detects two senders of one message, at the end of a cycle.
 
     Args:
         evidence: counter after the previous cycle, 0 to `FULL`.

@@ -53,13 +53,13 @@ from atalante_hal.wire.frame import (
 
 #: Flags of a CAN FD frame whose sender is error passive.
 _PASSIVE = FLAG_ESI | FLAG_FDF
-#: Value of the argument `tag` if each sender increments its own alive counter instead of sending the cycle number.
+#: Value of the argument `tag` for nodes whose alive counter is their own count and not the cycle number.
 _NO_TAG = -1
 #: Values of `Check` as plain integers. A value of at most `_FRESH` means new, usable data.
 _FRESH = _SOME_LOST = int(Check.SOME_LOST)
 _REPEATED, _CONFLICT, _WRONG_SEQUENCE = int(Check.REPEATED), int(Check.CONFLICT), int(Check.WRONG_SEQUENCE)
 _CRC, _LENGTH, _RANGE, _INVALID = int(Check.CRC), int(Check.LENGTH), int(Check.RANGE), int(Check.INVALID)
-#: Values of `Check` for frames without new values: damaged frames and repeats of the accepted frame.
+#: Check results of frames that contain no new values: damaged frames and repeats of the accepted frame.
 _NO_NEW_VALUES = frozenset({Check.CRC, Check.LENGTH, Check.REPEATED})
 #: Row number of a frame whose message is not in this process image.
 _FOREIGN = -1
@@ -67,8 +67,8 @@ _FOREIGN = -1
 NEVER = 1 << 30
 #: Lowest age at which an answer to a SYNC is rejected as replayed [cycles].
 LATEST = 16
-#: Half the period of the alive counter. A frame whose counter is ahead of the expected counter by this number or more is
-#: regarded as old, except after a long gap.
+#: Half the period of the alive counter.
+#: A frame whose counter is ahead of the expected counter by this number or more is regarded as old, except after a long gap.
 _HALF_TURN = 128
 
 
@@ -510,7 +510,7 @@ class TransmitImage:
         rows = len(self.codec.messages)
         self._counters: Words = np.zeros(rows, np.int64)
         self._singles = [self.frames[row : row + 1] for row in range(rows)]
-        # `specialised` calls each function once. These calls leave every counter at 0xFF, so the first frame has counter 0.
+        # `specialised` calls each function once, which leaves every alive counter at 0xFF. So the first sent frame has counter 0.
         self._protect = specialised(protect, self._octets, self._spans, self._counters)
         self._seal = specialised(seal, self.values, self.codec.table, self._words, self._spans, self._counters, 0xFF)
 

@@ -44,7 +44,7 @@ _ALL = b"\1" * len(JOINTS)
 
 
 class Lost(NamedTuple):
-    """Record of an encoder that jumped. Positions are on the motor side."""
+    """Data of an encoder whose reading jumped. All positions are on the motor side."""
 
     last: float  # newest received position [rad]
     cycles: int  # time from the encoder's last good position until `last` was received [cycles]
@@ -55,7 +55,7 @@ class Motion(NamedTuple):
     """Motor positions and velocities that the low-pass reads, shape (12,) each."""
 
     position: Vector  # new positions [rad]
-    before: Vector  # positions of the cycle before [rad]
+    before: Vector  # positions of the previous cycle [rad]
     velocity: Vector  # reported velocities [rad/s]
 
 
@@ -96,7 +96,7 @@ class EncoderChecks:
         self._speed = np.zeros(len(JOINTS))  # mean velocity of each encoder between its last two good positions [rad/s]
         self._earlier = np.zeros(len(JOINTS))  # `_deviation` at the last velocity check [rad/s]
         self._no_age = np.zeros(len(JOINTS), np.int64)
-        self._earlier_age: Cycles = np.full(len(JOINTS), NEVER)  # age of the joint values at the last velocity check
+        self._earlier_age: Cycles = np.full(len(JOINTS), NEVER)  # age of the values at the last velocity check [cycles]
         self._twice_allowed = 2.0 * robot.sensors.velocity_error * robot.gear
         self._wrong = [0] * len(JOINTS)
         self._wrong_findings: tuple[Finding, ...] = ()
@@ -308,7 +308,7 @@ def continues(mean: float, speed: float, top_speed: float) -> bool:
 
 
 def followed(lost: Lost, now: float, cycles: int, travel: float, noise: float) -> Lost:
-    """Return the updated record of an encoder that jumped.
+    """Return the updated `Lost` record of an encoder whose reading jumped.
 
     A change that is small enough to be motion of the joint is added to the expected position.
 

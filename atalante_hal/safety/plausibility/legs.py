@@ -42,11 +42,10 @@ from atalante_hal.wire.process_image import NEVER
 DRIFT_SAMPLES = 4
 #: Number of consecutive samples after which a stuck encoder is reported.
 STANDSTILL_SAMPLES = 2
-#: Drift of the IMUs that the standstill check tolerates per sample [rad]. IMUs without a fault drift by less than a tenth of
-#: this limit.
+#: Largest drift of the IMUs per sample that the standstill check tolerates [rad]; more than 10 times the drift without a fault.
 _IMU_DRIFT = 2e-5
-#: Largest change per sample of the estimated heading drift between pelvis IMU and tibia IMU [rad]. A leg is sampled every 32
-#: cycles, so this is 3e-4 rad/s.
+#: Largest change per sample of the estimated heading drift between pelvis IMU and tibia IMU [rad].
+#: A leg is sampled every 32 cycles, so this change is 3e-4 rad/s.
 _HEADING_DRIFT = 1e-5
 _PELVIS = IMUS.index("pelvis")
 _TIBIAE = tuple(IMUS.index(f"{side}_tibia") for side in SIDES)
@@ -63,7 +62,7 @@ class _Comparison(NamedTuple):
 
     angles: tuple[float, float, float]  # the three angles FH, TH and SH + SK from the IMUs [rad]
     errors: tuple[float, float, float]  # encoder angles minus `angles` [rad]
-    uncertainty: float = 0.0  # uncertainty of `errors` if the values are from different cycles [rad]
+    uncertainty: float = 0.0  # allowance on `errors` for encoder and IMU values of different cycles [rad]
 
 
 class Legs:
@@ -86,7 +85,7 @@ class Legs:
         self._heading = [0.0 for _ in SIDES]
         self._contradicts = [[0] * len(_AXES) for _ in SIDES]
         self._constant_samples = [constant_samples[hip : hip + len(_AXIS_OF)] for hip in _HIPS]
-        #: For each joint: comparison of its leg in the newest sample in which the encoder reading of the joint changed.
+        #: For each joint: comparison of encoders and IMUs in the last sample in which the encoder reading of this joint changed.
         self._moved: list[_Comparison | None] = [None] * len(JOINTS)
         #: Number of consecutive samples in which the leg turned but the encoder reading was constant, by joint index.
         self._turned: dict[int, int] = {}
@@ -230,7 +229,7 @@ def extrapolated(quaternion: list[float], gyro: list[float], time: float) -> lis
 
 
 def _follow_imu_drift(moved: _Comparison, axis: int, change: float) -> _Comparison:
-    """Return a copy of `moved` in which `change`, limited to +-`_IMU_DRIFT`, is added to the error about one axis."""
+    """Return a copy of `moved` with `change` added to the error about one axis; `change` is limited to +-`_IMU_DRIFT`."""
     errors = list(moved.errors)
     errors[axis] += max(-_IMU_DRIFT, min(_IMU_DRIFT, change))
     return moved._replace(errors=(errors[0], errors[1], errors[2]))

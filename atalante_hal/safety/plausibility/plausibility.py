@@ -66,8 +66,7 @@ class Plausibility:
         self._foot_ages = [NEVER] * len(self._rows.foot)  # age of the values of each foot at its last check [cycles]
         #: Cycle in which the last good values of each row were measured. Updated only while `_settled` is False.
         self._measured = dict.fromkeys((*self._joint_rows, *self._imu_rows), -NEVER)
-        #: Measured force of each faulty cell, by (foot, cell), shape (3,) [N]. The process image contains 0 instead of this
-        #: force.
+        #: Measured force of each faulty cell, by (foot, cell), shape (3,) [N]. In the process image, this force is set to 0.
         self._measured_forces: dict[tuple[int, int], Vector] = {}
         self._settled = False  # True if the last values of all rows were good and new
         self._turns = self._build_turns()

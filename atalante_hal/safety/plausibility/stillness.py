@@ -52,8 +52,7 @@ _TURN = 0.01
 _INERTIA = 100.0
 #: Number of cycles with a constant reading after which a joint is at rest, because an unbalanced torque would have moved it.
 _AT_REST = 3
-#: Angle that a joint with the inertia `_INERTIA` cannot turn without changing its encoder reading [rad]; 20 counts of a motor
-#: encoder.
+#: If a joint with the inertia `_INERTIA` turns by this angle [rad], its encoder reading must change. 20 motor encoder counts.
 _DRIVEN = 1e-5
 #: A joint closer to a position limit than this distance is regarded as being at its end stop [rad].
 _AT_STOP = 0.005
@@ -61,7 +60,7 @@ _NEVER = 1 << 30
 #: Indices of the ankles in JOINTS, and for each ankle the index of its foot in FEET and of its shank IMU in IMUS.
 _ANKLES = [JOINTS.index(f"{side}_{joint}") for side in SIDES for joint in ("SA", "HA")]
 _FOOT_OF = [0, 0, 1, 1]
-#: For each joint: index of the foot that holds it on the ground, -1 for a joint above the ankles.
+#: For each joint: index in FEET of the foot that stops its motion when the foot is on the ground; -1 for joints above the ankle.
 _HELD_BY = tuple(_FOOT_OF[_ANKLES.index(joint)] if joint in _ANKLES else -1 for joint in range(len(JOINTS)))
 _SHANK_OF = [IMUS.index(f"{side}_tibia") for side in SIDES for _ in ("SA", "HA")]
 
@@ -82,7 +81,7 @@ class Drive(NamedTuple):
     """
 
     cycles: Vector  # cycles with a constant reading
-    rest: Vector  # newest torque of the first `_AT_REST` of these cycles, with which the joint came to rest [Nm]
+    rest: Vector  # torque with which the joint came to rest [Nm]: the last torque of the first `_AT_REST` cycles
     low: Vector  # lowest torque [Nm]
     high: Vector  # highest torque [Nm]
     momentum: Vector  # angular momentum that the torque would cause [Nm s]
@@ -115,8 +114,8 @@ class Stillness:
         self._sampled = np.full(size, np.nan)
         self._same = np.empty(size, np.bool_)
         self._repeats = np.full(size, 0)
-        # Limits as numbers of samples. `every` - 1 cycles are subtracted, because the first sample of a standstill may be
-        # late by this time.
+        # Convert the limits from cycles to numbers of samples.
+        # The first sample of a standstill may be late by `every` - 1 cycles, so these cycles are subtracted.
         limit = np.full(size, _NEVER)
         limit[codec.slice("Position")] = self._to_stuck = (STUCK_CYCLES - every + 1) // every
         limit[codec.slice("Gyro")] = limit[codec.slice("Force")] = to_freeze = (FROZEN_CYCLES - every + 1) // every
@@ -130,7 +129,7 @@ class Stillness:
         )
         self._encoders_same, self._no_encoder = self._same[codec.slice("Position")], bytes(len(JOINTS))
         self._breakaway = robot.breakaway
-        self._loaded = 2.0 * robot.sensors.cell_free  # vertical force on a foot on the ground [N]
+        self._loaded = 2.0 * robot.sensors.cell_free  # a foot with more than this vertical force is on the ground [N]
         self._interval = every * period
         self._drive = Drive(*np.zeros((6, len(JOINTS))))
         #: Joints with a constant encoder reading despite a large torque, see the module docstring.
@@ -314,7 +313,7 @@ def follow_one(joint: int, readings: Readings, drive: Drive, breakaway: float, l
 
 
 def release(drive: Drive, joint: int) -> None:
-    """Clear the `Drive` record of a joint whose encoder reading has changed, or which the ground holds.
+    """Clear the `Drive` record of a joint whose encoder reading has changed, or whose foot is on the ground.
 
     Args:
         drive: record of all joints. Updated here.

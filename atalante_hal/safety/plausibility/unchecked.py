@@ -20,8 +20,8 @@ from atalante_hal.safety.plausibility.finding import FOOT_NODES, JOINT_NODES, Cy
 from atalante_hal.wire.e2e import Check
 from atalante_hal.wire.process_image import NEVER
 
-#: Time for which a check may lack usable data [cycles]. After this time its diagnostic is confirmed. The slowest check needs
-#: this time to detect a fault.
+#: Time for which a check may lack usable data before its diagnostic is confirmed [cycles].
+#: The slowest check needs the same time to detect a fault.
 UNCHECKED_CYCLES = 128
 #: Number of encoders per leg that are compared with the IMUs.
 _COMPARED = 4
