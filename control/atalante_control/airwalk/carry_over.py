@@ -46,7 +46,7 @@ class CarryOver:
 
     @property
     def pending(self) -> bool:
-        """Return whether a carry-over has started, and the first torque after the stance change is not computed yet."""
+        """Return whether a carry-over has started but the first torque after the stance change is not computed yet."""
         return bool(self.records[0].pending)
 
     def start(self, before: Vector) -> None:
@@ -59,7 +59,7 @@ class CarryOver:
         carry.before[:], carry.pending = before, True
 
     def cancel(self) -> None:
-        """Cancel a carry-over of the torque for which the torque jump has not been computed yet."""
+        """Cancel the carry-over of the torque if its torque jump has not been computed yet."""
         self.records[0].pending = False
 
 

@@ -19,7 +19,7 @@ class AirwalkConfig(StepGuideConfig):
     """
 
     #: True: the torques of the assisted joints and of the baseline controller follow the paper literally, see `guide.literal`.
-    #: Then no guide is certified for a disturbance torque.
+    #: If True, no guide is certified for a disturbance torque.
     literal_law: bool = False
     gains: PidGains = AIR_GAINS
     alpha: float = 0.4  # end of the re-centring, as a fraction of the step duration
@@ -45,11 +45,11 @@ class AirwalkConfig(StepGuideConfig):
         each departure.
         """
         return cls(
-            # In the paper, each assisted joint has a separate control law, the backup torque u_b uses the gains of the PID, and
-            # the baseline controller adds no gravity torque.
+            # In the paper, each assisted joint has a separate control law, and the backup torque u_b uses the gains of the PID.
+            # The baseline controller of the paper adds no gravity torque.
             literal_law=True,
             gains=replace(AIR_GAINS, integral_limit=math.inf),
             feedforward=0.0,  # the paper used no feedforward in its experiment in the air
-            gentler=(),  # the filter has no softer sets of gains to choose from
+            gentler=(),  # the guide filter has only the stiffest set of gains
             blend=0.0,  # torque jumps at stance changes are not compensated
         )

@@ -51,11 +51,12 @@ class GaitReference:
         time: Vector = np.arange(gait.cycles + 1, dtype=np.float64) * PERIOD
         (c0, c1), (c0d, c1d), _ = deadbeat.basis(time)
         end = self._end = int(np.searchsorted(time, deadbeat.end))
-        self._basis = np.zeros((2, end, 2 * _N))  # (s, s') of each cycle for s(0) = 1 rad, then for s'(0) = 1 rad/s
+        #: Re-centring (s, s') of each cycle: element 0 for s(0) = 1 rad, element 1 for s'(0) = 1 rad/s.
+        self._basis = np.zeros((2, end, 2 * _N))
         self._basis[0, :, :_N], self._basis[0, :, _N:] = c0[:end, None], c0d[:end, None]
         self._basis[1, :, :_N], self._basis[1, :, _N:] = c1[:end, None], c1d[:end, None]
         self._added = np.zeros_like(self._basis)
-        # s(0) and s'(0) are stored twice: once for the added angles and once for the added speeds.
+        # Each array contains its deviations twice: once for the added angles s and once for the added speeds s'.
         self._angles, self._rates = np.zeros(2 * _N), np.zeros(2 * _N)
 
     def start_step(self, stance: int, position: Vector, velocity: Vector) -> Deviation:
@@ -98,9 +99,9 @@ class StartMotion:
             it would exceed `SPEED_SHARE` of its velocity limit.
     """
 
-    #: Largest speed from the distance to the first pose, as a share of the velocity limit of the joint.
+    #: Largest speed with which a joint covers the distance to the first pose, as a share of its velocity limit.
     SPEED_SHARE = 0.5
-    #: Largest value of the derivative of 10 x^3 - 15 x^4 + 6 x^5 for x from 0 to 1.
+    #: Largest slope of the quintic 10 x^3 - 15 x^4 + 6 x^5 for x from 0 to 1.
     _STEEPEST = 1.875
 
     def __init__(self, first: Vector, duration: float, velocity_max: Vector) -> None:

@@ -19,7 +19,7 @@ class Telemetry:
 
     q_des: Annotated[Vector, len(JOINTS)]  # rad
     error: Annotated[Vector, 2]  # rad, q - q_des
-    q_bound: Annotated[Vector, 2]  # rad, distance from q_des to the upper bound for error > 0, else to the lower bound
+    q_bound: Annotated[Vector, 2]  # rad, distance from q_des to the guide bound on the side of the error
     guide: Annotated[Vector, 2]  # rad, distances from q_des to the upper and to the lower bound of the guide of SH
     #: h of the paper: at least 0 if the backup policy can keep both joints inside; the same value for both joints
     h: Annotated[Vector, 2]

@@ -32,11 +32,11 @@ from atalante_hal.types import Vector
 Pair = tuple[float, float]
 
 #: Number of elements of the state x: five quantities, each with an element for SH and then an element for SK.
-#: 1. tracking error e [rad]
-#: 2. true rate e' [rad/s]
-#: 3. measured rate e', after the low-pass of the drives [rad/s]
-#: 4. acceleration e'' that the present motor torque causes [rad/s2]
-#: 5. acceleration e'' that the torque of the last command will cause [rad/s2]
+#: 1. Tracking error e = q - q_des [rad].
+#: 2. True error rate e' [rad/s].
+#: 3. Measured error rate e', after the low-pass of the drives [rad/s].
+#: 4. Error acceleration e'' that the current motor torque causes [rad/s2].
+#: 5. Error acceleration e'' that the torque of the last command will cause [rad/s2].
 STATES = 10
 
 
@@ -88,8 +88,8 @@ class BackupPolicy:
 
     stiffness: Pair  # Nm/rad, k of SH and SK
     damping: Pair  # damping ratios of the heavy and of the light mode
-    #: kg m2, M11, M12 and M22 at the reference knee angle. At this angle the joint stiffness equals `stiffness`. At other angles
-    #: the joint stiffness differs from `stiffness`, because the mass matrix changes and the gains do not.
+    #: kg m2, mass matrix elements M11, M12 and M22 at the reference knee angle. There the joint stiffness equals `stiffness`.
+    #: At other angles the joint stiffness differs from `stiffness`, because the mass matrix changes and the gains do not.
     mass: tuple[float, float, float]
 
     def __post_init__(self) -> None:

@@ -65,7 +65,7 @@ class JointTorque:
 class Limit(NamedTuple):
     """Condition that limits the disturbance torques which a guide can promise to tolerate."""
 
-    #: largest promise under this condition, as a fraction of the chosen promised torques; negative if there is none
+    #: largest torques that may be promised under this condition, relative to the chosen promised torques; negative if none
     scale: float
     what: str  # condition in words, for a message
 
@@ -172,7 +172,7 @@ def _pair(torque: Vector) -> JointTorque | None:
 
 
 def _limit(room: Vector, reach: Vector, steps: int, what: str) -> Limit:
-    """Return the largest scale of the promised torques for which their effect and that of model errors fit into `room`.
+    """Return the largest scale of the promised torques with which their effect plus that of the model errors fits into `room`.
 
     Args:
         room: largest permitted effect on SH and SK in each cycle, shape (n, 2).
@@ -205,7 +205,7 @@ class _Horizon:
         beyond = prediction.beyond * SIZES
         self._factor = (beyond * rows[-1]).sum(axis=1) / (rows[-1] ** 2).sum(axis=1)
         remainder = beyond - self._factor[:, None] * rows[-1]
-        #: pairs of earlier cycles, as numbers of cycles ahead, and the weights of the errors in these cycles
+        #: the two predicted cycles (cycles ahead) that give the remainder, and the weights of the errors in these cycles
         self._pairs: list[tuple[tuple[int, int], Vector]] = []
         for near, far in ((0.1, 0.3), (0.25, 0.5), (0.4, 0.7)):
             lags = round(near * self.cycles), round(far * self.cycles)
@@ -231,8 +231,8 @@ class _Horizon:
         found = []
         for lags, weights in self._pairs:
             rooms, promises = (np.hstack(parts) for parts in zip(*map(room, lags), strict=True))
-            # Find the largest scale that satisfies
-            # `factor * (last - scale * last_promise) + (rooms - scale * promises) @ weights <= end - scale * end_promise`.
+            # Find the largest scale that satisfies the following inequality:
+            # factor * (last - scale * last_promise) + (rooms - scale * promises) @ weights <= end - scale * end_promise.
             have = end - self._factor * last - rooms @ weights
             need = end_promise - self._factor * last_promise - promises @ weights
             with np.errstate(divide="ignore"):

@@ -34,8 +34,8 @@ class StepGuideConfig:
     zeta: float = 0.01  # s, gain of lambda_d, which increases the weight of the backup torque while h decreases
     idealization: float = 1.0  # intensity of the joint idealization u_i in [0, 1] while the backup torque has weight 0
     feedforward: float = 1.0  # intensity of the feedforward u_f in [0, 1] while the backup torque has weight 0
-    #: Counter value above which the controller reports that the leg has left a guide with a promise. The counter rises by 1 in
-    #: each cycle with h < 0. It falls by 1, but not below 0, in each other cycle.
+    #: Counter value above which the controller reports that the leg has left a guide with a promise.
+    #: The counter rises by 1 in each cycle with h < 0. In every other cycle the counter falls by 1, but not below 0.
     outside_cycles: int = 150
     active: float = 0.05  # weight of the backup torque above which the filter is considered active
 

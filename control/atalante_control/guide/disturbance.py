@@ -65,8 +65,8 @@ class HandOver:
     deviation: float = math.radians(2.7)  # rad, largest |s(0)| of SH and SK
     rate: float = 0.25  # rad/s, largest |s'(0)| of SH and SK
     torque: Pair = (25.0, 13.0)  # Nm, largest torques of SH and SK that are carried over the stance change
-    #: rad/s2, largest joint acceleration before the stance change. Due to this acceleration, the measured velocity differs from
-    #: the true velocity at the start of the step.
+    #: rad/s2, largest joint acceleration before the stance change.
+    #: Due to this acceleration, the measured velocity differs from the true velocity at the start of the step.
     acceleration: float = 20.0
 
     def __post_init__(self) -> None:
@@ -168,26 +168,25 @@ _SPEED_MARGIN = 1.0
 class Effect(NamedTuple):
     """Effect of a disturbance on two outputs, one of SH and one of SK. An output is an error, a torque or a speed."""
 
-    #: (lags + 1, 2, 2) response to an acceleration that lasts one cycle, for each number of cycles ahead.
+    #: (lags + 1, 2, 2) response to an acceleration that lasts one cycle, 0 to `lags` cycles later.
     pushed: Vector
-    #: (lags + 1, 2, 2) response to an acceleration at the start of a prediction. The measured velocity lags behind the true
-    #: velocity and does not contain the effect of this acceleration yet, so the prediction starts with a wrong velocity.
-    #: Shape (0, 2, 2): this response is left out.
+    #: (lags + 1, 2, 2) response to an acceleration just before a prediction starts; (0, 2, 2) if this response is left out.
+    #: The measured velocity does not contain the effect of this acceleration yet, so the prediction starts with a wrong velocity.
     hidden: Vector
     #: (n, 2, 2) matrix for each cycle of the step. The output is this matrix times the response.
     left: Vector
 
 
 class Grid(NamedTuple):
-    """Start cycles and numbers of cycles ahead for which `spread` computes the largest output."""
+    """Cycles at which predictions start, and numbers of cycles ahead, for which `spread` computes the largest output."""
 
-    starts: int  # number of start cycles: 0 to starts - 1
+    starts: int  # number of start cycles; the start cycles are 0 to starts - 1
     block: int  # number of consecutive start cycles that share one row of the argument `ahead`
     lags: NDArray[np.int64]  # (lags,) numbers of cycles ahead, ascending
 
 
 def spread(effect: Effect, mobilities: Vector, bounds: Vector, grid: Grid, ahead: Vector) -> Vector:
-    """Compute the largest output that disturbances can cause since each start cycle, and since the start of the step.
+    """Compute the largest outputs caused by disturbances that begin at each start cycle or at the start of the step.
 
     The first result is written to `ahead`, the second result is returned. In both results, columns 0 and 1 are the effects of
     the budget on the two outputs, and columns 2 and 3 are the effects of the chosen promise. Each effect is a sum of absolute
@@ -206,7 +205,7 @@ def spread(effect: Effect, mobilities: Vector, bounds: Vector, grid: Grid, ahead
     """
     count, postures = len(bounds), mobilities.shape[1]
     total, added = np.zeros((count, 4)), np.zeros((grid.starts, 4))
-    both = np.zeros((2, 2, 2))  # responses `pushed` and `hidden`, `lag` cycles after the disturbance
+    both = np.zeros((2, 2, 2))  # responses `pushed` and `hidden` of the output, `lag` cycles after the disturbance
     column = 0
     for lag in range(count):
         reported = column < len(grid.lags) and grid.lags[column] == lag

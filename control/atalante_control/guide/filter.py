@@ -130,7 +130,7 @@ class GuideFilter:
         self._tick = specialised(tick, discarded, 0, LegState(*[0.0] * 10))
 
     def start_step(self, xi: float, deviation: Pair, rate: Pair, promise: float = 1.0) -> None:
-        """Start a step: compute the guide from the assistance factor, and the reference from the start deviations.
+        """Start a step: compute the guide from the assistance factor, and the reference from the deviations at the stance change.
 
         Args:
             xi: assistance factor of the whole step.
@@ -179,7 +179,7 @@ class GuideFilter:
         return np.asarray(self.prediction.ahead @ (self.prediction.compress @ self.state))
 
     def uncertainty(self) -> Vector:
-        """Return the largest change of `errors_ahead` by a wrong inertia or delay in the model, shape (n, 2) [rad]."""
+        """Return how much `errors_ahead` can change if inertia or delay of the model are wrong, shape (n, 2) [rad]."""
         x = self.state
         size = np.abs(np.concatenate([x[:2], x[2:4] - x[4:6], x[4:]]))
         return np.repeat(self.prediction.slack @ size, SLACK_CYCLES, axis=0)[: len(self.prediction.ahead)]
@@ -208,7 +208,7 @@ def tail(inverse: Vector) -> Vector:
 
 
 def narrowest(inverse: Vector, cycles: int) -> Vector:
-    """Return 1 / width of the guide at the narrowest place within a number of cycles, for each start cycle.
+    """Return for each cycle the largest 1 / width of the guide within the next `cycles` cycles.
 
     Args:
         inverse: 1 / distance to the guide for each cycle, shape (n, m) [1/rad]; the last row applies to all later cycles.

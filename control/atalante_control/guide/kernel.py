@@ -17,7 +17,7 @@ from atalante_hal.types import Vector
 
 Pair = tuple[float, float]
 
-#: The kernel replaces a share `x = torque / limit` or `x = speed / limit` by `1 - STEEPNESS * (1 - x)`, which is 1 at x = 1, too.
+#: The kernel replaces a ratio x = torque / limit or x = speed / limit by 1 - STEEPNESS * (1 - x), which is 1 at x = 1, too.
 #: The gait alone needs a large part of both limits, so the gate must rise only when torque or speed is near its limit.
 STEEPNESS = 4.0
 #: Number of elements of the compressed state, from which the predicted errors are computed.
@@ -45,7 +45,7 @@ class Guard:
     feedforward: float  # intensity of the feedforward u_f in [0, 1]
     promise: float  # promised torques that the filter assumes in this step, as a fraction of `Assumptions.promise`
     xi: float  # assistance factor of the step
-    fresh: bool  # true before the first cycle of a step
+    fresh: bool  # True until the first cycle of a step is computed
     motor: Annotated[Vector, 2]  # Nm, estimated torques of the motors
     lag: Annotated[Vector, 2]  # rad/s, estimated true velocity minus measured velocity
     state: Annotated[Vector, STATES]  # state of the last cycle, see `backup_policy`
@@ -53,11 +53,11 @@ class Guard:
     magnitude: Annotated[Vector, STATES]
     compression: Annotated[Vector, (COMPRESSED, STATES)]  # matrix from the state to the compressed state
     compressed: Annotated[Vector, COMPRESSED]  # compressed state of the last cycle
-    few_slack: Annotated[Vector, (STATES, 2)]  # largest value of each element of `Few.slack` over all rows
+    few_slack: Annotated[Vector, (STATES, 2)]  # elementwise maximum of `Few.slack` over all numbers of cycles ahead
     h: float  # h of the last cycle; at h >= 0, the backup policy can keep both joints inside the guide
     rate: float  # 1/s, dh/dt
     gate: float  # gate, the weight of the backup torque: `lambda + (1 - lambda) lambda_d`
-    bounds: Annotated[Vector, 4]  # rad, distances from q_des to the guide: upper and lower of SH, upper and lower of SK
+    bounds: Annotated[Vector, 4]  # rad, distances from q_des to the bounds: SH upper, SH lower, SK upper, SK lower
 
 
 class Lag:
@@ -98,28 +98,28 @@ class GuideTables(NamedTuple):
     few: Records[Few]  # (rows,) in ascending order of `Few.lag`
     #: (starts, lags, 4) largest errors of SH and SK due to model errors, then due to the promised torques [rad]
     reach: Vector
-    highest: Vector  # (starts, blocks, 4) largest `reach` in each block of cycles ahead
-    #: (starts, rows, 12) largest effects of disturbances. Columns 0 to 3: torques [Nm] and speeds [rad/s] of SH and SK due to
-    #: model errors. Columns 4 to 7: the same quantities due to the promised torques. Columns 8 to 11: speeds of SH and SK for the
-    #: worst inertia and delay, due to model errors and then due to the chosen promise [rad/s].
+    highest: Vector  # (starts, blocks, 4) maximum of `reach` over each block of cycles ahead [rad]
+    #: (starts, rows, 12) largest effects of disturbances on the torques [Nm] and speeds [rad/s] of SH and SK.
+    #: Columns 0 to 3: torques and speeds due to model errors. Columns 4 to 7: torques and speeds due to the promised torques.
+    #: Columns 8 to 11: speeds with the worst inertia and delay, due to model errors and then due to the promised torques.
     few_reach: Vector
     step: Vector  # (horizon + 1, COLUMNS) values of each cycle of the step; the column numbers are defined below
 
 
-INVERSE = 0  # columns 0 to 3 of `step`: 1 / distance to the upper and lower bound of SH, then of SK [1/rad]
+INVERSE = 0  # columns 0 to 3 of `step`: 1 / distance from q_des to the upper and lower bound of SH, then of SK [1/rad]
 REFERENCE = 4  # columns 4 and 5 of `step`: acceleration of q_des at the time when a command takes effect [rad/s2]
 VELOCITY = 6  # columns 6 and 7 of `step`: velocity of q_des after the low-pass of the drives [rad/s]
 BASE = 8  # columns 8 and 9 of `step`: torque that moves the leg along q_des [Nm]
 MASS = 10  # columns 10 to 12 of `step`: M11, M12 and M22 along q_des [kg m2]
 SPEED = 13  # columns 13 and 14 of `step`: velocity of q_des [rad/s]
-#: Column 15 of `step`: lower bound of the gate. At the start of a step the bound is 1, because the filter then takes over.
+#: Column 15 of `step`: lower bound of the gate. It is 1 at the start of a step, when the filter takes over the joints.
 FLOOR = 15
-#: Columns 16 to 19 of `step`: as columns 0 to 3, for the narrowest guide in the next `TAIL_CYCLES` cycles [1/rad].
+#: Columns 16 to 19 of `step`: maximum of columns 0 to 3 over the next `TAIL_CYCLES` cycles, plus a margin [1/rad].
 TAIL = 16
-#: Columns 20 to 23 of `step`: as columns 0 to 3, for the narrowest guide in `SLACK_CYCLES` cycles from now on [1/rad].
+#: Columns 20 to 23 of `step`: maximum of columns 0 to 3 over `SLACK_CYCLES` cycles from this cycle on [1/rad].
 NEAR = 20
 COLUMNS = 24
-#: The bound in the last predicted cycle is the narrowest guide in this number of cycles after the last predicted cycle.
+#: The last predicted error is compared with the narrowest guide within this number of cycles after the prediction.
 TAIL_CYCLES = 60
 
 
@@ -299,7 +299,7 @@ def _compressed(guard: Guard) -> tuple[float, float, float, float, float]:
 
 
 def bound_blocks(guide: GuideTables, cycle: int, blocks: int) -> int:
-    """Compute `Block.ratio` of each block, and return the number of the block with the largest ratio.
+    """Compute `Block.ratio`, the bound of error / width, of each block, and return the index of the block with the largest ratio.
 
     In a block, a predicted error differs from `Block.middle` times the compressed state y by at most `Block.spread` times abs(y).
     The disturbances add at most `GuideTables.highest`, and no width is below the width in the columns `NEAR`.
@@ -333,7 +333,7 @@ def bound_blocks(guide: GuideTables, cycle: int, blocks: int) -> int:
 
 
 def _few_ratio(guide: GuideTables, cycle: int, least: float) -> float:
-    """Return the larger of the predicted torque / limit and speed / limit, after conversion with the slope `STEEPNESS`.
+    """Return the largest predicted torque / limit or speed / limit x, converted to 1 - STEEPNESS * (1 - x).
 
     Args:
         guide: tables of the guide filter.

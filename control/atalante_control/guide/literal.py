@@ -48,7 +48,7 @@ class Letter:
     idealization: float  # intensity of the joint idealization u_i
     feedforward: float  # intensity of the feedforward u_f
     xi: float  # assistance factor of the step
-    fresh: bool  # true before the first cycle of a step
+    fresh: bool  # True until the first cycle of a step is computed
     h: Annotated[Vector, 2]  # h of the last cycle
 
 
@@ -169,7 +169,7 @@ def _guide_torque(tables: LiteralTables, cycle: int, joint: int, e: float, rate:
 
 
 def _largest_ratio(tables: LiteralTables, cycle: int, joint: int, e: float, rate: float, side: float) -> float:
-    """Return the largest |e| / q_bound from now to the end of the step, under u_b and the constant u_ext = `side * push`."""
+    """Return the largest |e| / q_bound from this cycle to the end of the step, under u_b and a constant u_ext = `side * push`."""
     letter, step = tables.letters[0], tables.step
     kp, kd, inertia = letter.kp[joint], letter.kd[joint], letter.inertia[joint]
     push, worst = side * letter.push[joint], 0.0

@@ -22,7 +22,7 @@ Pair = tuple[float, float]
 
 #: Numbers of cycles ahead at which torque and speed are predicted.
 FEW = np.array([1, 2, 3, 4, 6, 8, 11, 15, 20, 27, 36, 48, 64, 85, 113, 150, 200, 250, 300])
-#: Typical magnitude of each element of the state. These magnitudes are the weights of the elements in `Prediction.compress`.
+#: Typical magnitude of each element of the state, used as its weight in `Prediction.compress`.
 SIZES = np.repeat([0.07, 1.0, 1.0, 140.0, 140.0], 2)
 
 
@@ -38,7 +38,7 @@ class Assumptions:
     #: Smallest and largest number of cycles between a measurement and the torque that is computed from it.
     delays: tuple[int, int] = (1, 2)
     horizon: int = 300  # number of predicted cycles
-    overlap: int = 100  # number of cycles after the end of a step that the tables cover
+    overlap: int = 100  # number of cycles that the tables cover after the end of a step
 
     def __post_init__(self) -> None:
         """Check the ranges of the values.
@@ -53,7 +53,7 @@ class Assumptions:
 
 
 class StartReach(NamedTuple):
-    """Largest effects, in each cycle, of disturbances that act from the start of the step on.
+    """Largest effects, in each cycle of a step, of disturbances that act since the start of the step.
 
     Columns 0 and 1 are the effect of the model errors (`Leg.budget`) on SH and SK. Columns 2 and 3 are the effect of the chosen
     promised torques on SH and SK.
@@ -134,11 +134,10 @@ class Prediction:
         whole = Grid(starts, START_CYCLES, np.arange(horizon + 1))
         few, none = whole._replace(lags=FEW), whole._replace(lags=FEW[:0])
 
-        # `reach` is the maximum over all members of `family`. A joint moves faster if the leg is lighter than in the model, or if
-        # the command arrives later.
+        # `reach` is the maximum over all members of `family`, with different errors of inertia and delay.
+        # A joint moves faster if the leg is lighter than in the model, or if the command arrives later.
         self.reach = np.zeros((blocks, len(whole.lags), 4))
-        # Largest effects of the disturbances. Along axis 0: on the torque, on the speed, on the speed with the worst errors of
-        # inertia and delay.
+        # Largest effects of disturbances. Elements of axis 0: torque, speed, speed with the worst errors of inertia and delay.
         few_ahead = np.zeros((3, blocks, len(FEW), 4))
         lag = assumptions.loop.velocity_lag
         first, first_rates = [], []
@@ -151,8 +150,8 @@ class Prediction:
         torque, speed = Effect(nominal.pushed_feedback, nothing, self.mass), Effect(nominal.pushed_rate, nothing, same)
         first_torque = run(torque, mobilities, bounds, few, few_ahead[0])
         first_speed = run(speed, mobilities, bounds, few, few_ahead[1])
-        # Axes of `by_bound`: block of start cycles, element of `FEW`, cause (model errors, promised torques), output (torque,
-        # speed), joint (SH, SK).
+        # Axes of `by_bound`: block of start cycles, element of `FEW`, cause, output, joint.
+        # The causes are model errors and promised torques, the outputs torque and speed, the joints SH and SK.
         by_bound = few_ahead[:2].reshape(2, blocks, len(FEW), 2, 2).transpose(1, 2, 3, 0, 4)
         self.few_reach: Vector = np.concatenate([by_bound.reshape(blocks, len(FEW), 8), few_ahead[2]], axis=2)
         self.few_ahead: Vector = np.concatenate([nominal.feedback[FEW], nominal.rate[FEW]], axis=1)
@@ -167,7 +166,7 @@ class Prediction:
         )
 
 
-#: Cached tables of the last gaits and gains, ordered from the earliest to the latest use.
+#: Cached tables of the last gaits and gains, the least recently used first.
 _kept: dict[bytes, Prediction] = {}
 _MOST_KEPT = 8
 
@@ -195,7 +194,7 @@ def prediction_of(policy: BackupPolicy, leg: Leg, assumptions: Assumptions, blen
 
 
 def _separated(rows: Vector) -> Vector:
-    """Convert matrices for a new form of the state: the true velocities are replaced by true minus measured velocities."""
+    """Convert matrices that multiply the state, for a state with true minus measured velocities instead of true velocities."""
     result = rows.copy()
     result[..., 4:6] += rows[..., 2:4]
     return result

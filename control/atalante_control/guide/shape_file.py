@@ -95,7 +95,7 @@ def _shape(document: Mapping[str, Any]) -> GuideShape:
 
 
 def _eased(phase: Vector, knots: Vector) -> Vector:
-    """Return warped phases. Linear interpolation between the knots at these phases is half-cosine interpolation at `phase`."""
+    """Return warped phases, at which linear interpolation between the knots gives half-cosine interpolation at `phase`."""
     at = np.clip(np.searchsorted(knots, phase, side="right") - 1, 0, len(knots) - 2)
     length = knots[at + 1] - knots[at]
     return np.asarray(knots[at] + length * (0.5 - 0.5 * np.cos(math.pi * (phase - knots[at]) / length)))
@@ -109,7 +109,7 @@ def _check_keys(table: Mapping[str, Any], required: tuple[str, ...], optional: t
 
 
 def _choice(document: Mapping[str, Any], key: str, valid: tuple[str, ...]) -> str:
-    """Return the value of an optional key. The first valid value is the default."""
+    """Return the value of an optional key. The default is the first of the valid values."""
     value = document.get(key, valid[0])
     if value not in valid:
         raise ValueError(f"{key} must be one of {', '.join(valid)}, got {value!r}")

@@ -16,8 +16,8 @@ from atalante_hal.types import Vector
 
 PINCH_WIDTH = math.radians(1.0)  # rad, smallest half-width of the shape `pinched`
 SNAP_WIDTH = math.radians(0.1)  # rad, smallest half-width of the shape `snap`
-#: Smallest bound of a shape [rad], about two encoder counts at the joint. With a much smaller bound, h of the filter would
-#: overflow.
+#: Smallest bound of a shape [rad], about two encoder counts at the joint.
+#: With a much smaller bound, h of the guide filter would overflow.
 NARROWEST = 1e-6
 JOINTS = ("SH", "SK")  # joints with a guide, in the order of the bounds
 #: Phases and assistance factors at which a shape is checked on construction.
@@ -26,7 +26,7 @@ _CHECKED_FACTORS = np.linspace(0.0, 1.0, 21).tolist()
 
 
 def half_width(xi: float) -> float:
-    """Return the half-width of the guide before a shape is applied [rad]. In degrees, this is 0.5 + 7 (1 - Xi).
+    """Return the half-width of the guide before a shape is applied [rad]; it is 0.5 + 7 (1 - Xi) degrees.
 
     Args:
         xi: assistance factor in [0, 1].

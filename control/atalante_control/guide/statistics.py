@@ -15,7 +15,7 @@ class GuideStatistics:
     max_ratio: float = 0.0  # largest |e| / q_bound
     #: smallest h in the first cycle of a step; at h >= 0, the backup policy can keep both joints inside the guide
     min_h_at_start: float = 1.0
-    hand_overs_exceeded: int = 0  # number of stance changes with a deviation larger than the certificate assumes
+    hand_overs_exceeded: int = 0  # number of stance changes with a larger deviation than the certificate assumes
     factors: set[float] = field(default_factory=set)  # all assistance factors that a step has used
 
     @property

@@ -24,19 +24,19 @@ from atalante_hal.types import Vector
 
 #: Reference knee angle of the backup policy [rad], in the middle of the swing, see `BackupPolicy.mass`.
 _MIDDLE = math.radians(30.0)
-#: Indices of SH and SK of the left leg. The limits of the left leg apply to both legs, because both legs have the same limits.
+#: Indices of SH and SK of the left leg. SH and SK have the same limits in both legs.
 _ASSISTED = [LEG_JOINTS.index("SH"), LEG_JOINTS.index("SK")]
 #: Largest half-width of a guide, at assistance factor 0 [rad], see `half_width`.
 _WIDEST = math.radians(7.5)
-#: If no filter can promise the chosen torques, the selected filter promises this fraction of the largest torques that it can
-#: promise. With fraction 1, the backup torque would have weight 1 even without a disturbance.
+#: Used if no filter can promise the chosen torques: fraction of the largest possible torques that a filter then promises.
+#: With fraction 1, the backup torque would have weight 1 even without a disturbance.
 _USED = 0.95
-#: Number of decimal digits of the assistance factor, as on the bus.
+#: Number of decimal digits to which the assistance factor is rounded; the CAN signal has the same resolution.
 _DIGITS = 4
 
 
 class Choice(NamedTuple):
-    """Guide filter of a step, and the promised torques of this filter, as a fraction of the chosen promised torques."""
+    """Guide filter of a step, and the torques that it promises, as a fraction of the chosen promised torques."""
 
     guide: GuideFilter
     promise: float
@@ -83,7 +83,7 @@ class StepGuides:
             self.at(percent / 100)
 
     def at(self, xi: float) -> Choice:
-        """Return the softest filter that can promise the chosen torques; if there is none, the filter with the largest torques.
+        """Return the softest filter that can promise the chosen torques, or else the filter that can promise the largest torques.
 
         Args:
             xi: assistance factor in [0, 1].

@@ -38,7 +38,7 @@ _IMU_AGE = 10  # cycles, largest valid age of an IMU message, equal to the timeo
 
 
 class Ankle:
-    """Constants of one ankle, and its deviation from the targets at the stance change. The re-centring removes this deviation."""
+    """Constants of one ankle, and its deviation from the targets at the stance change, which the re-centring removes."""
 
     geometry: Annotated[Vector, 4]  # `FlatFoot.geometry`
     offset: float  # rad, added to SA

@@ -12,14 +12,14 @@ import math
 from atalante_hal.robot import MOTORS
 from atalante_hal.types import Vector
 
-#: Index of the front motor of thigh and shank, for the left and the right leg. The next index is the back motor.
+#: Indices in MOTORS of the front motors of thigh and shank, per leg. The back motor has the next index.
 _FRONT = tuple(
     tuple(MOTORS.index(f"{side}_{segment}_front") for segment in ("thigh", "shank")) for side in ("left", "right")
 )
 
 
 def intensity(xi: float) -> float:
-    """Return the factor of the vibration levels, 1 - exp(30 (Xi - 1)): close to 1 below Xi = 0.9, exactly 0 at Xi = 1.
+    """Return the factor 1 - exp(30 (Xi - 1)) of the vibration levels: close to 1 below Xi = 0.9, exactly 0 at Xi = 1.
 
     Args:
         xi: assistance factor in [0, 1].

@@ -63,7 +63,7 @@ class PidGains:
     integral_limit: float = 10.0  # Nm
 
 
-#: Gains for the suspended robot. The stance leg carries no load, so TH, SK, SA and HA of this leg get the gains of the swing leg.
+#: Gains for the suspended robot. Its stance leg carries no load, so TH, SK, SA and HA of this leg have the swing leg gains.
 #: With the gains for the ground, knee and ankle would oscillate, because these joints move small inertias (0.16, 0.04 kg m2).
 AIR_GAINS = PidGains(
     stance=LegGains(

@@ -23,9 +23,8 @@ _NO_INTEGRAL = (0.0,) * 6
 WALK_GAINS = PidGains(
     stance=replace(PidGains().stance, ki=_NO_INTEGRAL), swing=replace(PidGains().swing, ki=_NO_INTEGRAL)
 )
-#: Parameters of the guide on the ground. The guide is stiffer than in the air, because the leg with the patient is heavier than
-#: the empty leg. The hand-over box (largest deviations at a stance change for which a promise holds) covers the deviations at
-#: the landings.
+#: Parameters of the guide on the ground, stiffer than in the air, because the leg with the patient is heavier than the empty leg.
+#: The hand-over box contains the deviations at a stance change for which a promise holds. It covers those at the landings.
 WALK_GUIDE = StepGuideConfig(stiffness=(4500.0, 3300.0), hand_over=HandOver(deviation=math.radians(1.0), rate=0.3))
 
 
@@ -42,18 +41,17 @@ class WalkConfig:
     alpha: float = 0.3  # end of the re-centring, as a fraction of the step duration
     #: True: the torques of the periodic steps follow the paper literally, see `literal`. The guide then has no promised torques.
     literal_law: bool = False
-    #: m/m, gain of the ankle stabiliser: shift of the centre of pressure per error of the divergent component of motion
+    #: m/m, gain of the ankle stabiliser: shift of the centre of pressure / error of the divergent component of motion
     stabiliser: float = 2.5
     shift_limit: Pair = (0.12, 0.05)  # m, largest shifts of the centre of pressure: along the walk, sideways
     placement: PlacementConfig = field(default_factory=PlacementConfig)  # foot placement and step timing
     flat_foot: bool = True  # whether the ankle of the swing leg holds the sole level
     #: m/s, downward speed of the swing foot after the nominal end of a step: normal step, stop step
     reach_speed: Pair = (0.3, 0.03)
-    #: s, longest time in which the swing foot moves down after the nominal end of a step. `reach_knee` can end this motion
-    #: earlier.
+    #: s, longest downward motion of the swing foot after the nominal end of a step; `reach_knee` can end this motion earlier
     reach_time: float = 0.2
-    #: rad/s, largest speed of SH and SK while a late swing foot moves down. With an almost straight leg, this
-    #: limit makes the foot slower than `reach_speed`.
+    #: rad/s, largest speed of SH and SK while a late swing foot moves down.
+    #: With an almost straight leg, this limit makes the foot slower than `reach_speed`.
     reach_rate: float = 2.5
     reach_knee: float = 0.05  # rad, smallest knee angle while a late swing foot moves down
     #: Steering gains: TH offset per heading [rad/rad], TH offset per sideways deviation [rad/m], largest TH offset [rad].
@@ -70,9 +68,9 @@ class WalkConfig:
     shift: float = 1.5  # s, duration of a weight shift, onto one foot or back to both feet
     rest: float = 0.3  # s, wait between the weight shift and the first step
     guide: StepGuideConfig = WALK_GUIDE
-    #: End of the re-centring of SH and SK in a guided step, as a fraction of the step duration. With `alpha`, the re-centring of
-    #: the heavy leg would need more torque than the drives have. The other joints keep `alpha`, because the robot falls if they
-    #: are re-centred as slowly as SH and SK.
+    #: End of the re-centring of SH and SK in a guided step, as a fraction of the step duration.
+    #: With the smaller value `alpha`, the re-centring of the heavy leg would need more torque than the drives have.
+    #: All other joints use `alpha`, because the robot would fall if they were re-centred as slowly as SH and SK.
     guided_alpha: float = 0.5
     #: s, time after the start of a guided step in which the smallest allowed weight of the backup torque falls from 1 to 0
     engage: float = 0.02

@@ -58,7 +58,8 @@ from atalante_hal.types import Command, State, SupervisorState, Vector
 _N, _LEG = len(JOINTS), len(LEG_JOINTS)
 _SH, _SK = LEG_JOINTS.index("SH"), LEG_JOINTS.index("SK")
 _PELVIS, _TORSO = IMUS.index("pelvis"), IMUS.index("torso")
-_MARGIN = math.radians(1.0)  # rad, distance of a shifted swing leg from the position limits of its joints
+#: Smallest distance from its position limits to which foot placement may move a joint of the swing leg [rad].
+_MARGIN = math.radians(1.0)
 _IMU_AGE = 10  # cycles, largest valid age of an IMU message, equal to the timeout of this message in the DBC
 
 
@@ -106,7 +107,7 @@ class WalkController:
         self._tables = _tables(gaits, standing, kinematics, config, exoskeleton.toe_out)
 
         swinging = swing_leg(gaits.step, config.guided_alpha, worn, kinematics, gravity, config.guide.friction)
-        # The guide ends with the step, because the foot lands. So the prediction needs no cycles of the next step.
+        # On the ground the guide ends with the step, because the foot lands. So the prediction covers no cycles of the next step.
         self._guides = StepGuides(config.guide, robot, shape, swinging.leg, _fading(config.engage), 0)
         guide = config.guide
         self._literal = LiteralGuide(
@@ -135,7 +136,7 @@ class WalkController:
             config.stabiliser, *config.shift_limit, flat_feet(exoskeleton)[LEFT].geometry[2], exoskeleton.toe_out
         )
         force = np.zeros((len(FEET), len(CELLS), 3))
-        #: Copy of the requested torque, used if the state does not contain the torque that was sent.
+        #: Copy of the requested torque, used if the `State` does not contain the sent torque.
         self._sent = np.zeros(_N)
         self._state: State | None = None  # state whose arrays `_measured_by` contains
         self._measured = Measured(np.zeros(_N), np.zeros(_N), np.zeros(3), np.zeros(3), np.zeros(3), force, self._sent)
@@ -331,7 +332,7 @@ class WalkController:
         load = self._load.tolist()
         self._loaded = self._loaded + 1 if min(load) >= self._carrying else 0
         if phase in STEPPING:
-            # The phase rate of the step timing changes the position in the table. Without it, this is the cycle.
+            # Row of the phase table. Step timing changes its phase rate; with a phase rate of 1, the row is the cycle.
             cycle = int(self._placement.clock + self._placement.pace)
             landed = self._landed = self._impact.update(load[1 - self._stance], cycle / nominal)
         steps = self.statistics.steps + (phase is Phase.STEP)
@@ -353,7 +354,7 @@ class WalkController:
         if phase in STEPPING:
             self._impact.start_step()
         # In FINISH_STEP, the HAL changes to HOLD when the step number changes. A HOLD during a step would make the robot fall.
-        # In FINISH_STEP, the step number therefore does not change before the robot stands on both feet.
+        # Therefore the step number remains the same in FINISH_STEP until the robot stands on both feet.
         if phase is Phase.REST or (phase in STEPPING and not self._finishing):
             self._command.step = (self._command.step or 0) + 1
         self._command.walking = phase in WALKING
@@ -416,7 +417,7 @@ def _range(robot: Robot, config: WalkConfig) -> tuple[Vector, Vector]:
 
 
 def _fading(duration: float) -> Vector:
-    """Return factors that fall from 1 to 0 in a duration [s], one for each cycle."""
+    """Return one factor per cycle, which falls from 1 to 0 within a duration [s] along a half cosine."""
     factors: Vector = 0.5 + 0.5 * np.cos(math.pi * np.arange(round(duration / PERIOD)) * (PERIOD / duration))
     return factors
 

@@ -70,7 +70,7 @@ class Stage:
     #: rad/s, joint speeds at the start of the phase minus the speeds in the first row of the phase table
     rate: Annotated[Vector, len(JOINTS)]
     placed: bool  # True: foot placement and step timing act
-    literal: bool  # True: the law of the paper drives the robot, see `WalkConfig.literal`
+    literal: bool  # True: the control law follows the paper literally, see `WalkConfig.literal`
     flat: bool  # True: the sole of the swing foot is held level
     #: True: the guide filter drives SH and SK of the swing leg; False at Xi = 1 and in all phases except the periodic step
     assisted: bool
@@ -93,10 +93,8 @@ class Constants(NamedTuple):
 
     weight: float  # N, weight of robot and patient
     keep: float  # factor of the previous value in the low-pass of the foot forces
-    standing_gains: float  # N, load of a foot at which the full stance gains are applied while standing
-    walking_gains: (
-        float  # N, load of the stance foot at which the full stance gains are applied to its ankle while walking
-    )
+    standing_gains: float  # N, while standing: load of a foot at which its leg has the full stance gains
+    walking_gains: float  # N, while walking: load of the stance foot at which its ankle has full stance gains
     gains: Vector  # (2, 3, 12) gains of swing leg and stance leg: Kp [Nm/rad], Kd [Nm s/rad], Ki times the cycle time [Nm/rad]
     placement: PlacementConfig  # parameters of foot placement and step timing
 
@@ -107,7 +105,7 @@ class Assistance(NamedTuple):
     guide: GuideTables  # `GuideFilter.tables`
     literal: LiteralTables  # `LiteralGuide.tables`, used instead of the guide if `Stage.literal`
     unmodelled: Vector  # (n + 1, 2) Nm, `SwingLeg.unmodelled`: torque of SH and SK in each cycle of the step
-    fade: Vector  # (m,) factor of `Stage.excess` in each cycle after the nominal end of the step, falling from 1 to 0
+    fade: Vector  # (m,) factor of `Stage.excess` in each cycle after the nominal end of the step; falls from 1 to 0
 
 
 class Parts(NamedTuple):
@@ -154,7 +152,7 @@ def sense(measured: Measured, table: PhaseTable, constants: Constants, stabilise
         sensed.bearing[side] = min(force, load[side])
     move(parts.chain, measured.q, measured.qd)
 
-    # A foot that has just landed may bounce, so the stance foot is the reference as long as the stance foot carries load.
+    # A foot that has just landed may bounce, so the stance foot is the reference as long as it carries load.
     base = stage.stance
     if stage.double and load[base] < 0.1 * (load[0] + load[1]):
         base = 1 - base
@@ -206,7 +204,7 @@ def _velocity(point: Vector, sole: Vector, sole_velocity: Vector, gyro: Vector) 
 
 
 def start(measured: Measured, table: PhaseTable, parts: Parts) -> None:
-    """Store the deviations of the measured motion at the start of a phase. The re-centring starts from these deviations.
+    """Store the deviations of the measured motion at the start of a phase, from which the re-centring starts.
 
     Args:
         measured: measurements of the cycle.
@@ -218,8 +216,8 @@ def start(measured: Measured, table: PhaseTable, parts: Parts) -> None:
     placement.target[:], placement.offset[:], placement.speed[:], placement.change[:] = 0.0, 0.0, 0.0, 0.0
     for joint in range(n):
         stage.deviation[joint] = measured.q[joint] - table.rows[0, joint]
-        # In a phase without a swing foot, the measured speeds are ignored. After a landing, a re-centring that starts with the
-        # measured speeds would press the foot down.
+        # In a phase without a swing foot, the measured speeds are ignored.
+        # A re-centring that started with the measured speeds would press a landed foot down.
         stage.rate[joint] = 0.0 if stage.double else measured.qd[joint] - table.rows[0, n + joint]
     swing = 1 - stage.stance
     attitude, gyro = _tibia(swing, measured, parts)

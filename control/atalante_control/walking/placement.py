@@ -31,11 +31,11 @@ Pair = tuple[float, float]
 Vector3 = tuple[float, float, float]
 
 _FH, _SH, _SK = (LEG_JOINTS.index(name) for name in ("FH", "SH", "SK"))
-#: Joints of the swing leg that shift the foot.
+#: Joints of the swing leg with which the foot is shifted.
 _SHIFTING = (_FH, _SH, _SK)
-#: Joints from the pelvis to the ankle.
+#: Number of joints from the pelvis to the ankle.
 _LINKS = LEG_JOINTS.index("SA") + 1
-#: m3, smallest determinant of the Jacobian of the ankle; with a straight leg it is 0, and the foot is not shifted further
+#: m3, determinant of the ankle Jacobian below which the foot is not shifted further; a straight leg has determinant 0
 _SINGULAR = 1e-3
 _FASTEST = 3.0  # rad/s, largest desired speed of a joint that shifts the foot
 
@@ -43,33 +43,33 @@ _FASTEST = 3.0  # rad/s, largest desired speed of a joint that shifts the foot
 class PlacementConfig(NamedTuple):
     """Parameters of foot placement and step timing."""
 
-    #: m, predicted error of the DCM at the landing up to which nothing changes; with infinity, placement and timing are off
+    #: m, up to this predicted DCM error at the landing, the foot placement does not change; infinity: no placement and no timing
     dead_zone: float = 0.015
     forward: float = 0.15  # m, largest offset of a landing forwards and backwards
     outward: float = 0.16  # m, largest offset of a landing away from the stance foot
     inward: float = 0.02  # m, largest offset of a landing towards the stance foot
     slowest: float = 0.5  # smallest phase rate
     fastest: float = 1.4  # largest phase rate
-    #: s, time since the start of a step before which the error is ignored, because the new stance foot is not yet at rest
+    #: s, time after the start of a step in which the DCM error is ignored, because the new stance foot is not yet at rest
     settled: float = 0.08
-    #: s, time before the nominal landing in which the phase rate returns to 1, see `late_landing` for the offset
+    #: s, time before the nominal landing in which the phase rate returns to 1; `late_landing` then gives the offset
     frozen: float = 0.05
-    #: m, error of the DCM beyond which the ankle stabiliser cannot stop its growth: forward, sideways. The values were measured.
-    #: They are smaller than the limits of the stabiliser, because the PIDs of the stance leg act against the shift.
+    #: m, largest DCM error (forward, sideways) whose growth the ankle stabiliser can stop, as measured.
+    #: The values are smaller than the limits of the stabiliser, because the PIDs of the stance leg act against its shift.
     capacity: Pair = (0.10, 0.044)
     bandwidth: float = 25.0  # rad/s, natural frequency of the critically damped filter of the offset
     speed: float = 1.2  # m/s, largest speed of the offset
     acceleration: float = 25.0  # m/s2, largest acceleration of the offset
-    slew: float = 15.0  # 1/s, largest change of the phase rate per time
+    slew: float = 15.0  # 1/s, largest change of the phase rate per second
 
 
 class Placement:
     """State of foot placement and step timing in the current phase, and working memory of `shift_foot`."""
 
-    clock: float  # cycles, position in the table of the phase
+    clock: float  # cycles, row in the table of the phase, with fractions
     pace: float  # phase rate: nominal cycles per cycle
     target: Annotated[Vector, 2]  # m, requested offset of the landing in the walking frame
-    offset: Annotated[Vector, 2]  # m, present offset of the swing foot in the walking frame
+    offset: Annotated[Vector, 2]  # m, current offset of the swing foot in the walking frame
     speed: Annotated[Vector, 2]  # m/s, speed of the offset
     change: Annotated[Vector, 3]  # rad, changes of FH, SH and SK of the swing leg
     low: Annotated[Vector, 12]  # rad, smallest desired angles of the joints
@@ -90,7 +90,7 @@ class Motion(NamedTuple):
 
 
 def predicted(error: float, gain: float, limit: float, exponent: float) -> float:
-    """Return the error of the DCM at the landing with the action of the ankle, the solution of e' = w (e - sat(k e, L)) [m].
+    """Predict the DCM error at the landing [m], with the ankle stabiliser acting: the solution of e' = w (e - sat(k e, L)).
 
     Args:
         error: present error e [m].
@@ -137,7 +137,7 @@ def landing(config: PlacementConfig, gain: float, motion: Motion) -> tuple[float
     y = beyond(predicted(motion.error[1], gain, config.capacity[1], motion.exponent), config.dead_zone)
     if x == 0.0 and y == 0.0:
         return 0.0, 0.0, 1.0
-    # distance sideways that the nominal DCM has moved away from c at the nominal landing, xi(T) - c
+    # sideways distance from the centre of pressure c to the nominal DCM xi at the nominal landing, xi(T) - c
     outward = side * (motion.final[1] - motion.nominal[1]) * growth / (growth - 1.0)
     rate, distance = 1.0, outward + side * y
     if y != 0.0 and outward > 0.0:
@@ -156,7 +156,7 @@ def landing(config: PlacementConfig, gain: float, motion: Motion) -> tuple[float
 
 
 def late_landing(config: PlacementConfig, error: Pair, side: float) -> Pair:
-    """Return the offset of a landing that follows immediately, in the walking frame, forwards and to the left [m].
+    """Return the landing offset for a foot that is about to land, in the walking frame, forwards and to the left [m].
 
     Args:
         config: parameters.

@@ -34,8 +34,8 @@ class PhaseTable(NamedTuple):
     feedforward: Vector  # (n + 1, 12) Nm, u_f
     dcm: Vector  # (n + 1, 2) m, nominal DCM
     frequency: float  # rad/s, natural frequency w of the pendulum
-    recentring: Vector  # (m, 4) rows of `flat_foot.recentring_rows`
-    guided: Vector  # (m, 4) as `recentring`, for SH and SK of the swing leg, which a guide can assist
+    recentring: Vector  # (m, 4) re-centring rows of all joints without a guide, see `flat_foot.recentring_rows`
+    guided: Vector  # (m, 4) re-centring rows of SH and SK of the swing leg, which a guide can assist
     reach: Vector  # (2,) rad/s, speeds of SH and SK of the swing leg that lower the swing foot after the last cycle
     reach_cycles: int  # number of cycles in which the swing foot is lowered after the last row
 
@@ -74,8 +74,7 @@ def step_table(
         kinematics.update(q, qd)
         upright = _product(heading, rotation.T)  # rotation from pelvis to walking frame
         lever = body_position - position
-        # The sole is at rest on the ground. So the velocity of the centre of mass in the world is its velocity relative to the
-        # sole, here in the axes of the pelvis.
+        # The sole is at rest on the ground, so the velocity of the centre of mass in the world is that relative to the sole.
         relative = body_velocity - linear - np.array(cross(angular, lever))
         centre[cycle], speed[cycle] = upright @ lever, upright @ relative
     frequency = math.sqrt(GRAVITY / float(centre[:, 2].mean()))

@@ -80,7 +80,7 @@ class Standing:
             q: joint angles, shape (12,) [rad].
         """
         full = self._full(q)
-        # The pelvis is fixed in this model, so Pinocchio computes the centre of mass of the legs alone. The pelvis is added here.
+        # Pinocchio's centre of mass does not contain the pelvis, which is fixed in this model. So the pelvis is added here.
         pelvis, legs = self._model.inertias[0], pinocchio.centerOfMass(self._model, self._data, full)
         share = pelvis.mass * GRAVITY / self._weight
         centre = share * pelvis.lever + (1.0 - share) * legs

@@ -1,4 +1,4 @@
-"""Steering by the soles: `sole positions, headings -> deviation from the line -> offset of TH of the swing leg in the next step`.
+"""Steering along a line: `positions and headings of the soles -> deviation from the line -> offset of TH in the next step`.
 
 The line is the straight path that the robot must follow. It starts in the middle between the feet when the walk begins, in the
 direction of the mean heading of the soles. The position on the ground is the sum of the relative sole positions at each landing.
@@ -15,7 +15,7 @@ from atalante_hal.types import Vector
 
 
 class Steering:
-    """Deviation of the walk from the line, and the steering offset.
+    """Deviation of the walk from the desired line, and the offset of TH that steers back.
 
     Attributes:
         feet: positions of left and right sole, x along the line and y to the left of the line, shape (2, 2) [m].
@@ -34,16 +34,16 @@ class Steering:
 
     @property
     def lateral(self) -> float:
-        """Return the distance from the line to the middle between the feet, positive to the left [m]."""
+        """Return the distance of the middle between the feet from the desired line, positive to the left [m]."""
         return float(self.feet[:, 1].mean())
 
     @property
     def distance(self) -> float:
-        """Return the distance walked along the line [m]."""
+        """Return the distance walked along the desired line [m]."""
         return float(self.feet[:, 0].mean())
 
     def begin(self, step: Vector, headings: Vector) -> None:
-        """Start the line in the middle between the feet.
+        """Start the desired line in the middle between the feet.
 
         Args:
             step: position of the right sole relative to the left sole in world axes, shape (3,) [m].

@@ -32,7 +32,7 @@ _SH, _SK = LEG_JOINTS.index("SH"), LEG_JOINTS.index("SK")
 
 
 class SwingLeg(NamedTuple):
-    """Swing leg of a step, and the torque that the model of the swing leg leaves out."""
+    """Model of the swing leg in one step, and the torque that this model leaves out."""
 
     leg: Leg
     unmodelled: Vector  # (n + 1, 2) Nm, torque w of SH and SK, added to the gravity torques u_g
@@ -41,7 +41,7 @@ class SwingLeg(NamedTuple):
 def swing_leg(
     gait: Gait, alpha: float, worn: ArticulatedModel, kinematics: Kinematics, gravity: Gravity, friction: Friction
 ) -> SwingLeg:
-    """Return the swing leg along the nominal trajectory of a step, to the end of the step, because the foot lands then.
+    """Return the swing leg along the nominal trajectory of a step, up to the landing at the end of the step.
 
     Args:
         gait: right-stance step. By symmetry, the result also applies to the left-stance step.
@@ -69,6 +69,6 @@ def swing_leg(
 
 
 def _gravity(q: Vector, qd: Vector, kinematics: Kinematics, gravity: Gravity) -> Vector:
-    """Return u_g of a pose on the right foot, which is flat on the ground, shape (12,) [Nm]."""
+    """Return the gravity torques u_g of a pose with the right foot flat on the ground, shape (12,) [Nm]."""
     up = kinematics.update(q, qd).soles[RIGHT].rotation[:, 2]
     return gravity.torque(q, tilt_quaternion((up[0], up[1], up[2])))
