@@ -16,14 +16,13 @@ from atalante_hal.types import PERIOD, SupervisorState, Vector
 
 #: Speed of the hook [m/s].
 SPEED: Final = 0.1
-#: Time in ACTIVE after which the crane lowers the robot [s]. The walking controller needs this time to reach its standing pose:
-#: on the floor, friction holds the feet where they land, and a robot that begins to walk with a wrong stance width may fall.
+#: Time in ACTIVE after which the crane lowers the robot [s]. The walking controller first moves the legs to the standing pose.
+#: On the floor, friction would hold the feet, and a robot that begins to walk with a wrong stance width may fall.
 DELAY: Final = 2.0
-#: Stiffness and damping of the sling per kg of the robot. Under the weight of the robot, the sling stretches by
-#: GRAVITY / STIFFNESS, 25 mm.
+#: Stiffness and damping of the sling per kg of the robot. The weight of the robot stretches the sling by 25 mm.
 STIFFNESS: Final = 400.0  # N/m per kg
 DAMPING: Final = 28.0  # N s/m per kg
-#: Stiffness and damping of the pelvis attitude, per kg of the robot, while the tension of the sling equals the weight.
+#: Rotational stiffness and damping with which the sling rights the pelvis, per kg of the robot, at full weight on the sling.
 RIGHTING: Final = 100.0  # Nm/rad per kg
 ATTITUDE_DAMPING: Final = 1.5  # Nm s/rad per kg
 #: Slack of the sling at which lowering ends [m]. The pelvis of a walking robot rises by less, so the sling stays slack.

@@ -97,9 +97,8 @@ class Drives:
         self.parameters = parameters
         self.signals = signals
         self.state = [DriveState.SWITCH_ON_DISABLED] * len(JOINTS)
-        #: For each drive: True from the time at which the drive leaves OPERATION ENABLED without a command, for example for a
-        #: local hold, until the HAL acknowledges this. In this time the drive ignores ENABLE_OPERATION. The HAL acknowledges with
-        #: QUICK_STOP, or with a controlword that changes the state.
+        #: For each drive: True since the drive left OPERATION ENABLED without a command, for example for a local hold.
+        #: While True, the drive ignores ENABLE_OPERATION. QUICK_STOP or a controlword that changes the state sets it to False.
         self.latched = [False] * len(JOINTS)
         #: Delay of each drive from the command ENABLE_OPERATION to the state OPERATION ENABLED [cycles].
         self.enable_delay = [0] * len(JOINTS)
@@ -116,7 +115,7 @@ class Drives:
         self.encoders = Encoders(robot, parameters.velocity_bandwidth, signals.position, signals.velocity)
         self.motors = Motors(robot, parameters.motor, signals.torque, signals.temperature)
         self._slow_phase = 0
-        #: Controlwords that changed nothing when they were last evaluated; empty if the next controlwords must be evaluated.
+        #: Last evaluated controlwords if they changed nothing; equal words are then not evaluated again. Empty otherwise.
         self._steady = b""
         self._hold_at = np.zeros(len(JOINTS))  # setpoint of the local hold of each drive [rad]
         self._target, self._limit = np.zeros((2, len(JOINTS)))
@@ -199,10 +198,10 @@ class Drives:
     def _without_command(self, wanted: Vector) -> None:
         """Set the torque of drives in a state other than OPERATION ENABLED: hold torque in QUICK STOP ACTIVE, otherwise zero."""
         robot, limit = self._robot, self._own_limit
-        # The filtered velocity has too much delay for this loop, so the loop uses the raw encoder difference.
+        # The local hold uses the unfiltered encoder velocity, because the filtered velocity has too much delay.
         speed = self.encoders.speed
         jumped = np.abs(speed) > self.parameters.jump_speed
-        if jumped.any():  # hold the joint where it is, not where the encoder now reports the setpoint
+        if jumped.any():  # the encoder jumped: shift the setpoint by the jump, so that the joint does not move
             self._hold_at[jumped] += speed[jumped] * PERIOD
             speed[jumped] = 0.0
         hold = robot.hold_kp * (self._hold_at - self.encoders.angle) - robot.hold_kd * speed

@@ -48,7 +48,7 @@ from atalante_hal.wire.process_image import ReceiveImage, TransmitImage
 _RECEIVE_BUDGET = 128
 #: Capacity of the transmit buffer [frames]. The nodes send 19 cyclic frames per cycle, slow messages and emergencies.
 _BATCH = 128
-#: Values of `Check` for which a received command frame is rejected.
+#: E2E check results with which a received command frame is rejected.
 _REJECTED = (Check.CRC, Check.LENGTH, Check.RANGE, Check.INVALID)
 #: Half the period of the alive counter.
 _HALF_TURN = 128
@@ -115,7 +115,8 @@ class Emulator:
         self.pelvis_forces: list[Callable[[int], Vector]] = []
         self._pushing = False  # whether a wrench acted on the pelvis in the last time step
         self.crane: Crane | None = None  # crane of a robot on the ground, also an element of `pelvis_forces`
-        self.virtual_operator: VirtualOperator | None = None  # also an element of `pelvis_forces`
+        #: Operator who steadies a robot on the ground, also an element of `pelvis_forces`.
+        self.virtual_operator: VirtualOperator | None = None
         self.wearer: PassiveWearer | ActivePatient | None = None  # wearer whose limbs act on the joints
         self._build_images()
         self._bind_commands()
@@ -158,7 +159,7 @@ class Emulator:
         self._rx.values.fill(0.0)  # values until the first command: zero torque, zero vibration, HAL state OFF
         self._scratch = new_frames(_RECEIVE_BUDGET)
         self._scratch_from = [self._scratch[offset:] for offset in range(_RECEIVE_BUDGET)]
-        #: Number of frames that were received without SYNC. The scratch buffer keeps them for the next call.
+        #: Number of frames in the scratch buffer that arrived before the SYNC of their cycle, kept for the next call.
         self._waiting = 0
 
         self._sync_rows = [self._rx.codec.rows[m.name] for m in syncs]
@@ -168,9 +169,9 @@ class Emulator:
             rows = [row for row, m in enumerate(cyclic) if m.bus == sync.bus]
             self._shares.append(self._tx.frames[rows[0] : rows[-1] + 1])
         self._whole = [self._tx.frames]
-        #: Index of each leg's SYNC in the list of SYNCs.
+        #: For each leg: index of its SYNC message in the list of SYNC messages.
         self._leg_syncs = [[m.name for m in syncs].index(f"SYNC_{side.upper()}_LEG") for side in SIDES]
-        #: For each SYNC: answer of the last cycle that `_imperfect_cycle` ran, sent if the SYNC arrives late.
+        #: For each SYNC message: the answer frames of the last imperfect cycle, which are sent if this SYNC arrives late.
         self._answered = self._shares
         batch = new_frames(_BATCH)
         self._batch = batch.view(np.uint8).data
@@ -186,7 +187,7 @@ class Emulator:
         self._sync_cycles = values[codec.slice("Cycle")]
         self._command_rows = [codec.rows[f"COMMAND_{side.upper()}_LEG"] for side in SIDES]
         self._senders = [Senders(self._rx.codec.messages[row]) for row in self._command_rows]
-        #: For each leg: rows of its SYNC and of its command.
+        #: For each leg: rows of its SYNC message and of its command message in the process image.
         self._leg_rows = [
             (self._sync_rows[sync], row) for sync, row in zip(self._leg_syncs, self._command_rows, strict=True)
         ]

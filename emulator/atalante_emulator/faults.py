@@ -72,7 +72,7 @@ def _choice(names: Sequence[str], *, default: str | None = None) -> Parameter:
 _P = _number(0.0, 1.0, default=1.0)
 _MESSAGE = Parameter("the name of a message", lambda value: isinstance(value, str))
 _OTHER = Parameter("the name of another node of the same kind", lambda value: isinstance(value, str))
-#: Name of all force cells of a foot together.
+#: Parameter value that selects all force cells of a foot.
 ALL_CELLS: Final = "all"
 _CELL: Final = (*CELLS, ALL_CELLS)
 _AXES: Final = ("X", "Y", "Z")

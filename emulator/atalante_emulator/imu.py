@@ -55,7 +55,7 @@ def _sample(links: Vector, before: Vector, quaternion: Vector, gyro: Vector, acc
             before[i] = vx, vy, vz
         ax, ay, az = (vx - before[i, 0]) / PERIOD, (vy - before[i, 1]) / PERIOD, (vz - before[i, 2]) / PERIOD + GRAVITY
         before[i] = vx, vy, vz
-        # The matrix r rotates vectors from world axes into the sensor frame.
+        # r00 to r22 are the rotation matrix from world axes to the sensor frame.
         x2, y2, z2 = x + x, y + y, z + z
         xx, yy, zz, xy, xz, yz = x * x2, y * y2, z * z2, x * y2, x * z2, y * z2
         xw, yw, zw = w * x2, w * y2, w * z2

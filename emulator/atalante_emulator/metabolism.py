@@ -21,8 +21,8 @@ import numpy as np
 
 from atalante_hal.types import Vector
 
-#: Energy per litre of oxygen and of carbon dioxide [J/l], without the term of urinary nitrogen
-#: (Brockway, "Derivation of formulae used to calculate energy expenditure in man", Hum. Nutr. Clin. Nutr. 41C, 1987).
+#: Energy per litre of oxygen and of carbon dioxide [J/l], without the term of urinary nitrogen.
+#: Source: Brockway, "Derivation of formulae used to calculate energy expenditure in man", Hum. Nutr. Clin. Nutr. 41C, 1987.
 OXYGEN: Final = 16_580.0
 CARBON_DIOXIDE: Final = 4_510.0
 #: Sample period of all time series in this module [s].
@@ -33,13 +33,12 @@ SAMPLE: Final = 1.0
 class MetabolismParameters:
     """Parameters of metabolism and respirometer. Values without a source are assumptions."""
 
-    #: W/kg, metabolic rate of quiet standing (first term of the walking equation of Looney et al., Med. Sci. Sports Exerc. 51,
-    #: 2019)
+    #: W/kg, metabolic rate of quiet standing, from the walking equation of Looney et al., Med. Sci. Sports Exerc. 51, 2019
     standing: float = 1.44
     positive: float = 0.25  # efficiency of positive muscle work (Margaria, Int. Z. Angew. Physiol. 25, 1968)
     negative: float = 1.20  # magnitude of the efficiency of negative muscle work (Margaria 1968)
-    #: W/Nm, metabolic rate per muscle torque without motion: 0.054 times the largest joint speed (Minetti, Alexander, J. Theor.
-    #: Biol. 186, 1997). The largest joint speed is assumed to be 10 rad/s.
+    #: W/Nm, metabolic rate per muscle torque without motion: 0.054 times the largest joint speed, assumed to be 10 rad/s.
+    #: Source: Minetti, Alexander, J. Theor. Biol. 186, 1997.
     activation: float = 0.54
     quotient: float = 0.85  # respiratory exchange ratio, litres of CO2 per litre of O2
     oxygen_time: float = 30.0  # s, time constant of oxygen uptake after a change of the metabolic rate

@@ -30,8 +30,8 @@ class MotorParameters:
     thermal_time: float = 300.0  # time constant of the winding temperature [s]
 
 
-# Rows of the motor array: setpoint of the motor torque, ratio of true to measured motor torque, dry friction and damping of the
-# joint, external torque, resulting joint torque, torque of the wearer's limb.
+# Rows of the motor array, first to fourth: torque setpoint, ratio of true to measured torque, dry friction, damping.
+# Rows of the motor array, fifth to seventh: external torque, resulting joint torque, torque of the wearer's limb.
 _WANTED, _STRENGTH, _DRY, _DAMPING, _PUSH, _JOINT, _LIMB = range(7)
 
 

@@ -28,8 +28,8 @@ from atalante_hal.types import PERIOD, Vector
 Pair = tuple[float, float]
 
 _SH, _SK, _LEG = LEG_JOINTS.index("SH"), LEG_JOINTS.index("SK"), len(LEG_JOINTS)
-#: Thresholds of the load of a foot, as fractions of the weight. Before the first step, a foot stands if its load is above
-#: `_STANDING`. During the walk, a foot is in the air if its load is below `_AIR`, and then lands if its load is above `_LANDED`.
+#: Thresholds of the load of a foot, as fractions of the weight. Before the walk, a foot with more than `_STANDING` stands.
+#: During the walk, a foot with less than `_AIR` is in the air, and lands when its load exceeds `_LANDED`.
 _STANDING, _AIR, _LANDED = 0.25, 0.02, 0.1
 #: Time for which both feet must stand before the patient expects steps [cycles].
 _READY: Final = 500
@@ -48,17 +48,17 @@ class ActiveParameters:
     damping: Pair = (15.0, 8.0)  # Nm s/rad, feedback torque per rate of the error
     #: s, time from an error to the voluntary reaction (kinaesthetic reaction times are 0.12 to 0.18 s)
     delay: float = 0.15
-    #: rad, errors up to this angle are not perceived. The sense of joint position has a threshold of one to two degrees at hip
-    #: and knee (Domingo, Lam, J. NeuroEng. Rehabil. 11, 2014).
+    #: rad, largest joint angle error that the patient does not perceive.
+    #: The threshold at hip and knee is one to two degrees (Domingo, Lam, J. NeuroEng. Rehabil. 11, 2014).
     threshold: float = math.radians(1.0)
-    #: g / gain: share of `gain` times the perceived error that the patient adds to the torque in the next step of the same leg
+    #: learning rate g / gain: share of `gain` times the perceived error that is added to the torque in the leg's next step
     learning: float = 0.1
-    forgetting: float = 0.95  # f: share of the learned torque that the patient keeps for the next step of the same leg
+    forgetting: float = 0.95  # f: fraction of the learned torque that remains in the next step of the same leg
     noise: float = 0.1  # standard deviation of the torque as a fraction of the torque (signal-dependent noise)
     noise_time: float = 0.1  # s, correlation time of the noise
     activation: float = 0.05  # s, time constant from excitation to torque (Zajac, Crit. Rev. Biomed. Eng. 17, 1989)
-    #: Largest torque as a fraction of mass times gravity times height. The values are the maximum voluntary torques of the weaker
-    #: direction of each joint: hip flexion and knee flexion (Anderson, Madigan, Nussbaum, J. Biomech. 40, 2007).
+    #: Largest voluntary torque in the weaker direction of each joint (flexion), as a fraction of mass times gravity times height.
+    #: Source: Anderson, Madigan, Nussbaum, J. Biomech. 40, 2007.
     strength: Pair = (0.113, 0.087)
     fraction: float = 1.0  # strength of this patient as a fraction of an able-bodied person
 

@@ -39,8 +39,7 @@ class Operator:
     In HOLD the emulated operator does not press START. Call `start()` to end HOLD.
     """
 
-    #: Time between two presses of START while the HAL is in READY [cycles]. The first press follows this time after the change
-    #: to READY.
+    #: Time from the change of the HAL to READY to the first press of START, and between two presses in READY [cycles].
     REACTION = 200
 
     def __init__(self, assistance_factor: float | None = None, *, starts: bool = True) -> None:

@@ -197,8 +197,8 @@ class MuJoCoBody:
             torque: joint torques, shape (12,) [Nm].
         """
         self._torque[:] = torque
-        # Each call runs the second half of a time step, then the first half of the next time step. After the call, all sensor
-        # data therefore belong to the same time as the positions and velocities.
+        # Run the second half of a time step, then the first half of the next time step.
+        # After this, all sensor data belong to the same time as the positions and velocities.
         mujoco.mj_step2(self._model, self._data)
         mujoco.mj_step1(self._model, self._data)
 
@@ -239,7 +239,7 @@ def _prepare(spec: Any, free: bool, ground: float | None, friction: float, conta
         floor.contype, floor.conaffinity = 0, 1
         shapes.append(("floor", floor))
     for _, shape in shapes:
-        shape.friction[0], shape.condim = friction, 3  # MuJoCo uses the larger coefficient of the two shapes
+        shape.friction[0], shape.condim = friction, 3  # in a contact, MuJoCo uses the larger coefficient of the shapes
         shape.solref, shape.solimp[:2] = contact.solref, contact.solimp
     _add_sensors(spec, ground is not None)
 

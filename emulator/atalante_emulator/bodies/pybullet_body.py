@@ -23,8 +23,7 @@ SOLVER_ITERATIONS = 50
 #: Indices of attitude, velocity and angular velocity in the link state tuple of PyBullet.
 _ATTITUDE, _LINEAR, _ANGULAR = 5, 6, 7
 _BASE: Final = -1  # link index of the root link in PyBullet
-#: Number of elements of a contact: pad, normal vector (3), normal force, then value and direction (3) of each of the two friction
-#: forces.
+#: Number of elements of a contact: pad, normal vector (3), normal force, and both friction forces (value, direction (3)).
 _CONTACT: Final = 13
 #: Largest number of contacts in a time step. A sphere has at most one contact with a plane.
 _CONTACTS: Final = len(FEET) * len(CELLS)
@@ -34,7 +33,7 @@ _PACK_ATTITUDES = Struct(f"{4 * len(FEET)}d").pack_into
 
 
 def _sum_contacts(contacts: Vector, count: int, attitude: Vector, force: Vector) -> None:
-    """Add the contact forces of all corners, and transform them into the axes of the feet.
+    """Sum the contact forces on each corner of the soles, and transform the sums into the axes of the feet.
 
     Args:
         contacts: contacts of the time step, shape (n, _CONTACT).
@@ -104,7 +103,7 @@ class PyBulletBody:
         self._touches = ground is not None  # the only possible contacts are those with the floor
         if ground is not None:
             self._add_floor(ground, friction)
-        self._force, self._moment = [0.0] * 3, [0.0] * 3  # external wrench on the pelvis
+        self._force, self._moment = [0.0] * 3, [0.0] * 3  # external force [N] and moment [Nm] on the pelvis
         self._pushed = False
         joints, self.imu = np.zeros((2, len(JOINTS))), np.zeros((len(IMUS), LINK_STATE))
         self.position, self.velocity = joints
@@ -242,12 +241,12 @@ class PyBulletBody:
         return pybullet.getJointStates(self._body, self._joints, self._client), self._link_states(links), contacts
 
     def _unpack(self, joints: Any, links: Any, contacts: Any) -> None:
-        # The elements are written out, because a loop over the joints would take twice as long.
+        # The twelve joints are written out, because a loop over the joints would take twice as long.
         a, b, c, d, e, f, g, h, i, j, k, m = joints
         position = a[0], b[0], c[0], d[0], e[0], f[0], g[0], h[0], i[0], j[0], k[0], m[0]
         velocity = a[1], b[1], c[1], d[1], e[1], f[1], g[1], h[1], i[1], j[1], k[1], m[1]
         _PACK_JOINTS(self._joint_memory, 0, *position, *velocity)
-        # `links` contains the links of the IMUs, then the feet if their forces are needed.
+        # `links` contains the states of the IMU links, then those of the feet if the sole forces are needed.
         for memory, state in zip(self._imu_memory, links, strict=False):
             _PACK_LINK(memory, 0, *state[_ATTITUDE], *state[_LINEAR], *state[_ANGULAR])
         if contacts:
@@ -260,7 +259,7 @@ class PyBulletBody:
         left, right = feet
         _PACK_ATTITUDES(self._attitude_memory, 0, *left[_ATTITUDE], *right[_ATTITUDE])
         memory, pad_of, offset = self._contact_memory, self._pad_of, 0
-        # The vectors are unpacked by name, because packing them with `*` would take almost twice as long.
+        # Vectors of a contact are unpacked by name, because unpacking with `*` would take almost twice as long.
         for _, _, _, pad, _, _, _, (nx, ny, nz), _, normal, first, (ax, ay, az), second, (bx, by, bz) in contacts:
             _PACK_CONTACT(memory, offset, pad_of[pad], nx, ny, nz, normal, first, ax, ay, az, second, bx, by, bz)
             offset += _CONTACT_BYTES
