@@ -19,7 +19,7 @@ from atalante_hal.types import PERIOD, Controller, State
 
 #: Number of consecutive late cycles after which the robot goes to HOLD.
 OVERRUNS_TO_HOLD = 3
-#: Largest lateness of a cycle [s]. A later cycle (a gap) leads to HOLD. The watchdog of the drives has the same timeout.
+#: Lateness of a cycle above which the robot goes to HOLD [s]. The watchdog of the drives has the same timeout.
 GAP_TO_HOLD = 5e-3
 #: Largest time by which the loop may fall behind the monotonic clock within `DRIFT_CYCLES` cycles [s]. More leads to HOLD.
 DRIFT_TO_HOLD = 5e-3

@@ -41,8 +41,8 @@ _HEADER_BYTES = mmap.PAGESIZE
 _POLL_TIME = 500e-6
 #: If polling found no frame in one wait, the next waits sleep without polling, to save computing time. Number of these waits.
 _WAITS_WITHOUT_POLLING = 32
-#: Longest sleep of a waiting end [ms]; then the end reads the shared memory again.
-#: This is required, because a wake-up byte may arrive before the new value in the shared memory is visible.
+#: Longest sleep of a waiting end before it reads the shared memory again [ms].
+#: A sleep must be limited, because a wake-up byte may arrive before the new value in the shared memory is visible.
 _SLEEP = 20
 _WAKE_UP = b"\0"
 _REASON_BYTES = 4096

@@ -55,7 +55,7 @@ BOOST = 6.0
 #: Number of unsuccessful tests of a joint after which the joint has failed.
 TRIALS = 2
 #: Smallest mobility that proves that a joint follows its torque, in the order of LEG_JOINTS [1/(kg m2)].
-#: It is about half of the smallest mobility of the suspended robot, with straight or bent legs, empty or with 110 kg patient.
+#: `MOBILITY` is about half of the smallest mobility of the suspended robot: straight or bent legs, empty or with 110 kg patient.
 MOBILITY = (0.045, 0.23, 0.075, 0.56, 4.6, 6.8)
 
 

@@ -77,7 +77,7 @@ class Heartbeats:
         self.emergencies: dict[str, tuple[Dtc, int]] = {}
         self._cleared: set[str] = set()  # nodes whose emergency was cleared in this cycle
         #: Emergencies with the reaction INFO since the last `evaluate`, as (node, diagnostic, error code).
-        #: Also contains an entry with error code 0 for each frame of an error passive node.
+        #: `_notices` also contains an entry with error code 0 for each frame of an error passive node.
         self._notices: list[tuple[str, Dtc, int]] = []
         self._reset: set[str] = set()  # nodes that restarted since the last `evaluate`
         #: For each row of the process image: counter that detects two senders of the message, 0 to `FULL`. Default 0.

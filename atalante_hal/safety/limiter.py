@@ -63,7 +63,7 @@ _COUNT = len(JOINTS)
 #: Number of cycles after which a change of the commanded torque is visible in the measured acceleration.
 DELAY: Final = 3
 #: Smallest inertia that the torque of a joint accelerates while all other joints are free, in leg joint order [kg m2].
-#: Lower bound over all poses of the empty exoskeleton, suspended or floating. A gait does not depend on these values.
+#: `SMALLEST_INERTIA` is a lower bound over all poses of the empty exoskeleton, suspended or floating; no gait depends on it.
 SMALLEST_INERTIA: Final = (0.12, 0.14, 0.17, 0.11, 0.038, 0.038)
 #: Results of `limit`: all torques are unchanged, the torque of at least one joint was reduced, an input is not finite.
 _UNCHANGED, _CUT, _NOT_FINITE = range(3)

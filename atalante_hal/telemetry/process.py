@@ -47,7 +47,7 @@ _SESSION_END = 2.0
 #: Time limit for a subprocess that `tend` restarted to become ready [s].
 _RESTART = 30.0
 #: Time limit for the first subprocess to become ready, possibly during a run [s].
-#: After this time the subprocess is ended, and `tend` starts another subprocess.
+#: A subprocess that is not ready in time is ended, and `tend` starts another one.
 _JOIN = 60.0
 
 

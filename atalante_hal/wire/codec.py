@@ -28,7 +28,7 @@ BASE, FACTOR, OFFSET = range(3)
 #: Value of `plan[INVALID, i]` if signal i has no invalid code. Also the result of `encode` if all values were encoded.
 NO_CODE = -1
 # Results of `read_row`. INSIDE: all signals are in range. OUTSIDE: a signal is out of range, and none has its invalid code.
-# MARKED_INVALID: a signal is out of range, and a signal has its invalid code.
+# MARKED_INVALID (another result): a signal is out of range, and at least one signal has its invalid code.
 INSIDE, OUTSIDE, MARKED_INVALID = range(3)
 #: Adding and then subtracting this number rounds a float64 to an integer.
 _ROUND = 1.5 * 2.0**52

@@ -469,8 +469,8 @@ def classify_frame(words: Words, row: int, offset: int, e2e: E2EState, tag: int,
         return _CRC
     counter = int(octets[begin + COUNTER_BYTE])
     in_time = tag == _NO_TAG or tag - counter & 0xFF < LATEST
-    # After a gap of at least half a counter period, the counter no longer gives the order of the frames of a message.
-    # Then a frame is new if it answers one of the last `LATEST` SYNCs.
+    # After a gap of at least half a counter period, the counter does not give the order of frames any more.
+    # After such a gap, a frame is new if it answers one of the last `LATEST` SYNCs.
     back = tag != _NO_TAG and in_time and expected[row] != NOTHING and silent[row] >= _HALF_TURN
     result = classify_counter(expected[row], counter)
     if back and result == _REPEATED:
@@ -482,8 +482,8 @@ def classify_frame(words: Words, row: int, offset: int, e2e: E2EState, tag: int,
             return _CONFLICT
         result = _CONFLICT
     elif tag != _NO_TAG and not back:
-        # A frame is rejected if it answers no recent SYNC, or an earlier SYNC than the last accepted frame.
-        # The expected counter then does not change.
+        # Reject a frame that answers no recent SYNC, or an earlier SYNC than the last accepted frame.
+        # A rejected frame does not change the expected counter.
         backwards = expected[row] != NOTHING and counter - expected[row] + 1 & 0xFF >= _HALF_TURN
         if not in_time or backwards:
             return _WRONG_SEQUENCE

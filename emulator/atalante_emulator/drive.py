@@ -98,7 +98,7 @@ class Drives:
         self.signals = signals
         self.state = [DriveState.SWITCH_ON_DISABLED] * len(JOINTS)
         #: For each drive: True since the drive left OPERATION ENABLED without a command, for example for a local hold.
-        #: While True, the drive ignores ENABLE_OPERATION. QUICK_STOP or a controlword that changes the state sets it to False.
+        #: A latched drive ignores ENABLE_OPERATION, until the HAL sends QUICK_STOP or a controlword that changes the state.
         self.latched = [False] * len(JOINTS)
         #: Delay of each drive from the command ENABLE_OPERATION to the state OPERATION ENABLED [cycles].
         self.enable_delay = [0] * len(JOINTS)

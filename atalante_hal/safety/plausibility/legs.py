@@ -45,7 +45,7 @@ STANDSTILL_SAMPLES = 2
 #: Largest drift of the IMUs per sample that the standstill check tolerates [rad]; more than 10 times the drift without a fault.
 _IMU_DRIFT = 2e-5
 #: Largest change per sample of the estimated heading drift between pelvis IMU and tibia IMU [rad].
-#: A leg is sampled every 32 cycles, so this change is 3e-4 rad/s.
+#: A leg is sampled every 32 cycles, so this limit corresponds to 3e-4 rad/s.
 _HEADING_DRIFT = 1e-5
 _PELVIS = IMUS.index("pelvis")
 _TIBIAE = tuple(IMUS.index(f"{side}_tibia") for side in SIDES)

@@ -52,7 +52,7 @@ _TURN = 0.01
 _INERTIA = 100.0
 #: Number of cycles with a constant reading after which a joint is at rest, because an unbalanced torque would have moved it.
 _AT_REST = 3
-#: If a joint with the inertia `_INERTIA` turns by this angle [rad], its encoder reading must change. 20 motor encoder counts.
+#: Angle after which the encoder reading of a turning joint must have changed [rad]: 20 counts of a motor encoder.
 _DRIVEN = 1e-5
 #: A joint closer to a position limit than this distance is regarded as being at its end stop [rad].
 _AT_STOP = 0.005
@@ -69,7 +69,7 @@ class Readings(NamedTuple):
     """Signals that update the `Drive` record in each cycle. Positions are on the motor side."""
 
     position: Vector  # (12,) rad
-    before: Vector  # (12,) rad, positions of the cycle before
+    before: Vector  # (12,) rad, positions of the previous cycle
     torque: Vector  # (12,) Nm
     force: Vector  # (2, 4, 3) N
 

@@ -19,7 +19,7 @@ class AirwalkConfig(StepGuideConfig):
     """
 
     #: True: the torques of the assisted joints and of the baseline controller follow the paper literally, see `guide.literal`.
-    #: If True, no guide is certified for a disturbance torque.
+    #: With `literal_law`, no guide is certified for a disturbance torque.
     literal_law: bool = False
     gains: PidGains = AIR_GAINS
     alpha: float = 0.4  # end of the re-centring, as a fraction of the step duration

@@ -11,7 +11,7 @@ STEP_LENGTH_RANGE = (0.05, 0.40)  # m, accepted step lengths; some of them have 
 STEP_DURATION_RANGE = (0.4, 2.0)  # s, accepted step durations; some of them have no feasible gait
 
 #: Eight patients for the walks in the documentation.
-#: They lie within the range of the paper's subjects, 58 to 91 kg and 1.62 to 1.93 m. The paper gives only this range.
+#: The patients lie within the range of the paper's subjects: 58 to 91 kg, 1.62 to 1.93 m.
 STUDY_PATIENTS = tuple(
     Patient(mass, height)
     for mass, height in (

@@ -66,7 +66,7 @@ class HandOver:
     rate: float = 0.25  # rad/s, largest |s'(0)| of SH and SK
     torque: Pair = (25.0, 13.0)  # Nm, largest torques of SH and SK that are carried over the stance change
     #: rad/s2, largest joint acceleration before the stance change.
-    #: Due to this acceleration, the measured velocity differs from the true velocity at the start of the step.
+    #: Such an acceleration makes the measured velocity differ from the true velocity at the start of the step.
     acceleration: float = 20.0
 
     def __post_init__(self) -> None:
@@ -171,7 +171,7 @@ class Effect(NamedTuple):
     #: (lags + 1, 2, 2) response to an acceleration that lasts one cycle, 0 to `lags` cycles later.
     pushed: Vector
     #: (lags + 1, 2, 2) response to an acceleration just before a prediction starts; (0, 2, 2) if this response is left out.
-    #: The measured velocity does not contain the effect of this acceleration yet, so the prediction starts with a wrong velocity.
+    #: The measured velocity does not yet contain the effect of the last acceleration, so a prediction starts with an error.
     hidden: Vector
     #: (n, 2, 2) matrix for each cycle of the step. The output is this matrix times the response.
     left: Vector

@@ -57,10 +57,10 @@ class GuideConfig:
         ValueError: If a number is out of range.
     """
 
-    torque_limit: float  # Nm, largest predicted torque of SH and of SK
-    rate_limit: float  # Nm, largest change of the backup torque within one cycle
-    speed_limit: float  # rad/s, largest predicted speed of SH and of SK
-    worst_speed_limit: float  # rad/s, largest predicted speed for the worst model errors
+    torque_limit: float  # Nm, largest allowed torque of SH and SK in the prediction
+    rate_limit: float  # Nm, largest allowed change of the backup torque within one cycle
+    speed_limit: float  # rad/s, largest allowed speed of SH and SK in the prediction
+    worst_speed_limit: float  # rad/s, largest allowed speed in the prediction with the worst model errors
     zeta: float = 0.01  # s, gain of lambda_d, which increases the weight of the backup torque while h decreases
     derivative_time: float = 0.005  # s, time constant of the low-pass filter on dh/dt
     release: float = 0.03  # s, shortest time in which the weight of the backup torque falls from 1 to 0

@@ -18,7 +18,7 @@ from atalante_hal.types import Vector
 Pair = tuple[float, float]
 
 #: The kernel replaces a ratio x = torque / limit or x = speed / limit by 1 - STEEPNESS * (1 - x), which is 1 at x = 1, too.
-#: The gait alone needs a large part of both limits, so the gate must rise only when torque or speed is near its limit.
+#: The gait alone needs most of the allowed torque and speed, so the gate must rise only close to these limits.
 STEEPNESS = 4.0
 #: Number of elements of the compressed state, from which the predicted errors are computed.
 COMPRESSED = 5
@@ -32,9 +32,9 @@ class Guard:
     """Constants and state of the filter, and results of the last cycle."""
 
     gains: Annotated[Vector, (2, 4)]  # rows SH, SK; Kv [1/s2] in columns 0 and 1, Dv [1/s] in columns 2 and 3
-    torque_limit: float  # Nm, largest predicted torque
-    speed_limit: float  # rad/s, largest predicted speed of a joint
-    worst_speed_limit: float  # rad/s, largest predicted speed of a joint for the worst model errors
+    torque_limit: float  # Nm, largest allowed torque in the prediction
+    speed_limit: float  # rad/s, largest allowed speed of a joint in the prediction
+    worst_speed_limit: float  # rad/s, largest allowed speed of a joint in the prediction with the worst model errors
     tracking: float  # share of a commanded torque change that a motor reaches within one cycle
     keep: float  # weight of the old value in the low-pass of the measured velocity
     zeta: float  # s, gain of lambda_d, which increases the gate while h decreases

@@ -17,7 +17,7 @@ from atalante_hal.types import Vector
 PINCH_WIDTH = math.radians(1.0)  # rad, smallest half-width of the shape `pinched`
 SNAP_WIDTH = math.radians(0.1)  # rad, smallest half-width of the shape `snap`
 #: Smallest bound of a shape [rad], about two encoder counts at the joint.
-#: With a much smaller bound, h of the guide filter would overflow.
+#: With a much smaller bound of the shape, h of the guide filter would overflow.
 NARROWEST = 1e-6
 JOINTS = ("SH", "SK")  # joints with a guide, in the order of the bounds
 #: Phases and assistance factors at which a shape is checked on construction.

@@ -29,7 +29,7 @@ _ASSISTED = [LEG_JOINTS.index("SH"), LEG_JOINTS.index("SK")]
 #: Largest half-width of a guide, at assistance factor 0 [rad], see `half_width`.
 _WIDEST = math.radians(7.5)
 #: Used if no filter can promise the chosen torques: fraction of the largest possible torques that a filter then promises.
-#: With fraction 1, the backup torque would have weight 1 even without a disturbance.
+#: With the fraction 1, the backup torque would have weight 1 even without a disturbance.
 _USED = 0.95
 #: Number of decimal digits to which the assistance factor is rounded; the CAN signal has the same resolution.
 _DIGITS = 4

@@ -24,7 +24,7 @@ WALK_GAINS = PidGains(
     stance=replace(PidGains().stance, ki=_NO_INTEGRAL), swing=replace(PidGains().swing, ki=_NO_INTEGRAL)
 )
 #: Parameters of the guide on the ground, stiffer than in the air, because the leg with the patient is heavier than the empty leg.
-#: The hand-over box contains the deviations at a stance change for which a promise holds. It covers those at the landings.
+#: The hand-over box (deviations at a stance change for which a promise holds) covers the deviations at the landings.
 WALK_GUIDE = StepGuideConfig(stiffness=(4500.0, 3300.0), hand_over=HandOver(deviation=math.radians(1.0), rate=0.3))
 
 
@@ -51,7 +51,7 @@ class WalkConfig:
     #: s, longest downward motion of the swing foot after the nominal end of a step; `reach_knee` can end this motion earlier
     reach_time: float = 0.2
     #: rad/s, largest speed of SH and SK while a late swing foot moves down.
-    #: With an almost straight leg, this limit makes the foot slower than `reach_speed`.
+    #: With an almost straight leg, `reach_rate` makes the foot slower than `reach_speed`.
     reach_rate: float = 2.5
     reach_knee: float = 0.05  # rad, smallest knee angle while a late swing foot moves down
     #: Steering gains: TH offset per heading [rad/rad], TH offset per sideways deviation [rad/m], largest TH offset [rad].
