@@ -43,7 +43,7 @@ class State:
     cycle: int  # SYNC counter
     time: float  # s, `cycle` times the period
     supervisor: SupervisorState
-    assistance_factor: float  # Xi in [0, 1], set by the operator; ramped to 1 in FULL_ASSIST
+    assistance_factor: float  # factor Xi in [0, 1], set by the operator; ramped to 1 in FULL_ASSIST
     position: Vector  # (12,) rad
     velocity: Vector  # (12,) rad/s
     torque: Vector  # (12,) Nm, measured by the drive

@@ -37,7 +37,7 @@ _READY: Final = 500
 
 @dataclass(frozen=True)
 class ActiveParameters:
-    """Parameters of an active patient. A pair has a value for SH and a value for SK. Values without a source are assumptions.
+    """Parameters of an active patient. A pair has values for sagittal hip and knee. Values without a source are assumptions.
 
     Raises:
         ValueError: If a parameter is out of range.
@@ -80,14 +80,14 @@ class ActiveTask:
 
     mass: float  # kg, of the patient
     height: float  # m, of the patient
-    #: nominal angles of SH and SK of the swing leg in each cycle of a step, from landing to landing, shape (n + 1, 2) [rad]
+    #: nominal angles of hip and knee of the swing leg in each cycle of a step, from landing to landing, shape (n + 1, 2) [rad]
     swing: Sequence[Pair]
     seed: int = 0
     parameters: ActiveParameters = ActiveParameters()
 
 
 class ActivePatient:
-    """Legs of an active patient: the limbs of a passive wearer, and muscles at SH and SK of the swing leg.
+    """Legs of an active patient: the limbs of a passive wearer, and muscles at sagittal hip and knee of the swing leg.
 
     The patient feels the joint angles and the load on the feet. A landing starts the next step of the other leg.
 
@@ -192,7 +192,7 @@ class ActivePatient:
         return np.column_stack([np.convolve(white[:, k], kernel, "valid") for k in range(2)])
 
     def _excite(self, position: Vector, velocity: Vector) -> Pair:
-        """Return the excitation of SH and SK of the swing leg as torques [Nm], and advance the step by one cycle."""
+        """Return the excitation of sagittal hip and knee of the swing leg as torques [Nm], and advance the step by one cycle."""
         cycle = self._cycle
         if self._swing < 0 or cycle >= len(self._nominal):
             return 0.0, 0.0

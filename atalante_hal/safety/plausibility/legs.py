@@ -60,7 +60,7 @@ _HIPS = tuple(JOINTS.index(f"{side}_FH") for side in SIDES)
 class _Comparison(NamedTuple):
     """Comparison of the encoders and IMUs of a leg in one sample."""
 
-    angles: tuple[float, float, float]  # the three angles FH, TH and SH + SK from the IMUs [rad]
+    angles: tuple[float, float, float]  # leg angles from the IMUs: FH, TH and the sum SH + SK [rad]
     errors: tuple[float, float, float]  # encoder angles minus `angles` [rad]
     uncertainty: float = 0.0  # allowance on `errors` for encoder and IMU values of different cycles [rad]
 
@@ -81,7 +81,7 @@ class Legs:
         self._to_joint: Vector = robot.polarity / robot.gear
         self._attitude_error = robot.sensors.attitude_error
         self._attitude_change, self._misalignment = robot.sensors.attitude_change, robot.sensors.misalignment
-        #: Estimated heading drift between the IMUs of each leg since the start [rad]. It is subtracted from the error of TH.
+        #: Estimated heading drift between the IMUs of each leg [rad], which is subtracted from the error of the transverse hip.
         self._heading = [0.0 for _ in SIDES]
         self._contradicts = [[0] * len(_AXES) for _ in SIDES]
         self._constant_samples = [constant_samples[hip : hip + len(_AXIS_OF)] for hip in _HIPS]
@@ -187,7 +187,7 @@ class Legs:
 
 
 def hip_angles(pelvis: list[float], tibia: list[float]) -> tuple[float, float, float]:
-    """Return the angles FH, TH and SH + SK of the rotation Rx Rz Ry from the tibia frame to the pelvis frame [rad].
+    """Return the hip and knee angles FH, TH and SH + SK of the rotation Rx Rz Ry from the tibia frame to the pelvis frame [rad].
 
     Args:
         pelvis: attitude of the pelvis IMU, quaternion wxyz, sensor to world, of unit norm within the resolution of its signals.
@@ -200,7 +200,7 @@ def hip_angles(pelvis: list[float], tibia: list[float]) -> tuple[float, float, f
     x = a * f - b * e - c * h + d * g
     y = a * g + b * h - c * e - d * f
     z = a * h - b * g + c * f - d * e
-    sine = 2.0 * (w * z - x * y)  # sine of TH: minus element (0, 1) of the rotation matrix
+    sine = 2.0 * (w * z - x * y)  # sine of the transverse hip angle: minus element (0, 1) of the rotation matrix
     th = math.asin(max(-1.0, min(1.0, sine)))
     sagittal = math.atan2(2.0 * (x * z + w * y), 1.0 - 2.0 * (y * y + z * z))
     fh = math.atan2(2.0 * (y * z + w * x), 1.0 - 2.0 * (x * x + z * z))

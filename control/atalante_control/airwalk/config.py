@@ -24,7 +24,7 @@ class AirwalkConfig(StepGuideConfig):
     gains: PidGains = AIR_GAINS
     alpha: float = 0.4  # end of the re-centring, as a fraction of the step duration
     flat_foot: bool = True  # whether the ankle of the swing leg holds the sole level
-    ankle_offset: float = math.radians(1.0)  # rad, offset added to the desired SA angles of both legs
+    ankle_offset: float = math.radians(1.0)  # rad, offset added to the desired angles of both sagittal ankles
     startup: float = 2.0  # s, shortest duration of the motion from the measured pose to the first pose of the gait
     #: s, time in which the compensation of a torque jump fades out (see `carry_over`), or 0 for no compensation
     blend: float = 0.02

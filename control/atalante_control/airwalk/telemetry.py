@@ -15,12 +15,12 @@ Pair = tuple[float, float]
 
 
 class Telemetry:
-    """Telemetry of one cycle. Each pair except `guide` has a value for SH and a value for SK of the swing leg."""
+    """Telemetry of one cycle. Each pair except `guide` has values for sagittal hip and knee of the swing leg."""
 
     q_des: Annotated[Vector, len(JOINTS)]  # rad
     error: Annotated[Vector, 2]  # rad, q - q_des
     q_bound: Annotated[Vector, 2]  # rad, distance from q_des to the guide bound on the side of the error
-    guide: Annotated[Vector, 2]  # rad, distances from q_des to the upper and to the lower bound of the guide of SH
+    guide: Annotated[Vector, 2]  # rad, distances from q_des to upper and lower guide bound of the hip
     #: h of the paper: at least 0 if the backup policy can keep both joints inside; the same value for both joints
     h: Annotated[Vector, 2]
     gate: Annotated[Vector, 2]  # weight of the backup torque, the same value for both joints; published as `lambda`
@@ -45,7 +45,7 @@ class Step:
     completed: int  # number of right-stance steps completed before this step
     cycles: int  # cycles of a step
     xi: float  # assistance factor
-    assisted: bool  # whether SH and SK of the swing leg get the assistive torque; False at Xi = 1
+    assisted: bool  # True if hip and knee of the swing leg get the assistive torque; False at assistance factor 1
     intensity: float  # factor of the haptic levels
     literal: bool  # whether the control law follows the paper literally, see `guide.literal`
     active: float  # weight of the backup torque above which the filter is considered active

@@ -31,7 +31,7 @@ from atalante_hal.types import Vector
 
 Pair = tuple[float, float]
 
-#: Number of elements of the state x: five quantities, each with an element for SH and then an element for SK.
+#: Number of elements of the state x: five quantities, each with an element for the sagittal hip and then an element for the knee.
 #: 1. Tracking error e = q - q_des [rad].
 #: 2. True error rate e' [rad/s].
 #: 3. Measured error rate e', after the low-pass of the drives [rad/s].
@@ -80,7 +80,7 @@ class SampledLoop:
 
 @dataclass(frozen=True)
 class BackupPolicy:
-    """Gains of the backup policy, the control law that returns the coupled SH and SK to the desired motion.
+    """Gains of the backup policy, the control law that returns the coupled sagittal hip and knee to the desired motion.
 
     Raises:
         ValueError: If a value is not positive and finite, or the mass matrix is not positive definite.
@@ -110,26 +110,26 @@ class BackupPolicy:
         return kappa, 2.0 * np.array(self.damping) * np.sqrt(kappa), shapes[:, order].real
 
     def gains(self) -> tuple[Vector, Vector]:
-        """Return Kv and Dv, each of shape (2, 2) [1/s2, 1/s]."""
+        """Return the gain matrices Kv [1/s2] and Dv [1/s] of the backup policy, each of shape (2, 2)."""
         kappa, delta, shapes = self.modes()
         inverse = np.linalg.inv(shapes)
         return shapes @ np.diag(kappa) @ inverse, shapes @ np.diag(delta) @ inverse
 
 
 class Responses(NamedTuple):
-    """Motion of SH and SK under the backup policy, for each number of cycles ahead, 0 to n.
+    """Motion of sagittal hip and knee under the backup policy, for each number of cycles ahead, 0 to n.
 
     The rows of each array are SH and SK. `error`, `rate` and `feedback` are matrices to be multiplied by a state x with `STATES`
     elements. The arrays whose names begin with `pushed` are matrices to be multiplied by an acceleration of SH and SK that acts
     during the first cycle only.
     """
 
-    error: Vector  # (n + 1, 2, 10) predicted error e [rad]
-    rate: Vector  # (n + 1, 2, 10) predicted rate e' [rad/s]
-    feedback: Vector  # (n + 1, 2, 10) predicted backup acceleration -Kv e - Dv e' [rad/s2]
-    pushed_error: Vector  # (n + 1, 2, 2) error e [rad] after a unit acceleration of SH and of SK in the first cycle
-    pushed_rate: Vector  # (n + 1, 2, 2) rate e' [rad/s] after a unit acceleration of SH and of SK in the first cycle
-    #: (n + 1, 2, 2) backup acceleration [rad/s2] after a unit acceleration of SH and of SK in the first cycle
+    error: Vector  # (n + 1, 2, 10) matrix from the state to the predicted error e [rad]
+    rate: Vector  # (n + 1, 2, 10) matrix from the state to the predicted rate e' [rad/s]
+    feedback: Vector  # (n + 1, 2, 10) matrix from the state to the predicted -Kv e - Dv e' [rad/s2]
+    pushed_error: Vector  # (n + 1, 2, 2) error e [rad] after a unit acceleration of hip and knee in the first cycle
+    pushed_rate: Vector  # (n + 1, 2, 2) rate e' [rad/s] after a unit acceleration of hip and knee in the first cycle
+    #: (n + 1, 2, 2) backup acceleration [rad/s2] after a unit acceleration of hip and knee in the first cycle
     pushed_feedback: Vector
 
 

@@ -72,7 +72,7 @@ class Limit(NamedTuple):
 
 @dataclass(frozen=True)
 class Certificate:
-    """Result of the certification of a guide: the disturbance torques that are promised to leave both joints inside."""
+    """Result of the certification of a guide: the promised disturbance torques, under which both joints stay inside the guide."""
 
     shape: str
     xi: float
@@ -86,7 +86,7 @@ class Certificate:
 
 
 class PromiseLimits:
-    """Conditions that limit the promised torques of a guide filter. Conditions that do not depend on Xi are evaluated once."""
+    """Conditions that limit the promised torques of a guide filter. The limits of the drives are computed once."""
 
     def __init__(self, guide: GuideFilter) -> None:
         """Compute the limits of torque, speed and torque rate.
@@ -123,7 +123,7 @@ class PromiseLimits:
         self._horizon = _Horizon(guide)
 
     def at(self, xi: float) -> list[Limit]:
-        """Return the conditions, sorted from the strictest to the weakest.
+        """Return the conditions at an assistance factor, sorted from the strictest to the weakest.
 
         Args:
             xi: assistance factor in [0, 1].
@@ -137,7 +137,7 @@ class PromiseLimits:
         return sorted(found, key=lambda limit: limit.scale)
 
     def largest(self, xi: float) -> float:
-        """Return the largest possible promise as a fraction of the chosen promised torques; at most 0 if none is possible.
+        """Return the largest torques that can be promised, as a fraction of the chosen ones; at most 0 if none can be promised.
 
         Args:
             xi: assistance factor in [0, 1].

@@ -20,11 +20,11 @@ class StepGuideConfig:
     """
 
     friction: Friction = field(default_factory=Friction)
-    stiffness: Pair = (2800.0, 2900.0)  # Nm/rad, stiffness of SH and SK under the stiffest backup policy
+    stiffness: Pair = (2800.0, 2900.0)  # Nm/rad, stiffness of sagittal hip and knee under the stiffest backup policy
     #: stiffnesses of the softer backup policies as fractions of `stiffness`, ascending
     gentler: tuple[float, ...] = (0.78,)
     damping: Pair = (1.3, 0.85)  # damping ratios of the two modes of the backup policy
-    #: Nm, chosen promised torques: disturbance torques of SH and SK that the guide tolerates, if possible
+    #: Nm, chosen promised torques: disturbance torques of sagittal hip and knee that the guide tolerates, if possible
     promise: Pair = (30.0, 18.0)
     mismatch: Mismatch = field(default_factory=Mismatch)
     hand_over: HandOver = field(default_factory=HandOver)

@@ -44,7 +44,7 @@ class Mismatch:
 
     friction: float = 0.2  # largest error of the friction torque, as a fraction of this torque
     inertia: float = 0.1  # largest error of mass and inertia of the leg, as a fraction; one factor for the whole leg
-    residual: Pair = (1.0, 1.0)  # Nm, torque errors of SH and SK that have no model
+    residual: Pair = (1.0, 1.0)  # Nm, torque errors of sagittal hip and knee that have no model
 
     def __post_init__(self) -> None:
         for name in ("friction", "inertia"):
@@ -62,9 +62,9 @@ class HandOver:
         ValueError: If a value is negative or not finite.
     """
 
-    deviation: float = math.radians(2.7)  # rad, largest |s(0)| of SH and SK
-    rate: float = 0.25  # rad/s, largest |s'(0)| of SH and SK
-    torque: Pair = (25.0, 13.0)  # Nm, largest torques of SH and SK that are carried over the stance change
+    deviation: float = math.radians(2.7)  # rad, largest angle deviation |s(0)| of hip and knee
+    rate: float = 0.25  # rad/s, largest speed deviation |s'(0)| of sagittal hip and knee
+    torque: Pair = (25.0, 13.0)  # Nm, largest torques of sagittal hip and knee that are carried over the stance change
     #: rad/s2, largest joint acceleration before the stance change.
     #: Such an acceleration makes the measured velocity differ from the true velocity at the start of the step.
     acceleration: float = 20.0
@@ -77,7 +77,7 @@ class HandOver:
             raise ValueError(f"torque of the hand-over must be finite and at least 0 Nm, got {self.torque!r}")
 
     def largest(self, values: Vector) -> Vector:
-        """Return the largest absolute value of the re-centring s, s' or s'' for all deviations in the box.
+        """Return the largest absolute value of the re-centring s, s' or s'' for all deviations in the hand-over box.
 
         Args:
             values: values of s, s' or s'' for s(0) = 1 rad (first row) and for s'(0) = 1 rad/s (second row), shape (2, n).
@@ -95,7 +95,7 @@ class Leg(NamedTuple):
     """
 
     deadbeat: Deadbeat  # re-centring of the gait
-    time: Vector  # (n,) s, since the stance change
+    time: Vector  # (n,) s, time since the stance change
     q: Vector  # (n, 2) rad, nominal angles
     qd: Vector  # (n, 2) rad/s, nominal velocities
     qdd: Vector  # (n, 2) rad/s2, nominal accelerations
@@ -166,7 +166,7 @@ _SPEED_MARGIN = 1.0
 
 
 class Effect(NamedTuple):
-    """Effect of a disturbance on two outputs, one of SH and one of SK. An output is an error, a torque or a speed."""
+    """Effect of a disturbance on two outputs, one per joint (hip, knee). An output is an error, a torque or a speed."""
 
     #: (lags + 1, 2, 2) response to an acceleration that lasts one cycle, 0 to `lags` cycles later.
     pushed: Vector

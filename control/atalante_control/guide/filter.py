@@ -57,9 +57,9 @@ class GuideConfig:
         ValueError: If a number is out of range.
     """
 
-    torque_limit: float  # Nm, largest allowed torque of SH and SK in the prediction
+    torque_limit: float  # Nm, largest allowed torque of sagittal hip and knee in the prediction
     rate_limit: float  # Nm, largest allowed change of the backup torque within one cycle
-    speed_limit: float  # rad/s, largest allowed speed of SH and SK in the prediction
+    speed_limit: float  # rad/s, largest allowed speed of sagittal hip and knee in the prediction
     worst_speed_limit: float  # rad/s, largest allowed speed in the prediction with the worst model errors
     zeta: float = 0.01  # s, gain of lambda_d, which increases the weight of the backup torque while h decreases
     derivative_time: float = 0.005  # s, time constant of the low-pass filter on dh/dt
@@ -80,7 +80,7 @@ class GuideConfig:
 
 
 class GuideFilter:
-    """Guide filter of SH and SK for one gait, one shape and one set of gains. By symmetry, the filter serves both swing legs.
+    """Guide filter of hip and knee for one gait, one shape and one set of gains. By symmetry, the filter serves both swing legs.
 
     Call `start_step` at each stance change, then `tick` once per cycle.
 
@@ -153,7 +153,7 @@ class GuideFilter:
         guard.xi, guard.promise, guard.fresh = xi, promise, True
 
     def widths(self, xi: float) -> Vector:
-        """Return the distance from q_des to the nearer bound of the guide, for SH and SK in each cycle, shape (n, 2) [rad].
+        """Return the distance from q_des to the nearer bound of the guide, for hip and knee in each cycle, shape (n, 2) [rad].
 
         Args:
             xi: assistance factor in [0, 1].
@@ -161,7 +161,7 @@ class GuideFilter:
         return np.asarray(self.shape.bounds(self._phase, xi).min(axis=2).T)
 
     def tick(self, cycle: int, leg: LegState) -> Pair:
-        """Return the torques of SH and SK [Nm].
+        """Return the torques of sagittal hip and knee [Nm].
 
         Args:
             cycle: cycles since the stance change. A number above the length of the step is replaced by this length.
@@ -175,7 +175,7 @@ class GuideFilter:
         return self.tables.guards[0].state.copy()
 
     def errors_ahead(self) -> Vector:
-        """Return the tracking errors of SH and SK predicted in the last cycle without disturbance, shape (n, 2) [rad]."""
+        """Return the tracking errors of hip and knee predicted in the last cycle without disturbance, shape (n, 2) [rad]."""
         return np.asarray(self.prediction.ahead @ (self.prediction.compress @ self.state))
 
     def uncertainty(self) -> Vector:

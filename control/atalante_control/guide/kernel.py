@@ -31,7 +31,7 @@ START_CYCLES = 4
 class Guard:
     """Constants and state of the filter, and results of the last cycle."""
 
-    gains: Annotated[Vector, (2, 4)]  # rows SH, SK; Kv [1/s2] in columns 0 and 1, Dv [1/s] in columns 2 and 3
+    gains: Annotated[Vector, (2, 4)]  # backup gains of hip (row 0) and knee (row 1): Kv [1/s2], then Dv [1/s]
     torque_limit: float  # Nm, largest allowed torque in the prediction
     speed_limit: float  # rad/s, largest allowed speed of a joint in the prediction
     worst_speed_limit: float  # rad/s, largest allowed speed of a joint in the prediction with the worst model errors
@@ -57,13 +57,13 @@ class Guard:
     h: float  # h of the last cycle; at h >= 0, the backup policy can keep both joints inside the guide
     rate: float  # 1/s, dh/dt
     gate: float  # gate, the weight of the backup torque: `lambda + (1 - lambda) lambda_d`
-    bounds: Annotated[Vector, 4]  # rad, distances from q_des to the bounds: SH upper, SH lower, SK upper, SK lower
+    bounds: Annotated[Vector, 4]  # rad, distances to the bounds: hip upper, hip lower, knee upper, knee lower
 
 
 class Lag:
     """Prediction of the tracking errors for one number of cycles ahead. The fixed shape makes the compiled loops fast."""
 
-    #: matrix from the compressed state to the predicted errors e of SH and SK [rad]
+    #: matrix from the compressed state to the predicted errors e of sagittal hip and knee [rad]
     ahead: Annotated[Vector, (COMPRESSED, 2)]
 
 
@@ -82,9 +82,9 @@ class Few:
     """Prediction of torque and speed for one number of cycles ahead, see `prediction.FEW`."""
 
     lag: int  # number of cycles ahead
-    #: matrix from the state to the predicted backup accelerations [rad/s2] of SH and SK, then to their predicted e' [rad/s]
+    #: matrix from the state to the predicted backup accelerations [rad/s2] of hip and knee, then to their predicted e' [rad/s]
     ahead: Annotated[Vector, (STATES, 4)]
-    #: matrix from `Guard.magnitude` to the largest change of the predicted e' of SH and SK that model errors can cause [rad/s]
+    #: matrix from `Guard.magnitude` to the largest change of the predicted e' of hip and knee that model errors can cause [rad/s]
     slack: Annotated[Vector, (STATES, 2)]
 
 
@@ -96,17 +96,17 @@ class GuideTables(NamedTuple):
     lags: Records[Lag]  # (lags,)
     blocks: Records[Block]  # (blocks,)
     few: Records[Few]  # (rows,) in ascending order of `Few.lag`
-    #: (starts, lags, 4) largest errors of SH and SK due to model errors, then due to the promised torques [rad]
+    #: (starts, lags, 4) largest errors of sagittal hip and knee due to model errors, then due to the promised torques [rad]
     reach: Vector
     highest: Vector  # (starts, blocks, 4) maximum of `reach` over each block of cycles ahead [rad]
-    #: (starts, rows, 12) largest effects of disturbances on the torques [Nm] and speeds [rad/s] of SH and SK.
+    #: (starts, rows, 12) largest effects of disturbances on the torques [Nm] and speeds [rad/s] of sagittal hip and knee.
     #: Columns 0 to 3: torques and speeds due to model errors. Columns 4 to 7: torques and speeds due to the promised torques.
     #: Columns 8 to 11: speeds with the worst inertia and delay, due to model errors and then due to the promised torques.
     few_reach: Vector
     step: Vector  # (horizon + 1, COLUMNS) values of each cycle of the step; the column numbers are defined below
 
 
-INVERSE = 0  # columns 0 to 3 of `step`: 1 / distance from q_des to the upper and lower bound of SH, then of SK [1/rad]
+INVERSE = 0  # columns 0 to 3 of `step`: 1 / distance to the upper and lower bound of the hip, then of the knee [1/rad]
 REFERENCE = 4  # columns 4 and 5 of `step`: acceleration of q_des at the time when a command takes effect [rad/s2]
 VELOCITY = 6  # columns 6 and 7 of `step`: velocity of q_des after the low-pass of the drives [rad/s]
 BASE = 8  # columns 8 and 9 of `step`: torque that moves the leg along q_des [Nm]
@@ -124,16 +124,16 @@ TAIL_CYCLES = 60
 
 
 class LegState(NamedTuple):
-    """Measurements of SH and SK of the swing leg in one cycle."""
+    """Measurements of sagittal hip and knee of the swing leg in one cycle."""
 
     hip: float  # rad, q of SH
     knee: float  # rad, q of SK
-    hip_rate: float  # rad/s, measured velocity of SH
-    knee_rate: float  # rad/s, measured velocity of SK
+    hip_rate: float  # rad/s, measured velocity of the sagittal hip
+    knee_rate: float  # rad/s, measured velocity of the knee
     hip_desired: float  # rad, q_des of SH
     knee_desired: float  # rad, q_des of SK
-    hip_sent: float  # Nm, command of the previous cycle to SH, after the limiter
-    knee_sent: float  # Nm, command of the previous cycle to SK, after the limiter
+    hip_sent: float  # Nm, command of the previous cycle to the sagittal hip, after the limiter
+    knee_sent: float  # Nm, command of the previous cycle to the knee, after the limiter
     hip_gravity: float  # Nm, u_g of SH
     knee_gravity: float  # Nm, u_g of SK
 
@@ -165,7 +165,7 @@ def leg_state(hip: int, q: Vector, qd: Vector, desired: Vector, sent: Vector, gr
 
 
 def tick(guide: GuideTables, cycle: int, leg: LegState) -> Pair:
-    """Compute the torques of SH and SK for one cycle: (1 - gate) u_free + gate u_B.
+    """Compute the torques of sagittal hip and knee for one cycle: (1 - gate) u_free + gate u_B.
 
     Args:
         guide: tables of the guide filter; the results of the tick are written to `GuideTables.guards`.
@@ -226,7 +226,7 @@ def _estimate(guard: Guard, step: Vector, cycle: int, leg: LegState, m: tuple[fl
 
 
 def _acceleration(hip: float, knee: float, m: tuple[float, float, float], row: Vector) -> Pair:
-    """Return `M^-1 u - q_des''`, the acceleration of the tracking error e under torques u of SH and SK [rad/s2]."""
+    """Return `M^-1 u - q_des''`, the acceleration of the tracking error e under torques u of sagittal hip and knee [rad/s2]."""
     m11, m12, m22 = m
     determinant = m11 * m22 - m12 * m12
     return (m22 * hip - m12 * knee) / determinant - row[REFERENCE], (m11 * knee - m12 * hip) / determinant - row[
@@ -377,7 +377,7 @@ def _few_ratio(guide: GuideTables, cycle: int, least: float) -> float:
 
 
 def gate(h: float, xi: float) -> float:
-    """Return the gate lambda of the paper, `(1 + (Xi^10 - 1) h)^3`, clamped to [0, 1]; 1 outside the safe backward image.
+    """Return the gate lambda of the paper: (1 + (Xi^10 - 1) h)^3, clamped to [0, 1]; 1 outside the safe backward image (h < 0).
 
     Args:
         h: function that is at least 0 inside the safe backward image, at most 1.

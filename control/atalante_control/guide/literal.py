@@ -1,4 +1,4 @@
-"""Assistive torque computed literally as the paper prints it: `measured motion -> u_a = u_i + u_f + u_v` of SH and SK.
+"""Assistive torque computed literally as the paper prints it: `measured motion -> u_a = u_i + u_f + u_v` of hip and knee.
 
 This law is for comparisons with the paper. Its certificate contains no promised torques: it is not proven that the joints stay
 inside the guide under any disturbance torque.
@@ -36,7 +36,7 @@ _ASSISTED = [LEG_JOINTS.index("SH"), LEG_JOINTS.index("SK")]
 
 
 class Letter:
-    """Constants and state of the control law that follows the paper literally. Each array has values for SH and SK."""
+    """Constants and state of the control law that follows the paper literally. Each array has values for hip and knee."""
 
     kp: Annotated[Vector, 2]  # Nm/rad
     kd: Annotated[Vector, 2]  # Nm s/rad
@@ -59,9 +59,9 @@ class LiteralTables(NamedTuple):
     step: Vector  # (cycles + 1, 8) values of each cycle of the step; the columns are defined below
 
 
-BOUND = 0  # columns 0 to 3 of `step`: distances to the upper and lower bound of SH, then of SK [rad]
-REFERENCE = 4  # columns 4 and 5 of `step`: q_des'' of SH and SK [rad/s2]
-FEEDFORWARD = 6  # columns 6 and 7 of `step`: feedforward u_f of SH and SK at full intensity [Nm]
+BOUND = 0  # columns 0 to 3 of `step`: distances to the upper and lower bound of the hip, then of the knee [rad]
+REFERENCE = 4  # columns 4 and 5 of `step`: q_des'' of sagittal hip and knee [rad/s2]
+FEEDFORWARD = 6  # columns 6 and 7 of `step`: feedforward u_f of sagittal hip and knee at full intensity [Nm]
 
 
 @dataclass(frozen=True)
@@ -69,7 +69,7 @@ class LiteralConfig:
     """Parameters of the control law that follows the paper literally."""
 
     gains: LegGains  # gains of the baseline PID of the swing leg
-    push: Pair  # Nm, largest absolute value of the external torque u_ext of SH and SK
+    push: Pair  # Nm, largest absolute value of the external torque u_ext of sagittal hip and knee
     zeta: float  # s, gain of lambda_d; lambda_d increases the gate (factor of u_b) while h decreases
     idealization: float  # intensity of the joint idealization u_i, in [0, 1]
     feedforward: float  # intensity of the feedforward u_f, in [0, 1]
@@ -133,7 +133,7 @@ def no_promise(shape: str, xi: float) -> Certificate:
 
 
 def assistive_torque(tables: LiteralTables, guard: Guard, cycle: int, leg: LegState, rates: Pair) -> Pair:
-    """Compute the assistive torque u_a = u_i + u_f + u_v of SH and SK for one cycle [Nm].
+    """Compute the assistive torque u_a = u_i + u_f + u_v of sagittal hip and knee for one cycle [Nm].
 
     Args:
         tables: tables of the literal law.

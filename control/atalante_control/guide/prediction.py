@@ -30,7 +30,7 @@ SIZES = np.repeat([0.07, 1.0, 1.0, 140.0, 140.0], 2)
 class Assumptions:
     """Assumptions of a certificate: promised torques, time behaviour of the drives, model errors, start deviations."""
 
-    #: Nm, promised disturbance: largest torques at SH and SK under which the joints must stay inside the guide
+    #: Nm, promised disturbance: largest torques at sagittal hip and knee under which the joints must stay inside the guide
     promise: Pair = (30.0, 18.0)
     loop: SampledLoop = field(default_factory=SampledLoop)
     mismatch: Mismatch = field(default_factory=Mismatch)
@@ -151,7 +151,7 @@ class Prediction:
         first_torque = run(torque, mobilities, bounds, few, few_ahead[0])
         first_speed = run(speed, mobilities, bounds, few, few_ahead[1])
         # Axes of `by_bound`: block of start cycles, element of `FEW`, cause, output, joint.
-        # The causes are model errors and promised torques, the outputs torque and speed, the joints SH and SK.
+        # The causes are model errors and promised torques, the outputs torque and speed, the joints sagittal hip and knee.
         by_bound = few_ahead[:2].reshape(2, blocks, len(FEW), 2, 2).transpose(1, 2, 3, 0, 4)
         self.few_reach: Vector = np.concatenate([by_bound.reshape(blocks, len(FEW), 8), few_ahead[2]], axis=2)
         self.few_ahead: Vector = np.concatenate([nominal.feedback[FEW], nominal.rate[FEW]], axis=1)

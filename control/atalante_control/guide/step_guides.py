@@ -117,7 +117,7 @@ class StepGuides:
 
 
 def filter_config(config: StepGuideConfig, robot: Robot) -> GuideConfig:
-    """Return the parameters of the guide filters. The limits of torque and speed follow from the limits of SH and SK.
+    """Return the parameters of the guide filters. The limits of torque and speed follow from the limits of sagittal hip and knee.
 
     Args:
         config: reserves, gains and intensities.

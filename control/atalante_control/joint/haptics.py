@@ -19,7 +19,7 @@ _FRONT = tuple(
 
 
 def intensity(xi: float) -> float:
-    """Return the factor 1 - exp(30 (Xi - 1)) of the vibration levels: close to 1 below Xi = 0.9, exactly 0 at Xi = 1.
+    """Return the factor of the vibration levels at the assistance factor Xi: 1 - exp(30 (Xi - 1)), which is 0 at Xi = 1.
 
     Args:
         xi: assistance factor in [0, 1].

@@ -31,7 +31,7 @@ _ASSISTED = (LEG_JOINTS.index("SH"), LEG_JOINTS.index("SK"))
 
 
 class Law:
-    """Parameters of `idealization` for the assisted joints, SH and SK."""
+    """Parameters of `idealization` for the assisted joints, sagittal hip and knee."""
 
     fit: Annotated[Vector, (3, 3)]  # kg m2, `AssistedInertia.fit`
     coulomb: Annotated[Vector, 2]  # Nm
@@ -81,7 +81,7 @@ class AssistedInertia:
     """
 
     def __init__(self, articulated: ArticulatedModel, swing: Vector) -> None:
-        """Compute the mass matrix of SH and SK of the left leg. By symmetry the matrix also applies to the right leg.
+        """Compute the mass matrix of sagittal hip and knee of the left leg. By symmetry the matrix also applies to the right leg.
 
         Args:
             articulated: empty exoskeleton with the pelvis fixed.
@@ -108,7 +108,7 @@ class AssistedInertia:
         self.inertias: Pair = (float(blocks[:, 0].max()), float(blocks[:, 2].max()))
 
     def block(self, knee: float) -> tuple[float, float, float]:
-        """Return the mass matrix at a knee angle [kg m2]: M11 (SH), M12 (coupling of SH and SK), M22 (SK).
+        """Return the mass matrix at a knee angle [kg m2]: M11 (sagittal hip), M12 (coupling), M22 (knee).
 
         Args:
             knee: angle of SK [rad].
@@ -117,7 +117,7 @@ class AssistedInertia:
         return m11, m12, m22
 
     def velocity_torques(self, knee: float, hip_rate: float, knee_rate: float) -> Pair:
-        """Return the velocity torques (centrifugal, Coriolis) of SH and SK [Nm], see `velocity_torques`.
+        """Return the velocity torques (centrifugal, Coriolis) of sagittal hip and knee [Nm], see `velocity_torques`.
 
         Args:
             knee: angle of SK [rad].
@@ -143,7 +143,7 @@ def law_of(friction: Friction, inertia: AssistedInertia) -> Records[Law]:
 
 
 def idealization(law: Law, knee: float, hip_rate: float, knee_rate: float, gravity: Pair) -> Pair:
-    """Return u_i of SH and SK, the sum of friction compensation, velocity torques and u_g [Nm].
+    """Return u_i of sagittal hip and knee, the sum of friction compensation, velocity torques and u_g [Nm].
 
     Args:
         law: result of `law_of`.
@@ -172,7 +172,7 @@ def friction(velocity: float, coulomb: float, viscous: float, smoothing: float) 
 
 
 def mass(fit: Vector, knee: float) -> tuple[float, float, float]:
-    """Return M11, M12 and M22 of SH and SK at a knee angle [kg m2]. Compiled kernels can call this function.
+    """Return M11, M12 and M22 of sagittal hip and knee at a knee angle [kg m2]. Compiled kernels can call this function.
 
     Args:
         fit: `AssistedInertia.fit`.
@@ -187,7 +187,7 @@ def mass(fit: Vector, knee: float) -> tuple[float, float, float]:
 
 
 def velocity_torques(fit: Vector, knee: float, hip_rate: float, knee_rate: float) -> Pair:
-    """Return the velocity torques (centrifugal, Coriolis) of SH and SK [Nm]. Compiled kernels can call this function.
+    """Return the velocity torques (centrifugal, Coriolis) of sagittal hip and knee [Nm]. Compiled kernels can call this function.
 
     The torque of SH is M11' q1' q2' + M12' q2'^2, and the torque of SK is -M11' q1'^2 / 2. M11' and M12' are derivatives with
     respect to the knee angle; q1' and q2' are the speeds of SH and SK.

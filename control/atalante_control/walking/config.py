@@ -50,11 +50,11 @@ class WalkConfig:
     reach_speed: Pair = (0.3, 0.03)
     #: s, longest downward motion of the swing foot after the nominal end of a step; `reach_knee` can end this motion earlier
     reach_time: float = 0.2
-    #: rad/s, largest speed of SH and SK while a late swing foot moves down.
+    #: rad/s, largest speed of sagittal hip and knee while a late swing foot moves down.
     #: With an almost straight leg, `reach_rate` makes the foot slower than `reach_speed`.
     reach_rate: float = 2.5
     reach_knee: float = 0.05  # rad, smallest knee angle while a late swing foot moves down
-    #: Steering gains: TH offset per heading [rad/rad], TH offset per sideways deviation [rad/m], largest TH offset [rad].
+    #: Steering by an offset of the transverse hip: gain per heading [rad/rad], gain per sideways deviation [rad/m], limit [rad].
     steering: tuple[float, float, float] = STEERING
     #: s, time after the nominal end of a step at which the step ends if no landing is detected
     landing_timeout: float = 0.4
@@ -68,13 +68,13 @@ class WalkConfig:
     shift: float = 1.5  # s, duration of a weight shift, onto one foot or back to both feet
     rest: float = 0.3  # s, wait between the weight shift and the first step
     guide: StepGuideConfig = WALK_GUIDE
-    #: End of the re-centring of SH and SK in a guided step, as a fraction of the step duration.
+    #: End of the re-centring of sagittal hip and knee in a guided step, as a fraction of the step duration.
     #: With the smaller value `alpha`, the re-centring of the heavy leg would need more torque than the drives have.
-    #: All other joints use `alpha`, because the robot would fall if they were re-centred as slowly as SH and SK.
+    #: All other joints use `alpha`, because the robot would fall if they were re-centred as slowly as sagittal hip and knee.
     guided_alpha: float = 0.5
     #: s, time after the start of a guided step in which the smallest allowed weight of the backup torque falls from 1 to 0
     engage: float = 0.02
-    release: float = 0.03  # s, time after the nominal end of a guided step in which the baseline takes over SH and SK
+    release: float = 0.03  # s, time after a guided step in which the baseline takes over sagittal hip and knee
 
     @classmethod
     def literal(cls) -> WalkConfig:

@@ -64,7 +64,7 @@ def pressure_shift(parameters: Stabiliser, error: Vector) -> Pair:
 
 
 def ankle_torques(parameters: Stabiliser, shift: Vector, load: float, side: int) -> Pair:
-    """Return the SA and HA torques that shift the centre of pressure of one foot [Nm].
+    """Return the torques of sagittal and henke ankle that shift the centre of pressure of one foot [Nm].
 
     Args:
         parameters: geometry of the foot.

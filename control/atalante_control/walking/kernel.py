@@ -64,7 +64,7 @@ class Stage:
 
     stance: int  # stance leg, 0 left, 1 right
     double: bool  # whether no foot swings, because both feet are on the ground or the robot is suspended
-    steering: float  # rad, offset of TH of the swing leg at the end of the step
+    steering: float  # rad, steering: offset of the transverse hip of the swing leg at the end of the step
     #: rad, joint angles at the start of the phase minus the angles in the first row of the phase table
     deviation: Annotated[Vector, len(JOINTS)]
     #: rad/s, joint speeds at the start of the phase minus the speeds in the first row of the phase table
@@ -72,9 +72,9 @@ class Stage:
     placed: bool  # True: foot placement and step timing act
     literal: bool  # True: the control law follows the paper literally, see `WalkConfig.literal`
     flat: bool  # True: the sole of the swing foot is held level
-    #: True: the guide filter drives SH and SK of the swing leg; False at Xi = 1 and in all phases except the periodic step
+    #: True: the guide filter drives hip and knee of the swing leg. False at assistance factor 1 and outside the periodic step.
     assisted: bool
-    #: Nm, torque of the guide filter minus torque of the baseline controller at SH and SK, in the last guided cycle
+    #: Nm, torque of the guide filter minus torque of the baseline controller at sagittal hip and knee, in the last guided cycle
     excess: Annotated[Vector, 2]
 
 
@@ -104,7 +104,7 @@ class Assistance(NamedTuple):
 
     guide: GuideTables  # `GuideFilter.tables`
     literal: LiteralTables  # `LiteralGuide.tables`, used instead of the guide if `Stage.literal`
-    unmodelled: Vector  # (n + 1, 2) Nm, `SwingLeg.unmodelled`: torque of SH and SK in each cycle of the step
+    unmodelled: Vector  # (n + 1, 2) Nm, `SwingLeg.unmodelled`: torque of hip and knee in each cycle of the step
     fade: Vector  # (m,) factor of `Stage.excess` in each cycle after the nominal end of the step; falls from 1 to 0
 
 
@@ -293,7 +293,7 @@ def act(
 
 
 def _assist(cycle: int, measured: Measured, assistance: Assistance, parts: Parts) -> None:
-    """Replace the torques of SH and SK of the swing leg by the torques of the guide filter.
+    """Replace the torques of sagittal hip and knee of the swing leg by the torques of the guide filter.
 
     After the nominal end of the step, the baseline controller lowers the foot. `Stage.excess`, the difference of both torques in
     the last guided cycle, is added to its torque and fades out with `fade`, so the command is continuous.

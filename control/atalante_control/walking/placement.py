@@ -71,7 +71,7 @@ class Placement:
     target: Annotated[Vector, 2]  # m, requested offset of the landing in the walking frame
     offset: Annotated[Vector, 2]  # m, current offset of the swing foot in the walking frame
     speed: Annotated[Vector, 2]  # m/s, speed of the offset
-    change: Annotated[Vector, 3]  # rad, changes of FH, SH and SK of the swing leg
+    change: Annotated[Vector, 3]  # rad, changes of frontal hip, sagittal hip and knee of the swing leg
     low: Annotated[Vector, 12]  # rad, smallest desired angles of the joints
     high: Annotated[Vector, 12]  # rad, largest desired angles of the joints
     rotation: Annotated[Vector, (3, 3)]  # rotation matrix from the last link to the pelvis
@@ -189,7 +189,7 @@ def follow(config: PlacementConfig, placement: Placement, rate: float) -> None:
 def shift_foot(
     placement: Placement, links: Records[Link], first: int, desired: Vector, leg: int, shift: Vector3
 ) -> None:
-    """Shift the desired position of the ankle of the swing leg, by one Newton step for FH, SH and SK in each cycle.
+    """Shift the desired position of the swing ankle by one Newton step per cycle for frontal hip, sagittal hip and knee.
 
     The attitude of the foot is not considered, because the ankle holds the sole level.
 

@@ -35,8 +35,8 @@ class PhaseTable(NamedTuple):
     dcm: Vector  # (n + 1, 2) m, nominal DCM
     frequency: float  # rad/s, natural frequency w of the pendulum
     recentring: Vector  # (m, 4) re-centring rows of all joints without a guide, see `flat_foot.recentring_rows`
-    guided: Vector  # (m, 4) re-centring rows of SH and SK of the swing leg, which a guide can assist
-    reach: Vector  # (2,) rad/s, speeds of SH and SK of the swing leg that lower the swing foot after the last cycle
+    guided: Vector  # (m, 4) re-centring rows of sagittal hip and knee of the swing leg, which a guide can assist
+    reach: Vector  # (2,) rad/s, speeds of hip and knee of the swing leg that lower the swing foot after the last cycle
     reach_cycles: int  # number of cycles in which the swing foot is lowered after the last row
 
 
@@ -44,7 +44,7 @@ class Reach(NamedTuple):
     """Downward motion of a swing foot that has not landed at the nominal end of a step."""
 
     speed: float  # m/s, downward speed of the foot
-    rate: float  # rad/s, largest speed of SH and SK, even if the foot then moves more slowly than `speed`
+    rate: float  # rad/s, largest speed of sagittal hip and knee, even if the foot then moves more slowly than `speed`
     time: float  # s, longest duration of the downward motion
     knee: float  # rad, smallest knee angle during the downward motion
 
@@ -119,7 +119,7 @@ def _product(a: Vector, b: Vector) -> Vector:
 
 
 def _reach(q: Vector, swing: int, kinematics: Kinematics, upright: Vector) -> Vector:
-    """Return the changes of SH and SK per metre of vertical downward motion of the swing foot, shape (2,) [rad/m]."""
+    """Return the changes of sagittal hip and knee per metre of vertical downward motion of the swing foot, shape (2,) [rad/m]."""
     columns = []
     for joint in (_SH, _SK):
         rate = np.zeros(len(q))

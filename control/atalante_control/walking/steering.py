@@ -1,4 +1,4 @@
-"""Steering along a line: `positions and headings of the soles -> deviation from the line -> offset of TH in the next step`.
+"""Steering along a line: `positions and headings of the soles -> deviation from the line -> hip rotation in the next step`.
 
 The line is the straight path that the robot must follow. It starts in the middle between the feet when the walk begins, in the
 direction of the mean heading of the soles. The position on the ground is the sum of the relative sole positions at each landing.
@@ -15,7 +15,7 @@ from atalante_hal.types import Vector
 
 
 class Steering:
-    """Deviation of the walk from the desired line, and the offset of TH that steers back.
+    """Deviation of the walk from the desired line, and the offset of the transverse hip (TH) that steers back.
 
     Attributes:
         feet: positions of left and right sole, x along the line and y to the left of the line, shape (2, 2) [m].
@@ -66,7 +66,7 @@ class Steering:
         self.yaw = float(headings.mean()) - self._origin
 
     def offset(self) -> float:
-        """Return the offset of TH of the swing leg for the next step, positive to the left [rad]."""
+        """Return the offset of the transverse hip (TH) of the swing leg for the next step, positive to the left [rad]."""
         per_yaw, per_metre, largest = self._gains
         return -min(max(per_yaw * self.yaw + per_metre * self.lateral, -largest), largest)
 

@@ -35,7 +35,7 @@ class SwingLeg(NamedTuple):
     """Model of the swing leg in one step, and the torque that this model leaves out."""
 
     leg: Leg
-    unmodelled: Vector  # (n + 1, 2) Nm, torque w of SH and SK, added to the gravity torques u_g
+    unmodelled: Vector  # (n + 1, 2) Nm, torque w of sagittal hip and knee, added to the gravity torques u_g
 
 
 def swing_leg(
