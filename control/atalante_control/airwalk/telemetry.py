@@ -21,10 +21,10 @@ class Telemetry:
     error: Annotated[Vector, 2]  # rad, q - q_des
     q_bound: Annotated[Vector, 2]  # rad, distance from q_des to the guide bound on the side of the error
     guide: Annotated[Vector, 2]  # rad, distances from q_des to upper and lower guide bound of the hip
-    #: h of the paper: at least 0 if the backup policy can keep both joints inside; the same value for both joints
+    #: h of the paper: at least 0 if the backup policy can keep both joints inside the guide; the same value for both joints
     h: Annotated[Vector, 2]
     gate: Annotated[Vector, 2]  # weight of the backup torque, the same value for both joints; published as `lambda`
-    filter_active: Annotated[Vector, 2]  # 1 where the filter is active; the same value for both joints
+    filter_active: Annotated[Vector, 2]  # 1 while the guide filter is active, else 0; the same for both joints
     step: float  # number of completed right-stance steps
     phase: float  # t / T
     stance: float  # 0 left, 1 right
@@ -48,7 +48,7 @@ class Step:
     assisted: bool  # True if hip and knee of the swing leg get the assistive torque; False at assistance factor 1
     intensity: float  # factor of the haptic levels
     literal: bool  # whether the control law follows the paper literally, see `guide.literal`
-    active: float  # weight of the backup torque above which the filter is considered active
+    active: float  # weight of the backup torque above which the guide filter counts as active
 
 
 @dataclass

@@ -26,7 +26,7 @@ from atalante_control.model import Patient
 from atalante_hal.robot import Robot, load_robot
 
 FORMAT = "atalante-library/1"
-LEVELS_MIN = 3  # smallest number of levels of a parameter; a network fitted to only 2 levels has an error of 10 degrees
+LEVELS_MIN = 3  # smallest number of grid levels of a parameter; a network fitted to 2 levels has an error of 10 degrees
 
 Index = tuple[int, ...]
 #: Function that solves one gait. It must be defined at module level, because other processes import it.

@@ -162,7 +162,7 @@ def responses(policy: BackupPolicy, loop: SampledLoop, mobility: float, cycles: 
 
 
 def _powers(a: Vector, b: Vector, outputs: Vector, cycles: int) -> tuple[Vector, Vector]:
-    """Return C A^n and C A^(n-1) b for n from 0 to `cycles`; for n = 0 the vector C A^(n-1) b is set to zero.
+    """Return the free response C A^n and the impulse response C A^(n-1) b for n from 0 to `cycles`; the latter is 0 at n = 0.
 
     Args:
         a: matrix A, shape (m, m).

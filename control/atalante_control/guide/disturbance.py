@@ -44,7 +44,7 @@ class Mismatch:
 
     friction: float = 0.2  # largest error of the friction torque, as a fraction of this torque
     inertia: float = 0.1  # largest error of mass and inertia of the leg, as a fraction; one factor for the whole leg
-    residual: Pair = (1.0, 1.0)  # Nm, torque errors of sagittal hip and knee that have no model
+    residual: Pair = (1.0, 1.0)  # Nm, allowance for all other torque errors at hip and knee
 
     def __post_init__(self) -> None:
         for name in ("friction", "inertia"):

@@ -95,7 +95,7 @@ class GuideTables(NamedTuple):
     laws: Records[Law]  # (1,) mass matrix and friction
     lags: Records[Lag]  # (lags,)
     blocks: Records[Block]  # (blocks,)
-    few: Records[Few]  # (rows,) in ascending order of `Few.lag`
+    few: Records[Few]  # (rows,) predictions of torque and speed, in ascending order of `Few.lag`
     #: (starts, lags, 4) largest errors of sagittal hip and knee due to model errors, then due to the promised torques [rad]
     reach: Vector
     highest: Vector  # (starts, blocks, 4) maximum of `reach` over each block of cycles ahead [rad]
@@ -110,7 +110,7 @@ INVERSE = 0  # columns 0 to 3 of `step`: 1 / distance to the upper and lower bou
 REFERENCE = 4  # columns 4 and 5 of `step`: acceleration of q_des at the time when a command takes effect [rad/s2]
 VELOCITY = 6  # columns 6 and 7 of `step`: velocity of q_des after the low-pass of the drives [rad/s]
 BASE = 8  # columns 8 and 9 of `step`: torque that moves the leg along q_des [Nm]
-MASS = 10  # columns 10 to 12 of `step`: M11, M12 and M22 along q_des [kg m2]
+MASS = 10  # columns 10 to 12 of `step`: mass matrix M11, M12 and M22 along q_des [kg m2]
 SPEED = 13  # columns 13 and 14 of `step`: velocity of q_des [rad/s]
 #: Column 15 of `step`: lower bound of the gate. It is 1 at the start of a step, when the filter takes over the joints.
 FLOOR = 15
@@ -390,7 +390,7 @@ def gate(h: float, xi: float) -> float:
 
 
 def damped_gate(gate: float, rate: float, zeta: float) -> float:
-    """Return `lambda + (1 - lambda) lambda_d`, where `lambda_d = zeta max(0, -dh/dt)` is clamped to 1.
+    """Return the weight of the backup torque: lambda + (1 - lambda) lambda_d, with lambda_d = zeta max(0, -dh/dt) clamped to 1.
 
     Args:
         gate: lambda, in [0, 1]; the result is then in [0, 1] too.

@@ -183,6 +183,6 @@ def _largest_ratio(tables: LiteralTables, cycle: int, joint: int, e: float, rate
 
 
 def _friction(letter: Letter, joint: int, rate: float) -> float:
-    """Return k_d sign(q') + k_v q' [Nm]."""
+    """Return the friction torque k_d sign(q') + k_v q' [Nm]."""
     sign = math.copysign(1.0, rate) if rate != 0.0 else 0.0
     return float(letter.coulomb[joint] * sign + letter.viscous[joint] * rate)

@@ -62,7 +62,7 @@ class StartReach(NamedTuple):
     error: Vector  # (n, 4) rad
     torque: Vector  # (n, 4) Nm
     speed: Vector  # (n, 4) rad/s
-    worst_speed: Vector  # (n, 4) rad/s, for the worst errors of inertia and delay
+    worst_speed: Vector  # (n, 4) rad/s, speed with the worst errors of inertia and delay
     change: Vector  # (n, 4) Nm, change of the backup torque within one cycle
 
 

@@ -138,7 +138,7 @@ class WalkController:
         force = np.zeros((len(FEET), len(CELLS), 3))
         #: Copy of the requested torque, used if the `State` does not contain the sent torque.
         self._sent = np.zeros(_N)
-        self._state: State | None = None  # state whose arrays `_measured_by` contains
+        self._state: State | None = None  # `State` object whose arrays `_measured_by` contains
         self._measured = Measured(np.zeros(_N), np.zeros(_N), np.zeros(3), np.zeros(3), np.zeros(3), force, self._sent)
         self._measured_by = {_PELVIS: self._measured, _TORSO: self._measured}
         stages: Records[Stage] = zeros(Stage, 1)
@@ -332,7 +332,7 @@ class WalkController:
         load = self._load.tolist()
         self._loaded = self._loaded + 1 if min(load) >= self._carrying else 0
         if phase in STEPPING:
-            # Row of the phase table. Step timing changes its phase rate; with a phase rate of 1, the row is the cycle.
+            # `cycle` is the row of the phase table. With a phase rate of 1 (no step timing), it is the number of cycles.
             cycle = int(self._placement.clock + self._placement.pace)
             landed = self._landed = self._impact.update(load[1 - self._stance], cycle / nominal)
         steps = self.statistics.steps + (phase is Phase.STEP)

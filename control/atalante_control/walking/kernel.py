@@ -112,7 +112,7 @@ class Parts(NamedTuple):
     """Arrays of the controller parts. The kernels read and update them. Each part allocates the arrays that it owns."""
 
     chain: Chain  # `Kinematics.chain`
-    attitudes: Records[Attitude]  # (1,) `AttitudeObserver.records`
+    attitudes: Records[Attitude]  # (1,) state of the attitude observer
     links: Records[LinkRecord]  # (n,) `Gravity.links`
     pids: Records[PidRecord]  # (1,) `Pid.records`
     ankles: Records[Ankle]  # (2,) `ankle_records`

@@ -57,9 +57,9 @@ class PlacementConfig(NamedTuple):
     #: m, largest DCM error (forward, sideways) whose growth the ankle stabiliser can stop, as measured.
     #: The values are smaller than the limits of the stabiliser, because the PIDs of the stance leg act against its shift.
     capacity: Pair = (0.10, 0.044)
-    bandwidth: float = 25.0  # rad/s, natural frequency of the critically damped filter of the offset
-    speed: float = 1.2  # m/s, largest speed of the offset
-    acceleration: float = 25.0  # m/s2, largest acceleration of the offset
+    bandwidth: float = 25.0  # rad/s, natural frequency of the critically damped filter of the landing offset
+    speed: float = 1.2  # m/s, largest rate of change of the landing offset
+    acceleration: float = 25.0  # m/s2, largest acceleration of the landing offset
     slew: float = 15.0  # 1/s, largest change of the phase rate per second
 
 

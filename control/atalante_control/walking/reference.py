@@ -119,7 +119,7 @@ def _product(a: Vector, b: Vector) -> Vector:
 
 
 def _reach(q: Vector, swing: int, kinematics: Kinematics, upright: Vector) -> Vector:
-    """Return the changes of sagittal hip and knee per metre of vertical downward motion of the swing foot, shape (2,) [rad/m]."""
+    """Return the angle changes of hip and knee per metre of vertical downward motion of the swing foot, shape (2,) [rad/m]."""
     columns = []
     for joint in (_SH, _SK):
         rate = np.zeros(len(q))

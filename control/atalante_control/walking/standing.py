@@ -39,7 +39,7 @@ class Shift(NamedTuple):
     """Weight shift from the middle between the feet onto one foot, as Bezier control points along the path."""
 
     q: Vector  # (12, 8) rad
-    feedforward: Vector  # (12, 8) Nm, static torques without u_g
+    feedforward: Vector  # (12, 8) Nm, static torques without the gravity torques u_g
     centre: Vector  # (3, 8) m, centre of mass relative to the middle between the soles, in the walking frame
 
 

@@ -27,7 +27,7 @@ class Telemetry:
     load: Annotated[Vector, 2]  # N, filtered vertical force on the left and the right foot
     vertical: Annotated[Vector, 3]  # upward unit vector in the axes of the pelvis
     feet: Annotated[Vector, 4]  # m, positions (x, y) of left sole and right sole, each at the last landing of this sole
-    yaw: float  # rad, mean heading of the soles relative to the line at the last landing
+    yaw: float  # rad, mean heading of the soles relative to the desired line at the last landing
     phase: float  # value of `phases.Phase`
     step: float  # number of completed steps
     stance: float  # 0 left, 1 right
