@@ -38,7 +38,7 @@ LINK_DOWN: Final = errno.ENETDOWN
 LINK_REMOVED: Final = (errno.ENODEV, errno.ENXIO)
 #: Shortest time between two attempts to open a removed interface again [s].
 REOPEN_PERIOD: Final = 0.1
-#: When the link is lost, queued frames are dropped in at most this number of batches.
+#: Largest number of batches of queued frames that are dropped when the link is lost.
 DROPPED_BATCHES: Final = 64
 NO_ROOM = (errno.ENOBUFS, errno.EAGAIN)
 

@@ -173,7 +173,7 @@ def dtcs_of(bits: int) -> tuple[Dtc, ...]:
     return tuple(dtc for dtc in Dtc if bits & dtc.bit)
 
 
-#: Emergency error code (CiA 301, CiA 402-1) -> diagnostic. All other error codes have a diagnostic per group of codes.
+#: Emergency error code (CiA 301, CiA 402-1) -> diagnostic. For all other error codes, the highest digit gives the diagnostic.
 _EMERGENCIES = {
     0x3120: Dtc.UNDER_VOLTAGE,  # mains too low
     0x3220: Dtc.UNDER_VOLTAGE,  # DC link too low
@@ -184,7 +184,7 @@ _EMERGENCIES = {
     0x8250: Dtc.CMD_TIMEOUT,  # RPDO timeout
     0x8700: Dtc.SYNC_LOST,  # SYNC controller
 }
-#: Highest hexadecimal digit of an emergency error code -> diagnostic, for codes without a diagnostic of their own.
+#: Highest hexadecimal digit of an emergency error code -> diagnostic, for all codes that `_EMERGENCIES` does not contain.
 _EMERGENCY_CLASSES = {
     0x2: Dtc.EMCY_CURRENT,
     0x3: Dtc.EMCY_VOLTAGE,

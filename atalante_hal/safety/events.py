@@ -21,7 +21,7 @@ class Event:
     """Record of a single occurrence, such as a new diagnostic or a state change."""
 
     cycle: int
-    code: str  # e.g. NODE_TIMEOUT; cut to 39 bytes when packed
+    code: str  # code of the event, e.g. NODE_TIMEOUT; cut to 39 bytes when packed
     text: str  # one sentence for the operator; cut to 220 bytes when packed
     severity: str = "info"  # one of `SEVERITIES`
     node: str = "HAL"  # DBC name of the node; cut to 32 bytes when packed

@@ -361,7 +361,7 @@ class SafetyMonitor:
             return None
         self._stalled = 0
         if not self._proof_begun:
-            if not self.enabling:  # for one cycle, the HAL first sends each drive the torque that the drive reports
+            if not self.enabling:  # before the test, one cycle with the torques that the drives report
                 return None
             self._proof_begun = True
             proof.begin(state.position, self._limiter.last)

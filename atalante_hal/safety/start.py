@@ -59,7 +59,7 @@ class StartRequest(NamedTuple):
     stalled: int  # number of cycles since a drive last changed its state
     ending: bool  # True if the program is ending
     stop_requested: bool  # True if the operator requests STOP or HOLD
-    dead_man: bool  # True if the dead-man is pressed and the pendant has not timed out
+    dead_man: bool  # True if the dead-man switch is pressed and the pendant has not timed out
     diagnostic: str  # text of the worst confirmed diagnostic that demands a reaction; empty if there is none
     nodes_ready: bool  # True if every required node is trusted and has sent its status
     missing: Collection[str]  # DBC names of the nodes that make `nodes_ready` False

@@ -20,7 +20,7 @@ class Conditions:
     diagnostics: frozenset[Dtc] = frozenset()
     nodes_ready: bool = False  # every required node is trusted and has sent its status
     drives_enabled: bool = False  # all twelve drives are in OPERATION ENABLED
-    dead_man: bool = False  # the pendant has not timed out and its dead-man is pressed
+    dead_man: bool = False  # the pendant has not timed out and its dead-man switch is pressed
     #: the operator requested HOLD or a STOP that does not end a walk, or the program is ending
     stop_requested: bool = False
     start_wanted: bool = False  # START was pressed, and this start has not ended yet

@@ -45,7 +45,7 @@ class TelemetryChild(Closing):
         self._files: dict[str, int] = {}  # ring files that no session has taken over yet
         if files is None:
             files = self._files = {name: anonymous_file("atalante-telemetry", 0) for name in RINGS}
-        self._unread = b""  # output after the last line that was read
+        self._unread = b""  # output of the subprocess after the last line that was read
         self._process = subprocess.Popen(
             [sys.executable, "-P", "-m", "atalante_hal.telemetry"],
             stdin=subprocess.PIPE,

@@ -187,7 +187,7 @@ class TelemetryProcess(Closing):
         self._child: TelemetryChild | None = None
         self._restarts = 0
         self._faults: list[str] = []  # one sentence for each fault of a subprocess
-        self._recordings: list[str] = []  # names of the files begun so far
+        self._recordings: list[str] = []  # names of the recording files begun so far
         self._last_endpoint: str | None = None  # last endpoint in use; None before the first endpoint was opened
         self._restarting: threading.Thread | None = None  # thread that starts or restarts the subprocess
         self._progress = (0, 0.0)  # number of records read by the subprocess, and time of its last change [s]

@@ -141,7 +141,7 @@ def configuration(robot: str, listen: str) -> dict[str, Any]:
         "listen": {"endpoints": [listen]},
         "scouting": {"multicast": {"enabled": False}, "gossip": {"enabled": False}},
         "transport": {
-            "shared_memory": {"enabled": False},  # a killed process would leave its memory segments in /dev/shm
+            "shared_memory": {"enabled": False},  # a killed process would leave shared memory in /dev/shm
             "link": {
                 "tx": {
                     "queue": {

@@ -80,7 +80,7 @@ class Drive(NamedTuple):
     The motion is computed for a joint with the inertia `_INERTIA` that breaks away at `breakaway`.
     """
 
-    cycles: Vector  # cycles with a constant reading
+    cycles: Vector  # number of cycles since the encoder reading last changed
     rest: Vector  # torque with which the joint came to rest [Nm]: the last torque of the first `_AT_REST` cycles
     low: Vector  # lowest torque [Nm]
     high: Vector  # highest torque [Nm]
