@@ -82,7 +82,7 @@ class Thresholds:
 
     supply_low: float  # V at a drive; below this voltage the battery is nearly empty
     supply_under: float  # V at a drive; below this voltage the drives may soon fail to hold
-    #: Smallest ratio of torque limits, hot drive to the same drive of the other leg, with which walking is permitted.
+    #: Walking is permitted while a hot drive has at least this share of the torque limit of the same drive in the other leg.
     derated_imbalance: float
     full_assist_ramp: float  # s, time for the ramp of the assistance factor from 0 to 1 in FULL_ASSIST
     #: Largest angle outside a position limit that is still accepted [rad]. Beyond it, the joint is out of range.

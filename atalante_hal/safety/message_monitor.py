@@ -39,7 +39,7 @@ from atalante_hal.wire.process_image import NEVER, ReceiveImage
 #: Result of the E2E check of a rejected message -> diagnostic that becomes pending.
 PENDING = {
     Check.REPEATED: Dtc.E2E_REPEATED,
-    Check.CONFLICT: Dtc.E2E_REPEATED,  # for a single frame of the message in a cycle; for several frames see `rivals_of`
+    Check.CONFLICT: Dtc.E2E_REPEATED,  # if it is the only frame of its message in the cycle; otherwise see `rivals_of`
     Check.WRONG_SEQUENCE: Dtc.E2E_SEQUENCE,
     Check.CRC: Dtc.E2E_CRC,
     Check.LENGTH: Dtc.FRAME_LENGTH,

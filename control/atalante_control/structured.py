@@ -39,7 +39,7 @@ def dtype_of(record: type) -> np.dtype[np.void]:
         TypeError: If an annotation is of another type.
     """
     fields = [(name, *_field(record, name, hint)) for name, hint in get_type_hints(record, include_extras=True).items()]
-    # `np.record` allows attribute access where the kernels run as plain Python.
+    # `np.record` allows attribute access when numba is disabled and the kernels run as plain Python.
     return np.dtype((np.record, np.dtype(fields, align=True)))
 
 

@@ -186,10 +186,7 @@ class GuideFilter:
 
     @property
     def h(self) -> float:
-        """Return h of the last cycle.
-
-        At h >= 0, the backup policy can keep both joints inside the guide (safe backward image).
-        """
+        """Return h of the last cycle: at least 0 if the backup policy can keep both joints inside (safe backward image)."""
         return float(self.tables.guards[0].h)
 
     @property

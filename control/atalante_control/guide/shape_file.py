@@ -73,7 +73,9 @@ def _shape(document: Mapping[str, Any]) -> GuideShape:
             f"name must start with a lower-case letter, followed by at most 31 of a-z, 0-9, - and _, got {name!r}"
         )
     if name in SHAPES:
-        raise ValueError(f"name must differ from the shapes of this package ({', '.join(SHAPES)}), got {name!r}")
+        raise ValueError(
+            f"name must differ from the names of this package's shapes ({', '.join(SHAPES)}), got {name!r}"
+        )
     if not isinstance(summary, str):
         raise ValueError(f"summary must be a text, got {summary!r}")
     cosine = _choice(document, "interpolation", _INTERPOLATIONS) == "cosine"

@@ -66,7 +66,7 @@ class PlacementConfig(NamedTuple):
 class Placement:
     """State of foot placement and step timing in the current phase, and working memory of `shift_foot`."""
 
-    clock: float  # cycles, row in the table of the phase, with fractions
+    clock: float  # cycles, current row of the phase table, not rounded to an integer
     pace: float  # phase rate: nominal cycles per cycle
     target: Annotated[Vector, 2]  # m, requested offset of the landing in the walking frame
     offset: Annotated[Vector, 2]  # m, current offset of the swing foot in the walking frame
@@ -100,7 +100,7 @@ def predicted(error: float, gain: float, limit: float, exponent: float) -> float
         exponent: w t, natural frequency times time to the landing.
     """
     size = abs(error)
-    linear = limit / gain if gain > 0.0 else math.inf  # error up to which the shift is proportional to the error
+    linear = limit / gain if gain > 0.0 else math.inf  # largest error at which the shift does not reach its limit
     if size > linear:
         if size >= limit:
             return math.copysign(limit + (size - limit) * math.exp(exponent), error)

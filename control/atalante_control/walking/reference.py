@@ -74,7 +74,7 @@ def step_table(
         kinematics.update(q, qd)
         upright = _product(heading, rotation.T)  # rotation from pelvis to walking frame
         lever = body_position - position
-        # The sole is at rest on the ground, so the velocity of the centre of mass in the world is that relative to the sole.
+        # The sole rests on the ground, so the centre of mass has the same velocity relative to the sole as in the world.
         relative = body_velocity - linear - np.array(cross(angular, lever))
         centre[cycle], speed[cycle] = upright @ lever, upright @ relative
     frequency = math.sqrt(GRAVITY / float(centre[:, 2].mean()))

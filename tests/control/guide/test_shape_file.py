@@ -82,7 +82,7 @@ def test_example_is_valid():
         ('format = "atalante-guide-shape/1"\n', "", "format is missing; required keys are format, name, phase, SH, SK"),
         ("shape/1", "shape/2", "format must be 'atalante-guide-shape/1', got 'atalante-guide-shape/2'"),
         ('name = "own"', 'name = "Own shape"', r"name must start with a lower-case letter, .* got 'Own shape'"),
-        ('name = "own"', 'name = "pinched"', r"name must differ from the shapes of this package .* got 'pinched'"),
+        ('name = "own"', 'name = "pinched"', r"name must differ from the names of this package's shapes .* got 'pinched'"),
         ('name = "own"', 'name = "own"\nwidth = 3', "width is unknown; valid keys are format, name, phase, SH, SK"),
         ('name = "own"', 'name = "own"\nsummary = 3', "summary must be a text, got 3"),
         ('name = "own"', 'name = "own"\nscaling = "none"', "scaling must be one of proportional, cap, got 'none'"),
