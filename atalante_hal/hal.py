@@ -31,6 +31,9 @@ from atalante_hal.wire.process_image import NEVER, ReceiveImage
 
 #: Number of consecutive cycles with a limited torque after which TORQUE_SATURATED is confirmed.
 SATURATED_CYCLES = 200
+#: Number of consecutive exceptions of the controller that are bridged while the robot walks on the ground. The drives bridge as
+#: many lost commands.
+BRIDGED_ERRORS = 4
 #: Longest total wait for the nodes' answers while `Hal.stop` puts the robot into HOLD [s].
 STOP_PATIENCE = 1.0
 
@@ -77,6 +80,7 @@ class Hal:
         self._limiter = Limiter(robot, PERIOD)
         self._torque_sent = self.state.torque_sent = self._limiter.last.copy()
         self._commands = Commands(network, self._transceiver, self._parts, self._limiter.limit)
+        self._errors = 0  # number of consecutive cycles in which the controller raised an exception
         self._status = StatusReport(network, self._transceiver, robot.hash32, gait_hash)
         self._safety_monitor = SafetyMonitor(
             network,
@@ -193,6 +197,7 @@ class Hal:
                 Dtc.TORQUE_SATURATED, "the limiter cuts the torque", cycles > SATURATED_CYCLES, cycles
             )
         safety_monitor.step, safety_monitor.walking = command.step, command.walking
+        self._errors = 0
         if command.outside:
             safety_monitor.report(Dtc.GUIDE_OUTSIDE, "a joint is outside the virtual guide", command.guide_left)
         if command.hand_over_exceeded:
@@ -208,6 +213,7 @@ class Hal:
             Torques that were sent, shape (12,) [Nm], valid until the next call.
         """
         self._commands.hold()
+        self._errors = 0
         state, control, safety_monitor = self.state, self._commands.control, self._safety_monitor
         if safety_monitor.lowered:
             control[[node in safety_monitor.lowered for node in DRIVE_NODES]] = Controlword.DISABLE_VOLTAGE
@@ -258,13 +264,24 @@ class Hal:
     def fail(self, error: Exception) -> Vector:
         """Report an exception of the controller or of its command, and send HOLD in the same cycle.
 
+        While the robot walks on the ground, up to `BRIDGED_ERRORS` consecutive exceptions are bridged with the last torques, as a
+        drive bridges lost commands. The safety monitor then ends the walk, because HOLD within a step would make the robot fall.
+
         Args:
             error: Exception that `Controller.reset`, `Controller.update` or `write` raised.
 
         Returns:
             Torques that were sent, shape (12,) [Nm], valid until the next call.
         """
-        self._safety_monitor.report(Dtc.CONTROLLER_ERROR, f"the controller raised {type(error).__name__}: {error}")
+        safety_monitor = self._safety_monitor
+        safety_monitor.report(Dtc.CONTROLLER_ERROR, f"the controller raised {type(error).__name__}: {error}")
+        self._errors += 1
+        if self._errors > BRIDGED_ERRORS:
+            safety_monitor.report(Dtc.CONTROLLER_LOST, Dtc.CONTROLLER_LOST.meaning)
+        elif safety_monitor.walking:
+            self._limiter.apply(self._torque_sent, self._parts.motion)
+            self._commands.torque[:] = self._limiter.last
+            return self._send_command()
         return self._commands.send_prepared_hold(self.state.cycle)
 
     def report(self, dtc: Dtc, text: str, *, confirmed: bool = True, value: float = 0.0) -> None:

@@ -109,13 +109,19 @@ class Dtc(StrEnum):
     HAL_DUPLICATE = "HAL_DUPLICATE", _R.HOLD, _S.ERROR, "another HAL sends on this bus"
     # Control and time.
     CONTROLLER_ERROR = "CONTROLLER_ERROR", _R.HOLD, _S.ERROR, "the controller raised an exception"
+    CONTROLLER_LOST = (
+        "CONTROLLER_LOST",
+        _R.HOLD,
+        _S.ERROR,
+        "the controller raised exceptions in five consecutive cycles",
+    )
     CMD_NONFINITE = "CMD_NONFINITE", _R.HOLD, _S.ERROR, "the controller requested a torque of NaN or infinity"
     TORQUE_SATURATED = "TORQUE_SATURATED", _R.FULL_ASSIST, _S.WARNING, "the limiter cuts the torque"
     GUIDE_OUTSIDE = "GUIDE_OUTSIDE", _R.FULL_ASSIST, _S.WARNING, "a joint is outside the virtual guide"
     CYCLE_GAP = "CYCLE_GAP", _R.HOLD, _S.ERROR, "the time between two cycles is too long"
     OVERRUN = "OVERRUN", _R.HOLD, _S.ERROR, "several consecutive cycles are late, or the loop falls behind the clock"
     OPERATOR_STOP = "OPERATOR_STOP", _R.HOLD, _S.INFO, "STOP pressed, dead-man switch released, or pendant timed out"
-    SWING_TIMEOUT = "SWING_TIMEOUT", _R.FINISH_STEP, _S.ERROR, "a joint of the swing leg timed out briefly"
+    JOINT_TIMEOUT = "JOINT_TIMEOUT", _R.FINISH_STEP, _S.ERROR, "a joint timed out briefly"
     OVERSPEED = "OVERSPEED", _R.HOLD, _S.ERROR, "a joint moves faster than the limiter permits"
     # Outside the loop.
     RECORD_STOPPED = "RECORD_STOPPED", _R.INFO, _S.WARNING, "the recording ended early"
@@ -124,6 +130,47 @@ class Dtc(StrEnum):
     DBC_INVALID = "DBC_INVALID", _R.NOT_READY, _S.ERROR, "the DBC was rejected"
     CONFIG_INVALID = "CONFIG_INVALID", _R.NOT_READY, _S.ERROR, "the configuration was rejected"
     GAIT_INVALID = "GAIT_INVALID", _R.NOT_READY, _S.ERROR, "the gait was rejected"
+
+
+#: Codes with the reaction HOLD that do not prevent the HAL from controlling the robot for some more steps.
+_CONTROLLABLE = frozenset(
+    {
+        Dtc.E2E_REPEAT_RATE,
+        Dtc.E2E_LOSS_RATE,
+        Dtc.NODE_ERROR_PASSIVE,
+        Dtc.DERATED,
+        Dtc.BUS_ERROR,
+        Dtc.CONTROLLER_ERROR,
+        Dtc.OVERRUN,
+    }
+)
+#: Codes with the reaction HOLD that do not prevent it either if the affected node is not a drive. The walking controller
+#: bridges the loss of an IMU or of a foot until the robot stands.
+_CONTROLLABLE_WITHOUT_SENSOR = frozenset(
+    {
+        Dtc.E2E_SEQUENCE,
+        Dtc.E2E_CRC,
+        Dtc.E2E_FROZEN,
+        Dtc.NODE_TIMEOUT,
+        Dtc.NODE_LATE,
+        Dtc.FRAME_LENGTH,
+        Dtc.SIGNAL_RANGE,
+        Dtc.NODE_RESET,
+    }
+)
+
+
+def permits_walk_end(dtc: Dtc, drive: bool) -> bool:
+    """Return whether a walking robot may end its walk on both feet (FINISH_STEP) although a diagnostic demands HOLD.
+
+    A robot that stops within a step falls, because it stands on one foot and moves. So HOLD is delayed if the HAL still
+    receives the joints and the drives still follow the HAL.
+
+    Args:
+        dtc: confirmed diagnostic.
+        drive: True if the affected node is a drive.
+    """
+    return dtc in _CONTROLLABLE or (not drive and dtc in _CONTROLLABLE_WITHOUT_SENSOR)
 
 
 @dataclass(frozen=True)

@@ -10,11 +10,19 @@ one for the confirmed diagnostic. Every occurrence is counted.
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from dataclasses import dataclass, replace
 from itertools import islice
 
-from atalante_hal.safety.diagnostics import Dtc, Finding, Reaction, Severity, event_code, worst
+from atalante_hal.safety.diagnostics import (
+    Dtc,
+    Finding,
+    Reaction,
+    Severity,
+    event_code,
+    permits_walk_end,
+    worst,
+)
 from atalante_hal.safety.events import Event
 
 #: Length of the window after a logged event in which equal events are counted instead of logged [cycles].
@@ -156,6 +164,17 @@ class FaultMemory:
         """Return those confirmed codes that have the most severe reaction; empty if this reaction is INFO."""
         reaction = worst(self.confirmed)
         return frozenset(dtc for dtc in self.confirmed if dtc.reaction is reaction is not Reaction.INFO)
+
+    def walk_ends(self, drives: Collection[str]) -> frozenset[Dtc]:
+        """Return those confirmed codes with which a walking robot may end its walk before HOLD, see `permits_walk_end`.
+
+        A code is left out if it does not permit this for one of the nodes for which it is confirmed.
+
+        Args:
+            drives: DBC names of the drives.
+        """
+        confirmed = [key for key, entry in self.active.items() if entry.confirmed]
+        return self.confirmed - {dtc for dtc, node in confirmed if not permits_walk_end(dtc, node in drives)}
 
     def nodes_of(self, dtcs: frozenset[Dtc]) -> list[str]:
         """Return the nodes for which one of the codes is confirmed."""

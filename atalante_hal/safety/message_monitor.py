@@ -24,7 +24,7 @@ the robot goes to HOLD without a delay.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 
 import numpy as np
 import numpy.typing as npt
@@ -67,8 +67,8 @@ _DISTURBANCES = {
     Check.RANGE: Dtc.SIGNAL_RANGE,
     Check.INVALID: Dtc.SIGNAL_RANGE,
 }
-#: The robot goes to HOLD when the age of the data of a swing leg joint reaches this multiple of the message timeout.
-SWING_TIMEOUTS = 2
+#: The robot goes to HOLD when the age of the data of a joint in a tolerant leg reaches this multiple of the message timeout.
+BRIEF_TIMEOUTS = 2
 
 
 class MessageMonitor:
@@ -116,13 +116,13 @@ class MessageMonitor:
         """Return whether the data of a row is younger than the timeout of its message."""
         return bool(self._image.age[row] < self._timeouts[row])
 
-    def evaluate(self, cycle: int, memory: FaultMemory, swing: int | None = None) -> None:
+    def evaluate(self, cycle: int, memory: FaultMemory, tolerant: Collection[int] = ()) -> None:
         """Check all rows in one cycle. If `settled` is True and all rows have new data, this call may be omitted.
 
         Args:
             cycle: number of the current cycle.
             memory: fault memory in which diagnostics are raised.
-            swing: index of the swing leg in SIDES; None if there is no swing leg.
+            tolerant: indices in SIDES of the legs in which a brief timeout of a joint ends the walk and not the motion.
         """
         image = self._image
         checks, ages = image.check.tolist(), image.age.tolist()
@@ -137,7 +137,7 @@ class MessageMonitor:
         for row, check in enumerate(checks):
             rival = row in rivals
             if check or ages[row] or rival or self._evidence[row] or self.qualification[row] is not SETTLED:
-                self._check_row(cycle, memory, row, Check(check), ages[row], swing, rival)
+                self._check_row(cycle, memory, row, Check(check), ages[row], tolerant, rival)
         self.valid[:] = [check <= _FRESH and self.is_trusted(row) for row, check in enumerate(checks)]
         self.joints_valid = bool(self.valid[self._joint_rows].all())
         undisturbed = not (self._disturbed or any(self._evidence))
@@ -196,7 +196,7 @@ class MessageMonitor:
         row: int,
         check: Check,
         age: int,
-        swing: int | None,
+        tolerant: Collection[int],
         rival: bool,
     ) -> None:
         sender, two_senders = self._senders[row], self._check_senders(cycle, memory, row, rival)
@@ -210,9 +210,8 @@ class MessageMonitor:
         if confirmed and check is not Check.IMPLAUSIBLE:
             dtc = self._invalid[row] if check is Check.INVALID else CONFIRMED[check]
             text = f"{sender}: {dtc.meaning}; its data is {age} cycles old"
-            in_swing = swing is not None and self._legs[row] == swing
-            if brief := in_swing and age < SWING_TIMEOUTS * self._timeouts[row]:
-                memory.raise_dtc(cycle, Dtc.SWING_TIMEOUT, sender, value=age)
+            if brief := self._legs[row] in tolerant and age < BRIEF_TIMEOUTS * self._timeouts[row]:
+                memory.raise_dtc(cycle, Dtc.JOINT_TIMEOUT, sender, value=age)
             memory.raise_dtc(cycle, dtc, sender, value=age, confirmed=not brief, text=text)
         elif fresh and age and not late:
             memory.raise_dtc(cycle, Dtc.NODE_LATE, sender, value=age, confirmed=False)

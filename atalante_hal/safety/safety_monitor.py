@@ -16,7 +16,7 @@ import numpy as np
 
 from atalante_dbc import Network
 from atalante_hal.pendant import Pendant
-from atalante_hal.robot import JOINTS, Robot
+from atalante_hal.robot import JOINTS, SIDES, Robot
 from atalante_hal.safety.diagnostics import Dtc, Finding, Reaction
 from atalante_hal.safety.direction import DirectionProof
 from atalante_hal.safety.events import Event
@@ -210,7 +210,7 @@ class SafetyMonitor:
         """Raise all diagnostics of this cycle, run the state machine, and apply the reactions."""
         state, memory, cycle = self._state, self.memory, self._state.cycle
         message_monitor, pendant = self._message_monitor, self._pendant
-        message_monitor.evaluate(cycle, memory, self._plausibility.swing)
+        message_monitor.evaluate(cycle, memory, self._tolerant_legs())
         state.joints_valid = message_monitor.joints_valid
         self._heartbeats.evaluate(cycle, memory)
         for node in self._heartbeats.booted:
@@ -234,7 +234,8 @@ class SafetyMonitor:
             new=bool(self._image.check[row] <= Check.SOME_LOST),
             further_frames=self._image.decode_further_frames(row),
         )
-        walk_end_requested = self.walking and pendant.stop_requested and not pendant.hold_requested
+        operator_stops = pendant.stop_requested or not pendant.dead_man
+        walk_end_requested = self.walking and operator_stops and not pendant.hold_requested
         memory.close_cycle(cycle)
         self._duplicate_found |= Dtc.HAL_DUPLICATE in memory.confirmed and state.supervisor in (_S.OFF, _S.READY)
         self._process_start(nodes_ready)
@@ -248,6 +249,7 @@ class SafetyMonitor:
             start_wanted=self.start_wanted > 0,
             step_finished=self.step is None or self.step != self._finish[0] or cycle >= self._finish[1],
             walk_end_requested=walk_end_requested,
+            walk_ends=memory.walk_ends(DRIVE_NODES) if self.walking else frozenset(),
         )
         before = state.supervisor
         after, reasons = next_state(before, self.conditions)
@@ -271,6 +273,14 @@ class SafetyMonitor:
                 or self._ending
             )
         )
+
+    def _tolerant_legs(self) -> Sequence[int]:
+        """Return the legs in which a brief timeout of a joint leads to FINISH_STEP: both legs in a walk on the ground.
+
+        Otherwise the only such leg is the swing leg while the other foot is on the ground.
+        """
+        swing = self._plausibility.swing
+        return range(len(SIDES)) if self.walking else () if swing is None else (swing,)
 
     def _check_drives(self, nodes_ready: bool) -> None:
         state, memory = self._state, self.memory
@@ -419,7 +429,7 @@ class SafetyMonitor:
         if reasons:
             self.reason = memory.text_of(reasons) or self.reason
         elif before is not _S.FINISH_STEP:  # the HOLD after FINISH_STEP keeps the reason of FINISH_STEP
-            self.reason = entry_text(after, self.missing())
+            self.reason = entry_text(after, self.missing(), self._pendant.stop_requested)
         if after is _S.ACTIVE and before not in MOVING:
             # End all counting windows of events, so that the reason for the next HOLD is logged as a new event.
             memory.log_repeats(state.cycle, final=True)

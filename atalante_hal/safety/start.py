@@ -26,8 +26,8 @@ ENABLE_CYCLES = 200
 STALLED_CYCLES = 10
 #: Prefix of the event text for a refused START.
 REFUSED = "START refused: "
-#: Reason for FINISH_STEP and the HOLD that follows, if the operator requested STOP while the robot walked on the ground.
-WALK_ENDS = "the operator asked to stop, so the walk ends on both feet"
+#: End of the reason for FINISH_STEP and the HOLD that follows, if the operator ended a walk on the ground.
+WALK_ENDS = ", so the walk ends on both feet"
 _S = SupervisorState
 #: States in which START only acknowledges faults. An acknowledged fault may stay active for some cycles.
 _ACKNOWLEDGING = (_S.LOWER, _S.FAULT)
@@ -175,12 +175,13 @@ def missing_text(missing: Collection[str]) -> str:
     return f"no answer or not trusted yet: {', '.join(sorted(missing))}"
 
 
-def entry_text(state: SupervisorState, missing: Collection[str]) -> str:
+def entry_text(state: SupervisorState, missing: Collection[str], stop_requested: bool) -> str:
     """Return one sentence that explains why the HAL entered a state, for a state entered without a diagnostic.
 
     Args:
         state: state that was entered.
         missing: DBC names of the nodes that prevent READY.
+        stop_requested: True if STOP or HOLD was requested.
     """
     match state:
         case _S.OFF:
@@ -190,7 +191,7 @@ def entry_text(state: SupervisorState, missing: Collection[str]) -> str:
         case _S.ACTIVE:
             return "the operator pressed START"
         case _S.FINISH_STEP:
-            return WALK_ENDS
+            return stop_text(stop_requested) + WALK_ENDS
         case _:
             return "the operator acknowledged the fault with START"
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from atalante_hal.safety.diagnostics import Dtc, Reaction, worst
+from atalante_hal.safety.diagnostics import Dtc, Reaction
 from atalante_hal.types import SupervisorState
 
 
@@ -25,7 +25,10 @@ class Conditions:
     stop_requested: bool = False
     start_wanted: bool = False  # START was pressed, and this start has not ended yet
     step_finished: bool = False  # the walking step has ended, the robot does not walk, or FINISH_STEP took too long
-    walk_end_requested: bool = False  # the operator requested STOP while the robot walks on the ground
+    #: the operator requested STOP or released the dead-man, or the pendant timed out, while the robot walks on the ground
+    walk_end_requested: bool = False
+    #: those of the diagnostics that demand FINISH_STEP instead of HOLD, because the robot walks on the ground
+    walk_ends: frozenset[Dtc] = frozenset()
 
 
 _OFF, _READY, _ACTIVE = SupervisorState.OFF, SupervisorState.READY, SupervisorState.ACTIVE
@@ -53,7 +56,8 @@ def next_state(state: SupervisorState, conditions: Conditions) -> tuple[Supervis
     - any state except OFF, READY and FAULT -> LOWER if a diagnostic demands LOWER
     - ACTIVE, FULL_ASSIST, FINISH_STEP -> the state that the worst diagnostic demands, if this state is worse. In these
       three states, a released dead-man or `Conditions.stop_requested` adds the diagnostic `OPERATOR_STOP`
-    - ACTIVE, FULL_ASSIST -> FINISH_STEP if the operator requests STOP while the robot walks on the ground
+    - ACTIVE, FULL_ASSIST -> FINISH_STEP if the operator requests STOP or releases the dead-man while the robot walks on
+      the ground. The diagnostics in `Conditions.walk_ends` demand FINISH_STEP instead of HOLD
     - FINISH_STEP -> HOLD when the step is finished
     - OFF -> READY if every required node is trusted and no diagnostic demands a reaction; otherwise READY -> OFF
     - only if START is pressed and the cause is gone: READY, HOLD, FULL_ASSIST -> ACTIVE; LOWER -> HOLD;
@@ -68,14 +72,16 @@ def next_state(state: SupervisorState, conditions: Conditions) -> tuple[Supervis
         INFO. It is also empty if the operator requested the end of the walk and this reaction is milder than FINISH_STEP.
     """
     diagnostics = conditions.diagnostics
-    if state in MOVING and (conditions.stop_requested or not conditions.dead_man):
+    dead_man = conditions.dead_man or conditions.walk_end_requested
+    if state in MOVING and (conditions.stop_requested or not dead_man):
         diagnostics |= {Dtc.OPERATOR_STOP}
-    reaction = worst(diagnostics)
+    reactions = {dtc: Reaction.FINISH_STEP if dtc in conditions.walk_ends else dtc.reaction for dtc in diagnostics}
+    reaction = max(reactions.values(), default=Reaction.INFO)
     walk_ends = state in MOVING and conditions.walk_end_requested
     if reaction is Reaction.INFO or (walk_ends and reaction < Reaction.FINISH_STEP):
         reasons: frozenset[Dtc] = frozenset()
     else:
-        reasons = frozenset(dtc for dtc in diagnostics if dtc.reaction is reaction)
+        reasons = frozenset(dtc for dtc in diagnostics if reactions[dtc] is reaction)
     return _move(state, reaction, conditions), reasons
 
 

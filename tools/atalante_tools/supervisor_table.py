@@ -21,12 +21,18 @@ WELL: Final = Conditions(nodes_ready=True, drives_enabled=True, dead_man=True)
 FACTS: Final = (
     ("nothing", WELL),
     ("a node is missing or not trusted", replace(WELL, nodes_ready=False)),
-    ("the dead-man switch is released, or the pendant is lost", replace(WELL, dead_man=False)),
+    (
+        "the dead-man switch is released, or the pendant is lost, while the robot does not walk on the ground",
+        replace(WELL, dead_man=False),
+    ),
     (
         "the operator presses HOLD, or presses STOP while the robot does not walk on the ground",
         replace(WELL, stop_requested=True),
     ),
-    ("the operator presses STOP while the robot walks on the ground", replace(WELL, walk_end_requested=True)),
+    (
+        "the operator presses STOP, releases the dead-man switch, or the pendant is lost, while the robot walks on the ground",
+        replace(WELL, dead_man=False, walk_end_requested=True),
+    ),
     ("the step is finished", replace(WELL, step_finished=True)),
     ("START, and the drives are not enabled yet", replace(WELL, start_wanted=True, drives_enabled=False)),
     ("START, and the drives are enabled", replace(WELL, start_wanted=True)),

@@ -14,6 +14,7 @@ from atalante_hal.safety.diagnostics import (
     emergency,
     event_code,
     number_of,
+    permits_walk_end,
     worst,
 )
 from atalante_hal.safety.events import SEVERITIES
@@ -26,11 +27,11 @@ REACTIONS = {
     "TELEMETRY_DROPPED",
     R.NOT_READY: "HEARTBEAT_LOST DBC_MISMATCH DBC_INVALID CONFIG_INVALID GAIT_INVALID",
     R.FULL_ASSIST: "ENC_DRIFT IMU_INVALID IMU_SATURATED IMU_STUCK FOOT_CELL TORQUE_SATURATED GUIDE_OUTSIDE",
-    R.FINISH_STEP: "SUPPLY_LOW SWING_TIMEOUT",
+    R.FINISH_STEP: "SUPPLY_LOW JOINT_TIMEOUT",
     R.HOLD: "E2E_SEQUENCE E2E_CRC E2E_FROZEN E2E_LOSS_RATE NODE_TIMEOUT NODE_LATE NODE_DUPLICATE FRAME_LENGTH SIGNAL_RANGE "
     "NODE_RESET DRIVE_STATE EMCY_3xxx EMCY_8xxx DERATED UNDER_VOLTAGE SYNC_LOST CMD_TIMEOUT ENC_JUMP ENC_VELOCITY "
     "POSITION_RANGE CONTACT_IMPLAUSIBLE BUS_FLOOD BUS_OFF BUS_DOWN BUS_TX_FULL HAL_DUPLICATE CONTROLLER_ERROR CMD_NONFINITE "
-    "CYCLE_GAP OVERRUN OPERATOR_STOP E2E_REPEAT_RATE NODE_ERROR_PASSIVE BUS_ERROR OVERSPEED",
+    "CONTROLLER_LOST CYCLE_GAP OVERRUN OPERATOR_STOP E2E_REPEAT_RATE NODE_ERROR_PASSIVE BUS_ERROR OVERSPEED",
     R.LOWER: "EMCY_7xxx OVER_TEMP ENC_STUCK TORQUE_DIRECTION",
     R.FAULT: "DRIVE_FAULT EMCY_2xxx EMCY_xxxx",
 }  # fmt: skip
@@ -39,6 +40,19 @@ REACTIONS = {
 def test_every_code_has_its_expected_reaction():
     found = {reaction: {d.value for d in Dtc if d.reaction is reaction} for reaction in Reaction}
     assert found == {reaction: set(codes.split()) for reaction, codes in REACTIONS.items()}
+
+
+#: Codes with the reaction HOLD with which a walk may end on both feet: for every node, or only if the node is not a drive.
+WALK_ENDS = "E2E_REPEAT_RATE E2E_LOSS_RATE NODE_ERROR_PASSIVE DERATED BUS_ERROR CONTROLLER_ERROR OVERRUN"
+WALK_ENDS_WITHOUT_SENSOR = "E2E_SEQUENCE E2E_CRC E2E_FROZEN NODE_TIMEOUT NODE_LATE FRAME_LENGTH SIGNAL_RANGE NODE_RESET"
+
+
+def test_walk_ends_on_both_feet_only_if_the_joints_are_known_and_the_drives_follow():
+    with_drive = {dtc.value for dtc in Dtc if permits_walk_end(dtc, drive=True)}
+    with_sensor = {dtc.value for dtc in Dtc if permits_walk_end(dtc, drive=False)}
+    assert with_drive == set(WALK_ENDS.split())
+    assert with_sensor - with_drive == set(WALK_ENDS_WITHOUT_SENSOR.split())
+    assert {Dtc(code).reaction for code in with_sensor} == {R.HOLD}
 
 
 def test_severities_are_valid_and_stopping_codes_are_not_information():

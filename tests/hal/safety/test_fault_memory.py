@@ -192,6 +192,20 @@ def test_nodes_and_texts_of_confirmed_codes_are_returned(memory: FaultMemory):
     assert memory.text_of(frozenset({Dtc.BUS_OFF})) == ""
 
 
+def test_code_lets_the_walk_end_only_if_it_does_for_each_of_its_nodes(memory: FaultMemory):
+    drives = {"LEFT_SK"}
+    memory.raise_dtc(1, Dtc.NODE_TIMEOUT, "IMU_PELVIS")
+    memory.raise_dtc(1, Dtc.NODE_TIMEOUT, "LEFT_SK", confirmed=False)
+    memory.raise_dtc(1, Dtc.E2E_REPEAT_RATE, "LEFT_SK")
+    memory.raise_dtc(1, Dtc.OVER_TEMP, "LEFT_SK")
+    memory.close_cycle(1)
+    assert memory.walk_ends(drives) == {Dtc.NODE_TIMEOUT, Dtc.E2E_REPEAT_RATE}
+    memory.raise_dtc(2, Dtc.NODE_TIMEOUT, "IMU_PELVIS")
+    memory.raise_dtc(2, Dtc.NODE_TIMEOUT, "LEFT_SK")
+    memory.close_cycle(2)
+    assert memory.walk_ends(drives) == frozenset()
+
+
 def test_diagnostic_without_a_value_has_value_zero(memory: FaultMemory):
     memory.raise_dtc(3, Dtc.NODE_RESET, "LEFT_SK")
     assert logged(memory) == [(3, "NODE_RESET", "LEFT_SK", "error", 0.0)]

@@ -10,11 +10,11 @@ import numpy as np
 import pytest
 
 from atalante_dbc import Message, load
-from atalante_hal.hal import SATURATED_CYCLES
+from atalante_hal.hal import BRIDGED_ERRORS, SATURATED_CYCLES
 from atalante_hal.safety.diagnostics import Dtc
 from atalante_hal.safety.limiter import Limited, Limiter
 from atalante_hal.safety.safety_monitor import FINISH_STEP_CYCLES, RECALL_CYCLES
-from atalante_hal.safety.start import ENABLE_CYCLES, STALLED_CYCLES, WALK_ENDS
+from atalante_hal.safety.start import ENABLE_CYCLES, STALLED_CYCLES, WALK_ENDS, stop_text
 from atalante_hal.types import PERIOD, SupervisorState
 from atalante_hal.wire.cia402 import Controlword, DriveState
 from atalante_hal.wire.e2e import crc, data_id_bytes
@@ -270,15 +270,17 @@ def walking_on_the_ground(rig):
     return rig.walk(5, step=7, walking=True)
 
 
-def test_stop_while_walking_on_the_ground_ends_the_walk_before_hold(rig):
+@pytest.mark.parametrize("action", ["stop", "release"])
+def test_stop_while_walking_on_the_ground_ends_the_walk_before_hold(rig, action: str):
     walking_on_the_ground(rig)
-    rig.operator.stop()
+    getattr(rig.operator, action)()
     assert rig.walk(2, step=7, walking=True).supervisor is S.FINISH_STEP
-    assert rig.hal.reason == WALK_ENDS
-    assert [event.text for event in rig.hal.events][-1] == f"ACTIVE -> FINISH_STEP: {WALK_ENDS}"
+    reason = stop_text(action == "stop") + WALK_ENDS
+    assert rig.hal.reason == reason
+    assert [event.text for event in rig.hal.events][-1] == f"ACTIVE -> FINISH_STEP: {reason}"
     assert rig.walk(1000, step=7, walking=True).supervisor is S.FINISH_STEP
     assert rig.walk(2, step=8).supervisor is S.HOLD
-    assert "OPERATOR_STOP" in rig.codes()  # STOP is still pressed when the walk is over
+    assert "OPERATOR_STOP" in rig.codes()  # the action lasts until the walk is over
 
 
 def test_stop_while_walking_on_the_ground_has_a_time_limit(rig):
@@ -288,13 +290,58 @@ def test_stop_while_walking_on_the_ground_has_a_time_limit(rig):
     assert rig.walk(3, step=7, walking=True).supervisor is S.HOLD
 
 
-@pytest.mark.parametrize("action", ["hold", "release"])
-def test_hold_request_or_released_dead_man_while_walking_leads_directly_to_hold(rig, action: str):
+def test_hold_request_while_walking_leads_directly_to_hold(rig):
     walking_on_the_ground(rig)
     rig.operator.stop()
     assert rig.walk(5, step=7, walking=True).supervisor is S.FINISH_STEP
-    getattr(rig.operator, action)()
+    rig.operator.hold()
     assert rig.walk(2, step=7, walking=True).supervisor is S.HOLD
+
+
+def test_silent_imu_ends_a_walk_on_both_feet(rig):
+    walking_on_the_ground(rig)
+    rig.bus.to_hal = rig.drop(load().message("IMU_PELVIS_STATE").frame_id)
+    assert rig.walk(20, step=7, walking=True).supervisor is S.FINISH_STEP
+    assert rig.walk(2, step=8).supervisor is S.HOLD
+    assert "NODE_TIMEOUT" in rig.codes()
+
+
+@pytest.mark.parametrize("drive", ["LEFT_SK", "RIGHT_SK"])
+def test_silent_drive_ends_a_walk_and_after_ten_cycles_the_motion(rig, drive: str):
+    walking_on_the_ground(rig)
+    rig.bus.to_hal = rig.drop(load().message(f"{drive}_STATE").frame_id)
+    states = [rig.walk(1, step=7, walking=True).supervisor for _ in range(10)]
+    assert states == [S.ACTIVE] * 4 + [S.FINISH_STEP] * 5 + [S.HOLD]
+
+
+def test_exception_of_the_controller_in_a_walk_is_bridged_with_the_last_torques(rig):
+    walking_on_the_ground(rig)
+    rig.hal.read()
+    sent = rig.hal.write(rig.hold_torque(step=7, walking=True)).copy()
+    for number in range(BRIDGED_ERRORS):
+        assert rig.hal.read().supervisor is (S.FINISH_STEP if number else S.ACTIVE)
+        assert rig.hal.fail(ValueError("input")).tolist() == sent.tolist()
+        assert rig.controlwords() == {Controlword.ENABLE_OPERATION}
+    assert "CONTROLLER_LOST" not in rig.codes()
+    assert rig.walk(1, step=7, walking=True).supervisor is S.FINISH_STEP
+    for _ in range(BRIDGED_ERRORS):
+        rig.hal.read()
+        rig.hal.fail(ValueError("input"))
+    rig.hal.read()
+    assert not rig.hal.fail(ValueError("input")).any()
+    assert rig.controlwords() == {Controlword.QUICK_STOP}
+    assert rig.hal.read().supervisor is S.HOLD
+    assert "CONTROLLER_LOST" in rig.codes()
+
+
+def test_exceptions_of_several_runs_are_not_counted_as_consecutive(rig):
+    for _ in range(BRIDGED_ERRORS + 1):
+        rig.until(S.ACTIVE)
+        rig.hal.read()
+        assert not rig.hal.fail(ValueError("input")).any()
+        rig.until(S.HOLD)
+        rig.operator.start()
+    assert "CONTROLLER_LOST" not in rig.codes()
 
 
 def test_end_of_the_program_while_walking_leads_directly_to_hold(rig):

@@ -76,7 +76,10 @@ TORQUE = "the drive of left_FH reports 3 Nm in SWITCH_ON_DISABLED; must be withi
 
 
 def test_entry_text_of_off_names_the_missing_nodes():
-    assert entry_text(S.OFF, {"LEFT_SK", "IMU_TORSO"}) == "no answer or not trusted yet: IMU_TORSO, LEFT_SK"
+    assert (
+        entry_text(S.OFF, {"LEFT_SK", "IMU_TORSO"}, stop_requested=False)
+        == "no answer or not trusted yet: IMU_TORSO, LEFT_SK"
+    )
 
 
 @pytest.mark.parametrize(

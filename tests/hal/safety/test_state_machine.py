@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from itertools import product
 
 import pytest
@@ -54,7 +55,8 @@ TABLE = [
     (S.FULL_ASSIST, RUN | {"dead_man": False}, S.HOLD),
     (S.ACTIVE, RUN | {"walk_end_requested": True}, S.FINISH_STEP),
     (S.ACTIVE, GO | {"walk_end_requested": True}, S.FINISH_STEP),
-    (S.ACTIVE, RUN | {"walk_end_requested": True, "dead_man": False}, S.HOLD),
+    (S.ACTIVE, RUN | {"walk_end_requested": True, "dead_man": False}, S.FINISH_STEP),
+    (S.ACTIVE, RUN | {"walk_end_requested": True, "dead_man": False, "stop_requested": True}, S.HOLD),
     (S.FULL_ASSIST, RUN | {"walk_end_requested": True}, S.FINISH_STEP),
     (S.FINISH_STEP, RUN | {"walk_end_requested": True}, S.FINISH_STEP),
     (S.FINISH_STEP, RUN | {"walk_end_requested": True, "step_finished": True}, S.HOLD),
@@ -152,7 +154,7 @@ def check_laws(before: S, reaction: R, c: Conditions):
     if reaction is R.FAULT:
         assert then is S.FAULT
     if then in MOVING:
-        assert c.dead_man
+        assert c.dead_man or c.walk_end_requested
         assert not c.stop_requested
         assert reaction < R.HOLD
     if then in MOVING and before not in MOVING:
@@ -165,7 +167,7 @@ def check_laws(before: S, reaction: R, c: Conditions):
     # Only START of the operator leads to a less safe state. Exception: OFF to READY, in which nothing moves.
     if not (c.start_wanted and c.dead_man and not c.stop_requested) and (before, then) != (S.OFF, S.READY):
         assert then >= before or (before, then) == (S.READY, S.OFF)
-    # STOP ends the walk with the current step or earlier.
+    # STOP and a released dead-man switch end the walk with the current step or earlier.
     if before in MOVING and c.walk_end_requested:
         assert then >= S.FINISH_STEP
     # After a motion, the state machine does not return to OFF or READY, in which the drives are not enabled.
@@ -174,6 +176,21 @@ def check_laws(before: S, reaction: R, c: Conditions):
     # The next state of a moving robot is at least as safe as the reaction demands.
     if before in MOVING and reaction > R.NOT_READY:
         assert then >= S[reaction.name]
+
+
+@pytest.mark.parametrize("before", MOVING)
+def test_hold_waits_for_the_end_of_the_walk_only_if_every_diagnostic_permits_it(before: S):
+    codes = frozenset({Dtc.E2E_REPEAT_RATE, Dtc.NODE_TIMEOUT})
+    facts = Conditions(codes, **RUN, walk_ends=codes)
+    assert next_state(before, facts) == (S.FINISH_STEP, codes)
+    assert next_state(before, replace(facts, walk_ends=frozenset({Dtc.NODE_TIMEOUT}))) == (
+        S.HOLD,
+        frozenset({Dtc.E2E_REPEAT_RATE}),
+    )
+    assert next_state(before, replace(facts, diagnostics=codes | {Dtc.OVER_TEMP})) == (
+        S.LOWER,
+        frozenset({Dtc.OVER_TEMP}),
+    )
 
 
 @pytest.mark.parametrize("reaction", R)
@@ -188,7 +205,7 @@ def test_most_severe_code_determines_the_next_state_and_its_reasons(before, dtcs
     then, reasons = next_state(before, Conditions(dtcs, *facts))
     representative, _ = next_state(before, Conditions(frozenset({ONE_OF[worst(dtcs)]}), *facts))
     assert then is representative
-    stopped = before in MOVING and (not facts[2] or facts[3])
+    stopped = before in MOVING and (not (facts[2] or facts[6]) or facts[3])
     expected = worst([*dtcs, *([Dtc.OPERATOR_STOP] if stopped else [])])
     if before in MOVING and facts[6] and expected < R.FINISH_STEP:
         expected = R.INFO  # the end of the walk that the operator requested is more severe than the diagnostics

@@ -103,7 +103,7 @@ SCENARIOS: Final = (
                     observed=40,  # short, because foot forces that stay constant for 100 cycles are a fault
                 )
                 for frames, state, dtc, reacted in (
-                    (5, SupervisorState.FINISH_STEP, "SWING_TIMEOUT", 5),
+                    (5, SupervisorState.FINISH_STEP, "JOINT_TIMEOUT", 5),
                     (None, _HOLD, "NODE_TIMEOUT", 10),
                 )
             ),

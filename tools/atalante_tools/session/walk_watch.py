@@ -115,7 +115,7 @@ class WalkWatch:
             FaultLatched: If the robot is in FAULT.
             Failed: If the robot fell, or left ACTIVE early.
         """
-        from atalante_hal.safety.start import WALK_ENDS
+        from atalante_hal.safety.start import WALK_ENDS, stop_text
         from atalante_tools.console.outcome import FaultLatched
 
         if self.outcome == "fell":
@@ -126,7 +126,7 @@ class WalkWatch:
         if self.outcome == "fault":
             raise FaultLatched(f"the robot is in FAULT: {self._reason}")
         if self.outcome == "stopped":
-            if self._reason != WALK_ENDS:
+            if self._reason != stop_text(stop_requested=True) + WALK_ENDS:
                 raise Failed(f"the robot ended the walk early and stands: {self._reason}")
             print_message("stopped by the operator, the robot stands in HOLD")
         elif self.outcome != "stood":

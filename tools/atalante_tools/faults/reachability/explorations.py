@@ -124,7 +124,9 @@ class OperatorPath:
             options = [Operator(before.stop, min(before.cycles + 1, _LONG))]
         for operator in options:
             for (reception, inputs, _), frames in self._received(state.reception, operator).items():
-                for decided, environment in self._decided(state.supervision, inputs, operator.stop == STOPPED).items():
+                for decided, environment in self._decided(
+                    state.supervision, inputs, operator.stop in (RELEASED, STOPPED)
+                ).items():
                     late = decided.energises and operator.stop != NOTHING and operator.cycles >= SILENT_PENDANT
                     after = self._steps.without_press(reception) if decided.entered else reception
                     yield Transition(
@@ -179,7 +181,7 @@ class OperatorPath:
         Args:
             before: state of the safety monitor.
             inputs: inputs of the operator.
-            suspended: True if the robot does not walk on the ground, where STOP ends the walk first.
+            suspended: True if the robot does not walk on the ground, where STOP and the dead-man switch end the walk first.
         """
         results: dict[_Decided, Environment] = {}
         for environment in environments(before, suspended):
