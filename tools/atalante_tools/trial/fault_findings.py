@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 from itertools import groupby
 from typing import Any, Final
@@ -9,9 +10,16 @@ from typing import Any, Final
 from atalante_tools.faults.matrix import load_matrix
 from atalante_tools.trial.findings import Finding, Result
 
-#: Faults with which the robot must not fall: frames lost, late or doubled, an IMU or a force cell invalid, an exception of the
-#: controller, STOP, and a released or silent pendant.
-NO_FALL: Final = frozenset({"F01", "F02", "F03", "F05", "F06", "F24", "F30", "F31", "F32", "F33", "F45", "F56", "F63"})
+#: Faults with which the robot must not fall -> regular expression for the names of the cases to which this applies: frames are
+#: lost, late or doubled, an IMU, a foot or a force cell fails, the controller raises an exception, the loop is late, or the
+#: operator presses STOP or releases the dead-man. With HOLD on the pendant the robot may fall, because the drives hold at once.
+NO_FALL: Final = {
+    **dict.fromkeys(("F01", "F02", "F03", "F04", "F05", "F06", "F20", "F24", "F30", "F31", "F32", "F33"), ""),
+    "F19": "IMU|FOOT",
+    **dict.fromkeys(("F44", "F45"), ""),
+    "F56": "STOP|dead-man|pendant",
+    **dict.fromkeys(("F63", "F64", "F65"), ""),
+}
 #: Faults with which the robot must not fall if they begin in double support: the bus of the HAL fails.
 NO_FALL_IN_DOUBLE_SUPPORT: Final = frozenset({"F15", "F16"})
 
@@ -19,8 +27,8 @@ NO_FALL_IN_DOUBLE_SUPPORT: Final = frozenset({"F15", "F16"})
 def fault_findings(results: Sequence[Result]) -> list[Finding]:
     """Return one finding per fault.
 
-    With a fault of `NO_FALL`, no run may end in a fall. With another fault, each fall must have a diagnostic and a robot that is
-    no longer ACTIVE. With no fault may the HAL raise an exception.
+    With a fault and a case of `NO_FALL`, no run may end in a fall. With another fault, each fall must have a diagnostic and a
+    robot that is no longer ACTIVE. With no fault may the HAL raise an exception.
 
     Args:
         results: results of `fault` trials.
@@ -35,7 +43,7 @@ def fault_findings(results: Sequence[Result]) -> list[Finding]:
 def _finding(id_: str, fault: str, results: Sequence[Result]) -> Finding:
     runs = [(result["trial"]["case"], one) for result in results for one in result["runs"]]
     falls = [(case, one) for case, one in runs if one["outcome"] == "fell"]
-    failed = [one for case, one in runs if one["outcome"] == "exception" or _wrong_fall(id_, one)]
+    failed = [one for case, one in runs if one["outcome"] == "exception" or _wrong_fall(id_, case, one)]
     parts = [f"{len(falls)} of {len(runs)} walks fell"]
     parts += [f"{case}: {_moments(cases)}" for case, cases in _by_case(falls)]
     parts += [f"longest duration without a fall {_longest(result)}" for result in results if result["longest"]]
@@ -45,18 +53,21 @@ def _finding(id_: str, fault: str, results: Sequence[Result]) -> Finding:
 
 def _claim(id_: str) -> str:
     if id_ in NO_FALL:
-        return "no fall"
+        cases = NO_FALL[id_].replace("|", ", ")
+        return f"no fall (cases {cases}), and a diagnostic with each other fall" if cases else "no fall"
     if id_ in NO_FALL_IN_DOUBLE_SUPPORT:
         return "no fall in double support, and a diagnostic before each other fall"
     return "a diagnostic with each fall"
 
 
-def _wrong_fall(id_: str, run: dict[str, Any]) -> bool:
+def _wrong_fall(id_: str, case: str, run: dict[str, Any]) -> bool:
     """Return whether a run ended in a fall that is not accepted."""
     if run["outcome"] != "fell":
         return False
-    required = id_ in NO_FALL or (id_ in NO_FALL_IN_DOUBLE_SUPPORT and run["moment"] is None)
-    return required or not run["codes"] or run["state"] == "ACTIVE"
+    required = (id_ in NO_FALL and re.match(NO_FALL[id_], case)) or (
+        id_ in NO_FALL_IN_DOUBLE_SUPPORT and run["moment"] is None
+    )
+    return bool(required) or not run["codes"] or run["state"] == "ACTIVE"
 
 
 def _by_case(falls: Sequence[tuple[str, dict[str, Any]]]) -> list[tuple[str, list[dict[str, Any]]]]:

@@ -34,6 +34,8 @@ from atalante_tools.faults.reachability.search import Exploration, Transition, e
 _S = SupervisorState
 #: Stop actions of the operator: no stop action, dead-man switch released, STOP pressed, HOLD pressed.
 NOTHING, RELEASED, STOPPED, HELD = range(4)
+#: Value of `Inputs.stop` if the HAL has received HOLD.
+RECEIVED_HOLD: Final = 2
 #: Number of cycles after the stop action in which the HAL may still enable a drive, because it has not received a new
 #: pendant frame.
 SILENT_PENDANT: Final = LOST - 1
@@ -124,9 +126,8 @@ class OperatorPath:
             options = [Operator(before.stop, min(before.cycles + 1, _LONG))]
         for operator in options:
             for (reception, inputs, _), frames in self._received(state.reception, operator).items():
-                for decided, environment in self._decided(
-                    state.supervision, inputs, operator.stop in (RELEASED, STOPPED)
-                ).items():
+                suspended = operator.stop != NOTHING and inputs.stop != RECEIVED_HOLD
+                for decided, environment in self._decided(state.supervision, inputs, suspended).items():
                     late = decided.energises and operator.stop != NOTHING and operator.cycles >= SILENT_PENDANT
                     after = self._steps.without_press(reception) if decided.entered else reception
                     yield Transition(
@@ -181,7 +182,8 @@ class OperatorPath:
         Args:
             before: state of the safety monitor.
             inputs: inputs of the operator.
-            suspended: True if the robot does not walk on the ground, where STOP and the dead-man switch end the walk first.
+            suspended: True if the robot does not walk on the ground, where STOP, the dead-man switch and a lost pendant end the
+                walk first.
         """
         results: dict[_Decided, Environment] = {}
         for environment in environments(before, suspended):
