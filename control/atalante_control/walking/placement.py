@@ -100,7 +100,7 @@ def predicted(error: float, gain: float, limit: float, exponent: float) -> float
         exponent: w t, natural frequency times time to the landing.
     """
     size = abs(error)
-    linear = limit / gain if gain > 0.0 else math.inf  # largest error at which the shift does not reach its limit
+    linear = limit / gain if gain > 0.0 else math.inf  # error at which the shift reaches its limit
     if size > linear:
         if size >= limit:
             return math.copysign(limit + (size - limit) * math.exp(exponent), error)
