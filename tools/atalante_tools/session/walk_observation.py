@@ -18,6 +18,8 @@ if TYPE_CHECKING:
 FALLEN: Final = math.radians(35.0)
 #: Period of the observation [cycles]. In this time, the pelvis of a falling robot turns by less than 2 degrees.
 PERIOD_CYCLES: Final = 10
+#: Time for which a robot that left ACTIVE is observed [cycles]. A HOLD within a step may end in a fall after more than 1.5 s.
+AFTERMATH: Final = 5000
 #: Row of the pelvis IMU.
 _PELVIS: Final = IMUS.index("pelvis")
 

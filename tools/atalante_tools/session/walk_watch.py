@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import math
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any
 
 from atalante_hal.types import SupervisorState
 from atalante_tools.console.outcome import Failed
 from atalante_tools.console.terminal import print_message
+from atalante_tools.session.walk_observation import AFTERMATH
 
 if TYPE_CHECKING:
     from atalante_control.walking.controller import WalkController
@@ -15,8 +16,6 @@ if TYPE_CHECKING:
     from atalante_tools.session.rig import Rig
     from atalante_tools.session.walk_observation import Observation
 
-#: Time for which a robot that left ACTIVE is observed [cycles], because a HOLD within a step may end in a fall.
-_AFTERMATH: Final = 1500
 _FULL_ASSIST, _FINISH_STEP, _FAULT = SupervisorState.FULL_ASSIST, SupervisorState.FINISH_STEP, SupervisorState.FAULT
 
 
@@ -95,7 +94,7 @@ class WalkWatch:
             return bool(self._stop.wanted) or fault
         self._halted += 1
         self._reason = self._reason or self._rig.hal.reason
-        return self._halted > _AFTERMATH
+        return self._halted > AFTERMATH
 
     def _describe(self, state: State) -> str:
         controller = self._controller

@@ -31,7 +31,7 @@ from atalante_tools.faults.tasks import HORIZON, limited
 from atalante_tools.faults.verdict import exception_sentence
 from atalante_tools.session.body import describe
 from atalante_tools.session.rig import open_hal
-from atalante_tools.session.walk_observation import Observation
+from atalante_tools.session.walk_observation import AFTERMATH, Observation
 from atalante_tools.session.walk_options import solved_gaits
 from atalante_tools.trial.fault_plan import PERMANENT, FaultTrial
 from atalante_tools.trial.lockstep import target
@@ -44,8 +44,6 @@ if TYPE_CHECKING:
 _STEPS, _FAULTY_STEP = 2, 1
 #: Cycles from the start of the weight shift to a fault in double support.
 _SHIFTED: Final = 600
-#: Cycles for which a robot that left ACTIVE is observed. A HOLD within a step may end in a fall after more than 1.5 s.
-_AFTERMATH: Final = 5000
 #: Cycles for which the HAL is observed after a fall.
 _FALLEN: Final = 300
 #: Cycles after which a walk ends in any case. A walk without a fault lasts about 10000 cycles.
@@ -243,7 +241,7 @@ class _Walk:
                 if hal.moving and walk.done:
                     self.outcome = "stood"
                     return True
-                return halted > _AFTERMATH or state.cycle > _LONGEST
+                return halted > AFTERMATH or state.cycle > _LONGEST
 
             assert rig.emulator is not None
             clock = Absence(DisturbedClock(host_faults), rig.emulator)

@@ -9,10 +9,8 @@ from atalante_hal.types import State, SupervisorState
 from atalante_tools.console.options import EMBEDDED, Target
 from atalante_tools.console.stop_request import check_stop
 from atalante_tools.session.rig import Rig
-from atalante_tools.session.walk_observation import Observation
+from atalante_tools.session.walk_observation import AFTERMATH, Observation
 
-#: Time for which a robot that left ACTIVE is observed [cycles], because a HOLD within a step may end in a fall.
-_AFTERMATH: Final = 1500
 #: Time within which the robot must become ACTIVE [cycles].
 _START: Final = 30_000
 
@@ -70,4 +68,4 @@ class Ending:
             return True
         if state.supervisor is SupervisorState.FAULT:
             self.outcome = "fault"
-        return self._halted > _AFTERMATH or (not self._started and self.outcome == "fault")
+        return self._halted > AFTERMATH or (not self._started and self.outcome == "fault")
