@@ -35,6 +35,7 @@ class Record:
     def __init__(self, codec: Codec, controller_fields: Sequence[tuple[str, int]]) -> None:
         self.layout = Layout(_fields(codec, controller_fields))
         self._imu_rows = tuple(codec.rows[f"IMU_{imu.upper()}_STATE"] for imu in IMUS)
+        self._foot_rows = tuple(codec.rows[f"FOOT_{foot.upper()}_STATE"] for foot in FEET)
         self.values = np.zeros(self.layout.size)
         # Access to one number of a memoryview takes half as long as access to one number of an array.
         self.header = memoryview(self.values.data).cast("B").cast("d")[: len(HEADER_FIELDS)]
@@ -81,6 +82,7 @@ class Record:
             age=np.zeros(messages, np.int64),
             joints_valid=False,
             imu_rows=self._imu_rows,
+            foot_rows=self._foot_rows,
         )
 
 

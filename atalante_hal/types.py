@@ -58,6 +58,7 @@ class State:
     age: npt.NDArray[np.int64]  # (messages,) age of the data [cycles], counted from the SYNC that the message answers
     joints_valid: bool  # True if all twelve joint states are valid
     imu_rows: tuple[int, ...] = ()  # indices of the IMU messages in `valid` and `age`; empty if unknown
+    foot_rows: tuple[int, ...] = ()  # indices of the foot messages in `valid` and `age`; empty if unknown
     torque_sent: Vector | None = None  # (12,) Nm, last torques that were sent, after the limits; None if unknown
 
 

@@ -60,7 +60,10 @@ _SH, _SK = LEG_JOINTS.index("SH"), LEG_JOINTS.index("SK")
 _PELVIS, _TORSO = IMUS.index("pelvis"), IMUS.index("torso")
 #: Smallest distance from its position limits to which foot placement may move a joint of the swing leg [rad].
 _MARGIN = math.radians(1.0)
-_IMU_AGE = 10  # cycles, largest valid age of an IMU message, equal to the timeout of this message in the DBC
+#: Largest valid age of the message of an IMU or a foot [cycles], equal to the timeout of these messages in the DBC.
+_SENSOR_AGE = 10
+#: Share of the weight by which the load on the stance foot changes while the other foot swings, because the robot accelerates.
+_LOAD_ERROR = 0.15
 
 
 class WalkController:
@@ -136,6 +139,7 @@ class WalkController:
             config.stabiliser, *config.shift_limit, flat_feet(exoskeleton)[LEFT].geometry[2], exoskeleton.toe_out
         )
         force = np.zeros((len(FEET), len(CELLS), 3))
+        self._forces = force.copy()  # forces with an estimate for a lost foot
         #: Copy of the requested torque, used if the `State` does not contain the sent torque.
         self._sent = np.zeros(_N)
         self._state: State | None = None  # `State` object whose arrays `_measured_by` contains
@@ -319,13 +323,35 @@ class WalkController:
         self._state = state
 
     def _measure(self, state: State) -> None:
-        """Select the measurements of this cycle: those of the torso IMU if the data of the pelvis IMU is too old."""
+        """Select the measurements of this cycle.
+
+        If the data of the pelvis IMU is too old, the torso IMU is used. If the data of one foot is too old, the load on this foot
+        is estimated.
+
+        Args:
+            state: measured state of the robot.
+        """
         if state is not self._state:
             self._bind(state)
-        lost = bool(state.imu_rows) and state.age[state.imu_rows[_PELVIS]] > _IMU_AGE
+        lost = bool(state.imu_rows) and state.age[state.imu_rows[_PELVIS]] > _SENSOR_AGE
         self._measured = self._measured_by[_TORSO if lost else _PELVIS]
+        feet = [side for side, row in enumerate(state.foot_rows) if state.age[row] > _SENSOR_AGE]
+        if len(feet) == 1:
+            self._forces[:] = state.foot_force
+            self._forces[feet[0], :, 2] = self._load_without(feet[0]) / len(CELLS)
+            self._measured = self._measured._replace(force=self._forces)
         if state.torque_sent is None:
             self._sent[:] = self._pid.requested
+
+    def _load_without(self, side: int) -> float:
+        """Return the vertical load on a foot whose data is lost [N]: the share of the weight that the other foot does not carry.
+
+        Args:
+            side: index of the foot in FEET.
+        """
+        weight = self._constants.weight
+        missing = 1.0 - float(self._forces[1 - side, :, 2].sum()) / weight
+        return weight * min(1.0, max(0.0, missing - _LOAD_ERROR) / (1.0 - _LOAD_ERROR))
 
     def _facts(self, cycle: int) -> Facts:
         phase, nominal, landed = self.phase, len(self._table.rows) - 1, False

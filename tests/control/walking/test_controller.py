@@ -50,6 +50,7 @@ class Ideal:
             valid=valid,
             age=np.zeros(22, np.int64),
             joints_valid=True,
+            foot_rows=(0, 1),
         )
         self._torque = zero.copy()
 
@@ -57,7 +58,8 @@ class Ideal:
         body, state = self.body, self.state
         self._imus.sample(body.imu)
         state.position[:], state.velocity[:] = body.position, body.velocity
-        state.foot_force[:] = body.sole_force
+        received = state.age[list(state.foot_rows)] == 0
+        state.foot_force[received] = body.sole_force[received]
         if state.cycle == 0:
             controller.reset(state)
         torque = controller.update(state).torque.copy()
@@ -71,9 +73,12 @@ class Ideal:
 
 
 def walked(
-    engine: str, steps: int, *, finish_after: int | None = None, xi: float = 1.0
+    engine: str, steps: int, *, finish_after: int | None = None, xi: float = 1.0, lost_foot: int | None = None
 ) -> tuple[WalkController, list[Phase]]:
-    """Walk until the robot stands again; return the controller and its phases."""
+    """Walk until the robot stands again; return the controller and its phases.
+
+    After `finish_after` steps, FINISH_STEP begins and the data of the foot `lost_foot` is no longer received.
+    """
     controller = WalkController(ROBOT, PATIENT, WALK, steps)
     body = make_body(engine, urdf(ExoskeletonParameters(), ROBOT, PATIENT), free=True, ground=0.0)
     try:
@@ -86,6 +91,8 @@ def walked(
                 phases.append(controller.phase)
             if finish_after is not None and controller.statistics.steps == finish_after:
                 robot.state.supervisor = SupervisorState.FINISH_STEP
+                if lost_foot is not None:
+                    robot.state.age[robot.state.foot_rows[lost_foot]] = 100
             assert robot.upright(), f"fell in {controller.phase.name} after {controller.statistics.steps} steps"
             assert robot.state.cycle < 30_000
     finally:
@@ -138,6 +145,13 @@ def pushed(dead_zone: float, direction: float, force: float) -> bool:
 def test_robot_withstands_a_push_only_with_foot_placement_and_step_timing(direction: float, force: float) -> None:
     assert pushed(PlacementConfig().dead_zone, direction, force)
     assert not pushed(math.inf, direction, force)
+
+
+@pytest.mark.parametrize("foot", [0, 1])
+def test_robot_makes_a_stop_step_without_the_data_of_a_foot(foot: int) -> None:
+    controller, phases = walked("mujoco", 100, finish_after=1, lost_foot=foot)
+    assert phases[-3:] == [Phase.STOP, Phase.BACK, Phase.REST]
+    assert controller.max_dcm_error < 0.05
 
 
 def test_finish_step_ends_the_walk_with_a_stop_step() -> None:
