@@ -38,7 +38,7 @@ def ground_tick(effort: Effort) -> Measurement:
 
 
 def _standing(body: Body) -> Block:
-    """Put a robot on the floor, and return a benchmark block that measures the time per simulation step.
+    """Put a robot on the floor, and return a function that simulates `_STEPS` steps and returns the mean time per step [s].
 
     Args:
         body: robot with a free pelvis.

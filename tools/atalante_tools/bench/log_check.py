@@ -98,7 +98,7 @@ def validate_against_mdf(effort: Effort) -> Measurement:
 
 
 def _validation(path: Path, frames: Frames) -> Block:
-    """Return a benchmark block that validates the log, and fails if the report has findings."""
+    """Return a function that measures the validation of a log, and fails if the validator reports a finding."""
     from atalante_dbc.foreign import catalogue
     from atalante_tools.canlog.validate.run import validate_log
 

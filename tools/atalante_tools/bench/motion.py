@@ -35,13 +35,13 @@ from atalante_tools.session.walk_options import DEFAULT_PATIENT, DEFAULT_STEP
 POSE: Final = 0.15
 #: Number of cycles from power-on to the start of the measurement. The robot starts to walk within these cycles.
 _BEFORE_WALKING: Final = 3000
-#: As `_BEFORE_WALKING`, on the ground, where the robot is first lowered and shifts its weight.
+#: Number of cycles from power-on to the measurement on the ground. The robot is first lowered and shifts its weight.
 _BEFORE_STEPPING: Final = 8000
 #: Smallest vertical component of the upward axis of the pelvis of a robot that walks.
 _UPRIGHT: Final = 0.95
 #: Number of cycles that are timed together as one block.
 _BLOCK: Final = 50
-_STEPS: Final = 1000  # number of steps that no benchmark reaches
+_STEPS: Final = 1000  # requested walking steps, more than a benchmark takes
 _TICKS: Final = 40
 _INTEGRATIONS: Final = 4
 

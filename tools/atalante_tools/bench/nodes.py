@@ -270,7 +270,7 @@ def active_hal() -> RecordedHal:
     recording = Recording(walk())
     bus = RecordedBus(recording)
     hal = Hal(walk().network, walk().robot, bus)
-    hal._safety_monitor.proof.proven.fill(True)  # recorded nodes do not follow the pulses of the test of the directions
+    hal._safety_monitor.proof.proven.fill(True)  # recorded nodes do not react to test pulses
     for _ in range(2 * TURN):
         hal.read()
         hal.hold()

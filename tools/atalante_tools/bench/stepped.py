@@ -1,4 +1,4 @@
-"""Step-by-step integration of the tracking errors that the virtual guide predicts with tables.
+"""Simulation of the tracking errors of hip and knee, cycle by cycle. The guide filter predicts the same errors from tables.
 
 The integration is the reference for a check of the tables, and the baseline of the benchmark `filter_tick`.
 
@@ -17,7 +17,7 @@ from atalante_hal.types import Vector
 
 
 class SteppedRollout:
-    """Step-by-step integration of the tracking errors that a guide filter predicts."""
+    """Simulation, cycle by cycle, of the tracking errors that a guide filter predicts from tables."""
 
     def __init__(self, guide: GuideFilter) -> None:
         """Copy the gains of the backup policy, and the coefficients of the motor and of the velocity filter.

@@ -45,7 +45,7 @@ ROUTES: Final[dict[DriveState, tuple[Controlword, ...]]] = {
     _S.QUICK_STOP_ACTIVE: (_C.SHUTDOWN, _C.SWITCH_ON, _C.ENABLE_OPERATION, _C.QUICK_STOP),
 }
 
-#: Largest number of cycles that a drive may take for a transition. If a transition takes longer, the HAL ends the start.
+#: Largest number of cycles that a drive may take for a transition. If a transition takes longer, the HAL aborts the START.
 FOLLOW: Final = STALLED_CYCLES
 #: Number of cycles for which the test repeats a command that must leave the drive state unchanged.
 STAY: Final = 8

@@ -72,7 +72,7 @@ class LockStep:
         self._silent = 0
 
     def next_cycle(self, *, sync: bool, listen: Callable[[float], None]) -> None:
-        """Start the next cycle without a wait. Advance the emulated node once `WATCHDOG` consecutive cycles have no SYNC."""
+        """Start the next cycle without a wait. From the `WATCHDOG`-th consecutive cycle without SYNC on, advance the node."""
         self._silent = 0 if sync else self._silent + 1
         if self._silent >= self._watchdog:
             self._emulator.idle()

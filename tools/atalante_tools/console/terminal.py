@@ -101,7 +101,7 @@ class Progress:
             self._stream.write(text + "\n")
 
     def bar(self, done: int, total: int, unit: str) -> None:
-        """Print a bar with the finished share of a task and the time that it still needs, if the next line is due.
+        """Print a bar with the finished share of a task and its estimated remaining time, if the next line is due.
 
         Args:
             done: Number of finished parts, at least 1.

@@ -1,4 +1,4 @@
-"""Time of the emulated robot while the HAL sends nothing: `HAL cycle, delay of the loop -> cycles of the robot without SYNC`.
+"""Clock of the HAL that lets the emulated robot move while no SYNC is sent: `delay of the HAL loop -> robot cycles`.
 
 In lock-step, the emulated robot runs one cycle per SYNC. If a fault of the host suppresses the SYNC or delays the loop, the robot
 would stand still. A robot on the ground would then not fall.
@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 
 class Absence:
-    """Clock of the HAL that moves the emulated robot in the time without SYNC."""
+    """Lock-step clock of the HAL, which advances the emulated robot while the HAL sends no SYNC."""
 
     def __init__(self, clock: DisturbedClock, emulator: Emulator) -> None:
         """Start with equal times of the HAL and the robot.
@@ -29,7 +29,7 @@ class Absence:
         self._clock, self._emulator = clock, emulator
         self._begun = 0  # HAL cycles that have begun
         self._skipped = 0.0  # time that the loop has lost, because its cycles began more than a period late [s]
-        self._seen = 0  # cycle of the robot at the end of the last call
+        self._seen = 0  # cycle number of the robot at the end of the last call of `wait`
         self._alone = 0  # cycles of the robot since the last SYNC
 
     def wait(self) -> float:

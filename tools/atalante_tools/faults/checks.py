@@ -21,7 +21,7 @@ _FAILED: Final = 20
 #: Number of cycles without a command after which a drive must hold its position without the HAL (local hold).
 #: This number is not imported from the emulated drive, so that an error in the emulator cannot change the check.
 _WATCHDOG: Final = 5
-#: Highest true speed of a joint, as a multiple of its velocity limit.
+#: Largest accepted true speed of a joint, as a multiple of its velocity limit.
 _TOO_FAST: Final = 1.2
 _LEFT_LEG: Final = slice(0, len(LEG_JOINTS))
 

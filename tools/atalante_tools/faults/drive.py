@@ -34,7 +34,7 @@ _RESTARTED: Final = {
 
 
 def _start_with(name: str, node: str, share: float) -> Case:
-    """Return the case of a first START with a motor that produces `share` times the torque it measures."""
+    """Return a test case of the first START, in which a motor produces `share` times the torque that its drive measures."""
     return Case(
         name,
         (Fault("torque_weak", node, 0, share=share),),

@@ -18,10 +18,10 @@ if TYPE_CHECKING:
     from atalante_emulator.mechanics import Mechanics
     from atalante_hal.types import Controller
 
-#: Cycles of a walk in the air. A walk on the ground of `_STEPS` steps has about as many.
+#: Cycles of a walk in the air. A walk on the ground of `_STEPS` steps has about as many cycles.
 _CYCLES: Final = 60_000
 _STEPS: Final = 75
-#: Diagnostics of a walk without a fault: the filter and the limiter report that they act.
+#: Diagnostics that a walk without a fault may report: joint outside its guide, saturated torque, STOP of the operator.
 EXPECTED: Final = frozenset({"GUIDE_OUTSIDE", "TORQUE_SATURATED", "OPERATOR_STOP"})
 _SHAPES: Final = ("constant", "pinched")
 _FACTORS: Final = (1.0, 0.75, 0.5, 0.25, 0.0)

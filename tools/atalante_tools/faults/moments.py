@@ -35,14 +35,17 @@ _S = SupervisorState
 #: Largest accepted motion of a joint between START and ACTIVE, or in the first `_SETTLED` cycles after START [deg].
 SAG_MAX: Final = 1.0
 _SETTLED: Final = 40
-#: Cycles from READY to the operator's START, from STOP to a fault in HOLD, and from STOP to the operator's restart.
+#: Cycles from READY to the operator's START.
 _PAUSE: Final = 50
+#: Cycles from the operator's STOP to a fault that begins in HOLD.
 _STOPPED: Final = 60
+#: Cycles from the operator's STOP to the START that restarts the walk.
 _RESTART: Final = 200
 #: Longest observation of a fault [cycles]. A permanent fault is observed for this time.
 _LONGEST: Final = 400
-#: Cycles from the end of the observation to the operator's START, and from the second press of START to the end of the run.
+#: Cycles from the end of the observation to the operator's START.
 _REST: Final = 60
+#: Cycles from the second press of START to the end of the run.
 _END: Final = 300
 
 
@@ -54,7 +57,7 @@ class Moment(StrEnum):
     START = "start"  # in the cycle after START, while the drives are enabled
     WALKING = "walking"  # in the first walking step, when the left leg swings fastest
     HOLD = "hold"  # in HOLD, after the operator's STOP during the walk
-    RESTART = "restart"  # in the cycle after the operator's START that ends this HOLD
+    RESTART = "restart"  # in the cycle after the operator's START that restarts the walk from HOLD
 
 
 @dataclass(frozen=True)
@@ -87,7 +90,7 @@ def schedule(moment: Moment, engine: str) -> Schedule:
 
 
 class Extreme(NamedTuple):
-    """Largest value of all joints, and its joint."""
+    """Largest value among all joints, and the joint with this value."""
 
     value: float
     joint: str
@@ -95,12 +98,12 @@ class Extreme(NamedTuple):
 
 @dataclass(frozen=True)
 class Extremes:
-    """Largest values of a run."""
+    """Largest joint speed, torque step and joint motions of a run."""
 
     speed: Extreme  # joint velocity as a share of its limit
     torque_step: Extreme  # change of the commanded torque in one cycle [Nm]
     sag: Extreme  # motion between START and the end of the start [deg]
-    lost: Extreme  # motion in HOLD or a more severe state, from its first cycle on [deg]
+    lost: Extreme  # motion since the first cycle in HOLD or a more severe state [deg]
 
 
 @dataclass(frozen=True)
@@ -108,9 +111,9 @@ class MomentVerdict:
     """Result of a run with one fault at a moment, or with two faults."""
 
     moment: str
-    faults: tuple[str, ...]  # "ID name of the case" of each fault
+    faults: tuple[str, ...]  # for each fault: its ID and the name of the case
     state: str  # state of the HAL before the operator's START after the faults
-    restarted: bool  # whether this START led to ACTIVE
+    restarted: bool  # whether the operator's START after the faults led to ACTIVE
     extremes: Extremes | None  # None if the run raised an exception
     failures: tuple[str, ...]  # one sentence each
 
@@ -137,7 +140,7 @@ class MomentTask:
             return MomentVerdict(self.moment, names, "-", False, None, (exception_sentence(error),))
         extremes, before = _extremes(run, plan.starts), run.last_before_start
         failures = [*limit_violations(run), *_premature(run, plan.starts[0])]
-        if self.moment in (Moment.WALKING, Moment.HOLD):  # at all other moments START improves the state
+        if self.moment in (Moment.WALKING, Moment.HOLD):  # a later START may improve the state
             failures += automatic_improvements(run, before)
         if extremes.sag.value > SAG_MAX:
             sag = f"{extremes.sag.value:.2f} deg of {extremes.sag.joint}"

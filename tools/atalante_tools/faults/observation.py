@@ -60,7 +60,7 @@ class Observation:
 
     @property
     def last_before_start(self) -> int:
-        """Return the cycle before `pressed`, or the last cycle of the run if START was not pressed after the fault."""
+        """Return the last cycle before START was pressed after the fault; without this START, the last cycle of the run."""
         return (self.pressed or self.last + 1) - 1
 
     @property

@@ -71,7 +71,7 @@ def run_context() -> RunContext:
 
 
 class Milestones(NamedTuple):
-    """HAL cycles of a run without a fault. They are the same in all runs."""
+    """Milestones of a run without a fault, in HAL cycles. All runs have the same milestones."""
 
     ready: int  # first cycle in READY; the operator presses START in the next cycle
     active: int  # first cycle in ACTIVE
@@ -97,7 +97,7 @@ def milestones(engine: str = PYBULLET) -> Milestones:
 
 
 def walk_cycle(phase: float, engine: str = PYBULLET) -> int:
-    """Return the HAL cycle with a phase of the first walking step.
+    """Return the HAL cycle in which the first walking step reaches a phase.
 
     Args:
         phase: phase of the step, 0 to 1.

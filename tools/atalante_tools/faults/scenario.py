@@ -95,7 +95,7 @@ class Case:
 
     @property
     def ends(self) -> int | None:
-        """Return the first cycle after all stimuli, counted from the start of the case; None if a stimulus is permanent."""
+        """Return the first cycle after all faults and actions, counted from the start of the case; None if one is permanent."""
         ends = [None if one.cycles is None else one.start + one.cycles for one in self.stimuli]
         return None if None in ends else max((end for end in ends if end is not None), default=0)
 
@@ -106,6 +106,5 @@ class Scenario:
 
     id: str
     cases: tuple[Case, ...]
-    #: Case with a permanent fault, for the endurance run. The endurance run repeats this case with a shorter and shorter fault,
-    #: until the fault does not stop the walk. None means no endurance run.
+    #: Case with a permanent fault. The endurance run shortens this fault until the walk continues. None: no endurance run.
     permanent: Case | None = None

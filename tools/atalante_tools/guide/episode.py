@@ -1,4 +1,4 @@
-"""Steps of the ideal plant with the controller of the robot: `start, push -> |e| / q_bound over the step`.
+"""Simulation of walking steps on the ideal plant with the controller of the robot: `start, push -> |e| / q_bound over the step`.
 
 Each step calls the compiled cycle of the real controller, so the check covers the control law that runs on the robot. At the
 start of a step, the torques from before the stance change still act. The plant, the limiter and the drives are those of the
@@ -298,7 +298,7 @@ def walk_step(
 
 
 def safe_errors(goal: Goal, row: Vector, image: Vector, measured: Measured, guide: GuideTables, parts: Parts) -> None:
-    """Find the largest safe errors (h >= 0) by bisection. Do this at every tenth cycle; see `IdealLeg.image`.
+    """Find the largest safe tracking errors (h >= 0) at every tenth cycle by bisection; see `IdealLeg.image`.
 
     Args:
         goal: desired motion and guide.

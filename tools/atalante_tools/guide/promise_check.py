@@ -61,7 +61,7 @@ _SHARE: Final = 0.1
 
 @dataclass(frozen=True)
 class Effort:
-    """Effort of the check of one guide."""
+    """Number of steps and extent of the search for the check of one guide."""
 
     steps: int  # steps on the ideal plant with pushes up to the promised torques
     robot_steps: int  # steps on the emulated robot; 0: the robot is not used

@@ -33,7 +33,7 @@ _Choice = TypeVar("_Choice")
 DIRECTIONS: Final = tuple(itertools.product((1.0, -1.0), repeat=2))
 #: A stage of the beam search has `_STAGE` cycles, and keeps the `_BEAM` pushes with the largest predicted deviation.
 _STAGE, _BEAM = 40, 6
-#: Time over which the beam search extrapolates an error with its present rate [s].
+#: Time over which the beam search extrapolates a tracking error with its current rate [s].
 _AHEAD: Final = 0.03
 #: A search with at least this number of steps includes the beam search.
 _WITH_BEAM: Final = 1000
@@ -141,7 +141,7 @@ class Adversary:
         walked = self.leg.walk(self._plants[condition], start, push, box, numbers)
         self.steps += 1
         one = Tried(walked.ratio, kind, start, push, condition, noise, walked)
-        # A step with exactly the ratio of a stored step is a repetition of that step.
+        # A step with exactly the same ratio as a stored step is the same step, so it is not stored again.
         if all(one.ratio != other.ratio for other in self.tried):
             self.tried.append(one)
         self.tried.sort(key=lambda other: -other.ratio)
@@ -183,7 +183,7 @@ class Adversary:
             yield "feedback", Push(np.tile(bias, (cycles, 1)), feedback)
 
     def _switching(self, cycles: int) -> Iterator[tuple[str, Push]]:
-        """Yield pushes that switch after random times, each joint by itself or both together."""
+        """Yield pushes that switch after random times, at each joint separately or at both joints together."""
         while True:
             signs, slowest = np.ones((cycles, 2)), float(self._generator.choice([15.0, 40.0, 100.0, 250.0]))
             together = self._generator.random() < 0.5
@@ -266,7 +266,7 @@ class Adversary:
             kept = [signs for _, signs in ahead[:_BEAM]]
 
     def _mutate(self, box: Pair) -> None:
-        """Change one of the worst steps a little, and walk the changed step."""
+        """Change one of the worst steps slightly at random, and simulate the changed step."""
         generator, cycles = self._generator, self.leg.cycles + 1
         parent = self.tried[int(generator.integers(min(_PARENTS, len(self.tried))))]
         start, push, condition, noise = parent.start, parent.push, parent.condition, parent.noise
@@ -279,7 +279,7 @@ class Adversary:
         elif feedback.any() and change < 0.7:
             feedback += 0.3 * generator.standard_normal(feedback.shape)
         else:
-            if feedback.any():  # replace the feedback by the recorded push
+            if feedback.any():  # replace the feedback by the recorded signs
                 signs, feedback = np.where(parent.walked.log[:, 4:6] >= 0.0, 1.0, -1.0), _no_feedback()
             begin, length = int(generator.integers(cycles)), int(1 + generator.exponential(30.0))
             joints = [[0], [1], [0, 1]][int(generator.integers(3))]

@@ -61,7 +61,7 @@ def walk(target: Target, options: WalkOptions, *, as_json: bool) -> None:
 
 
 def _outputs(options: WalkOptions) -> Outputs | None:
-    """Return the outputs of the telemetry process; None if the user wants none."""
+    """Return the outputs of the telemetry process; None if the user requested no output."""
     recording = options.recording
     if recording.can_log is not None:
         require_format(recording.can_log)

@@ -50,8 +50,7 @@ class WalkOptions:
     law: Law  # control law of the periodic steps
     #: numbers of steps with full assistance, in the transition to `xi`, and with `xi`; None means that all steps have `xi`
     protocol: tuple[int, int, int] | None = None
-    #: options of the recording in `out`, of the CAN log and of telemetry. If the user requests none of these three outputs, no
-    #: telemetry process is started
+    #: Options of recording, CAN log and telemetry. If none of these outputs is requested, no telemetry process is started.
     recording: RecordingOptions = field(default_factory=RecordingOptions)
     out: Path | None = None  # folder for summary.json, trace.npz and walk.png; None means no files
 

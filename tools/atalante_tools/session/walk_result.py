@@ -34,7 +34,7 @@ class WalkResult:
     xi: float
     shape: str | None  # guide shape; None at Xi = 1, where there is no guide
     certified: bool | None  # whether the guide is certified; None at Xi = 1, where there is no guide
-    #: promised torque of SH [Nm]: up to this disturbance, both joints stay inside; None without promised torques
+    #: promised torque of SH [Nm]: up to this disturbance, both joints stay in the guide; None without promised torques
     promise_hip_nm: float | None
     #: promised torque of SK [Nm], see `promise_hip_nm`; None without promised torques
     promise_knee_nm: float | None

@@ -185,7 +185,11 @@ def faults(ids: tuple[str, ...], running: Running, as_json: bool) -> None:
 
 @command.command(short_help="Walk with full and then partial assistance, with every subject.")
 @_mass_option
-@click.option("--literal", is_flag=True, help="Use the control law of the paper to the letter. It has no promise.")
+@click.option(
+    "--literal",
+    is_flag=True,
+    help="Use the control law as the paper prints it. The guides then have no promised torque.",
+)
 @_walking()
 @_running("protocol")
 def protocol(masses: tuple[float, ...], literal: bool, walking: Walking, running: Running, as_json: bool) -> None:
@@ -243,7 +247,7 @@ def _record_failures(trials: Sequence[Trial], running: Running) -> None:
 
 
 def _known(masses: tuple[float, ...]) -> tuple[float, ...]:
-    """Return the masses if each is that of a subject.
+    """Return the masses if each of them is the mass of a virtual subject.
 
     Raises:
         UsageError: If a mass is not that of a subject.

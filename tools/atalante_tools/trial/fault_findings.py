@@ -10,9 +10,9 @@ from typing import Any, Final
 from atalante_tools.faults.matrix import load_matrix
 from atalante_tools.trial.findings import Finding, Result
 
-#: Faults with which the robot must not fall -> regular expression for the names of the cases to which this applies: frames are
-#: lost, late or doubled, an IMU, a foot or a force cell fails, the controller raises an exception, the loop is late, or the
-#: operator presses STOP or releases the dead-man. With HOLD on the pendant the robot may fall, because the drives hold at once.
+#: Fault ID -> regular expression for the names of the cases in which the robot must not fall. In these cases, frames are lost,
+#: late or doubled, an IMU, a foot or a force cell fails, the controller raises an exception, the loop is late, or the operator
+#: presses STOP or releases the dead-man switch. After HOLD the robot may fall, because the drives hold at once.
 NO_FALL: Final = {
     **dict.fromkeys(("F01", "F02", "F03", "F04", "F05", "F06", "F20", "F24", "F30", "F31", "F32", "F33"), ""),
     "F19": "IMU|FOOT",
@@ -83,7 +83,7 @@ def _moments(falls: Sequence[dict[str, Any]]) -> str:
 
 
 def _longest(result: Result) -> str:
-    """Return the shortest of the longest durations of all moments."""
+    """Return, as text, the longest fault duration without a fall at the worst moment."""
     limited = [
         (cycles, run["moment"])
         for cycles, run in zip(result["longest"], result["runs"], strict=True)

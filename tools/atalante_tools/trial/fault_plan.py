@@ -23,7 +23,7 @@ PERMANENT: Final = -1
 
 @dataclass(frozen=True)
 class FaultTrial:
-    """One case of a scenario, at all moments."""
+    """Trial of one case of a fault scenario, with one walk per moment."""
 
     kind: ClassVar[str] = "fault"
     id: str  # fault ID, as in the fault matrix

@@ -40,7 +40,7 @@ from atalante_tools.trial.plan import STEP
 if TYPE_CHECKING:
     from atalante_hal.safety.events import Event
 
-#: Steps of a walk before its stop step, and the step in which the fault begins, from 0.
+#: Steps of a walk before its stop step, and index of the step in which the fault begins (0 is the first step).
 _STEPS, _FAULTY_STEP = 2, 1
 #: Cycles from the start of the weight shift to a fault in double support.
 _SHIFTED: Final = 600
@@ -87,7 +87,7 @@ def run_fault(trial: FaultTrial) -> dict[str, Any]:
         "outcome": "computed",
         "fell": fell,
         "runs": [asdict(one) for one in runs],
-        "longest": longest,  # of a permanent fault: longest duration without a fall [cycles]; None means no fall
+        "longest": longest,  # longest duration of a permanent fault without a fall [cycles]; None: no fall
     }
 
 

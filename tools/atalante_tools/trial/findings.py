@@ -22,13 +22,11 @@ Result = dict[str, Any]
 #: Phases at which steps are compared with each other. Early landings end a step after about 0.9.
 _PHASES: Final = np.linspace(0.1, 0.8, 29)
 
-#: Two metabolic rates are called equal if their means differ by at most this fraction of the rate of quiet standing (1.44
-#: W/kg).
+#: Two metabolic rates count as equal if their means differ by at most this fraction of the rate of quiet standing.
 SAME: Final = 0.02
 STANDING: Final = 1.44  # W/kg, metabolic rate of quiet standing
 #: `TREND`: a quantity has a trend if its rank correlation with the assistance factor is at most minus this value.
-#: `ASYMMETRY`: largest mean difference between the k-th trial and the k-th trial from the end of a day, as a fraction of the
-#: range of all values.
+#: `ASYMMETRY`: largest mean difference between the k-th and the k-th last trial of a day, as a fraction of the range of values.
 TREND, ASYMMETRY = 0.8, 0.25
 #: Largest coefficient of variation of the baseline metabolic rates of a sweep.
 VARIATION: Final = 0.05
@@ -132,7 +130,7 @@ def sweep_findings(results: Sequence[Result]) -> list[Finding]:
 
 
 def protocol_findings(results: Sequence[Result]) -> list[Finding]:
-    """Return the findings of the protocol: all walks end standing and inside the guide, and all guides have a promise.
+    """Return the findings of the experiment `protocol`: walks end standing and inside the guide, guides have a promise.
 
     Args:
         results: results of `walk` trials.
@@ -147,7 +145,7 @@ def protocol_findings(results: Sequence[Result]) -> list[Finding]:
 
 
 def robust_findings(results: Sequence[Result]) -> list[Finding]:
-    """Return the findings of the robustness.
+    """Return the findings of the experiment `robustness`.
 
     Args:
         results: results of `robust` trials.
@@ -189,7 +187,7 @@ def normalised(result: Result) -> float:
 
 
 def step_variation(result: Result) -> float:
-    """Return how much e / q_bound varies from step to step: standard deviation over the last steps, mean of phases and joints.
+    """Return how much e / q_bound varies from step to step: standard deviation over the last steps, mean over phases and joints.
 
     Args:
         result: result of a guided walk.

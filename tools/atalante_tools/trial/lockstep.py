@@ -1,4 +1,4 @@
-"""Parts of all trials on the emulated robot: target in lock-step, end of a trial."""
+"""Parts that all trials share: the emulated robot in lock-step as target, and the end condition of a trial."""
 
 from __future__ import annotations
 

@@ -89,7 +89,7 @@ class WalkTrial:
     seed: int
     engine: str
     order: str = ""  # day and position of a trial of the sweep
-    literal: bool = False  # whether the control law is that of the paper to the letter
+    literal: bool = False  # whether the control law follows the paper literally
 
     @property
     def name(self) -> str:
@@ -104,7 +104,7 @@ class RobustTrial:
 
     kind: ClassVar[str] = "robust"
     number: int
-    mass: float  # kg, of the patient as the controller knows it
+    mass: float  # kg, mass of the patient in the model of the controller
     height: float  # m
     mass_share: float  # true mass of the patient / known mass
     friction: float  # between soles and floor
@@ -293,7 +293,7 @@ _REPORTING: Final = ("__init__.py", "findings.py", "fault_findings.py", "figures
 
 
 def _roots() -> list[Path]:
-    """Return the folders of the packages that a trial uses, without those of the tools."""
+    """Return the folders of the packages that a trial uses, except the folders of the tools."""
     import atalante_control
     import atalante_dbc
     import atalante_emulator

@@ -12,7 +12,7 @@ from atalante_tools.console.html import html_table, page
 from atalante_tools.console.terminal import print_message
 from atalante_tools.trial.findings import Finding, Result, condition
 
-#: Title of each experiment, and what its numbers mean.
+#: Title of each experiment, and an explanation of its numbers.
 EXPERIMENTS: Final = {
     "shapes": (
         "Guide shapes",
@@ -66,7 +66,7 @@ def verdict(finding: Finding) -> str:
 def write_report(
     experiment: str, results: Sequence[Result], findings: Sequence[Finding], quick: bool, missing: int, path: Path
 ) -> None:
-    """Write the report, and its findings as Markdown beside it. Without Matplotlib, the report contains no figures.
+    """Write the HTML report, and its findings as Markdown in the same folder. Without Matplotlib, the report contains no figures.
 
     Args:
         experiment: key of `EXPERIMENTS`.

@@ -39,7 +39,7 @@ from atalante_tools.trial.plan import STEP, RobustTrial
 _PUSH: Final = 0.2
 #: Time for which a robot that has fallen is observed [cycles].
 _FALLEN: Final = 1000
-#: First faulty cycle of the bus. Before it, the robot is OFF.
+#: First cycle with faults of the bus. Before this cycle, the robot is OFF.
 _BEGINS: Final = 1
 _RATE: Final = 100  # Hz, of a recording
 
@@ -147,7 +147,7 @@ class Pushes:
 
 
 class SafeEnding:
-    """End of a robust walk, called once per cycle. After a fall, the robot is observed further.
+    """End of a robust walk, called once per cycle. A robot that has fallen is observed for `_FALLEN` more cycles.
 
     Attributes:
         outcome: "stood", "fell", "hold" or "fault".

@@ -61,7 +61,7 @@ SEGMENTS: Final = ("full", "transition", "target")
 
 
 def run_trial(trial: ShapeTrial | WalkTrial | TreadmillTrial | RobustTrial) -> dict[str, Any]:
-    """Run a trial, and return its result. Other processes call this function, too.
+    """Run a trial, and return its result. Worker processes call this function, too.
 
     Args:
         trial: trial to run.
@@ -254,7 +254,7 @@ def _position(ratio: Vector) -> dict[str, Any]:
     return {
         # share of the time with a joint in the outer half of its guide
         "outer": round(float(np.mean(np.abs(ratio).max(axis=1) > 0.5)), 4),
-        "spread": round(float(ratio.std(axis=0).mean()), 4),  # standard deviation of each joint, mean of both joints
+        "spread": round(float(ratio.std(axis=0).mean()), 4),  # standard deviation, averaged over both joints
         "histogram": [np.histogram(ratio[:, k], EDGES)[0].tolist() for k in range(2)],
     }
 
@@ -290,7 +290,7 @@ class Effort:
         self._segments.append(sum(self._controller.statistics.steps >= end for end in self._ends))
 
     def result(self, mass: float, seed: int) -> dict[str, Any]:
-        """Return metabolic rates of the segments [W/kg], and the series of the respirometer.
+        """Return the metabolic rate of each part of the protocol [W/kg], and the series of the respirometer.
 
         Args:
             mass: mass of the subject [kg].

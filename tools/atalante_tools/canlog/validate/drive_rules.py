@@ -79,7 +79,7 @@ class DriveRules:
         self._limit_ns = project.number("cia402-response", "limit_ms") * 1e6
         state, command = project.text("cia402-transition", "state"), project.text("cia402-response", "command")
         commands = _command_fields(plan, command)
-        #: Drives by the message family (`plan.Family`) of their state messages. Key: first message index of the family.
+        #: Drives, grouped by the family (`plan.Family`) of their state messages. Key: first message index of the family.
         self.drives: dict[int, list[_Drive]] = {}
         for family in plan.families:
             index = next((p for p, f in enumerate(family.codec.fields) if f.name == state), None)

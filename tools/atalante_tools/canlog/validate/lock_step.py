@@ -37,8 +37,8 @@ _SPACING_NS, _LAST = 1000, 0.7
 class _Channel:
     """State of the clock for one channel after the last frame on this channel."""
 
-    #: plan index of the first SYNC message that was received on this channel; -1 if none was received yet. Only this message
-    #: gives the cycle number.
+    #: Plan index of the first SYNC message that was received on this channel; -1 if none was received yet.
+    #: The cycle number is read only from this message.
     sync: int = -1
     cycle: int = 0  # cycle number of the last SYNC
     begin: int = 0  # time stamp of the last SYNC in robot time [ns]

@@ -19,7 +19,7 @@ from atalante_tools.canlog.validate.findings import Findings
 from atalante_tools.canlog.validate.project import Project
 
 #: The interval histogram of a message has `BINS_A_CYCLE` bins per cycle time, and covers intervals up to `CYCLES` cycle times.
-#: One more bin, the last one, counts all longer intervals.
+#: The last bin counts all intervals longer than `CYCLES` cycle times.
 BINS_A_CYCLE, CYCLES = 100, 4
 BINS = BINS_A_CYCLE * CYCLES + 1
 _NEVER = -(1 << 62)
@@ -198,8 +198,8 @@ class TimingRules:
         """Add all intervals without lost frames to the interval statistics of the messages."""
         bins = np.minimum(np.maximum(share * BINS_A_CYCLE, 0.0), float(BINS - 1)).astype(np.int64)
         bins += (np.arange(len(stream.present)) * BINS).repeat(stream.stops - stream.starts)
-        # Leave out the intervals with lost, repeated or rejected frames. Without an alive counter (`NO_STEP`, less than
-        # `REPEATED`), lost frames are not detectable, so these intervals stay in the statistics.
+        # Exclude the intervals with lost, repeated or rejected frames from the statistics.
+        # Keep the intervals without an alive counter (`NO_STEP`, less than `REPEATED`): lost frames are not detectable there.
         incomplete = (
             odd[steps[odd] >= REPEATED]
             if rejected_before is None

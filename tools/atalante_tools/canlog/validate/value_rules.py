@@ -217,7 +217,7 @@ class _FamilyChecks:
         self.limited = np.array(list(self.bounds), np.intp)
         self.low = np.array([low for low, _ in self.bounds.values()], np.int64)
         self.high = np.array([high for _, high in self.bounds.values()], np.int64)
-        #: For each field that has no range, by field index: code for "no value".
+        #: Field index -> raw code for "no value", for each field without a range.
         self.coded = {
             p: _as_signed(f, f.invalid_raw) for p, f in fields if f.invalid_raw is not None and (p, f) not in ranged
         }

@@ -36,8 +36,7 @@ _S = SupervisorState
 NOTHING, RELEASED, STOPPED, HELD = range(4)
 #: Value of `Inputs.stop` if the HAL has received HOLD.
 RECEIVED_HOLD: Final = 2
-#: Number of cycles after the stop action in which the HAL may still enable a drive, because it has not received a new
-#: pendant frame.
+#: Number of cycles after a stop action in which the HAL may still enable a drive, because no new pendant frame arrived.
 SILENT_PENDANT: Final = LOST - 1
 #: Ages of late pendant frames [cycles]: all ages that the HAL accepts, and two ages that the HAL rejects.
 _LATE: Final = (*range(1, LOST + 1), 6, 16)
@@ -67,7 +66,7 @@ class Presses(NamedTuple):
 
 
 class StopState(NamedTuple):
-    """State of the search `stops`."""
+    """State of the search `stops`, which looks for torque commands after a stop action of the operator."""
 
     reception: Reception
     supervision: Supervision
@@ -75,7 +74,7 @@ class StopState(NamedTuple):
 
 
 class MoveState(NamedTuple):
-    """State of the search `moves`."""
+    """State of the search `moves`, which looks for a change to a better supervisor state without a press of START."""
 
     reception: Reception
     supervision: Supervision
@@ -259,7 +258,7 @@ def _contents(before: Reception, age: int) -> Iterator[PendantFrame]:
 
 
 def _agrees(frame: PendantFrame, operator: Operator) -> bool:
-    """Return whether a frame is consistent with the operator's stop action. A frame from before the action always is."""
+    """Return whether a frame is consistent with the operator's stop action. An earlier frame always is."""
     if frame.age > operator.cycles:
         return True  # the pendant sampled the frame before the action of the operator
     return {

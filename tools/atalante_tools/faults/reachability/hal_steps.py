@@ -31,8 +31,7 @@ from atalante_tools.faults.reachability.no_bus import NoBus
 
 #: Age at which pendant data times out [cycles]. The search does not distinguish higher ages.
 LOST: Final = 5
-#: Cycle number that each step uses. Another number would give the same results, because all counters are relative to this
-#: number.
+#: Cycle number that each step uses. All counters are relative to this number, so its value does not affect the results.
 _CYCLE: Final = 1001
 _TAG: Final = _CYCLE & 0xFF
 #: `_PRESSES` is the RequestCounter in the last accepted frame of the pendant.
@@ -46,8 +45,7 @@ QUALIFICATIONS: Final = {
     False: (Qualification(0, 0, False), Qualification(0, REQUALIFY - 1, False)),
     True: (SETTLED, Qualification(FULL - 4, REQUALIFY, True)),
 }
-#: Which RequestCounter the last call of `Pendant.evaluate` has read: none yet, the counter of the last accepted frame, an older
-#: counter, or the counter of a second sender.
+#: Source of the RequestCounter that `Pendant.evaluate` read last: none yet, last accepted frame, older frame, second sender.
 _NONE, _LATEST, _OLDER, _ROGUE = range(4)
 _EVALUATED: Final = {_NONE: None, _LATEST: _PRESSES, _OLDER: _PRESSES - 1, _ROGUE: _ROGUE_PRESSES}
 
@@ -58,7 +56,7 @@ class Reception(NamedTuple):
     age: int = 0  # age of the last accepted frame [cycles]; `LOST` after the timeout
     dead_man: bool = True  # whether the dead-man switch is pressed in the last accepted frame
     request: int = Request.START  # `Request` of the last accepted frame
-    evaluated: int = _LATEST  # which RequestCounter the last call of `Pendant.evaluate` has read
+    evaluated: int = _LATEST  # source of the RequestCounter that `Pendant.evaluate` read last
     rogue: bool = False  # the last accepted frame has the RequestCounter of a second sender
     stored: bool = False  # a START is stored until the pendant is trusted
     trusted: bool = True
@@ -88,7 +86,7 @@ class Inputs(NamedTuple):
 
 
 class Supervision(NamedTuple):
-    """Part of the search state: safety monitor."""
+    """Part of the search state that belongs to the safety monitor of the HAL."""
 
     supervisor: SupervisorState
     start: int  # `NO_START`, `LAST_START` or `START`
@@ -302,7 +300,7 @@ class HalSteps:
         monitor._reports.clear()
         monitor.start_wanted, monitor.enabling, monitor.moving, monitor.walking = 0, False, False, False
         monitor.recalled = -RECALL_CYCLES  # without this check more starts are possible
-        monitor._stalled = 0  # not searched: `LAST_START` covers every way in which a start can end
+        monitor._stalled = 0  # constant in the search: `LAST_START` covers all ways in which a START can end
         monitor._ending = monitor._duplicate_found = monitor._ramping = False
         monitor.lowered.clear()
         # The controlwords during the test of the directions are the same as while other drives are being enabled.

@@ -81,7 +81,7 @@ class EmbeddedRobot(Closing):
             process_group=0,
         )
         self._begun = False
-        # The parent detects the end of the child only if the child holds the only copy of this descriptor.
+        # The parent detects the end of the child only if the child holds the only copy of `child_bell`.
         os.close(child_bell)
         self.bus = SharedBus("embedded", memory, parent_bell, 0)
         self.bus.patience = _PATIENCE
