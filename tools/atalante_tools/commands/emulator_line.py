@@ -37,7 +37,7 @@ class Line(ResilientBus):
     """
 
     def __init__(self, bus: Bus, network: Network) -> None:
-        """Wrap a bus.
+        """Wrap the bus of the emulated robot.
 
         Args:
             bus: Open bus that carries the frames of all buses. `close` also closes this bus.

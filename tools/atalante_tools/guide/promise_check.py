@@ -135,7 +135,7 @@ def setup_of(subject: Subject | None, robot: Robot, config: AirwalkConfig | None
 
 
 def patients() -> list[Subject]:
-    """Return the subjects of `PATIENTS`."""
+    """Return the patients and step parameters of `PATIENTS` as inputs of the gait network."""
     return [Subject(Patient(mass, height), length, duration) for mass, height, length, duration in PATIENTS]
 
 

@@ -186,7 +186,7 @@ class EncoderNoise:
     """Noise of all joint encoders. Position signals get the noise, velocity signals get its derivative after the drive filter."""
 
     def __init__(self, emulator: Emulator, gear: Vector, noise: float, seed: int) -> None:
-        """Find the signals of the drives.
+        """Find the position and velocity signals of the drives, and compute the coefficient of the velocity filter.
 
         Args:
             emulator: emulated nodes.

@@ -78,7 +78,7 @@ class Walked:
     """Results and recording of a trial. The recording and the state of the CAN log are set when the telemetry is closed."""
 
     results: list[Result] = field(default_factory=list)  # one result per finished guide shape
-    recording: Recording | None = None  # None until the telemetry is closed
+    recording: Recording | None = None  # recording of the trial; None until the telemetry is closed
     can_log_complete: bool = True  # False if frames are missing in the CAN log
 
 

@@ -31,8 +31,8 @@ class Result:
 
     shape: str
     certified: bool  # whether the guide has a certificate at every assistance factor of the run
-    #: promised torque at the hip [Nm]: disturbances up to this torque at the hip, together with disturbances up to
-    #: `promise_knee_nm` at the knee, leave both joints in the guide. None if the guide has no promise.
+    #: Promised torque at the hip [Nm]; None if the guide has no promise.
+    #: Both joints stay in the guide under disturbances up to `promise_hip_nm` at the hip and `promise_knee_nm` at the knee.
     promise_hip_nm: float | None
     promise_knee_nm: float | None  # promised torque at the knee [Nm], see `promise_hip_nm`
     steps: int  # number of completed right-stance steps

@@ -74,7 +74,7 @@ def _outputs(options: WalkOptions) -> Outputs | None:
 def _walk(
     target: Target, options: WalkOptions, outputs: Outputs | None, child: TelemetryChild | None, *, as_json: bool
 ) -> None:
-    """Walk as `walk` does, with a subprocess for the outputs."""
+    """Walk, and print the result. The subprocess `child`, if any, writes the outputs."""
     from atalante_control.walking.config import WALK_GUIDE, WalkConfig
     from atalante_control.walking.controller import WalkController
     from atalante_hal.robot import load_robot

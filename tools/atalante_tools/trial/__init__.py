@@ -230,7 +230,7 @@ def robustness(seeds: int | None, steps: int | None, running: Running, as_json: 
 
 
 def _record_failures(trials: Sequence[Trial], running: Running) -> None:
-    """Repeat each trial that did not end standing, and record it."""
+    """Repeat each trial in which the robot did not end standing, and record the repetition."""
     from atalante_tools.trial.plan import RobustTrial
     from atalante_tools.trial.store import stored
 

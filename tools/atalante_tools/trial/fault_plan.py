@@ -43,7 +43,7 @@ class FaultTrial:
 
 
 def fault_trials(ids: Sequence[str], quick: bool, seed: int, engine: str) -> list[FaultTrial]:
-    """Return the trials of the given faults. Cases that begin at power-on or at a phase of their own are left out.
+    """Return the trials of the given faults. Cases that begin at power-on or at another phase than `MID_SWING` are left out.
 
     Args:
         ids: fault IDs. With none, all faults with a scenario.

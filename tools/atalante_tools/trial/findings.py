@@ -43,7 +43,7 @@ class Finding:
     id: str
     claim: str  # statement of the paper in one short sentence
     statistic: str  # measured values and limit
-    passed: bool | None  # None if the results are missing
+    passed: bool | None  # whether the results agree with the claim; None if results are missing
 
 
 def shape_findings(results: Sequence[Result]) -> list[Finding]:

@@ -299,7 +299,7 @@ class HalSteps:
         monitor.memory = FaultMemory()
         monitor._reports.clear()
         monitor.start_wanted, monitor.enabling, monitor.moving, monitor.walking = 0, False, False, False
-        monitor.recalled = -RECALL_CYCLES  # without this check more starts are possible
+        monitor.recalled = -RECALL_CYCLES  # no wait after QUICK_STOP, so that the search includes more STARTs
         monitor._stalled = 0  # constant in the search: `LAST_START` covers all ways in which a START can end
         monitor._ending = monitor._duplicate_found = monitor._ramping = False
         monitor.lowered.clear()
