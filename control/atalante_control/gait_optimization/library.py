@@ -1,26 +1,30 @@
 """Library of gaits for a grid of subjects, solved in parallel. An interrupted computation can be resumed.
 
-`Grid, solve -> one file for each gait`. `atalante_control.gait_optimization.fit` reads the files. Every gait is solved without
-a warm start, so a gait depends only on the parameters of its own subject. Other gaits, the number of processes and
+`Grid, solve -> one file for each gait`. `atalante_control.gait_optimization.fit` reads the files. No gait is solved from the gait
+of another patient, so a gait depends only on the parameters of its own subject. Other gaits, the number of processes and
 interruptions have no effect. The small error of the fit shows that the optimiser finds similar local minima for similar
 subjects. Failures are recorded in files.
+
+A file counts as a solved gait only if its content has the stored checksum, the parameters of its subject, the status `solved` and
+the version of the code that is installed. Any other file is rejected with a reason, and its gait is solved again.
 """
 
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Generator, Sequence
+from collections.abc import Callable, Generator, Mapping, Sequence
 from dataclasses import asdict, dataclass, fields, replace
 from functools import partial
 from itertools import pairwise, product
 from pathlib import Path
 from typing import Any
 
-from atalante_control.gait.gait import Gait, load_gait, write_gait
+from atalante_control.gait.gait import Gait, GaitError, check_gait, gait_from, read_object, write_gait, write_object
 from atalante_control.gait.subject import Subject
-from atalante_control.gait_optimization.parallel import fan_out
-from atalante_control.gait_optimization.result import SolvedGait
-from atalante_control.gait_optimization.solve import solve
+from atalante_control.gait_optimization.parallel import LostProcessError, fan_out
+from atalante_control.gait_optimization.result import SOLVED, SolvedGait
+from atalante_control.gait_optimization.second_start import solve_with_second_start, with_status
+from atalante_control.gait_optimization.solve import code_version, solve
 from atalante_control.gait_optimization.verify import Verifier
 from atalante_control.model import Patient
 from atalante_hal.robot import Robot, load_robot
@@ -54,8 +58,10 @@ class Grid:
 
     def __post_init__(self) -> None:
         for name, levels in zip(self.names(), self.axes(), strict=True):
-            if len(levels) < LEVELS_MIN or any(b <= a for a, b in pairwise(levels)):
+            if len(levels) < LEVELS_MIN or not all(a < b for a, b in pairwise(levels)):
                 raise ValueError(f"{name} must have at least {LEVELS_MIN} ascending levels, got {list(levels)}")
+            if len({f"{level:g}" for level in levels}) < len(levels):
+                raise ValueError(f"levels of {name} must differ in their first 6 digits, got {list(levels)}")
         for index in (tuple(0 for _ in self.shape), tuple(n - 1 for n in self.shape)):
             self.subject(index)
 
@@ -115,53 +121,78 @@ class Library:
                 )
             for name in ("gaits", "failed"):
                 (folder / name).mkdir(parents=True, exist_ok=True)
-            path.write_text(json.dumps({"format": FORMAT, **asdict(grid)}, indent=1) + "\n", encoding="utf-8")
+            write_object({"format": FORMAT, **asdict(grid)}, path)
         elif grid is not None and grid != found:
             raise LibraryError(
                 f"grid of the library in {folder} must be {grid}, got {found}: choose another folder or grid"
             )
         self.grid = grid or found or Grid()
 
-    def gait(self, index: Index, robot: Robot) -> Gait | None:
-        """Return the gait of a point of the grid, or None if it is not solved yet.
+    def gait(self, index: Index) -> Gait | None:
+        """Return the gait of a point of the grid, or None if there is no file. The limits of the robot are not checked here.
 
         Args:
             index: index of the level of each parameter.
-            robot: limits of the joints.
 
         Raises:
-            GaitError: If the gait file is not valid.
+            GaitError: If the file is not valid, has another content than was written, or was made for another subject or by
+                another version of the code.
         """
         path = self._path("gaits", index)
-        return load_gait(path, robot) if path.exists() else None
+        if not path.exists():
+            return None
+        gait = gait_from(read_object(path), str(path))
+        subject, record = self.grid.subject(index), gait.solver
+        expected: dict[str, tuple[object, object]] = {
+            "parameters": (subject.parameters(), dict(gait.parameters)),
+            "solver.status": (SOLVED, record.get("status")),
+            "solver.version": (code_version(), record.get("version")),
+            "solver.checksum": (gait.hash32, record.get("checksum")),
+        }
+        for key, (wanted, found) in expected.items():
+            if found != wanted:
+                raise GaitError(f"{path}: {key} must be {wanted!r}, got {found!r:.200}")
+        return gait
 
     def gaits(self, robot: Robot) -> dict[Index, Gait]:
-        """Return all gaits of the library.
+        """Return all solved gaits of the library. Files that do not count as solved are left out, see `rejected`.
 
         Args:
             robot: limits of the joints.
 
         Raises:
-            GaitError: If a gait file is not valid.
+            GaitError: If a solved gait exceeds a limit of the robot.
         """
-        found = ((index, self.gait(index, robot)) for index in self.grid.points())
-        return {index: gait for index, gait in found if gait is not None}
+        gaits, _ = self._read()
+        for index, gait in gaits.items():
+            check_gait(gait, robot, str(self._path("gaits", index)))
+        return gaits
+
+    def rejected(self) -> dict[Index, str]:
+        """Return the reason for each gait file that does not count as solved. `generate` solves these gaits again."""
+        return self._read()[1]
 
     def failures(self) -> dict[Index, str]:
-        """Return the reason of the last failure for each grid point that failed."""
-        failed = ((index, self._path("failed", index)) for index in self.grid.points())
-        return {
-            index: str(json.loads(path.read_text(encoding="utf-8"))["status"])
-            for index, path in failed
-            if path.exists()
-        }
+        """Return the reason of the last failure for each grid point that failed and is not solved."""
+        found = {}
+        for index in self.missing():
+            path = self._path("failed", index)
+            if path.exists():
+                found[index] = _status(path)
+        return found
 
     def missing(self) -> list[Index]:
-        """Return the grid points without a gait file."""
-        return [index for index in self.grid.points() if not self._path("gaits", index).exists()]
+        """Return the grid points without a solved gait."""
+        gaits, _ = self._read()
+        return [index for index in self.grid.points() if index not in gaits]
 
     def generate(
-        self, solve: Solve, *, jobs: int = 1, cluster: str | None = None
+        self,
+        solve: Solve,
+        *,
+        jobs: int = 1,
+        cluster: str | None = None,
+        on_lost: Callable[[str], None] | None = None,
     ) -> Generator[tuple[Subject, SolvedGait], None, None]:
         """Solve the missing gaits, and yield each result after it is written to disk.
 
@@ -169,14 +200,35 @@ class Library:
             solve: function that solves one gait, defined at module level.
             jobs: number of processes on this computer.
             cluster: address of a dask scheduler; its workers are used instead of processes on this computer.
+            on_lost: function that receives a message when a process has ended unexpectedly, see `fan_out`.
 
         Raises:
-            FanOutError: If the calls cannot be distributed, see `fan_out`.
+            FanOutError: If the calls cannot be distributed, see `fan_out`. If processes ended unexpectedly, the gaits without a
+                result are recorded as failures.
         """
-        tasks = [(index, self.grid.subject(index)) for index in self.missing()]
-        for index, solved in fan_out(partial(_solve, solve), tasks, jobs=jobs, cluster=cluster):
-            self._keep(index, solved)
-            yield self.grid.subject(index), solved
+        waiting = {index: self.grid.subject(index) for index in self.missing()}
+        tasks = list(waiting.items())
+        try:
+            for index, solved in fan_out(partial(_solve, solve), tasks, jobs=jobs, cluster=cluster, on_lost=on_lost):
+                self._keep(index, solved)
+                yield waiting.pop(index), solved
+        except LostProcessError as error:
+            for index, subject in waiting.items():
+                self._keep_failure(index, f"no result for {subject}: {error}", subject.parameters(), {})
+            raise
+
+    def _read(self) -> tuple[dict[Index, Gait], dict[Index, str]]:
+        """Return the solved gaits, and the reason for each file that does not count as solved."""
+        gaits, rejected = dict[Index, Gait](), dict[Index, str]()
+        for index in self.grid.points():
+            try:
+                gait = self.gait(index)
+            except GaitError as error:
+                rejected[index] = str(error)
+            else:
+                if gait is not None:
+                    gaits[index] = gait
+        return gaits, rejected
 
     def _path(self, kind: str, index: Index) -> Path:
         levels = (axis[i] for axis, i in zip(self.grid.axes(), index, strict=True))
@@ -187,22 +239,27 @@ class Library:
         )
 
     def _keep(self, index: Index, solved: SolvedGait) -> None:
-        failed = self._path("failed", index)
         if solved.solved:
-            write_gait(solved.gait, self._path("gaits", index))
-            failed.unlink(missing_ok=True)
+            record = {**solved.gait.solver, "checksum": solved.gait.hash32}
+            write_gait(replace(solved.gait, solver=record), self._path("gaits", index))
+            self._path("failed", index).unlink(missing_ok=True)
         else:
-            record = {"parameters": dict(solved.gait.parameters), "solver": dict(solved.gait.solver)}
-            failed.write_text(json.dumps({"status": solved.status, **record}, indent=1) + "\n", encoding="utf-8")
+            self._keep_failure(index, solved.status, solved.gait.parameters, solved.gait.solver)
+
+    def _keep_failure(
+        self, index: Index, status: str, parameters: Mapping[str, float], solver: Mapping[str, Any]
+    ) -> None:
+        record = {"status": status, "parameters": dict(parameters), "solver": dict(solver)}
+        write_object(record, self._path("failed", index))
 
 
 def solve_subject(subject: Subject) -> SolvedGait:
-    """Solve the gait of a subject without a warm start, and verify it with Pinocchio.
+    """Solve the gait of a subject, and verify it with Pinocchio. After a failure there is a second start.
 
     Args:
         subject: patient and step parameters.
     """
-    return verified(subject, solve(subject))
+    return solve_with_second_start(subject, _solve_and_verify)
 
 
 def solve_compiled(subject: Subject) -> SolvedGait:
@@ -213,7 +270,7 @@ def solve_compiled(subject: Subject) -> SolvedGait:
     Args:
         subject: patient and step parameters.
     """
-    return verified(subject, solve(subject, machine_code=True))
+    return solve_with_second_start(subject, partial(_solve_and_verify, machine_code=True))
 
 
 def verified(subject: Subject, solved: SolvedGait) -> SolvedGait:
@@ -231,13 +288,27 @@ def verified(subject: Subject, solved: SolvedGait) -> SolvedGait:
                 f"{subject}: {check.name} must be at most {check.limit:.3g} {check.unit} in the verification, "
                 f"got {check.value:.3g}"
             )
-            return replace(solved, status=status)
+            return with_status(solved, status)
     return solved
+
+
+def _solve_and_verify(subject: Subject, warm_start: Gait | None, machine_code: bool = False) -> SolvedGait:
+    return verified(subject, solve(subject, warm_start, machine_code=machine_code))
 
 
 def _solve(solve: Solve, task: tuple[Index, Subject]) -> tuple[Index, SolvedGait]:
     index, subject = task
     return index, solve(subject)
+
+
+def _status(path: Path) -> str:
+    """Return the reason in the record of a failure. A damaged record gives the reason why it cannot be read."""
+    try:
+        return str(read_object(path)["status"])
+    except GaitError as error:
+        return str(error)
+    except KeyError:
+        return f"{path}: status is missing"
 
 
 def _read_grid(path: Path) -> Grid:

@@ -10,18 +10,26 @@ import signal
 import threading
 import warnings
 from collections.abc import Callable, Generator, Iterable, Iterator
+from concurrent.futures.process import BrokenProcessPool
 from contextlib import ExitStack, contextmanager
+from itertools import count
 from typing import Final, TypeVar
 
 _Task = TypeVar("_Task")
 _Result = TypeVar("_Result")
 #: Timeout of the connection to a dask scheduler.
 _CONNECT_TIMEOUT: Final = "10s"
+#: Number of times that lost processes are replaced. A call that always ends its process is therefore not repeated forever.
+_REPLACEMENTS: Final = 3
 _LOKY_THREAD: Final = "ExecutorManagerThread"
 
 
 class FanOutError(RuntimeError):
-    """Failure to start parallel calls. The message states the remedy."""
+    """Failure of parallel calls. The message states the remedy."""
+
+
+class LostProcessError(FanOutError):
+    """Unexpected end of a process, for example for lack of memory. Some calls have no result."""
 
 
 def fan_out(
@@ -31,6 +39,7 @@ def fan_out(
     jobs: int = 1,
     cluster: str | None = None,
     patience: float | None = None,
+    on_lost: Callable[[str], None] | None = None,
 ) -> Generator[_Result, None, None]:
     """Call a function for many tasks in parallel, and yield the results in the order of completion.
 
@@ -42,9 +51,12 @@ def fan_out(
         jobs: number of processes on this computer. With 1, the calls run in this process.
         cluster: address of a dask scheduler such as tcp://127.0.0.1:8786. The project must be installed on its workers.
         patience: longest time between two results [s], or None for no limit. On a cluster there is no limit.
+        on_lost: function that receives a message when a process of this computer has ended unexpectedly, for example for lack of
+            memory. The calls without a result are then repeated in new processes, up to 3 times. If None, they are not repeated.
 
     Raises:
         FanOutError: If joblib or dask is missing, or the scheduler does not respond.
+        LostProcessError: If a process ended unexpectedly, and its calls are not repeated.
         TimeoutError: If no result arrives within `patience`.
     """
     if jobs == 1 and not cluster:
@@ -60,20 +72,38 @@ def fan_out(
         if cluster:
             stack.enter_context(_client(cluster))
             stack.enter_context(parallel_config(backend="dask"))
-        pool = Parallel(
-            n_jobs=-1 if cluster else jobs, return_as="generator_unordered", timeout=None if cluster else patience
-        )
-        with _without_ctrl_c():
-            results = pool(delayed(call)(task) for task in tasks)
-        try:
-            for result in results:  # noqa: UP028 - `yield from` would close `results` without suppressing its warnings
-                yield result
-        except multiprocessing.TimeoutError as error:  # joblib does not raise the built-in TimeoutError
-            raise TimeoutError(f"no parallel call finished within {patience:g} s") from error
-        finally:
-            with warnings.catch_warnings(), _without_loky_errors():
-                warnings.simplefilter("ignore", UserWarning)  # joblib warns about results that are not used
-                results.close()
+        pending = dict(enumerate(tasks))
+        for replacements in count():
+            pool = Parallel(
+                n_jobs=-1 if cluster else jobs, return_as="generator_unordered", timeout=None if cluster else patience
+            )
+            with _without_ctrl_c():
+                results = pool(delayed(_numbered)(call, number, task) for number, task in list(pending.items()))
+            try:
+                for number, result in results:
+                    del pending[number]
+                    yield result
+                return
+            except multiprocessing.TimeoutError as error:  # joblib does not raise the built-in TimeoutError
+                raise TimeoutError(f"no parallel call finished within {patience:g} s") from error
+            except BrokenProcessPool as error:
+                lost = (
+                    f"a process ended unexpectedly, for example for lack of memory; {len(pending)} calls have no result"
+                )
+                if on_lost is None or replacements == _REPLACEMENTS:
+                    raise LostProcessError(f"{lost}: repeat the command, if necessary with fewer --jobs") from error
+                on_lost(f"{lost} and are repeated in new processes")
+                # One of the calls that were started may end its process again. They are repeated after the other calls.
+                for number in list(pending)[: 2 * jobs]:  # joblib starts or queues this number of calls
+                    pending[number] = pending.pop(number)
+            finally:
+                with warnings.catch_warnings(), _without_loky_errors():
+                    warnings.simplefilter("ignore", UserWarning)  # joblib warns about results that are not used
+                    results.close()
+
+
+def _numbered(call: Callable[[_Task], _Result], number: int, task: _Task) -> tuple[int, _Result]:
+    return number, call(task)
 
 
 @contextmanager

@@ -23,6 +23,7 @@ from atalante_control.gait_optimization.fit import fit, inputs
 from atalante_control.gait_optimization.library import Grid, Library
 from atalante_control.gait_optimization.network_error import Deviation, deviation, findings, random_subjects
 from atalante_control.gait_optimization.result import SOLVED, SolvedGait
+from atalante_control.gait_optimization.solve import code_version
 from atalante_control.model import Patient
 from atalante_hal.robot import load_robot
 from atalante_tools.cli import cli
@@ -42,8 +43,9 @@ def synthetic(subject: Subject) -> SolvedGait:
     coefficients = AIRWALK.coefficients + (share @ DIRECTIONS).reshape(12, 8)
     feedforward = stance_dynamics(ROBOT, subject.patient).feedforward(coefficients, subject.step_duration)
     gait = Gait(
-        str(subject), subject.step_duration, coefficients, feedforward * 0.1, subject.parameters(), {"status": SOLVED}
-    )
+        str(subject), subject.step_duration, coefficients, feedforward * 0.1, subject.parameters(),
+        {"status": SOLVED, "version": code_version()},
+    )  # fmt: skip
     return SolvedGait(gait, SOLVED, 1e-9, 0.01, 10)
 
 
@@ -159,6 +161,11 @@ class TestCommand:
         assert "81 of 81 gaits solved" in made.stderr
         again = self.run("library", "--out", str(folder), *levels)
         assert "81 of them already solved" in again.stderr
+        next(folder.glob("gaits/*.json")).write_text("{")
+        assert "1 gait files are rejected" in self.run("fit", "--library", str(folder), "--out", str(file)).stderr
+        repaired = self.run("library", "--out", str(folder), *levels)
+        assert "80 of them already solved" in repaired.stderr
+        assert "1 gait files are rejected, for example" in repaired.stderr
         fitted = self.run("fit", "--library", str(folder), "--out", str(file), "--json")
         assert fitted.exit_code == 0, fitted.output
         assert load_network(file).low.tolist() == LOW.tolist()

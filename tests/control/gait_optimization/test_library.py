@@ -4,17 +4,24 @@ from __future__ import annotations
 
 import json
 import math
+import os
+import signal
+from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
-from atalante_control.gait.gait import AIRWALK_GAIT, Gait, load_gait
+from atalante_control.gait.gait import AIRWALK_GAIT, Gait, GaitError, load_gait, read_object, write_object
 from atalante_control.gait.subject import Subject
 from atalante_control.gait_optimization import library as library_module
 from atalante_control.gait_optimization.library import Grid, Library, LibraryError
+from atalante_control.gait_optimization.parallel import LostProcessError
 from atalante_control.gait_optimization.result import SOLVED, SolvedGait
+from atalante_control.gait_optimization.solve import code_version
 from atalante_hal.robot import load_robot
 
 ROBOT = load_robot()
@@ -27,7 +34,7 @@ REASON = "no such gait: the speed of the swing knee cannot hold"
 def synthetic(subject: Subject) -> SolvedGait:
     """Return a synthetic gait that depends on its subject."""
     share = 1.0 + 0.01 * (subject.step_length - 0.15)
-    made = {"status": SOLVED}
+    made = {"status": SOLVED, "version": code_version()}
     gait = Gait(str(subject), subject.step_duration, AIRWALK.coefficients * share, None, subject.parameters(), made)
     return SolvedGait(gait, SOLVED, 1e-9, 0.01, 10)
 
@@ -54,7 +61,7 @@ def test_every_gait_file_has_parameters_and_solver_record(tmp_path: Path) -> Non
     assert set(gaits) == set(GRID.points())
     for index, gait in gaits.items():
         assert gait.parameters == GRID.subject(index).parameters()
-        assert gait.solver == {"status": SOLVED}
+        assert gait.solver == {"status": SOLVED, "version": code_version(), "checksum": gait.hash32}
 
 
 def test_interrupted_and_resumed_run_gives_the_same_files(tmp_path: Path) -> None:
@@ -149,11 +156,12 @@ def test_default_grid_covers_the_subjects_of_the_paper() -> None:
 
 def test_gait_that_fails_verification_is_not_solved(monkeypatch: pytest.MonkeyPatch) -> None:
     """The synthetic gait ignores the ground, so Pinocchio rejects it."""
-    monkeypatch.setattr(library_module, "solve", lambda subject, machine_code=False: synthetic(subject))
+    monkeypatch.setattr(library_module, "solve", lambda subject, warm_start, machine_code=False: synthetic(subject))
     subject = GRID.subject((1, 1, 1, 1))
     for solve in (library_module.solve_subject, library_module.solve_compiled):
         outcome = solve(subject)
         assert not outcome.solved
+        assert outcome.gait.solver["status"] == outcome.status
         assert outcome.status.startswith(f"{subject}: ")
         assert " in the verification, got " in outcome.status
 
@@ -162,3 +170,126 @@ def test_failed_gait_is_not_verified() -> None:
     subject = GRID.subject((0, 3, 0, 0))
     failed = failing(subject)
     assert library_module.verified(subject, failed) is failed
+
+
+@pytest.fixture
+def solved_library(tmp_path: Path) -> Library:
+    library = Library(tmp_path, GRID)
+    assert len(list(library.generate(synthetic))) == POINTS
+    return library
+
+
+def change(path: Path, edit: Callable[[dict[str, Any]], Any]) -> None:
+    """Edit the JSON object of a file."""
+    document = read_object(path)
+    edit(document)
+    write_object(document, path)
+
+
+def truncate(path: Path) -> None:
+    path.write_bytes(path.read_bytes()[:-100])
+
+
+def change_one_number(path: Path) -> None:
+    change(path, lambda document: document["joints"]["left_SK"].__setitem__(3, 0.5))
+
+
+#: Damage to a gait file, and the words of the reason.
+DAMAGES: dict[str, tuple[Callable[[Path], Any], str]] = {
+    "truncated": (truncate, "Expecting|Unterminated"),
+    "empty": (lambda path: path.write_bytes(b""), "Expecting value"),
+    "binary": (lambda path: path.write_bytes(b"\xff\xfe\x00"), "decode"),
+    "list": (lambda path: path.write_text("[]"), "must be a JSON object"),
+    "key missing": (lambda path: change(path, lambda d: d.pop("joints")), "joints is missing"),
+    "number changed": (change_one_number, "solver.checksum must be"),
+    "checksum missing": (lambda path: change(path, lambda d: d["solver"].pop("checksum")), "solver.checksum must be"),
+    "duration changed": (lambda path: change(path, lambda d: d.update(duration=0.9)), "solver.checksum must be"),
+    "other version": (lambda path: change(path, lambda d: d["solver"].update(version="0.0.1+0")), "solver.version must be"),
+    "other status": (lambda path: change(path, lambda d: d["solver"].update(status=REASON)), "solver.status must be"),
+    "other patient": (lambda path: change(path, lambda d: d["parameters"].update(patient_mass=61.0)), "parameters must be"),
+    "other shank": (lambda path: change(path, lambda d: d["parameters"].update(shank_length=0.4)), "parameters must be"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("damage", DAMAGES)
+def test_damaged_gait_file_is_rejected_with_a_reason_and_solved_again(solved_library: Library, damage: str) -> None:
+    library, index = solved_library, (1, 2, 0, 2)
+    intact = files(library.folder)
+    path = next(library.folder.glob("gaits/m70_h1.8_l0.1_d1.json"))
+    spoil, reason = DAMAGES[damage]
+    spoil(path)
+    assert files(library.folder) != intact
+    with pytest.raises(GaitError, match=reason):
+        library.gait(index)
+    assert library.missing() == [index]
+    assert list(library.rejected()) == [index]
+    assert library.rejected()[index].startswith(str(path))
+    assert index not in library.gaits(ROBOT)
+    assert [subject for subject, _ in library.generate(synthetic)] == [GRID.subject(index)]
+    assert files(library.folder) == intact
+    assert not library.rejected()
+
+
+def test_gait_file_of_another_subject_is_rejected(solved_library: Library) -> None:
+    folder = solved_library.folder / "gaits"
+    (folder / "m60_h1.6_l0.1_d0.7.json").write_bytes((folder / "m80_h1.9_l0.2_d1.json").read_bytes())
+    assert list(solved_library.rejected()) == [(0, 0, 0, 0)]
+    assert "parameters must be" in solved_library.rejected()[0, 0, 0, 0]
+
+
+def test_unfinished_file_is_not_a_gait(solved_library: Library) -> None:
+    """A process that is killed while it writes leaves the file under its temporary name."""
+    path = next(solved_library.folder.glob("gaits/m70_h1.8_l0.1_d1.json"))
+    path.rename(path.with_name(f"{path.name}.new"))
+    assert solved_library.missing() == [(1, 2, 0, 2)]
+    assert not solved_library.rejected()
+
+
+@pytest.mark.parametrize(("content", "reason"), [("{", "Expecting"), ("{}", "status is missing")])
+def test_damaged_record_of_a_failure_gives_its_reason(tmp_path: Path, content: str, reason: str) -> None:
+    library = Library(tmp_path, GRID)
+    for path in {index: library._path("failed", index) for index in library.missing()[:2]}.values():
+        path.write_text(content)
+    failures = library.failures()
+    assert len(failures) == 2
+    assert all(reason in found for found in failures.values())
+
+
+def killed_once(marker: Path, subject: Subject) -> SolvedGait:
+    """End the process at the first call for one subject."""
+    if subject == GRID.subject((0, 0, 0, 1)) and not marker.exists():
+        marker.touch()
+        os.kill(os.getpid(), signal.SIGKILL)
+    return synthetic(subject)
+
+
+def killed_always(subject: Subject) -> SolvedGait:
+    """End the process at each call for one subject."""
+    if subject == GRID.subject((0, 0, 0, 1)):
+        os.kill(os.getpid(), signal.SIGKILL)
+    return synthetic(subject)
+
+
+def test_gaits_of_a_killed_process_are_solved_again(tmp_path: Path) -> None:
+    messages: list[str] = []
+    library = Library(tmp_path / "library", GRID)
+    solve = partial(killed_once, tmp_path / "marker")
+    assert len(list(library.generate(solve, jobs=2, on_lost=messages.append))) == POINTS
+    assert not library.missing()
+    assert len(messages) == 1
+    assert messages[0].startswith("a process ended unexpectedly")
+    assert messages[0].endswith("calls have no result and are repeated in new processes")
+
+
+def test_gait_that_always_ends_its_process_is_recorded_as_failed(tmp_path: Path) -> None:
+    messages: list[str] = []
+    library = Library(tmp_path, GRID)
+    with pytest.raises(LostProcessError, match="repeat the command, if necessary with fewer --jobs"):
+        list(library.generate(killed_always, jobs=2, on_lost=messages.append))
+    assert len(messages) == 3
+    failures = library.failures()
+    assert failures[0, 0, 0, 1].startswith(f"no result for {GRID.subject((0, 0, 0, 1))}: a process ended unexpectedly")
+    assert set(library.missing()) == set(failures)
+    assert len(failures) <= 4, "only the calls that run beside it may have no result"
+    assert len(list(library.generate(synthetic))) == len(failures)
+    assert not library.failures()

@@ -11,7 +11,7 @@ import time
 import pytest
 from joblib.externals.loky.process_executor import _ExecutorManagerThread
 
-from atalante_control.gait_optimization.parallel import FanOutError, fan_out
+from atalante_control.gait_optimization.parallel import FanOutError, LostProcessError, fan_out
 
 
 def doubled(number: int) -> tuple[int, int]:
@@ -80,6 +80,17 @@ def test_key_error_of_loky_at_shutdown_is_suppressed(
 def test_missing_result_raises_timeout_error() -> None:
     with pytest.raises(TimeoutError):
         list(fan_out(slow, [600.0], jobs=2, patience=0.1))
+
+
+def killed(_: int) -> None:
+    os.kill(os.getpid(), signal.SIGKILL)
+
+
+def test_end_of_a_process_gives_one_sentence() -> None:
+    with pytest.raises(
+        LostProcessError, match=r"^a process ended unexpectedly.*; 3 calls have no result: repeat the command"
+    ):
+        list(fan_out(killed, range(3), jobs=2))
 
 
 def test_missing_dependency_error_contains_the_command_to_type(monkeypatch: pytest.MonkeyPatch) -> None:

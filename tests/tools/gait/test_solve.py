@@ -52,7 +52,7 @@ def test_signal_during_optimisation_exits_with_its_code(
     monkeypatch: pytest.MonkeyPatch, number: int, code: int
 ) -> None:
     class Unsolved:
-        solved, status = False, "no such gait: the impact map cannot hold"
+        solved, status, iterations = False, "no such gait: the impact map cannot hold", 0
 
     def optimise(*_: object, **__: object) -> Unsolved:
         """Discard the exception that the signal raises and return no solution, as CasADi does."""

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Mapping
 from contextlib import closing
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import click
 
@@ -14,6 +16,9 @@ from atalante_tools.console.stop_request import stop_requested
 from atalante_tools.console.terminal import Progress, print_message, show_json, table
 from atalante_tools.gait.solve import solve
 from atalante_tools.session.extra import extra
+
+if TYPE_CHECKING:
+    from atalante_control.gait_optimization.library import Index
 
 _FOLDER = click.Path(file_okay=False, path_type=Path)
 _FILE = click.Path(dir_okay=False, path_type=Path)
@@ -75,8 +80,9 @@ def library(
 ) -> None:
     """Solve the gaits of a grid of patients, step lengths and step durations, and write a file per gait to DIR/gaits.
 
-    After an interruption, the same command solves the missing gaits. Failed gaits are listed on stderr and in DIR/failed,
-    and the next call retries them. The exit code is 1 if a gait failed.
+    After an interruption, the same command solves the missing gaits. It also solves gaits again whose files are damaged, were
+    made by another version of the code, or belong to another subject. Failed gaits are listed on stderr and in DIR/failed, and
+    the next call retries them. The exit code is 1 if a gait failed.
 
     \b
     Example: atalante gait library --out runs/library --jobs 2
@@ -92,10 +98,15 @@ def library(
     collection = Library(out, grid)
     points, todo = len(grid.points()), len(collection.missing())
     print_message(f"{points} gaits in {out}, {points - todo} of them already solved")
+    if rejected := collection.rejected():
+        print_message(f"{_rejected(rejected)}; these gaits are solved again")
     progress, start = Progress(), time.monotonic()
     solve = solve_compiled if machine_code else solve_subject
     # A signal such as Ctrl-C takes effect after the current gait. An interrupted optimiser would report a failed gait.
-    with stop_requested() as stop, closing(collection.generate(solve, jobs=jobs, cluster=cluster)) as outcomes:
+    with (
+        stop_requested() as stop,
+        closing(collection.generate(solve, jobs=jobs, cluster=cluster, on_lost=print_message)) as outcomes,
+    ):
         for done, (_, solved) in enumerate(outcomes, 1):
             if as_json:
                 show_json({**solved.gait.parameters, **solved.gait.solver})
@@ -145,6 +156,10 @@ def fit(folder: Path, out: Path, as_json: bool) -> None:
             f"{len(missing)} of {len(gaits) + len(missing)} gaits are missing in {folder}; "
             "the network is less accurate near the missing gaits"
         )
+    if rejected := collection.rejected():
+        print_message(f"{_rejected(rejected)}; solve these gaits again with `atalante gait library --out {folder}`")
+    if not gaits:
+        raise Failed(f"{folder} must contain at least one solved gait")
     print_message(f"fitting {len(gaits)} gaits")
     start = time.monotonic()
     fitted = fit_network(list(gaits.values()), collection.grid)
@@ -209,6 +224,11 @@ def check(file: Path | None, count: int, seed: int, as_json: bool) -> None:
         click.echo(table([["network against solved gaits", "value", "limit", "unit", ""], *rows]))
     if not all(finding.ok for finding in found):
         raise SystemExit(FAILED)
+
+
+def _rejected(reasons: Mapping[Index, str]) -> str:
+    """Return a sentence with the number of rejected gait files, and the reason for the first one."""
+    return f"{len(reasons)} gait files are rejected, for example {next(iter(reasons.values()))}"
 
 
 def _bar(share: float, width: int = 24) -> str:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -46,6 +47,9 @@ def solve(
 ) -> None:
     """Optimise the gait of a patient. If there is no gait, the exit code is 1 and stderr names the violated constraint.
 
+    After a failure, a periodic step is solved again from the gait of the same patient with a moderate step. If it fails too,
+    stderr also names the joints that are at a limit.
+
     The solved gait is verified with Pinocchio, independently of the optimiser. Torques are in Nm, angles in degrees.
 
     \b
@@ -56,6 +60,7 @@ def solve(
     if subject is None:
         raise click.UsageError("mass and height of the patient must be given: add --mass and --height")
     with extra():
+        from atalante_control.gait_optimization.second_start import solve_with_second_start
         from atalante_control.gait_optimization.solve import solve as optimise
     from atalante_control.gait.gait import write_gait
     from atalante_control.gait_optimization.verify import Verifier
@@ -70,7 +75,10 @@ def solve(
 
     # A signal such as Ctrl-C takes effect after the solve. An interrupted optimiser would report a failed gait.
     with stop_requested() as stop:
-        solved = optimise(subject, kind=kind, progress=show)
+        if kind == "periodic":
+            solved = solve_with_second_start(subject, partial(optimise, progress=show))
+        else:
+            solved = optimise(subject, kind=kind, progress=show)
     progress.clear()
     if stop.wanted:
         raise SystemExit(stop.exit_code)
