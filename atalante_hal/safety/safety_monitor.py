@@ -203,8 +203,11 @@ class SafetyMonitor:
         return self._image.crc_errors + self._heartbeats.image.crc_errors
 
     def missing(self) -> set[str]:
-        """Return the nodes that prevent READY: timed out, not trusted yet, without a status message, or with a different DBC."""
-        return self._message_monitor.missing() | self._heartbeats.missing()
+        """Return the nodes that prevent READY.
+
+        They timed out, are not trusted yet, sent no status message, have a different DBC, or were not checked at rest.
+        """
+        return self._message_monitor.missing() | self._heartbeats.missing() | self._plausibility.at_rest.unchecked
 
     def _evaluate(self, bus_faults: Sequence[Finding]) -> None:
         """Raise all diagnostics of this cycle, run the state machine, and apply the reactions."""
@@ -221,7 +224,8 @@ class SafetyMonitor:
         for finding in (*bus_faults, *self._plausibility.findings, *self._reports):
             memory.raise_finding(cycle, finding)
         self._reports.clear()
-        nodes_ready = message_monitor.nodes_ready and self._heartbeats.all_reported
+        checked = not self._plausibility.at_rest.unchecked
+        nodes_ready = message_monitor.nodes_ready and self._heartbeats.all_reported and checked
         self._check_drives(nodes_ready)
         if self._duplicate_found:
             memory.raise_dtc(
@@ -264,6 +268,7 @@ class SafetyMonitor:
             after is before
             and message_monitor.settled
             and self._heartbeats.quiet
+            and checked
             and not (
                 memory.active
                 or self._weak
@@ -344,7 +349,8 @@ class SafetyMonitor:
                 self.proof.failed.clear()
             self.start_wanted = ENABLE_CYCLES if state.supervisor in _STARTABLE else 0
         elif self.start_wanted:
-            self.start_wanted -= 1
+            if not self.proof.running:  # the test of the directions has its own end
+                self.start_wanted -= 1
         else:
             return
         states = state.drive_state.tobytes()
@@ -353,6 +359,8 @@ class SafetyMonitor:
         ended = self._prove_directions() or refusal(self._robot, self._start_request(nodes_ready))
         if ended:
             self._end_start(ended)
+        elif state.supervisor in (_S.READY, _S.HOLD):
+            self._plausibility.at_rest.disturb()
 
     def _all_enabled(self) -> bool:
         """Return whether all drives are in OPERATION ENABLED, and no recent QUICK_STOP can still change their state."""
@@ -418,6 +426,7 @@ class SafetyMonitor:
     def _enter(self, before: SupervisorState, after: SupervisorState, reasons: frozenset[Dtc]) -> None:
         state, memory = self._state, self.memory
         state.supervisor = after
+        self._plausibility.at_rest.enter(after)
         # Remove the START request, because one START may change the state only once.
         self.start_wanted = 0
         self._pendant.clear_press()
