@@ -97,14 +97,8 @@ class Dtc(StrEnum):
     IMU_INVALID = "IMU_INVALID", _R.FULL_ASSIST, _S.WARNING, "an IMU reports that it has no valid value"
     IMU_SATURATED = "IMU_SATURATED", _R.FULL_ASSIST, _S.WARNING, "an IMU reading is at the end of its measuring range"
     IMU_STUCK = "IMU_STUCK", _R.FULL_ASSIST, _S.WARNING, "the gyro reading of an IMU does not change"
-    IMU_IMPLAUSIBLE = "IMU_IMPLAUSIBLE", _R.NOT_READY, _S.WARNING, "an IMU at rest contradicts gravity or another IMU"
-    FOOT_CELL = "FOOT_CELL", _R.FULL_ASSIST, _S.WARNING, "a force cell contradicts the other cells or the posture"
-    CONTACT_IMPLAUSIBLE = (
-        "CONTACT_IMPLAUSIBLE",
-        _R.HOLD,
-        _S.ERROR,
-        "the load on the feet contradicts ground and posture",
-    )
+    FOOT_CELL = "FOOT_CELL", _R.FULL_ASSIST, _S.WARNING, "a force cell contradicts the other cells of its foot"
+    CONTACT_IMPLAUSIBLE = "CONTACT_IMPLAUSIBLE", _R.HOLD, _S.ERROR, "neither foot reports a load on the ground"
     TORQUE_DIRECTION = "TORQUE_DIRECTION", _R.LOWER, _S.ERROR, "a joint moves against its torque, or does not follow it"
     # Bus.
     BUS_FLOOD = "BUS_FLOOD", _R.HOLD, _S.ERROR, "more frames arrived than the HAL reads in a cycle"

@@ -6,23 +6,21 @@ A motor with exchanged phases and a drive with a wrong sign push a joint in the 
 At a start, drive state, position and reported torque do not show these faults. So the HAL adds a torque pulse to the torque that
 holds the pose, and evaluates the motion.
 
-*Pulse.* The pulse has the shape of the second derivative of sin(pi x)^4. So a free inertia moves away and back, and is then
-at rest in its initial position. The pulse moves a joint towards the middle of its range. Its peak is `PEAK` times
-`breakaway`, which exceeds the dry friction. The joints of a group hardly move each other. The groups contain a joint of the
-left leg and the same joint of the right leg at different times. So the torque on a joint must move the encoder of the same
-leg, and exchanged encoders of both legs are noticed.
+*Pulse.* The pulse has the shape of the second derivative of sin(pi x)^4. So a free inertia moves away and back, and is then at
+rest in its initial position. The pulse moves a joint towards the middle of its range. Its peak is `PEAK` times `breakaway`, which
+exceeds the dry friction. The joints of a group hardly move each other. Both legs are tested at the same time.
 
-*Pose.* A position control with a share of the drive's gains holds the pose, because the drives do not hold it in this time.
-With a wrong sign, this control pushes its joint away. A joint that moves by more than `TRAVEL` ends the start.
+*Pose.* A position control with a share of the drive's gains holds the pose, because the drives do not hold it in this time. With
+a wrong sign, this control pushes its joint away. A joint that moves by more than `TRAVEL` ends the start.
 
 *Result.* The mobility of a joint is the inverse of its effective inertia: the least-squares fit of the position by the double
-integral of the sent torque and a polynomial of time. A joint with a mobility of at least `MOBILITY` follows its torque, if
-the torque explains enough of its motion (`FIT`). A mobility of at most -`MOBILITY` is a wrong sign. A joint between these
-limits does not follow its torque. A disturbance may spoil a test, so a joint fails only after `TRIALS` tests. The legs of a
-suspended robot whose drives are off sink onto their end stops within some seconds, and their weight presses joints onto them.
-So the pulse is `BOOST` times larger for a joint within the position tolerance of its limit. If its foot carries load, the
-joint may be blocked. It then stays untested, and the next start tests it again. A joint that passed is not tested again until
-its drive restarts, because the wiring of a motor does not change while its drive is on.
+integral of the sent torque and a polynomial of time. A joint with a mobility of at least `MOBILITY` follows its torque. A
+mobility of at most -`MOBILITY` is a wrong sign. A joint between these limits does not follow its torque. A disturbance may
+spoil a test, so a joint fails only after `TRIALS` tests. The legs of a suspended robot whose drives are off sink onto their end
+stops within some seconds, and their weight presses joints onto them. So the pulse of a repeated test is `BOOST` times larger for
+a joint within the position tolerance of its limit. If its foot carries load, the joint may be blocked. It then stays
+untested, and the next start tests it again. A joint that passed is not tested again until its drive restarts, because the
+wiring of a motor does not change while its drive is on.
 """
 
 from __future__ import annotations
@@ -36,14 +34,8 @@ import numpy.typing as npt
 from atalante_hal.robot import JOINTS, LEG_JOINTS, SIDES, Robot
 from atalante_hal.types import PERIOD, Vector
 
-#: Joints that are tested at the same time, and duration of their pulse [cycles].
-GROUPS = (
-    (("left_FH", "right_SH"), 32),
-    (("left_SH", "right_FH"), 32),
-    (("left_TH", "left_SA", "right_SK"), 16),
-    (("left_SK", "right_HA"), 16),
-    (("left_HA", "right_TH", "right_SA"), 16),
-)
+#: Joints of a leg that are tested at the same time, and duration of their pulse [cycles].
+GROUPS = ((("FH", "SH"), 32), (("TH", "SA"), 16), (("SK", "HA"), 16))
 #: Delay from the command of a torque to the first position that shows its effect [cycles].
 LATENCY = 2
 #: Peak of the pulse as a multiple of `Robot.breakaway`, in the order of LEG_JOINTS. FH and SH move a whole leg.
@@ -58,18 +50,13 @@ INTEGRAL = 0.03
 TRAVEL = math.radians(1.5)
 #: A foot is loaded if its mean force during a test exceeds `LOAD * cell_free`, which is four times the noise of the mean.
 LOAD = 1.0 / 3.0
-#: Factor of the torque pulse of a joint near its end stop. The leg weight may press the joint onto the stop.
+#: Factor of the torque pulse in the second test of a joint near its end stop. The leg weight may press the joint onto the stop.
 BOOST = 6.0
 #: Number of unsuccessful tests of a joint after which the joint has failed.
 TRIALS = 2
-#: Smallest share of the motion, as a sum of squares, that the torque must explain. A reversed hip that falls onto its end stop
-#: and has the right sign by chance has a share of 0.12, joints without fault have at least 0.28.
-FIT = 0.2
 #: Smallest mobility that proves that a joint follows its torque, in the order of LEG_JOINTS [1/(kg m2)].
 #: `MOBILITY` is about half of the smallest mobility of the suspended robot: straight or bent legs, empty or with 110 kg patient.
 MOBILITY = (0.045, 0.23, 0.075, 0.56, 4.6, 6.8)
-
-_LEG = np.repeat(np.arange(len(SIDES)), len(LEG_JOINTS))  # index in SIDES of the leg of each joint
 
 
 def pulse(cycle: int, duration: int) -> float:
@@ -103,8 +90,7 @@ def mobility_of(torque: Vector, position: Vector) -> Vector:
         position: position in each cycle, measured before the torque was sent, shape (n, joints) [rad].
 
     Returns:
-        Mobility, shape (joints,) [1/(kg m2)]; 0 for a joint whose torque did not change. A positive mobility that explains less
-        than the share `FIT` of the motion is also 0.
+        Mobility, shape (joints,) [1/(kg m2)]; 0 for a joint whose torque did not change.
     """
     count = len(position)
     acting = np.zeros_like(torque)
@@ -113,12 +99,9 @@ def mobility_of(torque: Vector, position: Vector) -> Vector:
     # Remove the cubic polynomials of time from the response, because a joint may also move without a pulse.
     free = np.linalg.qr(np.vander(np.linspace(-1.0, 1.0, count), 4))[0]
     response -= free @ (free.T @ response)
-    moved = position - position[0]
-    moved = moved - free @ (free.T @ moved)
-    power, common = (response**2).sum(axis=0), (response * moved).sum(axis=0)
-    mobility: Vector = common / np.where(power > 0.0, power, np.inf)
-    explained = mobility * common >= FIT * (moved**2).sum(axis=0)
-    return np.where(explained | (mobility < 0.0), mobility, 0.0)
+    power = (response**2).sum(axis=0)
+    mobility: Vector = (response * (position - position[0])).sum(axis=0) / np.where(power > 0.0, power, np.inf)
+    return mobility
 
 
 class DirectionProof:
@@ -169,7 +152,7 @@ class DirectionProof:
         self._tests = [
             (joints, duration)
             for names, duration in GROUPS
-            if (joints := [j for j in self._unproven() if JOINTS[j] in names])
+            if (joints := [j for j in self._unproven() if LEG_JOINTS[j % len(LEG_JOINTS)] in names])
         ]
         self._next_test()
 
@@ -218,13 +201,12 @@ class DirectionProof:
         self._force.append(force)
         travel = np.abs(position - self._anchor)
         if not travel.max() <= TRAVEL:
-            far = travel > 0.5 * TRAVEL
-            # A faulty joint also moves its lighter neighbours in the same leg.
-            # The leg weight moves the same joint of both legs equally far, so the faulty joint moves farther than its twin.
-            excess = self._kp * (travel - np.roll(travel, len(LEG_JOINTS)))
-            same_leg = _LEG[np.argmax(travel)] == _LEG
-            joint = int(np.argmax(np.where(far & same_leg, excess, -np.inf)))
-            self._fail(np.flatnonzero(far).tolist())
+            far = np.flatnonzero(travel > 0.5 * TRAVEL)
+            # A faulty joint also moves its lighter neighbours.
+            # The leg weight moves the same joint of both legs equally far, so a difference between the legs shows the fault.
+            excess = self._kp * np.abs(travel - np.roll(travel, len(LEG_JOINTS)))
+            joint = int(far[np.argmax(excess[far])])
+            self._fail(far.tolist())
             moved = f"{math.degrees(travel[joint]):.1f} deg"
             return f"{JOINTS[joint]} moved by {moved} in the test of its direction; must be within {math.degrees(TRAVEL):.1f} deg"
         joints, duration = self._tests[0]
@@ -264,7 +246,8 @@ class DirectionProof:
     def _strength(self, joints: Sequence[int]) -> Vector:
         """Return the peaks of the pulses of a test, shape (joints,) [Nm]."""
         pressed = (self._anchor < self._low) | (self._anchor > self._high)
-        return np.where(pressed, BOOST, 1.0)[joints] * self._peak[joints]
+        repeated = np.array(self._trials) > 0
+        return np.where(pressed & repeated, BOOST, 1.0)[joints] * self._peak[joints]
 
     def _failure(self, joint: int) -> str:
         least = self._least[joint]

@@ -203,11 +203,8 @@ class SafetyMonitor:
         return self._image.crc_errors + self._heartbeats.image.crc_errors
 
     def missing(self) -> set[str]:
-        """Return the nodes that prevent READY.
-
-        They timed out, are not trusted yet, sent no status message, have a different DBC, or were not checked at rest.
-        """
-        return self._message_monitor.missing() | self._heartbeats.missing() | self._plausibility.at_rest.unchecked
+        """Return the nodes that prevent READY: timed out, not trusted yet, without a status message, or with a different DBC."""
+        return self._message_monitor.missing() | self._heartbeats.missing()
 
     def _evaluate(self, bus_faults: Sequence[Finding]) -> None:
         """Raise all diagnostics of this cycle, run the state machine, and apply the reactions."""
@@ -224,8 +221,7 @@ class SafetyMonitor:
         for finding in (*bus_faults, *self._plausibility.findings, *self._reports):
             memory.raise_finding(cycle, finding)
         self._reports.clear()
-        checked = not self._plausibility.at_rest.unchecked
-        nodes_ready = message_monitor.nodes_ready and self._heartbeats.all_reported and checked
+        nodes_ready = message_monitor.nodes_ready and self._heartbeats.all_reported
         self._check_drives(nodes_ready)
         if self._duplicate_found:
             memory.raise_dtc(
@@ -268,7 +264,6 @@ class SafetyMonitor:
             after is before
             and message_monitor.settled
             and self._heartbeats.quiet
-            and checked
             and not (
                 memory.active
                 or self._weak
@@ -349,8 +344,7 @@ class SafetyMonitor:
                 self.proof.failed.clear()
             self.start_wanted = ENABLE_CYCLES if state.supervisor in _STARTABLE else 0
         elif self.start_wanted:
-            if not self.proof.running:  # the test of the directions has its own end
-                self.start_wanted -= 1
+            self.start_wanted -= 1
         else:
             return
         states = state.drive_state.tobytes()
@@ -359,8 +353,6 @@ class SafetyMonitor:
         ended = self._prove_directions() or refusal(self._robot, self._start_request(nodes_ready))
         if ended:
             self._end_start(ended)
-        elif state.supervisor in (_S.READY, _S.HOLD):
-            self._plausibility.at_rest.disturb()
 
     def _all_enabled(self) -> bool:
         """Return whether all drives are in OPERATION ENABLED, and no recent QUICK_STOP can still change their state."""
@@ -426,7 +418,6 @@ class SafetyMonitor:
     def _enter(self, before: SupervisorState, after: SupervisorState, reasons: frozenset[Dtc]) -> None:
         state, memory = self._state, self.memory
         state.supervisor = after
-        self._plausibility.at_rest.enter(after)
         # Remove the START request, because one START may change the state only once.
         self.start_wanted = 0
         self._pendant.clear_press()

@@ -40,7 +40,7 @@ class Operator:
     """
 
     #: Time from the change of the HAL to READY to the first press of START, and between two presses in READY [cycles].
-    REACTION = 80
+    REACTION = 200
 
     def __init__(self, assistance_factor: float | None = None, *, starts: bool = True) -> None:
         """Press the dead-man switch and set the dial.

@@ -1,7 +1,7 @@
 """Schedule of the plausibility checks in each cycle.
 
-    process image -> one slow check in turn (standstill, velocity, feet, legs, sensors at rest, support, monitor of checks that
-    lack data) -> jump, range, IMUs -> state
+    process image -> one slow check in turn (standstill, velocity, feet, legs, monitor of checks that lack data) -> jump, range,
+    IMUs -> state
 
 Each cycle checks the encoders and the IMUs, and runs at most one slow check. If the new values of a joint or an IMU
 fail a check, they are rejected: the process image keeps the previous values, and the age of these values grows. The
@@ -16,7 +16,6 @@ from collections.abc import Callable
 
 from atalante_hal.robot import Robot
 from atalante_hal.safety.diagnostics import Dtc, Finding
-from atalante_hal.safety.plausibility.at_rest import AtRest
 from atalante_hal.safety.plausibility.encoders import EncoderChecks
 from atalante_hal.safety.plausibility.feet import FootChecks
 from atalante_hal.safety.plausibility.finding import JOINT_NODES, Ages, Rows, signals_of
@@ -24,21 +23,17 @@ from atalante_hal.safety.plausibility.imus import Imus
 from atalante_hal.safety.plausibility.legs import Legs
 from atalante_hal.safety.plausibility.rejections import Rejections
 from atalante_hal.safety.plausibility.stillness import Stillness
-from atalante_hal.safety.plausibility.support import Support
 from atalante_hal.safety.plausibility.unchecked import Unchecked
 from atalante_hal.types import Vector
 from atalante_hal.wire.e2e import Check
 from atalante_hal.wire.process_image import NEVER, ReceiveImage
 
-#: Interval of the foot checks, and mean interval of the samples of the sensors at rest [cycles].
+#: Interval of the foot checks [cycles].
 FEET = 4
-#: Interval of the checks of standstill, velocity and support, and of the monitor of checks that lack data [cycles].
+#: Interval of the standstill check, of the velocity check, and of the monitor of checks that lack data [cycles].
 SLOW = 16
 #: Period of the schedule of all slow checks [cycles]. Each leg is checked once per period.
 _PERIOD = 32
-#: Turns with a sample of the sensors at rest. Even and odd turns are equally many, because the mean of a block must not contain a
-#: vibration of 500 Hz.
-_REST_TURNS = (3, 10, 11, 12, 19, 26, 27, 28)
 _FRESH = int(Check.SOME_LOST)
 
 
@@ -52,7 +47,6 @@ class Plausibility:
 
     Attributes:
         findings: current findings; the tuple is replaced only when the findings change.
-        at_rest: checks of the sensors at rest.
     """
 
     def __init__(self, robot: Robot, image: ReceiveImage, period: float) -> None:
@@ -65,8 +59,6 @@ class Plausibility:
         self._stillness = Stillness(robot, image, now, before, SLOW, period)
         self._legs = Legs(robot, now, self._stillness.constant_samples, period)
         self._feet = FootChecks(robot, now, FEET)
-        self._support = Support(robot, now, SLOW)
-        self.at_rest = AtRest(robot, now, image.values[codec.slice("DriveState")], FEET, period)
         self._rows = Rows(codec)
         self._rejections = Rejections()
         self._unchecked = Unchecked(self._rows, image.check, SLOW)
@@ -94,10 +86,7 @@ class Plausibility:
         turns[0::SLOW] = [self._sample] * (_PERIOD // SLOW)
         turns[2::SLOW] = [self._check_velocity] * (_PERIOD // SLOW)
         turns[4::SLOW] = [self._check_unchecked] * (_PERIOD // SLOW)
-        turns[6::SLOW] = [self._support.evaluate] * (_PERIOD // SLOW)
         turns[1::FEET] = [self._check_feet] * (_PERIOD // FEET)
-        for turn in _REST_TURNS:
-            turns[turn] = self.at_rest.sample
         turns[8], turns[24] = self._legs.check_left, self._legs.check_right
         return turns
 
@@ -128,14 +117,11 @@ class Plausibility:
         return self.findings
 
     def reference(self, node: str) -> None:
-        """Skip the jump check for the next position of a joint whose drive has restarted and referenced its encoder.
-
-        A restarted IMU or foot must be checked at rest again.
+        """Skip the jump check for the next position of a joint whose drive has referenced its encoder.
 
         Args:
-            node: DBC name of the restarted node.
+            node: DBC name of the drive; the name of any other node has no effect.
         """
-        self.at_rest.forget(node)
         if node not in JOINT_NODES:
             return
         if self._settled:
@@ -212,8 +198,6 @@ class Plausibility:
             *self._legs.findings(),
             *self._stillness.findings(),
             *self._feet.findings(),
-            *self._support.findings(),
-            *self.at_rest.findings(),
             *self._unchecked.findings(),
         )
         if often := self._rejections.findings():

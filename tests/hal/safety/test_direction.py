@@ -51,23 +51,6 @@ def test_mobility_is_that_of_the_simulated_inertia_despite_its_weight(inertia: f
     assert mobility_of(torque, position) == pytest.approx([1.0 / inertia], rel=1e-6)
 
 
-@pytest.mark.parametrize(("disturbance", "passes"), [(0.0, True), (1.9, True), (2.1, False)])
-@pytest.mark.parametrize("sign", [-1.0, 1.0])
-def test_positive_mobility_must_explain_a_share_of_the_motion(disturbance: float, passes: bool, sign: float):
-    torque = np.array([[20.0 * pulse(cycle, 32)] for cycle in range(35)])
-    acting = np.concatenate([np.zeros((LATENCY, 1)), torque[:-LATENCY]])
-    response = np.cumsum(np.cumsum(acting, axis=0), axis=0) * PERIOD**2
-    other = np.sin(np.linspace(0.0, 8.0 * np.pi, 35))[:, None]
-    # Remove what a free joint does and what the torque explains, so that the disturbance does not change the mobility.
-    known = np.linalg.qr(np.hstack([np.vander(np.linspace(-1.0, 1.0, 35), 4), response]))[0]
-    other -= known @ (known.T @ other)
-    free = known[:, :4]
-    power = np.linalg.norm(response - free @ (free.T @ response))
-    # The share is 1 / (1 + disturbance^2), and 0.2 for a disturbance of 2.
-    position = sign * response + disturbance * power * other / np.linalg.norm(other)
-    assert mobility_of(torque, position) == pytest.approx([sign if passes or sign < 0.0 else 0.0], abs=1e-6)
-
-
 def test_mobility_of_a_joint_without_torque_change_is_zero():
     assert mobility_of(np.full((20, 1), 5.0), np.linspace(0.0, 1.0, 20)[:, None] ** 5).tolist() == [0.0]
 
@@ -117,8 +100,7 @@ def test_joints_that_passed_are_not_tested_again_until_their_drive_restarts(join
     joints.run()
     assert joints.run() == ("", 0)
     joints.proof.forget(ANKLE)
-    (duration,) = [duration for names, duration in GROUPS if JOINTS[ANKLE] in names]
-    assert joints.run() == ("", duration + LATENCY + 1)
+    assert joints.run() == ("", GROUPS[1][1] + LATENCY + 1)
     assert joints.proof.proven.all()
 
 
@@ -172,12 +154,10 @@ def test_noise_of_the_feet_is_no_load(joints: Joints, force: float):
 
 
 def test_failure_names_every_joint_and_the_report_lists_them_in_order(joints: Joints):
-    first = [JOINTS.index(name) for name in GROUPS[0][0]]
-    joints.strength[first] = 0.0
+    joints.strength[[KNEE, KNEE + 6]] = 0.0
     failure = joints.run()[0]
-    assert [part.split()[0] for part in failure.split(", ")] == ["left_FH", "right_SH"]
-    joints.strength[first], joints.strength[KNEE] = 1.0, 0.0
-    joints.run()
+    assert failure.count(", ") == 1
+    assert failure.split(", ")[1].startswith("right_SK does not follow its torque")
     report = joints.proof.report()
     assert report.startswith("effective inertia [kg m2]: left_FH 8.9, left_TH 1.7, left_SH 5.3, ")
 
@@ -194,7 +174,7 @@ def test_torque_is_pose_control_and_pulse_towards_the_middle():
     anchor = MIDDLE + np.tile([0.1, -0.1, -0.1, 0.1], 3)
     anchor[0] = MIDDLE[0]
     base, (kp, kd) = rng.normal(size=12), pose_gains(ROBOT)
-    tested = [JOINTS.index(name) for name in ("left_FH", "right_SH")]
+    tested = [JOINTS.index(f"{side}_{name}") for side in ("left", "right") for name in ("FH", "SH")]
     peak = np.zeros(12)
     peak[tested] = (np.where(anchor < MIDDLE, 1.0, -1.0) * np.array(PEAK * 2) * ROBOT.breakaway)[tested]
     proof.begin(anchor, base)
@@ -206,29 +186,31 @@ def test_torque_is_pose_control_and_pulse_towards_the_middle():
         np.testing.assert_allclose(proof.torque(position, velocity), expected, rtol=1e-12, atol=1e-12)
 
 
-@pytest.mark.parametrize("sign", [-1.0, 1.0])
-@pytest.mark.parametrize(("inside", "factor"), [(0.0, BOOST), (1.0, 1.0)])
-def test_joint_nearer_to_its_limit_than_the_tolerance_has_a_larger_pulse(sign: float, inside: float, factor: float):
-    proof = DirectionProof(ROBOT)
-    limit = ROBOT.position_max if sign > 0.0 else ROBOT.position_min
-    anchor = limit - sign * inside * ROBOT.thresholds.position_tolerance
+def test_only_a_repeated_test_of_a_joint_at_its_limit_has_a_larger_pulse():
+    proof, tolerance = DirectionProof(ROBOT), ROBOT.thresholds.position_tolerance
+    left_fh, left_sh, right_fh, right_sh = (
+        JOINTS.index(name) for name in ("left_FH", "left_SH", "right_FH", "right_SH")
+    )
+    anchor = MIDDLE.copy()
+    anchor[left_fh], anchor[left_sh] = ROBOT.position_min[left_fh], ROBOT.position_max[left_sh]
+    anchor[right_fh], anchor[right_sh] = (
+        ROBOT.position_min[right_fh] + tolerance,
+        ROBOT.position_max[right_sh] - tolerance,
+    )
     proof.begin(anchor, np.zeros(12))
-    largest = np.zeros(12)
-    while proof.running:
-        torque = proof.torque(anchor, np.zeros(12))
-        proof.sent(torque)
-        np.maximum(largest, np.abs(torque), out=largest)
-        failure = proof.evaluate(anchor, NO_FORCE)
-    first = [JOINTS.index(name) for name in GROUPS[0][0]]
-    np.testing.assert_allclose(largest[first], factor * (np.array(PEAK * 2) * ROBOT.breakaway)[first])
-    assert failure.count("does not follow its torque") == len(first)
-
-
-def test_same_joints_of_both_legs_are_tested_once_and_at_different_times():
-    tested = [name for names, _ in GROUPS for name in names]
-    assert sorted(tested) == sorted(JOINTS)
-    for names, _ in GROUPS:
-        assert len({name.split("_")[1] for name in names}) == len(names)
+    largest = []
+    for _ in range(TRIALS):
+        sums = []
+        for _ in range(32 + LATENCY + 1):
+            torque = proof.torque(anchor, np.zeros(12))
+            proof.sent(torque)
+            sums.append(np.abs(torque))
+            failure = proof.evaluate(anchor, NO_FORCE)
+        largest.append(np.max(sums, axis=0))
+    joints = [left_fh, left_sh, right_fh, right_sh]
+    np.testing.assert_allclose(largest[0][joints], (np.array(PEAK * 2) * ROBOT.breakaway)[joints])
+    np.testing.assert_allclose(largest[1][joints] / largest[0][joints], [BOOST, BOOST, 1.0, 1.0])
+    assert failure.count("does not follow its torque") == 4
 
 
 def test_large_motion_names_the_joint_and_not_a_lighter_one_before_it():
@@ -236,7 +218,7 @@ def test_large_motion_names_the_joint_and_not_a_lighter_one_before_it():
     proof.begin(MIDDLE, np.zeros(12))
     proof.sent(proof.torque(MIDDLE, np.zeros(12)))
     position = MIDDLE.copy()
-    position[[JOINTS.index("left_TH"), JOINTS.index("left_SH")]] += [0.7 * TRAVEL, 1.1 * TRAVEL]
+    position[[JOINTS.index("left_TH"), JOINTS.index("left_SH")]] += [0.6 * TRAVEL, 1.1 * TRAVEL]
     assert proof.evaluate(position, NO_FORCE).startswith("left_SH moved by 1.6 deg")
 
 
@@ -245,29 +227,7 @@ def test_large_motion_names_the_joint_that_its_pose_control_holds_most_strongly(
     joints.proof.torque(joints.position, joints.velocity)
     joints.proof.sent(np.zeros(12))
     moved = joints.position.copy()
-    moved[[0, 2, 5, 8]] += 0.9 * TRAVEL, 0.7 * TRAVEL, 1.1 * TRAVEL, 0.7 * TRAVEL
+    moved[[0, 2, 5, 8]] += 0.9 * TRAVEL, 0.6 * TRAVEL, 1.1 * TRAVEL, 0.6 * TRAVEL
     failure = joints.proof.evaluate(moved, NO_FORCE)
     assert failure == f"left_FH moved by {0.9 * 1.5:.1f} deg in the test of its direction; must be within 1.5 deg"
     assert joints.proof.failed == [0, 2, 5, 8]
-
-
-def test_large_motion_names_a_joint_of_the_leg_that_moved_farthest(joints: Joints):
-    joints.proof.begin(joints.position, np.zeros(12))
-    joints.proof.torque(joints.position, joints.velocity)
-    joints.proof.sent(np.zeros(12))
-    moved = joints.position.copy()
-    moved[[2, 8]] += 0.9 * TRAVEL, 0.1 * TRAVEL
-    moved[[3, 9]] += 0.7 * TRAVEL, 1.1 * TRAVEL
-    assert joints.proof.evaluate(moved, NO_FORCE).startswith("right_SK moved by ")
-    assert joints.proof.failed == [2, 3, 9]
-
-
-def test_large_motion_names_the_joint_that_moved_farther_than_its_twin(joints: Joints):
-    joints.proof.begin(joints.position, np.zeros(12))
-    joints.proof.torque(joints.position, joints.velocity)
-    joints.proof.sent(np.zeros(12))
-    moved = joints.position.copy()
-    moved[[2, 8]] += 0.8 * TRAVEL, 0.9 * TRAVEL
-    moved[[3, 9]] += 1.1 * TRAVEL, 0.7 * TRAVEL
-    assert joints.proof.evaluate(moved, NO_FORCE).startswith("left_SK moved by ")
-    assert joints.proof.failed == [2, 3, 8, 9]

@@ -112,9 +112,6 @@ class Recording:
             half_pitch = 0.5 * (walk.tables.q[0] + error)[leg + 2 : leg + 4].sum()
             for axis, value in (("W", np.cos(half_pitch)), ("Y", np.sin(half_pitch))):
                 self.values[:, codec.index(f"IMU_{side}_TIBIA_STATE", f"Quaternion{axis}")] = value
-            # The tibia is at rest, so the specific force points up.
-            for axis, share in (("X", -np.sin(2.0 * half_pitch)), ("Z", np.cos(2.0 * half_pitch) - 1.0)):
-                self.values[:, codec.index(f"IMU_{side}_TIBIA_STATE", f"Accel{axis}")] += 9.81 * share
         request = [codec.index("PENDANT_STATE", name) for name in ("Request", "RequestCounter")]
         self._before = _seal(image, self.values)
         self.values[:, request] = 1.0  # START pressed once
@@ -196,7 +193,7 @@ def _walking(walk: Walk, image: TransmitImage) -> Vector:
     codec, rng = image.codec, np.random.default_rng(1)
     values = np.zeros(codec.size)
     for name, low, high in (
-        ("Torque", -20.0, 20.0), ("Force", -5.0, 5.0), ("Gyro", -0.03, 0.03), ("Accel", -0.1, 0.1),
+        ("Torque", -20.0, 20.0), ("Force", -5.0, 5.0), ("Gyro", -0.1, 0.1), ("Accel", -0.1, 0.1),
     ):  # fmt: skip
         columns = codec.slice(name)
         values[columns] = rng.uniform(low, high, columns.stop - columns.start)

@@ -59,20 +59,6 @@ def _standing(foot: str, cycles: int) -> tuple[Fault, ...]:
     )
 
 
-def _before_start(name: str, fault: Fault, node: str, dtc: str | None = None) -> Case:
-    """Return a test case with a permanent fault that begins at power-on and must prevent READY and START."""
-    return Case(
-        name,
-        (fault,),
-        phase=None,
-        node=node,
-        dtc=dtc,
-        observed=400,
-        recovers=False,
-        checks=(start_is_rejected,),
-    )
-
-
 def _every(cycles: int, kind: str, target: str, count: int, **parameters: float) -> tuple[Fault, ...]:
     """Return periodic faults. Each fault lasts one cycle, and a fault begins every `cycles` cycles.
 
@@ -199,50 +185,6 @@ SCENARIOS: Final = (
                 ("both feet lift", 600, 600),
                 ("the left foot lifts", 600, 550),
                 ("the right foot lifts", 550, 600),
-            )
-        ),
-    ),
-    Scenario(
-        "F74",
-        (
-            *(
-                _before_start(f"{foot}, all cells {force:+g} N", Fault("cell_offset", foot, force=force), foot)
-                for foot in _FEET
-                for force in (200.0, -200.0)
-            ),
-            *(
-                _before_start(
-                    f"{_FEET[0]} {cell} +100 N", Fault("cell_offset", _FEET[0], cell=cell, force=100.0), _FEET[0]
-                )
-                for cell in CELLS
-            ),
-        ),
-    ),
-    Scenario(
-        "F77",
-        (
-            *(_before_start(f"{imu}, axis Z inverted", Fault("imu_inverted", imu, axis="Z"), imu) for imu in _IMUS),
-            *(
-                _before_start(
-                    f"IMU_TORSO turned about {axis}", Fault("imu_turned", "IMU_TORSO", axis=axis), "IMU_TORSO"
-                )
-                for axis in "XYZ"
-            ),
-            *(
-                _before_start(f"{imu} turned about {axis}", Fault("imu_turned", imu, axis=axis), node, "ENC_DRIFT")
-                for imu, node in (("IMU_PELVIS", "LEFT_FH"), ("IMU_LEFT_TIBIA", "LEFT_FH"))
-                for axis in "XZ"
-            ),
-        ),
-    ),
-    Scenario(
-        "F78",
-        tuple(
-            _before_start(f"{one} and {other}", Fault(kind, one, other=other), node)
-            for kind, one, other, node in (
-                ("sensor_swapped", "IMU_LEFT_TIBIA", "IMU_RIGHT_TIBIA", "LEFT_SH"),
-                ("sensor_swapped", "IMU_PELVIS", "IMU_LEFT_TIBIA", "RIGHT_SH"),
-                ("encoder_swapped", "LEFT_SH", "RIGHT_SH", "LEFT_SH"),
             )
         ),
     ),

@@ -15,9 +15,7 @@ from atalante_control.model import ExoskeletonParameters, pinocchio_model, urdf
 from atalante_hal.robot import CELLS, FEET, IMUS, JOINTS, load_robot
 from atalante_hal.safety.diagnostics import Dtc
 from atalante_hal.safety.plausibility import Finding, Plausibility
-from atalante_hal.safety.plausibility.at_rest import vertical
 from atalante_hal.safety.plausibility.finding import Signals, signals_of
-from atalante_hal.types import SupervisorState
 from atalante_hal.wire.codec import Codec
 from atalante_hal.wire.e2e import Check
 from atalante_hal.wire.frame import new_frames
@@ -92,13 +90,11 @@ class SimulatedRobot:
     gaps: set[int] = field(default_factory=set)  # rows with a frame after lost frames
     amplitude: float = 0.05  # rad
     standing: bool = False  # whether both feet carry load
-    supervisor: SupervisorState = SupervisorState.ACTIVE
 
     def __post_init__(self) -> None:
         self.image = ReceiveImage(MESSAGES, np.zeros(CODEC.size))
         self.now = signals_of(CODEC, self.image.values)
         self.checks = Plausibility(ROBOT, self.image, PERIOD)
-        self.checks.at_rest.supervisor = self.supervisor
         self.attitudes = attitudes(MIDDLE)
         self.run(1)
 
@@ -133,7 +129,7 @@ class SimulatedRobot:
             self.attitudes = attitudes(position)
         now.quaternion[:] = self.attitudes
         now.gyro[:] = 4e-3 * noise.gyro
-        now.accel[:] = [9.81 * np.array(vertical(attitude)) for attitude in self.attitudes]
+        now.accel[:] = [0.0, 0.0, 9.81]
         now.accel[:] += 0.05 * noise.accel
         now.force[:] = 3.0 * noise.force
         if self.standing:

@@ -11,14 +11,12 @@ from simulated_robot import CODEC, GEAR, MESSAGES, PERIOD, ROBOT, SimulatedRobot
 from atalante_hal.robot import JOINTS
 from atalante_hal.safety.diagnostics import Dtc
 from atalante_hal.safety.plausibility import Plausibility
-from atalante_hal.safety.plausibility.at_rest import AtRest
 from atalante_hal.safety.plausibility.encoders import EncoderChecks
 from atalante_hal.safety.plausibility.feet import FootChecks
 from atalante_hal.safety.plausibility.finding import measured, signals_of
 from atalante_hal.safety.plausibility.imus import Imus
 from atalante_hal.safety.plausibility.legs import Legs
 from atalante_hal.safety.plausibility.stillness import Stillness
-from atalante_hal.safety.plausibility.support import Support
 from atalante_hal.safety.plausibility.unchecked import Unchecked
 from atalante_hal.wire.process_image import ReceiveImage
 
@@ -83,8 +81,6 @@ def test_each_slow_check_runs_in_its_scheduled_cycle(monkeypatch: pytest.MonkeyP
         (Legs, "check_left"),
         (Legs, "check_right"),
         (FootChecks, "evaluate"),
-        (Support, "evaluate"),
-        (AtRest, "sample"),
         (Unchecked, "evaluate"),
     ):
         monkeypatch.setattr(owner, name, lambda *_, name=f"{owner.__name__}.{name}": bool(made.append(name)))
@@ -95,8 +91,6 @@ def test_each_slow_check_runs_in_its_scheduled_cycle(monkeypatch: pytest.MonkeyP
     expected |= {cycle + 16: name for cycle, name in expected.items()}
     expected |= {8: "Legs.check_left", 24: "Legs.check_right"}
     expected |= dict.fromkeys(range(1, 32, 4), "FootChecks.evaluate")
-    expected |= dict.fromkeys(range(6, 32, 16), "Support.evaluate")
-    expected |= dict.fromkeys((3, 10, 11, 12, 19, 26, 27, 28), "AtRest.sample")
     for cycle in range(64):
         assert checks.check() == ()
         assert made == ([expected[cycle % 32]] if cycle % 32 in expected else [])

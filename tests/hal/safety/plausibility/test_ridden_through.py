@@ -24,7 +24,6 @@ from atalante_hal.safety.diagnostics import Dtc
 from atalante_hal.safety.plausibility import Finding, Plausibility
 from atalante_hal.safety.plausibility.finding import Signals, signals_of
 from atalante_hal.safety.plausibility.unchecked import UNCHECKED_CYCLES
-from atalante_hal.types import SupervisorState
 from atalante_hal.wire.e2e import COUNTER_BYTE
 from atalante_hal.wire.frame import Frames, new_frames
 from atalante_hal.wire.process_image import ReceiveImage, TransmitImage
@@ -119,7 +118,6 @@ class Line:
         self.transmit, self.receive = TransmitImage(MESSAGES), ReceiveImage(MESSAGES)
         self.sent = signals_of(self.transmit.codec, self.transmit.values)
         self.checks = Plausibility(ROBOT, self.receive, PERIOD)
-        self.checks.at_rest.supervisor = SupervisorState.ACTIVE
         self.cycles = 0
         self.before = self.transmit.frames.copy()
         self.standing = False
@@ -288,7 +286,6 @@ class TestUnchecked:
         line = Line(undisturbed)
         line.receive = ReceiveImage(MESSAGES)
         line.checks = Plausibility(ROBOT, line.receive, PERIOD)
-        line.checks.at_rest.supervisor = SupervisorState.ACTIVE
 
         def empty(sent: Signals, cycle: int) -> None:
             sent.position[3] = sent.quaternion[1] = sent.force[0] = np.nan

@@ -307,7 +307,6 @@ class HalSteps:
         monitor.proof.proven.fill(True)
         monitor.proof.failed.clear()
         monitor.proof.running = False
-        monitor._plausibility.at_rest.unchecked.clear()
         rows = len(self._image.check)
         monitor._message_monitor.qualification = [SETTLED] * rows
         monitor._message_monitor._evidence = [0] * rows
