@@ -225,11 +225,20 @@ class WalkController:
         return pose
 
     @property
-    def halfway(self) -> bool:
-        """Return whether the middle step of the walk has reached phase 0.3."""
-        steps, middle = self.statistics.steps, self._steps_wanted // 2
-        return steps > middle or (
-            steps == middle and self.phase is Phase.STEP and self._record.elapsed >= 0.3 * self._step_duration
+    def steps_wanted(self) -> int:
+        """Return the number of periodic steps until the stop step."""
+        return self._steps_wanted
+
+    def reached(self, step: int, phase: float) -> bool:
+        """Return whether the walk has reached a phase of a periodic step, or is beyond it.
+
+        Args:
+            step: index of the step, from 0.
+            phase: nominal time since the start of the step, divided by the duration of a step.
+        """
+        steps = self.statistics.steps
+        return steps > step or (
+            steps == step and self.phase is Phase.STEP and self._record.elapsed >= phase * self._step_duration
         )
 
     @property

@@ -2,18 +2,24 @@
 
 from __future__ import annotations
 
+import pytest
+
 from atalante_control.gait.walk import DEFAULT_WALK, load_walk
 from atalante_control.model import Patient
+from atalante_control.structured import dtype_of
 from atalante_control.walking.controller import WalkController
 from atalante_control.walking.phases import Phase
+from atalante_control.walking.telemetry import Telemetry
 from atalante_emulator.faults import BATTERY, Fault
 from atalante_emulator.mechanics import Ground, Mechanics
 from atalante_emulator.pendant import Operator
 from atalante_hal.robot import load_robot
-from atalante_hal.types import State, SupervisorState
+from atalante_hal.types import PERIOD, State, SupervisorState, Vector
 from atalante_tools.console.options import MUJOCO, Target
 from atalante_tools.session.body import describe
 from atalante_tools.session.rig import open_hal
+from atalante_tools.session.walk_observation import Observation
+from atalante_tools.session.walk_options import Push
 
 ROBOT = load_robot()
 PATIENT = Patient(75.0, 1.75)
@@ -53,7 +59,7 @@ def test_stop_of_the_pendant_in_a_step_ends_the_walk_on_both_feet() -> None:
     seen: list[tuple[SupervisorState, Phase]] = []
 
     def stopped(state: State) -> bool:
-        if controller.halfway and state.supervisor is SupervisorState.ACTIVE:
+        if controller.reached(1, 0.3) and state.supervisor is SupervisorState.ACTIVE:
             operator.stop()
         if not seen or seen[-1] != (state.supervisor, controller.phase):
             seen.append((state.supervisor, controller.phase))
@@ -74,3 +80,33 @@ def test_stop_of_the_pendant_in_a_step_ends_the_walk_on_both_feet() -> None:
     assert [phase for phase in finishing if phase is not Phase.REST] == [Phase.STEP, Phase.STOP, Phase.BACK]
     assert seen[-1] == (SupervisorState.HOLD, Phase.REST)
     assert 1.0 - 2.0 * (x * x + y * y) > 0.99
+
+
+def test_push_begins_at_its_phase_in_a_right_stance_step_and_lasts_its_duration() -> None:
+    controller = WalkController(ROBOT, PATIENT, load_walk(DEFAULT_WALK, ROBOT), 4)
+    push, rows = Push(20.0, 90.0, step=1, phase=0.5), list[dict[str, float]]()
+    with open_hal(
+        Target("embedded", "", True, MUJOCO),
+        robot=ROBOT,
+        pose=controller.standing_pose.tolist(),
+        operator=Operator(),
+        controller_fields=controller.telemetry_fields,
+        mechanics=Mechanics(describe(ROBOT, None, PATIENT), MUJOCO, Ground()),
+    ) as rig:
+        assert rig.emulator is not None
+        Observation(rig, controller, push)
+        wrench = rig.emulator.pelvis_forces[-1]
+
+        def observed(hal_state: int) -> Vector:
+            force = wrench(hal_state)
+            if force.any():
+                assert force.tolist() == pytest.approx([0.0, 20.0, 0.0, 0.0, 0.0, 0.0])
+                record = controller.telemetry.view(dtype_of(Telemetry))
+                rows.append({name: float(record[name][0]) for name in ("step", "stance", "elapsed")})
+            return force
+
+        rig.emulator.pelvis_forces[-1] = observed
+        rig.run(controller, until=lambda _: controller.statistics.steps == 3)
+    assert len(rows) == round(push.duration / PERIOD)
+    assert {(row["step"], row["stance"]) for row in rows} == {(1.0, 1.0)}
+    assert rows[0]["elapsed"] == pytest.approx(0.4, abs=2 * PERIOD)

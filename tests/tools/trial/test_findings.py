@@ -11,12 +11,13 @@ import pytest
 from atalante_tools.trial.findings import (
     assist_findings,
     protocol_findings,
+    push_findings,
     robust_findings,
     shape_findings,
     step_variation,
     sweep_findings,
 )
-from atalante_tools.trial.plan import SWEEP, RobustTrial, ShapeTrial, TreadmillTrial, WalkTrial, fields
+from atalante_tools.trial.plan import SWEEP, PushTrial, RobustTrial, ShapeTrial, TreadmillTrial, WalkTrial, fields
 from atalante_tools.trial.report import write_report
 from atalante_tools.trial.run import EDGES
 
@@ -213,6 +214,27 @@ def test_robustness_needs_98_percent_standing_and_a_safe_end_of_the_others() -> 
     assert verdicts(robust_findings([])) == {"robust-walk": None, "robust-safe": None}
 
 
+def push_result(direction: float, phase: float, largest: float) -> Result:
+    trial = PushTrial(direction, phase, (50.0, 100.0), 75.0, 1.75, 0, "mujoco")
+    return {
+        "trial": fields(trial), "versions": VERSIONS, "outcome": "computed", "largest_push_n": largest, "end": "fell",
+        "diagnostics": {},
+    }  # fmt: skip
+
+
+def test_pushes_have_a_limit_for_the_worst_direction_and_one_forwards() -> None:
+    strong = [push_result(0.0, 0.0, 300.0), push_result(0.0, 0.5, 350.0), push_result(90.0, 0.0, 200.0)]
+    assert verdicts(push_findings(strong)) == {"push-worst": True, "push-forward": True}
+    weak_forwards = push_findings([*strong, push_result(0.0, 0.75, 250.0)])
+    assert verdicts(weak_forwards) == {"push-worst": True, "push-forward": False}
+    assert "smallest 250 N, mean 300 N; 2 of 3 pushes" in weak_forwards[1].statistic
+    assert verdicts(push_findings([*strong, push_result(90.0, 0.5, 150.0)])) == {
+        "push-worst": False,
+        "push-forward": True,
+    }
+    assert verdicts(push_findings(strong[2:])) == {"push-worst": True, "push-forward": None}
+
+
 def test_protocol_needs_certified_guides_and_no_alarm() -> None:
     walks = [
         {**walk_result(75.0, False, 0.5, net=0.0, error=1.0), "diagnostics": {"TORQUE_SATURATED": 4}} for _ in range(20)
@@ -227,11 +249,15 @@ def test_protocol_needs_certified_guides_and_no_alarm() -> None:
     assert verdicts(protocol_findings([{**walks[2], "outcome": "fell"}]))["protocol-contained"] is False
 
 
-@pytest.mark.parametrize("experiment", ["protocol", "robustness"])
+@pytest.mark.parametrize("experiment", ["protocol", "robustness", "pushes"])
 def test_reports_of_walks_contain_every_trial(experiment: str, tmp_path: Path) -> None:
     if experiment == "robustness":
         results = [robust_result(1), robust_result(2, "fell")]
         findings = robust_findings(results)
+    elif experiment == "pushes":
+        results = [push_result(direction, phase, 100.0) for direction in (0.0, 90.0, 270.0) for phase in (0.0, 0.5)]
+        results.pop()  # a trial is missing
+        findings = push_findings(results)
     else:
         results = [{**walk_result(75.0, True, 0.5, net=0.1, error=1.0), "diagnostics": {}}]
         findings = protocol_findings(results)

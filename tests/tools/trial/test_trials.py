@@ -22,7 +22,11 @@ from atalante_tools.cli import cli
 from atalante_tools.trial import lockstep, plan, store
 from atalante_tools.trial.plan import (
     PROTOCOL,
+    PUSH_DIRECTIONS,
+    PUSH_FORCES,
+    PUSH_PHASES,
     SWEEP,
+    PushTrial,
     RobustTrial,
     Trial,
     WalkSetting,
@@ -30,10 +34,12 @@ from atalante_tools.trial.plan import (
     assist_trials,
     key,
     protocol_trials,
+    push_trials,
     robust_trials,
     source_hash,
     sweep_trials,
 )
+from atalante_tools.trial.pushes import largest_push
 from atalante_tools.trial.robustness import robust_walk
 from atalante_tools.trial.run import run_trial
 from atalante_tools.trial.store import compute, path_of, stored
@@ -290,3 +296,19 @@ def test_robust_walk_that_falls_ends_in_a_safe_state() -> None:
     assert (result["outcome"], result["safe"]) == ("fell", True)
     assert result["state"] in ("HOLD", "LOWER", "FAULT")
     assert result["diagnostics"]
+
+
+def test_pushes_have_16_directions_and_8_phases() -> None:
+    trials = push_trials(PUSH_DIRECTIONS, PUSH_PHASES, PUSH_FORCES, 0, "mujoco")
+    assert len({trial.name for trial in trials}) == len(trials) == 16 * 8
+    assert all(isinstance(trial, PushTrial) and trial.forces == PUSH_FORCES for trial in trials)
+    assert list(PUSH_FORCES) == sorted(PUSH_FORCES)
+
+
+def test_largest_push_is_the_last_one_before_the_robot_falls() -> None:
+    trial = PushTrial(270.0, 0.25, (50.0, 1000.0, 2000.0), 75.0, 1.75, 0, "mujoco")
+    result = largest_push(trial)
+    assert (result["largest_push_n"], result["end"], result["outcome"]) == (50.0, "fell", "computed")
+    assert result["diagnostics"]
+    assert largest_push(replace(trial, forces=(1000.0,)))["largest_push_n"] == 0.0
+    assert largest_push(replace(trial, forces=(50.0,)))["end"] == "stood"

@@ -76,7 +76,7 @@ COMPLETE: Final = Effort(steps=1500, robot_steps=60, tightness=True)
 class Task:
     """Task to check one guide: conditions, effort, seed and largest push."""
 
-    conditions: Sequence[Condition]  # conditions of plant and robot
+    conditions: Sequence[Condition]  # deviations of the simulated leg and of the emulated robot from the model
     effort: Effort
     seed: int  # seed of the search
     push: Pair | None = None  # largest push at hip and knee [Nm]; None means the promised torques

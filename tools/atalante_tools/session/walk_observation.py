@@ -37,7 +37,7 @@ class Observation:
         Args:
             rig: Rig of the walk.
             controller: Controller of the walk.
-            push: Push in the middle of the walk; None means no push.
+            push: Push during the walk; None means no push.
         """
         self.fell = False
         self._rig, self._controller, self._push = rig, controller, push
@@ -84,10 +84,7 @@ class Observation:
         return {"true_lateral_m": lateral, "true_yaw_deg": yaw}
 
     def _wrench(self, _hal_state: int) -> Vector:
-        """Return force [N] and moment [Nm] of the push in this cycle, shape (6,).
-
-        The push begins when the middle step of the walk reaches phase 0.3.
-        """
+        """Return force [N] and moment [Nm] of the push in this cycle, shape (6,)."""
         import numpy as np
 
         from atalante_hal.types import PERIOD
@@ -95,7 +92,8 @@ class Observation:
         wrench = np.zeros(6)
         assert self._push is not None
         controller, push = self._controller, self._push
-        if self._pushed == 0 and not controller.halfway:
+        step = controller.steps_wanted // 2 if push.step is None else push.step
+        if self._pushed == 0 and not controller.reached(step, push.phase):
             return wrench
         self._pushed += 1
         if self._pushed * PERIOD <= push.duration:

@@ -26,11 +26,13 @@ DEFAULT_STEP: Final = (0.16, 0.8)
 
 @dataclass(frozen=True)
 class Push:
-    """Push at the pelvis of the emulated robot."""
+    """Push at the pelvis of the emulated robot, which begins at a phase of a periodic step."""
 
     force: float  # N
     direction: float  # deg, 0 forwards, 90 to the left
     duration: float = 0.2  # s
+    step: int | None = None  # index of the pushed step, from 0; None means the middle step of the walk
+    phase: float = 0.3  # time from the start of the step to the push / duration of a step
 
 
 @dataclass(frozen=True)

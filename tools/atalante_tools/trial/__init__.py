@@ -1,4 +1,4 @@
-"""Command `atalante trial`: experiments of the paper, robustness, and faults during walks, with virtual subjects.
+"""Command `atalante trial`: experiments of the paper, and walks with faults, pushes and errors, with virtual subjects.
 
 experiment -> trials (`plan`) -> results in files (`run`, `store`) -> findings -> report.html
 """
@@ -96,7 +96,7 @@ _mass_option = click.option(
 def command() -> None:
     """Repeat the experiments of the paper with virtual subjects on the emulated robot, and write a report.
 
-    The experiments `protocol`, `robustness` and `faults` are not in the paper.
+    The experiments `protocol`, `robustness`, `pushes` and `faults` are not in the paper.
 
     The report, one HTML file (and its findings as Markdown), contains tables, figures, and each finding of the paper with its
     statistic and its verdict. A verdict of FAIL is a result, not an error of the command. Each trial is stored in a file of its
@@ -109,6 +109,7 @@ def command() -> None:
              atalante trial faults F16 F56
              atalante trial protocol --shape pinched --mass 75
              atalante trial robustness --seeds 10
+             atalante trial pushes --quick
     """
 
 
@@ -227,6 +228,20 @@ def robustness(seeds: int | None, steps: int | None, running: Running, as_json: 
         _conduct("robustness", trials, robust_findings, running, as_json)
     finally:
         _record_failures(trials, running)
+
+
+@command.command(short_help="Find the largest push in each direction that the robot withstands.")
+@_running("pushes")
+def pushes(running: Running, as_json: bool) -> None:
+    """Push the walking robot at the pelvis, in 16 directions and at 8 phases of a step, with a force that rises until it falls.
+
+    The report contains a polar figure of the largest push that the robot withstands.
+    """
+    from atalante_tools.trial.findings import push_findings
+    from atalante_tools.trial.plan import PUSH_DIRECTIONS, PUSH_FORCES, PUSH_PHASES, QUICK_PUSHES, push_trials
+
+    grid = QUICK_PUSHES if running.quick else (PUSH_DIRECTIONS, PUSH_PHASES, PUSH_FORCES)
+    _conduct("pushes", push_trials(*grid, running.seed, running.engine), push_findings, running, as_json)
 
 
 def _record_failures(trials: Sequence[Trial], running: Running) -> None:

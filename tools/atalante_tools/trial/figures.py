@@ -58,6 +58,34 @@ def robustness(results: Sequence[Result]) -> bytes:
     return _png(figure)
 
 
+def pushes(results: Sequence[Result]) -> bytes:
+    """Draw the largest push over its direction: one thin line for each phase, and a thick line for the worst phase.
+
+    Args:
+        results: results of `push` trials.
+    """
+    figure, axis = plt.subplots(figsize=(6.4, 6.0), subplot_kw={"projection": "polar"})
+    forces = {(r["trial"]["direction"], r["trial"]["phase"]): r["largest_push_n"] for r in results}
+    directions, phases = (sorted({where[k] for where in forces}) for k in (0, 1))
+    angles = np.radians([*directions, directions[0]])
+    for number, phase in enumerate(phases):
+        line = [forces.get((direction, phase), math.nan) for direction in (*directions, directions[0])]
+        colour = plt.get_cmap("viridis")(number / max(1, len(phases) - 1))
+        axis.plot(angles, line, linewidth=0.9, color=colour, label=f"phase {phase:g}")
+    worst = [
+        min(force for (angle, _), force in forces.items() if angle == direction)
+        for direction in (*directions, directions[0])
+    ]
+    axis.plot(angles, worst, linewidth=2.5, color="black", label="worst phase")
+    axis.set(
+        theta_zero_location="N",  # forwards is up, 90 degrees (to the left) is left
+        ylim=(0.0, None),
+        title="largest push withstood [N]\n0 deg forwards, 90 deg to the left, right leg is stance leg",
+    )
+    axis.legend(fontsize=7, loc="lower left", bbox_to_anchor=(-0.15, -0.1))
+    return _png(figure)
+
+
 def joints(results: Sequence[Result], mass: float) -> bytes:
     """Draw hip and knee of the left leg in the four trials of one subject (figure "active and passive" of the paper).
 

@@ -34,6 +34,8 @@ VARIATION: Final = 0.05
 
 #: Smallest share of guides with a promise, and of robust walks that end standing.
 CERTIFIED, ROBUST = 0.95, 0.98
+#: Pushes of 0.2 s that the robot must withstand [N]: in the worst direction and phase, and forwards in the worst phase.
+PUSH_WORST, PUSH_FORWARD = 200.0, 300.0
 
 
 @dataclass(frozen=True)
@@ -165,6 +167,31 @@ def robust_findings(results: Sequence[Result]) -> list[Finding]:
             ends + ", ".join(unsafe), not unsafe if tested else None,
         ),
     ]  # fmt: skip
+
+
+def push_findings(results: Sequence[Result]) -> list[Finding]:
+    """Return the findings of the experiment `pushes`.
+
+    Args:
+        results: results of `push` trials.
+    """
+    forwards = [r for r in results if r["trial"]["direction"] == 0.0]
+    return [
+        _withstood("push-worst", "the robot withstands a push in every direction at every phase", results, PUSH_WORST),
+        _withstood("push-forward", "the robot withstands a push forwards at every phase", forwards, PUSH_FORWARD),
+    ]
+
+
+def _withstood(id_: str, claim: str, results: Sequence[Result], limit: float) -> Finding:
+    if not results:
+        return Finding(id_, claim, "no results", None)
+    forces = [float(r["largest_push_n"]) for r in results]
+    enough = sum(force >= limit for force in forces)
+    text = (
+        f"smallest {min(forces):.0f} N, mean {statistics.fmean(forces):.0f} N; "
+        f"{enough} of {len(forces)} pushes with at least {limit:.0f} N, all wanted"
+    )
+    return Finding(id_, claim, text, enough == len(forces))
 
 
 def condition(result: Result) -> str:

@@ -1,4 +1,4 @@
-"""Trials of the three experiments of the paper: `experiment, options -> list of trials`. Each trial has a key.
+"""Trials of the experiments: `experiment, options -> list of trials`. Each trial has a key.
 
 The key is a hash of the parameters of the trial and of the versions of everything that computes it, so a stored result is used
 again only if a new run would give the same result.
@@ -51,6 +51,11 @@ PUSH: Final = 100.0
 PUSH_STEPS: Final = 10
 #: Number of trials and steps of `robustness`.
 ROBUST, QUICK_ROBUST = (100, 60), (2, 4)
+#: Directions [deg] and phases of the pushes of `pushes`, and their forces in rising order [N].
+PUSH_DIRECTIONS: Final = tuple(22.5 * k for k in range(16))
+PUSH_PHASES: Final = tuple(k / 8 for k in range(8))
+PUSH_FORCES: Final = tuple(50.0 * k for k in range(1, 11))
+QUICK_PUSHES: Final = ((0.0, 90.0), (0.25,), (50.0, 1000.0))
 #: Assistance factors of `protocol`.
 PROTOCOL_FACTORS: Final = (0.5, 0.0)
 _PACKAGES: Final = ("numpy", "numba", "pin", "casadi", "pybullet", "mujoco-core")
@@ -123,6 +128,25 @@ class RobustTrial:
 
 
 @dataclass(frozen=True)
+class PushTrial:
+    """Walks with full assistance and one push at the pelvis each, in one direction and at one phase, with rising force."""
+
+    kind: ClassVar[str] = "push"
+    direction: float  # deg, of the push; 0 is forwards, 90 to the left
+    phase: float  # phase of a right-stance step at which the push begins
+    forces: tuple[float, ...]  # N, in rising order
+    mass: float  # kg, of the wearer
+    height: float  # m, of the wearer
+    seed: int
+    engine: str
+
+    @property
+    def name(self) -> str:
+        """Return a name that is unique in the experiment."""
+        return f"push-{self.direction:g}deg-phase{self.phase:g}"
+
+
+@dataclass(frozen=True)
 class TreadmillTrial:
     """Baseline of the sweep: level walking without exoskeleton. No body is simulated.
 
@@ -142,7 +166,7 @@ class TreadmillTrial:
         return f"treadmill-{self.order}-{self.mass:g}kg"
 
 
-Trial = ShapeTrial | WalkTrial | TreadmillTrial | RobustTrial | FaultTrial
+Trial = ShapeTrial | WalkTrial | TreadmillTrial | RobustTrial | PushTrial | FaultTrial
 
 
 @dataclass(frozen=True)
@@ -262,6 +286,25 @@ def robust_trials(count: int, steps: int, seed: int, engine: str) -> list[Trial]
             )
         )  # fmt: skip
     return trials
+
+
+def push_trials(
+    directions: Sequence[float], phases: Sequence[float], forces: Sequence[float], seed: int, engine: str
+) -> list[Trial]:
+    """Return one trial for each direction and phase of a push.
+
+    Args:
+        directions: directions of the pushes [deg].
+        phases: phases of a right-stance step at which the pushes begin.
+        forces: forces in rising order [N].
+        seed: seed of the sensor noise.
+        engine: name of the physics engine.
+    """
+    return [
+        PushTrial(direction, phase, tuple(forces), *SWEEP_SUBJECT, seed, engine)
+        for direction in directions
+        for phase in phases
+    ]
 
 
 @cache

@@ -49,6 +49,12 @@ EXPERIMENTS: Final = {
         "The emulated robot differs at random from the model of the controller: mass of the patient, friction of the floor, late "
         "motors. Its buses lose frames, and it is pushed at the pelvis. All parameters of a trial are in its result.",
     ),
+    "pushes": (
+        "Pushes",
+        "The robot walks with full assistance and a passive wearer, and is pushed at the pelvis for 0.2 s in a right-stance "
+        "step. It has withstood the push if it walks four more steps, makes the stop step and stands. The force rises until "
+        "the robot falls or stops; the table contains the largest force that it has withstood, and how the next walk ended.",
+    ),
 }  # fmt: skip
 _CERTIFIED: Final = {True: "yes", False: "no", None: "-"}
 _VERDICT: Final = {True: "pass", False: "FAIL", None: "not tested"}
@@ -174,6 +180,8 @@ def _trials(results: Sequence[Result]) -> tuple[list[str], list[list[str]]]:
         ("friction", lambda r: _number(r["trial"].get("friction"), 2)),
         ("motor delay [ms]", lambda r: str(r["trial"].get("delay", "-"))),
         ("state at the end", lambda r: r.get("state", "-")),
+        ("largest push [N]", lambda r: _number(r.get("largest_push_n"), 0)),
+        ("end of the last walk", lambda r: r.get("end", "-")),
         ("largest DCM error [m]", lambda r: _number(r.get("max_dcm_error_m"), 3)),
     ]
     filled = [(head, cells) for head, value in columns if set(cells := [value(r) for r in results]) != {"-"}]
@@ -213,6 +221,8 @@ def _figures(experiment: str, results: Sequence[Result]) -> list[str]:
         print_message(f"no figures: {error.name} is not installed; type `pip install 'atalante-hal[plot]'`")
         return [f"<p>No figures: {escape(str(error.name))} is not installed.</p>"]
     walks = [r for r in ended if r["trial"]["kind"] == "walk"]
+    if experiment == "pushes":
+        return [_image("largest push over its direction", lambda: figures.pushes(ended))]
     if experiment == "shapes":
         return [_image("left hip in each guide shape", lambda: figures.shapes(ended))]
     if experiment == "robustness":

@@ -46,7 +46,8 @@ from atalante_tools.session.walk_observation import Observation
 from atalante_tools.session.walk_options import solved_gaits
 from atalante_tools.session.walk_result import diagnostics
 from atalante_tools.trial.lockstep import Ending, target
-from atalante_tools.trial.plan import STEP, RobustTrial, ShapeTrial, TreadmillTrial, WalkTrial
+from atalante_tools.trial.plan import STEP, PushTrial, RobustTrial, ShapeTrial, TreadmillTrial, WalkTrial
+from atalante_tools.trial.pushes import largest_push
 from atalante_tools.trial.robustness import robust_walk
 
 _SH, _LEG = LEG_JOINTS.index("SH"), len(LEG_JOINTS)
@@ -60,7 +61,7 @@ EDGES: Final = tuple(round(-1.0 + 0.05 * k, 2) for k in range(41))
 SEGMENTS: Final = ("full", "transition", "target")
 
 
-def run_trial(trial: ShapeTrial | WalkTrial | TreadmillTrial | RobustTrial) -> dict[str, Any]:
+def run_trial(trial: ShapeTrial | WalkTrial | TreadmillTrial | RobustTrial | PushTrial) -> dict[str, Any]:
     """Run a trial, and return its result. Worker processes call this function, too.
 
     Args:
@@ -70,6 +71,8 @@ def run_trial(trial: ShapeTrial | WalkTrial | TreadmillTrial | RobustTrial) -> d
         return _shape(trial)
     if isinstance(trial, WalkTrial):
         return _walk(trial)
+    if isinstance(trial, PushTrial):
+        return largest_push(trial)
     return robust_walk(trial) if isinstance(trial, RobustTrial) else _treadmill(trial)
 
 
