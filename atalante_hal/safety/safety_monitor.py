@@ -22,6 +22,7 @@ from atalante_hal.safety.direction import DirectionProof
 from atalante_hal.safety.events import Event
 from atalante_hal.safety.fault_memory import FaultMemory
 from atalante_hal.safety.heartbeats import Heartbeats
+from atalante_hal.safety.hold_stability import HoldStability
 from atalante_hal.safety.limiter import Limiter
 from atalante_hal.safety.message_monitor import MessageMonitor
 from atalante_hal.safety.plausibility import Plausibility
@@ -116,6 +117,8 @@ class SafetyMonitor:
         self._stalled = 0  # number of cycles during this start in which no drive has changed its state
         self._states_at_start = b""  # drive states in the previous cycle of this start
         self.lowered: set[str] = set()
+        self._hold_stability = HoldStability()
+        self._oscillating: set[str] = set()  # DBC names of the drives whose joints oscillated since the last START
         #: True if `evaluate` may skip a cycle that has new data, no fault and the same pendant and drive values as before.
         self._steady = False
         self._reports: list[Finding] = []  # faults that loop and controller reported since the last `evaluate`
@@ -139,18 +142,20 @@ class SafetyMonitor:
         Returns:
             The verdict; None if all inputs are unchanged, so that the last verdict is still valid.
         """
-        pendant = self._pendant
+        pendant, state = self._pendant, self._state
+        oscillations = () if self.moving else self._hold_stability.check(state.velocity, state.drive_state)
         if (
             self._steady
             and self._image.all_fresh
             and not self._plausibility.findings
             and not bus_faults
+            and not oscillations
             and pendant.signals.tobytes() == pendant.evaluated
             and self._drive_side.tobytes() == self._drives_evaluated
         ):
             return None
-        self._evaluate(bus_faults)
-        state = self._state
+        self._oscillating.update(finding.node for finding in oscillations)
+        self._evaluate((*bus_faults, *oscillations))
         limit, diagnostics = self._limiter.limit, self.memory.bits
         return Verdict(state.supervisor, state.assistance_factor, limit, diagnostics, self._acknowledged)
 
@@ -206,7 +211,7 @@ class SafetyMonitor:
         """Return the nodes that prevent READY: timed out, not trusted yet, without a status message, or with a different DBC."""
         return self._message_monitor.missing() | self._heartbeats.missing()
 
-    def _evaluate(self, bus_faults: Sequence[Finding]) -> None:
+    def _evaluate(self, findings: Sequence[Finding]) -> None:
         """Raise all diagnostics of this cycle, run the state machine, and apply the reactions."""
         state, memory, cycle = self._state, self.memory, self._state.cycle
         message_monitor, pendant = self._message_monitor, self._pendant
@@ -218,7 +223,7 @@ class SafetyMonitor:
             if node in DRIVE_NODES:
                 self.proof.forget(DRIVE_NODES.index(node))
         self._heartbeats.booted.clear()
-        for finding in (*bus_faults, *self._plausibility.findings, *self._reports):
+        for finding in (*findings, *self._plausibility.findings, *self._reports):
             memory.raise_finding(cycle, finding)
         self._reports.clear()
         nodes_ready = message_monitor.nodes_ready and self._heartbeats.all_reported
@@ -342,6 +347,7 @@ class SafetyMonitor:
             if not self.proof.running:  # another press of START does not restart a running direction test
                 self._proof_begun = False
                 self.proof.failed.clear()
+                self._oscillating.clear()
             self.start_wanted = ENABLE_CYCLES if state.supervisor in _STARTABLE else 0
         elif self.start_wanted:
             self.start_wanted -= 1
@@ -422,6 +428,8 @@ class SafetyMonitor:
         self.start_wanted = 0
         self._pendant.clear_press()
         self.moving = after in MOVING
+        if before in MOVING and not self.moving:
+            self._hold_stability.restart()
         self.walking = self.walking and self.moving
         if Dtc.OPERATOR_STOP in reasons:
             text = "the program is ending" if self._ending else stop_text(self._pendant.stop_requested)
@@ -462,10 +470,11 @@ class SafetyMonitor:
     def _update_lowered(self) -> None:
         """Update the set `lowered`: in LOWER and FAULT, add each drive with a confirmed diagnostic whose reaction is LOWER.
 
-        In all other states, `lowered` contains the drives of the joints that failed in the last test of the directions.
+        In all other states, `lowered` contains the drives of the joints that failed in the last test of the directions, and of
+        those that oscillated since the last START.
         """
         if self._state.supervisor in (_S.LOWER, _S.FAULT):
             lower = frozenset(dtc for dtc in self.memory.confirmed if dtc.reaction is Reaction.LOWER)
             self.lowered.update(node for node in self.memory.nodes_of(lower) if node in DRIVE_NODES)
         else:
-            self.lowered = {DRIVE_NODES[joint] for joint in self.proof.failed}
+            self.lowered = {DRIVE_NODES[joint] for joint in self.proof.failed} | self._oscillating

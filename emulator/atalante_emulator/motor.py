@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections import deque
 from dataclasses import dataclass
 
 import numpy as np
@@ -29,6 +28,10 @@ class MotorParameters:
     heating: float = 70.0  # temperature rise after a long time at half the torque limit [K]
     thermal_time: float = 300.0  # time constant of the winding temperature [s]
 
+
+_MOTORS = np.arange(len(JOINTS))
+#: Largest number of cycles by which the torque of a motor can be late.
+MOST_LATE = 20
 
 # Rows of the motor array, first to fourth: torque setpoint, ratio of true to measured torque, dry friction, damping.
 # Rows of the motor array, fifth to seventh: external torque, resulting joint torque, torque of the wearer's limb.
@@ -63,9 +66,10 @@ class Motors:
         self._tracking = 1.0 - math.exp(-PERIOD / parameters.current_loop)
         self._motors = np.zeros((7, len(JOINTS)))
         self.wanted, self._joint = self._motors[_WANTED], self._motors[_JOINT]
-        self._late = deque(
-            np.zeros((parameters.dead_time, len(JOINTS)))
-        )  # setpoints that have not reached the current loop
+        #: Cycles until a new setpoint reaches the current loop of each motor, and the setpoints of the last cycles.
+        self._dead_time = np.full(len(JOINTS), parameters.dead_time)
+        self._setpoints = np.zeros((MOST_LATE + 1, len(JOINTS)))
+        self._cycle = 0
         #: Torques of the wearer's limbs on the joints, shape (12,) [Nm]. The emulator writes into this array.
         self.limb = self._motors[_LIMB]
         self._viscous = np.array(parameters.viscous * both)
@@ -95,6 +99,15 @@ class Motors:
         """
         self._motors[_STRENGTH, motor] = strength
 
+    def delay(self, motor: int, cycles: int) -> None:
+        """Set the additional time until a setpoint reaches the current loop of a motor.
+
+        Args:
+            motor: index of the motor.
+            cycles: additional time [cycles], at most `MOST_LATE` together with the dead time of all motors.
+        """
+        self._dead_time[motor] = self._parameters.dead_time + cycles
+
     def push(self, joint: int, torque: float) -> None:
         """Set an external torque on a joint, which is added to the motor torque.
 
@@ -117,9 +130,10 @@ class Motors:
             Joint torques, shape (12,) [Nm].
         """
         setpoint = self.wanted
-        if self._late:
-            self._late.append(setpoint.copy())
-            setpoint = self._late.popleft()
+        if self._dead_time.any():
+            self._cycle += 1
+            self._setpoints[self._cycle % len(self._setpoints)] = setpoint
+            setpoint = self._setpoints[(self._cycle - self._dead_time) % len(self._setpoints), _MOTORS]
         self._advance(velocity, setpoint, self._motors, self._tracking, self._parameters.friction_speed, self._torque)
         torque: list[float] = self._joint.tolist()
         return torque

@@ -186,6 +186,20 @@ class TestDrives:
         hal.run(400)
         assert CROUCHED[KNEE] - emulator.body.position[KNEE] < 0.9 * sag
 
+    def test_torque_of_a_late_motor_arrives_late_until_the_fault_ends(self, world: Make) -> None:
+        late, emulator = world(Fault("torque_late", "LEFT_SK", BEGIN, 200, by=7), cycles=BEGIN - 1)
+        healthy, other = world(cycles=BEGIN - 1)
+        wanted, torque = [], []
+        for _ in range(200):
+            late.run(1)
+            wanted.append(emulator.drives.motors.wanted[KNEE])
+            torque.append(late.joints("Torque")[KNEE])
+        lags = [abs(np.subtract(torque[20:], wanted[20 - lag : 200 - lag])).sum() for lag in range(12)]
+        assert int(np.argmin(lags)) == 7 + 1  # one cycle until the torque is measured and sent
+        late.run(50)
+        assert not emulator.drives.motors._dead_time.any()
+        del healthy, other
+
     def test_over_temperature_lowers_the_joint_slowly(self, world: Make) -> None:
         hal, emulator = world(Fault("over_temperature", "LEFT_SK", BEGIN, 20, degrees=130.0), cycles=BEGIN + 1)
         assert hal.joints("Temperature")[KNEE] == 130.0

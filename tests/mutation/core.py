@@ -23,6 +23,7 @@ CORE = {
         ("atalante_hal/safety/state_machine.py", "atalante_hal/safety/diagnostics.py", "atalante_hal/wire/cia402.py"),
         ("hal/safety/test_state_machine.py", "hal/safety/test_diagnostics.py", "hal/wire/test_cia402.py"),
     ),
+    "hold_stability": (("atalante_hal/safety/hold_stability.py",), ("hal/safety/test_hold_stability.py",)),
     "direction": (("atalante_hal/safety/direction.py",), ("hal/safety/test_direction.py",)),
     "limiter": (("atalante_hal/safety/limiter.py",), ("hal/safety/test_limiter.py",)),
     "guide": (

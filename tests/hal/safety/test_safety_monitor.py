@@ -11,7 +11,9 @@ import pytest
 
 from atalante_dbc import Message, load
 from atalante_hal.hal import BRIDGED_ERRORS, SATURATED_CYCLES
+from atalante_hal.robot import JOINTS
 from atalante_hal.safety.diagnostics import Dtc
+from atalante_hal.safety.hold_stability import REVERSALS
 from atalante_hal.safety.limiter import Limited, Limiter
 from atalante_hal.safety.safety_monitor import FINISH_STEP_CYCLES, RECALL_CYCLES
 from atalante_hal.safety.start import ENABLE_CYCLES, STALLED_CYCLES, WALK_ENDS, stop_text
@@ -22,6 +24,7 @@ from atalante_hal.wire.frame import Frames
 from atalante_hal.wire.process_image import TransmitImage
 
 S = SupervisorState
+KNEE = JOINTS.index("left_SK")
 
 
 def test_robot_stays_ready_without_a_start_press(make_rig):
@@ -387,6 +390,55 @@ def test_joint_that_cannot_hold_is_lowered_and_the_others_hold(rig):
     rig.operator.start()
     assert rig.until(S.ACTIVE, 150).supervisor is S.ACTIVE
     assert [c for c in rig.codes() if c in S.__members__][-3:] == ["LOWER", "HOLD", "ACTIVE"]
+
+
+def shake(rig, joint="LEFT_SK"):
+    """Let the state frames of a drive report a velocity that reverses every five cycles, until the drive is off."""
+    signals = rig.emulator.signals
+    velocity, drive = (signals.index(f"{joint}_STATE", name) for name in ("Velocity", "DriveState"))
+
+    def report(cycle: int, values: np.ndarray) -> None:
+        if values[drive] in (DriveState.QUICK_STOP_ACTIVE, DriveState.OPERATION_ENABLED):
+            values[velocity] = 60.0 * (-1) ** (cycle // 5)
+
+    rig.emulator.before_send.append(report)
+
+
+def test_joint_that_oscillates_in_hold_is_lowered_until_the_next_start(rig):
+    rig.until(S.ACTIVE)
+    rig.operator.hold()
+    rig.until(S.HOLD)
+    rig.run(10)
+    shake(rig)
+    rig.run(6 * REVERSALS)
+    assert rig.hal.state.supervisor is S.LOWER
+    assert "left_SK oscillates although its drive holds it" in rig.hal.reason
+    state = rig.run(50)
+    assert state.drive_state[KNEE] == DriveState.SWITCH_ON_DISABLED
+    assert (np.delete(state.drive_state, KNEE) == DriveState.QUICK_STOP_ACTIVE).all()
+    assert rig.codes().count("HOLD_UNSTABLE") == 1
+    rig.operator.start()
+    assert rig.until(S.HOLD, 5).drive_state[KNEE] == DriveState.SWITCH_ON_DISABLED
+    rig.operator.start()
+    rig.until(S.ACTIVE, 150)  # the controller moves the joint, its drive does not hold it
+    assert rig.run(6 * REVERSALS).supervisor is S.ACTIVE
+    rig.operator.hold()
+    rig.until(S.LOWER, 6 * REVERSALS)
+    rig.run(3)
+    assert rig.hal.state.drive_state[KNEE] == DriveState.SWITCH_ON_DISABLED
+
+
+def test_joint_that_oscillates_before_active_is_switched_off(make_rig):
+    rig = make_rig(starts=False)
+    rig.until(S.READY)
+    shake(rig)
+    rig.operator.start()
+    state = rig.run(150)
+    assert "HOLD_UNSTABLE" in rig.codes()
+    assert "ACTIVE" not in rig.codes()
+    assert state.supervisor is S.READY
+    assert state.drive_state[KNEE] == DriveState.SWITCH_ON_DISABLED
+    assert (np.delete(state.drive_state, KNEE) == DriveState.QUICK_STOP_ACTIVE).all()
 
 
 def test_start_without_progress_fails_and_names_the_drive(make_rig):

@@ -17,7 +17,7 @@ from atalante_tools.faults.checks import (
     nothing_sags,
     start_fails_and_names_the_hip,
 )
-from atalante_tools.faults.scenario import Case, HostFault, Scenario
+from atalante_tools.faults.scenario import Case, HostFault, OperatorAction, Scenario
 
 _S = SupervisorState
 _KNEE: Final = "LEFT_SK"
@@ -256,6 +256,19 @@ SCENARIOS: Final = (
         (
             *(_start_with(f"LEFT_{joint} reversed", f"LEFT_{joint}", -1.0) for joint in LEG_JOINTS),
             *(_start_with(f"LEFT_{joint} dead", f"LEFT_{joint}", 0.0) for joint in ("SK", "SA", "HA")),
+        ),
+    ),
+    # The position control of the knee's drive becomes unstable when its motor is eight cycles late.
+    Scenario(
+        "F74",
+        tuple(
+            Case(
+                f"knee in HOLD, {late} cycles late",
+                (OperatorAction("hold"), Fault("torque_late", _KNEE, 0, 600, by=late)),
+                node=_KNEE,
+                observed=_LOWERED,
+            )
+            for late in (8, 10)
         ),
     ),
     # A push accelerates the joint beyond its top speed within 25 cycles.

@@ -1,0 +1,92 @@
+"""Check that no joint oscillates while its drive holds its position: `velocity, drive state -> findings`.
+
+A drive that holds its position controls the joint by itself, and the HAL does not limit its torque. The joint oscillates if
+this control does not suit the joint: a wrong parameter, a loose gear, or a motor that reacts late. A joint oscillates if
+its velocity reverses again and again. A joint that is stopped in motion, pushed or carried reverses less often.
+"""
+
+from __future__ import annotations
+
+from typing import Final, NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from atalante_hal.compiled import specialised
+from atalante_hal.robot import JOINTS
+from atalante_hal.safety.diagnostics import Dtc, Finding
+from atalante_hal.types import Vector
+from atalante_hal.wire.cia402 import DriveState
+
+#: Speed that a joint must exceed in both directions, so that a change of direction counts [rad/s].
+SPEED: Final = 0.5
+#: Longest time between two reversals of an oscillation [cycles].
+INTERVAL: Final = 100
+#: Number of consecutive reversals at which a joint oscillates.
+REVERSALS: Final = 6
+
+
+class Swings(NamedTuple):
+    """Record of the reversals of all joints, shape (12,) each."""
+
+    direction: npt.NDArray[np.int64]  # sign of the last velocity above `SPEED`; 0 if there is none
+    age: npt.NDArray[np.int64]  # time since the last velocity above `SPEED` in this direction began [cycles]
+    reversals: npt.NDArray[np.int64]  # number of consecutive reversals
+
+
+def _follow(velocity: Vector, drive_state: Vector, swings: Swings, driven: tuple[float, float]) -> bool:
+    """Update the reversals of all joints by one cycle, and return whether a joint oscillates.
+
+    Args:
+        velocity: joint velocities, shape (12,) [rad/s].
+        drive_state: states of the drives, shape (12,).
+        swings: record to update.
+        driven: states in which a drive controls its joint.
+    """
+    oscillates = False
+    for i in range(len(velocity)):
+        swings.age[i] += 1
+        if swings.age[i] > INTERVAL or (drive_state[i] != driven[0] and drive_state[i] != driven[1]):
+            swings.direction[i] = swings.reversals[i] = 0
+        direction = (velocity[i] > SPEED) - (velocity[i] < -SPEED)
+        if direction != 0 and direction != swings.direction[i]:
+            swings.reversals[i] += swings.direction[i] != 0
+            swings.direction[i], swings.age[i] = direction, 0
+        oscillates |= swings.reversals[i] >= REVERSALS
+    return oscillates
+
+
+class HoldStability:
+    """Check of all joints while the HAL sends no torques of the controller."""
+
+    def __init__(self) -> None:
+        """Create the check, and compile its kernel."""
+        self._swings = Swings(*np.zeros((3, len(JOINTS)), np.int64))
+        self._driven = (float(DriveState.QUICK_STOP_ACTIVE), float(DriveState.OPERATION_ENABLED))
+        zero = np.zeros(len(JOINTS))
+        self._follow = specialised(_follow, zero, zero, self._swings, self._driven)
+        self.restart()
+
+    def restart(self) -> None:
+        """Forget all reversals, because the controller moved the joints until now."""
+        for record in self._swings:
+            record[:] = 0
+
+    def check(self, velocity: Vector, drive_state: Vector) -> tuple[Finding, ...]:
+        """Check the velocities of one cycle, and return one finding for each joint that oscillates.
+
+        Args:
+            velocity: joint velocities, shape (12,) [rad/s].
+            drive_state: states of the drives, shape (12,).
+        """
+        if not self._follow(velocity, drive_state, self._swings, self._driven):
+            return ()
+        return tuple(
+            Finding(
+                Dtc.HOLD_UNSTABLE, joint.upper(), float(count), True,
+                f"{joint} oscillates although its drive holds it: {count} reversals in a row faster than "
+                f"{np.degrees(SPEED):.0f} deg/s; its drive is switched off",
+            )
+            for joint, count in zip(JOINTS, self._swings.reversals.tolist(), strict=True)
+            if count >= REVERSALS
+        )  # fmt: skip
