@@ -188,7 +188,7 @@ def _limit(room: Vector, reach: Vector, steps: int, what: str) -> Limit:
 
 
 class _Horizon:
-    """Condition on the scale of the promised torques: one cycle after the horizon, the error is still within the guide.
+    """Condition on the promised torques, times a factor: one cycle after the horizon, the error is still within the guide.
 
     At the end of the horizon, fast motions have decayed. The error one cycle beyond the horizon is therefore the error at the
     end of the horizon times a factor, plus a remainder. The remainder is a linear combination of the errors in two earlier
@@ -215,7 +215,7 @@ class _Horizon:
         self._reach = prediction.reach[self._starts // START_CYCLES]
 
     def limit(self, width: Vector, narrowest: Vector) -> Limit:
-        """Return the largest scale of the promised torques that meets the condition.
+        """Return the largest multiple of the promised torques that meets this condition.
 
         Args:
             width: distance from q_des to the nearer bound of the guide in each cycle, shape (n, 2) [rad].

@@ -151,7 +151,7 @@ class Prediction:
         first_torque = run(torque, mobilities, bounds, few, few_ahead[0])
         first_speed = run(speed, mobilities, bounds, few, few_ahead[1])
         # Axes of `by_bound`: block of start cycles, element of `FEW`, cause, output, joint.
-        # The causes are model errors and promised torques, the outputs torque and speed, the joints sagittal hip and knee.
+        # Causes: model errors, promised torques. Outputs: torque, speed. Joints: sagittal hip, sagittal knee.
         by_bound = few_ahead[:2].reshape(2, blocks, len(FEW), 2, 2).transpose(1, 2, 3, 0, 4)
         self.few_reach: Vector = np.concatenate([by_bound.reshape(blocks, len(FEW), 8), few_ahead[2]], axis=2)
         self.few_ahead: Vector = np.concatenate([nominal.feedback[FEW], nominal.rate[FEW]], axis=1)

@@ -43,7 +43,7 @@ class Result:
     real_time_factor: float
     frames: int
     crc_errors: int
-    #: number of steps that started outside the hand-over box, which is the range of start deviations for which the promise holds
+    #: number of steps that started with a larger deviation than the certificate of the guide assumes
     hand_overs_exceeded: int
 
 

@@ -10,10 +10,10 @@ from typing import Any, Final
 from atalante_tools.faults.matrix import load_matrix
 from atalante_tools.trial.findings import Finding, Result
 
-#: Fault ID -> regular expression for the names of the cases in which the robot must not fall. In these cases, frames are lost,
-#: late or doubled, an IMU, a foot or a force cell fails, the controller raises an exception, the loop is late, or the operator
-#: presses STOP or releases the dead-man switch. A drive without data for ten cycles is left out, because its joint must not be
-#: moved. After HOLD the robot may fall, because the drives hold at once.
+#: Fault ID -> regular expression for the names of the cases in which the robot must not fall. These are lost, late and doubled
+#: frames; a failed IMU, foot or force cell; an exception of the controller; a late loop; STOP; a released dead-man switch. A
+#: drive without data for ten cycles is left out, because its joint must not be moved. After HOLD the robot may fall, because the
+#: drives hold at once.
 NO_FALL: Final = {
     **dict.fromkeys(("F01", "F02", "F03", "F05", "F20", "F24", "F30", "F31", "F32", "F33"), ""),
     "F04": "LEFT|RIGHT|5 frames",
