@@ -48,11 +48,11 @@ def _follow(velocity: Vector, drive_state: Vector, swings: Swings, driven: tuple
         swings.age[i] += 1
         if swings.age[i] > INTERVAL or (drive_state[i] != driven[0] and drive_state[i] != driven[1]):
             swings.direction[i] = swings.reversals[i] = 0
-        direction = (velocity[i] > SPEED) - (velocity[i] < -SPEED)
+        direction = int(velocity[i] > SPEED) - int(velocity[i] < -SPEED)
         if direction != 0 and direction != swings.direction[i]:
-            swings.reversals[i] += swings.direction[i] != 0
+            swings.reversals[i] += int(swings.direction[i] != 0)
             swings.direction[i], swings.age[i] = direction, 0
-        oscillates |= swings.reversals[i] >= REVERSALS
+        oscillates = oscillates or swings.reversals[i] >= REVERSALS
     return oscillates
 
 
