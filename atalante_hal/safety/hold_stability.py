@@ -43,7 +43,6 @@ def _follow(velocity: Vector, drive_state: Vector, swings: Swings, driven: tuple
         swings: record to update.
         driven: states in which a drive controls its joint.
     """
-    oscillates = False
     for i in range(len(velocity)):
         swings.age[i] += 1
         if swings.age[i] > INTERVAL or (drive_state[i] != driven[0] and drive_state[i] != driven[1]):
@@ -52,8 +51,7 @@ def _follow(velocity: Vector, drive_state: Vector, swings: Swings, driven: tuple
         if direction != 0 and direction != swings.direction[i]:
             swings.reversals[i] += int(swings.direction[i] != 0)
             swings.direction[i], swings.age[i] = direction, 0
-        oscillates = oscillates or swings.reversals[i] >= REVERSALS
-    return oscillates
+    return bool(swings.reversals.max() >= REVERSALS)
 
 
 class HoldStability:
@@ -83,10 +81,10 @@ class HoldStability:
             return ()
         return tuple(
             Finding(
-                Dtc.HOLD_UNSTABLE, joint.upper(), float(count), True,
-                f"{joint} oscillates although its drive holds it: {count} reversals in a row faster than "
+                Dtc.HOLD_UNSTABLE, JOINTS[joint].upper(), float(count), True,
+                f"{JOINTS[joint]} oscillates although its drive holds it: {count} reversals in a row faster than "
                 f"{np.degrees(SPEED):.0f} deg/s; its drive is switched off",
             )
-            for joint, count in zip(JOINTS, self._swings.reversals.tolist(), strict=True)
+            for joint, count in enumerate(self._swings.reversals.tolist())
             if count >= REVERSALS
         )  # fmt: skip

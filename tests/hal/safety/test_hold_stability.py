@@ -77,6 +77,15 @@ def test_slow_samples_between_two_swings_do_not_count() -> None:
     assert counted.index(True) == 6 * (REVERSALS // 2)
 
 
+@pytest.mark.parametrize("speeds", [(SPEED, -ABOVE), (ABOVE, -SPEED)])
+def test_both_directions_must_exceed_the_speed(speeds: tuple[float, float]) -> None:
+    check, states = HoldStability(), np.full(len(JOINTS), float(DriveState.QUICK_STOP_ACTIVE))
+    velocity = np.zeros(len(JOINTS))
+    for value in speeds * REVERSALS:
+        velocity[KNEE] = value
+        assert check.check(velocity, states) == ()
+
+
 def test_pause_ends_the_series() -> None:
     check = HoldStability()
     oscillate(check, REVERSALS - 1)
