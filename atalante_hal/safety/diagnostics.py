@@ -100,6 +100,7 @@ class Dtc(StrEnum):
     FOOT_CELL = "FOOT_CELL", _R.FULL_ASSIST, _S.WARNING, "a force cell contradicts the other cells of its foot"
     CONTACT_IMPLAUSIBLE = "CONTACT_IMPLAUSIBLE", _R.HOLD, _S.ERROR, "neither foot reports a load on the ground"
     TORQUE_DIRECTION = "TORQUE_DIRECTION", _R.LOWER, _S.ERROR, "a joint moves against its torque, or does not follow it"
+    TORQUE_TRACKING = "TORQUE_TRACKING", _R.LOWER, _S.ERROR, "a drive reports another torque than that of its command"
     HOLD_UNSTABLE = "HOLD_UNSTABLE", _R.LOWER, _S.ERROR, "a joint oscillates although its drive holds its position"
     # Bus.
     BUS_FLOOD = "BUS_FLOOD", _R.HOLD, _S.ERROR, "more frames arrived than the HAL reads in a cycle"

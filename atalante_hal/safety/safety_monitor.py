@@ -28,6 +28,7 @@ from atalante_hal.safety.message_monitor import MessageMonitor
 from atalante_hal.safety.plausibility import Plausibility
 from atalante_hal.safety.start import ENABLE_CYCLES, Refusal, StartRequest, entry_text, refusal, stop_text
 from atalante_hal.safety.state_machine import MOVING, Conditions, next_state
+from atalante_hal.safety.torque_tracking import TorqueTracking
 from atalante_hal.types import PERIOD, State, SupervisorState, Vector
 from atalante_hal.wire.cia402 import DriveState
 from atalante_hal.wire.e2e import SETTLED, Check, Qualification, qualify
@@ -73,6 +74,7 @@ class SafetyMonitor:
         enabling: True while drives are being enabled. In this time, the limiter follows the torques that the drives report.
         recalled: cycle in which QUICK_STOP was last sent to a drive in OPERATION ENABLED.
         proof: test of the directions of all joints, which must be over before the state becomes ACTIVE.
+        torque_tracking: comparison of the reported torques with the sent torques while the robot moves.
         lowered: DBC names of the drives that cannot hold and are being lowered.
     """
 
@@ -118,6 +120,7 @@ class SafetyMonitor:
         self._states_at_start = b""  # drive states in the previous cycle of this start
         self.lowered: set[str] = set()
         self._hold_stability = HoldStability()
+        self.torque_tracking = TorqueTracking(robot.breakaway)
         self._oscillating: set[str] = set()  # DBC names of the drives whose joints oscillated since the last START
         #: True if `evaluate` may skip a cycle that has new data, no fault and the same pendant and drive values as before.
         self._steady = False
@@ -143,21 +146,32 @@ class SafetyMonitor:
             The verdict; None if all inputs are unchanged, so that the last verdict is still valid.
         """
         pendant, state = self._pendant, self._state
-        oscillations = () if self.moving else self._hold_stability.check(state.velocity, state.drive_state)
+        found = self._check_joints()
         if (
             self._steady
             and self._image.all_fresh
             and not self._plausibility.findings
             and not bus_faults
-            and not oscillations
+            and not found
             and pendant.signals.tobytes() == pendant.evaluated
             and self._drive_side.tobytes() == self._drives_evaluated
         ):
             return None
-        self._oscillating.update(finding.node for finding in oscillations)
-        self._evaluate((*bus_faults, *oscillations))
+        self._evaluate((*bus_faults, *found))
         limit, diagnostics = self._limiter.limit, self.memory.bits
         return Verdict(state.supervisor, state.assistance_factor, limit, diagnostics, self._acknowledged)
+
+    def _check_joints(self) -> tuple[Finding, ...]:
+        """Return the faults of the drives that their torques and joints show in this cycle."""
+        state = self._state
+        if self.moving:
+            found = self.torque_tracking.check(self._limiter.last, self._limiter.limit, state.torque)
+            for finding in found:  # the next START tests this joint again
+                self.proof.forget(DRIVE_NODES.index(finding.node))
+            return found
+        found = self._hold_stability.check(state.velocity, state.drive_state)
+        self._oscillating.update(finding.node for finding in found)
+        return found
 
     def accept(self, frames: Frames) -> list[int]:
         """Process all frames except the 1 ms messages to the HAL: status messages, emergencies and unknown frames.
@@ -430,6 +444,7 @@ class SafetyMonitor:
         self.moving = after in MOVING
         if before in MOVING and not self.moving:
             self._hold_stability.restart()
+            self.torque_tracking.restart()
         self.walking = self.walking and self.moving
         if Dtc.OPERATOR_STOP in reasons:
             text = "the program is ending" if self._ending else stop_text(self._pendant.stop_requested)

@@ -163,6 +163,11 @@ NODE_KINDS: Final[Mapping[str, Kind]] = {
         "drive",
         {"share": _number(-2.0, 2.0)},
     ),
+    "torque_wrong": Kind(
+        "a drive produces a multiple of the commanded torque, and measures the torque that it produces",
+        "drive",
+        {"share": _number(-2.0, 2.0)},
+    ),
     "torque_late": Kind("a motor produces its torque `by` cycles late", "drive", {"by": _whole(1, 20)}),
     "over_temperature": Kind("a drive has a given temperature", "drive", {"degrees": _number(-40.0, 214.0, "degC")}),
     "heat_ramp": Kind(

@@ -34,8 +34,9 @@ _MOTORS = np.arange(len(JOINTS))
 MOST_LATE = 20
 
 # Rows of the motor array, first to fourth: torque setpoint, ratio of true to measured torque, dry friction, damping.
-# Rows of the motor array, fifth to seventh: external torque, resulting joint torque, torque of the wearer's limb.
-_WANTED, _STRENGTH, _DRY, _DAMPING, _PUSH, _JOINT, _LIMB = range(7)
+# Rows of the motor array, fifth to eighth: external torque, resulting joint torque, torque of the wearer's limb, ratio of
+# measured torque to setpoint.
+_WANTED, _STRENGTH, _DRY, _DAMPING, _PUSH, _JOINT, _LIMB, _GAIN = range(8)
 
 
 def _advance(
@@ -46,13 +47,13 @@ def _advance(
     Args:
         velocity: true joint velocities, shape (12,) [rad/s].
         setpoint: setpoints of the motor torques that reach the current loops, shape (12,) [Nm].
-        motors: motor array, shape (7, 12). Its joint torques are updated.
+        motors: motor array, shape (8, 12). Its joint torques are updated.
         tracking: share of the torque deviation that the current loop removes per `PERIOD`.
         friction_speed: joint speed at which dry friction reaches 76 % of its full value [rad/s].
         torque: measured motor torques, shape (12,) [Nm]. Updated here.
     """
     for i in range(len(torque)):
-        torque[i] += tracking * (setpoint[i] - torque[i])
+        torque[i] += tracking * (motors[_GAIN, i] * setpoint[i] - torque[i])
         friction = motors[_DRY, i] * math.tanh(velocity[i] / friction_speed) + motors[_DAMPING, i] * velocity[i]
         motors[_JOINT, i] = motors[_STRENGTH, i] * torque[i] - friction + motors[_PUSH, i] + motors[_LIMB, i]
 
@@ -64,7 +65,7 @@ class Motors:
         both = len(SIDES)
         self._parameters, self._torque, self.temperature = parameters, torque, temperature
         self._tracking = 1.0 - math.exp(-PERIOD / parameters.current_loop)
-        self._motors = np.zeros((7, len(JOINTS)))
+        self._motors = np.zeros((8, len(JOINTS)))
         self.wanted, self._joint = self._motors[_WANTED], self._motors[_JOINT]
         #: Cycles until a new setpoint reaches the current loop of each motor, and the setpoints of the last cycles.
         self._dead_time = np.full(len(JOINTS), parameters.dead_time)
@@ -74,7 +75,7 @@ class Motors:
         self.limb = self._motors[_LIMB]
         self._viscous = np.array(parameters.viscous * both)
         self._braked = self._viscous + parameters.brake * both
-        self._motors[_STRENGTH] = 1.0
+        self._motors[_STRENGTH] = self._motors[_GAIN] = 1.0
         self._motors[_DRY] = parameters.coulomb * both
         self._motors[_DAMPING] = self._braked
         self._heat = parameters.heating / (0.5 * robot.torque_max) ** 2
@@ -98,6 +99,15 @@ class Motors:
             strength: ratio. A motor without fault has 1, a reversed motor -1.
         """
         self._motors[_STRENGTH, motor] = strength
+
+    def misdrive(self, motor: int, gain: float) -> None:
+        """Set the ratio of measured torque to setpoint of a motor. The true torque changes with the measured torque.
+
+        Args:
+            motor: index of the motor.
+            gain: ratio. A motor without fault has 1, a motor whose power stage is off 0.
+        """
+        self._motors[_GAIN, motor] = gain
 
     def delay(self, motor: int, cycles: int) -> None:
         """Set the additional time until a setpoint reaches the current loop of a motor.

@@ -133,6 +133,10 @@ class NodeFaults:
         if cycle in (fault.start, fault.end):
             self._drives.motors.weaken(_drive(nodes), fault["share"] if cycle < fault.end else 1.0)
 
+    def _torque_wrong(self, fault: Fault, nodes: Nodes, cycle: int) -> None:
+        if cycle in (fault.start, fault.end):
+            self._drives.motors.misdrive(_drive(nodes), fault["share"] if cycle < fault.end else 1.0)
+
     def _torque_late(self, fault: Fault, nodes: Nodes, cycle: int) -> None:
         if cycle in (fault.start, fault.end):
             self._drives.motors.delay(_drive(nodes), fault["by"] if cycle < fault.end else 0)
@@ -267,6 +271,7 @@ _EFFECTS: Final[dict[str, Callable[[NodeFaults, Fault, Nodes, int], None]]] = {
     "reset": NodeFaults._reset,
     "push": NodeFaults._push,
     "torque_weak": NodeFaults._torque_weak,
+    "torque_wrong": NodeFaults._torque_wrong,
     "torque_late": NodeFaults._torque_late,
     "over_temperature": NodeFaults._over_temperature,
     "heat_ramp": NodeFaults._heat_ramp,

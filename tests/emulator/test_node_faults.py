@@ -186,6 +186,15 @@ class TestDrives:
         hal.run(400)
         assert CROUCHED[KNEE] - emulator.body.position[KNEE] < 0.9 * sag
 
+    @pytest.mark.parametrize("share", [-1.0, 0.0, 0.5])
+    def test_drive_with_a_wrong_torque_measures_it_until_the_fault_ends(self, world: Make, share: float) -> None:
+        hal, emulator = world(Fault("torque_wrong", "LEFT_SK", BEGIN, 10, share=share), cycles=BEGIN + 8)
+        wanted = emulator.drives.motors.wanted[KNEE]
+        assert abs(wanted) > 5.0
+        assert hal.joints("Torque")[KNEE] == pytest.approx(share * wanted, abs=0.3 * abs(wanted))
+        hal.run(30)
+        assert hal.joints("Torque")[KNEE] == pytest.approx(emulator.drives.motors.wanted[KNEE], abs=0.3 * abs(wanted))
+
     def test_torque_of_a_late_motor_arrives_late_until_the_fault_ends(self, world: Make) -> None:
         late, emulator = world(Fault("torque_late", "LEFT_SK", BEGIN, 200, by=7), cycles=BEGIN - 1)
         healthy, other = world(cycles=BEGIN - 1)

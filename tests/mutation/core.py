@@ -24,6 +24,7 @@ CORE = {
         ("hal/safety/test_state_machine.py", "hal/safety/test_diagnostics.py", "hal/wire/test_cia402.py"),
     ),
     "hold_stability": (("atalante_hal/safety/hold_stability.py",), ("hal/safety/test_hold_stability.py",)),
+    "torque_tracking": (("atalante_hal/safety/torque_tracking.py",), ("hal/safety/test_torque_tracking.py",)),
     "direction": (("atalante_hal/safety/direction.py",), ("hal/safety/test_direction.py",)),
     "limiter": (("atalante_hal/safety/limiter.py",), ("hal/safety/test_limiter.py",)),
     "guide": (

@@ -17,6 +17,7 @@ from atalante_hal.safety.hold_stability import REVERSALS
 from atalante_hal.safety.limiter import Limited, Limiter
 from atalante_hal.safety.safety_monitor import FINISH_STEP_CYCLES, RECALL_CYCLES
 from atalante_hal.safety.start import ENABLE_CYCLES, STALLED_CYCLES, WALK_ENDS, stop_text
+from atalante_hal.safety.torque_tracking import CONFIRM, SPAN
 from atalante_hal.types import PERIOD, SupervisorState
 from atalante_hal.wire.cia402 import Controlword, DriveState
 from atalante_hal.wire.e2e import crc, data_id_bytes
@@ -426,6 +427,42 @@ def test_joint_that_oscillates_in_hold_is_lowered_until_the_next_start(rig):
     rig.until(S.LOWER, 6 * REVERSALS)
     rig.run(3)
     assert rig.hal.state.drive_state[KNEE] == DriveState.SWITCH_ON_DISABLED
+
+
+def test_drive_that_reports_another_torque_is_switched_off_and_tested_at_the_next_start(rig):
+    rig.until(S.ACTIVE)
+    rig.run(2 * SPAN)
+    set_signal(rig, "LEFT_SK_STATE", "Torque", 30.0)
+    assert rig.run(CONFIRM - 1).supervisor is S.ACTIVE
+    assert rig.run(1).supervisor is S.LOWER
+    assert "left_SK reports a torque of 30.0 Nm" in rig.hal.reason
+    rig.emulator.before_send.clear()
+    state = rig.run(50)
+    assert state.drive_state[KNEE] == DriveState.SWITCH_ON_DISABLED
+    assert (np.delete(state.drive_state, KNEE) == DriveState.QUICK_STOP_ACTIVE).all()
+    rig.operator.start()
+    rig.until(S.HOLD, 5)
+    before = rig.codes().count("DIRECTIONS_PROVEN")
+    rig.operator.start()
+    rig.until(S.ACTIVE, 150)
+    assert rig.codes().count("DIRECTIONS_PROVEN") == before + 1
+
+
+def test_torques_are_compared_anew_after_each_start(rig):
+    rig.until(S.ACTIVE)
+    rig.run(2 * SPAN)
+    set_signal(rig, "LEFT_SK_STATE", "Torque", 30.0)
+    rig.run(CONFIRM - 1)
+    rig.emulator.before_send.clear()
+    rig.operator.hold()
+    rig.until(S.HOLD)
+    rig.operator.start()
+    rig.until(S.ACTIVE, 150)
+    set_signal(rig, "LEFT_SK_STATE", "Torque", 30.0)
+    rig.run(SPAN + CONFIRM - 4)
+    assert "TORQUE_TRACKING" not in rig.codes()
+    rig.run(4)
+    assert "TORQUE_TRACKING" in rig.codes()
 
 
 def test_joint_that_oscillates_before_active_is_switched_off(make_rig):

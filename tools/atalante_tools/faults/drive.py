@@ -271,6 +271,26 @@ SCENARIOS: Final = (
             for late in (8, 10)
         ),
     ),
+    # The HAL finds a wrong torque when it exceeds its tolerance, a fifth of the breakaway torque of the joint.
+    Scenario(
+        "F75",
+        tuple(
+            Case(
+                f"{node} with {share:g} times its torque",
+                (Fault("torque_wrong", node, 0, 600, share=share),),
+                node=node,
+                observed=_LOWERED,
+            )
+            for node, share in (
+                *((f"LEFT_{joint}", -1.0) for joint in LEG_JOINTS),
+                *((f"LEFT_{joint}", 0.0) for joint in LEG_JOINTS),
+                (_KNEE, 0.4),
+                (_KNEE, 1.6),
+                (_HIP, 0.4),
+                (_HIP, 1.6),
+            )
+        ),
+    ),
     # A push accelerates the joint beyond its top speed within 25 cycles.
     Scenario(
         "F71",

@@ -1,0 +1,108 @@
+"""Check that each drive produces the torque that the HAL sends: `torques sent, torques reported -> findings`.
+
+A drive that stays in OPERATION ENABLED may still produce another torque: a power stage that is off, exchanged phases, or a
+wrong current. If its torque measurement works, its state frames show it while the drive state does not.
+
+*Range.* A drive follows a command within two milliseconds. It repeats its last command for up to four cycles, and its frame
+may be late by four cycles. So a reported torque must lie in the range of the torques sent in the last `SPAN` cycles. The drive
+may limit a torque that the HAL still reduces with its torque rate. The range then includes the torque limit. A torque may be
+outside the range by `TOLERANCE` times the breakaway torque of the joint. That is less than half of its dry friction.
+
+*Limits of the check.* A drive that reports the torque of its command but produces another torque passes.
+"""
+
+from __future__ import annotations
+
+from typing import Final, NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from atalante_hal.compiled import specialised
+from atalante_hal.robot import JOINTS
+from atalante_hal.safety.diagnostics import Dtc, Finding
+from atalante_hal.types import Vector
+
+#: Number of cycles of which the sent torques count: four lost commands, four cycles in which the frame is late, and four cycles
+#: for the answer of the drive.
+SPAN: Final = 12
+#: Largest distance of a reported torque from the range of the sent torques, relative to the breakaway torque of the joint.
+TOLERANCE: Final = 0.2
+#: Number of consecutive cycles with a wrong torque at which a drive does not follow its command.
+CONFIRM: Final = 5
+
+
+class Tracking(NamedTuple):
+    """Memory of the check."""
+
+    sent: Vector  # (SPAN, 12) Nm, torques sent in the last cycles; the oldest is overwritten
+    cycles: npt.NDArray[np.int64]  # (1,) number of cycles since the restart
+    wrong: npt.NDArray[np.int64]  # (12,) number of consecutive cycles with a wrong torque
+
+
+def _compare(sent: Vector, limit: Vector, reported: Vector, tolerance: Vector, tracking: Tracking) -> bool:
+    """Compare the reported torques of one cycle with the sent torques, and return whether a drive does not follow its command.
+
+    Args:
+        sent: torques sent in the last cycle, shape (12,) [Nm].
+        limit: torque limits of the drives, shape (12,) [Nm].
+        reported: reported torques, shape (12,) [Nm].
+        tolerance: largest distance of a reported torque from the range of the sent torques, shape (12,) [Nm].
+        tracking: memory to update.
+    """
+    row, found = tracking.cycles[0] % SPAN, False
+    tracking.cycles[0] += 1
+    complete = tracking.cycles[0] >= SPAN
+    for i in range(len(sent)):
+        tracking.sent[row, i] = sent[i]
+        low = high = sent[i]
+        for past in range(SPAN):
+            low, high = min(low, tracking.sent[past, i]), max(high, tracking.sent[past, i])
+        low, high = min(low, limit[i]) - tolerance[i], max(high, -limit[i]) + tolerance[i]
+        within = low <= reported[i] <= high
+        tracking.wrong[i] = tracking.wrong[i] + 1 if complete and not within else 0
+        found = found or tracking.wrong[i] >= CONFIRM
+    return found
+
+
+class TorqueTracking:
+    """Check of all drives while the HAL sends the torques of the controller.
+
+    Attributes:
+        tolerance: largest distance of a reported torque from the range of the sent torques, shape (12,) [Nm].
+
+    Args:
+        breakaway: breakaway torques of the joints, shape (12,) [Nm].
+    """
+
+    def __init__(self, breakaway: Vector) -> None:
+        self.tolerance = TOLERANCE * breakaway
+        self._tracking = Tracking(np.zeros((SPAN, len(JOINTS))), np.zeros(1, np.int64), np.zeros(len(JOINTS), np.int64))
+        zero = np.zeros(len(JOINTS))
+        self._compare = specialised(_compare, zero, zero, zero, self.tolerance, self._tracking)
+        self.restart()
+
+    def restart(self) -> None:
+        """Forget all torques, because the drives did not follow the controller until now."""
+        for record in self._tracking:
+            record[:] = 0
+
+    def check(self, sent: Vector, limit: Vector, reported: Vector) -> tuple[Finding, ...]:
+        """Compare the torques of one cycle, and return one finding for each drive that does not follow its command.
+
+        Args:
+            sent: torques sent in the last cycle, shape (12,) [Nm].
+            limit: torque limits of the drives, shape (12,) [Nm].
+            reported: torques reported in this cycle, shape (12,) [Nm].
+        """
+        if not self._compare(sent, limit, reported, self.tolerance, self._tracking):
+            return ()
+        return tuple(
+            Finding(
+                Dtc.TORQUE_TRACKING, JOINTS[joint].upper(), float(reported[joint]), True,
+                f"{JOINTS[joint]} reports a torque of {reported[joint]:.1f} Nm, which must follow the command of "
+                f"{sent[joint]:.1f} Nm",
+            )
+            for joint, cycles in enumerate(self._tracking.wrong.tolist())
+            if cycles >= CONFIRM
+        )  # fmt: skip
