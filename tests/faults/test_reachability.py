@@ -10,6 +10,7 @@ from pathlib import Path
 import pytest
 
 from atalante_emulator import drive as emulated
+from atalante_emulator.pendant import Request
 from atalante_hal.safety import safety_monitor
 from atalante_hal.safety.safety_monitor import SafetyMonitor
 from atalante_hal.safety.start import ENABLE_CYCLES
@@ -35,9 +36,14 @@ S = SupervisorState
 PAGE = Path(__file__).parents[2] / "docs" / "reference" / "reachability.md"
 
 
+@pytest.fixture(scope="module")
+def path() -> OperatorPath:
+    return OperatorPath()
+
+
 @pytest.mark.parametrize("name", SEARCHES)
-def test_no_sequence_of_inputs_breaks_a_property(name: str):
-    found = search(name)
+def test_no_sequence_of_inputs_breaks_a_property(name: str, path: OperatorPath):
+    found = search(name, path)
     assert found.broken == "", found.trace
     figures = re.search(rf"^\| {name} \| (\d+) \| (\d+) \|", PAGE.read_text(), re.MULTILINE)
     assert figures
@@ -46,7 +52,7 @@ def test_no_sequence_of_inputs_breaks_a_property(name: str):
 
 
 def test_report_has_one_row_for_each_search(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]):
-    monkeypatch.setattr(report, "search", lambda name: Exploration(2, 3, "", ()))
+    monkeypatch.setattr(report, "search", lambda name, path: Exploration(2, 3, "", ()))
     report.main()
     rows = capsys.readouterr().out.splitlines()
     assert rows[0] == "| search | states | transitions | properties |"
@@ -55,7 +61,7 @@ def test_report_has_one_row_for_each_search(monkeypatch: pytest.MonkeyPatch, cap
 
 def test_report_ends_with_the_trace_of_a_violation(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]):
     violated = Exploration(2, 3, LATCH_PROPERTY, (("press", "READY"), ("release", "ACTIVE")))
-    monkeypatch.setattr(report, "search", lambda name: violated)
+    monkeypatch.setattr(report, "search", lambda name, path: violated)
     with pytest.raises(SystemExit, match="1"):
         report.main()
     printed = capsys.readouterr().out
@@ -114,6 +120,18 @@ def test_late_watchdog_is_found_and_its_scenario_shows_it(monkeypatch: pytest.Mo
 def test_released_latch_is_found(monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(emulated, "next_state", lambda state, word, *, latched: cia402.next_state(state, word))
     assert DriveSteps().search().broken in (LATCH_PROPERTY, WATCHDOG_PROPERTY)
+
+
+def test_a_decision_does_not_depend_on_earlier_pendant_frames():
+    steps = hal_steps.HalSteps()
+    before = hal_steps.Supervision(S.ACTIVE, hal_steps.NO_START, enabling=True)
+    inputs, environment = hal_steps.Inputs(True, 0, False), hal_steps.Environment(walking=True)
+    expected = list(steps.decide(before, inputs, environment))
+    frame = hal_steps.PendantFrame(0, True, Request.START, False)
+    for dead_man, request, rogue, stored in product((True, False), Request, (True, False), (True, False)):
+        received = hal_steps.Reception(dead_man=dead_man, request=request, rogue=rogue, stored=stored)
+        steps.receive(received, (frame, frame))  # each doubled frame fills the leaky bucket of the HAL
+    assert list(steps.decide(before, inputs, environment)) == expected
 
 
 # -- abstraction ------------------------------------------------------------------------------------------------------

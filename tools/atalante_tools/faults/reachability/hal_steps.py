@@ -24,7 +24,7 @@ from atalante_hal.safety.safety_monitor import DRIVE_NODES, RECALL_CYCLES
 from atalante_hal.safety.state_machine import MOVING
 from atalante_hal.types import Command, SupervisorState
 from atalante_hal.wire.cia402 import Controlword, DriveState
-from atalante_hal.wire.e2e import FULL, NOTHING, REQUALIFY, SETTLED, Qualification
+from atalante_hal.wire.e2e import FULL, NOTHING, REQUALIFY, SETTLED, Check, Qualification
 from atalante_hal.wire.frame import Frames, new_frames
 from atalante_hal.wire.process_image import NEVER, TransmitImage
 from atalante_tools.faults.reachability.no_bus import NoBus
@@ -146,13 +146,30 @@ class HalSteps:
         self._dtc = {reaction: next(d for d in Dtc if d.reaction is reaction) for reaction in Reaction}
         self._parts = self._hal._parts
         self._frame = cache(self._sealed)
-        #: `_receive` and `_without_press` with a cache of all results.
+        #: `_receive`, `_process` and `_without_press` with a cache of all results.
         self.receive, self.without_press = cache(self._receive), cache(self._without_press)
+        self._processed = cache(self._process)
 
     # -- pendant -----------------------------------------------------------------------------------------------------
 
     def _receive(self, before: Reception, frames: tuple[PendantFrame, ...]) -> tuple[tuple[Reception, Inputs], ...]:
         """Return the possible results of a cycle in which frames of the pendant arrive.
+
+        `own_request` belongs to the pendant, not to the HAL. It is therefore computed here, so that the HAL runs only once for
+        states that differ only in it.
+
+        Args:
+            before: state before the cycle.
+            frames: frames that arrive, in order.
+        """
+        own = [frame.request for frame in frames if not (frame.sender or frame.age)]
+        return tuple(
+            (after if after.age == LOST else after._replace(own_request=_own_request(before, own, after)), inputs)
+            for after, inputs in self._processed(before._replace(own_request=0), frames)
+        )
+
+    def _process(self, before: Reception, frames: tuple[PendantFrame, ...]) -> tuple[tuple[Reception, Inputs], ...]:
+        """Return the possible results of the HAL, with `own_request` 0.
 
         Counters that a state does not contain are set to each value that gives another result, see the tests.
 
@@ -204,11 +221,7 @@ class HalSteps:
         trusted = monitor._message_monitor.is_trusted(row)
         now = int(image.age[row])
         if now < LOST:
-            own = [frame.request for frame in frames if not (frame.sender or frame.age)] if rogue else [int(request)]
-            own_request = (before.own_request, *own)[-1]
-            after = Reception(
-                now, dead_man == 1, int(request), evaluated, rogue, pendant._pressed, trusted, own_request
-            )
+            after = Reception(now, dead_man == 1, int(request), evaluated, rogue, pendant._pressed, trusted, 0)
         else:
             after = SILENT._replace(evaluated=evaluated, stored=pendant._pressed, trusted=trusted)
         stop = 2 if pendant.hold_requested else int(pendant.stop_requested)
@@ -313,8 +326,12 @@ class HalSteps:
         hal.state.drive_state[:] = DriveState.OPERATION_ENABLED
         hal.state.torque[:] = 0.0
         self._parts.motion[:] = 0.0
-        self._image.refused = []
-        self._others_answer()
+        # A step must not depend on the pendant frames of an earlier step.
+        monitor._message_monitor._disturbed.clear()
+        monitor._message_monitor._was_trusted = [True] * rows
+        self._image.refused, self._image.error_passive, self._image._offered = [], [], None
+        self._image.age.fill(0)
+        self._image.check.fill(Check.OK)
 
     def _others_answer(self) -> None:
         """Mark the data of every node except the pendant as new."""
@@ -331,6 +348,17 @@ class HalSteps:
         monitor.start_wanted, monitor.enabling = START_CYCLES[state.start], state.enabling
         if state.lowered:
             monitor.lowered.add(DRIVE_NODES[0])
+
+
+def _own_request(before: Reception, own: list[int], after: Reception) -> int:
+    """Return the `Request` of the last intact frame of the pendant itself.
+
+    Args:
+        before: state before the cycle.
+        own: requests of the frames that the pendant itself sent in this cycle.
+        after: state after the cycle, whose last accepted frame is not older than the timeout.
+    """
+    return (before.own_request, *own)[-1] if after.rogue else after.request
 
 
 #: Controlword with which a drive follows the torque commands of the HAL.
