@@ -65,6 +65,9 @@ def specialised(function: Callable[P, R], *args: P.args, **kwargs: P.kwargs) -> 
     if machine is function:
         return function
     dispatcher = cast(Any, machine)
+    if len(dispatcher.overloads) == 1:  # that of the first call; finding it by the types of its arguments takes longer
+        (only,) = dispatcher.overloads.values()
+        return cast(Callable[P, R], only.entry_point)
     types = tuple(dispatcher.typeof_pyval(arg) for arg in args)
     return cast(Callable[P, R], dispatcher.get_overload(types))
 

@@ -48,6 +48,12 @@ def test_specialised_function_gives_the_same_result_and_checks_bounds(monkeypatc
     assert specialised(total, values, 1.5) is total
 
 
+def test_specialised_function_has_the_types_of_its_own_call() -> None:
+    reals, integers = np.array([0.5, 2.5]), np.array([3, 4])
+    for values in (reals, integers, reals, integers):
+        assert specialised(element, values, 0)(values, 1) == values[1]
+
+
 def test_function_is_compiled_only_once() -> None:
     assert compiled(total) is compiled(total)
     assert compiled(total) is not total
