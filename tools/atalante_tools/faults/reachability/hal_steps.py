@@ -270,7 +270,6 @@ class HalSteps:
         monitor._heartbeats.all_reported = environment.nodes_ready
         if not environment.enabled:
             hal.state.drive_state[1] = DriveState.QUICK_STOP_ACTIVE
-        self._others_answer()
         findings = [
             Finding(self._dtc[environment.reaction], DRIVE_NODES[0 if environment.mine else 1], 0.0, True, "input")
         ]
@@ -338,7 +337,7 @@ class HalSteps:
         image, row = self._image, self._row
         age, check = int(image.age[row]), int(image.check[row])
         image.age.fill(0)
-        image.check.fill(0)
+        image.check.fill(Check.OK)
         image.age[row], image.check[row] = age, check
 
     def _write(self, state: Supervision) -> None:
