@@ -91,7 +91,7 @@ class Motors:
         """
         self._motors[_DAMPING] = np.where(powered, self._viscous, self._braked)
 
-    def weaken(self, motor: int, strength: float) -> None:
+    def set_strength(self, motor: int, strength: float) -> None:
         """Set the ratio of true torque to measured torque of a motor.
 
         Args:
@@ -100,7 +100,7 @@ class Motors:
         """
         self._motors[_STRENGTH, motor] = strength
 
-    def misdrive(self, motor: int, gain: float) -> None:
+    def set_gain(self, motor: int, gain: float) -> None:
         """Set the ratio of measured torque to setpoint of a motor. The true torque changes with the measured torque.
 
         Args:
@@ -130,8 +130,8 @@ class Motors:
     def advance(self, velocity: Vector) -> list[float]:
         """Advance the motors by one `PERIOD` and return the torques on the joints.
 
-        The measured motor torque follows the setpoint `wanted`. The joint torque is the true motor torque (see `weaken`) minus
-        friction and brake torque, plus the external torque and the torque of the wearer's limb.
+        The measured motor torque follows the setpoint `wanted`. The joint torque is the true motor torque (see `set_strength`)
+        minus friction and brake torque, plus the external torque and the torque of the wearer's limb.
 
         Args:
             velocity: true joint velocities, shape (12,) [rad/s]. The friction depends on them.

@@ -131,11 +131,11 @@ class NodeFaults:
 
     def _torque_weak(self, fault: Fault, nodes: Nodes, cycle: int) -> None:
         if cycle in (fault.start, fault.end):
-            self._drives.motors.weaken(_drive(nodes), fault["share"] if cycle < fault.end else 1.0)
+            self._drives.motors.set_strength(_drive(nodes), fault["share"] if cycle < fault.end else 1.0)
 
     def _torque_wrong(self, fault: Fault, nodes: Nodes, cycle: int) -> None:
         if cycle in (fault.start, fault.end):
-            self._drives.motors.misdrive(_drive(nodes), fault["share"] if cycle < fault.end else 1.0)
+            self._drives.motors.set_gain(_drive(nodes), fault["share"] if cycle < fault.end else 1.0)
 
     def _torque_late(self, fault: Fault, nodes: Nodes, cycle: int) -> None:
         if cycle in (fault.start, fault.end):

@@ -58,11 +58,11 @@ def test_weak_motor_makes_less_torque_than_it_measures(robot: Robot) -> None:
     measured = np.zeros(12)
     motors = Motors(robot, SMOOTH, measured, np.zeros(12))
     motors.power(POWERED)
-    motors.weaken(2, 0.25)
+    motors.set_strength(2, 0.25)
     motors.wanted[:] = 40.0
     np.testing.assert_allclose(settle(motors), [40.0, 40.0, 10.0] + [40.0] * 9, rtol=1e-6)
     np.testing.assert_allclose(measured, 40.0, rtol=1e-6)
-    motors.weaken(2, 1.0)
+    motors.set_strength(2, 1.0)
     np.testing.assert_allclose(settle(motors), 40.0, rtol=1e-6)
 
 

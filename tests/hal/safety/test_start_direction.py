@@ -25,7 +25,7 @@ ONCE = sum(duration + LATENCY + 1 for _, duration in GROUPS)
 @pytest.mark.parametrize("joint", range(6), ids=JOINTS[:6])
 def test_start_with_a_reversed_motor_fails_and_names_the_joint(make_rig, joint: int):
     rig = make_rig(starts=False)
-    rig.emulator.drives.motors.weaken(joint, -1.0)
+    rig.emulator.drives.motors.set_strength(joint, -1.0)
     rig.until(S.READY)
     rig.operator.start()
     anchor, moved = rig.emulator.body.position.copy(), np.zeros(12)
@@ -49,7 +49,7 @@ def test_start_with_a_reversed_motor_fails_and_names_the_joint(make_rig, joint: 
 @pytest.mark.parametrize("joint", [3, 4, 5], ids=[JOINTS[j] for j in (3, 4, 5)])
 def test_start_with_a_dead_motor_fails(make_rig, joint: int):
     rig = make_rig()
-    rig.emulator.drives.motors.weaken(joint, 0.0)
+    rig.emulator.drives.motors.set_strength(joint, 0.0)
     rig.run(600)
     assert [event.text.split()[0] for event in rig.hal.events if event.code == "START_FAILED"][:1] == [JOINTS[joint]]
     assert not any(event.code == "ACTIVE" for event in rig.hal.events)
