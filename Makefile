@@ -73,8 +73,8 @@ clean: ## remove the virtual environments, runs and site
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || { echo "Python must be 3.11 or newer: call make PYTHON=/path/to/python3.11" >&2; exit 1; }
 	$(PYTHON) -m venv .venv
 
-# Install an extra, and compile its modules on all cores, because pip compiles on one core. The tests of the packages, half of all
-# modules, are left out. Some packages contain files that are not valid Python; pip ignores them, too.
+# Install an extra, and compile its modules on all cores, because pip compiles on one core. The tests of the packages are left out,
+# because they take half of the time. Some packages contain files that are not valid Python; pip ignores them, too.
 define install
 $(BIN)/pip install --quiet --disable-pip-version-check --no-compile --editable '.[$(1)]'
 @$(BIN)/python -W ignore -m compileall -qq -j 0 -x '/tests/' .venv/lib || true

@@ -57,7 +57,7 @@ CONFIRMED = {
 }
 #: Check results that prove a second sender if another intact frame of the message arrived in the same cycle.
 _RIVAL = (Check.CONFLICT, Check.WRONG_SEQUENCE)
-#: Check results of rejected frames with correct format and CRC.
+#: Results of the E2E check of a rejected frame whose format and CRC are correct.
 _INTACT = (*_RIVAL, Check.RANGE, Check.INVALID)
 _FRESH = int(Check.SOME_LOST)
 #: Result of the E2E check of a rejected frame -> diagnostic that is raised when its leaky bucket is full.

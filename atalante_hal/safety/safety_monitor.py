@@ -162,11 +162,14 @@ class SafetyMonitor:
         return Verdict(state.supervisor, state.assistance_factor, limit, diagnostics, self._acknowledged)
 
     def _check_joints(self) -> tuple[Finding, ...]:
-        """Return the faults of the drives that their torques and joints show in this cycle."""
+        """Check the torques of the drives while the robot moves, and else the joints for oscillations; return the faults found.
+
+        A drive with a wrong torque loses its proof of direction. The drive of an oscillating joint is stored.
+        """
         state = self._state
         if self.moving:
             found = self.torque_tracking.check(self._limiter.last, self._limiter.limit, state.torque)
-            for finding in found:  # the next START tests this joint again
+            for finding in found:  # the next START tests the direction of this joint again
                 self.proof.forget(DRIVE_NODES.index(finding.node))
             return found
         found = self._hold_stability.check(state.velocity, state.drive_state)

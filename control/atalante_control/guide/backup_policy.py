@@ -134,7 +134,7 @@ class Responses(NamedTuple):
 
 
 def responses(policy: BackupPolicy, loop: SampledLoop, mobility: float, cycles: int, delay: int = 1) -> Responses:
-    """Compute the response of the sampled loop for each number of cycles ahead.
+    """Compute how the sampled loop responds to its initial state and to a unit acceleration, in each cycle.
 
     Args:
         policy: gains of the backup policy.

@@ -36,7 +36,7 @@ _DIGITS = 4
 
 
 class Choice(NamedTuple):
-    """Guide filter of a step, and the torques that it promises, as a fraction of the chosen promised torques."""
+    """Guide filter of a step, and the disturbance torques for which it is certified, as a fraction of the chosen ones."""
 
     guide: GuideFilter
     promise: float

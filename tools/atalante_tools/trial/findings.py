@@ -132,7 +132,7 @@ def sweep_findings(results: Sequence[Result]) -> list[Finding]:
 
 
 def protocol_findings(results: Sequence[Result]) -> list[Finding]:
-    """Return the findings of the experiment `protocol`: walks end standing and inside the guide, guides have a promise.
+    """Return the findings of `protocol`: whether all walks end standing, inside the guide, and with certified guides.
 
     Args:
         results: results of `walk` trials.
