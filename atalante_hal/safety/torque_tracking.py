@@ -50,7 +50,7 @@ def _compare(sent: Vector, limit: Vector, reported: Vector, tolerance: Vector, t
         tolerance: largest distance of a reported torque from the range of the sent torques, shape (12,) [Nm].
         tracking: memory to update.
     """
-    row, found = tracking.cycles[0] % SPAN, False
+    row = tracking.cycles[0] % SPAN
     tracking.cycles[0] += 1
     complete = tracking.cycles[0] >= SPAN
     for i in range(len(sent)):
@@ -61,8 +61,7 @@ def _compare(sent: Vector, limit: Vector, reported: Vector, tolerance: Vector, t
         low, high = min(low, limit[i]) - tolerance[i], max(high, -limit[i]) + tolerance[i]
         within = low <= reported[i] <= high
         tracking.wrong[i] = tracking.wrong[i] + 1 if complete and not within else 0
-        found = found or tracking.wrong[i] >= CONFIRM
-    return found
+    return bool(tracking.wrong.max() >= CONFIRM)
 
 
 class TorqueTracking:

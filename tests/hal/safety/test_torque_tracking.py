@@ -38,6 +38,12 @@ def test_torque_beyond_the_tolerance_is_found_after_the_confirmation(joint: int,
         assert wrong_cycles([sent] * cycles, reported, joint=joint) == found
 
 
+@pytest.mark.parametrize("direction", [1.0, -1.0])
+def test_torque_at_exactly_the_tolerance_is_not_found(direction: float) -> None:
+    cycles = SPAN + CONFIRM
+    assert wrong_cycles([0.0] * cycles, [direction * TOLERANCE * BREAKAWAY[KNEE]] * cycles) == []
+
+
 @pytest.mark.parametrize(("share", "found"), [(-1.0, True), (0.0, True), (0.4, True), (1.0, False), (1.6, True)])
 def test_share_of_the_torque_is_found(share: float, found: bool) -> None:
     sent = [20.0] * (SPAN + CONFIRM)
