@@ -12,15 +12,16 @@ import warnings
 from collections.abc import Callable, Generator, Iterable, Iterator
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import ExitStack, contextmanager
-from itertools import count
 from typing import Final, TypeVar
 
 _Task = TypeVar("_Task")
 _Result = TypeVar("_Result")
 #: Timeout of the connection to a dask scheduler.
 _CONNECT_TIMEOUT: Final = "10s"
-#: Number of times that lost processes are replaced. A call that always ends its process is therefore not repeated forever.
-_REPLACEMENTS: Final = 3
+#: Number of unexpected ends of a process after which each further call gets processes of its own. Then only the calls that end
+#: their process have no result.
+_SHARED_LOSSES: Final = 3
+_REMEDY: Final = "repeat the command, if necessary with fewer --jobs"
 _LOKY_THREAD: Final = "ExecutorManagerThread"
 
 
@@ -29,7 +30,7 @@ class FanOutError(RuntimeError):
 
 
 class LostProcessError(FanOutError):
-    """Unexpected end of a process, for example for lack of memory. Some calls have no result."""
+    """Unexpected end of a process, for example for lack of memory. Calls have no result because of it."""
 
 
 def fan_out(
@@ -52,11 +53,12 @@ def fan_out(
         cluster: address of a dask scheduler such as tcp://127.0.0.1:8786. The project must be installed on its workers.
         patience: longest time between two results [s], or None for no limit. On a cluster there is no limit.
         on_lost: function that receives a message when a process of this computer has ended unexpectedly, for example for lack of
-            memory. The calls without a result are then repeated in new processes, up to 3 times. If None, they are not repeated.
+            memory. The calls without a result are then repeated in new processes. After 3 such ends, they are called one at a
+            time, and a call that ends its process again is not repeated. If None, no call is repeated.
 
     Raises:
         FanOutError: If joblib or dask is missing, or the scheduler does not respond.
-        LostProcessError: If a process ended unexpectedly, and its calls are not repeated.
+        LostProcessError: If calls have no result because their processes ended unexpectedly. The other calls were finished.
         TimeoutError: If no result arrives within `patience`.
     """
     if jobs == 1 and not cluster:
@@ -72,34 +74,42 @@ def fan_out(
         if cluster:
             stack.enter_context(_client(cluster))
             stack.enter_context(parallel_config(backend="dask"))
-        pending = dict(enumerate(tasks))
-        for replacements in count():
+        pending, without_result, losses = dict(enumerate(tasks)), 0, 0
+        while pending:
+            alone = losses >= _SHARED_LOSSES
+            calls = list(pending.items())[: 1 if alone else None]
             pool = Parallel(
                 n_jobs=-1 if cluster else jobs, return_as="generator_unordered", timeout=None if cluster else patience
             )
-            with _without_ctrl_c():
-                results = pool(delayed(_numbered)(call, number, task) for number, task in list(pending.items()))
+            results = None
             try:
+                with _without_ctrl_c():
+                    results = pool(delayed(_numbered)(call, number, task) for number, task in calls)
                 for number, result in results:
                     del pending[number]
                     yield result
-                return
             except multiprocessing.TimeoutError as error:  # joblib does not raise the built-in TimeoutError
                 raise TimeoutError(f"no parallel call finished within {patience:g} s") from error
             except BrokenProcessPool as error:
-                lost = (
-                    f"a process ended unexpectedly, for example for lack of memory; {len(pending)} calls have no result"
-                )
-                if on_lost is None or replacements == _REPLACEMENTS:
-                    raise LostProcessError(f"{lost}: repeat the command, if necessary with fewer --jobs") from error
-                on_lost(f"{lost} and are repeated in new processes")
-                # One of the calls that were started may end its process again. They are repeated after the other calls.
-                for number in list(pending)[: 2 * jobs]:  # joblib starts or queues this number of calls
-                    pending[number] = pending.pop(number)
+                if on_lost is None:
+                    raise LostProcessError(f"{_lost(len(pending))}: {_REMEDY}") from error
+                losses += 1
+                if alone:
+                    del pending[calls[0][0]]
+                    without_result += 1
+                else:
+                    on_lost(f"{_lost(len(pending))}; they are repeated in new processes")
             finally:
-                with warnings.catch_warnings(), _without_loky_errors():
-                    warnings.simplefilter("ignore", UserWarning)  # joblib warns about results that are not used
-                    results.close()
+                if results is not None:
+                    with warnings.catch_warnings(), _without_loky_errors():
+                        warnings.simplefilter("ignore", UserWarning)  # joblib warns about results that are not used
+                        results.close()
+        if without_result:
+            raise LostProcessError(f"{_lost(without_result)}: {_REMEDY}")
+
+
+def _lost(calls: int) -> str:
+    return f"a process ended unexpectedly, for example for lack of memory; calls without a result: {calls}"
 
 
 def _numbered(call: Callable[[_Task], _Result], number: int, task: _Task) -> tuple[int, _Result]:
