@@ -18,9 +18,10 @@ integral of the sent torque and a polynomial of time. A joint with a mobility of
 mobility of at most -`MOBILITY` is a wrong sign. A joint between these limits does not follow its torque. A disturbance may
 spoil a test, so a joint fails only after `TRIALS` tests. The legs of a suspended robot whose drives are off sink onto their end
 stops within some seconds, and their weight presses joints onto them. So the pulse of a repeated test is `BOOST` times larger for
-a joint within the position tolerance of its limit. If its foot carries load, the joint may be blocked. It then stays
-untested, and the next start tests it again. A joint that passed is not tested again until its drive restarts, because the
-wiring of a motor does not change while its drive is on.
+a joint within the position tolerance of its limit. If its foot carries load, the joint may be blocked. A foot that only touches
+the floor hits it during the pulse, and the impact stops the ankle. An impact lasts one or two cycles, so it hardly changes the
+mean force. A joint whose foot carried load or hit the floor stays untested, and the next start tests it again. A joint that
+passed is not tested again until its drive restarts, because the wiring of a motor does not change while its drive is on.
 """
 
 from __future__ import annotations
@@ -50,6 +51,9 @@ INTEGRAL = 0.03
 TRAVEL = math.radians(1.5)
 #: A foot is loaded if its mean force during a test exceeds `LOAD * cell_free`, which is four times the noise of the mean.
 LOAD = 1.0 / 3.0
+#: A foot hit the floor if the sum of its forces in two consecutive cycles exceeds `HIT * cell_free`, which is four times the
+#: noise of this sum. An impact that stops an ankle has at least 1.5 times this sum.
+HIT = 2.0
 #: Factor of the torque pulse in the second test of a joint near its end stop. The leg weight may press the joint onto the stop.
 BOOST = 6.0
 #: Number of unsuccessful tests of a joint after which the joint has failed.
@@ -123,7 +127,7 @@ class DirectionProof:
         self._middle = 0.5 * (robot.position_min + robot.position_max)
         self._kp, self._kd = pose_gains(robot)
         self._least = np.array(MOBILITY * both)
-        self._load = LOAD * robot.sensors.cell_free
+        self._free = robot.sensors.cell_free
         stop = robot.thresholds.position_tolerance
         self._low, self._high = robot.position_min + stop, robot.position_max - stop
         self.proven: npt.NDArray[np.bool_] = np.zeros(len(JOINTS), np.bool_)
@@ -217,7 +221,7 @@ class DirectionProof:
 
     def _evaluate_test(self, joints: Sequence[int], duration: int) -> str:
         again: list[int] = []
-        loaded = np.abs(np.mean(self._force, axis=0)) > self._load
+        supported = self._on_the_floor()
         for joint in joints:
             mobility, least = self.mobility[joint], self._least[joint]
             self._trials[joint] += 1
@@ -225,7 +229,7 @@ class DirectionProof:
                 self.proven[joint] = True
             elif self._trials[joint] < TRIALS:
                 again.append(joint)
-            elif mobility <= -least or not loaded[joint // len(LEG_JOINTS)]:
+            elif mobility <= -least or not supported[joint // len(LEG_JOINTS)]:
                 self.failed.append(joint)
         if self.failed:
             self._fail(self.failed)
@@ -235,6 +239,14 @@ class DirectionProof:
             self._tests.insert(0, (again, duration))
         self._next_test()
         return ""
+
+    def _on_the_floor(self) -> npt.NDArray[np.bool_]:
+        """Return whether each foot carried load or hit the floor during the test, shape (2,)."""
+        force = np.array(self._force)
+        loaded = np.abs(np.mean(force, axis=0)) > LOAD * self._free
+        hit = np.abs(force[1:] + force[:-1]).max(axis=0) > HIT * self._free
+        supported: npt.NDArray[np.bool_] = loaded | hit
+        return supported
 
     def report(self) -> str:
         """Return the result of the tests as one sentence, with the effective inertia of each joint."""

@@ -99,16 +99,16 @@ class Started:
 
 
 @contextmanager
-def robot(mechanics: Mechanics | None, *faults: Fault) -> Iterator[Started]:
+def robot(mechanics: Mechanics | None, *faults: Fault, pose: list[float] = POSE) -> Iterator[Started]:
     operator = Operator(starts=False)
     with open_hal(
-        Target(EMBEDDED, "", lockstep=True), pose=POSE, operator=operator, faults=faults, mechanics=mechanics
+        Target(EMBEDDED, "", lockstep=True), pose=pose, operator=operator, faults=faults, mechanics=mechanics
     ) as rig:
         yield Started(rig, operator)
 
 
-def crane() -> Mechanics:
-    return Mechanics(urdf(ExoskeletonParameters(), ROBOT, Patient(80.0, 1.75)), ground=Ground())
+def crane(mass: float = 80.0) -> Mechanics:
+    return Mechanics(urdf(ExoskeletonParameters(), ROBOT, Patient(mass, 1.75)), ground=Ground())
 
 
 places = pytest.mark.parametrize("place", [lambda: None, crane], ids=["air", "crane"])
@@ -181,3 +181,15 @@ def test_start_with_a_drive_that_never_enables_fails_without_sag(place, holds: b
         assert started.hal.state.supervisor is state
         assert moved.max() < SAG
         assert {D(s) for s in np.delete(started.drives.signals.state, JOINTS.index("left_SH"))} == {D.QUICK_STOP_ACTIVE}
+
+
+def test_feet_that_touch_the_floor_lightly_do_not_prevent_the_start():
+    """The straight legs sink with their drives off until the feet touch the floor, so the pulses press the soles onto it."""
+    with robot(crane(50.0), pose=[0.0] * len(JOINTS)) as started:
+        started.until(S.READY)
+        for _ in range(3000):
+            started.cycle()
+        started.start(300)
+        assert started.hal.state.supervisor is S.ACTIVE, started.hal.reason
+        (proven,) = [event.text for event in started.hal.events if event.code == "DIRECTIONS_PROVEN"]
+        assert "not tested under load: left_SA, right_SA" in proven
