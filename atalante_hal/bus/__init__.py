@@ -59,7 +59,7 @@ class Bus(Protocol):
 
     @property
     def dropped(self) -> int:
-        """Return the number of frames, since the bus was opened, that arrived but were lost or are not valid CAN frames."""
+        """Return the number of incoming frames, since the bus was opened, that were lost or are not valid CAN frames."""
         ...
 
     def send(self, frames: Frames) -> None:

@@ -254,7 +254,8 @@ def refusal(interface: str, *, one_process: bool = False) -> str:
     if adapter is None:
         import can
 
-        if interface in can.VALID_INTERFACES:  # a plug-in of python-can; `PythonCanBus` checks its CAN FD support
+        # a plug-in of python-can, about which this table has no facts; `PythonCanBus` checks its CAN FD support
+        if interface in can.VALID_INTERFACES:
             return ""
         known = ", ".join(sorted(can.VALID_INTERFACES))
         return f"there is no CAN interface {interface!r}; use one of {known}"

@@ -60,7 +60,8 @@ class JoinedBus:
         self._capacity = capacity
         self._batches = Batches()
         self._shares: dict[bytes, list[Share]] = {}
-        self._tails: list[list[Frames]] = []  # for each known receive buffer: list of its slices `frames[i:]`
+        #: for each receive buffer that was passed so far: list of its slices `frames[i:]`
+        self._tails: list[list[Frames]] = []
         self._turn = 0  # index of the channel to read first; changes in each call, so that a busy channel cannot block the others
         self._closed = False
         self._failure: BusError | None = None  # error that a channel raised in the current call of `receive`

@@ -30,18 +30,18 @@ from atalante_hal.bus.batch import Batches
 from atalante_hal.memory import anonymous_file
 from atalante_hal.wire.frame import FRAME_BYTES, Frames
 
-#: Indices of the counters of each end: frames sent, frames received, calls of `step` requested, calls of `step` completed.
+#: Indices of the counters of each bus end: frames sent, frames received, calls of `step` requested, calls of `step` completed.
 _SENT, _RECEIVED, _REQUESTED, _COMPLETED = range(4)
-#: Indices of the flags of each end. A flag is 1 while the end is in the named state.
+#: Indices of the flags of each bus end. A flag is 1 while the end serves, sleeps or is closed.
 _SERVING, _SLEEPING, _CLOSED = range(4, 7)
-#: Number of 64-bit header words of each end: one cache line.
+#: Number of 64-bit header words of each bus end: one cache line.
 _END_WORDS = 8
 _HEADER_BYTES = mmap.PAGESIZE
-#: Time for which a waiting end polls before it sleeps [s], longer than the computing time of a cycle.
+#: Time for which a bus end that waits for frames polls before it sleeps [s], longer than the computing time of a cycle.
 _POLL_TIME = 500e-6
-#: If polling found no frame in one wait, the next waits sleep without polling, to save computing time. Number of these waits.
+#: Number of waits that sleep without polling after a wait in which polling found no frame. This saves computing time.
 _WAITS_WITHOUT_POLLING = 32
-#: Longest sleep of a waiting end before it reads the shared memory again [ms].
+#: Longest sleep of a waiting bus end before it reads the shared memory again [ms].
 #: A sleep must be limited, because a wake-up byte may arrive before the new value in the shared memory is visible.
 _SLEEP = 20
 _WAKE_UP = b"\0"
@@ -60,7 +60,7 @@ class SharedBus:
     """
 
     def __init__(self, name: str, memory: int, wake_socket: int, end: int) -> None:
-        """Attach to one end of the bus.
+        """Attach to one of the two ends of the bus.
 
         Args:
             name: Name of this end.
@@ -85,16 +85,16 @@ class SharedBus:
         self._outgoing, self._incoming = queues[end], queues[1 - end]
         self._size = size
         self._sent = self._received = 0
-        self._waits_without_polling = 0  # number of following waits that sleep without polling
+        self._waits_without_polling = 0  # number of the next waits that sleep without polling
         self._closed = False
-        self._close_reason = ""  # reason for closing that the other end sent
+        self._close_reason = ""  # why the other end was closed, as that end has reported
         self._stamps: Stamps = np.zeros(size // FRAME_BYTES, np.int64)
         self._received_at = 0
         self._batches = Batches()
 
     @property
     def stamps(self) -> Stamps:
-        """Return the time of the last `receive()` that returned frames, repeated per frame. Shape (capacity,), int64 [ns]."""
+        """Return the time of the last `receive()` that returned frames, once for each frame. Shape (capacity,), int64 [ns]."""
         self._stamps.fill(self._received_at)
         return self._stamps
 
@@ -168,7 +168,7 @@ class SharedBus:
         return count
 
     def serve(self, step: Callable[[], object]) -> None:
-        """Serve the other end: call `step` for each request of the other end, until the bus is down.
+        """Serve the other end of the bus: call `step` for each of its requests, until the bus is down.
 
         Args:
             step: Function that receives the queued frames and sends the answers. While it runs, `receive` does not wait.

@@ -26,7 +26,7 @@ from atalante_hal.wire.frame import FLAG_FDF, FRAME_BYTES, Frames, as_words, new
 CLASSIC_BYTES = 16  # struct can_frame
 CAN_RAW_ERR_FILTER: Final = 2
 SO_RCVBUFFORCE: Final = 33
-SO_TIMESTAMPNS: Final = 35  # number of the socket option, and also of its control message
+SO_TIMESTAMPNS: Final = 35  # number of the socket option; its control message has the same number
 SO_RXQ_OVFL: Final = 40
 SIOCGIFFLAGS: Final = 0x8913
 SIOCGIFMTU: Final = 0x8921
@@ -34,11 +34,11 @@ IFF_UP: Final = 1
 #: Classes of error frames to receive (linux/can/error.h): transmit timeout, controller problem, bus-off, controller restarted.
 ERROR_FRAMES = 0x0001 | 0x0004 | 0x0040 | 0x0100
 LINK_DOWN: Final = errno.ENETDOWN
-#: Error codes of a call on the socket of a removed interface. The kernel does not bind the socket again.
+#: Error codes of a call on a socket whose interface was removed. The kernel does not bind such a socket again.
 LINK_REMOVED: Final = (errno.ENODEV, errno.ENXIO)
 #: Shortest time between two attempts to open a removed interface again [s].
 REOPEN_PERIOD: Final = 0.1
-#: Largest number of batches of queued frames that are dropped when the link is lost.
+#: Largest number of batches of queued frames that are received and dropped when the link is lost.
 DROPPED_BATCHES: Final = 64
 NO_ROOM = (errno.ENOBUFS, errno.EAGAIN)
 
@@ -288,7 +288,7 @@ class SocketCanBus:
         return self._link_error(code) or BusError(f"{self.name} cannot send: {reason}")
 
     def _link_error(self, code: int) -> BusDown | None:
-        """Return the error of an interface that is down or removed, and drop its queued frames; None for other codes."""
+        """Return the error for the error code of an interface that is down or removed, and drop its queued frames; else None."""
         if code != LINK_DOWN and code not in LINK_REMOVED:
             return None
         self._drop_queued()

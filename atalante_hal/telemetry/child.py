@@ -22,7 +22,7 @@ from typing import Any
 from atalante_hal.closing import Closing
 from atalante_hal.memory import anonymous_file
 
-#: Names of the rings that a session can have: cycle records, events, and CAN frames for the CAN log.
+#: Names of the ring buffers that a session can have: cycle records, events, and CAN frames for the CAN log.
 RINGS = RECORDS, EVENTS, FRAMES = "records", "events", "frames"
 
 
@@ -42,7 +42,7 @@ class TelemetryChild(Closing):
         Args:
             files: Name -> file descriptor of each ring of the session. None: the session does not exist yet.
         """
-        self._files: dict[str, int] = {}  # ring files that no session has taken over yet
+        self._files: dict[str, int] = {}  # files of the ring buffers, until `take_files` passes them to a session
         if files is None:
             files = self._files = {name: anonymous_file("atalante-telemetry", 0) for name in RINGS}
         self._unread = b""  # output of the subprocess after the last line that was read
@@ -56,7 +56,7 @@ class TelemetryChild(Closing):
         self.pid = self._process.pid
 
     def take_files(self) -> dict[str, int]:
-        """Return name and file descriptor of each ring. The caller owns the descriptors from now on."""
+        """Return name and file descriptor of each ring buffer. From now on, the caller must close the descriptors."""
         files, self._files = self._files, {}
         return files
 

@@ -1,4 +1,4 @@
-"""Ring records with the CAN frames of the HAL, for a CAN log.
+"""Records of the ring buffer that passes the CAN frames of the HAL to a CAN log.
 
 The HAL passes its frame arrays to a `RingTap`. The tap collects the frames in a record of up to 64 frames. The record is
 full after two or three cycles, and then the tap writes it to the ring. The record does not contain the bus of a frame.
@@ -17,7 +17,7 @@ from atalante_hal.telemetry.ring import RingWriter
 from atalante_hal.wire.frame import FRAME, FRAME_BYTES, Frames
 
 FRAMES_PER_RECORD = 64
-#: Record of the ring with CAN frames. Its first `count` frames are used. The time of a frame is `base_ns` plus its stamp [ns].
+#: Record of CAN frames. Only the first `count` frames are used. The time of a frame is `base_ns` plus its stamp [ns].
 #: The flag `sent` is 1 for a frame that the HAL sent and 0 for a received frame.
 FRAME_RECORD = np.dtype(
     [

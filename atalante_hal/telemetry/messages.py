@@ -19,14 +19,14 @@ from atalante_hal.telemetry.schema import message_class
 
 #: Assisted joints in left stance and in right stance: sagittal hip and knee of the swing leg.
 ASSISTED = (("right_SH", "right_SK"), ("left_SH", "left_SK"))
-#: Name of the controller's field in the record, for each field of the message `Guide`.
+#: For each field of the message `Guide`: name of the controller's record field that contains its value.
 _GUIDE_FIELDS = {"error": "error", "bound": "q_bound", "h": "h", "lambda": "lambda", "desired_position": "q_des"}
 _GUIDE_OTHERS = ("filter_active", "step", "phase", "stance")
 
 
 @dataclass(slots=True)
 class Sample:
-    """Record of one cycle, with its time and its run."""
+    """Record of one control cycle, with its time and the number of its run."""
 
     values: list[float]  # values of the record, in the order of its layout
     cycle: int

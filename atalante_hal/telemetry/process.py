@@ -183,7 +183,7 @@ class TelemetryProcess(Closing):
         self._runs = 0
         self._closed = False
         self._tap: RingTap | None = None
-        self._early = child  # subprocess that was started early, for the first `start`; None if there is none
+        self._early = child  # subprocess that was started before the first call of `start`; None if there is none
         self._child: TelemetryChild | None = None
         self._restarts = 0
         self._faults: list[str] = []  # one sentence for each fault of a subprocess

@@ -105,7 +105,7 @@ class Publisher(Closing):
         self.messages += 1
 
     def begin_run(self, number: int, about: Mapping[str, object]) -> None:
-        """Do nothing, because every `SystemState` message contains the number of the run.
+        """Do nothing at the begin of a run, because every `SystemState` message contains the number of the run.
 
         Args:
             number: Ignored.

@@ -42,7 +42,8 @@ _READ, _LOST, _READER_PID, _KEPT = range(16, 20)
 _HEADER_BYTES = 256
 
 _WRITER_BYTE, _READER_BYTE = 0, 1  # offsets of the bytes that writer and reader lock
-_LOCK_TRIES = 50  # attempts to lock a byte; `_held` of the other end also locks the byte, for some microseconds
+#: number of attempts to lock a byte, because `_held` of the other end also locks it for some microseconds
+_LOCK_TRIES = 50
 
 _WAIT = 0.0002  # s, polling period
 NOTES_BYTES = 1 << 16

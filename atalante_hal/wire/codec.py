@@ -28,7 +28,7 @@ BASE, FACTOR, OFFSET = range(3)
 #: Value of `plan[INVALID, i]` if signal i has no invalid code. Also the result of `encode` if all values were encoded.
 NO_CODE = -1
 # Results of `read_row`. INSIDE: all signals are in range. OUTSIDE: a signal is out of range, and none has its invalid code.
-# MARKED_INVALID (another result): a signal is out of range, and at least one signal has its invalid code.
+# MARKED_INVALID: a signal is out of range, and at least one signal has its invalid code.
 INSIDE, OUTSIDE, MARKED_INVALID = range(3)
 #: Adding and then subtracting this number rounds a float64 to an integer.
 _ROUND = 1.5 * 2.0**52
@@ -125,7 +125,7 @@ class Codec:
             raise KeyError(f"there is no signal {message}.{signal}; messages are {', '.join(self.rows)}") from None
 
     def slice(self, group: str) -> slice:
-        """Return the slice of a quantity in the decoded values.
+        """Return the slice that selects all signals of one quantity, such as Force, from the decoded values.
 
         The elements of the slice are in the order of the frame identifiers.
 

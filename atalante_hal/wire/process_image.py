@@ -53,7 +53,7 @@ from atalante_hal.wire.frame import (
 
 #: Flags of a CAN FD frame whose sender is error passive.
 _PASSIVE = FLAG_ESI | FLAG_FDF
-#: Value of the argument `tag` for nodes whose alive counter is their own count and not the cycle number.
+#: Value of the argument `tag` for nodes whose alive counter counts their own frames, not the cycles.
 _NO_TAG = -1
 #: Values of `Check` as plain integers. A value of at most `_FRESH` means new, usable data.
 _FRESH = _SOME_LOST = int(Check.SOME_LOST)
@@ -298,7 +298,7 @@ class ReceiveImage:
         return foreign
 
     def decode_further_frames(self, row: int) -> list[Vector]:
-        """Decode the intact frames that a row received in this cycle, except the frame that was committed last.
+        """Decode the intact frames of one message in this cycle, except the frame that was committed last.
 
         Repetitions of an accepted frame are left out. Call this method before the receive buffer is used again.
 
@@ -321,7 +321,7 @@ class ReceiveImage:
         ]
 
     def _decoded(self, frames: Frames, index: int, row: int) -> Vector:
-        """Return a copy of `values` with the signals of a row taken from frame `index` of the receive buffer."""
+        """Return a copy of `values` in which the signals of one row come from frame `index` of the receive buffer."""
         table = self.codec.table._replace(codes=np.zeros_like(self.codec.table.codes))
         values = self.values.copy()
         read_row(frames.view(np.int64), (index - row) * WORDS, row, table)
@@ -345,7 +345,7 @@ class _Received:
 
 
 def _words_of(frames: Frames) -> Words:
-    """Return the frames as a flat array of 64-bit words, the only array type that the specialised functions accept."""
+    """Return the frames as a flat array of 64-bit words, because the compiled functions accept no other array type."""
     return frames.view(np.int64).ravel()
 
 
@@ -544,7 +544,7 @@ class TransmitImage:
         return self._octets.tobytes()
 
     def seal_prepared(self, prepared: bytes) -> Frames:
-        """Protect and return frames that were encoded beforehand, so that a later fault in the values cannot affect them.
+        """Add counter and CRC to frames that `prepare` encoded earlier, so that later faults in the values cannot affect them.
 
         Args:
             prepared: result of `prepare`.

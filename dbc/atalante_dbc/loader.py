@@ -49,7 +49,7 @@ def load_cached(path: Path) -> Network:
     try:
         key = _key(path)
     except OSError:
-        return _parse(path)  # `_parse` raises the error of a file that cannot be read
+        return _parse(path)  # the file cannot be read, so `_parse` raises a `DbcError`
     file = Path(cache_from_source(str(path)))
     network = _cached(file, key)
     if network is None:

@@ -17,7 +17,7 @@ from atalante_hal.types import PERIOD, SupervisorState, Vector
 #: Speed of the hook [m/s].
 SPEED: Final = 0.1
 #: Time in ACTIVE after which the crane lowers the robot [s]. The walking controller first moves the legs to the standing pose.
-#: On the floor, friction would hold the feet, and a robot that begins to walk with a wrong stance width may fall.
+#: A walk should begin with the right stance width, but on the floor friction would keep the feet where they are.
 DELAY: Final = 2.0
 #: Stiffness and damping of the sling per kg of the robot. The weight of the robot stretches the sling by 25 mm.
 STIFFNESS: Final = 400.0  # N/m per kg

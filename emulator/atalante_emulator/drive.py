@@ -115,7 +115,7 @@ class Drives:
         self.encoders = Encoders(robot, parameters.velocity_bandwidth, signals.position, signals.velocity)
         self.motors = Motors(robot, parameters.motor, signals.torque, signals.temperature)
         self._slow_phase = 0
-        #: Last evaluated controlwords if they changed nothing; equal words are then not evaluated again. Empty otherwise.
+        #: The last evaluated controlwords, if they changed nothing; equal controlwords are not evaluated again. Empty otherwise.
         self._steady = b""
         self._hold_at = np.zeros(len(JOINTS))  # setpoint of the local hold of each drive [rad]
         self._target, self._limit = np.zeros((2, len(JOINTS)))

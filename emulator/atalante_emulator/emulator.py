@@ -171,7 +171,7 @@ class Emulator:
         self._whole = [self._tx.frames]
         #: For each leg: index of its SYNC message in the list of SYNC messages.
         self._leg_syncs = [[m.name for m in syncs].index(f"SYNC_{side.upper()}_LEG") for side in SIDES]
-        #: For each SYNC message: the answer frames of the last imperfect cycle, which are sent if this SYNC arrives late.
+        #: For each SYNC message: answer frames of the last cycle that had missing or late frames, for a SYNC that arrives late.
         self._answered = self._shares
         batch = new_frames(_BATCH)
         self._batch = batch.view(np.uint8).data
@@ -378,7 +378,7 @@ class Emulator:
     # -- steps of one cycle ------------------------------------------------------------------------------------------
 
     def _sample_next(self) -> None:
-        """Sample the sensors for the next cycle. If `before_send` is empty, also encode the frames of the next cycle."""
+        """Sample the sensors for the next cycle. If `before_send` contains no function, also encode the next frames."""
         body = self.body
         position = body.position
         if self._node_faults is not None:

@@ -178,7 +178,7 @@ class AirwalkController:
             self._guides.prepare()
 
     def choice(self, xi: float) -> Choice:
-        """Return the guide filter that is used at an assistance factor, together with its promised torques.
+        """Return the guide filter that is used at an assistance factor, together with its certified disturbance torques.
 
         The promised torques are expressed as a fraction of the chosen promised torques.
 

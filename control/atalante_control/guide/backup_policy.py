@@ -87,7 +87,7 @@ class BackupPolicy:
     """
 
     stiffness: Pair  # Nm/rad, k of SH and SK
-    damping: Pair  # damping ratios of the heavy and of the light mode
+    damping: Pair  # damping ratios of the two coupled modes of motion, the slower mode first
     #: kg m2, mass matrix elements M11, M12 and M22 at the reference knee angle. There the joint stiffness equals `stiffness`.
     #: At other angles the joint stiffness differs from `stiffness`, because the mass matrix changes and the gains do not.
     mass: tuple[float, float, float]
@@ -117,7 +117,7 @@ class BackupPolicy:
 
 
 class Responses(NamedTuple):
-    """Motion of sagittal hip and knee under the backup policy, for each number of cycles ahead, 0 to n.
+    """Predicted motion of sagittal hip and knee under the backup policy, 0 to n cycles after the prediction starts.
 
     The rows of each array are SH and SK. `error`, `rate` and `feedback` are matrices to be multiplied by a state x with `STATES`
     elements. The arrays whose names begin with `pushed` are matrices to be multiplied by an acceleration of SH and SK that acts

@@ -1,4 +1,4 @@
-r"""Guide certificate: the disturbance torque for which the filter keeps the joints inside a guide. `guide filter -> Certificate`.
+r"""Guide certificate: the disturbance torques that cannot move a joint out of a guide. `guide filter -> Certificate`.
 
 **The promise.** Both joints stay inside the guide while disturbance torques of at most `hip` Nm act on the sagittal hip (SH) and
 at most `knee` Nm on the sagittal knee (SK), at the same time and in any direction. The friction of the leg may differ from the
@@ -50,7 +50,7 @@ from atalante_hal.types import Vector
 Pair = tuple[float, float]
 
 _JOINTS = ("SH", "SK")
-#: Smallest disturbance torque at the hip that is promised [Nm]. A guide that tolerates less has no promise.
+#: Smallest disturbance torque at the hip that is certified [Nm]. A guide that withstands less gets no certified torques.
 SMALLEST = 1.0
 
 
@@ -63,30 +63,31 @@ class JointTorque:
 
 
 class Limit(NamedTuple):
-    """Condition that limits the disturbance torques which a guide can promise to tolerate."""
+    """Condition that limits the disturbance torques for which a guide can be certified."""
 
-    #: largest torques that may be promised under this condition, relative to the chosen promised torques; negative if none
+    #: largest disturbance torques that meet this condition, as a multiple of the requested torques; negative if none meet it
     scale: float
     what: str  # condition in words, for a message
 
 
 @dataclass(frozen=True)
 class Certificate:
-    """Result of the certification of a guide: the promised disturbance torques, under which both joints stay inside the guide."""
+    """Result of the certification of a guide: the disturbance torques under which both joints stay inside the guide."""
 
     shape: str
     xi: float
-    certified: bool  # whether torques are promised for this guide
-    reason: str  # what limits the promised torques, or why there are none, as a sentence
-    promise: JointTorque | None  # promised torques, for which the running filter is built; None if there are none
-    #: largest torques that a filter with these gains could promise; None if there are none
+    certified: bool  # whether the guide is certified for any disturbance torques
+    reason: str  # sentence that states what limits the certified torques, or why there are none
+    #: certified disturbance torques, for which the running filter is built; None if there are none
+    promise: JointTorque | None
+    #: largest disturbance torques for which a filter with these gains could be certified; None if there are none
     largest: JointTorque | None
-    #: fraction of the guide width that remains under the promised torques; negative without promised torques
+    #: smallest fraction of the guide width that remains free under the certified torques; negative without certified torques
     margin: float
 
 
 class PromiseLimits:
-    """Conditions that limit the promised torques of a guide filter. The limits of the drives are computed once."""
+    """Conditions that limit the certified disturbance torques of a guide filter. The limits of the drives are computed once."""
 
     def __init__(self, guide: GuideFilter) -> None:
         """Compute the limits of torque, speed and torque rate.
@@ -137,7 +138,7 @@ class PromiseLimits:
         return sorted(found, key=lambda limit: limit.scale)
 
     def largest(self, xi: float) -> float:
-        """Return the largest torques that can be promised, as a fraction of the chosen ones; at most 0 if none can be promised.
+        """Return the largest disturbance torques that can be certified, as a multiple of the requested ones; at most 0 if none.
 
         Args:
             xi: assistance factor in [0, 1].
@@ -172,7 +173,7 @@ def _pair(torque: Vector) -> JointTorque | None:
 
 
 def _limit(room: Vector, reach: Vector, steps: int, what: str) -> Limit:
-    """Return the largest scale of the promised torques with which their effect plus that of the model errors fits into `room`.
+    """Return the largest multiple of the requested torques whose effect, plus the effect of the model errors, is at most `room`.
 
     Args:
         room: largest permitted effect on SH and SK in each cycle, shape (n, 2).
@@ -188,7 +189,7 @@ def _limit(room: Vector, reach: Vector, steps: int, what: str) -> Limit:
 
 
 class _Horizon:
-    """Condition on the promised torques, times a factor: one cycle after the horizon, the error is still within the guide.
+    """Condition on the requested torques, times a factor: one cycle after the prediction ends, the error is within the guide.
 
     At the end of the horizon, fast motions have decayed. The error one cycle beyond the horizon is therefore the error at the
     end of the horizon times a factor, plus a remainder. The remainder is a linear combination of the errors in two earlier
@@ -205,7 +206,7 @@ class _Horizon:
         beyond = prediction.beyond * SIZES
         self._factor = (beyond * rows[-1]).sum(axis=1) / (rows[-1] ** 2).sum(axis=1)
         remainder = beyond - self._factor[:, None] * rows[-1]
-        #: the two predicted cycles (cycles ahead) that give the remainder, and the weights of the errors in these cycles
+        #: two predicted cycles, as numbers of cycles after the start, and the weights of their errors in the remainder
         self._pairs: list[tuple[tuple[int, int], Vector]] = []
         for near, far in ((0.1, 0.3), (0.25, 0.5), (0.4, 0.7)):
             lags = round(near * self.cycles), round(far * self.cycles)
@@ -215,7 +216,7 @@ class _Horizon:
         self._reach = prediction.reach[self._starts // START_CYCLES]
 
     def limit(self, width: Vector, narrowest: Vector) -> Limit:
-        """Return the largest multiple of the promised torques that meets this condition.
+        """Return the largest multiple of the requested disturbance torques that meets this condition.
 
         Args:
             width: distance from q_des to the nearer bound of the guide in each cycle, shape (n, 2) [rad].

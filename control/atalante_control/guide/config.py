@@ -1,4 +1,4 @@
-"""Parameters of the virtual guides of a walk: gains, promise, and assumptions of the promise. `config -> step guides`."""
+"""Parameters of the virtual guides of a walk: gains, requested disturbance torques, assumed errors. `config -> step guides`."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ class StepGuideConfig:
     #: stiffnesses of the softer backup policies as fractions of `stiffness`, ascending
     gentler: tuple[float, ...] = (0.78,)
     damping: Pair = (1.3, 0.85)  # damping ratios of the two modes of the backup policy
-    #: Nm, chosen promised torques: disturbance torques of sagittal hip and knee that the guide tolerates, if possible
+    #: Nm, requested disturbance torques at sagittal hip and knee, for which each guide is certified if possible
     promise: Pair = (30.0, 18.0)
     mismatch: Mismatch = field(default_factory=Mismatch)
     hand_over: HandOver = field(default_factory=HandOver)
@@ -34,7 +34,7 @@ class StepGuideConfig:
     zeta: float = 0.01  # s, gain of lambda_d, which increases the weight of the backup torque while h decreases
     idealization: float = 1.0  # intensity of the joint idealization u_i in [0, 1] while the backup torque has weight 0
     feedforward: float = 1.0  # intensity of the feedforward u_f in [0, 1] while the backup torque has weight 0
-    #: Counter value above which the controller reports that the leg has left a guide with a promise.
+    #: Counter value above which the controller reports that the leg has left a certified guide.
     #: The counter rises by 1 in each cycle with h < 0. In every other cycle the counter falls by 1, but not below 0.
     outside_cycles: int = 150
     active: float = 0.05  # weight of the backup torque above which the filter is considered active

@@ -36,7 +36,7 @@ _POSTURES = 3  # number of knee angles for which the mass matrix is evaluated in
 
 @dataclass(frozen=True)
 class Mismatch:
-    """Largest errors of the model under which the promised torques hold.
+    """Largest model errors for which the guide certificate holds.
 
     Raises:
         ValueError: If a value is out of range.
@@ -56,7 +56,7 @@ class Mismatch:
 
 @dataclass(frozen=True)
 class HandOver:
-    """Hand-over box: range of deviations at the start of a step within which the promised torques hold.
+    """Hand-over box: range of deviations at the start of a step for which the guide certificate holds.
 
     Raises:
         ValueError: If a value is negative or not finite.
@@ -64,7 +64,8 @@ class HandOver:
 
     deviation: float = math.radians(2.7)  # rad, largest angle deviation |s(0)| of hip and knee
     rate: float = 0.25  # rad/s, largest speed deviation |s'(0)| of sagittal hip and knee
-    torque: Pair = (25.0, 13.0)  # Nm, largest torques of sagittal hip and knee that are carried over the stance change
+    #: Nm, largest torques of sagittal hip and knee that the carry-over adds at the start of a step
+    torque: Pair = (25.0, 13.0)
     #: rad/s2, largest joint acceleration before the stance change.
     #: Such an acceleration makes the measured velocity differ from the true velocity at the start of the step.
     acceleration: float = 20.0
@@ -178,11 +179,11 @@ class Effect(NamedTuple):
 
 
 class Grid(NamedTuple):
-    """Cycles at which predictions start, and numbers of cycles ahead, for which `spread` computes the largest output."""
+    """Start cycles and lengths [cycles] of the predictions for which `spread` computes the largest output."""
 
     starts: int  # number of start cycles; the start cycles are 0 to starts - 1
     block: int  # number of consecutive start cycles that share one row of the argument `ahead`
-    lags: NDArray[np.int64]  # (lags,) numbers of cycles ahead, ascending
+    lags: NDArray[np.int64]  # (lags,) prediction lengths [cycles], ascending
 
 
 def spread(effect: Effect, mobilities: Vector, bounds: Vector, grid: Grid, ahead: Vector) -> Vector:

@@ -205,7 +205,7 @@ def tail(inverse: Vector) -> Vector:
 
 
 def narrowest(inverse: Vector, cycles: int) -> Vector:
-    """Return for each cycle the largest 1 / width of the guide within the next `cycles` cycles.
+    """Return for each cycle 1 / width at the narrowest point of the guide within the next `cycles` cycles [1/rad].
 
     Args:
         inverse: 1 / distance to the guide for each cycle, shape (n, m) [1/rad]; the last row applies to all later cycles.
@@ -221,14 +221,14 @@ def narrowest(inverse: Vector, cycles: int) -> Vector:
 
 
 def _lags(prediction: Prediction) -> Records[Lag]:
-    """Return the tables of the predicted errors, one for each number of cycles ahead."""
+    """Return the tables of the predicted errors, one table for each predicted cycle."""
     lags = zeros(Lag, len(prediction.ahead))
     lags["ahead"] = prediction.ahead.swapaxes(1, 2)
     return lags
 
 
 def _blocks(prediction: Prediction) -> Records[Block]:
-    """Return the bounds of the predicted errors, one for each block of cycles ahead."""
+    """Return the bounds of the predicted errors, one for each block of consecutive predicted cycles."""
     blocks, starts = zeros(Block, len(prediction.slack)), np.arange(0, len(prediction.ahead), SLACK_CYCLES)
     high, low = (extreme.reduceat(prediction.ahead, starts).swapaxes(1, 2) for extreme in (np.maximum, np.minimum))
     blocks["slack"] = prediction.slack.swapaxes(1, 2)
@@ -237,7 +237,7 @@ def _blocks(prediction: Prediction) -> Records[Block]:
 
 
 def _few(prediction: Prediction) -> Records[Few]:
-    """Return the tables of the predicted torques and speeds, one for each number of cycles in `FEW`."""
+    """Return the tables of the predicted torques and speeds, one for each prediction length in `FEW`."""
     rows = zeros(Few, len(FEW))
     rows["lag"], rows["slack"] = FEW, prediction.few_slack.swapaxes(1, 2)
     rows["ahead"] = prediction.few_ahead.swapaxes(1, 2)

@@ -17,7 +17,7 @@ from atalante_hal.types import Vector
 
 Pair = tuple[float, float]
 
-#: The kernel replaces a ratio x = torque / limit or x = speed / limit by 1 - STEEPNESS * (1 - x), which is 1 at x = 1, too.
+#: The kernel uses 1 - STEEPNESS * (1 - x) instead of a ratio x = torque / limit or x = speed / limit. Both are 1 at the limit.
 #: The gait alone needs most of the allowed torque and speed, so the gate must rise only close to these limits.
 STEEPNESS = 4.0
 #: Number of elements of the compressed state, from which the predicted errors are computed.
@@ -43,17 +43,17 @@ class Guard:
     release: float
     idealization: float  # intensity of the joint idealization u_i in [0, 1]
     feedforward: float  # intensity of the feedforward u_f in [0, 1]
-    promise: float  # promised torques that the filter assumes in this step, as a fraction of `Assumptions.promise`
+    promise: float  # disturbance torques that the filter assumes in this step, as a fraction of `Assumptions.promise`
     xi: float  # assistance factor of the step
     fresh: bool  # True until the first cycle of a step is computed
     motor: Annotated[Vector, 2]  # Nm, estimated torques of the motors
     lag: Annotated[Vector, 2]  # rad/s, estimated true velocity minus measured velocity
     state: Annotated[Vector, STATES]  # state of the last cycle, see `backup_policy`
-    #: absolute value of each element of `state`; true e' is replaced by true minus measured e'
+    #: absolute values of the elements of `state`, but the true e' is replaced by the true minus the measured e'
     magnitude: Annotated[Vector, STATES]
     compression: Annotated[Vector, (COMPRESSED, STATES)]  # matrix from the state to the compressed state
     compressed: Annotated[Vector, COMPRESSED]  # compressed state of the last cycle
-    few_slack: Annotated[Vector, (STATES, 2)]  # elementwise maximum of `Few.slack` over all numbers of cycles ahead
+    few_slack: Annotated[Vector, (STATES, 2)]  # elementwise maximum of `Few.slack` over all prediction lengths
     h: float  # h of the last cycle; at h >= 0, the backup policy can keep both joints inside the guide
     rate: float  # 1/s, dh/dt
     gate: float  # gate, the weight of the backup torque: `lambda + (1 - lambda) lambda_d`
@@ -61,7 +61,7 @@ class Guard:
 
 
 class Lag:
-    """Prediction of the tracking errors for one number of cycles ahead. The fixed shape makes the compiled loops fast."""
+    """Prediction of the tracking errors a fixed number of cycles ahead. The fixed array shapes make the compiled loops fast."""
 
     #: matrix from the compressed state to the predicted errors e of sagittal hip and knee [rad]
     ahead: Annotated[Vector, (COMPRESSED, 2)]
@@ -70,7 +70,7 @@ class Lag:
 class Block:
     """Bounds of the predicted tracking errors over `SLACK_CYCLES` consecutive cycles ahead."""
 
-    #: matrix from `Guard.magnitude` to the largest change of the predicted errors by errors of the model [rad]
+    #: matrix from `Guard.magnitude` to the largest change of the predicted errors that model errors can cause [rad]
     slack: Annotated[Vector, (STATES, 2)]
     middle: Annotated[Vector, (COMPRESSED, 2)]  # mean of the largest and the smallest `Lag.ahead` in the block
     #: half the difference of the largest and the smallest `Lag.ahead` in the block
@@ -79,7 +79,7 @@ class Block:
 
 
 class Few:
-    """Prediction of torque and speed for one number of cycles ahead, see `prediction.FEW`."""
+    """Prediction of torque and speed a fixed number of cycles ahead, see `prediction.FEW`."""
 
     lag: int  # number of cycles ahead
     #: matrix from the state to the predicted backup accelerations [rad/s2] of hip and knee, then to their predicted e' [rad/s]
@@ -96,12 +96,12 @@ class GuideTables(NamedTuple):
     lags: Records[Lag]  # (lags,)
     blocks: Records[Block]  # (blocks,)
     few: Records[Few]  # (rows,) predictions of torque and speed, in ascending order of `Few.lag`
-    #: (starts, lags, 4) largest errors of sagittal hip and knee due to model errors, then due to the promised torques [rad]
+    #: (starts, lags, 4) largest errors of sagittal hip and knee due to model errors, then due to the requested disturbances [rad]
     reach: Vector
     highest: Vector  # (starts, blocks, 4) maximum of `reach` over each block of cycles ahead [rad]
     #: (starts, rows, 12) largest effects of disturbances on the torques [Nm] and speeds [rad/s] of sagittal hip and knee.
-    #: Columns 0 to 3: torques and speeds due to model errors. Columns 4 to 7: torques and speeds due to the promised torques.
-    #: Columns 8 to 11: speeds with the worst inertia and delay, due to model errors and then due to the promised torques.
+    #: Columns 0 to 3: torques and speeds due to model errors. Columns 4 to 7: the same due to the requested disturbances.
+    #: Columns 8 to 11: speeds with the worst inertia and delay, due to model errors and then due to the requested disturbances.
     few_reach: Vector
     step: Vector  # (horizon + 1, COLUMNS) values of each cycle of the step; the column numbers are defined below
 

@@ -122,7 +122,7 @@ class LiteralGuide:
 
 
 def no_promise(shape: str, xi: float) -> Certificate:
-    """Return a certificate without promised torques, for a guide whose control law follows the paper literally.
+    """Return a certificate for no disturbance torque, because the control law follows the paper literally.
 
     Args:
         shape: name of the shape.

@@ -20,7 +20,7 @@ from atalante_hal.types import Vector
 
 Pair = tuple[float, float]
 
-#: Numbers of cycles ahead at which torque and speed are predicted.
+#: Prediction lengths at which torque and speed are computed [cycles].
 FEW = np.array([1, 2, 3, 4, 6, 8, 11, 15, 20, 27, 36, 48, 64, 85, 113, 150, 200, 250, 300])
 #: Typical magnitude of each element of the state, used as its weight in `Prediction.compress`.
 SIZES = np.repeat([0.07, 1.0, 1.0, 140.0, 140.0], 2)
@@ -28,9 +28,9 @@ SIZES = np.repeat([0.07, 1.0, 1.0, 140.0, 140.0], 2)
 
 @dataclass(frozen=True)
 class Assumptions:
-    """Assumptions of a certificate: promised torques, time behaviour of the drives, model errors, start deviations."""
+    """Assumptions of a certificate: disturbance torques, time behaviour of the drives, model errors, start deviations."""
 
-    #: Nm, promised disturbance: largest torques at sagittal hip and knee under which the joints must stay inside the guide
+    #: Nm, requested disturbance: largest torques at sagittal hip and knee under which the joints must stay inside the guide
     promise: Pair = (30.0, 18.0)
     loop: SampledLoop = field(default_factory=SampledLoop)
     mismatch: Mismatch = field(default_factory=Mismatch)
@@ -151,7 +151,7 @@ class Prediction:
         first_torque = run(torque, mobilities, bounds, few, few_ahead[0])
         first_speed = run(speed, mobilities, bounds, few, few_ahead[1])
         # Axes of `by_bound`: block of start cycles, element of `FEW`, cause, output, joint.
-        # Causes: model errors, promised torques. Outputs: torque, speed. Joints: sagittal hip, sagittal knee.
+        # Causes: model errors, requested disturbances. Outputs: torque, speed. Joints: sagittal hip, sagittal knee.
         by_bound = few_ahead[:2].reshape(2, blocks, len(FEW), 2, 2).transpose(1, 2, 3, 0, 4)
         self.few_reach: Vector = np.concatenate([by_bound.reshape(blocks, len(FEW), 8), few_ahead[2]], axis=2)
         self.few_ahead: Vector = np.concatenate([nominal.feedback[FEW], nominal.rate[FEW]], axis=1)
@@ -194,7 +194,7 @@ def prediction_of(policy: BackupPolicy, leg: Leg, assumptions: Assumptions, blen
 
 
 def _separated(rows: Vector) -> Vector:
-    """Convert matrices that multiply the state, for a state with true minus measured velocities instead of true velocities."""
+    """Convert matrices for a state with true velocities into matrices for a state with true minus measured velocities."""
     result = rows.copy()
     result[..., 4:6] += rows[..., 2:4]
     return result

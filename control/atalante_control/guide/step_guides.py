@@ -28,7 +28,7 @@ _MIDDLE = math.radians(30.0)
 _ASSISTED = [LEG_JOINTS.index("SH"), LEG_JOINTS.index("SK")]
 #: Largest half-width of a guide, at assistance factor 0 [rad], see `half_width`.
 _WIDEST = math.radians(7.5)
-#: Used if no filter can promise the chosen torques: fraction of the largest possible torques that a filter then promises.
+#: Fraction of the largest possible disturbance torques that is certified if no filter withstands the requested torques.
 #: With the fraction 1, the backup torque would have weight 1 even without a disturbance.
 _USED = 0.95
 #: Number of decimal digits to which the assistance factor is rounded; the CAN signal has the same resolution.
@@ -36,7 +36,7 @@ _DIGITS = 4
 
 
 class Choice(NamedTuple):
-    """Guide filter of a step, and the disturbance torques for which it is certified, as a fraction of the chosen ones."""
+    """Guide filter of a step, and the disturbance torques for which it is certified, as a fraction of the requested ones."""
 
     guide: GuideFilter
     promise: float
@@ -74,7 +74,7 @@ class StepGuides:
         self._choices: dict[float, Choice] = {}
 
     def prepare(self) -> None:
-        """Choose and store the filter and its promised torques for every assistance factor from 0 to 1, in steps of 0.01.
+        """Choose and store the filter and its certified torques for every assistance factor from 0 to 1, in steps of 0.01.
 
         The computation for one assistance factor takes longer than a cycle. In real time, `prepare` must therefore be called
         before a walk.
@@ -83,7 +83,7 @@ class StepGuides:
             self.at(percent / 100)
 
     def at(self, xi: float) -> Choice:
-        """Return the softest filter that can promise the chosen torques, or else the filter that can promise the largest torques.
+        """Return the softest filter that withstands the requested disturbance torques, or else the one that withstands most.
 
         Args:
             xi: assistance factor in [0, 1].

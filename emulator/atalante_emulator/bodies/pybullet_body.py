@@ -152,7 +152,8 @@ class PyBulletBody:
             pybullet.changeDynamics(self._body, pad, lateralFriction=friction, **client)
 
     def _link_states(self, links: Sequence[int]) -> Any:
-        # The second flag requests the forward kinematics. Without it, PyBullet returns the poses of the previous time step.
+        # The argument after `links` requests velocities, and the next one the forward kinematics.
+        # Without forward kinematics, PyBullet returns the poses of the previous time step.
         return pybullet.getLinkStates(self._body, links, 1, 1, physicsClientId=self._client)
 
     def reset(self, position: Sequence[float], base: Pose | None = None) -> None:
