@@ -292,8 +292,8 @@ class SocketCanBus:
         if code != LINK_DOWN and code not in LINK_REMOVED:
             return None
         self._drop_queued()
-        # An interface goes down before it is removed. `_drop_queued` may have dropped the second error, that of the removal.
-        # Therefore this function also checks whether the socket is still bound to the interface.
+        # An interface goes down before it is removed. `_drop_queued` may have dropped the error message about the removal.
+        # A removed interface is therefore detected by its socket, which the kernel unbinds.
         if code == LINK_DOWN and self._is_bound():
             return BusDown(f"{self.name} is down: type `ip link set {self.name} up`")
         self._removed = f"{self.name} was removed: plug the adapter in again; the link is opened again when it is up"

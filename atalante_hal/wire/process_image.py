@@ -67,8 +67,7 @@ _FOREIGN = -1
 NEVER = 1 << 30
 #: Lowest age at which an answer to a SYNC is rejected as replayed [cycles].
 LATEST = 16
-#: Half the period of the alive counter.
-#: A frame whose counter is ahead of the expected counter by this number or more is regarded as old, except after a long gap.
+#: A frame whose counter is ahead of the expected counter by half a counter period or more is regarded as old, except after a gap.
 _HALF_TURN = 128
 
 
@@ -469,8 +468,8 @@ def classify_frame(words: Words, row: int, offset: int, e2e: E2EState, tag: int,
         return _CRC
     counter = int(octets[begin + COUNTER_BYTE])
     in_time = tag == _NO_TAG or tag - counter & 0xFF < LATEST
-    # After a gap of at least half a counter period, the counter does not give the order of frames any more.
-    # After such a gap, a frame is new if it answers one of the last `LATEST` SYNCs.
+    # After a gap of at least half a counter period, the counter does not show whether a frame is new or old.
+    # After a long gap, a frame counts as new if it answers one of the last `LATEST` SYNCs.
     back = tag != _NO_TAG and in_time and expected[row] != NOTHING and silent[row] >= _HALF_TURN
     result = classify_counter(expected[row], counter)
     if back and result == _REPEATED:

@@ -66,8 +66,7 @@ class HandOver:
     rate: float = 0.25  # rad/s, largest speed deviation |s'(0)| of sagittal hip and knee
     #: Nm, largest torques of sagittal hip and knee that the carry-over adds at the start of a step
     torque: Pair = (25.0, 13.0)
-    #: rad/s2, largest joint acceleration before the stance change.
-    #: Such an acceleration makes the measured velocity differ from the true velocity at the start of the step.
+    #: rad/s2, largest joint acceleration before the stance change. It determines the error of the measured velocity at the start.
     acceleration: float = 20.0
 
     def __post_init__(self) -> None:
@@ -172,7 +171,7 @@ class Effect(NamedTuple):
     #: (lags + 1, 2, 2) response to an acceleration that lasts one cycle, 0 to `lags` cycles later.
     pushed: Vector
     #: (lags + 1, 2, 2) response to an acceleration just before a prediction starts; (0, 2, 2) if this response is left out.
-    #: The measured velocity does not yet contain the effect of the last acceleration, so a prediction starts with an error.
+    #: A prediction starts with an error, because the measured velocity does not yet contain the effect of the last acceleration.
     hidden: Vector
     #: (n, 2, 2) matrix for each cycle of the step. The output is this matrix times the response.
     left: Vector

@@ -18,7 +18,7 @@ from atalante_hal.types import Vector
 Pair = tuple[float, float]
 
 #: The kernel uses 1 - STEEPNESS * (1 - x) instead of a ratio x = torque / limit or x = speed / limit. Both are 1 at the limit.
-#: The gait alone needs most of the allowed torque and speed, so the gate must rise only close to these limits.
+#: The gait alone needs most of the allowed torque and speed, so the gate must rise only close to the limits of torque and speed.
 STEEPNESS = 4.0
 #: Number of elements of the compressed state, from which the predicted errors are computed.
 COMPRESSED = 5

@@ -64,7 +64,7 @@ class PidGains:
 
 
 #: Gains for the suspended robot. Its stance leg carries no load, so TH, SK, SA and HA of this leg have the swing leg gains.
-#: With the gains for the ground, knee and ankle would oscillate, because these joints move small inertias (0.16, 0.04 kg m2).
+#: With the gains for the ground, the knee and ankle of a suspended robot would oscillate, because they move small inertias.
 AIR_GAINS = PidGains(
     stance=LegGains(
         kp=(3000.0, 720.0, 3000.0, 900.0, 300.0, 180.0),

@@ -389,7 +389,7 @@ class WalkController:
         if phase in STEPPING:
             self._impact.start_step()
         # In FINISH_STEP, the HAL changes to HOLD when the step number changes. A HOLD during a step would make the robot fall.
-        # Therefore the step number remains the same in FINISH_STEP until the robot stands on both feet.
+        # Therefore, in FINISH_STEP, the controller does not change the step number until the robot stands on both feet.
         if phase is Phase.REST or (phase in STEPPING and not self._finishing):
             self._command.step = (self._command.step or 0) + 1
         self._command.walking = phase in WALKING

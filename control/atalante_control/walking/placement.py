@@ -55,7 +55,7 @@ class PlacementConfig(NamedTuple):
     #: s, time before the nominal landing in which the phase rate returns to 1; `late_landing` then gives the offset
     frozen: float = 0.05
     #: m, largest DCM error (forward, sideways) whose growth the ankle stabiliser can stop, as measured.
-    #: The values are smaller than the limits of the stabiliser, because the PIDs of the stance leg act against its shift.
+    #: These errors are smaller than the limits of the stabiliser, because the PIDs of the stance leg act against its shift.
     capacity: Pair = (0.10, 0.044)
     bandwidth: float = 25.0  # rad/s, natural frequency of the critically damped filter of the landing offset
     speed: float = 1.2  # m/s, largest rate of change of the landing offset

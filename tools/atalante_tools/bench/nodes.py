@@ -34,9 +34,8 @@ from atalante_tools.bench.measure import require
 
 #: Number of cycles after which an alive counter wraps to 0.
 TURN = 256
-#: Number of poses in the recording. The HAL runs its slow checks in every 16th cycle. 15 and 16 have no common factor, so the
-#: slow checks read all poses, one after the other. With 16 poses, the slow checks would always read the same pose, and report
-#: constant sensor values as a fault.
+#: Number of poses in the recording. It has no common factor with 16, because the HAL runs its slow checks in every 16th cycle.
+#: With 16 poses, the slow checks would always read the same pose, and report constant sensor values as a fault.
 POSES = 15
 #: Tracking error of the recorded joints [rad], too small to saturate the guide filter.
 ERROR = 0.01
@@ -124,7 +123,7 @@ class Recording:
         image.values[image.codec.slice("SupplyVoltage")] = 48.0
         gap = max(m.cycle_ms for m in slow) // len(slow)
         #: Messages with long periods: (message, period in cycles, phase in cycles).
-        #: The phases are spread evenly, so that every block of ten cycles has the same number of frames.
+        #: The phases of the messages are spread evenly, so that every block of ten cycles has the same number of frames.
         self.slow = tuple((m, m.cycle_ms, gap * row % m.cycle_ms) for row, m in enumerate(slow))
         self._slow = _seal(image, image.values[None, :])
         self._slow_turn = [0] * len(slow)

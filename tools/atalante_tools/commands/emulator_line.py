@@ -18,10 +18,10 @@ from atalante_hal.wire.e2e import COUNTER_BYTE, check_counter
 from atalante_hal.wire.frame import Frames, new_frames
 from atalante_tools.session.takeover import PendantReader, Takeover
 
-#: The emulated pendant resumes sending if no frame of another pendant is received for this time [cycles].
-#: The time is longer than `QUIET_CYCLES`, so that a pendant in another process resumes first.
+#: Time without a frame of another pendant after which the emulated pendant resumes sending [cycles].
+#: It is longer than `QUIET_CYCLES`, so that a pendant in another process resumes before the emulated pendant.
 PENDANT_QUIET: Final = 12
-#: Number of received frames with increasing counters, all of one emulated message, that prove another robot on the bus.
+#: Number of received frames of an emulated message, with increasing counters, that prove another robot on the bus.
 ROBOT_FRAMES: Final = 3
 
 

@@ -19,7 +19,7 @@ from atalante_tools.conform.node_tester import NodeTester, NotTested
 _S, _C = DriveState, Controlword
 
 #: Legal transitions of a drive: (state, command) -> (transition number in CiA 402, next state).
-#: A command that has no transition in the current state must leave this state unchanged.
+#: A command that has no transition in the current drive state must leave the drive state unchanged.
 LEGAL: Final[dict[tuple[DriveState, Controlword], tuple[int, DriveState]]] = {
     (_S.SWITCH_ON_DISABLED, _C.SHUTDOWN): (2, _S.READY_TO_SWITCH_ON),
     (_S.READY_TO_SWITCH_ON, _C.SWITCH_ON): (3, _S.SWITCHED_ON),

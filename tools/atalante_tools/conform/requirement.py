@@ -69,8 +69,8 @@ def _result(tester: NodeTester, requirement: Requirement) -> Result:
         silence = _silence(tester, frames, cycle)
         measured = silence + outcome.measured
         if outcome.passed:
-            # Without a frame of the node, the requirement is not tested.
-            # Otherwise a node that is switched off would pass, because it sends no forbidden frame.
+            # If no frame of the node was received, the requirement is not tested.
+            # A node that is switched off would pass the tests for forbidden frames, because it sends no frame at all.
             return Result(requirement, Verdict.NOT_TESTED if silence else Verdict.PASSED, measured)
         if tester.clock.delay < LATE:
             return Result(requirement, Verdict.FAILED, measured)

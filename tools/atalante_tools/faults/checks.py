@@ -19,7 +19,7 @@ _SAG: Final = math.radians(1.0)
 #: Largest number of cycles from START to the event START_FAILED if a drive cannot be enabled.
 _FAILED: Final = 20
 #: Number of cycles without a command after which a drive must hold its position without the HAL (local hold).
-#: This number is not imported from the emulated drive, so that an error in the emulator cannot change the check.
+#: `_WATCHDOG` is not imported from the emulated drive, so that an error in the emulator cannot change the check.
 _WATCHDOG: Final = 5
 #: Largest accepted true speed of a joint, as a multiple of its velocity limit.
 _TOO_FAST: Final = 1.2

@@ -20,7 +20,8 @@ _FEET: Final = tuple(f"FOOT_{name.upper()}" for name in FEET)
 #: Share of doubled frames that the HAL tolerates permanently. The HAL does not tolerate a share above 0.2.
 _OFTEN: Final = 0.15
 #: Permanent communication faults that must not prevent the detection of a sensor fault.
-#: The last two faults delay messages that the sensor checks use. A message that is doubled in every cycle is a fault (F63).
+#: The late messages of a joint and of the pelvis IMU contain values that the sensor checks use.
+#: Only some frames are doubled, because a message that is doubled in every cycle is itself a fault (F63).
 _TOLERATED: Final = {
     "FOOT_LEFT often doubled": Fault("duplicate", "FOOT_LEFT_STATE", p=_OFTEN),
     "FOOT_LEFT a cycle late": Fault("delay", "FOOT_LEFT_STATE"),
@@ -219,7 +220,7 @@ SCENARIOS: Final = (
                 checks=(start_is_rejected,),
             ),
             # The controller moves the joint to compensate the drift, until the joint reaches its mechanical limit.
-            # Only then the reported position leaves its range, so the detection takes up to 400 cycles.
+            # The reported position leaves its range only at the mechanical limit, so the detection takes up to 400 cycles.
             Case(
                 "RIGHT_SA at 2 rad/s",
                 (Fault("encoder_drift", "RIGHT_SA", rate=2.0),),

@@ -12,8 +12,8 @@ from atalante_control.guide.shapes import GuideShape
 from atalante_hal.types import Vector
 
 KINDS: Final = ("smooth", "notched", "piecewise")
-#: Range of the random widths above and below the desired trajectory, as fractions of `half_width(xi)`. In a notch, the width is
-#: at least `_NARROW` times the width outside the notch.
+#: Range of the random widths above and below the desired trajectory, as fractions of `half_width(xi)`.
+#: In a notch, the width is at least `_NARROW` times the width outside the notch.
 _NARROW, _WIDE = 0.15, 1.0
 #: Largest assistance factor of a random guide.
 _LARGEST_FACTOR: Final = 0.95

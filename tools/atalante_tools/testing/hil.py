@@ -31,8 +31,7 @@ if TYPE_CHECKING:
 
 #: On a CAN interface, the emulated robot waits at most this time for the frames of one cycle [s].
 _POLL: Final = 0.01
-#: Time to listen on a CAN interface before the emulated robot uses the interface [s].
-#: The interface is considered free if no frame arrives during this time.
+#: Time to listen on a CAN interface before the emulated robot uses it [s]. The interface is free if no frame arrives.
 _QUIET: Final = 0.15
 #: Largest number of frames in a recording, about 30 s.
 KEPT: Final = 600_000

@@ -43,7 +43,7 @@ _HEX = np.full(256, _NOT_HEX, np.uint8)
 _HEX[np.frombuffer(b"0123456789", np.uint8)] = np.arange(10)
 _HEX[np.frombuffer(b"ABCDEF", np.uint8)] = _HEX[np.frombuffer(b"abcdef", np.uint8)] = np.arange(10, 16)
 #: Lookup table for two characters: value of two hexadecimal digits; 0xFFFF if one of the characters is not a hexadecimal digit.
-#: The index is the pair of characters as a little-endian 16-bit number.
+#: The index into the lookup table is the pair of characters as a little-endian 16-bit number.
 _HEX_PAIR = np.full(1 << 16, 0xFFFF, np.uint16)
 _HEX_PAIR.reshape(256, 256)[:] = np.where(
     (_HEX < 16) & (_HEX < 16)[:, None], _HEX.astype(np.uint16) << 4 | _HEX[:, None], 0xFFFF

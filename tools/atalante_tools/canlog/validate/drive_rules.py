@@ -30,8 +30,7 @@ _SPONTANEOUS = {(s, f) for s in DriveState for f in (_S.FAULT_REACTION_ACTIVE, _
 LEGAL = {(int(state), int(after)) for (state, _), after in TRANSITIONS.items()} | {
     (int(a), int(b)) for a, b in _SPONTANEOUS
 }
-#: Pairs (state, controlword) to which a drive need not respond.
-#: A drive ignores these controlwords if the quick stop is not acknowledged yet, or if the cause of the fault persists.
+#: Pairs (state, controlword) without a required response: the quick stop is not acknowledged, or the cause of a fault persists.
 EXEMPT = {(int(_S.QUICK_STOP_ACTIVE), int(_C.ENABLE_OPERATION)), (int(_S.FAULT), int(_C.FAULT_RESET))}
 _NOTHING = -1
 

@@ -59,7 +59,7 @@ class LoadRules:
         #: Start time of each time window with at least one frame [s], set by `finish`. Shape (windows,).
         self.begins: npt.NDArray[np.float64] = np.zeros(0)
         #: Bus load in each time window, 1 at full load, set by `finish`. Shape (windows, buses).
-        #: The first columns are the buses of the DBC; the other columns are the log channels without a bus.
+        #: The first columns of the bus load are the buses of the DBC; the other columns are the log channels without a bus.
         self.load: npt.NDArray[np.float64] = np.zeros((0, len(plan.buses)))
 
     @property

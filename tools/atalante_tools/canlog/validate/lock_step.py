@@ -25,8 +25,7 @@ Stamps = npt.NDArray[np.int64]
 CYCLE: Final = "Cycle"
 #: If no SYNC arrives within this time [ns], the HAL has probably stopped, and the time stamps follow the wall clock.
 PAUSE_NS: Final = 200_000_000
-#: Largest accepted increment of the cycle number between two SYNCs.
-#: Any other increment (restarted HAL, damaged frame) is replaced by 1.
+#: Largest accepted increment of the cycle number between two SYNCs. A larger one (restarted HAL, damaged frame) counts as 1.
 MOST_STEPS: Final = 1000
 #: `_SPACING_NS` is the time between the stamps of two consecutive frames in a cycle [ns].
 #: `_LAST` is the latest stamp in a cycle, as a share of the cycle time (0 to 1).
@@ -37,8 +36,7 @@ _SPACING_NS, _LAST = 1000, 0.7
 class _Channel:
     """State of the clock for one channel after the last frame on this channel."""
 
-    #: Plan index of the first SYNC message that was received on this channel; -1 if none was received yet.
-    #: The cycle number is read only from this message.
+    #: Plan index of the first SYNC message received on this channel, from which the cycle number is read; -1: none received yet.
     sync: int = -1
     cycle: int = 0  # cycle number of the last SYNC
     begin: int = 0  # time stamp of the last SYNC in robot time [ns]

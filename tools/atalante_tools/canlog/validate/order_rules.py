@@ -30,8 +30,8 @@ class _Bus:
     stamp: int = 0  # time stamp of the last SYNC frame [ns]
     cycle_of: dict[int, int] = field(default_factory=dict)  # cycle number of the last state frame, by message index
     jump_of: dict[int, int] = field(default_factory=dict)  # cycles between the last two state frames, by message index
-    #: Message index -> time stamp of the last state frame [ns], if this frame was the second state frame in its cycle.
-    #: If the next cycle has no state frame, the second frame belongs to the next cycle and arrived before its SYNC.
+    #: Message index -> time stamp of the last state frame [ns] if it was the second one in its cycle.
+    #: Such a frame may have arrived before the SYNC of its cycle; this is certain if the next cycle has no state frame.
     doubtful: dict[int, int] = field(default_factory=dict)
 
 

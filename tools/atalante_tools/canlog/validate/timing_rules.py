@@ -19,7 +19,7 @@ from atalante_tools.canlog.validate.findings import Findings
 from atalante_tools.canlog.validate.project import Project
 
 #: The interval histogram of a message has `BINS_A_CYCLE` bins per cycle time, and covers intervals up to `CYCLES` cycle times.
-#: The last bin counts all intervals longer than `CYCLES` cycle times.
+#: The last bin of the interval histogram counts all intervals longer than `CYCLES` cycle times.
 BINS_A_CYCLE, CYCLES = 100, 4
 BINS = BINS_A_CYCLE * CYCLES + 1
 _NEVER = -(1 << 62)
@@ -199,7 +199,7 @@ class TimingRules:
         bins = np.minimum(np.maximum(share * BINS_A_CYCLE, 0.0), float(BINS - 1)).astype(np.int64)
         bins += (np.arange(len(stream.present)) * BINS).repeat(stream.stops - stream.starts)
         # Exclude the intervals with lost, repeated or rejected frames from the statistics.
-        # Keep the intervals without an alive counter (`NO_STEP`, less than `REPEATED`): lost frames are not detectable there.
+        # Keep the intervals of messages without an alive counter (`NO_STEP`), because lost frames are not detectable there.
         incomplete = (
             odd[steps[odd] >= REPEATED]
             if rejected_before is None
@@ -262,7 +262,7 @@ class TimingRules:
         first, last = int(self._first[row]), int(self._last[row])
         mean = self._sum[row] / count
         # Report only if both the mean and the median deviate, as with a wrong cycle time.
-        # A long gap changes only the mean, and the rule cycle-gap reports this gap.
+        # A long gap changes only the mean interval, and the rule cycle-gap reports the gap.
         if (
             count >= self._mean_intervals
             and abs(mean / cycle - 1.0) > self._mean_tolerance
