@@ -30,7 +30,7 @@ class MotorParameters:
 
 
 _MOTORS = np.arange(len(JOINTS))
-#: Largest number of cycles by which the torque of a motor can be late.
+#: Largest delay of a motor torque that the emulator supports [cycles].
 MOST_LATE = 20
 
 # Rows of the motor array, first to fourth: torque setpoint, ratio of true to measured torque, dry friction, damping.

@@ -29,7 +29,7 @@ Pair = tuple[float, float]
 
 _SH, _SK, _LEG = LEG_JOINTS.index("SH"), LEG_JOINTS.index("SK"), len(LEG_JOINTS)
 #: Thresholds of the load of a foot, as fractions of the weight. Before the walk, a foot with more than `_STANDING` stands.
-#: During the walk, a foot with less than `_AIR` is in the air, and lands when its load exceeds `_LANDED`.
+#: During the walk, a foot with less than `_AIR` is in the air. It lands when its load exceeds `_LANDED`.
 _STANDING, _AIR, _LANDED = 0.25, 0.02, 0.1
 #: Time for which both feet must stand before the patient expects steps [cycles].
 _READY: Final = 500

@@ -13,7 +13,7 @@ points open. This controller decides them as follows:
 - *Xi towards 1.* Below Xi = 1 the assisted joints get the torque of the guide filter alone. At Xi = 1 they get exactly the torque
   of the baseline controller. Xi changes only at a stance change, so the carry-over makes the command continuous.
 - *Gains.* A narrow guide requires a stiff backup policy, but a stiff policy reaches the torque limit in a wide guide. There are
-  a few sets of gains. Each step uses the softest set whose certificate includes the chosen promise at the Xi of the step. The
+  a few sets of gains. Each step uses the softest set whose certificate includes the requested promise at the Xi of the step. The
   promise is a disturbance torque that does not move the joints out of the guide.
 - *Leaving the guide.* A counter rises in each cycle with h below 0 (outside the safe backward image) and falls in each other
   cycle. If the counter exceeds `outside_cycles` although the guide has a promise, the disturbance is larger than promised. The
@@ -180,7 +180,7 @@ class AirwalkController:
     def choice(self, xi: float) -> Choice:
         """Return the guide filter that is used at an assistance factor, together with its certified disturbance torques.
 
-        The promised torques are expressed as a fraction of the chosen promised torques.
+        The certified torques are expressed as a fraction of the requested disturbance torques.
 
         Args:
             xi: assistance factor in [0, 1].

@@ -124,7 +124,7 @@ def _array(name: str, content: bytes) -> Array:
     if fortran_order:
         raise ArrayFileError(f"{name} must be in C order")
     data = content[stream.tell() :]
-    # The size is a product of Python integers, because a NumPy product can overflow.
+    # The size is computed with Python integers, because a NumPy product can overflow.
     size = dtype.itemsize
     for length in shape:
         size *= length

@@ -27,8 +27,8 @@ The filter does not know the true state, so it uses bounds. Errors of inertia an
 (`Prediction.slack`), and the measured velocity lags behind the true velocity (part of `Prediction.reach`). So the h of the
 filter is at most the true h, and the gate is at least as large as the proof requires.
 
-All bounds are linear in the promise. The largest possible promise is therefore a multiple of the chosen promise. The certified
-promise is the smaller one of the largest possible and the chosen promise. It does not depend on the intensities of idealization
+All bounds are linear in the promise. The largest possible promise is therefore a multiple of the requested promise. The certified
+promise is the smaller of the largest possible and the requested promise. It does not depend on the intensities of idealization
 u_i and feedforward u_f. The backup torque includes u_i and u_f completely, so conditions 1 and 2 do not depend on the
 intensities. A torque that is not compensated acts only while the gate is below 1, so it affects only condition 3. At zero
 intensities this torque increases 6 g by less than 0.2 in each shape of the package.
@@ -150,7 +150,7 @@ class PromiseLimits:
 
         Args:
             xi: assistance factor in [0, 1].
-            promise: promise for which the filter is built, as a fraction of the chosen promise.
+            promise: promise for which the filter is built, as a fraction of the requested promise.
         """
         guide, strictest = self._guide, self.at(xi)[0]
         chosen = np.array(guide.prediction.assumptions.promise)
@@ -177,7 +177,7 @@ def _limit(room: Vector, reach: Vector, steps: int, what: str) -> Limit:
 
     Args:
         room: largest permitted effect on SH and SK in each cycle, shape (n, 2).
-        reach: columns 0 and 1: effect of model errors on SH and SK; columns 2 and 3: effect of the chosen promised torques on SH
+        reach: columns 0 and 1: effect of model errors on SH and SK; columns 2 and 3: effect of the requested torques on SH
             and SK, to be multiplied by the scale; shape (n, 4).
         steps: number of cycles of a step. All of them are checked.
         what: start of the message; joint and phase are appended.

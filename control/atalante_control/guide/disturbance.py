@@ -189,13 +189,13 @@ def spread(effect: Effect, mobilities: Vector, bounds: Vector, grid: Grid, ahead
     """Compute the largest outputs caused by disturbances that begin at each start cycle or at the start of the step.
 
     The first result is written to `ahead`, the second result is returned. In both results, columns 0 and 1 are the effects of
-    the budget on the two outputs, and columns 2 and 3 are the effects of the chosen promise. Each effect is a sum of absolute
+    the budget on the two outputs, and columns 2 and 3 are the effects of the requested promise. Each effect is a sum of absolute
     values.
 
     Args:
         effect: effect of a disturbance on the outputs.
         mobilities: inverse mass matrices of each cycle, shape (n, postures, 2, 2).
-        bounds: torque bounds of SH and SK (rows), budget and chosen promise (columns), in each cycle, shape (n, 2, 2) [Nm].
+        bounds: torque bounds of SH and SK (rows), budget and requested promise (columns), in each cycle, shape (n, 2, 2) [Nm].
         grid: start cycles, and numbers of cycles ahead, of the predictions in `ahead`.
         ahead: shape (blocks, lags, 4). Each element is raised to the largest output of its start cycles, for its number of cycles
             ahead. Predictions past the end of `bounds` are left out.

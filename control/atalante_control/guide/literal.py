@@ -1,6 +1,6 @@
 """Assistive torque computed literally as the paper prints it: `measured motion -> u_a = u_i + u_f + u_v` of hip and knee.
 
-This law is for comparisons with the paper. Its certificate contains no promised torques: it is not proven that the joints stay
+This law is for comparisons with the paper. Its certificate contains no certified torques: it is not proven that the joints stay
 inside the guide under any disturbance torque.
 Each joint is treated as a separate inertia, J q'' = u_v + u_f + u_ext. The backup torque u_b is the PD part of the baseline PID.
 In each cycle the motion under u_b is integrated to the end of the step twice: with the largest and with the smallest constant

@@ -56,7 +56,7 @@ class StartReach(NamedTuple):
     """Largest effects, in each cycle of a step, of disturbances that act since the start of the step.
 
     Columns 0 and 1 are the effect of the model errors (`Leg.budget`) on SH and SK. Columns 2 and 3 are the effect of the chosen
-    promised torques on SH and SK.
+    certified torques on SH and SK.
     """
 
     error: Vector  # (n, 4) rad

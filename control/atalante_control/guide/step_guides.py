@@ -1,8 +1,8 @@
 """Virtual guides of a walk, in the air or on the ground: one guide filter for each set of gains, and the selection for each step.
 
 `assistance factor -> guide filter, promise, certificate`. A narrow guide requires a stiff backup policy, but a stiff policy
-reaches the torque limit in a wide guide. Each step uses the softest filter that is certified for the chosen promise (disturbance
-torques) at the assistance factor of the step.
+reaches the torque limit in a wide guide. Each step uses the softest filter that is certified for the requested promise
+(disturbance torques) at the assistance factor of the step.
 """
 
 from __future__ import annotations

@@ -45,7 +45,7 @@ def _numbers(values: Sequence[float]) -> str:
 
 
 def _number(value: float) -> str:
-    # repr() prints all digits. float() is needed, because repr() of a NumPy scalar contains its type. Adding 0.0 avoids -0.0.
+    # repr() prints all digits. float() is needed, because repr() of a NumPy number also prints its type. Adding 0.0 removes -0.0.
     return repr(float(value) + 0.0)
 
 

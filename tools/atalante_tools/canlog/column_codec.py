@@ -72,7 +72,7 @@ class ColumnCodec:
         self._plan()
 
     def index(self, name: str) -> int:
-        """Return the index of a signal in `fields`. The result of `extract` has the signal in the row with this index.
+        """Return the index of a signal in `fields`, which is also the row of this signal in the result of `extract`.
 
         Raises:
             KeyError: If the message has no such signal; the error lists the signals.
@@ -85,7 +85,7 @@ class ColumnCodec:
             ) from None
 
     def _plan(self) -> None:
-        """Assign a source word to each field: an Intel word, a byte-swapped Motorola word, or two joined words."""
+        """Assign to each field the 64-bit word from which it is read: an Intel, a byte-swapped Motorola or two joined words."""
         rows: dict[tuple[str, int], int] = {}
         self._little: list[int] = []  # Intel words
         self._big: list[int] = []  # Motorola words, byte-swapped

@@ -22,7 +22,7 @@ Rows = npt.NDArray[np.int16]
 
 @dataclass(frozen=True)
 class Family:
-    """Family of messages: all messages with equal fields, which are decoded together."""
+    """Family of messages: all messages with the same signal layout, which are decoded together."""
 
     rows: range
     codec: ColumnCodec
@@ -103,7 +103,7 @@ class Plan:
                 continue
             extended[frame_id] = row
             if mask != _ALL_BITS:
-                # If a parameter group has two messages, the masked identifier is ambiguous and is treated as unknown.
+                # If two messages belong to one J1939 parameter group, the masked identifier is ambiguous and treated as unknown.
                 known = groups.setdefault(mask, {})
                 known[frame_id & mask] = UNKNOWN if frame_id & mask in known else row
         self._standard = standard
@@ -135,7 +135,7 @@ class Plan:
         return rows
 
     def rows_in_other_format(self, can_ids: npt.NDArray[np.uint32]) -> Rows:
-        """Return, for each identifier, the index of the message with the same number in the other format. Shape (n,).
+        """Return the index of the message with the same number, but with the other identifier length (11 or 29 bits). Shape (n,).
 
         The two formats are 11 bits and 29 bits. The index is `UNKNOWN` if the DBC has no such message.
         """

@@ -49,7 +49,8 @@ class Line(ResilientBus):
         self._pendant_ids = [m.frame_id for m in network.sent_by("PENDANT")]
         nodes = [node.name for node in network.nodes if node.kind not in ("master", "pendant")]
         self._own = {m.frame_id: m for name in nodes for m in network.sent_by(name)}
-        self._in_row: dict[int, tuple[int, int]] = {}  # CAN identifier -> last counter, frames in a row
+        #: CAN identifier -> last counter, number of frames with increasing counters
+        self._in_row: dict[int, tuple[int, int]] = {}
         self.sent = 0
         self.received = 0
         self.other_robot = ""

@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 
 
 def _protocol(_ctx: click.Context, _param: click.Parameter, text: str | None) -> tuple[int, int, int] | None:
-    """Convert the typed protocol to numbers of steps (option callback).
+    """Convert the text of the option `--protocol`, such as 112,38,225, to three numbers of steps (option callback).
 
     Raises:
         click.BadParameter: If the text is not three positive numbers.
@@ -67,7 +67,7 @@ def _protocol(_ctx: click.Context, _param: click.Parameter, text: str | None) ->
     "--protocol",
     callback=_protocol,
     metavar="A,B,C",
-    help="A steps with full assistance, B steps in which Xi falls to --xi, and C steps with --xi. Replaces --steps.",
+    help="Numbers of steps: A with full assistance, B in which Xi falls to --xi, and C with --xi. Replaces --steps.",
 )
 @click.option(
     "--wearer",

@@ -82,11 +82,11 @@ class Vectors:
         return np.array(order, np.intp)
 
     def header(self, images: int) -> bytes:
-        """Return the first bytes of the stream: magic, network hash and number of images."""
+        """Return the first bytes of the stream: magic number, network hash and number of images."""
         return HEADER.pack(MAGIC, self._build.network.hash32, images)
 
     def images(self, count: int) -> Iterator[bytes]:
-        """Yield images with minimum, maximum, invalid and then random values.
+        """Yield images, which are sets of payloads, with minimum, maximum, invalid and then random signal values.
 
         Call this only once per instance, because a second call would continue the counters and the random numbers.
         """
@@ -96,7 +96,7 @@ class Vectors:
             yield np.concatenate([part.view(np.uint8) for part in parts])[self._order].tobytes()
 
     def examples(self) -> Iterator[dict[str, Any]]:
-        """Yield JSON objects with minimum, maximum, invalid and random values.
+        """Yield JSON objects with minimum, maximum, invalid and random signal values.
 
         Call this only once per instance, because a second call would continue the counters and the random numbers.
         """

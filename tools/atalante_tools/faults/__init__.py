@@ -149,7 +149,7 @@ def _counts(counts: dict[str, int]) -> str:
     default=200,
     show_default=True,
     metavar="N",
-    help="Number of random pairs of faults at random moments.",
+    help="Number of random pairs of faults that begin at random times.",
 )
 @click.option(
     "--seed", type=click.IntRange(0), default=0, show_default=True, metavar="N", help="Seed of the random pairs."

@@ -111,7 +111,7 @@ SCENARIOS: Final = (
         ),
         permanent=Case("one leg", (Fault("drop", "SYNC_LEFT_LEG"),)),
     ),
-    # A drive detects lost commands from the alive counter of the next command, so the detection takes one more cycle.
+    # A drive detects lost commands from the alive counter of the next command, so the detection takes one cycle longer.
     Scenario("F24", tuple(Case(f"{n} frames", (Fault("drop", _COMMAND, 0, n),), detected=n + 1) for n in range(1, 5))),
     Scenario(
         "F25",

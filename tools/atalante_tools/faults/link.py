@@ -100,7 +100,7 @@ SCENARIOS: Final = (
                     node=_KNEE,
                     reacted=reacted,
                     recovers=False,
-                    observed=40,  # few, because foot forces that stay constant for 100 cycles are a fault
+                    observed=40,  # few cycles, because foot forces that stay constant for 100 cycles are a fault
                 )
                 for frames, state, dtc, reacted in (
                     (5, SupervisorState.FINISH_STEP, "JOINT_TIMEOUT", 5),

@@ -1,4 +1,4 @@
-"""Faults at other moments than in the fault matrix: from power-on to the operator's restart, single and in random pairs.
+"""Faults that begin at other times than in the fault matrix, from power-on to the operator's restart, single and in random pairs.
 
     case of the matrix, moment -> run with a schedule of START and STOP -> safety checks, measured extremes
 
@@ -50,7 +50,7 @@ _END: Final = 300
 
 
 class Moment(StrEnum):
-    """Moment at which a fault begins."""
+    """Point of a run at which a fault begins."""
 
     BOOT = "boot"  # in the first cycle of the HAL
     READY = "ready"  # in READY, before the operator's START
@@ -70,7 +70,7 @@ class Schedule:
 
 
 def schedule(moment: Moment, engine: str) -> Schedule:
-    """Return the schedule of a run in which the fault begins at a moment.
+    """Return the schedule of a run in which the fault begins at a given `Moment`.
 
     Args:
         moment: moment at which the fault begins.
@@ -108,7 +108,7 @@ class Extremes:
 
 @dataclass(frozen=True)
 class MomentVerdict:
-    """Result of a run with one fault at a moment, or with two faults."""
+    """Result of a run in which one fault begins at a `Moment`, or two faults."""
 
     moment: str
     faults: tuple[str, ...]  # for each fault: its ID and the name of the case
@@ -120,7 +120,7 @@ class MomentVerdict:
 
 @dataclass(frozen=True)
 class MomentTask:
-    """Task to run cases of the fault matrix at a moment. The cases begin `delays` cycles after the moment."""
+    """Task to run cases of the fault matrix that begin `delays` cycles after a `Moment`."""
 
     moment: Moment
     cases: tuple[tuple[str, int], ...]  # fault ID, index of the case in its scenario
@@ -128,7 +128,7 @@ class MomentTask:
     engine: str = PYBULLET
 
     def __call__(self) -> MomentVerdict:
-        """Run the cases and check what must be true for all faults at all moments."""
+        """Run the cases and check what must be true for every fault, whenever it begins."""
         chosen = [SCENARIOS[id_].cases[index] for id_, index in self.cases]
         names = tuple(f"{id_} {case.name}" for (id_, _), case in zip(self.cases, chosen, strict=True))
         stimuli = tuple(shifted(s, d) for case, d in zip(chosen, self.delays, strict=True) for s in case.stimuli)
@@ -150,7 +150,7 @@ class MomentTask:
 
 
 def single_tasks(ids: Sequence[str], engine: str) -> list[MomentTask]:
-    """Return one task per case of the matrix and moment.
+    """Return one task for each case of the fault matrix and each `Moment`.
 
     Args:
         ids: IDs of the scenarios.
@@ -165,7 +165,7 @@ def single_tasks(ids: Sequence[str], engine: str) -> list[MomentTask]:
 
 
 def random_pairs(count: int, seed: int, engine: str) -> list[MomentTask]:
-    """Return tasks with two random cases of the matrix at a random moment.
+    """Return tasks with two random cases of the fault matrix that begin at a random `Moment`.
 
     The second case begins 0 to 50 cycles after the first.
 

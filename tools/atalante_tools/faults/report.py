@@ -50,7 +50,7 @@ class Summary:
     lines: tuple[Line, ...]
     endurance: tuple[Endurance, ...]
     pairs: tuple[PairVerdict, ...]
-    moments: tuple[MomentVerdict, ...]  # single faults and random pairs at all moments
+    moments: tuple[MomentVerdict, ...]  # runs in which single faults or random pairs begin at each `Moment`
     seconds: float  # duration of the campaign [s]
 
     @classmethod
@@ -79,7 +79,7 @@ class Summary:
 
     @property
     def passed(self) -> bool:
-        """Return whether all faults, pairs and runs at other moments passed."""
+        """Return whether all faults, all pairs, and all runs with other start times passed."""
         failed = [*(pair.failures for pair in self.pairs), *(run.failures for run in self.moments)]
         return all(line.passed for line in self.lines) and not any(failed)
 
@@ -136,7 +136,7 @@ class Summary:
         return "\n\n".join(parts) + "\n"
 
     def _moments(self) -> str:
-        """Return a table with the extremes of each moment and fault: a row per moment for all runs, then a row per fault."""
+        """Return a table of the largest values: first a row for each `Moment` with all its runs, then a row for each fault."""
         single = [run for run in self.moments if len(run.faults) == 1]
         pairs = [run for run in self.moments if len(run.faults) > 1]
         groups = [(f"all, {moment}", [run for run in single if run.moment == moment]) for moment in Moment]

@@ -165,8 +165,8 @@ class Scope:
 
     endurance: bool  # endurance runs
     pairs: bool  # the pairs of `REPRESENTATIVES` during a walk
-    moments: bool  # each case at each moment from power-on to the restart
-    random_pairs: int  # number of random pairs of cases at random moments
+    moments: bool  # each case, begun at each `Moment` from power-on to the restart
+    random_pairs: int  # number of random pairs of cases that begin at random times
     seed: int  # seed of the random pairs
 
 

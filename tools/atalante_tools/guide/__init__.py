@@ -1,4 +1,4 @@
-"""Command `atalante guide`: search for pushes that contradict the promises of the virtual guides.
+"""Command `atalante guide`: search for pushes that move a joint out of a certified virtual guide.
 
 The promise of a guide is a torque at hip and knee. The certificate of the guide states that no push up to this torque moves a
 joint out of the guide. The adversary is a search for a push up to this torque that does move a joint out of the guide.
@@ -49,7 +49,7 @@ class CheckOptions:
     factors: tuple[float, ...]  # assistance factors; empty means `FACTORS`
     patients: bool  # whether to check the network gaits of several patients, too
     conditions: tuple[str, ...]  # names of conditions; empty means all
-    push: tuple[float, float] | None  # largest push at hip and knee [Nm]; None means the promised torques
+    push: tuple[float, float] | None  # largest push at hip and knee [Nm]; None means the certified torques
     steps: int | None  # steps on the plant per guide; None means the number in `effort`
     robot_steps: int | None  # steps on the emulated robot per guide; None means the number in `effort`
     seed: int  # seed of the search and of the noise
@@ -93,14 +93,14 @@ _CHECK_OPTIONS = [
                       "mass (both), encoder noise, 1 % frame loss, 1 ms more delay. Repeat the option for several conditions.  "
                       "[default: all]"),
     click.option("--push", type=(Between(0.0, 500.0), Between(0.0, 500.0)), default=None, metavar="HIP KNEE",
-                 help="Largest push at hip and knee [Nm].  [default: the promised torques of the guide]"),
+                 help="Largest push at hip and knee [Nm].  [default: the certified torques of the guide]"),
     click.option("--steps", type=click.IntRange(1), metavar="N",
                  help="Steps on the ideal plant per guide.  [default: 1500, with --quick 60]"),
     click.option("--robot-steps", type=click.IntRange(0), metavar="N",
                  help="Steps on the emulated robot per guide.  [default: 60, with --quick 0]"),
     click.option("--seed", type=SEED, default=0, show_default=True, metavar="N", help="Seed of the search and of the noise."),
     click.option("--quick", is_flag=True,
-                 help="Run a short search: only on the ideal plant, and only pushes up to the promised torques."),
+                 help="Run a short search: only on the ideal plant, and only pushes up to the certified torques."),
     click.option("--plot", type=OutputFile(".png", ".svg", ".pdf"), metavar="FILE",
                  help="Draw the last guide: its bounds, the safe errors (safe backward image) and the worst step."),
     click.option("--table", type=OutputFile(".md"), metavar="FILE", help="Write the results as a Markdown table."),
@@ -113,9 +113,9 @@ _CHECK_OPTIONS = [
 @command.command(short_help="Search for the worst push within the promise of a guide.")
 @options_as("options", CheckOptions, [*_CHECK_OPTIONS, law_options(), json_option, subject_options])
 def check(options: CheckOptions, as_json: bool, subject: Subject | None) -> None:
-    """Search for the worst push up to the promised torques of each guide, and print the torques and the worst |e| / q_bound.
+    """Search for the worst push up to the certified torques of each guide, and print the torques and the worst |e| / q_bound.
 
-    A push acts on hip and knee of the swing leg at the same time. The torque at each joint is at most the promised torque, and
+    A push acts on hip and knee of the swing leg at the same time. The torque at each joint is at most the certified torque, and
     its direction may change at any time. The promise is kept if the ratio |e| / q_bound is at most 1. The column "left at" is
     the smallest multiple of the promise that moved a joint out of the guide. The exit code is 1 if a promise is broken, but with
     --push it is 0.
@@ -147,7 +147,7 @@ def check(options: CheckOptions, as_json: bool, subject: Subject | None) -> None
     if broken and options.push is None:
         worst = max(broken, key=lambda verdict: verdict.worst_ratio or 0.0)
         raise Failed(
-            f"all {len(verdicts)} guides must keep their promise, but {len(broken)} did not; worst: {worst.shape} at "
+            f"all {len(verdicts)} certified guides must withstand the pushes, but {len(broken)} did not; worst: {worst.shape} at "
             f"Xi {worst.xi:g} with |e| / q_bound {worst.worst_ratio:.3f}{f' ({worst.stopped})' if worst.stopped else ''}"
         )
 

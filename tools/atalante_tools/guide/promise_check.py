@@ -1,4 +1,4 @@
-"""Check of a guide: search for the worst push, and comparison with the promise. `gait, shape, Xi -> Verdict`.
+"""Check of a guide: search for the worst push, and comparison with the certified torques. `gait, shape, Xi -> Verdict`.
 
 The promise of a guide is a torque at hip and knee. The search (class `Adversary`) uses pushes up to these torques, unless
 `Task.push` gives other limits. At the start of a step, the leg deviates from the nominal motion. The hand-over box (`HandOver`)
@@ -53,9 +53,9 @@ PATIENTS: Final = (
 _CORNERS: Final = 64
 #: Time by which the measured velocity of a drive lags behind the true velocity, due to its low-pass filter and half a cycle [s].
 _VELOCITY_LAG: Final = 2.0e-3
-#: The search for `Verdict.left_at` tries pushes up to this multiple of the promised torques.
+#: The search for `Verdict.left_at` tries pushes up to this multiple of the certified torques.
 LARGEST_FACTOR: Final = 6.0
-#: The search for `Verdict.left_at` walks this share of `Effort.steps` for each multiple of the promised torques that it tries.
+#: The search for `Verdict.left_at` walks this share of `Effort.steps` for each multiple of the certified torques that it tries.
 _SHARE: Final = 0.1
 
 
@@ -63,7 +63,7 @@ _SHARE: Final = 0.1
 class Effort:
     """Number of steps and extent of the search for the check of one guide."""
 
-    steps: int  # steps on the ideal plant with pushes up to the promised torques
+    steps: int  # steps on the ideal plant with pushes up to the certified torques
     robot_steps: int  # steps on the emulated robot; 0: the robot is not used
     tightness: bool  # whether to search for the smallest push that moves a joint out of the guide
 
@@ -79,7 +79,7 @@ class Task:
     conditions: Sequence[Condition]  # deviations of the simulated leg and of the emulated robot from the model
     effort: Effort
     seed: int  # seed of the search
-    push: Pair | None = None  # largest push at hip and knee [Nm]; None means the promised torques
+    push: Pair | None = None  # largest push at hip and knee [Nm]; None means the certified torques
 
 
 @dataclass(frozen=True)
@@ -90,8 +90,10 @@ class Verdict:
     xi: float
     gait: str
     certified: bool
-    promise_hip_nm: float | None  # largest push at the hip: `Task.push` or the promise [Nm]; None if there is neither
-    promise_knee_nm: float | None  # largest push at the knee: `Task.push` or the promise [Nm]; None if there is neither
+    #: largest push at the hip: `Task.push`, else the certified torque [Nm]; None if there is neither
+    promise_hip_nm: float | None
+    #: largest push at the knee: `Task.push`, else the certified torque [Nm]; None if there is neither
+    promise_knee_nm: float | None
     worst_ratio: float | None  # largest |e| / q_bound of plant and robot; None if no step was walked
     steps: int  # number of steps on plant and robot
     plant_ratio: float | None  # largest |e| / q_bound on the ideal plant
@@ -99,9 +101,9 @@ class Verdict:
     worst_push: str  # kind of the worst push on the plant
     worst_condition: str  # deviation of the plant from the model in the worst step, for example "friction +20 %"
     stopped: str  # reason why the robot left ACTIVE; empty if it did not
-    #: smallest multiple of the promised torques that moved a joint out of the guide; None if not searched or not found
+    #: smallest multiple of the certified torques that moved a joint out of the guide; None if not searched or not found
     left_at: float | None
-    reason: str  # what limits the promised torques, or why there are none
+    reason: str  # what limits the certified torques, or why there are none
 
     @property
     def broken(self) -> bool:
@@ -140,7 +142,7 @@ def patients() -> list[Subject]:
 
 
 def promise_of(certificate: Certificate) -> Pair | None:
-    """Return the promised torque at hip and knee [Nm], or None if the certificate has no promise.
+    """Return the certified torques at hip and knee [Nm], or None if the guide is not certified.
 
     Args:
         certificate: certificate of the running guide.

@@ -37,7 +37,7 @@ def read(log: LogFile, chunk_frames: int) -> Iterator[Chunk]:
             log.position = file.tell() if not log.compressed else log.position
             end = MARGIN + kept + got
             if not got:
-                break  # now the file has ended, or `broken` describes a read error
+                break  # the file has ended, or `broken` describes a read error
             stop = _after_last_newline(text, end - got, end)
             if not stop:
                 kept += got

@@ -13,10 +13,10 @@ from atalante_tools.canlog.plan import Plan
 from atalante_tools.canlog.validate.rules import RULE_OF
 
 Stamps = npt.NDArray[np.int64]
-#: Maximum number of unknown identifiers with one finding each. All further identifiers share the finding `OTHERS`.
+#: Maximum number of unknown identifiers that get a finding of their own. All others share the finding `OTHERS`.
 MAX_UNKNOWN_IDS = 100
 OTHERS = "(others)"
-#: Rules whose findings can outnumber the messages of the DBC.
+#: Rules that can have more findings than the DBC has messages, because they concern unknown identifiers.
 _UNBOUNDED = ("unknown-id",)
 
 

@@ -29,7 +29,8 @@ class _Bus:
     count: int = 0  # SYNC frames so far
     stamp: int = 0  # time stamp of the last SYNC frame [ns]
     cycle_of: dict[int, int] = field(default_factory=dict)  # cycle number of the last state frame, by message index
-    jump_of: dict[int, int] = field(default_factory=dict)  # cycles between the last two state frames, by message index
+    #: number of cycles between the last two state frames, by message index
+    jump_of: dict[int, int] = field(default_factory=dict)
     #: Message index -> time stamp of the last state frame [ns] if it was the second one in its cycle.
     #: Such a frame may have arrived before the SYNC of its cycle; this is certain if the next cycle has no state frame.
     doubtful: dict[int, int] = field(default_factory=dict)

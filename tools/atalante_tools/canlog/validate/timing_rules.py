@@ -293,7 +293,7 @@ def jitter_p99(histogram: npt.NDArray[np.int64]) -> float:
     return float(distance[order[int(np.searchsorted(reached, 0.99 * total))]]) / BINS_A_CYCLE
 
 
-@lru_cache(maxsize=64)  # most messages have the same median
+@lru_cache(maxsize=64)  # cached, because most messages have the same median interval
 def _by_distance(bins: int, middle: int) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.intp]]:
     """Return the distance of each bin to the middle bin, and the bins in the order of this distance. Shape (bins,) each."""
     distance = np.abs(np.arange(bins) - middle)

@@ -256,7 +256,7 @@ def raw_bounds(limits: Field) -> tuple[int, int]:
     return _codes_within(limits.minimum, limits.maximum, limits.factor, limits.offset, raw_range(limits))
 
 
-@lru_cache(maxsize=4096)  # many signals of a DBC have equal limits
+@lru_cache(maxsize=4096)  # cached, because many signals of a DBC have equal limits
 def _codes_within(minimum: float, maximum: float, factor: float, offset: float, codes: range) -> tuple[int, int]:
     raw = sorted((x - offset) / factor for x in (minimum, maximum))
     low, high = math.ceil(raw[0] - 1e-6), math.floor(raw[1] + 1e-6)

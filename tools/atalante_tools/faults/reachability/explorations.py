@@ -258,7 +258,7 @@ def _contents(before: Reception, age: int) -> Iterator[PendantFrame]:
 
 
 def _agrees(frame: PendantFrame, operator: Operator) -> bool:
-    """Return whether a frame is consistent with the operator's stop action. An earlier frame always is."""
+    """Return whether a frame agrees with the operator's stop action. A frame from before the action always agrees."""
     if frame.age > operator.cycles:
         return True  # the pendant sampled the frame before the action of the operator
     return {
