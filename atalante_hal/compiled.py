@@ -65,7 +65,8 @@ def specialised(function: Callable[P, R], *args: P.args, **kwargs: P.kwargs) -> 
     if machine is function:
         return function
     dispatcher = cast(Any, machine)
-    if len(dispatcher.overloads) == 1:  # that of the first call; finding it by the types of its arguments takes longer
+    # If only the first call compiled a version, no search by argument types is needed, which would take longer.
+    if len(dispatcher.overloads) == 1:
         (only,) = dispatcher.overloads.values()
         return cast(Callable[P, R], only.entry_point)
     types = tuple(dispatcher.typeof_pyval(arg) for arg in args)

@@ -171,7 +171,7 @@ class Transceiver:
         except BusError as error:
             self._find(Dtc.BUS_DOWN, True, 0.0, f"the bus {self.bus.name} cannot receive: {error}")
             count = first
-            if cycle is not None:  # pause: with a failing bus, lock-step cycles would run as fast as possible
+            if cycle is not None:  # The pause keeps lock-step cycles on a failing bus from running as fast as possible.
                 time.sleep(min(patience, _DOUBTFUL_PATIENCE))
         if self.tap is not None:
             self.tap.received(scratch[first:] if first else scratch, count - first)

@@ -134,7 +134,7 @@ class Dtc(StrEnum):
     GAIT_INVALID = "GAIT_INVALID", _R.NOT_READY, _S.ERROR, "the gait was rejected"
 
 
-#: Codes with the reaction HOLD that do not prevent the HAL from controlling the robot for some more steps.
+#: Codes with the reaction HOLD with which the HAL can still control the robot for some more steps.
 _CONTROLLABLE = frozenset(
     {
         Dtc.E2E_REPEAT_RATE,
@@ -146,8 +146,8 @@ _CONTROLLABLE = frozenset(
         Dtc.OVERRUN,
     }
 )
-#: Codes with the reaction HOLD that do not prevent it either if the affected node is not a drive. The walking controller
-#: bridges the loss of an IMU or of a foot until the robot stands.
+#: Codes with the reaction HOLD that permit some more steps only if the affected node is not a drive.
+#: The walking controller bridges the loss of an IMU or of a foot until the robot stands.
 _CONTROLLABLE_WITHOUT_SENSOR = frozenset(
     {
         Dtc.E2E_SEQUENCE,

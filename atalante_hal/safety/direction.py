@@ -1,4 +1,4 @@
-"""Proof of direction: before ACTIVE, each joint moves a little, and its encoder must follow the torque.
+"""Test of the joint directions: before ACTIVE, each joint moves a little, and its encoder must follow the torque.
 
     all drives enabled -> torque pulse on each joint -> mobility of the joint -> ACTIVE, or START_FAILED
 
@@ -51,8 +51,8 @@ INTEGRAL = 0.03
 TRAVEL = math.radians(1.5)
 #: A foot is loaded if its mean force during a test exceeds `LOAD * cell_free`, which is four times the noise of the mean.
 LOAD = 1.0 / 3.0
-#: A foot hit the floor if the sum of its forces in two consecutive cycles exceeds `HIT * cell_free`, which is four times the
-#: noise of this sum. An impact that stops an ankle has at least 1.5 times this sum.
+#: A foot hit the floor if the sum of its forces in two consecutive cycles exceeds `HIT * cell_free`.
+#: This limit is four times the noise of the sum. An impact that stops an ankle has at least 1.5 times this limit.
 HIT = 2.0
 #: Factor of the torque pulse in the second test of a joint near its end stop. The leg weight may press the joint onto the stop.
 BOOST = 6.0
@@ -143,7 +143,7 @@ class DirectionProof:
         self._torque: list[Vector] = []  # sent torques in each cycle of the current test
 
     def begin(self, position: Vector, torque: Vector) -> None:
-        """Begin the tests of all joints whose direction is not proven.
+        """Begin the tests of all joints whose direction is not verified yet.
 
         Args:
             position: present joint positions, shape (12,) [rad], which the position control holds.

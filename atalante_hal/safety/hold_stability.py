@@ -30,7 +30,7 @@ class Swings(NamedTuple):
     """Record of the reversals of all joints, shape (12,) each."""
 
     direction: npt.NDArray[np.int64]  # sign of the last velocity above `SPEED`; 0 if there is none
-    age: npt.NDArray[np.int64]  # time since the last velocity above `SPEED` in this direction began [cycles]
+    age: npt.NDArray[np.int64]  # cycles since the joint first exceeded `SPEED` in this direction
     reversals: npt.NDArray[np.int64]  # number of consecutive reversals
 
 

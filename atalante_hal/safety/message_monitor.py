@@ -39,7 +39,7 @@ from atalante_hal.wire.process_image import NEVER, ReceiveImage
 #: Result of the E2E check of a rejected message -> diagnostic that becomes pending.
 PENDING = {
     Check.REPEATED: Dtc.E2E_REPEATED,
-    Check.CONFLICT: Dtc.E2E_REPEATED,  # if it is the only frame of its message in the cycle; otherwise see `rivals_of`
+    Check.CONFLICT: Dtc.E2E_REPEATED,  # if its message has no other frame in the cycle; otherwise see `rivals_of`
     Check.WRONG_SEQUENCE: Dtc.E2E_SEQUENCE,
     Check.CRC: Dtc.E2E_CRC,
     Check.LENGTH: Dtc.FRAME_LENGTH,
@@ -67,7 +67,7 @@ _DISTURBANCES = {
     Check.RANGE: Dtc.SIGNAL_RANGE,
     Check.INVALID: Dtc.SIGNAL_RANGE,
 }
-#: The robot goes to HOLD when the age of the data of a joint in a tolerant leg reaches this multiple of the message timeout.
+#: In a walk on the ground, HOLD follows when the age of the data of a joint reaches this multiple of the message timeout.
 BRIEF_TIMEOUTS = 2
 
 

@@ -162,7 +162,7 @@ class SafetyMonitor:
         return Verdict(state.supervisor, state.assistance_factor, limit, diagnostics, self._acknowledged)
 
     def _check_joints(self) -> tuple[Finding, ...]:
-        """Check the torques of the drives while the robot moves, and else the joints for oscillations; return the faults found.
+        """Check the torques of the drives while the robot moves, otherwise check the joints for oscillations. Return the faults.
 
         A drive with a wrong torque loses its proof of direction. The drive of an oscillating joint is stored.
         """
@@ -394,7 +394,7 @@ class SafetyMonitor:
             return None
         self._stalled = 0
         if not self._proof_begun:
-            if not self.enabling:  # before the test, one cycle with the torques that the drives report
+            if not self.enabling:  # in the cycle before the test, the drives get the torques that they report
                 return None
             self._proof_begun = True
             proof.begin(state.position, self._limiter.last)

@@ -27,7 +27,7 @@ class Conditions:
     step_finished: bool = False  # the walking step has ended, the robot does not walk, or FINISH_STEP took too long
     #: the operator requested STOP or released the dead-man, or the pendant timed out, while the robot walks on the ground
     walk_end_requested: bool = False
-    #: those of the diagnostics that demand FINISH_STEP instead of HOLD, because the robot walks on the ground
+    #: confirmed diagnostics that lead to FINISH_STEP instead of HOLD, because the robot walks on the ground
     walk_ends: frozenset[Dtc] = frozenset()
 
 

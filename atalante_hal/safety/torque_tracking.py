@@ -23,8 +23,7 @@ from atalante_hal.robot import JOINTS
 from atalante_hal.safety.diagnostics import Dtc, Finding
 from atalante_hal.types import Vector
 
-#: Number of cycles of which the sent torques count: four lost commands, four cycles in which the frame is late, and four cycles
-#: for the answer of the drive.
+#: Number of cycles in which a sent torque counts: four lost commands, four late cycles, and four cycles for the drive's answer.
 SPAN: Final = 12
 #: Largest distance of a reported torque from the range of the sent torques, relative to the breakaway torque of the joint.
 TOLERANCE: Final = 0.2
@@ -33,10 +32,10 @@ CONFIRM: Final = 5
 
 
 class Tracking(NamedTuple):
-    """Memory of the check."""
+    """State of the check: the sent torques, and a counter of wrong torques for each drive."""
 
     sent: Vector  # (SPAN, 12) Nm, torques sent in the last cycles; the oldest is overwritten
-    cycles: npt.NDArray[np.int64]  # (1,) number of cycles since the restart
+    cycles: npt.NDArray[np.int64]  # (1,) number of cycles since the restart of the check
     wrong: npt.NDArray[np.int64]  # (12,) number of consecutive cycles with a wrong torque
 
 

@@ -62,7 +62,7 @@ class _Comparison(NamedTuple):
 
     angles: tuple[float, float, float]  # leg angles from the IMUs: FH, TH and the sum SH + SK [rad]
     errors: tuple[float, float, float]  # encoder angles minus `angles` [rad]
-    uncertainty: float = 0.0  # allowance on `errors` for encoder and IMU values of different cycles [rad]
+    uncertainty: float = 0.0  # largest part of `errors` due to encoder and IMU values of different cycles [rad]
 
 
 class Legs:

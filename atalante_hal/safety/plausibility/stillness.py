@@ -81,7 +81,7 @@ class Drive(NamedTuple):
     """
 
     cycles: Vector  # number of cycles since the encoder reading last changed
-    rest: Vector  # torque with which the joint came to rest [Nm]: the last torque of the first `_AT_REST` cycles
+    rest: Vector  # torque that held the joint when it came to rest [Nm], at the end of the first `_AT_REST` cycles
     low: Vector  # lowest torque [Nm]
     high: Vector  # highest torque [Nm]
     momentum: Vector  # angular momentum that the torque would cause [Nm s]

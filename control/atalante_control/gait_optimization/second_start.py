@@ -76,7 +76,7 @@ def joints_at_limits(solved: SolvedGait) -> list[str]:
         "angle": (tables.q.min(axis=0) <= low + margin) | (tables.q.max(axis=0) >= high - margin),
         "speed": np.abs(tables.qd).max(axis=0) >= (1.0 - _AT_LIMIT) * requirements.speed_share * robot.velocity_max,
     }
-    if solved.peak_torque.size:  # it is empty if the torques are unknown
+    if solved.peak_torque.size:  # `peak_torque` is empty if the torques are unknown
         reached["torque"] = solved.peak_torque >= (1.0 - _AT_LIMIT) * requirements.torque_share * robot.torque_max
     return [
         f"{quantity} of {joint}"

@@ -42,7 +42,7 @@ _OPTIONS: dict[str, Any] = {
     "print_time": False,
     "error_on_fail": False,
     "calc_lam_p": False,
-    "no_nlp_grad": True,  # only sensitivities need the gradient; compiled functions provide no sensitivities
+    "no_nlp_grad": True,  # The gradient is needed only for sensitivities, which compiled functions do not provide.
 }
 #: IPOPT options of a warm start: a small initial barrier parameter mu, and bound multipliers computed from mu.
 #: A warm start takes 17 to 21 iterations with these options, and 34 to 36 iterations with the default options.

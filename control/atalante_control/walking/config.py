@@ -24,7 +24,7 @@ WALK_GAINS = PidGains(
     stance=replace(PidGains().stance, ki=_NO_INTEGRAL), swing=replace(PidGains().swing, ki=_NO_INTEGRAL)
 )
 #: Parameters of the guide on the ground, stiffer than in the air, because the leg with the patient is heavier than the empty leg.
-#: The hand-over box (deviations at a stance change for which a promise holds) covers the deviations at the landings.
+#: The hand-over box (deviations at a stance change for which the guide is certified) covers the deviations at the landings.
 WALK_GUIDE = StepGuideConfig(stiffness=(4500.0, 3300.0), hand_over=HandOver(deviation=math.radians(1.0), rate=0.3))
 
 
@@ -39,7 +39,7 @@ class WalkConfig:
     gains: PidGains = WALK_GAINS
     impact: ImpactConfig = field(default_factory=ImpactConfig)
     alpha: float = 0.3  # end of the re-centring, as a fraction of the step duration
-    #: True: the torques of the periodic steps follow the paper literally, see `literal`. The guide then has no promised torques.
+    #: True: the torques of the periodic steps follow the paper literally, see `literal`. The guide is then not certified.
     literal_law: bool = False
     #: m/m, gain of the ankle stabiliser: shift of the centre of pressure / error of the divergent component of motion
     stabiliser: float = 2.5

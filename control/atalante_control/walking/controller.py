@@ -142,7 +142,7 @@ class WalkController:
         self._forces = force.copy()  # forces with an estimate for a lost foot
         #: Copy of the requested torque, used if the `State` does not contain the sent torque.
         self._sent = np.zeros(_N)
-        self._state: State | None = None  # `State` object whose arrays `_measured_by` contains
+        self._state: State | None = None  # `State` object whose arrays are in `_measured_by`
         self._measured = Measured(np.zeros(_N), np.zeros(_N), np.zeros(3), np.zeros(3), np.zeros(3), force, self._sent)
         self._measured_by = {_PELVIS: self._measured, _TORSO: self._measured}
         stages: Records[Stage] = zeros(Stage, 1)

@@ -67,7 +67,7 @@ class Placement:
     """State of foot placement and step timing in the current phase, and working memory of `shift_foot`."""
 
     clock: float  # cycles, current row of the phase table, not rounded to an integer
-    pace: float  # phase rate: nominal cycles per cycle
+    pace: float  # phase rate: progress of the step in one cycle, in nominal cycles
     target: Annotated[Vector, 2]  # m, requested offset of the landing in the walking frame
     offset: Annotated[Vector, 2]  # m, current offset of the swing foot in the walking frame
     speed: Annotated[Vector, 2]  # m/s, speed of the offset

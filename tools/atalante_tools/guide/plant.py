@@ -63,8 +63,7 @@ class Plant(NamedTuple):
     """Constants of the plant, for compiled functions. Index 0 is the hip, index 1 the knee."""
 
     mass: Vector  # (3, 3) kg m2, rows: M11, M12, M22; columns: coefficients of 1, cos q_SK, sin q_SK
-    #: (2, 4) Nm, gravity torques; rows: hip, knee; columns: coefficients of cos q_SH, sin q_SH, cos(q_SH + q_SK),
-    #: sin(q_SH + q_SK)
+    #: (2, 4) Nm, gravity torques of hip and knee (rows): coefficients of cos and sin of q_SH, cos and sin of q_SH + q_SK.
     weight: Vector
     coulomb: Vector  # (2,) Nm, dry friction
     viscous: Vector  # (2,) Nm s/rad, viscous friction

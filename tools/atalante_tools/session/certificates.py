@@ -13,7 +13,7 @@ if TYPE_CHECKING:
 
 
 def weakest(certificates: Iterable[Certificate]) -> Certificate:
-    """Return the certificate with the smallest promised hip torque. A certificate without promised torques is the weakest.
+    """Return the weakest certificate: one without certified torques, or else the one with the smallest torque at the hip.
 
     Args:
         certificates: Certificates of one guide shape, one for each assistance factor. At least one is needed.
@@ -36,7 +36,7 @@ def promise_fields(certificate: Certificate | None) -> dict[str, Any]:
 
 
 def announce(certificates: Collection[Certificate], mismatch: Mismatch, leg: str) -> None:
-    """Print the certificate of each guide shape: the promised torques, or the reason why there are none.
+    """Print the certificate of each guide shape: the certified torques, or the reason why there are none.
 
     Args:
         certificates: Certificates to print.

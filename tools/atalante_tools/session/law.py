@@ -22,7 +22,7 @@ class Law:
 
     idealization: float = 1.0  # intensity of the joint idealization u_i while the guide does not act, 0 to 1
     feedforward: float = 1.0  # intensity of the feedforward u_f while the guide does not act, 0 to 1
-    literal: bool = False  # whether the law follows the paper literally; the guides then have no promised torques
+    literal: bool = False  # whether the law follows the paper literally; the guides are then not certified
 
     def config(self) -> AirwalkConfig:
         """Return the parameters of the airwalk controller."""
@@ -55,7 +55,7 @@ def law_options() -> Callable[[_Command], _Command]:
         click.option(
             "--literal",
             is_flag=True,
-            help="Use the control law exactly as the paper prints it, for comparisons. The guides then have no promised torque.",
+            help="Use the control law exactly as the paper prints it, for comparisons. The guides are then not certified.",
         ),
     ]
     return options_as("law", _law, options)

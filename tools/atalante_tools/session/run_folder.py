@@ -31,10 +31,10 @@ class Result:
 
     shape: str
     certified: bool  # whether the guide has a certificate at every assistance factor of the run
-    #: Promised torque at the hip [Nm]; None if the guide has no promise.
+    #: Certified disturbance torque at the hip [Nm]; None if the guide is not certified.
     #: Both joints stay in the guide under disturbances up to `promise_hip_nm` at the hip and `promise_knee_nm` at the knee.
     promise_hip_nm: float | None
-    promise_knee_nm: float | None  # promised torque at the knee [Nm], see `promise_hip_nm`
+    promise_knee_nm: float | None  # certified torque at the knee [Nm], see `promise_hip_nm`
     steps: int  # number of completed right-stance steps
     max_ratio: float | None  # largest ratio of tracking error to guide width, |e| / q_bound
     inside: float | None  # share of the time with both assisted joints inside the guide, 0 to 1

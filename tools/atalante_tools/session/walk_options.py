@@ -32,7 +32,7 @@ class Push:
     direction: float  # deg, 0 forwards, 90 to the left
     duration: float = 0.2  # s
     step: int | None = None  # index of the pushed step, from 0; None means the middle step of the walk
-    phase: float = 0.3  # time from the start of the step to the push / duration of a step
+    phase: float = 0.3  # phase of the push: time since the start of the step / duration of the step
 
 
 @dataclass(frozen=True)

@@ -34,9 +34,9 @@ class WalkResult:
     xi: float
     shape: str | None  # guide shape; None at Xi = 1, where there is no guide
     certified: bool | None  # whether the guide is certified; None at Xi = 1, where there is no guide
-    #: promised torque of SH [Nm]: up to this disturbance, both joints stay in the guide; None without promised torques
+    #: certified torque at SH [Nm]: up to this disturbance, both joints stay in the guide; None without certificate
     promise_hip_nm: float | None
-    #: promised torque of SK [Nm], see `promise_hip_nm`; None without promised torques
+    #: certified torque at SK [Nm], see `promise_hip_nm`; None without certificate
     promise_knee_nm: float | None
     max_ratio: float | None  # largest tracking error as a fraction of the guide; None if no step was guided
     inside: float | None  # fraction of the guided time with both joints inside the guide; None if no step was guided

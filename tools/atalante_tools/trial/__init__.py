@@ -189,7 +189,7 @@ def faults(ids: tuple[str, ...], running: Running, as_json: bool) -> None:
 @click.option(
     "--literal",
     is_flag=True,
-    help="Use the control law as the paper prints it. The guides then have no promised torque.",
+    help="Use the control law as the paper prints it. The guides are then not certified.",
 )
 @_walking()
 @_running("protocol")

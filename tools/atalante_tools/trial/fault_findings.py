@@ -1,4 +1,4 @@
-"""Findings of the experiment `faults`: `results -> falls of each fault, with moments, reasons and longest durations`."""
+"""Findings of the experiment `faults`: `results -> falls of each fault, with start times, reasons and longest durations`."""
 
 from __future__ import annotations
 
@@ -10,10 +10,11 @@ from typing import Any, Final
 from atalante_tools.faults.matrix import load_matrix
 from atalante_tools.trial.findings import Finding, Result
 
-#: Fault ID -> regular expression for the names of the cases in which the robot must not fall. These are lost, late and doubled
-#: frames; a failed IMU, foot or force cell; an exception of the controller; a late loop; STOP; a released dead-man switch. A
-#: drive without data for ten cycles is left out, because its joint must not be moved. After HOLD the robot may fall, because the
-#: drives hold at once.
+#: Fault ID -> regular expression for the names of the cases in which the robot must not fall.
+#: The cases are lost, late and doubled frames; a failed IMU, foot or force cell; an exception of the controller.
+#: Further cases are a late loop, STOP, and a released dead-man switch.
+#: A drive without data for ten cycles is left out, because its joint must not be moved.
+#: After HOLD the robot may fall, because the drives hold at once.
 NO_FALL: Final = {
     **dict.fromkeys(("F01", "F02", "F03", "F05", "F20", "F24", "F30", "F31", "F32", "F33"), ""),
     "F04": "LEFT|RIGHT|5 frames",
@@ -78,7 +79,7 @@ def _by_case(falls: Sequence[tuple[str, dict[str, Any]]]) -> list[tuple[str, lis
 
 
 def _moments(falls: Sequence[dict[str, Any]]) -> str:
-    """Return moments, end states, first diagnostics and the reason of falls with one case."""
+    """Return as text, for the falls with one case: when the fault began, the end states, the first diagnostics, the reason."""
     moments = ", ".join(moment_name(run["moment"]) for run in falls)
     states = ", ".join(dict.fromkeys(run["state"] for run in falls))
     codes = ", ".join(dict.fromkeys(run["codes"][0] if run["codes"] else "no diagnostic" for run in falls))
@@ -86,7 +87,7 @@ def _moments(falls: Sequence[dict[str, Any]]) -> str:
 
 
 def _longest(result: Result) -> str:
-    """Return, as text, the longest fault duration without a fall at the worst moment."""
+    """Return, as text, the longest fault duration without a fall, for the worst start of the fault."""
     limited = [
         (cycles, run["moment"])
         for cycles, run in zip(result["longest"], result["runs"], strict=True)
@@ -99,7 +100,7 @@ def _longest(result: Result) -> str:
 
 
 def moment_name(moment: float | None) -> str:
-    """Return the name of a moment.
+    """Return the name of the point of a walk at which a fault begins.
 
     Args:
         moment: phase of the step; None means in double support.

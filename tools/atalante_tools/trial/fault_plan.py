@@ -1,4 +1,4 @@
-"""Trials of the experiment `faults`: each case of the fault matrix, injected at nine moments of a walk on the ground.
+"""Trials of the experiment `faults`: each case of the fault matrix, injected at nine points of a walk on the ground.
 
     scenarios of the fault matrix -> trials
 
@@ -23,7 +23,7 @@ PERMANENT: Final = -1
 
 @dataclass(frozen=True)
 class FaultTrial:
-    """Trial of one case of a fault scenario, with one walk per moment."""
+    """Trial of one case of a fault scenario, with one walk for each point at which the fault begins."""
 
     kind: ClassVar[str] = "fault"
     id: str  # fault ID, as in the fault matrix

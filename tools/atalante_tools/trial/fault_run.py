@@ -1,4 +1,4 @@
-"""Run the trials of the experiment `faults`: `trial -> one walk on the ground per moment -> outcomes, diagnostics, durations`.
+"""Run the trials of the experiment `faults`: `trial -> a walk for each start of the fault -> outcomes, diagnostics, durations`.
 
 A first walk without a fault gives the cycles of the moments. All walks with the same seed are equal until the fault begins.
 """
@@ -66,7 +66,7 @@ class FaultRun:
 
 
 def run_fault(trial: FaultTrial) -> dict[str, Any]:
-    """Run a trial at all its moments, and return its result.
+    """Run the walks of a trial, one for each point at which the fault begins, and return the result.
 
     Args:
         trial: trial to run.
@@ -122,7 +122,7 @@ def longest_without(falls: Callable[[int], bool], horizon: int, resolution: int)
 
 
 def _run(trial: FaultTrial, case: Case, moment: float | None) -> FaultRun:
-    """Walk with a fault that begins at a moment."""
+    """Walk with a fault that begins at a given point of the walk."""
     shift, step = _cycles(trial.mass, trial.height, trial.seed, trial.engine)
     begins = shift + _SHIFTED if moment is None else step + round(moment * STEP[1] / PERIOD)
     walk = _Walk(case.stimuli, begins)

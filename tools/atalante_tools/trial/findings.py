@@ -32,7 +32,7 @@ TREND, ASYMMETRY = 0.8, 0.25
 VARIATION: Final = 0.05
 
 
-#: Smallest share of guides with a promise, and of robust walks that end standing.
+#: Smallest share of guides that are certified, and of robust walks that end standing.
 CERTIFIED, ROBUST = 0.95, 0.98
 #: Pushes of 0.2 s that the robot must withstand [N]: in the worst direction and phase, and forwards in the worst phase.
 PUSH_WORST, PUSH_FORWARD = 200.0, 300.0
