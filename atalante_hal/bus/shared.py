@@ -56,6 +56,7 @@ class SharedBus:
 
     Attributes:
         patience: Longest wait of the client in lock-step for an answer [s]; 0 if this end is not a client.
+        before_request: Function that `receive` of the client calls before it requests a step. With None, nothing is called.
         dropped: Always 0, because no frame is lost here.
     """
 
@@ -70,6 +71,7 @@ class SharedBus:
         """
         self.name = name
         self.patience = 0.0
+        self.before_request: Callable[[], object] | None = None
         self.dropped = 0
         self._wake_socket = socket.socket(fileno=wake_socket)
         self._wake_socket.setblocking(False)
@@ -186,6 +188,18 @@ class SharedBus:
             if peers[_SLEEPING]:
                 self._wake_peer()
 
+    def run_step(self) -> None:
+        """Request a step of the server, and wait until the step is complete. Frames that the server sends stay queued.
+
+        Only the client in lock-step may call this method.
+
+        Raises:
+            BusDown: If the other end is closed, or the step is not complete within `patience`.
+        """
+        peers, requested = self._peers, self._request()
+        if not self._until(lambda: peers[_COMPLETED] == requested, self.patience):
+            raise BusDown(f"{self.name}: the other end did not complete a step within {self.patience:g} s")
+
     def wait_until_served(self, timeout: float) -> None:
         """Wait until the other end has called `serve`.
 
@@ -224,13 +238,20 @@ class SharedBus:
     def _request_step(self) -> bool:
         """Request a step from the other end, and return whether the other end sent frames."""
         peers, received = self._peers, self._received
-        self._own[_SENT] = self._sent
-        self._own[_REQUESTED] = requested = self._own[_REQUESTED] + 1
-        if peers[_SLEEPING]:
-            self._wake_peer()
+        if self.before_request is not None:
+            self.before_request()
+        requested = self._request()
         # The server publishes the frames of a step before it marks the step as completed, so no frame is missed here.
         self._until(lambda: peers[_SENT] != received or peers[_COMPLETED] == requested, self.patience)
         return peers[_SENT] != received
+
+    def _request(self) -> int:
+        """Publish the sent frames, and request a step of the other end. Return the number of requests so far."""
+        self._own[_SENT] = self._sent
+        self._own[_REQUESTED] = requested = self._own[_REQUESTED] + 1
+        if self._peers[_SLEEPING]:
+            self._wake_peer()
+        return requested
 
     def _wait(self, timeout: float) -> bool:
         """Wait up to `timeout` [s] for frames and return whether any arrived. Do not wait while this end runs `serve`."""

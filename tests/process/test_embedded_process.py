@@ -8,7 +8,9 @@ import subprocess
 import sys
 import time
 from pathlib import Path
+from types import SimpleNamespace
 
+import numpy as np
 import pytest
 
 from atalante_dbc import Network
@@ -19,9 +21,10 @@ from atalante_hal.types import SupervisorState
 from atalante_tools.console.options import Target
 from atalante_tools.console.outcome import Failed
 from atalante_tools.console.stop_request import StopRequest
-from atalante_tools.session.embedded import EmbeddedRobot, halves
+from atalante_tools.session.embedded import EmbeddedRobot, cores_are_idle, halves
 from atalante_tools.session.pose_hold import PoseHold
 from atalante_tools.session.rig import Watch, open_hal
+from atalante_tools.session.walk_observation import Observation
 
 EMBEDDED = Target("embedded", "", lockstep=True)
 LONG = 60.0
@@ -148,3 +151,45 @@ def test_robot_subprocess_ends_when_its_hal_is_killed(connected: bool) -> None:
             assert hal.stdout.readline() == "walking\n"
         hal.kill()
     assert wait_for_end(pid)
+
+
+@pytest.mark.parametrize(
+    ("cores", "running", "others", "idle"),
+    [
+        (2, 1, 0, True),  # only this thread
+        (2, 2, 0, False),
+        (2, 1, 1, False),
+        (3, 1, 1, True),
+        (3, 2, 1, False),
+        (1, 1, 0, False),
+        (2, 0, 0, True),  # this thread was not counted
+    ],
+)
+def test_robot_needs_a_core_that_is_idle(
+    cores: int, running: int, others: int, idle: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(os, "sched_getaffinity", lambda _: set(range(cores)))
+    monkeypatch.setattr(os, "cpu_count", lambda: cores)
+    load = tmp_path / "loadavg"
+    load.write_text(f"0.50 0.40 0.30 {running}/196 4711\n")
+    assert cores_are_idle(others, load) is idle
+
+
+def test_cores_are_idle_if_the_load_is_not_known(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(os, "sched_getaffinity", lambda _: {0, 1})
+    assert cores_are_idle(0, tmp_path / "loadavg")
+
+
+def test_observation_of_a_walk_survives_the_end_of_the_robot_subprocess(network: Network, robot: Robot) -> None:
+    robot_process = EmbeddedRobot()
+    with open_hal(EMBEDDED, network=network, robot=robot, robot_process=robot_process) as rig:
+        controller = SimpleNamespace(walking=False, vertical=np.array([0.0, 0.0, 1.0]))
+        observation = Observation(rig, controller, None)  # type: ignore[arg-type]
+        rig.hal.read()
+        rig.hal.hold()
+        assert rig.access is not None
+        assert abs(rig.access.attitude()[3]) > 0.99
+        os.kill(robot_process.pid, signal.SIGKILL)
+        rig.hal.state.cycle = 10
+        assert not observation.check()
+        assert observation.true_deviation() == {"true_lateral_m": None, "true_yaw_deg": None}

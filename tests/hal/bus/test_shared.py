@@ -100,6 +100,36 @@ def test_each_receive_without_queued_frames_runs_one_step(asker: tuple[SharedBus
     assert answering.received == [[], [100], [7], []]
 
 
+def test_run_step_waits_for_the_end_of_the_step_and_keeps_its_frames(asker: tuple[SharedBus, Answering]) -> None:
+    ours, answering = asker
+    answering.pause = 0.02
+    ours.send(frames_of(7))
+    ours.run_step()
+    assert answering.received == [[7]]
+    block = new_frames(8)
+    assert ours.receive(block) == 1  # the frame of the step; no further step
+    assert answering.received == [[7]]
+
+
+def test_run_step_raises_bus_down_if_the_step_does_not_end(asker: tuple[SharedBus, Answering]) -> None:
+    ours, answering = asker
+    answering.pause, ours.patience = 0.2, 0.01
+    with pytest.raises(BusDown, match=r"did not complete a step within 0\.01 s"):
+        ours.run_step()
+
+
+def test_function_before_a_request_runs_once_per_step(asker: tuple[SharedBus, Answering]) -> None:
+    ours, answering = asker
+    steps: list[int] = []
+    ours.before_request = lambda: steps.append(len(answering.received))
+    block = new_frames(8)
+    for cycle in range(3):
+        ours.send(frames_of(cycle))
+        assert ours.receive(block) == 1
+    ours.run_step()  # no cycle, so the function is not called
+    assert steps == [0, 1, 2]
+
+
 def test_frames_beyond_the_buffer_are_returned_without_another_step(asker: tuple[SharedBus, Answering]) -> None:
     ours, answering = asker
     ours.send(frames_of(1, 5))

@@ -79,6 +79,37 @@ def test_protocol_lowers_the_assistance_step_by_step() -> None:
     assert 0.0 < result["cpu_per_second"] < 10.0
 
 
+def test_walk_with_push_and_dial_has_the_same_result_and_frames_in_two_processes(tmp_path: Path) -> None:
+    arguments = (
+        "--protocol",
+        "1,1,1",
+        "--xi",
+        "0.5",
+        "--engine",
+        "mujoco",
+        "--push",
+        "60",
+        "--push-direction",
+        "90",
+        "--json",
+    )
+    results, frames = [], []
+    for option in ("--robot-process", "--no-robot-process"):
+        log = tmp_path / f"{option}.log"
+        code, out, errors = run(*arguments, option, "--can-log", str(log))
+        assert code == 0, errors
+        result = json.loads(out)
+        assert result.pop("robot_process") == (option == "--robot-process")
+        del result["real_time_factor"], result["cpu_per_second"]
+        results.append(result)
+        frames.append(log.read_bytes())
+    assert results[0] == results[1]
+    assert frames[0] == frames[1]
+    assert results[0]["max_dcm_error_m"] > 0.015  # of the push; 0.012 m without it
+    assert results[0]["max_ratio"] > 0.0  # in the step after the dial was turned
+    assert results[0]["true_lateral_m"] is not None
+
+
 def test_dial_falls_linearly_from_full_assistance() -> None:
     operator = Operator()
     dial = Dial(operator, (3, 3, 2), 0.2)
@@ -123,6 +154,7 @@ def test_robot_that_is_pushed_over_ends_with_code_1() -> None:
         (("--protocol", "1,2,0"), "must be three positive numbers of steps"),
         (("--protocol", "1,2,3", "-i", "socketcan", "-c", "vcan0"), "--protocol requires the emulated robot"),
         (("--push", "50", "-i", "socketcan", "-c", "vcan0"), "--push requires the emulated robot"),
+        (("--robot-process", "-i", "socketcan", "-c", "vcan0"), "--robot-process requires the emulated robot"),
         (("--step-length", "0.9"), "step length must be 0.05 to 0.4 m, got 0.9 m"),
     ],
 )

@@ -125,6 +125,12 @@ def _protocol(_ctx: click.Context, _param: click.Parameter, text: str | None) ->
     help="Folder for recording.mcap, summary.json, trace.npz (telemetry of the controller at 100 Hz) and walk.png. Existing "
     "files are replaced.  [default: no files]",
 )
+@click.option(
+    "--robot-process/--no-robot-process",
+    default=None,
+    help="Run the emulated robot in a process of its own, in parallel with the HAL. This is faster on idle processor cores. The "
+    "result is the same.  [default: if a core is idle, and another one for recording, CAN log and telemetry]",
+)
 @options_as("recording", RecordingOptions, RECORDING_OPTIONS)
 @target_options(embedded=True)
 @json_option
@@ -144,6 +150,7 @@ def command(
     friction: float,
     seed: int,
     out: Path | None,
+    robot_process: bool | None,
     recording: RecordingOptions,
     target: Target,
     as_json: bool,
@@ -158,6 +165,7 @@ def command(
     Example: atalante walk --steps 40 --mass 75 --height 1.75
     """
     emulated = {"--push": push is not None, "--wearer passive": wearer == "passive", "--protocol": protocol is not None}
+    emulated["--robot-process"] = bool(robot_process)
     for option, given in emulated.items():
         if given and not target.embedded:
             raise click.UsageError(f"{option} requires the emulated robot of -i embedded")
@@ -177,6 +185,7 @@ def command(
         law=law,
         protocol=protocol,
         recording=recording,
+        robot_process=robot_process,
         out=out,
     )
     walk(target, options, as_json=as_json)

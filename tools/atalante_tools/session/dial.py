@@ -6,16 +6,17 @@ from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from atalante_emulator.pendant import Operator
+    from atalante_tools.session.embedded.access import Access
 
 
 class Dial:
     """Assistance dial of the emulated pendant. The emulated operator reduces the assistance factor from step to step."""
 
-    def __init__(self, operator: Operator, protocol: tuple[int, int, int], xi: float) -> None:
+    def __init__(self, operator: Operator | Access, protocol: tuple[int, int, int], xi: float) -> None:
         """Set the dial to full assistance.
 
         Args:
-            operator: Operator of the emulated pendant.
+            operator: Operator of the emulated pendant, or access to the robot of this operator.
             protocol: Numbers of steps with full assistance, in the transition, and with `xi`.
             xi: Assistance factor at the end.
         """

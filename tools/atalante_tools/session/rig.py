@@ -32,6 +32,7 @@ from atalante_tools.console.stop_request import StopRequest, check_stop, ended_b
 from atalante_tools.console.terminal import Progress, print_message
 from atalante_tools.session.body import describe, open_mechanics
 from atalante_tools.session.embedded import EmbeddedRobot, SpawnConfig
+from atalante_tools.session.embedded.access import Access, LocalAccess
 
 if TYPE_CHECKING:
     from atalante_emulator.emulator import Emulator
@@ -52,12 +53,14 @@ class Rig:
     Attributes:
         target: Bus and clock.
         hal: HAL of the run.
+        access: Access to an embedded robot beside the bus, in this process or in another. None if the robot is not embedded.
         emulator: Emulator of a robot in this process. None if the robot is real or in another process.
         operator: Emulated operator of a robot in this process. None if the robot is real or in another process.
     """
 
     target: Target
     hal: Hal
+    access: Access | None = None
     emulator: Emulator | None = None
     operator: Operator | None = None
 
@@ -150,6 +153,7 @@ def open_hal(
     robot = robot or load_robot()
     with ExitStack() as stack:
         emulator = None
+        access: Access | None = None
         if robot_process is not None:
             stack.enter_context(robot_process)
             if operator is not None:
@@ -158,6 +162,7 @@ def open_hal(
                 )
             robot_process.begin(SpawnConfig(network, robot, mechanics or _suspended(robot, target), pose, seed, faults))
             bus: Bus = robot_process.bus
+            access = robot_process.access
         elif target.embedded:
             hal_end, robot_end = lockstep_pair()
             bus = hal_end
@@ -173,6 +178,7 @@ def open_hal(
             )  # fmt: skip
             mechanics.complete(emulator)
             hal_end.step = emulator.poll
+            access = LocalAccess(emulator, operator)
         else:
             bus = join(network, open_buses(network, target))
         stack.callback(bus.close)
@@ -189,7 +195,7 @@ def open_hal(
         if robot_process is None and not target.embedded:
             hal.listen()
         check_stop()
-        yield Rig(target, hal, emulator, operator if emulator else None)
+        yield Rig(target, hal, access, emulator, operator if emulator else None)
 
 
 def _suspended(robot: Robot, target: Target) -> Mechanics:

@@ -36,6 +36,7 @@ from atalante_tools.session.walk_watch import WalkWatch
 if TYPE_CHECKING:
     from atalante_control.walking.controller import WalkController
     from atalante_hal.telemetry.child import TelemetryChild
+    from atalante_tools.session.embedded import EmbeddedRobot
 
 
 def walk(target: Target, options: WalkOptions, *, as_json: bool) -> None:
@@ -50,14 +51,26 @@ def walk(target: Target, options: WalkOptions, *, as_json: bool) -> None:
         Failed: If the robot fell or did not walk to the end, or the recording or the CAN log is incomplete.
     """
     from atalante_hal.telemetry.child import TelemetryChild
+    from atalante_tools.session.embedded import EmbeddedRobot
 
     outputs = _outputs(options)
     with ExitStack() as stack:
         if options.out is not None:
             stack.enter_context(run_folder(options.out))
-        # start the subprocess early: it imports its modules while this process creates the controller
+        two_processes = _robot_process_wanted(target, options, outputs)  # before the telemetry process loads a core
+        # start the subprocesses early: they import their modules while this process creates the controller
         child = None if outputs is None else stack.enter_context(TelemetryChild())
-        _walk(target, options, outputs, child, as_json=as_json)
+        robot = stack.enter_context(EmbeddedRobot(target.engine)) if two_processes else None
+        _walk(target, options, robot, outputs, child, as_json=as_json)
+
+
+def _robot_process_wanted(target: Target, options: WalkOptions, outputs: Outputs | None) -> bool:
+    """Return whether the emulated robot gets its own process: as the user wants it, or if there are idle cores."""
+    if not target.embedded or options.robot_process is not None:
+        return target.embedded and bool(options.robot_process)
+    from atalante_tools.session.embedded import cores_are_idle
+
+    return cores_are_idle(others=0 if outputs is None else 1)
 
 
 def _outputs(options: WalkOptions) -> Outputs | None:
@@ -72,9 +85,24 @@ def _outputs(options: WalkOptions) -> Outputs | None:
 
 
 def _walk(
-    target: Target, options: WalkOptions, outputs: Outputs | None, child: TelemetryChild | None, *, as_json: bool
+    target: Target,
+    options: WalkOptions,
+    robot_process: EmbeddedRobot | None,
+    outputs: Outputs | None,
+    child: TelemetryChild | None,
+    *,
+    as_json: bool,
 ) -> None:
-    """Walk, and print the result. The subprocess `child`, if any, writes the outputs."""
+    """Walk, and print the result.
+
+    Args:
+        target: Bus and clock.
+        options: Options of the user.
+        robot_process: Subprocess of the emulated robot. None means that an emulated robot runs in this process.
+        outputs: Outputs of the telemetry process; None means no outputs.
+        child: Subprocess that writes the outputs.
+        as_json: Whether to print a JSON object instead of text.
+    """
     from atalante_control.walking.config import WALK_GUIDE, WalkConfig
     from atalante_control.walking.controller import WalkController
     from atalante_hal.robot import load_robot
@@ -96,15 +124,13 @@ def _walk(
         _announce(controller, options.xi)
     if not target.lockstep:
         controller.prepare()
-    mechanics = operator = None
+    mechanics = None
     if target.embedded:
         from atalante_emulator.mechanics import Ground, Mechanics
-        from atalante_emulator.pendant import Operator
         from atalante_emulator.wearer import LimbParameters
 
         ground, limbs = Ground(friction=options.friction), LimbParameters() if options.passive else None
         mechanics = Mechanics(describe(robot, None, patient), target.engine, ground, limbs)
-        operator = Operator()
     with ExitStack() as stack:
         rig = stack.enter_context(
             open_hal(
@@ -112,10 +138,10 @@ def _walk(
                 robot=robot,
                 seed=options.seed,
                 pose=controller.standing_pose.tolist(),
-                operator=operator,
                 assistance_factor=options.xi if options.protocol is None else 1.0,
                 controller_fields=controller.telemetry_fields,
                 gait_hash=gaits.step.hash32,
+                robot_process=robot_process,
                 mechanics=mechanics,
             )
         )
@@ -128,8 +154,8 @@ def _walk(
             recorder = Recorder(rig, telemetry, EndpointReport(telemetry))
         observation, trace = Observation(rig, controller, options.push), WalkTrace(controller)
         dial = None
-        if options.protocol is not None and operator is not None:
-            dial = Dial(operator, options.protocol, options.xi)
+        if options.protocol is not None and rig.access is not None:
+            dial = Dial(rig.access, options.protocol, options.xi)
 
         def record() -> None:
             trace.sample(rig.hal.state.cycle)
@@ -165,6 +191,7 @@ def _walk(
             max_dcm_error_m=round(controller.max_dcm_error, 4),
             diagnostics=diagnostics(rig.hal),
             real_time_factor=round(statistics.real_time_factor, 2),
+            robot_process=robot_process is not None,
             cpu_per_second=round(processor / (statistics.cycles * PERIOD), 4),
         )
         if as_json:

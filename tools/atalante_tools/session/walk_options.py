@@ -54,6 +54,8 @@ class WalkOptions:
     protocol: tuple[int, int, int] | None = None
     #: Options of recording, CAN log and telemetry. If none of these outputs is requested, no telemetry process is started.
     recording: RecordingOptions = field(default_factory=RecordingOptions)
+    #: Whether the emulated robot runs in a process of its own; None means if there are enough processor cores.
+    robot_process: bool | None = None
     out: Path | None = None  # folder for summary.json, trace.npz and walk.png; None means no files
 
 

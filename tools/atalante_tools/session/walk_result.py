@@ -56,7 +56,10 @@ class WalkResult:
     max_dcm_error_m: float  # largest error of the divergent component of motion
     diagnostics: dict[str, int]  # number of occurrences of each diagnostic of the HAL
     real_time_factor: float
-    cpu_per_second: float  # processor time of this process per second of the run
+    robot_process: bool  # whether the emulated robot ran in a process of its own, in parallel with the HAL
+    cpu_per_second: (
+        float  # processor time of this process per second of the run, with its waits for a robot in another process
+    )
 
 
 def guide_fields(certificate: Certificate | None, statistics: GuideStatistics) -> dict[str, Any]:

@@ -1,6 +1,7 @@
 """Embedded robot in a subprocess. The physics of the robot runs in parallel with the HAL and the controller.
 
-    HAL <-> SharedBus <-> emulator and body (python -m atalante_tools.session.embedded)
+    HAL       <-> SharedBus <-> emulator and body (python -m atalante_tools.session.embedded)
+    operator  <-> RemoteAccess, ServedAccess <-> pushes, dial, true motion
 
 The subprocess ("child") is a new Python interpreter in a separate process group. Ctrl-C therefore reaches only the parent. The
 loop of the parent ends in HOLD and then closes the bus. If one process ends, the other process detects it on the bus and ends.
@@ -15,9 +16,11 @@ import os
 import pickle
 import subprocess
 import sys
+import time
 from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass
+from pathlib import Path
 from typing import TYPE_CHECKING, ClassVar
 
 from atalante_dbc import Network
@@ -28,6 +31,7 @@ from atalante_hal.robot import Robot
 from atalante_tools.console.options import PYBULLET
 from atalante_tools.console.outcome import Failed
 from atalante_tools.session.body import require_engine
+from atalante_tools.session.embedded.access import RemoteAccess, access_memory
 
 if TYPE_CHECKING:
     from atalante_emulator.faults import Fault
@@ -36,6 +40,8 @@ if TYPE_CHECKING:
 #: `_PATIENCE` is the timeout of the answer to a SYNC [s]. `_START` is the timeout of the creation of the robot [s].
 #: `_END` is the longest wait for the end of the child after the bus is closed [s].
 _PATIENCE, _START, _END = 2.0, 60.0, 5.0
+#: File with the load of the computer, number of samples of the load, and time between two samples [s].
+_LOAD, _LOAD_SAMPLES, _LOAD_INTERVAL = Path("/proc/loadavg"), 5, 2e-3
 
 
 @dataclass(frozen=True)
@@ -57,6 +63,7 @@ class EmbeddedRobot(Closing):
 
     Attributes:
         bus: HAL side of the bus to the child.
+        access: Access to the robot beside the bus.
     """
 
     _open: ClassVar[list[EmbeddedRobot]] = []
@@ -73,11 +80,12 @@ class EmbeddedRobot(Closing):
         """
         require_engine(engine)
         memory, parent_bell, child_bell = descriptors()
+        access = access_memory()
         self._child = subprocess.Popen(
-            [sys.executable, "-P", "-m", "atalante_tools.session.embedded", str(memory), str(child_bell)],
+            [sys.executable, "-P", "-m", "atalante_tools.session.embedded", str(memory), str(child_bell), str(access)],
             stdin=subprocess.PIPE,
             stdout=subprocess.DEVNULL,
-            pass_fds=(memory, child_bell),
+            pass_fds=(memory, child_bell, access),
             process_group=0,
         )
         self._begun = False
@@ -85,6 +93,7 @@ class EmbeddedRobot(Closing):
         os.close(child_bell)
         self.bus = SharedBus("embedded", memory, parent_bell, 0)
         self.bus.patience = _PATIENCE
+        self.access = RemoteAccess(self.bus, access)
         self._part_from_child()
 
     def _part_from_child(self) -> None:
@@ -140,6 +149,29 @@ class EmbeddedRobot(Closing):
             self._child.wait()
         if self._child.stdin is not None:
             self._child.stdin.close()
+
+
+def cores_are_idle(others: int, load: Path = _LOAD) -> bool:
+    """Return whether there is a processor core for this process, and an idle core for the robot and for each other process.
+
+    On a busy computer two processes that wait for each other are slower than one process, because the scheduler runs other
+    programs in between.
+
+    Args:
+        others: Number of other processes that will run during the whole run, such as the telemetry process.
+        load: File of Linux with the number of threads that run or wait for a core.
+    """
+    if len(os.sched_getaffinity(0)) < 2 + others:
+        return False
+    samples = []
+    for _ in range(_LOAD_SAMPLES):
+        try:
+            samples.append(int(load.read_text().split()[3].partition("/")[0]))
+        except (OSError, IndexError, ValueError):
+            return True  # the load is not known
+        time.sleep(_LOAD_INTERVAL)
+    busy = max(1, min(samples))  # this thread and all others that ran in every sample
+    return (os.cpu_count() or 1) - busy >= 1 + others
 
 
 def halves(cores: set[int]) -> tuple[set[int], set[int]]:
