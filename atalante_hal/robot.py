@@ -89,7 +89,7 @@ class Thresholds:
     position_tolerance: float
     #: Largest torque that a drive may report while it is off [Nm]. A drive that is on may exceed its limit by this torque.
     idle_torque: float
-    surplus_frames: float  # largest number of frames in a cycle besides the cyclic ones, such as status messages
+    surplus_frames: float  # largest number of frames in a cycle that are not cyclic, such as status messages
 
 
 @dataclass(frozen=True)

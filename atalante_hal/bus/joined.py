@@ -26,8 +26,9 @@ class Share(NamedTuple):
     """Frames of a batch that are sent on one channel."""
 
     link: Bus
-    indices: list[int]  # indices of these frames in the batch
-    frames: Frames  # send buffer for these frames; always the same array object, because a bus caches memory views of each array
+    indices: list[int]  # indices of the channel's frames in the batch
+    #: send buffer for the channel's frames; always the same array object, because a bus caches memory views of each array
+    frames: Frames
 
 
 class JoinedBus:

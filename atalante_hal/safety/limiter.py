@@ -74,7 +74,7 @@ class Limited:
     """Result of limiting one command."""
 
     finite: bool  # whether all inputs were finite; if not, the whole command was ignored
-    clamped: bool  # the torque of at least one joint was cut
+    clamped: bool  # the limiter reduced the torque of at least one joint
 
 
 class JointLimits(NamedTuple):

@@ -129,7 +129,7 @@ class MessageMonitor:
         rivals = rivals_of(image.refused, checks) if image.refused else frozenset()
         for row, result in image.refused:
             if result is Check.CONFLICT and row in rivals:
-                continue  # `_check_senders` raises this diagnostic
+                continue  # `_check_senders` raises the diagnostic for two senders
             dtc = self._invalid[row] if result is Check.INVALID else PENDING[result]
             value = ages[row] if ages[row] < NEVER else 0
             memory.raise_dtc(cycle, dtc, self._senders[row], value=value, confirmed=False)
@@ -237,7 +237,7 @@ def rivals_of(refused: Sequence[tuple[int, Check]], checks: Sequence[int]) -> fr
     """
     intact = Counter(row for row, result in refused if result in _INTACT)
     for row in intact:
-        intact[row] += checks[row] <= _FRESH or checks[row] == Check.IMPLAUSIBLE  # the accepted frame also counts
+        intact[row] += checks[row] <= _FRESH or checks[row] == Check.IMPLAUSIBLE  # the accepted frame is intact, too
     return frozenset(row for row, result in refused if result in _RIVAL and intact[row] > 1)
 
 

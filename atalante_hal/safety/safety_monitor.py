@@ -115,9 +115,9 @@ class SafetyMonitor:
         self.enabling = False
         self.recalled = -RECALL_CYCLES
         self.proof = DirectionProof(robot)
-        self._proof_begun = False  # True if the test of the joint directions has begun in this start
-        self._stalled = 0  # number of cycles during this start in which no drive has changed its state
-        self._states_at_start = b""  # drive states in the previous cycle of this start
+        self._proof_begun = False  # True if the test of the joint directions has begun in the current start
+        self._stalled = 0  # number of cycles since a drive last changed its state, during a start
+        self._states_at_start = b""  # drive states in the previous cycle, during a start
         self.lowered: set[str] = set()
         self._hold_stability = HoldStability()
         self.torque_tracking = TorqueTracking(robot.breakaway)

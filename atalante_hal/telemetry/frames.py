@@ -96,7 +96,7 @@ class RingTap:
             done += fit
 
     def flush(self) -> None:
-        """Write the collected frames to the ring."""
+        """Write the collected frames to the ring buffer."""
         if self._used:
             self._count[0] = self._used
             self._ring.write(self._record)
@@ -104,7 +104,7 @@ class RingTap:
 
 
 def batches(records: npt.NDArray[np.uint8]) -> Iterator[tuple[Frames, Stamps, npt.NDArray[np.uint8]]]:
-    """Yield the frames of each record of the ring.
+    """Yield the frames of each record of the ring buffer.
 
     Args:
         records: Records as `RingReader.read` returns them, shape (k, record size) bytes.

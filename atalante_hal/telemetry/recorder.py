@@ -57,7 +57,7 @@ class Recorder(Closing):
             raise self._failed(error) from error
 
     def put(self, key: str, payload: bytes, timestamp: int, cycle: int) -> None:
-        """Add a message.
+        """Add a message to the recording.
 
         Args:
             key: Key of the stream.

@@ -148,7 +148,7 @@ class _Ring:
 
 
 class RingWriter(_Ring, Closing):
-    """Writing end of a ring.
+    """Writing end of a ring buffer.
 
     Args:
         record_size: Size of a record [bytes].
@@ -198,7 +198,7 @@ class RingWriter(_Ring, Closing):
         self._limit = slots - 1 if lossless else sys.maxsize
 
     def write(self, record: memoryview | npt.NDArray[Any] | bytes) -> None:
-        """Copy one record into the ring.
+        """Copy one record into the ring buffer.
 
         Args:
             record: Contiguous buffer of `record_size` bytes.
@@ -274,7 +274,7 @@ class RingWriter(_Ring, Closing):
 
 
 class RingReader(_Ring, Closing):
-    """Reading end of a ring.
+    """Reading end of a ring buffer.
 
     Args:
         fd: Descriptor of the writer (`RingWriter.fd`, inherited or duplicated). The reader owns and closes it.

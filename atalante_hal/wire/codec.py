@@ -92,7 +92,7 @@ class Codec:
             mask, largest = (1 << s.length) - 1, (1 << s.length - s.signed) - 1
             invalid = NO_CODE if s.invalid_raw is None else s.invalid_raw
             plan.append((row * WORDS + 1 + s.start // 64, s.start % 64, mask, largest, low, high, invalid))
-            # If the offset is a multiple of the factor, it is added to the code as an integer, because integer addition is exact.
+            # An offset that is a multiple of the factor is added to the code as an integer, because integer addition is exact.
             code = s.offset / s.factor
             exact = code == round(code) and round(code) * s.factor == s.offset
             scales.append((code, s.factor, 0.0) if exact else (0.0, s.factor, s.offset))

@@ -51,12 +51,12 @@ class DriveParameters:
     trip_temperature: float = 120.0  # winding temperature that switches the power stage off [degC]
     cool_enough: float = 100.0  # highest winding temperature at which an over-temperature error can end [degC]
     supply: float = 48.0  # nominal supply voltage [V]
-    hold_below: float = 40.0  # lowest supply voltage without a local hold [V]
+    hold_below: float = 40.0  # supply voltage below which a drive starts its local hold [V]
     jump_speed: float = (
         20.0  # highest plausible joint speed from two samples; a faster change is an encoder error [rad/s]
     )
     off_below: float = 20.0  # lowest supply voltage at which the power stage works [V]
-    rest_speed: float = 0.05  # the controlled lowering of a leg ends when its joint is slower than this [rad/s]
+    rest_speed: float = 0.05  # joint speed below which the controlled lowering of a leg ends [rad/s]
 
 
 class DriveSignals(NamedTuple):

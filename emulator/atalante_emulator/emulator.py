@@ -346,7 +346,8 @@ class Emulator:
         for leg, row in enumerate(self._command_rows):
             check = checks[row]
             self._commanded[leg] |= check <= Check.SOME_LOST
-            if check in (Check.SOME_LOST, Check.IMPLAUSIBLE):  # IMPLAUSIBLE means here that the command is too late
+            # in this process image, IMPLAUSIBLE marks a command that is too late
+            if check in (Check.SOME_LOST, Check.IMPLAUSIBLE):
                 self.drives.warn(leg, COMMAND_LOST)
             elif check in _REJECTED:
                 self.drives.warn(leg, COMMAND_REJECTED)

@@ -98,7 +98,7 @@ class AttitudeError:
             self.apply(0.0, np.tile([1.0, 0.0, 0.0, 0.0], (count, 1)))
 
     def draw(self) -> None:
-        """Draw the errors at the end of the next interval."""
+        """Draw the attitude errors at the end of the next interval."""
         self._slow = self._keep * self._slow + self._new * self._generator.standard_normal(self._slow.shape)
         self._heading += self._rate * self._interval
         self._last, self._next = self._next, self._slow.copy()

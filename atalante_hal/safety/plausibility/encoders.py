@@ -262,7 +262,7 @@ class EncoderChecks:
         )
 
     def findings(self) -> tuple[Finding, ...]:
-        """Return the current findings."""
+        """Return the current findings of the encoder checks."""
         if not (self.outside or self.too_fast or any(self.jumps)):
             return self._wrong_findings
         jumps = (self._jump(joint) for joint, jumps in enumerate(self.jumps) if jumps)

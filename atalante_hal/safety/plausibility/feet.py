@@ -102,7 +102,7 @@ class FootChecks:
             self._twisted.pop(foot, None)
 
     def findings(self) -> tuple[Finding, ...]:
-        """Return the current findings."""
+        """Return the current findings of the foot checks."""
         cells = tuple(_contradicting(foot, *twisted) for foot, twisted in self._twisted.items())
         return (*cells, _BOTH_SWING) if self._both_swing() else cells
 

@@ -85,7 +85,7 @@ class Imus:
         return None if abs(squared - 1.0) <= self._norm_error else math.sqrt(squared)
 
     def findings(self) -> tuple[Finding, ...]:
-        """Return the current findings."""
+        """Return the current findings of the IMU checks."""
         return (
             *(_no_attitude(imu, norm, self._confirmed[imu]) for imu, norm in self.no_attitude.items()),
             *(_saturated(imu, value, self._confirmed[imu]) for imu, value in self.saturated.items()),

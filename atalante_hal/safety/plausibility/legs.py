@@ -61,7 +61,7 @@ class _Comparison(NamedTuple):
     """Comparison of the encoders and IMUs of a leg in one sample."""
 
     angles: tuple[float, float, float]  # leg angles from the IMUs: FH, TH and the sum SH + SK [rad]
-    errors: tuple[float, float, float]  # encoder angles minus `angles` [rad]
+    errors: tuple[float, float, float]  # encoder angles minus IMU angles [rad]
     uncertainty: float = 0.0  # largest part of `errors` due to encoder and IMU values of different cycles [rad]
 
 
@@ -182,7 +182,7 @@ class Legs:
         self._stuck[leg] = tuple(stuck)
 
     def findings(self) -> tuple[Finding, ...]:
-        """Return the current findings."""
+        """Return the current findings of the leg checks."""
         return (*self._drifts[0], *self._drifts[1], *self._stuck[0], *self._stuck[1])
 
 

@@ -241,7 +241,7 @@ class Stillness:
         self.cells = [(foot, cell) for foot, cell in np.argwhere(dead).tolist()]
 
     def findings(self) -> tuple[Finding, ...]:
-        """Return the current findings."""
+        """Return the current findings of the standstill checks."""
         return (
             *self.encoders.values(),
             *map(_frozen_imu, self.imus),

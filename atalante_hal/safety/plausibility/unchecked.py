@@ -83,7 +83,7 @@ class Unchecked:
         return bool(self._findings)
 
     def findings(self) -> tuple[Finding, ...]:
-        """Return the current findings."""
+        """Return the current findings about checks that cannot run."""
         return self._findings
 
 

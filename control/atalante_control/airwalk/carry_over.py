@@ -35,7 +35,7 @@ class CarryOver:
     """
 
     def __init__(self, duration: float) -> None:
-        """Compute the factors of the fade-out.
+        """Compute the factors with which the compensation of the torque jump fades out.
 
         Args:
             duration: time in which the compensation of the torque jump fades out [s]. With 0, the jump is not compensated.

@@ -52,7 +52,7 @@ class Parts(NamedTuple):
 
 
 class Outputs:
-    """Results of one cycle."""
+    """Results of one control cycle."""
 
     desired: Annotated[Vector, 2 * len(JOINTS)]  # q_des [rad], then q_des' [rad/s]
     gravity: Annotated[Vector, len(JOINTS)]  # Nm, u_g

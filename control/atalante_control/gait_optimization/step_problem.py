@@ -261,7 +261,7 @@ class StepProblem:
             program.add_linear(name, "rad", point(rest[0]) - point(index), np.zeros(_N))
 
     def constraint_bounds(self, around: Gait | None = None) -> tuple[Vector, Vector]:
-        """Return the lower and upper bounds of g.
+        """Return the lower and upper bounds of the constraint function g.
 
         Args:
             around: periodic gait after a start step or before a stop step; None for a periodic step.

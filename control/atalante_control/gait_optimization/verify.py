@@ -37,7 +37,7 @@ class GaitCheck(NamedTuple):
 
     @property
     def holds(self) -> bool:
-        """Return whether the value is within the limit."""
+        """Return whether the checked value is within its limit."""
         return self.value <= self.limit
 
 

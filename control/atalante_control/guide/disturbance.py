@@ -42,7 +42,7 @@ class Mismatch:
         ValueError: If a value is out of range.
     """
 
-    friction: float = 0.2  # largest error of the friction torque, as a fraction of this torque
+    friction: float = 0.2  # largest error of the friction torque, as a fraction of the friction torque
     inertia: float = 0.1  # largest error of mass and inertia of the leg, as a fraction; one factor for the whole leg
     residual: Pair = (1.0, 1.0)  # Nm, allowance for all other torque errors at hip and knee
 

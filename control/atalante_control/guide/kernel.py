@@ -22,7 +22,7 @@ Pair = tuple[float, float]
 STEEPNESS = 4.0
 #: Number of elements of the compressed state, from which the predicted errors are computed.
 COMPRESSED = 5
-#: Number of consecutive predicted cycles that share one bound of the model errors in `Block.slack`.
+#: Number of consecutive predicted cycles that share one bound in `Block.slack` of the effect of model errors.
 SLACK_CYCLES = 10
 #: Length of a block of start cycles. Predictions that start in the same block use the same row of `GuideTables.reach`.
 START_CYCLES = 4
@@ -293,7 +293,7 @@ def _error_ratio(guide: GuideTables, cycle: int) -> float:
 
 
 def _compressed(guard: Guard) -> tuple[float, float, float, float, float]:
-    """Return the elements of the compressed state."""
+    """Return the five elements of the compressed state, from which the errors are predicted."""
     y = guard.compressed
     return y[0], y[1], y[2], y[3], y[4]
 

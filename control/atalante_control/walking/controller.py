@@ -177,7 +177,8 @@ class WalkController:
             outputs=outputs,
             telemetry=telemetry,
         )
-        self._carrying = config.loaded * weight  # N, smallest load of each foot that counts as standing on both feet
+        #: N, load that each foot must carry so that the robot counts as standing on both feet
+        self._carrying = config.loaded * weight
         self._settled, self._rest, self._timeout = (
             round(seconds / PERIOD) for seconds in (config.settle, config.rest, config.landing_timeout)
         )

@@ -79,7 +79,7 @@ class Stage:
 
 
 class Sensed:
-    """Results of `sense`."""
+    """Results of the first half of a cycle, `sense`: loads, kinematics, attitude."""
 
     load: Annotated[Vector, 2]  # N, filtered vertical force on the left and the right foot
     #: N, the smaller of filtered and unfiltered vertical force, which drops without delay when a foot leaves the ground
@@ -125,7 +125,7 @@ class Parts(NamedTuple):
 
 
 class Outputs:
-    """Results of `act`."""
+    """Results of the second half of a cycle, `act`: desired motion and torque command."""
 
     desired: Annotated[Vector, 2 * len(JOINTS)]  # q_des [rad], then q_des' [rad/s]
     gravity: Annotated[Vector, len(JOINTS)]  # Nm, u_g

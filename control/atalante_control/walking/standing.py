@@ -49,7 +49,7 @@ class Standing:
     def __init__(
         self, articulated: ArticulatedModel, gravity: Gravity, exoskeleton: ExoskeletonParameters, robot: Robot
     ) -> None:
-        """Store the model.
+        """Store the model of robot and patient.
 
         Args:
             articulated: model of the robot with the patient, with a fixed pelvis.

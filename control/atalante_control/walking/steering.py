@@ -23,7 +23,7 @@ class Steering:
     """
 
     def __init__(self, gains: tuple[float, float, float]) -> None:
-        """Set the gains.
+        """Set the gains of the steering.
 
         Args:
             gains: TH offset per heading [rad/rad], TH offset per sideways deviation [rad/m], and largest TH offset [rad].

@@ -37,7 +37,7 @@ class Latency:
     median_us: float
     p99_us: float
     max_us: float
-    wire_us: float  # largest total transmission time of all frames of this kind in one cycle, computed from the DBC
+    wire_us: float  # largest total transmission time of these states or commands in one cycle, computed from the DBC
     budget_us: float
 
     @property

@@ -74,7 +74,7 @@ class Observer:
     """Observer of a bus: collects the frames of all nodes and makes reports from them."""
 
     def __init__(self, network: Network, robot: Robot, now: float) -> None:
-        """Start the observation.
+        """Start the observation of a bus.
 
         Args:
             network: Nodes and messages of the DBC.

@@ -23,7 +23,7 @@ _OFF: Final = 250
 #: `_ANSWER_CYCLES` is the duration of the test that checks the answers to SYNC [cycles].
 _HEARTBEAT_CYCLES, _ANSWER_CYCLES = 520, 200
 #: Largest accepted deviations of the measured heartbeat period, as a fraction of the period in the DBC.
-#: `_MEAN` is for the mean of all measured periods. `_SINGLE` is for each single measured period.
+#: `_MEAN` limits the deviation of the mean of all measured periods, `_SINGLE` the deviation of each period.
 _MEAN, _SINGLE = 0.1, 0.5
 #: The flood test sends `_FLOOD` random frames in each of `_FLOOD_CYCLES` cycles. The bus load stays below 100 %.
 _FLOOD, _FLOOD_CYCLES = 6, 100

@@ -61,7 +61,7 @@ class EmulatorTechnician:
         self.certain = True
 
     def request(self, action: Action, node: str) -> None:
-        """Carry out the action immediately."""
+        """Carry out an action on the emulated node immediately."""
         operator = self._operator
         match action:
             case Action.POWER_UP:

@@ -112,7 +112,7 @@ class MomentVerdict:
 
     moment: str
     faults: tuple[str, ...]  # for each fault: its ID and the name of the case
-    state: str  # state of the HAL before the operator's START after the faults
+    state: str  # state of the HAL just before the operator presses START after the faults
     restarted: bool  # whether the operator's START after the faults led to ACTIVE
     extremes: Extremes | None  # None if the run raised an exception
     failures: tuple[str, ...]  # one sentence each

@@ -29,7 +29,7 @@ class Line:
     bound: int
     dtc: str
     cases: int
-    failures: tuple[str, ...]  # one text per failure: name of the case and a sentence
+    failures: tuple[str, ...]  # description of each failure: name of the case and a sentence
 
 
 def line_of(verdicts: Sequence[Verdict]) -> Line:
@@ -45,7 +45,7 @@ def line_of(verdicts: Sequence[Verdict]) -> Line:
 
 @dataclass(frozen=True)
 class Summary:
-    """All results of a campaign."""
+    """All results of a fault campaign."""
 
     lines: tuple[Line, ...]
     endurance: tuple[Endurance, ...]
@@ -55,7 +55,7 @@ class Summary:
 
     @classmethod
     def of(cls, results: Iterable[Result], seconds: float = 0.0) -> Summary:
-        """Summarize the results of a campaign.
+        """Summarize the results of a fault campaign.
 
         Args:
             results: results in any order.

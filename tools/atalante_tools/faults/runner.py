@@ -48,7 +48,7 @@ _RESTART: Final = 300
 
 @dataclass(frozen=True)
 class RunContext:
-    """Objects that all runs of a process share."""
+    """Network, robot, gait and controller, which all runs of a process share."""
 
     network: Network
     robot: Robot
@@ -140,7 +140,7 @@ class CaseRun:
     """
 
     def __init__(self, case: Case, begins: int, *, starts: bool = True) -> None:
-        """Prepare the run.
+        """Prepare the run of a fault case.
 
         Args:
             case: faults to inject and actions of the operator.

@@ -161,7 +161,7 @@ def run_case(id_: str, case: Case) -> Verdict:
 
 @dataclass(frozen=True)
 class Scope:
-    """Runs of a campaign besides the cases of the fault matrix."""
+    """Additional runs of a campaign, besides the cases of the fault matrix."""
 
     endurance: bool  # endurance runs
     pairs: bool  # the pairs of `REPRESENTATIVES` during a walk

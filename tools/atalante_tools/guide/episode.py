@@ -74,7 +74,7 @@ class Goal(NamedTuple):
 
 
 class Walked(NamedTuple):
-    """Result of a step."""
+    """Result of a simulated step."""
 
     ratio: float  # largest |e| / q_bound
     cycle: int  # cycle with the largest ratio
@@ -84,7 +84,7 @@ class Walked(NamedTuple):
 
 @dataclass(frozen=True)
 class Setup:
-    """Gait, robot and model of a check."""
+    """Gait, robot and model with which a guide is checked."""
 
     robot: Robot
     gait: Gait

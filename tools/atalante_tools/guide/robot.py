@@ -42,7 +42,7 @@ _STATES: Final = tuple(f"{joint.upper()}_STATE" for joint in JOINTS)
 
 
 class RobotStep(NamedTuple):
-    """Swing of one leg of the robot."""
+    """Recorded swing of one leg of the robot."""
 
     ratio: float  # largest |e| / q_bound
     push: int  # index of the push in the list of pushes
@@ -183,7 +183,7 @@ class _Hand:
 
 
 class EncoderNoise:
-    """Noise of all joint encoders. Position signals get the noise, velocity signals get its derivative after the drive filter."""
+    """Noise of all joint encoders. The velocity signals get the derivative of the noise, filtered as in the drives."""
 
     def __init__(self, emulator: Emulator, gear: Vector, noise: float, seed: int) -> None:
         """Find the position and velocity signals of the drives, and compute the coefficient of the velocity filter.

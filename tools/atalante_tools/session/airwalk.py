@@ -58,7 +58,7 @@ _Command = TypeVar("_Command", bound=Callable[..., Any])
 
 @dataclass(frozen=True)
 class Options:
-    """Options of a trial."""
+    """Options of a walk in the air inside virtual guides."""
 
     steps: int  # number of right-stance steps per guide shape
     xi: float  # assistance factor, 0 to 1

@@ -52,7 +52,7 @@ class Session:
         now: Callable[[], float] = time.monotonic,
         losses: Callable[[], int] = lambda: 0,
     ) -> None:
-        """Create the session.
+        """Create a pendant session on an open bus.
 
         Args:
             node: Pendant node on its bus.

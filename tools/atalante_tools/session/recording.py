@@ -56,7 +56,7 @@ RECORDING_OPTIONS: Final = [
 
 @dataclass(frozen=True)
 class RecordingOptions:
-    """Values of `RECORDING_OPTIONS`."""
+    """Values of the options `--record-rate`, `--can-log` and `--telemetry`."""
 
     record_rate: int = 100  # recording rate [Hz]
     can_log: Path | None = None  # log file for all CAN frames. None means no CAN log.

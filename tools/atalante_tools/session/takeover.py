@@ -30,9 +30,9 @@ DRAW_CYCLES: Final = 50
 #: A pendant stops sending after this number of consecutive frames of another pendant.
 #: The HAL tolerates two senders for three cycles.
 PRESENT_FRAMES: Final = 2
-#: A silent pendant gives up after this number of consecutive frames of another pendant.
+#: A pendant that has stopped sending gives up after this number of consecutive frames of another pendant.
 LOST_FRAMES: Final = 3
-#: A silent pendant resumes sending if no frame of another pendant is received for this time [cycles].
+#: A pendant that has stopped sending resumes if no frame of another pendant arrives for this time [cycles].
 #: The HAL reports a timeout after 5 cycles without a frame.
 QUIET_CYCLES: Final = 3
 #: E2E check results of a frame with a valid CRC, whether or not its counter is as expected.

@@ -62,7 +62,7 @@ class FaultRun:
     #: diagnostics since the first faulty cycle, except information, in the order of their first report
     codes: tuple[str, ...]
     detected: int | None  # cycles from the first faulty cycle to the diagnostic of the fault matrix, both included
-    reason: str  # reason of the state, as the HAL states it, or the exception
+    reason: str  # reason that the HAL states for its last state, or the exception
 
 
 def run_fault(trial: FaultTrial) -> dict[str, Any]:
@@ -180,7 +180,7 @@ class _Walk:
     """
 
     def __init__(self, stimuli: Sequence[Stimulus], begins: int) -> None:
-        """Prepare the walk.
+        """Prepare the walk with its faults.
 
         Args:
             stimuli: faults and actions of the operator.

@@ -49,7 +49,7 @@ class Finding:
 
 
 def shape_findings(results: Sequence[Result]) -> list[Finding]:
-    """Return the finding of the first experiment.
+    """Return the finding of the experiment `shapes`.
 
     Args:
         results: results of `shape` trials.
@@ -65,7 +65,7 @@ def shape_findings(results: Sequence[Result]) -> list[Finding]:
 
 
 def assist_findings(results: Sequence[Result]) -> list[Finding]:
-    """Return the findings of the second experiment.
+    """Return the findings of the experiment `assist`.
 
     Args:
         results: results of `walk` trials, four for each subject.
@@ -111,7 +111,7 @@ def assist_findings(results: Sequence[Result]) -> list[Finding]:
 
 
 def sweep_findings(results: Sequence[Result]) -> list[Finding]:
-    """Return the findings of the third experiment.
+    """Return the findings of the experiment `sweep`.
 
     Args:
         results: results of `walk` trials of the sweep; results of `treadmill` trials are ignored.

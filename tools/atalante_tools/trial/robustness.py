@@ -45,7 +45,7 @@ _RATE: Final = 100  # Hz, of a recording
 
 
 def robust_walk(trial: RobustTrial, recording: Path | None = None) -> dict[str, Any]:
-    """Walk, and return the result.
+    """Run a trial of the experiment `robustness`, and return its result.
 
     Args:
         trial: trial to run.
@@ -117,7 +117,7 @@ def bus_faults(trial: RobustTrial) -> list[Fault]:
 
 
 class Pushes:
-    """Pushes at the pelvis.
+    """Pushes at the pelvis of the walking robot, at the times that the trial defines.
 
     Attributes:
         count: number of pushes that have begun.

@@ -117,7 +117,7 @@ class _ScriptedPendant(Pendant):
     """Pendant that returns the inputs which the search has set."""
 
     def evaluate(self, present: bool, **others: object) -> None:
-        """Leave the inputs unchanged.
+        """Leave the operator's inputs as the search has set them.
 
         Args:
             present: has no effect.
@@ -125,7 +125,7 @@ class _ScriptedPendant(Pendant):
         """
 
     def clear_press(self) -> None:
-        """Do nothing."""
+        """Do nothing, because the search drops a stored START itself."""
 
 
 class HalSteps:
@@ -311,7 +311,7 @@ class HalSteps:
         monitor.memory = FaultMemory()
         monitor._reports.clear()
         monitor.start_wanted, monitor.enabling, monitor.moving, monitor.walking = 0, False, False, False
-        monitor.recalled = -RECALL_CYCLES  # no wait after QUICK_STOP, so that the search includes more STARTs
+        monitor.recalled = -RECALL_CYCLES  # skip the wait after QUICK_STOP, so that the search includes more STARTs
         monitor._stalled = 0  # constant in the search: `LAST_START` covers all ways in which a START can end
         monitor._ending = monitor._duplicate_found = monitor._ramping = False
         monitor.lowered.clear()

@@ -41,4 +41,4 @@ class NoBus:
         return count
 
     def close(self) -> None:
-        """Do nothing."""
+        """Do nothing; there is no resource to release."""
