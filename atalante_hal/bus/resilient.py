@@ -76,7 +76,7 @@ class ResilientBus(WrappedBus):
         return count
 
     def _update_down(self, *, proven: bool) -> None:
-        """Update `down` after a call that raised no error.
+        """Update the error message `down` after a call that raised no error.
 
         Args:
             proven: Whether a frame was sent or received.

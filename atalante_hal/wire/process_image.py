@@ -212,7 +212,7 @@ class ReceiveImage:
         self.all_fresh = False
 
     def begins(self, frames: Frames, count: int) -> bool:
-        """Return whether the buffer begins with one frame of every row, in row order. Then the cycle is complete.
+        """Return whether the buffer begins with one frame of every row, in row order, so that the cycle is complete.
 
         Args:
             frames: receive buffer.

@@ -46,7 +46,7 @@ class Rejections:
                 self._buckets[sensor] = bucket, cause
 
     def forget(self, sensor: int) -> None:
-        """Empty the bucket of a sensor.
+        """Empty the leaky bucket of a sensor.
 
         Args:
             sensor: index of the sensor.

@@ -97,7 +97,7 @@ def _shape(document: Mapping[str, Any]) -> GuideShape:
 
 
 def _eased(phase: Vector, knots: Vector) -> Vector:
-    """Return warped phases, at which linear interpolation between the knots gives half-cosine interpolation at `phase`."""
+    """Return phases at which linear interpolation between the knots equals half-cosine interpolation at `phase`."""
     at = np.clip(np.searchsorted(knots, phase, side="right") - 1, 0, len(knots) - 2)
     length = knots[at + 1] - knots[at]
     return np.asarray(knots[at] + length * (0.5 - 0.5 * np.cos(math.pi * (phase - knots[at]) / length)))

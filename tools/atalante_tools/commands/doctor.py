@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from atalante_tools.commands.bus_timing import BusTiming
     from atalante_tools.commands.machine import Interface, Machine
 
-#: Recommended length of a transmit queue [frames]. One interface may carry all four buses, which is at least 26 frames per cycle.
+#: Recommended length of a transmit queue [frames]. An interface that carries all four buses sends at least 26 frames per cycle.
 QUEUE: Final = 1000
 #: MTU of a CAN FD interface [bytes].
 FD_MTU: Final = 72

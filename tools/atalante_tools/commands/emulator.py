@@ -173,7 +173,7 @@ def end_condition(stop: StopRequest, emulator: Emulator, bus: Line) -> Callable[
     progress = Progress(period=STATUS_PERIOD)
     has_pendant = emulator.operator is not None
     alone = True
-    received = 0  # frames up to the last status line
+    received = 0  # number of frames at the last status line
 
     def is_over() -> bool:
         nonlocal has_pendant, alone, received

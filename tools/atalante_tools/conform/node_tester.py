@@ -72,7 +72,7 @@ class LockStep:
         self._silent = 0
 
     def next_cycle(self, *, sync: bool, listen: Callable[[float], None]) -> None:
-        """Start the next cycle without a wait. From the `WATCHDOG`-th consecutive cycle without SYNC on, advance the node."""
+        """Start the next cycle without a wait. From the `WATCHDOG`-th cycle in a row without SYNC, also advance the node."""
         self._silent = 0 if sync else self._silent + 1
         if self._silent >= self._watchdog:
             self._emulator.idle()
@@ -225,7 +225,7 @@ class NodeTester:
         return self.sync.frame(cycle, counter=counter, length=length, classic=classic, flip=flip)
 
     def _send(self, frames: Frames) -> None:
-        # A bus caches the memory address of each array that it sends. Therefore one array is reused for each number of frames.
+        # A bus caches the memory address of each array that it sends, so the tester reuses one array for each number of frames.
         outbox = self._outboxes.setdefault(len(frames), new_frames(len(frames)))
         as_words(outbox)[:] = as_words(frames)
         try:

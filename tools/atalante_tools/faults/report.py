@@ -166,7 +166,7 @@ class Summary:
 
 
 def _moment_row(runs: Sequence[MomentVerdict]) -> list[str]:
-    """Return the number of runs, of failed and of restarted runs, and the largest values with their joints, as text."""
+    """Return the numbers of runs, failed runs and restarted runs, and the largest values with their joints, as text."""
     extremes = [run.extremes for run in runs if run.extremes is not None]
     counts = [len(runs), sum(bool(run.failures) for run in runs), sum(run.restarted for run in runs)]
     worst = [

@@ -220,7 +220,7 @@ def _scaled(exoskeleton: ExoskeletonParameters, mass: float) -> ExoskeletonParam
 
 
 def _faults(condition: Condition) -> list[Fault]:
-    """Return the communication faults of a condition."""
+    """Return the communication faults that a `Condition` requires."""
     faults = []
     if condition.loss:
         faults += [Fault("drop", message, 0, None, p=condition.loss) for message in (*_STATES, *_COMMANDS)]

@@ -132,7 +132,7 @@ class PushTrial:
     """Walks with full assistance and one push at the pelvis each, in one direction and at one phase, with rising force."""
 
     kind: ClassVar[str] = "push"
-    direction: float  # deg, of the push; 0 is forwards, 90 to the left
+    direction: float  # deg, direction of the push; 0 is forwards, 90 to the left
     phase: float  # phase of a right-stance step at which the push begins
     forces: tuple[float, ...]  # N, in rising order
     mass: float  # kg, of the wearer

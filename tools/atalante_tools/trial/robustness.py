@@ -100,7 +100,7 @@ def robust_walk(trial: RobustTrial, recording: Path | None = None) -> dict[str, 
 
 
 def _parameters(trial: RobustTrial) -> EmulatorParameters:
-    """Return the parameters of the nodes on the ground, with motors that react late."""
+    """Return the parameters of the emulated nodes of a robot on the ground, with motors that react late."""
     drive = replace(GROUND_PARAMETERS.drive, motor=MotorParameters(dead_time=trial.delay))
     return replace(GROUND_PARAMETERS, drive=drive)
 
