@@ -35,7 +35,7 @@ MOST_LATE = 20
 
 # Rows of the motor array, first to fourth: torque setpoint, ratio of true to measured torque, dry friction, damping.
 # Rows of the motor array, fifth to seventh: external torque, resulting joint torque, torque of the wearer's limb.
-# Row of the motor array, eighth: ratio of measured torque to setpoint.
+# Eighth row of the motor array: ratio of measured torque to setpoint.
 _WANTED, _STRENGTH, _DRY, _DAMPING, _PUSH, _JOINT, _LIMB, _GAIN = range(8)
 
 

@@ -34,7 +34,7 @@ class Rejections:
         return bool(self._buckets)
 
     def update(self, rejected: Mapping[int, Dtc]) -> None:
-        """Update all buckets at the end of a cycle.
+        """Update all leaky buckets at the end of a cycle.
 
         Args:
             rejected: pending diagnostic of each sensor whose new values were rejected in this cycle, by sensor index.

@@ -19,7 +19,7 @@ _Result = TypeVar("_Result")
 #: Timeout of the connection to a dask scheduler.
 _CONNECT_TIMEOUT: Final = "10s"
 #: Number of unexpected ends of a process after which each further call gets processes of its own.
-#: With processes of their own, only the calls that end their process have no result.
+#: If each call has processes of its own, only the calls that end their process have no result.
 _SHARED_LOSSES: Final = 3
 _REMEDY: Final = "repeat the command, if necessary with fewer --jobs"
 _LOKY_THREAD: Final = "ExecutorManagerThread"
@@ -30,7 +30,7 @@ class FanOutError(RuntimeError):
 
 
 class LostProcessError(FanOutError):
-    """Unexpected end of a process, for example for lack of memory. Calls have no result because of it."""
+    """Unexpected end of a process, for example for lack of memory. Some calls therefore have no result."""
 
 
 def fan_out(

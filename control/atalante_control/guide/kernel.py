@@ -24,7 +24,7 @@ STEEPNESS = 4.0
 COMPRESSED = 5
 #: Number of consecutive predicted cycles that share one bound in `Block.slack` of the effect of model errors.
 SLACK_CYCLES = 10
-#: Length of a block of start cycles. Predictions that start in the same block use the same row of `GuideTables.reach`.
+#: Number of start cycles in a block. Predictions that start in the same block use the same row of `GuideTables.reach`.
 START_CYCLES = 4
 
 

@@ -198,7 +198,7 @@ class MuJoCoBody:
         """
         self._torque[:] = torque
         # Run the second half of a time step, then the first half of the next time step.
-        # In this order of the halves, the sensor data belong to the same time as the positions and velocities.
+        # Because the first half runs last, the sensor data belong to the same time as the positions and velocities.
         mujoco.mj_step2(self._model, self._data)
         mujoco.mj_step1(self._model, self._data)
 

@@ -19,7 +19,7 @@ from atalante_hal.wire.frame import Frames, new_frames
 from atalante_tools.session.takeover import PendantReader, Takeover
 
 #: Time without a frame of another pendant after which the emulated pendant resumes sending [cycles].
-#: It is longer than `QUIET_CYCLES`, so that a pendant in another process resumes before the emulated pendant.
+#: `PENDANT_QUIET` is longer than `QUIET_CYCLES`, so that a pendant in another process resumes before the emulated pendant.
 PENDANT_QUIET: Final = 12
 #: Number of received frames of an emulated message, with increasing counters, that prove another robot on the bus.
 ROBOT_FRAMES: Final = 3

@@ -57,7 +57,8 @@ def walk(target: Target, options: WalkOptions, *, as_json: bool) -> None:
     with ExitStack() as stack:
         if options.out is not None:
             stack.enter_context(run_folder(options.out))
-        two_processes = _robot_process_wanted(target, options, outputs)  # before the telemetry process loads a core
+        # decided here, before the telemetry process loads a core
+        two_processes = _robot_process_wanted(target, options, outputs)
         # start the subprocesses early: they import their modules while this process creates the controller
         child = None if outputs is None else stack.enter_context(TelemetryChild())
         robot = stack.enter_context(EmbeddedRobot(target.engine)) if two_processes else None

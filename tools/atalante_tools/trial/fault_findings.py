@@ -12,7 +12,7 @@ from atalante_tools.trial.findings import Finding, Result
 
 #: Fault ID -> regular expression for the names of the cases in which the robot must not fall.
 #: The cases are lost, late and doubled frames; a failed IMU, foot or force cell; an exception of the controller.
-#: Further cases are a late loop, STOP, and a released dead-man switch.
+#: The robot must also not fall after a late loop, STOP, or the release of the dead-man switch.
 #: A drive without data for ten cycles is left out, because its joint must not be moved.
 #: After HOLD the robot may fall, because the drives hold at once.
 NO_FALL: Final = {

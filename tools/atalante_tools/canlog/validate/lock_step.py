@@ -25,7 +25,7 @@ Stamps = npt.NDArray[np.int64]
 CYCLE: Final = "Cycle"
 #: If no SYNC arrives within this time [ns], the HAL has probably stopped, and the time stamps follow the wall clock.
 PAUSE_NS: Final = 200_000_000
-#: Largest accepted increment of the cycle number between two SYNCs. A larger one (restarted HAL, damaged frame) counts as 1.
+#: Largest accepted increment of the cycle number between two SYNCs. Others (restarted HAL, damaged frame) count as 1.
 MOST_STEPS: Final = 1000
 #: `_SPACING_NS` is the time between the stamps of two consecutive frames in a cycle [ns].
 #: `_LAST` is the latest stamp in a cycle, as a share of the cycle time (0 to 1).

@@ -32,7 +32,7 @@ class _Bus:
     #: number of cycles between the last two state frames, by message index
     jump_of: dict[int, int] = field(default_factory=dict)
     #: Message index -> time stamp of the last state frame [ns] if it was the second one in its cycle.
-    #: Such a frame may have arrived before the SYNC of its cycle; this is certain if the next cycle has no state frame.
+    #: A second frame may have arrived before its own SYNC; this is certain if the next cycle has no state frame.
     doubtful: dict[int, int] = field(default_factory=dict)
 
 

@@ -1,4 +1,4 @@
-"""Access to an emulated robot beside the bus: pushes, assistance dial and true motion, in this process or in a subprocess.
+"""Access to an emulated robot in addition to the bus: pushes, assistance dial and true motion, in this process or a subprocess.
 
     push, dial -> emulated robot -> true attitude of the pelvis, true position of the feet
 
@@ -42,7 +42,7 @@ class Stance(NamedTuple):
 
 
 class Access(Protocol):
-    """Access to an emulated robot beside the bus."""
+    """Access to an emulated robot in addition to the bus: pushes, assistance dial and true motion."""
 
     def push(self, wrench: Callable[[], Vector]) -> None:
         """Push the pelvis with the wrench that a function returns.
@@ -135,7 +135,7 @@ class RemoteAccess:
     """Access to an emulator in a subprocess, at the other end of a `SharedBus`."""
 
     def __init__(self, bus: SharedBus, memory: int) -> None:
-        """Attach to the memory.
+        """Attach to the memory that both processes share.
 
         Args:
             bus: Bus to the subprocess. This process is the client.
@@ -182,7 +182,7 @@ class ServedAccess:
     """Other end of a `RemoteAccess`, in the process of the emulator."""
 
     def __init__(self, memory: int, emulator: Emulator, operator: Operator) -> None:
-        """Attach to the memory.
+        """Attach to the memory that both processes share.
 
         Args:
             memory: File descriptor of `access_memory`. This object closes it.
