@@ -38,6 +38,7 @@ PAGE = Path(__file__).parents[2] / "docs" / "reference" / "reachability.md"
 
 @pytest.fixture(scope="module")
 def path() -> OperatorPath:
+    """Path of the unchanged HAL. A change of what the HAL decides does not change how it receives the frames of the pendant."""
     return OperatorPath()
 
 
@@ -71,32 +72,32 @@ def test_report_ends_with_the_trace_of_a_violation(monkeypatch: pytest.MonkeyPat
 # -- broken on purpose ------------------------------------------------------------------------------------------------
 
 
-def test_restart_without_start_is_found_and_its_scenario_shows_it(monkeypatch: pytest.MonkeyPatch):
+def test_restart_without_start_is_found_and_its_scenario_shows_it(path: OperatorPath, monkeypatch: pytest.MonkeyPatch):
     def restarts(state, conditions):
         if state is S.HOLD:
             conditions = replace(conditions, start_wanted=True, drives_enabled=True)
         return next_state(state, conditions)
 
     monkeypatch.setattr(safety_monitor, "next_state", restarts)
-    found = OperatorPath().moves()
+    found = OperatorPath(path).moves()
     assert found.broken == RESTART_PROPERTY
     run = observe(replay.case_of([cycle for cycle, _ in found.trace]), 5, recovery=False)
     assert automatic_improvements(run, run.last)
 
 
-def test_ignored_dead_man_is_found_and_its_scenario_shows_it(monkeypatch: pytest.MonkeyPatch):
+def test_ignored_dead_man_is_found_and_its_scenario_shows_it(path: OperatorPath, monkeypatch: pytest.MonkeyPatch):
     def ignores(state, conditions):
         return next_state(state, replace(conditions, dead_man=True, stop_requested=False))
 
     monkeypatch.setattr(safety_monitor, "next_state", ignores)
-    found = OperatorPath().stops()
+    found = OperatorPath(path).stops()
     assert found.broken == STOP_PROPERTY
     run = observe(replay.case_of([cycle for cycle, _ in found.trace]), 5, recovery=False)
     assert run.state(run.last) is S.ACTIVE
     assert (run.drive_state[-1] == DriveState.OPERATION_ENABLED).all()
 
 
-def test_second_move_of_a_start_is_found(monkeypatch: pytest.MonkeyPatch):
+def test_second_move_of_a_start_is_found(path: OperatorPath, monkeypatch: pytest.MonkeyPatch):
     enter = SafetyMonitor._enter
 
     def keeps(self, before, after, reasons):
@@ -105,7 +106,7 @@ def test_second_move_of_a_start_is_found(monkeypatch: pytest.MonkeyPatch):
         self.start_wanted = wanted
 
     monkeypatch.setattr(SafetyMonitor, "_enter", keeps)
-    assert OperatorPath().moves().broken in (MOVE_PROPERTY, RESTART_PROPERTY)
+    assert OperatorPath(path).moves().broken in (MOVE_PROPERTY, RESTART_PROPERTY)
 
 
 def test_late_watchdog_is_found_and_its_scenario_shows_it(monkeypatch: pytest.MonkeyPatch):

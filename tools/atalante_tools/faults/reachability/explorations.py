@@ -7,7 +7,7 @@ START that have not changed the state yet. A single search with both counts woul
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from functools import cache
 from itertools import product
 from typing import Final, NamedTuple
@@ -89,6 +89,10 @@ class Cycle(NamedTuple):
     operator: Operator = Operator()
 
 
+#: Results of the reception of pendant frames -> frames that cause them. The last element of a result: whether START was pressed.
+_Receptions = dict[tuple[Reception, Inputs, bool], tuple[PendantFrame, ...]]
+
+
 class _Decided(NamedTuple):
     supervision: Supervision
     energises: bool  # the HAL sends ENABLE OPERATION to a drive
@@ -105,9 +109,17 @@ _INITIAL: Final = (
 class OperatorPath:
     """Combined transition function of pendant, link and HAL."""
 
-    def __init__(self) -> None:
+    def __init__(self, receives_like: OperatorPath | None = None) -> None:
+        """Prepare the steps of the HAL.
+
+        Args:
+            receives_like: path that receives the same frames in the same way. Its stored results are used, because reception is
+                the longest part of a search. None means that nothing is stored yet.
+        """
         self._steps = HalSteps()
-        self._received, self._decided, self._commanded = cache(self._receive), cache(self._decide), cache(self._command)
+        self._received: Callable[[Reception, Operator], _Receptions]
+        self._received = cache(self._receive) if receives_like is None else receives_like._received
+        self._decided, self._commanded = cache(self._decide), cache(self._command)
 
     def stops(self) -> Exploration[StopState, Cycle]:
         """Search for a torque command that the HAL sends too long after a stop action of the operator."""
@@ -158,14 +170,12 @@ class OperatorPath:
                     wrong,
                 )
 
-    def _receive(
-        self, before: Reception, operator: Operator
-    ) -> dict[tuple[Reception, Inputs, bool], tuple[PendantFrame, ...]]:
+    def _receive(self, before: Reception, operator: Operator) -> _Receptions:
         """Return the possible results of receiving pendant frames. Each result is mapped to the frames that cause it.
 
         The third element of a result is True if a press of START was received from the pendant.
         """
-        results: dict[tuple[Reception, Inputs, bool], tuple[PendantFrame, ...]] = {}
+        results: _Receptions = {}
         for frames in arrivals(before, operator):
             presses = [
                 frame for frame in frames if not frame.sender and frame.pressed and frame.request == Request.START
