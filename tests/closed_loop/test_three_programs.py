@@ -78,9 +78,10 @@ class Programs:
             time.sleep(0.001)
 
     def close(self) -> None:
-        """Stop all programs that still run."""
-        for name in list(self._threads):
-            self.end(name)
+        """Stop all programs that still run. The robot is the last, because the others wait for its frames for a long time."""
+        for name in (CONTROLLER, PENDANT, ROBOT):
+            if name in self._threads:
+                self.end(name)
 
     def _robot(self, bus: Bus, stop: StopRequest) -> None:
         body = PyBulletBody(self._urdf_text)
