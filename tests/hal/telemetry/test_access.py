@@ -348,7 +348,7 @@ class TestCommand:
 
             monkeypatch.setattr(TelemetryProcess, "begin_run", subscribe_first)
             out = folder / "run"
-            command = ["airwalk", "--steps", "2", "--telemetry", str(folder / "telemetry.toml"), "--out", str(out)]
+            command = ["airwalk", "--steps", "1", "--telemetry", str(folder / "telemetry.toml"), "--out", str(out)]
             result = CliRunner().invoke(cli, command)
             assert (result.exit_code, result.exception) == (0, None), result.stderr
             for _ in range(TRIES):
@@ -358,7 +358,7 @@ class TestCommand:
         assert str(got[0].encoding) == "application/protobuf;atalante.v1.JointStates"
         summary = json.loads((out / "summary.json").read_text())
         assert summary["telemetry"] == str(folder / "telemetry.toml")
-        assert [shape["steps"] for shape in summary["shapes"]] == [2]
+        assert [shape["steps"] for shape in summary["shapes"]] == [1]
         assert (out / "guide_shapes.png").read_bytes().startswith(b"\x89PNG")
         with (out / "recording.mcap").open("rb") as file:
             counts = make_reader(file).get_summary().statistics.channel_message_counts

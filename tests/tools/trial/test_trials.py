@@ -19,6 +19,7 @@ from click.testing import CliRunner
 from atalante_control.model import Patient
 from atalante_emulator.metabolism import MetabolismParameters
 from atalante_tools.cli import cli
+from atalante_tools.session.walk_options import Push
 from atalante_tools.trial import lockstep, plan, store
 from atalante_tools.trial.plan import (
     PROTOCOL,
@@ -271,28 +272,29 @@ def test_robust_trials_are_drawn_from_the_seed_within_their_ranges() -> None:
     assert len({trial.seed for trial in trials}) == 100
 
 
-def test_robust_walk_is_pushed_and_its_recording_is_readable(tmp_path: Path) -> None:
-    trial = robust_trials(1, 3, 0, "mujoco")[0]
+def robust_trial(steps: int) -> RobustTrial:
+    """Return a trial of the default subject, whose gaits are in a file, with a push in the first step."""
+    trial = robust_trials(1, steps, 0, "mujoco")[0]
     assert isinstance(trial, RobustTrial)
-    trial = replace(trial, pushes=((0.4, 90.0),), delay=1, loss=0.001)
+    return replace(trial, mass=SUBJECT.mass, height=SUBJECT.height, pushes=((0.4, 90.0),), delay=1, loss=0.001)
+
+
+def test_robust_walk_is_pushed_and_its_recording_is_readable(tmp_path: Path) -> None:
+    trial = robust_trial(1)
     result = robust_walk(trial, tmp_path / "walk.mcap")
-    assert (result["outcome"], result["steps"], result["safe"], result["pushes"]) == ("stood", 3, True, 1)
+    assert (result["outcome"], result["steps"], result["safe"], result["pushes"]) == ("stood", 1, True, 1)
     assert result["max_dcm_error_m"] > 1.5 * robust_walk(replace(trial, force=0.0))["max_dcm_error_m"]
     assert (tmp_path / "walk.mcap").stat().st_size > 10_000
 
 
 def test_robot_that_cannot_start_ends_the_trial(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(lockstep, "_START", 200)
-    trial = robust_trials(1, 3, 0, "mujoco")[0]
-    assert isinstance(trial, RobustTrial)
-    result = robust_walk(trial)
+    result = robust_walk(robust_trial(1))
     assert (result["outcome"], result["steps"], result["safe"]) == ("no start", 0, True)
 
 
 def test_robust_walk_that_falls_ends_in_a_safe_state() -> None:
-    trial = robust_trials(1, 3, 0, "mujoco")[0]
-    assert isinstance(trial, RobustTrial)
-    result = robust_walk(replace(trial, pushes=((0.4, 90.0),), force=2000.0))
+    result = robust_walk(replace(robust_trial(1), force=2000.0))
     assert (result["outcome"], result["safe"]) == ("fell", True)
     assert result["state"] in ("HOLD", "LOWER", "FAULT")
     assert result["diagnostics"]
@@ -305,10 +307,21 @@ def test_pushes_have_16_directions_and_8_phases() -> None:
     assert list(PUSH_FORCES) == sorted(PUSH_FORCES)
 
 
-def test_largest_push_is_the_last_one_before_the_robot_falls() -> None:
+def test_largest_push_is_the_last_one_before_the_robot_falls(monkeypatch: pytest.MonkeyPatch) -> None:
+    # Walks with the same push are equal, so each is walked once. `forces` of the trial does not affect a walk.
+    walks: dict[Push, tuple[str, dict[str, int]]] = {}
+    module = sys.modules[largest_push.__module__]  # the package has a command of the same name
+    walk = module._pushed_walk
+
+    def walk_once(trial: PushTrial, push: Push) -> tuple[str, dict[str, int]]:
+        walks[push] = walks.get(push) or walk(trial, push)
+        return walks[push]
+
+    monkeypatch.setattr(module, "_pushed_walk", walk_once)
     trial = PushTrial(270.0, 0.25, (50.0, 1000.0, 2000.0), 75.0, 1.75, 0, "mujoco")
     result = largest_push(trial)
     assert (result["largest_push_n"], result["end"], result["outcome"]) == (50.0, "fell", "computed")
     assert result["diagnostics"]
+    assert [push.force for push in walks] == [50.0, 1000.0]
     assert largest_push(replace(trial, forces=(1000.0,)))["largest_push_n"] == 0.0
     assert largest_push(replace(trial, forces=(50.0,)))["end"] == "stood"
