@@ -6,6 +6,11 @@ of each function is cached in a folder of the user's cache directory. The folder
 its callees and its constants. So a second start does not compile, and every change leads to a new compilation. The machine
 code uses only instructions that all processors of an architecture have. So all machines of one architecture give the same
 results, and a virtual machine can use the cache of its host.
+
+*Reference counts.* By default, numba counts the references to each array that a function passes to another function, because
+the last user of an array must free it. The counting takes most of the time of a kernel that calls small functions. Therefore
+`specialised` compiles a function without reference counts. numba refuses this for a function that creates an array, which
+is then compiled with reference counts.
 """
 
 from __future__ import annotations
@@ -30,6 +35,11 @@ Function = TypeVar("Function", bound=Callable[..., Any])
 P = ParamSpec("P")
 R = TypeVar("R")
 
+#: Name of a file in the cache folder of a function that creates arrays, so it cannot be compiled without reference counts.
+_MARK = "creates-arrays"
+#: For each function given to `specialised`: whether it creates arrays.
+_CREATES_ARRAYS: dict[Callable[..., Any], bool] = {}
+
 
 def compiled(function: Function) -> Function:
     """Return the function compiled to machine code; array bounds are checked, as in Python.
@@ -43,9 +53,12 @@ def compiled(function: Function) -> Function:
     Returns:
         The compiled function; `function` itself if NUMBA_DISABLE_JIT is set.
     """
-    if os.environ.get("NUMBA_DISABLE_JIT", "0") not in ("", "0"):
-        return function
-    return cast(Function, _compiled(function))
+    return function if interpreted(function) else cast(Function, _compiled(function, True))
+
+
+def interpreted(_function: Callable[..., Any]) -> bool:
+    """Return whether a function runs as plain Python, because NUMBA_DISABLE_JIT is set."""
+    return os.environ.get("NUMBA_DISABLE_JIT", "0") not in ("", "0")
 
 
 def specialised(function: Callable[P, R], *args: P.args, **kwargs: P.kwargs) -> Callable[P, R]:
@@ -60,17 +73,29 @@ def specialised(function: Callable[P, R], *args: P.args, **kwargs: P.kwargs) -> 
         *args: Arguments of the first call, whose results are discarded.
         **kwargs: Must be empty, because machine code takes positional arguments only.
     """
-    machine = compiled(function)
-    machine(*args, **kwargs)
-    if machine is function:
+    if interpreted(function):
+        function(*args, **kwargs)
         return function
-    dispatcher = cast(Any, machine)
-    # If only the first call compiled a version, no search by argument types is needed, which would take longer.
-    if len(dispatcher.overloads) == 1:
+    counted = _CREATES_ARRAYS.get(function)
+    if counted is None:
+        counted = _CREATES_ARRAYS[function] = _is_marked(function)
+    if not counted:
+        try:
+            return cast(Callable[P, R], _machine_code(function, args, False))
+        except _numba().core.errors.NumbaError:  # the function creates an array, or it is wrong
+            _CREATES_ARRAYS[function] = True
+            _mark(function)
+    return cast(Callable[P, R], _machine_code(function, args, True))
+
+
+def _machine_code(function: Callable[..., Any], args: tuple[Any, ...], counted: bool) -> Any:
+    """Compile a function, call it once, and return its machine code for the types of the arguments."""
+    dispatcher = _compiled(function, counted)
+    dispatcher(*args)
+    if len(dispatcher.overloads) == 1:  # that of this call; finding it by the types of its arguments takes longer
         (only,) = dispatcher.overloads.values()
-        return cast(Callable[P, R], only.entry_point)
-    types = tuple(dispatcher.typeof_pyval(arg) for arg in args)
-    return cast(Callable[P, R], dispatcher.get_overload(types))
+        return only.entry_point
+    return dispatcher.get_overload(tuple(dispatcher.typeof_pyval(arg) for arg in args))
 
 
 @cache
@@ -97,31 +122,45 @@ def _numba() -> Any:
 
 
 @cache
-def _compiled(function: FunctionType) -> Any:
+def _compiled(function: FunctionType, counted: bool) -> Any:
+    """Return the dispatcher of a function, with or without reference counts."""
     numba = _numba()
     config: Any = numba.config
     config.CPU_NAME, config.CPU_FEATURES = "generic", ""
-    folder = _folder(function)
+    folder = _folder(function, counted)
     config.CACHE_DIR = str(folder or "")
     if folder is None or not any(folder.iterdir()):
         _log.info("compiling %s.%s", function.__module__, function.__qualname__)
-    return numba.njit(boundscheck=True, cache=folder is not None)(_twin(function))
+    return numba.njit(boundscheck=True, cache=folder is not None, _nrt=counted)(_twin(function, counted))
 
 
-def _twin(function: FunctionType) -> FunctionType:
+def _mark(function: Callable[..., Any]) -> None:
+    """Store in the cache that a function creates arrays."""
+    folder = _folder(cast(FunctionType, function), False)
+    if folder is not None:
+        (folder / _MARK).touch()
+
+
+def _is_marked(function: Callable[..., Any]) -> bool:
+    """Return whether the cache states that a function creates arrays."""
+    folder = _folder(cast(FunctionType, function), False)
+    return folder is not None and (folder / _MARK).exists()
+
+
+def _twin(function: FunctionType, counted: bool) -> FunctionType:
     """Return a copy of a function in which each called function is replaced by its compiled form."""
     names = {name: value for name, value in function.__globals__.items() if name != function.__name__}
     for name, callee in _callees(function):
-        names[name] = _callee(callee)
+        names[name] = _callee(callee, counted)
     twin = FunctionType(function.__code__, names, function.__name__, function.__defaults__)
     twin.__module__, twin.__qualname__ = function.__module__, function.__qualname__
     return twin
 
 
 @cache
-def _callee(function: FunctionType) -> Any:
+def _callee(function: FunctionType, counted: bool) -> Any:
     """Return the compiled form of a called function. Each function is compiled once for all its callers."""
-    return _numba().njit(boundscheck=True)(_twin(function))
+    return _numba().njit(boundscheck=True, _nrt=counted)(_twin(function, counted))
 
 
 def _names(code: CodeType) -> Iterator[str]:
@@ -167,13 +206,18 @@ def _constants(code: CodeType) -> tuple[Any, ...]:
     return tuple(_constants(c) if isinstance(c, CodeType) else c for c in code.co_consts) + code.co_names
 
 
-def _folder(function: FunctionType) -> Path | None:
-    """Return the cache folder for the machine code of a function; None if the user's cache is not writable."""
+def _folder(function: FunctionType, counted: bool = True) -> Path | None:
+    """Return the cache folder for the machine code of a function; None if the user's cache is not writable.
+
+    Args:
+        function: Function to compile.
+        counted: Whether the machine code counts references.
+    """
     digest = hashlib.sha256(f"{_numba().__version__} {sys.version}".encode())
     for part in _compile_inputs(function):
         digest.update(part + b"\0")
     base = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache", "atalante", "compiled")
-    folder = base / f"{function.__name__.strip('_')}-{digest.hexdigest()[:16]}"
+    folder = base / f"{function.__name__.strip('_')}-{digest.hexdigest()[:16]}{'' if counted else '-uncounted'}"
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError:

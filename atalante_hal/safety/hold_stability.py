@@ -43,6 +43,7 @@ def _follow(velocity: Vector, drive_state: Vector, swings: Swings, driven: tuple
         swings: record to update.
         driven: states in which a drive controls its joint.
     """
+    oscillates = False
     for i in range(len(velocity)):
         swings.age[i] += 1
         if swings.age[i] > INTERVAL or (drive_state[i] != driven[0] and drive_state[i] != driven[1]):
@@ -51,7 +52,8 @@ def _follow(velocity: Vector, drive_state: Vector, swings: Swings, driven: tuple
         if direction != 0 and direction != swings.direction[i]:
             swings.reversals[i] += int(swings.direction[i] != 0)
             swings.direction[i], swings.age[i] = direction, 0
-    return bool(swings.reversals.max() >= REVERSALS)
+        oscillates |= swings.reversals[i] >= REVERSALS
+    return oscillates
 
 
 class HoldStability:

@@ -51,7 +51,7 @@ def _compare(sent: Vector, limit: Vector, reported: Vector, tolerance: Vector, t
     """
     row = tracking.cycles[0] % SPAN
     tracking.cycles[0] += 1
-    complete = tracking.cycles[0] >= SPAN
+    complete, deviates = tracking.cycles[0] >= SPAN, False
     for i in range(len(sent)):
         tracking.sent[row, i] = sent[i]
         low = high = sent[i]
@@ -60,7 +60,8 @@ def _compare(sent: Vector, limit: Vector, reported: Vector, tolerance: Vector, t
         low, high = min(low, limit[i]) - tolerance[i], max(high, -limit[i]) + tolerance[i]
         within = low <= reported[i] <= high
         tracking.wrong[i] = tracking.wrong[i] + 1 if complete and not within else 0
-    return bool(tracking.wrong.max() >= CONFIRM)
+        deviates |= tracking.wrong[i] >= CONFIRM
+    return deviates
 
 
 class TorqueTracking:

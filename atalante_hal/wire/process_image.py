@@ -375,9 +375,9 @@ def accept_exact(
             return False
     if not (intact(octets, e2e.spans, expected) and read_codes(words, table)):
         return False
-    values_before[:] = values
+    copy(values, 0, values_before)
     scale(table, values)
-    e2e.kept[:] = octets
+    copy(words, 0, e2e.kept.view(np.int64))
     for row in range(len(headers)):
         expected[row] = expected[row] + 1 & 0xFF
     return True
@@ -475,7 +475,7 @@ def classify_frame(words: Words, row: int, offset: int, e2e: E2EState, tag: int,
     if back and result == _REPEATED:
         result = _WRONG_SEQUENCE
     if result == _REPEATED:
-        if (octets[begin:end] == kept[spans[row, 0] : spans[row, 1]]).all():
+        if equal(octets, begin, kept[spans[row, 0] : spans[row, 1]]):
             return _REPEATED
         if not restarts:
             return _CONFLICT
@@ -488,8 +488,37 @@ def classify_frame(words: Words, row: int, offset: int, e2e: E2EState, tag: int,
             return _WRONG_SEQUENCE
     expected[row], silent[row] = counter + 1 & 0xFF, 0
     head = row * FRAME_BYTES
-    kept[head : head + FRAME_BYTES] = octets[head + offset : head + offset + FRAME_BYTES]
+    copy(octets, head + offset, kept[head : head + FRAME_BYTES])
     return _SOME_LOST if result == _WRONG_SEQUENCE and restarts else result
+
+
+# numba creates a temporary array for `target[:] = source` and for `first == second`, so the next two functions are loops.
+
+
+def copy(source: Vector | Words | Octets, begin: int, target: Vector | Words | Octets) -> None:
+    """Copy elements of an array to another array.
+
+    Args:
+        source: array to copy from.
+        begin: index of the first element to copy.
+        target: output, shape (n,); receives the next n elements of `source`.
+    """
+    for i in range(len(target)):
+        target[i] = source[begin + i]
+
+
+def equal(octets: Octets, begin: int, others: Octets) -> bool:
+    """Return whether a part of a byte array has the same bytes as another array.
+
+    Args:
+        octets: array with the part to compare.
+        begin: index of the first byte to compare.
+        others: bytes to compare with, shape (n,).
+    """
+    same = True
+    for i in range(len(others)):
+        same &= octets[begin + i] == others[i]
+    return bool(same)
 
 
 class TransmitImage:

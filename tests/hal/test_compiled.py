@@ -54,6 +54,78 @@ def test_specialised_function_has_the_types_of_its_own_call() -> None:
         assert specialised(element, values, 0)(values, 1) == values[1]
 
 
+def _doubled(values: Any) -> Any:
+    return 2.0 * values
+
+
+def _copied(source: Any, target: Any) -> None:
+    target[:] = source
+
+
+def _sum_of_first(values: Any, count: int) -> float:
+    return total(values[:count], math.inf)
+
+
+def test_specialised_function_may_create_arrays() -> None:
+    values, target = np.arange(3.0), np.zeros(3)
+    doubled, copied = specialised(_doubled, values), specialised(_copied, values, target)
+    for _ in range(2):
+        values += 1.0
+        assert doubled(values).tolist() == (2.0 * values).tolist()
+        copied(values, target)
+        assert target.tolist() == values.tolist()
+
+
+def test_specialised_function_counts_no_references_unless_it_creates_arrays() -> None:
+    values = np.arange(4.0)
+    assert specialised(_sum_of_first, values, 2)(values, 3) == GAIN * 3.0
+    specialised(_doubled, values)
+    codes = [
+        "".join(module._compiled(function, counted).inspect_llvm().values())  # type: ignore[arg-type]
+        for function, counted in ((_sum_of_first, False), (_doubled, True))
+    ]
+    assert ["NRT_" in code for code in codes] == [False, True]
+
+
+def test_calls_of_a_specialised_function_keep_the_reference_count_of_an_array() -> None:
+    values = np.arange(4.0)
+    first = specialised(_sum_of_first, values, 2)
+    before = sys.getrefcount(values)
+    for _ in range(100):
+        first(values, 3)
+        with pytest.raises(IndexError):
+            specialised(element, values, 0)(values, 4)
+    assert sys.getrefcount(values) == before
+
+
+def test_second_process_does_not_compile_a_function_that_creates_arrays_again(tmp_path: Path) -> None:
+    (tmp_path / "kernel.py").write_text("def double(x):\n    return 2.0 * x\n")
+    script = (
+        "import logging, numpy; logging.basicConfig(level=logging.INFO, format='%(message)s')\n"
+        "from atalante_hal.compiled import specialised; from kernel import double\n"
+        "print(specialised(double, numpy.ones(1))(numpy.ones(1)))"
+    )
+    logs = [
+        subprocess.run(
+            [sys.executable, "-c", script],
+            cwd=tmp_path,
+            env={"XDG_CACHE_HOME": str(tmp_path), "PATH": "/usr/bin:/bin"},
+            capture_output=True,
+            text=True,
+            check=True,
+        ).stderr.splitlines()
+        for _ in range(2)
+    ]
+    assert logs == [["compiling kernel.double"] * 2, []]  # first without, then with reference counts
+
+
+def test_wrong_specialised_function_raises_the_error_of_numba() -> None:
+    from numba.core.errors import TypingError
+
+    with pytest.raises(TypingError):
+        specialised(total, 1.0, 1.0)
+
+
 def test_function_is_compiled_only_once() -> None:
     assert compiled(total) is compiled(total)
     assert compiled(total) is not total

@@ -5,18 +5,19 @@ All other compiled functions stay compiled: some of them take minutes without ma
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from typing import Any
+
 from core import CORE
 
 import atalante_hal.compiled as compilation
-from atalante_hal.compiled import Function
 
-_compiled = compilation.compiled
+_interpreted = compilation.interpreted
 _CORE_MODULES = {file.removesuffix(".py").replace("/", ".") for files, _ in CORE.values() for file in files}
 
 
-def _compiled_outside_the_core(function: Function) -> Function:
-    return function if function.__module__ in _CORE_MODULES else _compiled(function)
+def _interpreted_in_the_core(function: Callable[..., Any]) -> bool:
+    return function.__module__ in _CORE_MODULES or _interpreted(function)
 
 
-# A plugin of the command line is imported before the modules that use `compiled`.
-compilation.compiled = _compiled_outside_the_core
+compilation.interpreted = _interpreted_in_the_core

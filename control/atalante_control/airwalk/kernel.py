@@ -83,7 +83,8 @@ def run(
     leg = swing * len(LEG_JOINTS)
     hip, knee = leg + _SH, leg + _SK
 
-    desired[:] = row
+    for k in range(len(desired)):  # `desired[:] = row` would create an array
+        desired[k] = row[k]
     if level:
         tibia = _TIBIAE[swing]
         write_level_ankle(parts.ankles[swing], parts.cubics, cycle, attitudes[tibia], gyros[tibia], desired)
@@ -103,7 +104,9 @@ def run(
     if step.assisted:
         torque[hip], torque[knee] = assisted
     add_carried(parts.carries, parts.blend, cycle, torque)
-    parts.pids[0].requested[:] = torque
+    requested = parts.pids[0].requested
+    for joint in range(len(requested)):
+        requested[joint] = torque[joint]
 
     errors = q[hip] - desired[hip], q[knee] - desired[knee]
     bounds, ratio, active = write_telemetry(parts.telemetry, step, guide.guards[0], cycle, desired, errors)

@@ -288,7 +288,9 @@ def act(
             torque[side * _LEG + _HA] += henke
     if stage.assisted:
         _assist(cycle, measured, assistance, parts)
-    parts.pids[0].requested[:] = torque
+    requested = parts.pids[0].requested
+    for joint in range(len(requested)):  # `requested[:] = torque` would create an array
+        requested[joint] = torque[joint]
     write_telemetry(parts.telemetry, cycle * PERIOD, not stage.double, desired, sensed.load, balance, up)
 
 
