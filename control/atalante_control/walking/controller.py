@@ -148,13 +148,18 @@ class WalkController:
         stages: Records[Stage] = zeros(Stage, 1)
         sensed: Records[Sensed] = zeros(Sensed, 1)
         balances: Records[Balance] = zeros(Balance, 1)
-        placements: Records[Placement] = zeros(Placement, 1)
+        placed = zeros(Placement, 1)
+        placements: Records[Placement] = placed
         placements[0].low[:], placements[0].high[:] = _range(robot, config)
-        self._placement = placements[0]
+        #: Row of the phase table and its change per cycle, shape (1,). Fields of arrays are read faster than fields of records.
+        self._clock, self._pace = placed["clock"], placed["pace"]
         outputs: Records[Outputs] = zeros(Outputs, 1)
         telemetry = zeros(Telemetry, 1)
         self.telemetry: Vector = telemetry.view(np.float64)
         self._record = telemetry[0]
+        guarded = [name for name, width in TELEMETRY_FIELDS for _ in range(width)].index("error")
+        #: Fields `error`, `q_bound`, `h` and `gate` of the telemetry, which follow each other, shape (6,).
+        self._guarded = self.telemetry[guarded : guarded + 6]
         self._stage, self._load, self._step, self._heading = (
             stages[0],
             sensed[0].load,
@@ -369,7 +374,7 @@ class WalkController:
         self._loaded = self._loaded + 1 if min(load) >= self._carrying else 0
         if phase in STEPPING:
             # `cycle` is the row of the phase table. With a phase rate of 1 (no step timing), it is the number of cycles.
-            cycle = int(self._placement.clock + self._placement.pace)
+            cycle = int(self._clock[0] + self._pace[0])
             landed = self._landed = self._impact.update(load[1 - self._stance], cycle / nominal)
         steps = self.statistics.steps + (phase is Phase.STEP)
         loaded, stopping = self._loaded >= self._settled, self._stopping or steps >= self._steps_wanted
@@ -434,15 +439,23 @@ class WalkController:
 
     def _watch_guide(self, cycle: int) -> None:
         """Add a guided cycle to the statistics, and report to the HAL if the leg is outside the guide."""
-        command, record, guide = self._command, self._record, self.config.guide
+        command, guide = self._command, self.config.guide
         guided = self._assisted and cycle < len(self._assistance.unmodelled)
-        command.outside = guided and record.h < 0.0
         command.hand_over_exceeded = guided and cycle == 0 and self._exceeded
-        if guided:
-            ratio = float(np.max(np.abs(record.error) / record.q_bound))
-            self.statistics.guide.count(cycle, ratio, float(record.h), bool(record.gate > guide.active))
+        if not guided:
+            command.outside = False
+        else:
+            hip, knee, hip_bound, knee_bound, h, gate = self._guarded.tolist()
+            command.outside = h < 0.0
+            ratio = max(_ratio(hip, hip_bound), _ratio(knee, knee_bound))
+            self.statistics.guide.count(cycle, ratio, h, gate > guide.active)
             self._outside = self._outside + 1 if command.outside else max(0, self._outside - 1)
         command.guide_left = self._promised and self._outside > guide.outside_cycles
+
+
+def _ratio(error: float, bound: float) -> float:
+    """Return |e| / q_bound of a joint; infinity if the guide has no width."""
+    return abs(error) / bound if bound else math.inf
 
 
 def _range(robot: Robot, config: WalkConfig) -> tuple[Vector, Vector]:

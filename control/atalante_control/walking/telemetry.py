@@ -34,6 +34,7 @@ class Telemetry:
     elapsed: float  # s, time since the start of the phase
     max_dcm_error: float  # m, largest error of the DCM in the steps so far
     assistance_factor: float  # assistance factor of this step; 1 outside the periodic gait
+    # The controller reads the fields from `error` to `gate` as one vector.
     error: Annotated[Vector, 2]  # rad, q - q_des of sagittal hip and knee of the swing leg, in the last guided cycle
     q_bound: Annotated[Vector, 2]  # rad, distance from q_des to the bound of the guide on the side of the error
     h: float  # h of the paper: at least 0 if the backup policy can keep both joints inside the guide
