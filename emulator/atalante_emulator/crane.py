@@ -11,7 +11,7 @@ from typing import Final
 
 import numpy as np
 
-from atalante_emulator.bodies import GRAVITY, PELVIS, Body
+from atalante_emulator.bodies import GRAVITY, PELVIS, Body, Motion
 from atalante_hal.types import PERIOD, SupervisorState, Vector
 
 #: Speed of the hook [m/s].
@@ -48,7 +48,7 @@ class Crane:
         self._body, self._mass, self._automatic = body, body.mass, automatic
         self._wrench = np.zeros(6)
         motion = body.motion(PELVIS)
-        self._at, self._heading = motion.position, _yaw(motion.attitude)
+        self._hold(motion)
         self._hook = self._top = self._goal = float(motion.position[2]) + GRAVITY / STIFFNESS
         self._waited = 0
         self.lowered = False
@@ -62,7 +62,7 @@ class Crane:
         """Lift the robot straight up from its current position, until the hook is at its initial height."""
         self._automatic = False
         motion = self._body.motion(PELVIS)
-        self._at, self._heading = motion.position, _yaw(motion.attitude)
+        self._hold(motion)
         self._hook = max(self._hook, float(motion.position[2]))
         self._goal, self.lowered = self._top, False
 
@@ -78,19 +78,30 @@ class Crane:
                 self.lower()
         if self.lowered:
             return self._wrench
-        self._hook += float(np.clip(self._goal - self._hook, -SPEED * PERIOD, SPEED * PERIOD))
-        position, attitude, velocity, rate = self._body.motion(PELVIS)
-        stretch = self._hook - position[2]
-        tension = max(0.0, self._mass * (STIFFNESS * stretch - DAMPING * velocity[2])) if stretch > 0.0 else 0.0
-        share = min(1.0, tension / (self._mass * GRAVITY))
-        self._wrench[:2] = share * self._mass * (STIFFNESS * (self._at - position)[:2] - DAMPING * velocity[:2])
-        self._wrench[2] = tension
-        turn = _turn_to_upright(attitude, self._heading)
-        self._wrench[3:] = share * self._mass * (RIGHTING * turn - ATTITUDE_DAMPING * rate)
+        self._hook += max(-SPEED * PERIOD, min(self._goal - self._hook, SPEED * PERIOD))
+        motion = self._body.motion(PELVIS)
+        x, y, z = motion.position.tolist()
+        vx, vy, vz = motion.velocity.tolist()
+        mass, stretch = self._mass, self._hook - z
+        tension = max(0.0, mass * (STIFFNESS * stretch - DAMPING * vz)) if stretch > 0.0 else 0.0
+        share = min(1.0, tension / (mass * GRAVITY))
+        wrench, across, (at_x, at_y) = self._wrench, share * mass, self._at
+        wrench[0] = across * (STIFFNESS * (at_x - x) - DAMPING * vx)
+        wrench[1] = across * (STIFFNESS * (at_y - y) - DAMPING * vy)
+        wrench[2] = tension
+        turn = _turn_to_upright(motion.attitude, self._half_heading)
+        for axis, (angle, rate) in enumerate(zip(turn, motion.rate.tolist(), strict=True)):
+            wrench[3 + axis] = across * (RIGHTING * angle - ATTITUDE_DAMPING * rate)
         if stretch < -SLACK and self._goal < self._hook:
             self.lowered = True
-            self._wrench[:] = 0.0
-        return self._wrench
+            wrench[:] = 0.0
+        return wrench
+
+    def _hold(self, motion: Motion) -> None:
+        """Hold the horizontal position and the heading of the pelvis from now on."""
+        x, y, _ = motion.position.tolist()
+        self._at, half = (x, y), 0.5 * _yaw(motion.attitude)
+        self._half_heading = float(np.sin(half)), float(np.cos(half))
 
 
 def _yaw(attitude: Vector) -> float:
@@ -98,18 +109,17 @@ def _yaw(attitude: Vector) -> float:
     return float(np.arctan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z)))
 
 
-def _turn_to_upright(attitude: Vector, heading: float) -> Vector:
-    """Return the rotation from an attitude to the upright attitude with a given heading, in world axes, shape (3,) [rad].
+def _turn_to_upright(attitude: Vector, half_heading: tuple[float, float]) -> tuple[float, float, float]:
+    """Return the rotation from an attitude to the upright attitude with a given heading, in world axes [rad].
 
     The result is 2 sin(angle / 2) along the axis of rotation. For a small angle it is the rotation vector.
 
     Args:
         attitude: quaternion xyzw, shape (4,).
-        heading: yaw angle [rad].
+        half_heading: sine and cosine of half the yaw angle.
     """
-    s, c = np.sin(0.5 * heading), np.cos(0.5 * heading)
-    x, y, z, w = attitude
+    s, c = half_heading
+    x, y, z, w = attitude.tolist()
     # Product of the quaternion (0, 0, s, c) and the conjugate of the attitude.
-    vector = np.array([-c * x + s * y, -s * x - c * y, s * w - c * z])
-    scalar = c * w + s * z
-    return 2.0 * vector * (1.0 if scalar >= 0.0 else -1.0)
+    twice = 2.0 if c * w + s * z >= 0.0 else -2.0
+    return twice * (-c * x + s * y), twice * (-s * x - c * y), twice * (s * w - c * z)

@@ -69,6 +69,7 @@ class Motors:
         self.wanted, self._joint = self._motors[_WANTED], self._motors[_JOINT]
         #: Cycles until a new setpoint reaches the current loop of each motor, and the setpoints of the last cycles.
         self._dead_time = np.full(len(JOINTS), parameters.dead_time)
+        self._late = parameters.dead_time > 0  # whether any setpoint is delayed
         self._setpoints = np.zeros((MOST_LATE + 1, len(JOINTS)))
         self._cycle = 0
         #: Torques of the wearer's limbs on the joints, shape (12,) [Nm]. The emulator writes into this array.
@@ -117,6 +118,7 @@ class Motors:
             cycles: additional time [cycles], at most `MOST_LATE` together with the dead time of all motors.
         """
         self._dead_time[motor] = self._parameters.dead_time + cycles
+        self._late = bool(self._dead_time.any())
 
     def push(self, joint: int, torque: float) -> None:
         """Set an external torque on a joint, which is added to the motor torque.
@@ -140,7 +142,7 @@ class Motors:
             Joint torques, shape (12,) [Nm].
         """
         setpoint = self.wanted
-        if self._dead_time.any():
+        if self._late:
             self._cycle += 1
             self._setpoints[self._cycle % len(self._setpoints)] = setpoint
             setpoint = self._setpoints[(self._cycle - self._dead_time) % len(self._setpoints), _MOTORS]

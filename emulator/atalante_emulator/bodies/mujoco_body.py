@@ -127,6 +127,7 @@ class MuJoCoBody:
         q = model.jnt_qposadr[model.joint(JOINTS[0]).id]
         self._q = data.qpos[q : q + len(JOINTS)]
         self._torque = data.qfrc_applied[first : first + len(JOINTS)]
+        self._body_of: dict[str, int] = {}  # MuJoCo's numbers of the links that `motion` was called for
         pelvis = model.body(PELVIS).id
         self._wrench = data.xfrc_applied[pelvis]
         self._sensed = _Sensed(self._q, data.qvel[first : first + len(JOINTS)], *_views(data.sensordata))
@@ -172,7 +173,9 @@ class MuJoCoBody:
         Raises:
             KeyError: If the URDF has no such link.
         """
-        body = self._model.body(link).id
+        body = self._body_of.get(link)
+        if body is None:
+            body = self._body_of[link] = self._model.body(link).id
         w, x, y, z = self._data.xquat[body]
         twist = np.zeros(6)
         mujoco.mj_objectVelocity(self._model, self._data, mujoco.mjtObj.mjOBJ_XBODY, body, twist, 0)

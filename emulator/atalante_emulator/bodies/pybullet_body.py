@@ -200,8 +200,11 @@ class PyBulletBody:
             state = self._link_states([self._index_of[link]])[0]
             centre, position, attitude = state[0], state[4], state[_ATTITUDE]
             velocity, rate = state[_LINEAR], state[_ANGULAR]
-        arm = np.array(position) - centre  # PyBullet returns the velocity of the centre of mass
-        return Motion(np.array(position), np.array(attitude), np.array(velocity) + np.cross(rate, arm), np.array(rate))
+        # PyBullet returns the velocity of the centre of mass. Another point has the velocity v + w x r.
+        rx, ry, rz = (a - b for a, b in zip(position, centre, strict=True))
+        (vx, vy, vz), (wx, wy, wz) = velocity, rate
+        moved = vx + (wy * rz - wz * ry), vy + (wz * rx - wx * rz), vz + (wx * ry - wy * rx)
+        return Motion(np.array(position), np.array(attitude), np.array(moved), np.array(rate))
 
     def step(self, torque: Sequence[float]) -> None:
         """Apply joint torques for one `PERIOD` and update the motion, the link states and the sole forces.
