@@ -37,9 +37,6 @@ from atalante_hal.wire.frame import Frames
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
     signal.signal(signal.SIGINT, signal.default_int_handler)
 
-# The collection of the tests creates many objects and no garbage. `pytest_collection_finish` enables the garbage collector.
-gc.disable()
-
 # Examples have no deadline, because the first example may compile functions.
 settings.register_profile("any time", deadline=None)
 settings.load_profile("any time")
@@ -103,6 +100,7 @@ def pytest_configure(config: pytest.Config) -> None:
     # With xdist the tests run in its workers, which load this file, too.
     if hasattr(config, "workerinput") or not config.getoption("numprocesses", None):
         hal_witness.start(str(config.stash[_witness_key].folder))
+        gc.disable()  # until `pytest_collection_finish`, because the collection of the tests creates many objects and no garbage
 
 
 def pytest_collection_finish() -> None:
