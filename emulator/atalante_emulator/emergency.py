@@ -143,7 +143,7 @@ class Errors:
         self._active[node] = {}
 
     def warn(self, node: int, code: int) -> None:
-        """Report a warning, which is an error without a reaction, unless the same warning was reported a short time ago.
+        """Report a warning, unless the same warning was reported a short time ago. A warning is an error without a reaction.
 
         Args:
             node: index of the node.

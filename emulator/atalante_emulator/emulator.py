@@ -48,7 +48,7 @@ from atalante_hal.wire.process_image import ReceiveImage, TransmitImage
 _RECEIVE_BUDGET = 128
 #: Capacity of the transmit buffer [frames]. The nodes send 19 cyclic frames per cycle, slow messages and emergencies.
 _BATCH = 128
-#: E2E check results with which a received command frame is rejected.
+#: The nodes reject a received command frame with one of these E2E check results.
 _REJECTED = (Check.CRC, Check.LENGTH, Check.RANGE, Check.INVALID)
 #: Half the period of the alive counter.
 _HALF_TURN = 128
@@ -159,7 +159,7 @@ class Emulator:
         self._rx.values.fill(0.0)  # values until the first command: zero torque, zero vibration, HAL state OFF
         self._scratch = new_frames(_RECEIVE_BUDGET)
         self._scratch_from = [self._scratch[offset:] for offset in range(_RECEIVE_BUDGET)]
-        #: Number of frames in the scratch buffer that arrived before the SYNC of their cycle, kept for the next call.
+        #: Number of frames that arrived before the SYNC of their cycle. The scratch buffer keeps these frames for the next call.
         self._waiting = 0
 
         self._sync_rows = [self._rx.codec.rows[m.name] for m in syncs]
@@ -171,7 +171,8 @@ class Emulator:
         self._whole = [self._tx.frames]
         #: For each leg: index of its SYNC message in the list of SYNC messages.
         self._leg_syncs = [[m.name for m in syncs].index(f"SYNC_{side.upper()}_LEG") for side in SIDES]
-        #: For each SYNC message: answer frames of the last cycle that had missing or late frames, for a SYNC that arrives late.
+        #: Answers to SYNC that are sent if a SYNC arrives late, in the order of the SYNC messages.
+        #: The answers are copied in each cycle that has missing or late frames.
         self._answered = self._shares
         batch = new_frames(_BATCH)
         self._batch = batch.view(np.uint8).data
@@ -317,7 +318,7 @@ class Emulator:
         return True
 
     def _commands_in_step(self) -> bool:
-        """Return whether no command is late. A command and the SYNC of the next cycle have the same alive counter."""
+        """Return whether all commands are on time. A command and the SYNC of the next cycle have the same alive counter."""
         counters = self._counters.tobytes()
         (left_sync, left), (right_sync, right) = self._leg_rows
         return counters[left_sync] == counters[left] and counters[right_sync] == counters[right]

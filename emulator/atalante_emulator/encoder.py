@@ -80,6 +80,6 @@ class Encoders:
 
     @property
     def speed(self) -> Vector:
-        """Joint velocities computed from the last two counts, without low-pass, for the local hold, shape (12,) [rad/s]."""
+        """Joint velocities for the local hold, shape (12,) [rad/s], computed from the last two counts without a low-pass."""
         speed: Vector = (self._counts - self._before) / (self._counts_per_rad * PERIOD)
         return speed

@@ -40,7 +40,7 @@ class Kind:
     does: str  # description of the effect in one line
     targets: str  # valid types of the target: message, node, bus, or a kind of node such as drive
     parameters: Mapping[str, Parameter] = field(default_factory=dict)  # name -> definition
-    signals: bool = False  # whether signals of the target message are valid as additional parameters
+    signals: bool = False  # whether each signal of the target message is an additional parameter
 
 
 def _number(low: float, high: float, unit: str = "", *, default: float | None = None) -> Parameter:

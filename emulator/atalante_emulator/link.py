@@ -40,7 +40,7 @@ class _Disturbance:
 
     def __init__(self, fault: Fault, network: Network, seed: str) -> None:
         self.fault = fault
-        # The fault `inject` sends copies of a received frame, so it becomes active one cycle before its first copy.
+        # The fault `inject` becomes active one cycle before it sends its first copy, because it must first receive a frame.
         self.from_cycle = fault.start - (fault.kind == "inject")
         self.messages = {message.frame_id: message for message in messages_of(fault, network)}
         self.random = random.Random(seed)

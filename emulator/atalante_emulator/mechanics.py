@@ -27,7 +27,7 @@ class Ground:
     """Floor, crane and virtual operator of a robot with a free pelvis. The height of the floor is 0."""
 
     friction: float = FRICTION  # coefficient of friction between soles and floor
-    clearance: float = 0.03  # height of the lowest corner of the suspended soles above the floor [m]
+    clearance: float = 0.03  # height of the lowest sole corner above the floor while the robot is suspended [m]
     operator_force: float = 0.0  # largest force of the virtual operator [N]; 0 if there is no virtual operator
 
 

@@ -33,16 +33,17 @@ SAMPLE: Final = 1.0
 class MetabolismParameters:
     """Parameters of metabolism and respirometer. Values without a source are assumptions."""
 
-    #: W/kg, metabolic rate of quiet standing, from the walking equation of Looney et al., Med. Sci. Sports Exerc. 51, 2019
+    #: Metabolic rate of quiet standing [W/kg].
+    #: Source: walking equation of Looney et al., Med. Sci. Sports Exerc. 51, 2019.
     standing: float = 1.44
     positive: float = 0.25  # efficiency of positive muscle work (Margaria, Int. Z. Angew. Physiol. 25, 1968)
     negative: float = 1.20  # magnitude of the efficiency of negative muscle work (Margaria 1968)
-    #: W/Nm, metabolic rate per muscle torque without motion: 0.054 times the largest joint speed, assumed to be 10 rad/s.
+    #: Metabolic rate per muscle torque without motion [W/Nm]: 0.054 times the largest joint speed, assumed to be 10 rad/s.
     #: Source: Minetti, Alexander, J. Theor. Biol. 186, 1997.
     activation: float = 0.54
     quotient: float = 0.85  # respiratory exchange ratio, litres of CO2 per litre of O2
-    oxygen_time: float = 30.0  # s, time constant of oxygen uptake after a change of the metabolic rate
-    carbon_dioxide_time: float = 60.0  # s, time constant of carbon dioxide output; body tissue stores the gas
+    oxygen_time: float = 30.0  # time constant of oxygen uptake after a change of the metabolic rate [s]
+    carbon_dioxide_time: float = 60.0  # time constant of CO2 output [s], longer because body tissue stores CO2
     noise: float = 0.05  # standard deviation of a sample of the respirometer, as a fraction of the sample
 
 

@@ -82,7 +82,7 @@ class Motors:
         self._heat = parameters.heating / (0.5 * robot.torque_max) ** 2
         temperature.fill(parameters.ambient)
         self._advance = compiled(_advance)
-        self.advance(np.zeros(len(JOINTS)))  # this first call compiles the kernel, which takes longer than a cycle
+        self.advance(np.zeros(len(JOINTS)))  # compiles the kernel now; the compilation takes longer than a cycle
 
     def power(self, powered: npt.NDArray[np.bool_]) -> None:
         """Switch the power stage of each motor on or off. A motor whose power stage is off brakes its joint.
@@ -121,7 +121,7 @@ class Motors:
         self._late = bool(self._dead_time.any())
 
     def push(self, joint: int, torque: float) -> None:
-        """Set an external torque on a joint, which is added to the motor torque.
+        """Set an external torque on a joint. The external torque is added to the motor torque.
 
         Args:
             joint: index of the joint.

@@ -29,7 +29,7 @@ _MEASURED: Final = ("Quaternion", "Gyro", "Accel", "Force")
 
 
 class NodeFaults:
-    """Node faults and sensor faults of one emulator. `begin` and `rewrite` apply them in each cycle."""
+    """Node faults and sensor faults of one emulator. `begin` and `rewrite` apply the faults in each cycle."""
 
     def __init__(
         self,
@@ -82,7 +82,7 @@ class NodeFaults:
         return self._position
 
     def rewrite(self, cycle: int, values: Vector) -> None:
-        """Apply the sensor faults that are active in this cycle to the values before they are sent.
+        """Apply the active sensor faults to the values of this cycle, before these values are sent.
 
         Args:
             cycle: number of the cycle.

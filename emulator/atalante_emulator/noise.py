@@ -33,7 +33,7 @@ class SensorNoise:
         self._bias = imus.draw_bias(self._of_imus)
         self._attitude = imus.attitude_error(NOISE_CYCLES * PERIOD, of_attitude)
         self._quaternion = codec.slice("Quaternion")
-        self._values: Vector | None = None  # output array of the last `add`; `_attitudes` is a view of it
+        self._values: Vector | None = None  # output array of the last `add`; `_attitudes` is a view of this array
         self._attitudes = np.zeros((0, 4))
 
     def add(self, cycle: int, truth: Vector, values: Vector) -> None:

@@ -29,7 +29,7 @@ Pair = tuple[float, float]
 
 _SH, _SK, _LEG = LEG_JOINTS.index("SH"), LEG_JOINTS.index("SK"), len(LEG_JOINTS)
 #: Thresholds of the load of a foot, as fractions of the weight. Before the walk, a foot with more than `_STANDING` stands.
-#: During the walk, a foot with less than `_AIR` is in the air. It lands when its load exceeds `_LANDED`.
+#: During the walk, a foot with less than `_AIR` is in the air. A foot in the air lands when its load exceeds `_LANDED`.
 _STANDING, _AIR, _LANDED = 0.25, 0.02, 0.1
 #: Time for which both feet must stand before the patient expects steps [cycles].
 _READY: Final = 500
@@ -43,20 +43,20 @@ class ActiveParameters:
         ValueError: If a parameter is out of range.
     """
 
-    #: Nm/rad, feedback torque per perceived error: the stiffness of a person who resists a motion
+    #: feedback torque per perceived error [Nm/rad]: the stiffness of a person who resists a motion
     gain: Pair = (150.0, 80.0)
-    damping: Pair = (15.0, 8.0)  # Nm s/rad, feedback torque per rate of the error
-    #: s, time from an error to the voluntary reaction (kinaesthetic reaction times are 0.12 to 0.18 s)
+    damping: Pair = (15.0, 8.0)  # feedback torque per rate of the error [Nm s/rad]
+    #: time from an error to the voluntary reaction [s] (kinaesthetic reaction times are 0.12 to 0.18 s)
     delay: float = 0.15
-    #: rad, largest joint angle error that the patient does not perceive.
+    #: Largest joint angle error that the patient does not perceive [rad].
     #: The threshold at hip and knee is one to two degrees (Domingo, Lam, J. NeuroEng. Rehabil. 11, 2014).
     threshold: float = math.radians(1.0)
-    #: learning rate g / gain: share of `gain` times the perceived error that is added to the torque in the leg's next step
+    #: Learning rate: the patient adds `learning` times `gain` times the perceived error to the torque in the leg's next step.
     learning: float = 0.1
     forgetting: float = 0.95  # f: fraction of the learned torque that remains in the next step of the same leg
     noise: float = 0.1  # standard deviation of the torque as a fraction of the torque (signal-dependent noise)
-    noise_time: float = 0.1  # s, correlation time of the noise
-    activation: float = 0.05  # s, time constant from excitation to torque (Zajac, Crit. Rev. Biomed. Eng. 17, 1989)
+    noise_time: float = 0.1  # correlation time of the noise [s]
+    activation: float = 0.05  # time constant from excitation to torque [s] (Zajac, Crit. Rev. Biomed. Eng. 17, 1989)
     #: Largest voluntary torque in the weaker direction of each joint (flexion), as a fraction of mass times gravity times height.
     #: Source: Anderson, Madigan, Nussbaum, J. Biomech. 40, 2007.
     strength: Pair = (0.113, 0.087)
@@ -78,8 +78,8 @@ class ActiveParameters:
 class ActiveTask:
     """Task of an active patient: the person, the motion to track, and the seed of the noise. The task can be pickled."""
 
-    mass: float  # kg, of the patient
-    height: float  # m, of the patient
+    mass: float  # mass of the patient [kg]
+    height: float  # height of the patient [m]
     #: nominal angles of hip and knee of the swing leg in each cycle of a step, from landing to landing, shape (n + 1, 2) [rad]
     swing: Sequence[Pair]
     seed: int = 0

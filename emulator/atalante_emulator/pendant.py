@@ -39,7 +39,7 @@ class Operator:
     In HOLD the emulated operator does not press START. Call `start()` to end HOLD.
     """
 
-    #: Time from the change of the HAL to READY to the first press of START, and between two presses in READY [cycles].
+    #: In READY, the operator presses START each time this number of cycles has passed.
     REACTION = 200
 
     def __init__(self, assistance_factor: float | None = None, *, starts: bool = True) -> None:
@@ -90,7 +90,7 @@ class Operator:
         self.signals = self.signals._replace(dead_man=False)
 
     def squeeze(self) -> None:
-        """Press the dead-man switch after a release."""
+        """Press the dead-man switch again after a release."""
         self.signals = self.signals._replace(dead_man=True)
 
     def receive(self, hal_state: int) -> None:

@@ -19,9 +19,9 @@ _log = logging.getLogger(__name__)
 
 #: Largest lean of the pelvis at which the operator exerts no force [rad]. The pelvis of a walking robot leans by less.
 DEADBAND: Final = 0.1
-STIFFNESS: Final = 2000.0  # N/rad, force for each rad of lean beyond `DEADBAND`
-DAMPING: Final = 300.0  # N s/rad, force for each rad/s of the lean rate
-#: Time without a force after which an intervention has ended [cycles].
+STIFFNESS: Final = 2000.0  # force for each rad of lean beyond `DEADBAND` [N/rad]
+DAMPING: Final = 300.0  # force for each rad/s of the lean rate [N s/rad]
+#: An intervention of the operator ends after this time without a force [cycles].
 _PAUSE: Final = 200
 
 
