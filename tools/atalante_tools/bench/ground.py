@@ -1,4 +1,4 @@
-"""Benchmark of the physics engines: simulate one millisecond of a robot with a patient that stands on its soles."""
+"""Benchmark of the physics engines: simulate one millisecond of a standing robot with a patient."""
 
 from __future__ import annotations
 

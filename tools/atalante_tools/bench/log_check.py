@@ -24,7 +24,7 @@ from atalante_tools.canlog.column_codec import crc_differences, crc_of_zeros
 from atalante_tools.canlog.plan import Plan
 from atalante_tools.canlog.validate.project import Project
 
-#: Length of the recording in a normal and in a quick run [cycles], a multiple of the period of every message.
+#: Length of the recording [cycles] in a normal run, and in a quick run. Both lengths are multiples of all message periods.
 _CYCLES, _QUICK_CYCLES = 2000, 300
 #: Number of copies of the recording in the log of a normal run, and in the log of a quick run.
 _REPEATED, _QUICK_REPEATED = 25, 2

@@ -81,7 +81,7 @@ class Effort:
 
 
 def timed(work: Callable[[], object], repetitions: int) -> Block:
-    """Return a block that calls the function `work` `repetitions` times, and returns the time per call [s]."""
+    """Return a block that calls the function `work` repeatedly and returns the mean time per call [s]."""
     counter = range(repetitions)
     # The processor time of this thread excludes the time of other processes.
     now = time.thread_time

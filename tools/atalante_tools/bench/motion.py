@@ -37,11 +37,11 @@ POSE: Final = 0.15
 _BEFORE_WALKING: Final = 3000
 #: Number of cycles from power-on to the measurement on the ground. The robot is first lowered and shifts its weight.
 _BEFORE_STEPPING: Final = 8000
-#: Smallest vertical component of the upward axis of the pelvis of a robot that walks.
+#: While the robot walks, the upward axis of the pelvis must have at least this vertical component.
 _UPRIGHT: Final = 0.95
 #: Number of cycles that are timed together as one block.
 _BLOCK: Final = 50
-_STEPS: Final = 1000  # requested walking steps, more than a benchmark takes
+_STEPS: Final = 1000  # number of requested walking steps; a benchmark ends before the last step
 _TICKS: Final = 40
 _INTEGRATIONS: Final = 4
 
@@ -150,7 +150,7 @@ def lockstep_walk(engine: str) -> Callable[[Effort], Measurement]:
 
 
 def _against_real_time(stack: _Stack) -> Measurement:
-    """Return the median time of the blocks for one simulated second, with real time as the baseline."""
+    """Return the median wall time of the blocks for one simulated second. The baseline is real time, 1 s."""
     ordered = [block / (_BLOCK * PERIOD) for block in sorted(stack.blocks)]
     seconds, undisturbed = statistics.median(ordered), ordered[len(ordered) // 10]
     # Another process on the same physical core almost halves the speed, so the remark also reports the fastest blocks.
@@ -247,7 +247,7 @@ def _stack(robot_process: EmbeddedRobot | None) -> Iterator[_Stack]:
 
 @contextmanager
 def _walking_stack(engine: str) -> Iterator[_Stack]:
-    """Open HAL, walking controller, emulated robot on the ground in a subprocess, and telemetry ring.
+    """Open HAL, walking controller and telemetry ring. The emulated robot stands on the ground and runs in a subprocess.
 
     Args:
         engine: physics engine of the emulated robot.

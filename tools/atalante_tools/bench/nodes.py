@@ -34,7 +34,7 @@ from atalante_tools.bench.measure import require
 
 #: Number of cycles after which an alive counter wraps to 0.
 TURN = 256
-#: Number of poses in the recording. It has no common factor with 16, because the HAL runs its slow checks in every 16th cycle.
+#: Number of poses in the recording. The number has no common factor with 16: the HAL runs slow checks in every 16th cycle.
 #: With 16 poses, the slow checks would always read the same pose, and report constant sensor values as a fault.
 POSES = 15
 #: Tracking error of the recorded joints [rad], too small to saturate the guide filter.

@@ -17,7 +17,7 @@ from atalante_hal.types import Vector
 
 
 class SteppedRollout:
-    """Simulation, cycle by cycle, of the tracking errors that a guide filter predicts from tables."""
+    """Simulation of the tracking errors of hip and knee. A guide filter predicts the same errors from tables."""
 
     def __init__(self, guide: GuideFilter) -> None:
         """Copy the gains of the backup policy, and the coefficients of the motor and of the velocity filter.
@@ -31,7 +31,7 @@ class SteppedRollout:
         self._cycles = len(guide.prediction.ahead)
 
     def errors(self, state: Vector) -> Vector:
-        """Return the tracking errors of hip and knee in n cycles from now on, without disturbance. Shape (n, 2) [rad].
+        """Return the tracking errors of hip and knee in the next n cycles if no disturbance acts. Shape (n, 2) [rad].
 
         Args:
             state: state of the sampled loop, see `backup_policy`, shape (10,).

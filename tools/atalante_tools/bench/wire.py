@@ -208,7 +208,7 @@ def _no_compiler() -> Measurement | None:
 
 
 def _frame_checker() -> tuple[Callable[[bytes, int], bool], tuple[str, ...]]:
-    """Return the baseline of `e2e_check`: a function that checks the CRC of one payload, and remarks about this function."""
+    """Return the baseline of `e2e_check` and remarks. The baseline is a function that checks the CRC of one payload."""
     try:
         import e2e
     except ModuleNotFoundError:

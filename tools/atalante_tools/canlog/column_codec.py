@@ -1,4 +1,4 @@
-"""Codec for logs, which decodes many frames of one message in one call, for any DBC, and computes E2E CRCs.
+"""Codec for logs and for any DBC. It decodes many frames of one message in one call, and computes E2E CRCs.
 
 The codec of the control loop (`codec.Codec`) decodes all messages of one cycle and requires that no signal crosses a
 64-bit word. The codec in this module decodes many frames of one message. It supports Intel and Motorola layouts,
@@ -85,7 +85,7 @@ class ColumnCodec:
             ) from None
 
     def _plan(self) -> None:
-        """Assign to each field the 64-bit word from which it is read: an Intel, a byte-swapped Motorola or two joined words."""
+        """Assign a 64-bit word to each field: an Intel word, a byte-swapped Motorola word, or one joined from two words."""
         rows: dict[tuple[str, int], int] = {}
         self._little: list[int] = []  # Intel words
         self._big: list[int] = []  # Motorola words, byte-swapped
@@ -166,7 +166,7 @@ class ColumnCodec:
         return column if field.offset == 0 else np.asarray(column + exact(int(field.offset)))
 
     def present(self, raw: Words, index: int) -> Mask | None:
-        """Return the mask of the frames that contain the field, shape (n,), or None if all frames contain it.
+        """Return the mask of the frames that contain the field, shape (n,), or None if all frames contain the field.
 
         Args:
             raw: result of `extract`, shape (fields, n).

@@ -135,7 +135,7 @@ class Plan:
         return rows
 
     def rows_in_other_format(self, can_ids: npt.NDArray[np.uint32]) -> Rows:
-        """Return the index of the message with the same number, but with the other identifier length (11 or 29 bits). Shape (n,).
+        """Return for each identifier the index of the message with the same number in the other identifier format. Shape (n,).
 
         The two formats are 11 bits and 29 bits. The index is `UNKNOWN` if the DBC has no such message.
         """

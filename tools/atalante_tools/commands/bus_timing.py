@@ -1,4 +1,4 @@
-"""Measurement of the time from a SYNC to the frames that answer this SYNC, from their receive timestamps.
+"""Measurement of the time from a SYNC to the frames that answer this SYNC. The times are receive timestamps.
 
 frames, stamps -> BusTiming -> Latency of states and commands, per bus
 """

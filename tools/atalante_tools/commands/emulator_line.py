@@ -18,10 +18,10 @@ from atalante_hal.wire.e2e import COUNTER_BYTE, check_counter
 from atalante_hal.wire.frame import Frames, new_frames
 from atalante_tools.session.takeover import PendantReader, Takeover
 
-#: Time without a frame of another pendant after which the emulated pendant resumes sending [cycles].
+#: The emulated pendant resumes sending after this time without a frame of another pendant [cycles].
 #: `PENDANT_QUIET` is longer than `QUIET_CYCLES`, so that a pendant in another process resumes before the emulated pendant.
 PENDANT_QUIET: Final = 12
-#: Number of received frames of an emulated message, with increasing counters, that prove another robot on the bus.
+#: This number of received frames of one emulated message, with increasing counters, proves another robot on the bus.
 ROBOT_FRAMES: Final = 3
 
 
@@ -77,7 +77,7 @@ class Line(ResilientBus):
         return ""
 
     def send(self, frames: Frames) -> None:
-        """Send frames with `ResilientBus.send`. Omit frames of the emulated pendant while the takeover rule forbids them.
+        """Send frames with `ResilientBus.send`. Omit frames of the emulated pendant while the takeover rule forbids these frames.
 
         Args:
             frames: Frames to send.

@@ -135,7 +135,8 @@ def latches(tester: NodeTester) -> Outcome:
     axis.enable()
     last = tester.command.counter
     received = tester.states([frame for _ in range(LATCHED) for frame in tester.cycle()])
-    # A drive whose watchdog is too slow accepts the next command, because its counter increases by the largest valid step.
+    # The counter of the next command increases by the largest valid step.
+    # A drive whose watchdog is too slow accepts this command.
     received += axis.send(axis.command(_C.ENABLE_OPERATION, counter=last + MAX_DELTA & 0xFF))
     received += axis.run(2 * SHOWN, _C.ENABLE_OPERATION)
     stopped = any(state_of(frame) == _S.QUICK_STOP_ACTIVE for frame in received)

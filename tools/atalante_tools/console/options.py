@@ -101,7 +101,7 @@ DEFAULT_STEP: Final = (0.15, 0.9)
 
 
 def length(text: str) -> float:
-    """Convert a length that the user entered to metres (option type). For example, 1.75 and 175 are both 1.75 m.
+    """Option type for a length: converts the text of the user to metres. For example, 1.75 and 175 are both 1.75 m.
 
     Args:
         text: Length of a body part or a step. Numbers below 5 are metres, other numbers are centimetres.
@@ -119,7 +119,7 @@ def length(text: str) -> float:
 def options_as(
     name: str, meaning: Callable[..., object], options: Sequence[Callable[[Any], Any]]
 ) -> Callable[[_Command], _Command]:
-    """Return a decorator that adds several options to a command. The command receives their values as one argument.
+    """Return a decorator that adds several options to a command. The command receives the option values as one argument.
 
     Args:
         name: Name of the argument of the command.
@@ -261,7 +261,7 @@ class Target:
 
 
 def target_options(*, embedded: bool, clock: bool = True) -> Callable[[_Command], _Command]:
-    """Return a decorator that adds `-i`, `-c` and `--lockstep/--wall` and passes them as the argument `target`.
+    """Return a decorator that adds `-i`, `-c` and `--lockstep/--wall`. The command gets their values as the argument `target`.
 
     Args:
         embedded: Whether to allow the embedded robot, which is then the default.

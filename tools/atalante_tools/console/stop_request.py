@@ -24,7 +24,7 @@ _SIGNALS = (signal.SIGINT, signal.SIGTERM)
 
 
 class Stopped(SystemExit):
-    """Exception that ends the command after a stop signal. `except Exception` does not catch it."""
+    """Exception that ends the command after a stop signal. `except Exception` does not catch this exception."""
 
 
 class StopRequest:

@@ -59,7 +59,7 @@ class Vectors:
         self._order = self._stream_order()
 
     def _stream_order(self) -> npt.NDArray[np.intp]:
-        """Return, for each byte of the output stream, its index in the concatenated arrays of one set of payloads."""
+        """Return the order of the output bytes, as indices into the concatenated arrays of one set of payloads."""
         build, codec = self._build, self._codec
         rows = len(build.messages)
         parts = (FRAME_BYTES * rows, FRAME_BYTES * rows, 8 * codec.size, 8 * codec.size, rows)

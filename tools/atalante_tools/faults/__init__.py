@@ -100,7 +100,7 @@ def run(id_: str, name: str, engine: str, as_json: bool) -> None:
     default=3_000_000,
     show_default=True,
     metavar="N",
-    help="Number of cycles of 1 ms of all walks together.",
+    help="Total number of cycles in all walks. A cycle lasts 1 ms.",
 )
 @jobs_option
 @dask_option

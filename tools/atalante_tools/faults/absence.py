@@ -28,12 +28,12 @@ class Absence:
         """
         self._clock, self._emulator = clock, emulator
         self._begun = 0  # HAL cycles that have begun
-        self._skipped = 0.0  # time that the loop has lost, because its cycles began more than a period late [s]
+        self._skipped = 0.0  # time lost by the loop in cycles that began more than a period late [s]
         self._seen = 0  # cycle number of the robot at the end of the last call of `wait`
         self._alone = 0  # cycles of the robot since the last SYNC
 
     def wait(self) -> float:
-        """Return the delay of this cycle [s], after the robot has moved until the start of the cycle."""
+        """Move the robot until the start of this cycle. Return the delay of this cycle [s]."""
         late = self._clock.wait()
         if self._emulator.cycle > self._seen:
             self._alone = 0

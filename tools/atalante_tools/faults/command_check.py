@@ -69,7 +69,7 @@ class _Leg:
         )
 
     def consecutive(self) -> npt.NDArray[np.bool_]:
-        """Return, for each frame except the last, whether it and the frame of the next cycle enable a drive. Shape (n - 1, 6)."""
+        """Return whether each frame and the frame of the next cycle both enable a drive. Shape (n - 1, 6)."""
         enabled = self.word == Controlword.ENABLE_OPERATION
         return np.asarray(enabled[1:] & enabled[:-1] & (np.diff(self.cycle) == 1)[:, None])
 

@@ -52,7 +52,7 @@ class HostFaults:
 
 
 class TimedStimuli:
-    """Faults and operator actions of a case that begins in a HAL cycle.
+    """Faults and operator actions of a case that begins in a given HAL cycle.
 
     Attributes:
         faults: faults of the emulated robot, with their start in its cycles.
@@ -143,7 +143,7 @@ class DisturbedClock:
         self._behind = 0.0  # accumulated delay of the loop during the fault `slow` [s]
 
     def wait(self) -> float:
-        """Return the time from the deadline of the cycle to its start [s], as `WallClock.wait` does."""
+        """Return the time from the deadline to the start of the cycle [s], as `WallClock.wait` does."""
         fault = self._now.of("late", "slow")
         if fault is None:
             self._behind = 0.0

@@ -174,7 +174,7 @@ SCENARIOS: Final = (
                 checks=(limit_follows_temperature,),
             ),
             Case(
-                "up to 105 degC, 1 K per cycle",  # after 65 cycles, above 90 degC, the drive reduces its torque limit
+                "up to 105 degC, 1 K per cycle",  # the drive exceeds 90 degC after 65 cycles, and then reduces its torque limit
                 (Fault("heat_ramp", _KNEE, 0, 400, rate=1000.0, up_to=105.0),),
                 node=_KNEE,
                 detected=70,
@@ -271,7 +271,7 @@ SCENARIOS: Final = (
             for late in (8, 10)
         ),
     ),
-    # The HAL finds a wrong torque when it exceeds its tolerance, a fifth of the breakaway torque of the joint.
+    # The HAL detects a torque error above a fifth of the breakaway torque of the joint.
     Scenario(
         "F75",
         tuple(

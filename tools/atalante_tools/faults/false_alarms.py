@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from atalante_emulator.mechanics import Mechanics
     from atalante_hal.types import Controller
 
-#: Cycles of a walk in the air. A walk on the ground of `_STEPS` steps has about as many cycles.
+#: Number of cycles of a walk in the air. A walk of `_STEPS` steps on the ground has about the same number of cycles.
 _CYCLES: Final = 60_000
 _STEPS: Final = 75
 #: Diagnostics that a walk without a fault may report: joint outside its guide, saturated torque, STOP of the operator.

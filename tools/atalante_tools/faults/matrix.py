@@ -16,7 +16,7 @@ from atalante_hal.types import SupervisorState
 
 MATRIX_FILE: Final = Path(__file__).with_name("FAULTS.md")
 COLUMNS: Final = ("ID", "Fault", "Detected by", "Cycles", "Reaction", "State", "DTC", "Proof")
-#: The column Proof contains this text if the scenario with the ID of the fault is its proof.
+#: The column Proof contains this text if the proof is the scenario with the ID of the fault.
 SCENARIO: Final = "scenario"
 _ID = re.compile(r"F\d\d")
 _BOUND = re.compile(r"(\d+)(?: / (\d+))?")

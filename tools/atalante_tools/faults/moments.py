@@ -1,4 +1,4 @@
-"""Faults that begin at other times than in the fault matrix, from power-on to the operator's restart, single and in random pairs.
+"""Single faults and random pairs of faults that begin at other times than in the fault matrix, from power-on to the restart.
 
     case of the matrix, moment -> run with a schedule of START and STOP -> safety checks, measured extremes
 
@@ -108,7 +108,7 @@ class Extremes:
 
 @dataclass(frozen=True)
 class MomentVerdict:
-    """Result of a run in which one fault begins at a `Moment`, or two faults."""
+    """Result of a run in which one fault or two faults begin at a `Moment`."""
 
     moment: str
     faults: tuple[str, ...]  # for each fault: its ID and the name of the case

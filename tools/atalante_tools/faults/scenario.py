@@ -95,7 +95,7 @@ class Case:
 
     @property
     def ends(self) -> int | None:
-        """Return the first cycle after all faults and actions, counted from the start of the case; None if one is permanent."""
+        """Return the first cycle after all faults and actions, counted from the start of the case. None: a fault is permanent."""
         ends = [None if one.cycles is None else one.start + one.cycles for one in self.stimuli]
         return None if None in ends else max((end for end in ends if end is not None), default=0)
 

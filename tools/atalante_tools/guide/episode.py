@@ -342,7 +342,7 @@ def _walk() -> Any:
 
 
 def _state(position: Vector, velocity: Vector, torque: Vector, xi: float) -> State:
-    """Return the fault-free state of the HAL that the controller receives at the stance change."""
+    """Return the state that the HAL passes to the controller at the stance change. No fault is active."""
     attitude = np.zeros((len(IMUS), 4))
     attitude[:, 0] = 1.0
     zero = np.zeros(len(JOINTS))

@@ -49,13 +49,13 @@ PATIENTS: Final = (
     (67.0, 1.68, 0.18, 0.9), (70.0, 1.75, 0.15, 0.9), (73.0, 1.70, 0.10, 0.8), (76.0, 1.80, 0.15, 1.0),
     (80.0, 1.75, 0.18, 0.9), (84.0, 1.80, 0.12, 0.9), (88.0, 1.85, 0.15, 0.9), (91.0, 1.85, 0.15, 0.9),
 )  # fmt: skip
-#: Number of corners of the hand-over box (range of start deviations) from which steps start.
+#: Steps start from this number of corners of the hand-over box, which is the range of start deviations.
 _CORNERS: Final = 64
-#: Time by which the measured velocity of a drive lags behind the true velocity, due to its low-pass filter and half a cycle [s].
+#: Lag of the measured velocity of a drive [s], caused by the low-pass filter and by the sampling (half a cycle).
 _VELOCITY_LAG: Final = 2.0e-3
 #: The search for `Verdict.left_at` tries pushes up to this multiple of the certified torques.
 LARGEST_FACTOR: Final = 6.0
-#: The search for `Verdict.left_at` walks this share of `Effort.steps` for each multiple of the certified torques that it tries.
+#: For each multiple of the certified torques, the search for `Verdict.left_at` walks this share of `Effort.steps`.
 _SHARE: Final = 0.1
 
 
@@ -100,7 +100,7 @@ class Verdict:
     robot_ratio: float | None  # largest |e| / q_bound on the emulated robot; None if the robot was not used
     worst_push: str  # kind of the worst push on the plant
     worst_condition: str  # deviation of the plant from the model in the worst step, for example "friction +20 %"
-    stopped: str  # reason why the robot left ACTIVE; empty if it did not
+    stopped: str  # reason why the robot left ACTIVE; empty if the robot stayed in ACTIVE
     #: smallest multiple of the certified torques that moved a joint out of the guide; None if not searched or not found
     left_at: float | None
     reason: str  # what limits the certified torques, or why there are none

@@ -94,7 +94,7 @@ class Adversary:
         return self.tried[0]
 
     def leaving_factor(self, box: Pair, largest: float, budget: int) -> float | None:
-        """Return the smallest multiple of `box` at which a push was found that moves a joint out of the guide, accurate to 5 %.
+        """Find the smallest multiple of `box` with a push that moves a joint out of the guide. The accuracy is 5 %.
 
         Return None if no such push was found up to the multiple `largest`.
 
@@ -121,7 +121,7 @@ class Adversary:
         return outside
 
     def _leaves(self, box: Pair, factor: float, budget: int) -> bool:
-        """Return whether a push was found that is at most `factor` times `box` and moves a joint out of the guide.
+        """Search for a push of at most `factor` times `box` that moves a joint out of the guide. Return whether one was found.
 
         The worst pushes so far are tried first.
         """

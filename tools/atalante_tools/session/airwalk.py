@@ -83,7 +83,7 @@ class Walked:
 
 
 def trial_options(steps: int, out: str) -> Callable[[_Command], _Command]:
-    """Return a decorator that adds the options of a trial to a command and passes them to it as the argument `options`.
+    """Return a decorator that adds the options of a trial to a command. The command gets their values as the argument `options`.
 
     Args:
         steps: Default of `--steps`.
@@ -181,7 +181,7 @@ def _walk_all(
             with _open(target, options, network, robot, controller, gait.hash32, robot_process, exoskeleton) as rig:
                 robot_process = _start_robot(target, stack) if name != last else None
                 if telemetry is None:
-                    # The certificates are printed after the bus was opened: if the bus is missing, only its error is printed.
+                    # The certificates are printed after the bus was opened. If the bus is missing, only the error is printed.
                     certificates = {shape: walking.certificate(options.xi) for shape, walking in controllers.items()}
                     announce(certificates.values(), controller.config.mismatch, "swing leg of the empty exoskeleton")
                     about = {"seed": options.seed, "steps": options.steps, "xi": options.xi, **asdict(options.law)}
@@ -269,7 +269,7 @@ def _controllers(
     return exoskeleton, gait, controllers
 
 
-#: Smallest number of processor cores at which the embedded robot gets its own process, beside HAL and telemetry.
+#: With at least this number of processor cores, the embedded robot runs in a process of its own.
 _CORES = 3
 
 

@@ -83,7 +83,7 @@ class Session:
                 return
 
     def take_over(self) -> None:
-        """Listen, and copy the signals of another pendant if one sends. Then press the dead-man switch and answer each SYNC."""
+        """Listen, and copy the signals of another pendant that sends. Then press the dead-man switch and answer each SYNC."""
         self.listen()
         print_message(
             f"taking over from another pendant on {self._target}"
@@ -145,7 +145,7 @@ class Session:
         self.press_stop()
 
     def check_takeover(self) -> None:
-        """Raise an error if the takeover failed, because another pendant did not stop sending.
+        """Raise an error if the takeover failed. The cause of this failure is a pendant that did not stop sending.
 
         Raises:
             Failed: If the takeover failed.

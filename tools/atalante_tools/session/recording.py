@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from atalante_hal.telemetry.process import Recording, TelemetryProcess, TelemetrySummary
     from atalante_tools.session.rig import Rig
 
-#: Longest wait for the telemetry process before a run on the wall clock [s]. A process that is ready later joins the run.
+#: Longest wait for the telemetry process before a run on the wall clock [s]. If ready later, this process joins the run.
 _TELEMETRY_WAIT: Final = 5.0
 #: Period of the check of the telemetry process [cycles].
 _TEND_CYCLES: Final = 250
@@ -206,7 +206,7 @@ class EndpointReport:
     """Printer of the Zenoh endpoint, at the start and after each change of the endpoint."""
 
     def __init__(self, telemetry: TelemetryProcess) -> None:
-        """Print the notices of the telemetry and its endpoint.
+        """Print the notices and the endpoint of the telemetry.
 
         Args:
             telemetry: Telemetry that is started.

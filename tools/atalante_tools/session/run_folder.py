@@ -93,7 +93,7 @@ def write_summary(out: Path, options: Mapping[str, Any], results: Sequence[Resul
 
 
 def _figure(out: Path, recording: Recording) -> str:
-    """Draw the figure and return its file name. If it cannot be drawn, print the reason and return an empty string."""
+    """Draw the figure and return its file name. If drawing fails, print the reason and return an empty string."""
     name = "guide_shapes.png"
     if "recording.mcap" not in recording.files:
         print_message("no figure: recording.mcap was not written")

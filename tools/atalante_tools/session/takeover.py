@@ -40,7 +40,7 @@ _INTACT: Final = (Check.OK, Check.SOME_LOST, Check.REPEATED, Check.CONFLICT, Che
 
 
 class Takeover:
-    """Takeover rule of one pendant, which decides whether the pendant answers the last SYNC.
+    """Takeover rule of one pendant. The rule decides whether the pendant answers the last SYNC.
 
     Attributes:
         established: Whether this pendant was the only pendant that sent at the end of its takeover.
@@ -82,7 +82,7 @@ class Takeover:
         self._free_from = self._cycle + 1 + TAKEOVER_CYCLES + self._random.randrange(DRAW_CYCLES)
 
     def sync(self, tag: int) -> None:
-        """Process a SYNC received from the HAL: decide whether this pendant answers it.
+        """Process a SYNC received from the HAL: decide whether this pendant answers the SYNC.
 
         Args:
             tag: Counter that an answer to this SYNC contains, 0 to 255.
@@ -165,7 +165,7 @@ class PendantReader:
         return synced
 
     def _read_one(self, frame: Frames) -> bool:
-        """Read one frame, shape (1,). Return whether it is a SYNC."""
+        """Read one frame, shape (1,). Return whether the frame is a SYNC."""
         image = self._image
         image.new_cycle()
         image.accept_each(frame, 1)

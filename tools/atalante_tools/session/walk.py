@@ -57,7 +57,7 @@ def walk(target: Target, options: WalkOptions, *, as_json: bool) -> None:
     with ExitStack() as stack:
         if options.out is not None:
             stack.enter_context(run_folder(options.out))
-        # decided here, before the telemetry process loads a core
+        # The idle cores are counted before the telemetry process loads a core.
         two_processes = _robot_process_wanted(target, options, outputs)
         # start the subprocesses early: they import their modules while this process creates the controller
         child = None if outputs is None else stack.enter_context(TelemetryChild())
@@ -66,7 +66,7 @@ def walk(target: Target, options: WalkOptions, *, as_json: bool) -> None:
 
 
 def _robot_process_wanted(target: Target, options: WalkOptions, outputs: Outputs | None) -> bool:
-    """Return whether the emulated robot gets its own process: as the user wants it, or if there are idle cores."""
+    """Return whether the emulated robot gets its own process. If the user did not decide, the number of idle cores decides."""
     if not target.embedded or options.robot_process is not None:
         return target.embedded and bool(options.robot_process)
     from atalante_tools.session.embedded import cores_are_idle

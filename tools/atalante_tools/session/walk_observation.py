@@ -53,7 +53,7 @@ class Observation:
         access = self._rig.access
         try:
             upright = float(self._controller.vertical[2]) if access is None else self._compare(access)
-        except BusDown:  # the process of the robot has ended; the HAL reports it
+        except BusDown:  # the process of the robot has ended, which the HAL reports
             return self.fell
         self.fell = self.fell or upright < math.cos(FALLEN)
         return self.fell

@@ -26,11 +26,11 @@ DEFAULT_STEP: Final = (0.16, 0.8)
 
 @dataclass(frozen=True)
 class Push:
-    """Push at the pelvis of the emulated robot, which begins at a phase of a periodic step."""
+    """Push at the pelvis of the emulated robot. The push begins at a given phase of a periodic step."""
 
-    force: float  # N
-    direction: float  # deg, 0 forwards, 90 to the left
-    duration: float = 0.2  # s
+    force: float  # force of the push [N]
+    direction: float  # direction of the push [deg]: 0 is forwards, 90 is to the left
+    duration: float = 0.2  # duration of the push [s]
     step: int | None = None  # index of the pushed step, from 0; None means the middle step of the walk
     phase: float = 0.3  # phase of the push: time since the start of the step / duration of the step
 
@@ -54,7 +54,7 @@ class WalkOptions:
     protocol: tuple[int, int, int] | None = None
     #: Options of recording, CAN log and telemetry. If none of these outputs is requested, no telemetry process is started.
     recording: RecordingOptions = field(default_factory=RecordingOptions)
-    #: Whether the emulated robot runs in a process of its own; None means if there are enough processor cores.
+    #: Whether the emulated robot runs in a process of its own; None: only if enough processor cores are idle.
     robot_process: bool | None = None
     out: Path | None = None  # folder for summary.json, trace.npz and walk.png; None means no files
 

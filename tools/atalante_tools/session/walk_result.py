@@ -58,7 +58,7 @@ class WalkResult:
     real_time_factor: float
     robot_process: bool  # whether the emulated robot ran in a process of its own, in parallel with the HAL
     cpu_per_second: (
-        float  # processor time of this process per second of the run, with its waits for a robot in another process
+        float  # processor time of this process per second of the run, including waits for a robot in another process
     )
 
 

@@ -110,7 +110,7 @@ def connect(hal_bus: Bus, emulator: Emulator) -> Callable[[], object] | None:
 
 
 class Stepper:
-    """HAL loop that a test advances cycle by cycle. The default `controller` holds the pose at the start of ACTIVE."""
+    """HAL loop that a test advances cycle by cycle. The default `controller` holds the first pose of ACTIVE."""
 
     def __init__(self, hal: Hal, clock: Clock) -> None:
         self.hal = hal
@@ -129,7 +129,7 @@ class Stepper:
         return [event.code for event in self.hal.events]
 
     def cycle(self) -> State:
-        """Run one cycle and return the state that the HAL read in it."""
+        """Run one cycle and return the state that the HAL read in this cycle."""
         self._clock.wait()
         state = self.hal.read()
         if self.hal.moving:

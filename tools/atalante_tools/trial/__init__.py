@@ -233,7 +233,7 @@ def robustness(seeds: int | None, steps: int | None, running: Running, as_json: 
 @command.command(short_help="Find the largest push in each direction that the robot withstands.")
 @_running("pushes")
 def pushes(running: Running, as_json: bool) -> None:
-    """Push the walking robot at the pelvis, in 16 directions and at 8 phases of a step, with a force that rises until it falls.
+    """Push the walking robot in 16 directions and at 8 phases of a step. The force rises until the robot falls.
 
     The report contains a polar figure of the largest push that the robot withstands.
     """

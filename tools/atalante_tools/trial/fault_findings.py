@@ -24,7 +24,7 @@ NO_FALL: Final = {
     "F56": "STOP|dead-man|pendant",
     **dict.fromkeys(("F63", "F64", "F65"), ""),
 }
-#: Faults with which the robot must not fall if they begin in double support: the bus of the HAL fails.
+#: IDs of the faults in which the bus of the HAL fails. The robot must not fall if such a fault begins in double support.
 NO_FALL_IN_DOUBLE_SUPPORT: Final = frozenset({"F15", "F16"})
 
 
@@ -79,7 +79,7 @@ def _by_case(falls: Sequence[tuple[str, dict[str, Any]]]) -> list[tuple[str, lis
 
 
 def _moments(falls: Sequence[dict[str, Any]]) -> str:
-    """Return as text, for the falls with one case: when the fault began, the end states, the first diagnostics, the reason."""
+    """Return a text about the falls in one case: starts of the fault, end states, first diagnostics and reason."""
     moments = ", ".join(moment_name(run["moment"]) for run in falls)
     states = ", ".join(dict.fromkeys(run["state"] for run in falls))
     codes = ", ".join(dict.fromkeys(run["codes"][0] if run["codes"] else "no diagnostic" for run in falls))
@@ -87,7 +87,7 @@ def _moments(falls: Sequence[dict[str, Any]]) -> str:
 
 
 def _longest(result: Result) -> str:
-    """Return, as text, the longest fault duration without a fall, for the worst start of the fault."""
+    """Return the longest fault duration without a fall as text, for the worst start of the fault."""
     limited = [
         (cycles, run["moment"])
         for cycles, run in zip(result["longest"], result["runs"], strict=True)

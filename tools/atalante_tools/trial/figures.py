@@ -40,7 +40,7 @@ def shapes(results: Sequence[Result]) -> bytes:
 
 
 def robustness(results: Sequence[Result]) -> bytes:
-    """Draw mass error and friction of each walk, with a filled marker if it ended standing and a cross otherwise.
+    """Draw mass error and friction of each walk, with a filled marker if the walk ended standing, otherwise with a cross.
 
     Args:
         results: results of `robust` trials.

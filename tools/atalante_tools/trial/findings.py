@@ -24,15 +24,16 @@ _PHASES: Final = np.linspace(0.1, 0.8, 29)
 
 #: Two metabolic rates count as equal if their means differ by at most this fraction of the rate of quiet standing.
 SAME: Final = 0.02
-STANDING: Final = 1.44  # W/kg, metabolic rate of quiet standing
-#: `TREND`: a quantity has a trend if its rank correlation with the assistance factor is at most minus this value.
-#: `ASYMMETRY`: largest mean difference between the k-th and the k-th last trial of a day, as a fraction of the range of values.
+STANDING: Final = 1.44  # metabolic rate of quiet standing [W/kg]
+#: A quantity has a falling trend if its rank correlation with the assistance factor is between -1 and -`TREND`.
+#: `ASYMMETRY` is the largest mean difference between a day's k-th trial and k-th trial from the end, as a fraction of the range.
 TREND, ASYMMETRY = 0.8, 0.25
 #: Largest coefficient of variation of the baseline metabolic rates of a sweep.
 VARIATION: Final = 0.05
 
 
-#: Smallest share of guides that are certified, and of robust walks that end standing.
+#: `CERTIFIED` is the smallest accepted share of certified guides.
+#: `ROBUST` is the smallest accepted share of walks that end standing in the experiment `robustness`.
 CERTIFIED, ROBUST = 0.95, 0.98
 #: Pushes of 0.2 s that the robot must withstand [N]: in the worst direction and phase, and forwards in the worst phase.
 PUSH_WORST, PUSH_FORWARD = 200.0, 300.0

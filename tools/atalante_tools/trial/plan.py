@@ -105,15 +105,15 @@ class WalkTrial:
 
 @dataclass(frozen=True)
 class RobustTrial:
-    """Walk with full assistance of a robot that differs from its model, on a disturbed bus, with pushes."""
+    """Walk of a robot that differs from its model: with full assistance, lost frames, late motors and pushes."""
 
     kind: ClassVar[str] = "robust"
     number: int
-    mass: float  # kg, mass of the patient in the model of the controller
+    mass: float  # mass of the patient in the model of the controller [kg]
     height: float  # m
     mass_share: float  # true mass of the patient / known mass
     friction: float  # between soles and floor
-    delay: int  # ms, constant delay of the motor torques
+    delay: int  # constant delay of the motor torques [ms]
     loss: float  # probability that a frame is lost, on all buses
     pushes: tuple[tuple[float, float], ...]  # time since the first periodic step [s] and direction [deg] of each push
     force: float  # N, of each push
@@ -129,10 +129,10 @@ class RobustTrial:
 
 @dataclass(frozen=True)
 class PushTrial:
-    """Walks with full assistance and one push at the pelvis each, in one direction and at one phase, with rising force."""
+    """Walks with full assistance, each with one push at the pelvis. Only the force of the push differs between the walks."""
 
     kind: ClassVar[str] = "push"
-    direction: float  # deg, direction of the push; 0 is forwards, 90 to the left
+    direction: float  # direction of the push [deg]: 0 is forwards, 90 is to the left
     phase: float  # phase of a right-stance step at which the push begins
     forces: tuple[float, ...]  # N, in rising order
     mass: float  # kg, of the wearer

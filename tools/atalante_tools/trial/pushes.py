@@ -28,7 +28,7 @@ _AFTER: Final = 4
 
 
 def largest_push(trial: PushTrial) -> dict[str, Any]:
-    """Push the robot with each force of a trial until it falls or stops, and return the result.
+    """Push the robot with each force of a trial until the robot falls or stops, and return the result.
 
     Each force has a walk of its own. A force counts only if the robot withstands all smaller forces, too.
 

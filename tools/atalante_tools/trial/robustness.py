@@ -1,4 +1,4 @@
-"""Walk of a robot that differs from its model, on a disturbed bus, with pushes: `trial -> rig in lock-step -> result`.
+"""Walk of a robot that differs from its model, with lost frames and pushes: `trial -> rig in lock-step -> result`.
 
 The controller knows the nominal patient. The emulated robot carries a patient with another mass and stands on a floor with random
 friction. Its motors react late, its buses lose frames, and it is pushed at the pelvis.

@@ -263,7 +263,7 @@ def _position(ratio: Vector) -> dict[str, Any]:
 
 
 class Effort:
-    """Work of the muscles of the subject in each second of the walk, and the gas exchange that follows from it."""
+    """Work of the muscles of the subject in each second of the walk, and the resulting gas exchange."""
 
     def __init__(self, rig: Rig, controller: WalkController, protocol: tuple[int, int, int]) -> None:
         """Create an empty series of samples.

@@ -50,7 +50,7 @@ class FrameRules:
         # The additional last element makes the index 0 valid for a DBC without messages. No message uses this element.
         self._fd, self._switch = np.array([*fd, UNKNOWN], np.int8), np.array([*switch, UNKNOWN], np.int8)
         self._length, self._sender = np.append(plan.lengths, 0), np.append(plan.sender_of_row, UNKNOWN)
-        #: Node that recorded the log; None if not known yet; empty if it cannot be determined (see `_RECORDER`).
+        #: Node that recorded the log; None if not known yet; empty if the node cannot be determined (see `_RECORDER`).
         self.recorder: str | None = None
         self.direction_seen = False
 

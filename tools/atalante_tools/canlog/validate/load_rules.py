@@ -58,7 +58,7 @@ class LoadRules:
         self._busy: list[npt.NDArray[np.float64]] = []  # for each chunk: wire times [s], shape (windows, buses)
         #: Start time of each time window with at least one frame [s], set by `finish`. Shape (windows,).
         self.begins: npt.NDArray[np.float64] = np.zeros(0)
-        #: Bus load in each time window, 1 at full load, set by `finish`. Shape (windows, buses).
+        #: Bus load in each time window as a fraction of full load, set by `finish`. Shape (windows, buses).
         #: The first columns of the bus load are the buses of the DBC; the other columns are the log channels without a bus.
         self.load: npt.NDArray[np.float64] = np.zeros((0, len(plan.buses)))
 
@@ -75,7 +75,7 @@ class LoadRules:
         return wire_time(layout.extended, fd, switch, layout.length, self._nominal, self._data)
 
     def expected(self, bus: int) -> float | None:
-        """Return the largest load of a bus that the messages of the DBC can cause, 1 at full load.
+        """Return the largest bus load that the messages of the DBC can cause, as a fraction of full load.
 
         Args:
             bus: index of the bus in the plan.

@@ -25,7 +25,8 @@ Stamps = npt.NDArray[np.int64]
 CYCLE: Final = "Cycle"
 #: If no SYNC arrives within this time [ns], the HAL has probably stopped, and the time stamps follow the wall clock.
 PAUSE_NS: Final = 200_000_000
-#: Largest accepted increment of the cycle number between two SYNCs. Others (restarted HAL, damaged frame) count as 1.
+#: Largest accepted increment of the cycle number between two SYNCs. A larger or a negative increment counts as 1.
+#: Such an increment follows from a restart of the HAL or from a damaged frame.
 MOST_STEPS: Final = 1000
 #: `_SPACING_NS` is the time between the stamps of two consecutive frames in a cycle [ns].
 #: `_LAST` is the latest stamp in a cycle, as a share of the cycle time (0 to 1).
@@ -36,7 +37,8 @@ _SPACING_NS, _LAST = 1000, 0.7
 class _Channel:
     """State of the clock for one channel after the last frame on this channel."""
 
-    #: Plan index of the first SYNC message received on this channel, from which the cycle number is read; -1: none received yet.
+    #: Plan index of the first SYNC message that was received on this channel; -1: no SYNC yet.
+    #: The clock reads the cycle number from this message.
     sync: int = -1
     cycle: int = 0  # cycle number of the last SYNC
     begin: int = 0  # time stamp of the last SYNC in robot time [ns]

@@ -31,8 +31,8 @@ class _Bus:
     cycle_of: dict[int, int] = field(default_factory=dict)  # cycle number of the last state frame, by message index
     #: number of cycles between the last two state frames, by message index
     jump_of: dict[int, int] = field(default_factory=dict)
-    #: Message index -> time stamp of the last state frame [ns] if it was the second one in its cycle.
-    #: A second frame may have arrived before its own SYNC; this is certain if the next cycle has no state frame.
+    #: Message index -> time stamp of the last state frame [ns], if the cycle of this frame has two state frames.
+    #: The second state frame arrived before its SYNC if the next cycle has no state frame.
     doubtful: dict[int, int] = field(default_factory=dict)
 
 

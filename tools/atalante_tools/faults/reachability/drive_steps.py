@@ -49,7 +49,7 @@ class Drive(NamedTuple):
 
 
 class DriveObserver(NamedTuple):
-    """Values with which the search checks the properties. The search counts these values independently of the drive."""
+    """Values with which the search checks the properties. The search computes these values independently of the drive."""
 
     command_age: int = WATCHDOG  # cycles since the last valid command was sent
     sync_age: int = 0  # cycles since the last SYNC

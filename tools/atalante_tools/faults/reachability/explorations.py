@@ -1,4 +1,4 @@
-"""Exhaustive searches over the pendant, its link to the HAL, and the HAL. They check safety properties at each transition.
+"""Exhaustive searches over the pendant, its link to the HAL, and the HAL. Each transition is checked for safety properties.
 
 There are two searches, and both visit all states of pendant reception and safety monitor. The search `stops` also counts the
 cycles since the operator released the dead-man switch or pressed STOP or HOLD. The search `moves` also counts the presses of
@@ -36,7 +36,7 @@ _S = SupervisorState
 NOTHING, RELEASED, STOPPED, HELD = range(4)
 #: Value of `Inputs.stop` if the HAL has received HOLD.
 RECEIVED_HOLD: Final = 2
-#: Number of cycles after a stop action in which the HAL may still enable a drive, because no new pendant frame arrived.
+#: If no new pendant frame arrives after a stop action, the HAL may still enable a drive for this number of cycles.
 SILENT_PENDANT: Final = LOST - 1
 #: Ages of late pendant frames [cycles]: all ages that the HAL accepts, and two ages that the HAL rejects.
 _LATE: Final = (*range(1, LOST + 1), 6, 16)
@@ -74,7 +74,7 @@ class StopState(NamedTuple):
 
 
 class MoveState(NamedTuple):
-    """State of the search `moves`, which looks for a change to a better supervisor state without a press of START."""
+    """State of the search `moves`, which looks for a change to a better supervisor state that no press of START caused."""
 
     reception: Reception
     supervision: Supervision
@@ -126,7 +126,7 @@ class OperatorPath:
         return explore([StopState(*state) for state in _INITIAL], self._stop_successors)
 
     def moves(self) -> Exploration[MoveState, Cycle]:
-        """Search for a change to a better supervisor state without a press of START as its cause."""
+        """Search for a change to a better supervisor state that no press of START caused."""
         return explore([MoveState(*state) for state in _INITIAL], self._move_successors)
 
     def _stop_successors(self, state: StopState) -> Iterator[Transition[StopState, Cycle]]:
@@ -186,7 +186,7 @@ class OperatorPath:
         return results
 
     def _decide(self, before: Supervision, inputs: Inputs, suspended: bool) -> dict[_Decided, Environment]:
-        """Return the possible decisions of the HAL. Each decision is mapped to an environment that causes it.
+        """Return the possible decisions of the HAL. Each decision is mapped to an `Environment` that causes this decision.
 
         Args:
             before: state of the safety monitor.

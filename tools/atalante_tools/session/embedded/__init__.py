@@ -46,7 +46,7 @@ _LOAD, _LOAD_SAMPLES, _LOAD_INTERVAL = Path("/proc/loadavg"), 5, 2e-3
 
 @dataclass(frozen=True)
 class SpawnConfig:
-    """Description from which the child process creates the robot. The parent process writes it to the stdin of the child."""
+    """Description from which the child process creates the robot. The child reads this description from its stdin."""
 
     network: Network
     robot: Robot
@@ -152,7 +152,7 @@ class EmbeddedRobot(Closing):
 
 
 def cores_are_idle(others: int, load: Path = _LOAD) -> bool:
-    """Return whether there is a processor core for this process, and an idle core for the robot and for each other process.
+    """Return whether enough processor cores are idle: one core for the robot, and one core for each other process.
 
     On a busy computer two processes that wait for each other are slower than one process, because the scheduler runs other
     programs in between.

@@ -1,4 +1,4 @@
-"""Main program of the subprocess with the embedded robot. `EmbeddedRobot` starts it.
+"""Main program of the subprocess with the embedded robot. `EmbeddedRobot` starts this subprocess.
 
 Command line: `python -m atalante_tools.session.embedded MEMORY BELL ACCESS`. The program reads the `SpawnConfig` from stdin.
 All other communication uses the bus and the memory of the access. The program ends when the HAL closes the bus.

@@ -106,7 +106,7 @@ class LocalAccess:
 
 
 class _Shared(NamedTuple):
-    """Views of the memory of both processes. The HAL writes all fields but `answer` before it requests a step of the bus.
+    """Views of the memory of both processes. The HAL writes all fields except `answer` before it requests a step of the bus.
 
     The emulator reads these fields at the start of the step, and writes `answer` before the end of the step. As on a `SharedBus`,
     stores must become visible in program order.
@@ -120,7 +120,7 @@ class _Shared(NamedTuple):
 
 
 def access_memory() -> int:
-    """Create the memory of a `RemoteAccess` and its `ServedAccess`. Return its file descriptor."""
+    """Create the memory of a `RemoteAccess` and its `ServedAccess`. Return the file descriptor of the memory."""
     return anonymous_file("atalante-access", np.dtype(np.float64).itemsize * _SIZE)
 
 
@@ -194,7 +194,7 @@ class ServedAccess:
         self._turns, self._pushed, self._wrench = 0.0, False, np.zeros(6)
 
     def step(self) -> None:
-        """Answer a question of the HAL process. If there is none, apply its inputs and run a cycle of the emulator."""
+        """Answer a question of the HAL process. Without a question, apply the inputs of the HAL and run one cycle."""
         shared = self._shared
         question = shared.question[0]
         if question == _ATTITUDE:
