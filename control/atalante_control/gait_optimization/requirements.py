@@ -20,7 +20,9 @@ class Requirements:
     friction: float = 0.5  # largest ratio of horizontal to vertical ground force
     force_min: float = 300.0  # N, smallest vertical ground force
     sole_share: float = 0.6  # fraction of the sole in which the centre of pressure must be
-    cell_share: float = 0.8  # fraction of the rectangle between the force cells in which the centre of pressure must be
+    #: Fraction of the rectangle between the force cells in which the centre of pressure must be at the nodes. Between two nodes,
+    #: and in the gaits of the network, the centre of pressure is up to 3 mm farther outside.
+    cell_share: float = 0.7
     yaw_lever: float = 0.03  # m, largest ratio of yaw moment about the sole centre to vertical ground force
     #: Required height of the swing sole at mid-swing [m]. At other times this height is multiplied by sin(pi t / T)^2.
     #: In start and stop steps the required height is multiplied by sin(pi t / T)^4.
@@ -29,10 +31,13 @@ class Requirements:
     roll: float = math.radians(5.0)  # rad, largest roll of the pelvis
     pitch: float = math.radians(6.0)  # rad, largest pitch of the pelvis
     yaw: float = math.radians(6.0)  # rad, largest yaw of the pelvis
-    #: m/s, range of the vertical speed of the landing foot, upwards positive
+    #: m/s, range of the vertical speed of the ankle of the landing foot, upwards positive
     landing_speed: tuple[float, float] = -0.03, -0.003
-    landing_slide: float = 0.035  # m/s, largest forward speed and largest lateral speed of the landing foot
-    landing_turn: float = 0.2  # rad/s, largest angular velocity of the landing foot about each axis
+    #: m/s, range of the vertical speed of each corner of the landing sole, upwards positive
+    corner_speed: tuple[float, float] = -0.03, 0.0
+    corner_slide: float = (
+        0.025  # m/s, largest forward speed and largest lateral speed of each corner of the landing sole
+    )
     #: Largest jump of a joint speed at the impact [rad/s].
     #: The fit error of the gait network increases the speed jump. The increased jump must stay below VELOCITY_JUMP.
     impact_jump: float = 0.6 * VELOCITY_JUMP

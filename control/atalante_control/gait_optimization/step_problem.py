@@ -373,17 +373,22 @@ class StepProblem:
         ]
 
     def _touchdown(self, q: Symbol, rate: Symbol) -> list[Rows]:
-        """Return the constraints of a soft landing: limits of the vertical, horizontal and angular speed of the foot."""
+        """Return the constraints of a soft landing: limits of the speeds of the ankle and of the corners of the sole."""
         requirements = self.requirements
         foot = self.chain.frames(q, rate)[self.chain.swing_foot]
-        speed = self._yaw @ foot.rotation @ foot.linear
-        one = np.ones(3)
+        ankle = self._yaw @ foot.rotation @ foot.linear
+        corners = [
+            self._yaw @ foot.rotation @ (foot.linear + casadi.cross(foot.angular, casadi.DM(corner)))
+            for corner in self._corners()
+        ]
+        count = len(corners)
         low, high = (np.array([value]) for value in requirements.landing_speed)
-        slide, turn = requirements.landing_slide * one[:2], requirements.landing_turn * one
+        corner_low, corner_high = (np.full(count, value) for value in requirements.corner_speed)
+        slide = np.full(2 * count, requirements.corner_slide)
         return [
-            Rows("landing speed", "m/s", 0.02, speed[2], low, high),
-            Rows("landing slide", "m/s", requirements.landing_slide, speed[:2], -slide, slide),
-            Rows("landing turn", "rad/s", requirements.landing_turn, foot.angular, -turn, turn),
+            Rows("landing speed", "m/s", 0.02, ankle[2], low, high),
+            Rows("landing speed of the corners", "m/s", 0.02, _stacked(corners, slice(2, 3)), corner_low, corner_high),
+            Rows("landing slide of the corners", "m/s", 0.02, _stacked(corners, slice(2)), -slide, slide),
         ]
 
     def _add_impact(self) -> None:
@@ -431,6 +436,11 @@ class StepProblem:
 
 def _outside(values: Vector, bounds: tuple[Vector, Vector]) -> Vector:
     return np.maximum(np.maximum(bounds[0] - values, values - bounds[1]), 0.0)
+
+
+def _stacked(vectors: list[Symbol], components: slice) -> Symbol:
+    """Return some components of several vectors, one vector after the other."""
+    return casadi.vertcat(*(vector[components] for vector in vectors))
 
 
 def _tilt(rotation: Symbol) -> Symbol:

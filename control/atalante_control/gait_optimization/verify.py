@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import pinocchio
 
-from atalante_control.gait.gait import SIGN, SWAP, Gait
+from atalante_control.gait.gait import POSITION_JUMP, SIGN, SWAP, VELOCITY_JUMP, Gait
 from atalante_control.model import BASE_LINK, GRAVITY, LEG_LINKS, ExoskeletonParameters, Patient, pinocchio_model, urdf
 from atalante_hal.robot import SIDES, Robot
 from atalante_hal.types import Vector
@@ -22,9 +22,28 @@ from atalante_hal.types import Vector
 _LEFT, _RIGHT = (f"{side}_{LEG_LINKS['HA']}" for side in SIDES)
 _SAMPLES = 201  # number of samples of a step
 _LOCAL = pinocchio.ReferenceFrame.LOCAL
-_EXACT = 1e-6  # tolerance of the equality constraints of the optimiser, in SI units
+_CLEARANCE = 0.05  # m, intended height of the swing sole at mid-swing
 _SLIDING = 1.0  # Ns, accepted impact impulse above the friction limit; 1 Ns changes the robot speed by some mm/s
+_SLIDE = 0.04  # m/s, accepted horizontal speed of a corner of the sole at the landing
+_DROP = 0.035  # m/s, accepted downward speed of a corner of the sole at the landing
+_LIFT = 0.005  # m/s, accepted upward speed of a corner of the sole at the landing
+_SHORTFALL = 2e-3  # m, accepted difference of the height of the swing sole to the intended height
 _SINKING = 1e-3  # m, accepted depth of the swing sole below the ground at the start of the swing
+
+
+class Tolerances(NamedTuple):
+    """Accepted errors of the conditions that a solved step satisfies exactly."""
+
+    landing_height: float  # m, height error of the landing foot
+    landing_rotation: float  # rad, rotation error of the landing foot about each axis
+    angle_jump: float  # rad, jump of a joint angle at the stance change
+    impact_speed: float  # rad/s, error of a joint speed after the impact
+
+
+#: Tolerances of a solved step: those of the equality constraints of the optimiser.
+EXACT = Tolerances(1e-6, 1e-6, 1e-6, 1e-6)
+#: Tolerances of a step of the gait network. The network interpolates solved steps, so it meets these conditions approximately.
+INTERPOLATED = Tolerances(1e-3, math.radians(0.3), POSITION_JUMP, VELOCITY_JUMP)
 
 
 class GaitCheck(NamedTuple):
@@ -66,17 +85,20 @@ class Verifier:
         self._left, self._right, self._pelvis = (model.getFrameId(name) for name in (_LEFT, _RIGHT, BASE_LINK))
         self.weight = pinocchio.computeTotalMass(model) * GRAVITY  # N
 
-    def verify(self, gait: Gait, kind: str = "periodic") -> tuple[GaitCheck, ...]:
+    def verify(self, gait: Gait, kind: str = "periodic", tolerances: Tolerances = EXACT) -> tuple[GaitCheck, ...]:
         """Run all checks of a right-stance step.
 
         Args:
             gait: gait to verify.
             kind: kind of step, `periodic`, `start` or `stop`. A start step begins at rest, a stop step ends at rest. Neither has
                 an impact.
+            tolerances: accepted errors of the equality constraints.
         """
         motion = _sampled(gait, np.linspace(0.0, 1.0, _SAMPLES))
-        checks = [*self._joints(motion), *self._loads(motion), *self._swing(motion)]
-        return (*checks, *(self._cycle(motion) if kind == "periodic" else self._rest(motion, kind)))
+        checks = [*self._joints(motion), *self._loads(motion), *self._swing(motion, 2 if kind == "periodic" else 4)]
+        if kind == "periodic":
+            return (*checks, *self._cycle(motion, tolerances), *self._touchdown(motion))
+        return (*checks, *self._rest(motion, kind, tolerances))
 
     def loads(self, q: Vector, qd: Vector, qdd: Vector) -> tuple[Vector, Vector]:
         """Return joint torques (12,) [Nm] and ground wrench (6,) [N, Nm] of one state.
@@ -114,10 +136,7 @@ class Verifier:
             Joint speeds after the impact (12,) [rad/s], impulse on the left foot (6,), and twist of the right foot (6,).
         """
         model, data, joints = self._articulated.model, self._data, self._articulated.v
-        configuration, before = self._on_right_foot(q), np.zeros(model.nv)
-        before[joints] = qd
-        leaving = pinocchio.computeFrameJacobian(model, data, configuration, self._right, _LOCAL).copy()
-        before[:6] = -np.linalg.solve(leaving[:, :6], leaving @ before)
+        configuration, before, leaving = self._standing(q, qd)
         landing = pinocchio.computeFrameJacobian(model, data, configuration, self._left, _LOCAL).copy()
         upper = np.triu(pinocchio.crba(model, data, configuration))
         mass = upper + np.triu(upper, 1).T
@@ -125,6 +144,20 @@ class Verifier:
         outcome = np.linalg.solve(system, np.concatenate([mass @ before, np.zeros(6)]))
         after = outcome[: model.nv]
         return after[joints], outcome[model.nv :], leaving @ after
+
+    def corner_speeds(self, q: Vector, qd: Vector) -> Vector:
+        """Return the velocities of the corners of the left sole, in the axes of the left foot, shape (4, 3) [m/s].
+
+        The right foot is at rest.
+
+        Args:
+            q: joint angles, shape (12,) [rad].
+            qd: joint speeds, shape (12,) [rad/s].
+        """
+        configuration, speed, _ = self._standing(q, qd)
+        model, data = self._articulated.model, self._data
+        twist = pinocchio.computeFrameJacobian(model, data, configuration, self._left, _LOCAL) @ speed
+        return np.asarray(twist[:3] + np.cross(twist[3:], self._corners()))
 
     def _joints(self, motion: _Motion) -> list[GaitCheck]:
         robot = self._robot
@@ -165,7 +198,7 @@ class Verifier:
             GaitCheck("yaw moment per vertical force", float(np.abs(moment[:, 2] / vertical).max()), 0.05, "m"),
         ]
 
-    def _swing(self, motion: _Motion) -> list[GaitCheck]:
+    def _swing(self, motion: _Motion, exponent: int) -> list[GaitCheck]:
         heights, widths, tilt = [], [], []
         forward = self._forward()
         for q in motion.q:
@@ -174,13 +207,26 @@ class Verifier:
             heights.append((swing.rotation @ self._corners().T)[2] + swing.translation[2] - self._exo.sole_centre[1])
             widths.append((forward.T @ swing.translation)[1])
             tilt.append(np.abs(pinocchio.log3(forward.T @ pelvis.rotation)).max())
+        lowest = np.min(heights, axis=1)
+        needed = _CLEARANCE * np.sin(np.pi * np.linspace(0.0, 1.0, _SAMPLES)) ** exponent
         return [
-            GaitCheck("depth of the swing sole in the ground", float(-np.min(heights)), _SINKING, "m"),
+            GaitCheck("swing sole below its intended height", float((needed - lowest).max()), _SHORTFALL, "m"),
+            GaitCheck("depth of the swing sole in the ground", float(-lowest.min()), _SINKING, "m"),
             GaitCheck("lateral overlap of the feet", self._foot_width() - min(widths), 0.0, "m"),
             GaitCheck("rotation of the pelvis", max(tilt), math.radians(8.0), "rad"),
         ]
 
-    def _cycle(self, motion: _Motion) -> list[GaitCheck]:
+    def _touchdown(self, motion: _Motion) -> list[GaitCheck]:
+        """Return the checks of a soft landing at the corners of the sole."""
+        speeds = self.corner_speeds(motion.q[-1], motion.qd[-1])
+        slide = np.hypot(speeds[:, 0], speeds[:, 1])
+        return [
+            GaitCheck("slide of a sole corner at the landing", float(slide.max()), _SLIDE, "m/s"),
+            GaitCheck("downward speed of a sole corner at the landing", float(-speeds[:, 2].min()), _DROP, "m/s"),
+            GaitCheck("upward speed of a sole corner at the landing", float(speeds[:, 2].max()), _LIFT, "m/s"),
+        ]
+
+    def _cycle(self, motion: _Motion, tolerances: Tolerances) -> list[GaitCheck]:
         """Return the checks of a periodic step: landing pose, periodicity, impact map."""
         after, impulse, leaving = self.impact(motion.q[-1], motion.qd[-1])
         mirrored_q, mirrored_qd = SIGN * motion.q[0][SWAP], SIGN * motion.qd[0][SWAP]
@@ -188,33 +234,48 @@ class Verifier:
         sliding = math.hypot(impulse[0], impulse[1]) - 0.5 * impulse[2]
         sinking = -min(leaving[2] + np.cross(leaving[3:], corner)[2] for corner in self._corners())
         return [
-            *self._landing(motion.q[-1]),
-            GaitCheck("angle jump at the stance change", float(np.abs(motion.q[-1] - mirrored_q).max()), _EXACT, "rad"),
-            GaitCheck("speed error of the impact map", float(np.abs(after - mirrored_qd).max()), _EXACT, "rad/s"),
+            *self._landing(motion.q[-1], tolerances),
+            GaitCheck(
+                "angle jump at the stance change",
+                float(np.abs(motion.q[-1] - mirrored_q).max()),
+                tolerances.angle_jump,
+                "rad",
+            ),
+            GaitCheck(
+                "speed error of the impact map",
+                float(np.abs(after - mirrored_qd).max()),
+                tolerances.impact_speed,
+                "rad/s",
+            ),
             GaitCheck("downward impact impulse", float(-impulse[2]), 0.0, "Ns"),
             GaitCheck("impact impulse beyond friction", sliding, _SLIDING, "Ns"),
-            GaitCheck("sinking speed of the rear foot", float(sinking), 0.01 + _EXACT, "m/s"),
+            GaitCheck("sinking speed of the rear foot", float(sinking), 0.01 + EXACT.impact_speed, "m/s"),
         ]
 
-    def _rest(self, motion: _Motion, kind: str) -> list[GaitCheck]:
+    def _rest(self, motion: _Motion, kind: str, tolerances: Tolerances) -> list[GaitCheck]:
         end = 0 if kind == "start" else -1
         return [
-            *self._landing(motion.q[end]),
-            GaitCheck("speed at rest", float(np.abs(motion.qd[end]).max()), _EXACT, "rad/s"),
+            *self._landing(motion.q[end], tolerances),
+            GaitCheck("speed at rest", float(np.abs(motion.qd[end]).max()), tolerances.impact_speed, "rad/s"),
             GaitCheck("acceleration at rest", float(np.abs(motion.qdd[end]).max()), 1e-3, "rad/s2"),
         ]
 
-    def _landing(self, q: Vector) -> list[GaitCheck]:
+    def _landing(self, q: Vector, tolerances: Tolerances) -> list[GaitCheck]:
         """Return the checks that the left foot is flat on the ground, and that its toe-out mirrors that of the right foot."""
         stance, swing, _ = self._poses(q)
         relative = stance.actInv(swing)
         turned = self._forward() @ self._forward()
         return [
-            GaitCheck("height error of the landing foot", abs(float(relative.translation[2])), _EXACT, "m"),
+            GaitCheck(
+                "height error of the landing foot",
+                abs(float(relative.translation[2])),
+                tolerances.landing_height,
+                "m",
+            ),
             GaitCheck(
                 "rotation error of the landing foot",
                 float(np.abs(pinocchio.log3(turned.T @ relative.rotation)).max()),
-                _EXACT,
+                tolerances.landing_rotation,
                 "rad",
             ),
         ]
@@ -234,6 +295,15 @@ class Verifier:
         configuration[self._articulated.q] = q
         configuration[:7] = pinocchio.SE3ToXYZQUAT(stance.actInv(pelvis))
         return np.asarray(configuration)
+
+    def _standing(self, q: Vector, qd: Vector) -> tuple[Vector, Vector, Vector]:
+        """Return configuration and speed of the floating robot whose right foot is at rest, and the Jacobian of this foot."""
+        model, joints = self._articulated.model, self._articulated.v
+        configuration, speed = self._on_right_foot(q), np.zeros(model.nv)
+        speed[joints] = qd
+        jacobian = pinocchio.computeFrameJacobian(model, self._data, configuration, self._right, _LOCAL).copy()
+        speed[:6] = -np.linalg.solve(jacobian[:, :6], jacobian @ speed)
+        return configuration, speed, jacobian
 
     def _forward(self) -> Vector:
         """Return the rotation from the walking frame to the frame of the stance foot. Its angle is the toe-out."""
