@@ -79,6 +79,7 @@ def main() -> None:
             "--height=1.65,1.75,1.85",
             "--step-length=0.12,0.15,0.18",
             "--step-duration=0.8,0.9,1",
+            "--size=81",
         )
         run("gait", "library", "--out", out / "library", "--jobs", "2", *levels)
         run("gait", "fit", "--library", out / "library", "--out", out / "network.npz")

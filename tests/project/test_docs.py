@@ -31,7 +31,7 @@ NOT_RUN = {
     r"^python -m pytest": "runs tests that are part of this suite",
     r"^atalante airwalk --steps 100": "runs until it is stopped; tests/project/test_examples.py runs it with the subscriber",
     r"faults\.reachability\.report$": "tests/faults/test_reachability.py runs the same searches and the report",
-    r"^atalante gait (library|fit|check)": "takes minutes",
+    r"^atalante gait (library|fit|check|verify)": "takes minutes, or needs the result of such a command",
     r"^atalante faults campaign": "takes an hour",
     r"^atalante guide check --patients": "takes hours",
 }

@@ -9,7 +9,7 @@ are not exactly continuous: the error of the fit causes a jump of less than 0.02
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
@@ -22,21 +22,22 @@ from atalante_control.dynamics.stance import stance_dynamics
 from atalante_control.gait.array_file import ArrayFileError, read_arrays, write_arrays
 from atalante_control.gait.gait import DEGREE, SIGN, SWAP, Gait
 from atalante_control.gait.subject import Subject
+from atalante_control.model import Patient
 from atalante_hal.robot import JOINTS, Robot
 from atalante_hal.types import Vector
 
-FORMAT = "atalante-gait-network/2"
+FORMAT = "atalante-gait-network/3"
 DEFAULT_NETWORK = Path(__file__).parents[1] / "gaits" / "network.npz"
-#: Inputs of the network in their order: name -> unit.
-INPUTS = {"mass": "kg", "height": "m", "step_length": "m", "step_duration": "s"}
+#: Inputs of the network in their order: name -> unit. The lengths of thigh and shank are relative to Winter's table.
+INPUTS = {"mass": "kg", "height": "m", "step_length": "m", "step_duration": "s", "thigh": "", "shank": ""}
+LEG_SEGMENTS = ("thigh", "shank")  # body segments whose length is an input
 OUTPUTS = len(JOINTS) * (DEGREE + 1)
 LAYERS_MAX = 4
 WIDTH_MAX = 128  # largest number of neurons of a layer
 #: Largest accepted angle jump at the stance change [rad], due to rounding errors in the weights of the last layer.
 _PERIODICITY_DEFECT = 1e-9
 _ANGLE_MAX = 2.0 * np.pi  # rad, largest accepted absolute value of a control point
-#: Largest accepted deviation of thigh and shank length from Winter's table [m]. The network was fitted with Winter's lengths.
-_LEG_TOLERANCE = 1e-3
+_ROUNDING = 1e-9  # relative tolerance of the range for rounding errors of a ratio of lengths
 
 
 class NetworkError(ValueError):
@@ -54,8 +55,8 @@ class Layer(NamedTuple):
 class GaitNetwork:
     """Gait network: weights of the layers, and range of the inputs for which the weights were fitted."""
 
-    low: Vector  # smallest valid values of INPUTS, shape (4,)
-    high: Vector  # largest valid values of INPUTS, shape (4,)
+    low: Vector  # smallest valid values of INPUTS, shape (6,)
+    high: Vector  # largest valid values of INPUTS, shape (6,)
     layers: tuple[Layer, ...]  # layers in order; tanh follows each layer except the last
     version: str  # version of atalante-hal that fitted the network
 
@@ -65,7 +66,7 @@ class GaitNetwork:
         The result is a continuous function of the inputs.
 
         Args:
-            inputs: values of INPUTS, shape (4,).
+            inputs: values of INPUTS, shape (6,).
 
         Returns:
             Control points in the order of JOINTS, shape (12, 8) [rad].
@@ -86,12 +87,11 @@ class GaitNetwork:
             robot: robot description for the dynamics.
 
         Raises:
-            NetworkError: If a parameter is outside the range of the network, if the leg lengths are not those of Winter's table,
-                or if the angles are too large to compute torques.
+            NetworkError: If a parameter is outside the range of the network, or if the angles are too large to compute torques.
         """
         self.check(subject)
         with np.errstate(over="ignore", invalid="ignore"):
-            coefficients = self.coefficients(_inputs(subject))
+            coefficients = self.coefficients(inputs_of(subject))
         largest = np.abs(coefficients).max()
         if not largest <= _ANGLE_MAX:
             raise NetworkError(
@@ -112,20 +112,44 @@ class GaitNetwork:
         Raises:
             NetworkError: If a parameter is out of range. The message states the parameter and the valid range.
         """
-        for name, value, low, high in zip(INPUTS, _inputs(subject), self.low, self.high, strict=True):
-            if not low <= value <= high:
+        patient = subject.patient
+        for name, value, low, high in zip(INPUTS, inputs_of(subject), self.low, self.high, strict=True):
+            if not low * (1.0 - _ROUNDING) <= value <= high * (1.0 + _ROUNDING):
+                if name in LEG_SEGMENTS:
+                    winter = Patient(patient.mass, patient.height).length(name)
+                    raise NetworkError(
+                        f"{name} length for the gait network must be {low * winter:.3f} to {high * winter:.3f} m "
+                        f"at a height of {patient.height:g} m, got {patient.length(name):.3f} m: "
+                        "compute this gait with `atalante gait solve`"
+                    )
                 unit = INPUTS[name]
                 raise NetworkError(
                     f"{name.replace('_', ' ')} for the gait network must be {low:g} to {high:g} {unit}, got {value:g} {unit}"
                 )
-        patient = subject.patient
-        winter = type(patient)(patient.mass, patient.height)
-        for segment in ("thigh", "shank"):
-            if abs(patient.length(segment) - winter.length(segment)) > _LEG_TOLERANCE:
-                raise NetworkError(
-                    f"{segment} length for the gait network must be that of Winter's table, {winter.length(segment):.3f} m, "
-                    f"got {patient.length(segment):.3f} m: compute this gait with `atalante gait solve`"
-                )
+
+
+def inputs_of(subject: Subject) -> Vector:
+    """Return the inputs of the network for a subject, in the order of INPUTS, shape (6,).
+
+    Args:
+        subject: patient and step parameters.
+    """
+    patient = subject.patient
+    winter = Patient(patient.mass, patient.height)
+    legs = [patient.length(segment) / winter.length(segment) for segment in LEG_SEGMENTS]
+    return np.array([patient.mass, patient.height, subject.step_length, subject.step_duration, *legs])
+
+
+def subject_of(inputs: Sequence[float]) -> Subject:
+    """Return the subject with the given inputs of the network.
+
+    Args:
+        inputs: values of INPUTS. The step duration must be a whole number of milliseconds.
+    """
+    mass, height, length, duration, thigh, shank = inputs
+    winter = Patient(mass, height)
+    legs = (ratio * winter.length(segment) for ratio, segment in zip((thigh, shank), LEG_SEGMENTS, strict=True))
+    return Subject(Patient(mass, height, *legs), length, duration)
 
 
 def periodicity() -> Vector:
@@ -249,7 +273,3 @@ def _network(arrays: Mapping[str, npt.NDArray[Any]]) -> GaitNetwork:
             f"the angles of a gait must be continuous at the stance change, got weights with a jump of {defect:.2g} rad"
         )
     return GaitNetwork(low, high, layers, str(about["version"]))
-
-
-def _inputs(subject: Subject) -> Vector:
-    return np.array([subject.patient.mass, subject.patient.height, subject.step_length, subject.step_duration])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 from atalante_control.gait.gait import PERIOD
@@ -57,4 +58,21 @@ class Subject:
     def __str__(self) -> str:
         """Return patient and step parameters as one line of text."""
         patient = self.patient
-        return f"{patient.mass:g} kg, {patient.height:g} m, step {self.step_length:g} m in {self.step_duration:g} s"
+        legs = {"thigh": patient.thigh_length, "shank": patient.shank_length}
+        given = "".join(f"{segment} {value:.3f} m, " for segment, value in legs.items() if value is not None)
+        return (
+            f"{patient.mass:g} kg, {patient.height:g} m, {given}step {self.step_length:g} m in {self.step_duration:g} s"
+        )
+
+
+def patient_of(parameters: Mapping[str, float]) -> Patient:
+    """Return the patient of a gait.
+
+    Args:
+        parameters: parameters of the gait. The leg lengths may be missing, the patient then has those of Winter's table.
+
+    Raises:
+        KeyError: If mass or height is missing.
+    """
+    mass, height = (parameters[name] for name in ("patient_mass", "patient_height"))
+    return Patient(mass, height, parameters.get("thigh_length"), parameters.get("shank_length"))

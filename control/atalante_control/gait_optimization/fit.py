@@ -24,20 +24,23 @@ import numpy as np
 from sklearn.exceptions import ConvergenceWarning
 from sklearn.neural_network import MLPRegressor
 
-from atalante_control.dynamics.gait_network import GaitNetwork, Layer, periodicity
+from atalante_control.dynamics.gait_network import GaitNetwork, Layer, inputs_of, periodicity
 from atalante_control.gait.gait import DEGREE, Gait, bezier, derivative
+from atalante_control.gait.subject import Subject, patient_of
 from atalante_control.gait_optimization.library import Grid
 from atalante_hal.robot import JOINTS
 from atalante_hal.types import Vector
 
 HIDDEN = (64, 64)
-ITERATIONS = 3000  # largest number of L-BFGS iterations in one run of the optimiser
-ROUNDS = 2  # number of runs of the optimiser; the second run starts from the result of the first run
+ITERATIONS = 1500  # largest number of L-BFGS iterations
 RESOLUTION = math.radians(0.003)  # rad, largest rms error caused by the principal directions that are left out
-JUMP_KEPT = 0.45  # fraction of the speed jump of each gait at the stance change that the fit keeps
-END_WEIGHT = 20.0  # weight of the samples at start and end of a step; the other samples have weight 1
+JUMP_KEPT = 0.4  # fraction of the speed jump of each gait at the stance change that the fit keeps
+END_WEIGHT = 40.0  # weight of the samples at start and end of a step; the other samples have weight 1
 ACCELERATION_WEIGHT = 5e-2  # s2, weight of an acceleration error [rad/s2] relative to an angle error [rad]
-ALPHA = 1e-7  # penalty on the squared weights of the network; it smooths the gaits between the grid points
+#: Root mean square of the learnt coordinates after scaling. L-BFGS stops if an iteration reduces the squared error by less than
+#: 2e-9. For coordinates of size 1 this is too early.
+TARGET_SIZE = 10.0
+ALPHA = 1e-5  # penalty on the squared weights of the network; it smooths the gaits between the grid points
 SEED = 1  # seed of the initial weights
 _SAMPLES = 41  # number of samples of a step at which two gaits are compared
 
@@ -58,7 +61,7 @@ def fit(gaits: Sequence[Gait], grid: Grid, *, hidden: Sequence[int] = HIDDEN, it
         gaits: gaits with the parameters of their subjects.
         grid: grid of the library; its smallest and largest levels become the range of the network.
         hidden: number of neurons of each hidden layer.
-        iterations: largest number of L-BFGS iterations in one run of the optimiser.
+        iterations: largest number of L-BFGS iterations.
     """
     low, high = (np.array([axis[end] for axis in grid.axes()]) for end in (0, -1))
     x = (np.array([inputs(gait) for gait in gaits]) - low) * (2.0 / (high - low)) - 1.0
@@ -75,16 +78,15 @@ def fit(gaits: Sequence[Gait], grid: Grid, *, hidden: Sequence[int] = HIDDEN, it
     outside = np.sqrt(np.cumsum(spread[::-1] ** 2)[::-1] / len(gaits))
     directions = directions[: int((outside > RESOLUTION).sum())]
     scores = deviations @ directions.T
-    unit = float(np.sqrt((scores**2).sum(axis=1).mean()))
+    unit = float(np.sqrt((scores**2).sum(axis=1).mean())) / TARGET_SIZE
 
     perceptron = MLPRegressor(
         hidden_layer_sizes=tuple(hidden), activation="tanh", solver="lbfgs", alpha=ALPHA, tol=1e-12,
-        max_iter=iterations, max_fun=2 * iterations, random_state=SEED, warm_start=True,
+        max_iter=iterations, max_fun=2 * iterations, random_state=SEED,
     )  # fmt: skip
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", ConvergenceWarning)  # the optimiser usually stops at the iteration limit
-        for _ in range(ROUNDS):
-            perceptron.fit(x, scores / unit)
+        perceptron.fit(x, scores / unit)
     back = unit * directions @ np.linalg.inv(root)
     *first, last = (Layer(*layer) for layer in zip(perceptron.coefs_, perceptron.intercepts_, strict=True))
     layers = (*first, Layer(last.weights @ back, last.bias @ back + mean))
@@ -96,13 +98,13 @@ def fit(gaits: Sequence[Gait], grid: Grid, *, hidden: Sequence[int] = HIDDEN, it
 
 
 def inputs(gait: Gait) -> Vector:
-    """Return the inputs of the network for the subject of a gait, in the order of INPUTS, shape (4,).
+    """Return the inputs of the network for the subject of a gait, in the order of INPUTS, shape (6,).
 
     Args:
         gait: gait with the parameters of its subject.
     """
-    names = ("patient_mass", "patient_height", "step_length", "step_duration")
-    return np.array([gait.parameters[name] for name in names])
+    parameters = gait.parameters
+    return inputs_of(Subject(patient_of(parameters), parameters["step_length"], parameters["step_duration"]))
 
 
 def _metric(duration: float) -> Vector:

@@ -1,4 +1,4 @@
-"""Library of gaits for a grid of subjects, solved in parallel. An interrupted computation can be resumed.
+"""Library of gaits for points of a grid of subjects, solved in parallel. An interrupted computation can be resumed.
 
 `Grid, solve -> one file for each gait`. `atalante_control.gait_optimization.fit` reads the files. No gait is solved from the gait
 of another patient, so a gait depends only on the parameters of its own subject. Other gaits, the number of processes and
@@ -12,13 +12,17 @@ the version of the code that is installed. Any other file is rejected with a rea
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Callable, Generator, Mapping, Sequence
-from dataclasses import asdict, dataclass, fields, replace
+from dataclasses import asdict, dataclass, replace
 from functools import partial
-from itertools import pairwise, product
+from itertools import count, pairwise, product
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
+from atalante_control.dynamics.gait_network import INPUTS, subject_of
 from atalante_control.gait.gait import Gait, GaitError, check_gait, gait_from, read_object, write_gait, write_object
 from atalante_control.gait.subject import Subject
 from atalante_control.gait_optimization.parallel import LostProcessError, fan_out
@@ -26,10 +30,10 @@ from atalante_control.gait_optimization.result import SOLVED, SolvedGait
 from atalante_control.gait_optimization.second_start import solve_with_second_start, with_status
 from atalante_control.gait_optimization.solve import code_version, solve
 from atalante_control.gait_optimization.verify import Verifier
-from atalante_control.model import Patient
 from atalante_hal.robot import Robot, load_robot
 
-FORMAT = "atalante-library/1"
+FORMAT = "atalante-library/2"
+_ROOT_ITERATIONS = 60  # number of fixed-point iterations after which the root of the sequence is exact to rounding
 LEVELS_MIN = 3  # smallest number of grid levels of a parameter; a network fitted to 2 levels has an error of 10 degrees
 
 Index = tuple[int, ...]
@@ -43,18 +47,24 @@ class LibraryError(ValueError):
 
 @dataclass(frozen=True)
 class Grid:
-    """Grid of subjects. The default covers the subjects of the paper (58 to 91 kg, 1.62 to 1.93 m).
+    """Selected points of a grid of subjects. The default covers the subjects of the paper (58 to 91 kg, 1.62 to 1.93 m).
 
-    Each attribute is the list of levels of one parameter, in ascending order.
+    The levels of a parameter are listed in ascending order. A grid of six parameters has too many points to solve all of them.
+    Therefore the library contains `size` points: all combinations of smallest and largest levels, and points of a
+    low-discrepancy sequence. The sequence has no gaps and no repetitions, so a larger `size` only adds points.
 
     Raises:
-        ValueError: If there are fewer than three levels, levels are not ascending, or a subject is out of range.
+        ValueError: If there are fewer than three levels, levels are not ascending, the size is too small, or a subject is out of
+            range.
     """
 
-    mass: tuple[float, ...] = (58.0, 68.0, 80.0, 91.0)  # kg
-    height: tuple[float, ...] = (1.62, 1.71, 1.83, 1.93)  # m
-    step_length: tuple[float, ...] = (0.10, 0.13, 0.165, 0.20)  # m
-    step_duration: tuple[float, ...] = (0.7, 0.78, 0.88, 0.99, 1.1)  # s
+    mass: tuple[float, ...] = (58.0, 65.0, 74.0, 84.0, 91.0)  # kg
+    height: tuple[float, ...] = (1.62, 1.69, 1.775, 1.86, 1.93)  # m
+    step_length: tuple[float, ...] = (0.10, 0.12, 0.15, 0.18, 0.20)  # m
+    step_duration: tuple[float, ...] = (0.7, 0.74, 0.8, 0.88, 0.97, 1.05, 1.1)  # s
+    thigh: tuple[float, ...] = (0.94, 0.965, 1.0, 1.035, 1.06)  # length of the thigh relative to Winter's table
+    shank: tuple[float, ...] = (0.94, 0.965, 1.0, 1.035, 1.06)  # length of the shank relative to Winter's table
+    size: int = 1000  # number of selected points; if the grid has fewer points, all points are selected
 
     def __post_init__(self) -> None:
         for name, levels in zip(self.names(), self.axes(), strict=True):
@@ -62,17 +72,22 @@ class Grid:
                 raise ValueError(f"{name} must have at least {LEVELS_MIN} ascending levels, got {list(levels)}")
             if len({f"{level:g}" for level in levels}) < len(levels):
                 raise ValueError(f"levels of {name} must differ in their first 6 digits, got {list(levels)}")
-        for index in (tuple(0 for _ in self.shape), tuple(n - 1 for n in self.shape)):
+        corners = self._corners()
+        if self.size < len(corners):
+            raise ValueError(
+                f"size must be at least {len(corners)}, the number of corners of the grid, got {self.size}"
+            )
+        for index in corners:
             self.subject(index)
 
     @staticmethod
     def names() -> tuple[str, ...]:
         """Return the names of the parameters, in the order of an `Index`."""
-        return tuple(field.name for field in fields(Grid))
+        return tuple(INPUTS)
 
     def axes(self) -> tuple[tuple[float, ...], ...]:
         """Return the levels of each parameter, in the order of `names`."""
-        return (self.mass, self.height, self.step_length, self.step_duration)
+        return tuple(getattr(self, name) for name in self.names())
 
     @property
     def shape(self) -> tuple[int, ...]:
@@ -80,17 +95,30 @@ class Grid:
         return tuple(map(len, self.axes()))
 
     def subject(self, index: Index) -> Subject:
-        """Return the subject at a point of the grid, with the leg lengths of Winter's table.
+        """Return the subject at a point of the grid.
 
         Args:
             index: index of the level of each parameter.
         """
-        mass, height, length, duration = (levels[i] for levels, i in zip(self.axes(), index, strict=True))
-        return Subject(Patient(mass, height), length, duration)
+        return subject_of([levels[i] for levels, i in zip(self.axes(), index, strict=True)])
 
     def points(self) -> list[Index]:
-        """Return the indices of all points of the grid."""
-        return list(product(*map(range, self.shape)))
+        """Return the indices of the selected points."""
+        shape = np.array(self.shape)
+        if math.prod(self.shape) <= self.size:
+            return list(product(*map(range, self.shape)))
+        # Additive recurrence with the powers of the root g of g^(d + 1) = g + 1, the golden ratio for d = 1.
+        root = 2.0
+        for _ in range(_ROOT_ITERATIONS):
+            root = (1.0 + root) ** (1.0 / (len(shape) + 1))
+        rates = root ** -np.arange(1.0, len(shape) + 1.0)
+        selected, steps = dict.fromkeys(self._corners()), count()
+        while len(selected) < self.size:
+            selected.setdefault(tuple(((0.5 + next(steps) * rates) % 1.0 * shape).astype(int).tolist()))
+        return list(selected)
+
+    def _corners(self) -> list[Index]:
+        return list(product(*((0, levels - 1) for levels in self.shape)))
 
 
 class Library:
@@ -235,7 +263,7 @@ class Library:
         return (
             self.folder
             / kind
-            / ("_".join(f"{letter}{v:g}" for letter, v in zip("mhld", levels, strict=True)) + ".json")
+            / ("_".join(f"{letter}{v:g}" for letter, v in zip("mhldts", levels, strict=True)) + ".json")
         )
 
     def _keep(self, index: Index, solved: SolvedGait) -> None:
@@ -317,7 +345,10 @@ def _read_grid(path: Path) -> Grid:
         raise ValueError(f"the grid of a library must be a JSON object, got {type(document).__name__}")
     if (found := document.pop("format", None)) != FORMAT:
         raise ValueError(f"format of the grid of a library must be {FORMAT!r}, got {found!r:.80}")
-    return Grid(**{name: _levels(name, values) for name, values in document.items()})
+    size = document.pop("size", None)
+    if type(size) is not int:
+        raise ValueError(f"size must be an integer, got {size!r}")
+    return Grid(size=size, **{name: _levels(name, values) for name, values in document.items()})
 
 
 def _levels(name: str, values: Any) -> tuple[float, ...]:

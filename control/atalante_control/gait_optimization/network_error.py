@@ -13,10 +13,10 @@ from typing import NamedTuple
 import numpy as np
 import pinocchio
 
+from atalante_control.dynamics.gait_network import subject_of
 from atalante_control.dynamics.stance import stance_dynamics
 from atalante_control.gait.gait import Gait, GaitError, check_gait
 from atalante_control.gait.subject import Subject
-from atalante_control.model import Patient
 from atalante_hal.robot import Robot
 from atalante_hal.types import Vector
 
@@ -51,15 +51,15 @@ def random_subjects(low: Vector, high: Vector, count: int, seed: int) -> Iterato
     """Yield random subjects within the range of a network.
 
     Args:
-        low: smallest valid values of INPUTS, shape (4,).
-        high: largest valid values of INPUTS, shape (4,).
+        low: smallest valid values of INPUTS, shape (6,).
+        high: largest valid values of INPUTS, shape (6,).
         count: number of subjects.
         seed: seed of the random generator.
     """
     rng = np.random.default_rng(seed)
     for _ in range(count):
-        mass, height, length, duration = rng.uniform(low, high).tolist()
-        yield Subject(Patient(mass, height), length, round(duration, 3))
+        mass, height, length, duration, *legs = rng.uniform(low, high).tolist()
+        yield subject_of([mass, height, length, round(duration, 3), *legs])
 
 
 def deviation(subject: Subject, gait: Gait, solved: Gait, robot: Robot) -> Deviation:

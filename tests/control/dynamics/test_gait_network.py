@@ -20,9 +20,11 @@ from atalante_control.dynamics.gait_network import (
     GaitNetwork,
     Layer,
     NetworkError,
+    inputs_of,
     load_network,
     periodicity,
     save_network,
+    subject_of,
 )
 from atalante_control.dynamics.stance import stance_dynamics
 from atalante_control.gait.array_file import CHECKSUM, write_arrays
@@ -41,10 +43,11 @@ def untrained(seed: int) -> GaitNetwork:
     _, _, right = np.linalg.svd(periodicity())
     basis = right[len(periodicity()) :]
     layers = (
-        Layer(rng.normal(size=(4, 5)), rng.normal(size=5)),
+        Layer(rng.normal(size=(len(INPUTS), 5)), rng.normal(size=5)),
         Layer(rng.normal(size=(5, len(basis))) @ basis * 0.05, rng.normal(size=len(basis)) @ basis * 0.05),
     )
-    return GaitNetwork(np.array([50.0, 1.5, 0.1, 0.6]), np.array([90.0, 1.9, 0.2, 1.2]), layers, "untrained")
+    low, high = np.array([50.0, 1.5, 0.1, 0.6, 0.9, 0.95]), np.array([90.0, 1.9, 0.2, 1.2, 1.1, 1.05])
+    return GaitNetwork(low, high, layers, "untrained")
 
 
 def random_inputs(network: GaitNetwork, count: int, seed: int = 0) -> np.ndarray:
@@ -52,8 +55,8 @@ def random_inputs(network: GaitNetwork, count: int, seed: int = 0) -> np.ndarray
 
 
 def subject(inputs: np.ndarray) -> Subject:
-    mass, height, length, duration = inputs.tolist()
-    return Subject(Patient(mass, height), length, round(duration, 3))
+    mass, height, length, duration, *legs = inputs.tolist()
+    return subject_of([mass, height, length, round(duration, 3), *legs])
 
 
 @pytest.mark.parametrize("network", [SHIPPED, untrained(1)], ids=["shipped", "untrained"])
@@ -120,7 +123,11 @@ def test_feedforward_is_the_inverse_dynamics_of_the_trajectory() -> None:
         ),
         (
             lambda low, high: Subject(Patient(75.0, 1.75, 0.47), 0.15, 0.9),
-            "thigh length for the gait network must be that of Winter's table",
+            r"thigh length for the gait network must be 0.403 to 0.454 m at a height of 1.75 m, got 0.470 m",
+        ),
+        (
+            lambda low, high: Subject(Patient(75.0, 1.75, None, 0.40), 0.15, 0.9),
+            r"shank length for the gait network must be 0.405 to 0.456 m at a height of 1.75 m, got 0.400 m",
         ),
     ],
 )
@@ -136,6 +143,21 @@ def test_ends_of_the_range_are_accepted() -> None:
         SHIPPED.check(subject(inputs))
 
 
+def test_inputs_are_the_leg_lengths_relative_to_the_table_of_winter() -> None:
+    patient = Patient(70.0, 1.7, 0.95 * 0.245 * 1.7, 1.05 * 0.246 * 1.7)
+    values = [70.0, 1.7, 0.12, 0.9, 0.95, 1.05]
+    np.testing.assert_allclose(inputs_of(Subject(patient, 0.12, 0.9)), values, rtol=1e-12)
+    np.testing.assert_allclose(inputs_of(subject_of(values)), values, rtol=1e-12)
+    np.testing.assert_array_equal(inputs_of(Subject(Patient(70.0, 1.7), 0.12, 0.9))[4:], [1.0, 1.0])
+
+
+def test_gait_depends_on_the_leg_lengths() -> None:
+    winter, longer = Patient(75.0, 1.75), Patient(75.0, 1.75, thigh_length=0.45)
+    one, other = (SHIPPED.gait(Subject(patient, 0.15, 0.9), ROBOT) for patient in (winter, longer))
+    assert np.degrees(np.abs(one.coefficients - other.coefficients).max()) > 0.3
+    assert other.parameters["thigh_length"] == 0.45
+
+
 def test_saved_network_is_loaded_bit_for_bit(tmp_path: Path) -> None:
     network = untrained(2)
     save_network(network, tmp_path / "network.npz")
@@ -149,18 +171,19 @@ def test_saved_network_is_loaded_bit_for_bit(tmp_path: Path) -> None:
     ("change", "sentence"),
     [
         ({"format": np.array("atalante-gait-network/9")}, "format must be"),
-        ({"inputs": np.array(["mass"])}, "inputs must be mass, height, step_length, step_duration"),
+        ({"format": np.array("atalante-gait-network/2")}, "format must be 'atalante-gait-network/3'"),
+        ({"inputs": np.array(["mass"])}, "inputs must be mass, height, step_length, step_duration, thigh, shank"),
         ({"format": np.zeros(())}, "format must be text"),
         ({"surprise": np.zeros(3)}, "'surprise.npy' is not a valid member"),
         ({"bias_1": None}, "bias_1 is missing"),
-        ({"weights_3": np.zeros((4, 5))}, "weights_2 is missing"),
-        ({"low": np.zeros(3)}, "the arrays 'low' and 'high' must be 4 numbers"),
-        ({"weights_0": np.full((4, 5), np.nan)}, "weights_0 must be an array of finite 64-bit floats"),
-        ({"weights_0": np.full((4, 5), np.inf)}, "weights_0 must be an array of finite 64-bit floats"),
-        ({"weights_0": np.full((4, 5), "1.0")}, "weights_0 must be an array of finite 64-bit floats"),
-        ({"weights_0": np.zeros((3, 5))}, r"weights_0 must have shape \(4, n\)"),
-        ({"bias_0": np.zeros(4)}, r"weights_0 must have shape \(4, n\) and bias_0 shape \(n,\), with n from 1 to 128"),
-        ({"weights_0": np.zeros((4, 129)), "bias_0": np.zeros(129)}, r"weights_0 must have shape \(4, n\)"),
+        ({"weights_3": np.zeros((6, 5))}, "weights_2 is missing"),
+        ({"low": np.zeros(3)}, "the arrays 'low' and 'high' must be 6 numbers"),
+        ({"weights_0": np.full((6, 5), np.nan)}, "weights_0 must be an array of finite 64-bit floats"),
+        ({"weights_0": np.full((6, 5), np.inf)}, "weights_0 must be an array of finite 64-bit floats"),
+        ({"weights_0": np.full((6, 5), "1.0")}, "weights_0 must be an array of finite 64-bit floats"),
+        ({"weights_0": np.zeros((3, 5))}, r"weights_0 must have shape \(6, n\)"),
+        ({"bias_0": np.zeros(4)}, r"weights_0 must have shape \(6, n\) and bias_0 shape \(n,\), with n from 1 to 128"),
+        ({"weights_0": np.zeros((6, 129)), "bias_0": np.zeros(129)}, r"weights_0 must have shape \(6, n\)"),
         ({"weights_1": np.zeros((5, 8)), "bias_1": np.zeros(8)}, f"last layer must have {OUTPUTS} columns"),
         ({"bias_1": np.arange(96.0)}, "the angles of a gait must be continuous at the stance change"),
     ],

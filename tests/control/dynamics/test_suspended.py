@@ -12,6 +12,7 @@ from atalante_control.dynamics.gravity import Gravity
 from atalante_control.dynamics.suspended import check_suspended, suspended_gait
 from atalante_control.gait.gait import AIRWALK_GAIT, Gait, GaitError, bezier, check_gait, load_gait, motion
 from atalante_control.gait.subject import Subject
+from atalante_control.gait_optimization.network_error import random_subjects
 from atalante_control.guide.shapes import SHAPES
 from atalante_control.model import ExoskeletonParameters, Patient, pinocchio_model, urdf
 from atalante_hal.robot import JOINTS, load_robot
@@ -146,15 +147,9 @@ def test_gait_without_feedforward_is_checked_with_its_inverse_dynamics() -> None
         check_suspended(AIRWALK, weak, articulated, gravity, 0.0)
 
 
-def random_subjects(count: int) -> list[Subject]:
-    network = load_network()
-    drawn = np.random.default_rng(12).uniform(network.low, network.high, (count, 4)).tolist()
-    return [Subject(Patient(mass, height), length, round(duration, 3)) for mass, height, length, duration in drawn]
-
-
 def test_200_gaits_of_the_network_are_accepted() -> None:
     network = load_network()
-    for subject in random_subjects(200):
+    for subject in random_subjects(network.low, network.high, 200, seed=12):
         exoskeleton = EXOSKELETON.fitted(subject.patient)
         articulated = pinocchio_model(urdf(exoskeleton, ROBOT))
         gait, gravity = network.gait(subject, ROBOT), Gravity(articulated)

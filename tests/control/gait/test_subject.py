@@ -2,7 +2,7 @@ from __future__ import annotations
 
 import pytest
 
-from atalante_control.gait.subject import Subject
+from atalante_control.gait.subject import Subject, patient_of
 from atalante_control.model import Patient
 
 PATIENT = Patient(75.0, 1.75, thigh_length=0.44)
@@ -17,7 +17,17 @@ def test_subject_parameters_have_the_keys_of_a_gait_file() -> None:
         "step_length": 0.16,
         "step_duration": 0.8,
     }
-    assert str(Subject(PATIENT, 0.16, 0.8)) == "75 kg, 1.75 m, step 0.16 m in 0.8 s"
+    assert str(Subject(PATIENT, 0.16, 0.8)) == "75 kg, 1.75 m, thigh 0.440 m, step 0.16 m in 0.8 s"
+    assert str(Subject(Patient(75.0, 1.75), 0.16, 0.8)) == "75 kg, 1.75 m, step 0.16 m in 0.8 s"
+
+
+def test_patient_of_a_gait_has_the_leg_lengths_of_the_gait() -> None:
+    parameters = Subject(PATIENT, 0.16, 0.8).parameters()
+    assert patient_of(parameters).length("thigh") == 0.44
+    legs_unknown = {name: parameters[name] for name in ("patient_mass", "patient_height")}
+    assert patient_of(legs_unknown) == Patient(75.0, 1.75)
+    with pytest.raises(KeyError, match="patient_height"):
+        patient_of({"patient_mass": 75.0})
 
 
 @pytest.mark.parametrize(

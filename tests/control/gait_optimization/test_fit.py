@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 
-from atalante_control.dynamics.gait_network import load_network, periodicity
+from atalante_control.dynamics.gait_network import inputs_of, load_network, periodicity
 from atalante_control.dynamics.stance import stance_dynamics
 from atalante_control.gait.gait import AIRWALK_GAIT, Gait, load_gait
 from atalante_control.gait.subject import Subject
@@ -30,16 +30,25 @@ from atalante_tools.cli import cli
 
 ROBOT = load_robot()
 AIRWALK = load_gait(AIRWALK_GAIT, ROBOT)
-GRID = Grid((58.0, 75.0, 91.0), (1.62, 1.78, 1.93), (0.1, 0.15, 0.2), (0.8, 0.95, 1.1))
+GRID = Grid(size=160)
 LOW, HIGH = (np.array([axis[end] for axis in GRID.axes()]) for end in (0, -1))
 _, _, _RIGHT = np.linalg.svd(periodicity())
 #: Periodic directions in which the synthetic gaits differ.
-DIRECTIONS = np.random.default_rng(8).normal(size=(5, 72)) @ _RIGHT[24:] * 0.004
+DIRECTIONS = np.random.default_rng(8).normal(size=(6, 72)) @ _RIGHT[24:] * 0.004
 
 
 def synthetic(subject: Subject) -> SolvedGait:
-    mass, height, length, duration = (2.0 * (inputs_of(subject) - LOW) / (HIGH - LOW) - 1.0).tolist()
-    share = np.array([mass, height + 0.3 * height * length, length, duration + 0.2 * mass**2, math.sin(duration)])
+    mass, height, length, duration, thigh, shank = (2.0 * (inputs_of(subject) - LOW) / (HIGH - LOW) - 1.0).tolist()
+    share = np.array(
+        [
+            mass,
+            height + 0.3 * height * length,
+            length,
+            duration + 0.2 * mass**2,
+            math.sin(duration),
+            thigh - shank + 0.2 * thigh * height,
+        ]
+    )
     coefficients = AIRWALK.coefficients + (share @ DIRECTIONS).reshape(12, 8)
     feedforward = stance_dynamics(ROBOT, subject.patient).feedforward(coefficients, subject.step_duration)
     gait = Gait(
@@ -47,10 +56,6 @@ def synthetic(subject: Subject) -> SolvedGait:
         {"status": SOLVED, "version": code_version()},
     )  # fmt: skip
     return SolvedGait(gait, SOLVED, 1e-9, 0.01, 10)
-
-
-def inputs_of(subject: Subject) -> np.ndarray:
-    return np.array([subject.patient.mass, subject.patient.height, subject.step_length, subject.step_duration])
 
 
 @pytest.fixture(scope="module")
@@ -79,8 +84,9 @@ def test_same_library_gives_the_same_network(gaits: list[Gait]) -> None:
 
 
 def test_inputs_are_the_parameters_of_the_subject() -> None:
-    gait = synthetic(Subject(Patient(70.0, 1.7), 0.12, 0.9)).gait
-    np.testing.assert_array_equal(inputs(gait), [70.0, 1.7, 0.12, 0.9])
+    patient = Patient(70.0, 1.7, thigh_length=1.02 * 0.245 * 1.7)
+    gait = synthetic(Subject(patient, 0.12, 0.9)).gait
+    np.testing.assert_allclose(inputs(gait), [70.0, 1.7, 0.12, 0.9, 1.02, 1.0], rtol=1e-12)
 
 
 def test_deviation_of_a_gait_from_itself_is_zero() -> None:
@@ -127,7 +133,7 @@ def test_random_subjects_are_off_the_grid_and_repeatable() -> None:
     assert all(subject.patient.mass not in GRID.mass for subject in subjects)
 
 
-#: Options of a library of 81 gaits.
+#: Options of a library of 81 gaits: the corners of the grid and 17 other points.
 SMALL = (
     "--mass",
     "60,70,80",
@@ -137,6 +143,8 @@ SMALL = (
     "0.1,0.15,0.2",
     "--step-duration",
     "0.8,0.9,1.0",
+    "--size",
+    "81",
 )
 
 
@@ -155,16 +163,17 @@ class TestCommand:
             f"--{name.replace('_', '-')}={','.join(map(str, axis))}"
             for name, axis in zip(GRID.names(), GRID.axes(), strict=True)
         ]
+        levels.append(f"--size={GRID.size}")
         made = self.run("library", "--out", str(folder), "--json", *levels)
         assert made.exit_code == 0, made.output
-        assert len(made.stdout.splitlines()) == 81
-        assert "81 of 81 gaits solved" in made.stderr
+        assert len(made.stdout.splitlines()) == 160
+        assert "160 of 160 gaits solved" in made.stderr
         again = self.run("library", "--out", str(folder), *levels)
-        assert "81 of them already solved" in again.stderr
+        assert "160 of them already solved" in again.stderr
         next(folder.glob("gaits/*.json")).write_text("{")
         assert "1 gait files are rejected" in self.run("fit", "--library", str(folder), "--out", str(file)).stderr
         repaired = self.run("library", "--out", str(folder), *levels)
-        assert "80 of them already solved" in repaired.stderr
+        assert "159 of them already solved" in repaired.stderr
         assert "1 gait files are rejected, for example" in repaired.stderr
         fitted = self.run("fit", "--library", str(folder), "--out", str(file), "--json")
         assert fitted.exit_code == 0, fitted.output
@@ -182,9 +191,10 @@ class TestCommand:
         monkeypatch.setattr(library_module, "solve_subject", fails)
         result = self.run("library", "--out", str(tmp_path), *SMALL)
         assert result.exit_code == 1
-        assert result.stderr.count("failed: ") == 27
+        failures = Library(tmp_path).failures()
+        assert 20 < len(failures) < 81
+        assert result.stderr.count("failed: ") == len(failures)
         assert "the swing clearance cannot hold" in result.stderr
-        assert len(Library(tmp_path).failures()) == 27
 
     @pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
     def test_interrupted_library_reports_its_progress_and_resumes(

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
+import itertools
 import json
-import math
 import os
 import signal
 from collections.abc import Callable
@@ -26,8 +26,10 @@ from atalante_hal.robot import load_robot
 
 ROBOT = load_robot()
 AIRWALK = load_gait(AIRWALK_GAIT, ROBOT)
-GRID = Grid((60.0, 70.0, 80.0), (1.6, 1.7, 1.8, 1.9), (0.1, 0.15, 0.2), (0.7, 0.8, 1.0))
-POINTS = math.prod(GRID.shape)
+GRID = Grid((60.0, 70.0, 80.0), (1.6, 1.7, 1.8, 1.9), (0.1, 0.15, 0.2), (0.7, 0.8, 1.0), size=108)
+POINTS = GRID.size
+#: A corner of the grid, and the name of its file.
+CORNER, CORNER_FILE = (2, 3, 0, 2, 0, 4), "m80_h1.9_l0.1_d1_t0.94_s1.06.json"
 REASON = "no such gait: the speed of the swing knee cannot hold"
 
 
@@ -88,7 +90,8 @@ def test_two_processes_give_the_same_files(tmp_path: Path) -> None:
 def test_failures_are_listed_and_retried(tmp_path: Path) -> None:
     library = Library(tmp_path, GRID)
     failed = {str(subject) for subject, solved in library.generate(failing) if not solved.solved}
-    assert len(failed) == 3 * 2 * 3
+    assert failed == {str(subject) for subject in map(GRID.subject, GRID.points()) if not failing(subject).solved}
+    assert 10 < len(failed) < POINTS
     failures = Library(tmp_path).failures()
     assert set(failures.values()) == {REASON}
     assert {str(GRID.subject(index)) for index in failures} == failed
@@ -121,9 +124,10 @@ def test_library_folder_rejects_another_grid(tmp_path: Path) -> None:
     [
         "{",
         "[]",
-        '{"format": "atalante-library/2"}',
-        json.dumps({"format": "atalante-library/1", "mass": 3}),
-        json.dumps({"format": "atalante-library/1", "weight": [50, 60, 70]}),
+        '{"format": "atalante-library/1"}',
+        json.dumps({"format": "atalante-library/2", "size": 100, "mass": 3}),
+        json.dumps({"format": "atalante-library/2", "size": "all"}),
+        json.dumps({"format": "atalante-library/2", "size": 100, "weight": [50, 60, 70]}),
     ],
 )
 def test_invalid_grid_file_is_rejected(tmp_path: Path, content: str) -> None:
@@ -138,10 +142,11 @@ def test_invalid_grid_file_is_rejected(tmp_path: Path, content: str) -> None:
         ({"mass": (60.0, 70.0)}, "mass must have at least 3 ascending levels"),
         ({"step_duration": (0.7, 0.9, 0.8)}, "step_duration must have at least 3 ascending levels"),
         ({"height": (1.4, 1.6, 1.8)}, "height of the patient must be 1.5 to 2 m, got 1.4 m"),
+        ({"size": 63}, "size must be at least 64, the number of corners of the grid, got 63"),
         ({"step_length": (0.1, 0.2, 0.5)}, "step length must be 0.05 to 0.4 m, got 0.5 m"),
     ],
 )
-def test_invalid_grid_is_rejected(levels: dict[str, tuple[float, ...]], sentence: str) -> None:
+def test_invalid_grid_is_rejected(levels: dict[str, Any], sentence: str) -> None:
     with pytest.raises(ValueError, match=f"^{sentence}"):
         Grid(**levels)
 
@@ -151,13 +156,37 @@ def test_default_grid_covers_the_subjects_of_the_paper() -> None:
     assert min(grid.shape) >= 3
     assert (grid.mass[0], grid.mass[-1]) == (58.0, 91.0)
     assert (grid.height[0], grid.height[-1]) == (1.62, 1.93)
-    np.testing.assert_allclose(grid.subject((0, 0, 0, 0)).patient.length("thigh"), 0.245 * 1.62)
+    np.testing.assert_allclose(grid.subject((0, 0, 0, 0, 2, 2)).patient.length("thigh"), 0.245 * 1.62)
+
+
+def test_selected_points_are_the_corners_and_an_even_sample_of_the_grid() -> None:
+    points = Grid().points()
+    assert points == Grid().points()
+    assert len(set(points)) == len(points) == Grid().size
+    ends = [(0, levels - 1) for levels in Grid().shape]
+    assert set(itertools.product(*ends)) == set(points[: 2 ** len(ends)])
+    inner = np.array(points[2 ** len(ends) :])
+    for column, levels in zip(inner.T, Grid().shape, strict=True):
+        counts = np.bincount(column, minlength=levels)
+        assert counts.min() > 0.7 * counts.mean()
+    assert np.abs(np.corrcoef(inner.T) - np.eye(len(ends))).max() < 0.1
+
+
+def test_larger_library_contains_the_points_of_a_smaller_one() -> None:
+    small, large = Grid(size=100).points(), Grid(size=300).points()
+    assert large[: len(small)] == small
+
+
+def test_all_points_are_selected_if_the_grid_has_no_more() -> None:
+    levels = (0.96, 1.0, 1.04)
+    grid = Grid((60.0, 70.0, 80.0), (1.6, 1.7, 1.8), (0.1, 0.15, 0.2), (0.7, 0.8, 1.0), levels, levels, size=729)
+    assert grid.points() == list(itertools.product(range(3), repeat=6))
 
 
 def test_gait_that_fails_verification_is_not_solved(monkeypatch: pytest.MonkeyPatch) -> None:
     """The synthetic gait ignores the ground, so Pinocchio rejects it."""
     monkeypatch.setattr(library_module, "solve", lambda subject, warm_start, machine_code=False: synthetic(subject))
-    subject = GRID.subject((1, 1, 1, 1))
+    subject = GRID.subject((1, 1, 1, 1, 1, 1))
     for solve in (library_module.solve_subject, library_module.solve_compiled):
         outcome = solve(subject)
         assert not outcome.solved
@@ -167,7 +196,7 @@ def test_gait_that_fails_verification_is_not_solved(monkeypatch: pytest.MonkeyPa
 
 
 def test_failed_gait_is_not_verified() -> None:
-    subject = GRID.subject((0, 3, 0, 0))
+    subject = GRID.subject((0, 3, 0, 0, 0, 0))
     failed = failing(subject)
     assert library_module.verified(subject, failed) is failed
 
@@ -213,9 +242,9 @@ DAMAGES: dict[str, tuple[Callable[[Path], Any], str]] = {
 
 @pytest.mark.parametrize("damage", DAMAGES)
 def test_damaged_gait_file_is_rejected_with_a_reason_and_solved_again(solved_library: Library, damage: str) -> None:
-    library, index = solved_library, (1, 2, 0, 2)
+    library, index = solved_library, CORNER
     intact = files(library.folder)
-    path = next(library.folder.glob("gaits/m70_h1.8_l0.1_d1.json"))
+    path = next(library.folder.glob(f"gaits/{CORNER_FILE}"))
     spoil, reason = DAMAGES[damage]
     spoil(path)
     assert files(library.folder) != intact
@@ -232,16 +261,16 @@ def test_damaged_gait_file_is_rejected_with_a_reason_and_solved_again(solved_lib
 
 def test_gait_file_of_another_subject_is_rejected(solved_library: Library) -> None:
     folder = solved_library.folder / "gaits"
-    (folder / "m60_h1.6_l0.1_d0.7.json").write_bytes((folder / "m80_h1.9_l0.2_d1.json").read_bytes())
-    assert list(solved_library.rejected()) == [(0, 0, 0, 0)]
-    assert "parameters must be" in solved_library.rejected()[0, 0, 0, 0]
+    (folder / "m60_h1.6_l0.1_d0.7_t0.94_s0.94.json").write_bytes((folder / CORNER_FILE).read_bytes())
+    assert list(solved_library.rejected()) == [(0, 0, 0, 0, 0, 0)]
+    assert "parameters must be" in solved_library.rejected()[0, 0, 0, 0, 0, 0]
 
 
 def test_unfinished_file_is_not_a_gait(solved_library: Library) -> None:
     """A process that is killed while it writes leaves the file under its temporary name."""
-    path = next(solved_library.folder.glob("gaits/m70_h1.8_l0.1_d1.json"))
+    path = next(solved_library.folder.glob(f"gaits/{CORNER_FILE}"))
     path.rename(path.with_name(f"{path.name}.new"))
-    assert solved_library.missing() == [(1, 2, 0, 2)]
+    assert solved_library.missing() == [CORNER]
     assert not solved_library.rejected()
 
 
@@ -257,7 +286,7 @@ def test_damaged_record_of_a_failure_gives_its_reason(tmp_path: Path, content: s
 
 def killed_once(marker: Path, subject: Subject) -> SolvedGait:
     """End the process at the first call for one subject."""
-    if subject == GRID.subject((0, 0, 0, 1)) and not marker.exists():
+    if subject == GRID.subject((0, 0, 0, 2, 0, 0)) and not marker.exists():
         marker.touch()
         os.kill(os.getpid(), signal.SIGKILL)
     return synthetic(subject)
@@ -265,7 +294,7 @@ def killed_once(marker: Path, subject: Subject) -> SolvedGait:
 
 def killed_always(subject: Subject) -> SolvedGait:
     """End the process at each call for one subject."""
-    if subject == GRID.subject((0, 0, 0, 1)):
+    if subject == GRID.subject((0, 0, 0, 2, 0, 0)):
         os.kill(os.getpid(), signal.SIGKILL)
     return synthetic(subject)
 
@@ -289,7 +318,7 @@ def test_gait_that_always_ends_its_process_is_recorded_as_failed(tmp_path: Path)
     assert len(messages) == 3
     failures = library.failures()
     (reason,) = failures.values()
-    assert reason.startswith(f"no result for {GRID.subject((0, 0, 0, 1))}: a process ended unexpectedly")
-    assert library.missing() == list(failures) == [(0, 0, 0, 1)]
+    assert reason.startswith(f"no result for {GRID.subject((0, 0, 0, 2, 0, 0))}: a process ended unexpectedly")
+    assert library.missing() == list(failures) == [(0, 0, 0, 2, 0, 0)]
     assert len(list(library.generate(synthetic))) == 1
     assert not library.failures()

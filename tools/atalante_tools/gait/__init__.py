@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from contextlib import closing
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import click
 
@@ -22,6 +22,23 @@ if TYPE_CHECKING:
 
 _FOLDER = click.Path(file_okay=False, path_type=Path)
 _FILE = click.Path(dir_okay=False, path_type=Path)
+_network_option = click.option(
+    "--network", "file", type=_FILE, metavar="FILE", help="Network file.  [default: the network of the package]"
+)
+_seed_option = click.option(
+    "--seed", type=SEED, default=0, show_default=True, metavar="N", help="Seed of the random subjects."
+)
+
+
+def _count_option(default: int) -> Callable[[Any], Any]:
+    return click.option(
+        "--count",
+        type=click.IntRange(min=1),
+        default=default,
+        show_default=True,
+        metavar="N",
+        help="Number of random subjects.",
+    )
 
 
 def levels_of(text: str) -> tuple[float, ...]:
@@ -38,13 +55,14 @@ def levels_of(text: str) -> tuple[float, ...]:
 
 @click.group()
 def command() -> None:
-    """Optimise gaits, collect them in a library, fit the gait network of the controller, and check the network.
+    """Optimise gaits, collect them in a library, fit the gait network of the controller, and check the network and its gaits.
 
     \b
     Example: atalante gait solve --mass 75 --height 175
              atalante gait library --out runs/library --jobs 2
              atalante gait fit --library runs/library --out runs/network.npz
              atalante gait check --network runs/network.npz
+             atalante gait verify --network runs/network.npz
     """
 
 
@@ -74,11 +92,28 @@ command.add_command(solve)
 @click.option("--height", type=levels_of, metavar="M,...", help="Patient heights of the grid, in m.")
 @click.option("--step-length", type=levels_of, metavar="M,...", help="Step lengths of the grid, in m.")
 @click.option("--step-duration", type=levels_of, metavar="S,...", help="Step durations of the grid, in s.")
+@click.option(
+    "--thigh",
+    type=levels_of,
+    metavar="X,...",
+    help="Thigh lengths of the grid, relative to Winter's table (0.94,1,1.06).",
+)
+@click.option(
+    "--shank",
+    type=levels_of,
+    metavar="X,...",
+    help="Shank lengths of the grid, relative to Winter's table (0.94,1,1.06).",
+)
+@click.option(
+    "--size",
+    type=int,
+    metavar="N",
+    help="Number of gaits: the corners of the grid, and points that fill the grid evenly. A larger number keeps the points of a "
+    "smaller number.  [default: 1000]",
+)
 @json_option
-def library(
-    out: Path, jobs: int, machine_code: bool, cluster: str | None, as_json: bool, **levels: tuple[float, ...] | None
-) -> None:
-    """Solve the gaits of a grid of patients, step lengths and step durations, and write a file per gait to DIR/gaits.
+def library(out: Path, jobs: int, machine_code: bool, cluster: str | None, as_json: bool, **grid_options: Any) -> None:
+    """Solve gaits of a grid of patients, step lengths and step durations, and write a file per gait to DIR/gaits.
 
     After an interruption, the same command solves the missing gaits. It also solves gaits again whose files are damaged, were
     made by another version of the code, or belong to another subject. Failed gaits are listed on stderr and in DIR/failed, and
@@ -92,7 +127,7 @@ def library(
     with extra():
         from atalante_control.gait_optimization.library import Grid, Library, solve_compiled, solve_subject
     try:
-        grid = Grid(**{name: values for name, values in levels.items() if values is not None})
+        grid = Grid(**{name: value for name, value in grid_options.items() if value is not None})
     except ValueError as error:
         raise click.UsageError(str(error)) from error
     collection = Library(out, grid)
@@ -181,13 +216,9 @@ def fit(folder: Path, out: Path, as_json: bool) -> None:
 
 
 @command.command(short_help="Compare the gait network with newly solved gaits.")
-@click.option(
-    "--network", "file", type=_FILE, metavar="FILE", help="Network file.  [default: the network of the package]"
-)
-@click.option(
-    "--count", type=click.IntRange(min=1), default=50, show_default=True, metavar="N", help="Number of random subjects."
-)
-@click.option("--seed", type=SEED, default=0, show_default=True, metavar="N", help="Seed of the random subjects.")
+@_network_option
+@_count_option(100)
+@_seed_option
 @json_option
 def check(file: Path | None, count: int, seed: int, as_json: bool) -> None:
     """Compare the gait network with newly solved gaits of random subjects. The exit code is 1 if a deviation is too large.
@@ -223,6 +254,44 @@ def check(file: Path | None, count: int, seed: int, as_json: bool) -> None:
         rows = [[f.name, f"{f.value:.4f}", f"{f.limit:g}", f.unit, "ok" if f.ok else "FAIL"] for f in found]
         click.echo(table([["network against solved gaits", "value", "limit", "unit", ""], *rows]))
     if not all(finding.ok for finding in found):
+        raise SystemExit(FAILED)
+
+
+@command.command(short_help="Verify the gaits of the gait network.")
+@_network_option
+@_count_option(200)
+@_seed_option
+@json_option
+def verify(file: Path | None, count: int, seed: int, as_json: bool) -> None:
+    """Verify the gaits of the network for random subjects with Pinocchio. The exit code is 1 if a gait fails a check.
+
+    Checked are joint angles, speeds and torques, ground forces, centre of pressure, friction, clearance of the swing foot, the
+    landing at the corners of the sole, and the impact, at 201 samples per step. No gait is solved.
+
+    \b
+    Example: atalante gait verify
+             atalante gait verify --network runs/network.npz --count 50 --seed 7
+    """
+    from atalante_control.dynamics.gait_network import load_network
+    from atalante_control.gait_optimization.network_error import random_subjects
+    from atalante_control.gait_optimization.network_verification import network_checks, worst_checks
+    from atalante_hal.robot import load_robot
+
+    robot, network = load_robot(), load_network(file)
+    progress, checks = Progress(), []
+    for number, subject in enumerate(random_subjects(network.low, network.high, count, seed)):
+        checks.append(network_checks(network, subject, robot))
+        if progress.due():
+            progress.show(f"{_bar((number + 1) / count)} {number + 1}/{count} gaits")
+    progress.clear()
+    found = worst_checks(checks)
+    if as_json:
+        for check in found:
+            show_json(check._asdict())
+    else:
+        rows = [[c.name, f"{c.value:.3g}", f"{c.limit:.3g}", c.unit, str(c.failures)] for c in found]
+        click.echo(table([[f"{count} gaits of the network", "worst", "limit", "unit", "failures"], *rows]))
+    if any(check.failures for check in found):
         raise SystemExit(FAILED)
 
 
