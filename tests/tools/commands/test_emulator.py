@@ -94,12 +94,12 @@ def test_the_legs_are_adjusted_to_the_given_patient(
     monkeypatch.setattr(
         body_module, "open_mechanics", lambda mechanics: (bodies.append(mechanics.urdf), opened(mechanics))[1]
     )
-    for arguments in ((), ("--mass", "75", "--height", "175")):
+    for arguments in ((), ("--mass", "75", "--height", "175", "--shank", "0.42")):
         result = OtherProcess(network, robot, 5, monkeypatch).run(*arguments)
         assert result.exit_code == 130, result.stderr
     exoskeleton = ExoskeletonParameters()
-    assert bodies == [urdf(exoskeleton, robot), urdf(exoskeleton.fitted(Patient(75.0, 1.75)), robot)]
-    assert "atalante airwalk -i pcan -c test --mass 75 --height 1.75\n" in result.stderr
+    assert bodies == [urdf(exoskeleton, robot), urdf(exoskeleton.fitted(Patient(75.0, 1.75, None, 0.42)), robot)]
+    assert "atalante airwalk -i pcan -c test --mass 75 --height 1.75 --shank 0.42\n" in result.stderr
 
 
 def test_equal_seeds_give_equal_sensor_noise(network: Network, robot: Robot, monkeypatch: pytest.MonkeyPatch) -> None:

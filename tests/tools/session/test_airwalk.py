@@ -401,9 +401,9 @@ def test_a_signal_ends_in_hold_and_keeps_recording_and_summary(number, code, tmp
 
 def test_a_patient_s_gait_of_the_network_is_walked_inside_a_certified_guide(tmp_path: Path):
     done = atalante("demo", "--shape", "pinched", "--steps", "2", "--mass", "75", "--height", "175", "--step-length", "0.16",
-                    "--step-duration", "0.8", "--out", str(tmp_path), "--json")  # fmt: skip
+                    "--step-duration", "0.8", "--thigh", "0.44", "--shank", "0.42", "--out", str(tmp_path), "--json")  # fmt: skip
     assert done.returncode == 0, done.stderr
-    assert "gait of the network: 75 kg, 1.75 m, step 0.16 m in 0.8 s" in done.stderr
+    assert "gait of the network: 75 kg, 1.75 m, thigh 0.440 m, shank 0.420 m, step 0.16 m in 0.8 s" in done.stderr
     result = json.loads(done.stdout.splitlines()[0])
     assert result["certified"]
     assert result["max_ratio"] < 1.0
@@ -419,6 +419,11 @@ def test_a_patient_s_gait_of_the_network_is_walked_inside_a_certified_guide(tmp_
             ["--mass", "75", "--height", "175", "--step-length", "0.35"],
             1,
             "step length for the gait network must be 0.1 to 0.2 m",
+        ),
+        (
+            ["--mass", "75", "--height", "175", "--thigh", "50"],
+            1,
+            "thigh length for the gait network must be 0.403 to 0.454 m at a height of 1.75 m, got 0.500 m",
         ),
         (["--mass", "75"], 2, "a patient requires both --mass and --height"),
         (["--step-length", "0.15"], 2, "require a patient"),

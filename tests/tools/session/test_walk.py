@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import pytest
 
-from atalante_control.gait.walk import DEFAULT_WALK, load_walk
+from atalante_control.gait.subject import Subject
+from atalante_control.gait.walk import DEFAULT_WALK, load_walk, write_walk
 from atalante_control.model import Patient
 from atalante_control.structured import dtype_of
 from atalante_control.walking.controller import WalkController
@@ -17,9 +20,10 @@ from atalante_hal.robot import load_robot
 from atalante_hal.types import PERIOD, State, SupervisorState, Vector
 from atalante_tools.console.options import MUJOCO, Target
 from atalante_tools.session.body import describe
+from atalante_tools.session.law import Law
 from atalante_tools.session.rig import open_hal
 from atalante_tools.session.walk_observation import Observation
-from atalante_tools.session.walk_options import Push
+from atalante_tools.session.walk_options import Push, WalkOptions, gaits_of, gaits_of_subject
 
 ROBOT = load_robot()
 PATIENT = Patient(75.0, 1.75)
@@ -110,3 +114,24 @@ def test_push_begins_at_its_phase_in_a_right_stance_step_and_lasts_its_duration(
     assert len(rows) == round(push.duration / PERIOD)
     assert {(row["step"], row["stance"]) for row in rows} == {(1.0, 1.0)}
     assert rows[0]["elapsed"] == pytest.approx(0.4, abs=2 * PERIOD)
+
+
+def test_gaits_fit_the_leg_lengths_of_the_patient(tmp_path: Path) -> None:
+    longer = Patient(75.0, 1.75, thigh_length=0.44)
+    gaits = gaits_of_subject(Subject(longer, 0.16, 0.8), ROBOT)
+    assert gaits.step.parameters["thigh_length"] == 0.44
+    assert gaits.hash32 != load_walk(DEFAULT_WALK, ROBOT).hash32
+    write_walk(gaits, tmp_path / "walk.json")
+    options = WalkOptions(
+        steps=1, xi=1.0, shape="pinched", passive=False, subject=None, gait=tmp_path / "walk.json", seed=0, friction=0.6,
+        push=None, law=Law(),
+    )  # fmt: skip
+    patient, read = gaits_of(options, ROBOT)
+    assert patient.length("thigh") == 0.44
+    assert read.hash32 == gaits.hash32
+
+
+def test_default_patient_walks_with_the_walk_file_of_the_package() -> None:
+    winter = Patient(75.0, 1.75, PATIENT.length("thigh"), PATIENT.length("shank"))
+    for patient in (PATIENT, winter):
+        assert gaits_of_subject(Subject(patient, 0.16, 0.8), ROBOT).hash32 == load_walk(DEFAULT_WALK, ROBOT).hash32

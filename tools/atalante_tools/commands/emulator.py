@@ -11,7 +11,15 @@ from typing import TYPE_CHECKING, Final
 
 import click
 
-from atalante_tools.console.options import SEED, Between, Target, engine_option, patient_options, target_options
+from atalante_tools.console.options import (
+    SEED,
+    Between,
+    Target,
+    engine_option,
+    patient_arguments,
+    patient_options,
+    target_options,
+)
 from atalante_tools.console.outcome import Failed
 from atalante_tools.console.stop_request import StopRequest, stop_requested
 from atalante_tools.console.terminal import Progress, print_message
@@ -73,7 +81,7 @@ LISTEN: Final = 0.25
     help="Largest horizontal force with which a virtual operator steadies the pelvis of the robot [N]. Requires --ground. "
     "With 0, there is no operator.",
 )
-@patient_options(legs=False)
+@patient_options
 def command(
     target: Target,
     seed: int,
@@ -90,8 +98,8 @@ def command(
     interface goes down, the emulator waits until the interface is up again. The emulator does not start if another robot
     answers on the bus.
 
-    --mass and --height adjust the leg lengths to a patient. Give the same values to `atalante airwalk`. In the air, the
-    exoskeleton is empty. On the ground, the patient wears the exoskeleton.
+    --mass, --height, --thigh and --shank adjust the leg lengths to a patient. Give the same values to `atalante airwalk`. In
+    the air, the exoskeleton is empty. On the ground, the patient wears the exoskeleton.
 
     \b
     Example: atalante emulator -i socketcan -c vcan0
@@ -116,7 +124,7 @@ def command(
     other_side = f"atalante airwalk {target.arguments}"
     if patient is not None:
         exoskeleton = exoskeleton.fitted(patient)
-        other_side += f" --mass {patient.mass:g} --height {patient.height:g}"
+        other_side += f" {patient_arguments(patient)}"
     ground = None if friction is None else Ground(friction, operator_force=operator_force)
     mechanics = Mechanics(
         describe(robot, exoskeleton, patient if ground else None),

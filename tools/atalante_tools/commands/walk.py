@@ -77,7 +77,7 @@ def _protocol(_ctx: click.Context, _param: click.Parameter, text: str | None) ->
     help="Limbs of the emulated patient: none (masses only) or passive (the impedance of relaxed legs).",
 )
 @law_options()
-@patient_options(legs=False)
+@patient_options
 @click.option(
     "--step-length",
     type=length,

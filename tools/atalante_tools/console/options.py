@@ -143,41 +143,50 @@ def options_as(
     return decorate
 
 
-def patient_options(*, legs: bool) -> Callable[[_Command], _Command]:
-    """Return a decorator that adds `--mass` and `--height` and passes the argument `patient` to the command.
+def _segment_option(name: str, ends: str) -> Callable[[Any], Any]:
+    return click.option(
+        f"--{name}",
+        type=length,
+        metavar="M",
+        help=f"Distance from {ends} of the patient, in m (0.43) or cm (43).  "
+        "[default: estimated from the height with Winter's anthropometric table]",
+    )
+
+
+def patient_options(command: _Command) -> _Command:
+    """Add `--mass`, `--height`, `--thigh` and `--shank` to a command, which then gets the argument `patient`.
 
     `patient` is None if the user gave none of the options.
 
     Args:
-        legs: Whether to add `--thigh` and `--shank` too.
+        command: Command to decorate.
     """
     options = [
         click.option("--mass", type=float, metavar="KG", help="Body mass of the patient [kg]."),
         click.option("--height", type=length, metavar="M", help="Body height of the patient, in m (1.75) or cm (175)."),
+        _segment_option("thigh", "hip to knee"),
+        _segment_option("shank", "knee to ankle"),
     ]
-    if legs:
-        options += [
-            click.option(
-                "--thigh",
-                type=length,
-                metavar="M",
-                help="Distance from hip to knee, in m (0.43) or cm (43).  "
-                "[default: estimated from the height with Winter's anthropometric table]",
-            ),
-            click.option(
-                "--shank",
-                type=length,
-                metavar="M",
-                help="Distance from knee to ankle, in m (0.43) or cm (43).  "
-                "[default: estimated from the height with Winter's anthropometric table]",
-            ),
-        ]
+    return options_as("patient", _patient, options)(command)
 
-    return options_as("patient", _patient, options)
+
+def patient_arguments(patient: Patient) -> str:
+    """Return the options of a patient as text for the command line of another `atalante` command.
+
+    Args:
+        patient: Patient that the user gave.
+    """
+    given = {
+        "mass": patient.mass,
+        "height": patient.height,
+        "thigh": patient.thigh_length,
+        "shank": patient.shank_length,
+    }
+    return " ".join(f"--{name} {value:g}" for name, value in given.items() if value is not None)
 
 
 def subject_options(command: _Command) -> _Command:
-    """Add `--mass`, `--height`, `--step-length`, `--step-duration` to a command, which then gets the argument `subject`.
+    """Add the options of the patient, `--step-length` and `--step-duration` to a command, which then gets the argument `subject`.
 
     `subject` is None if the user gave none of the options.
 
@@ -186,7 +195,7 @@ def subject_options(command: _Command) -> _Command:
     """
     step_length, step_duration = DEFAULT_STEP
     options = [
-        patient_options(legs=False),
+        patient_options,
         click.option(
             "--step-length",
             type=length,

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 
 @click.command()
-@patient_options(legs=True)
+@patient_options
 @click.option(
     "--urdf",
     "urdf_file",

@@ -71,8 +71,8 @@ def gaits_of(options: WalkOptions, robot: Robot) -> tuple[Patient, WalkGaits]:
         NetworkError: If the subject is outside the range of the network.
         Failed: If the gait optimisation is needed, but not installed.
     """
+    from atalante_control.gait.subject import patient_of
     from atalante_control.gait.walk import DEFAULT_WALK, load_walk
-    from atalante_control.model import Patient
 
     if options.gait is not None or options.subject is None or _is_default(options.subject):
         gaits = load_walk(options.gait or DEFAULT_WALK, robot)
@@ -80,7 +80,7 @@ def gaits_of(options: WalkOptions, robot: Robot) -> tuple[Patient, WalkGaits]:
         if options.subject is not None:
             return options.subject.patient, gaits
         try:
-            return Patient(parameters["patient_mass"], parameters["patient_height"]), gaits
+            return patient_of(parameters), gaits
         except KeyError as error:
             raise Failed(
                 f"the parameters of the step in {options.gait} must contain {error.args[0]}: add --mass and --height"
@@ -135,8 +135,7 @@ def gaits_of_subject(subject: Subject, robot: Robot) -> WalkGaits:
 
 
 def _is_default(subject: Subject) -> bool:
-    patient = subject.patient
-    return ((patient.mass, patient.height), (subject.step_length, subject.step_duration)) == (
-        DEFAULT_PATIENT,
-        DEFAULT_STEP,
-    )
+    from atalante_control.gait.subject import Subject
+    from atalante_control.model import Patient
+
+    return subject.parameters() == Subject(Patient(*DEFAULT_PATIENT), *DEFAULT_STEP).parameters()
