@@ -31,7 +31,7 @@ from atalante_hal.wire.process_image import NEVER, ReceiveImage
 
 #: Number of consecutive cycles with a limited torque after which TORQUE_SATURATED is confirmed.
 SATURATED_CYCLES = 200
-#: Largest number of consecutive exceptions of the controller with which a robot on the ground continues to walk.
+#: A robot on the ground continues to walk after at most this number of consecutive exceptions of the controller.
 #: A drive tolerates the same number of lost commands.
 BRIDGED_ERRORS = 4
 #: Longest total wait for the nodes' answers while `Hal.stop` puts the robot into HOLD [s].

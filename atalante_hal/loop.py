@@ -21,7 +21,7 @@ from atalante_hal.types import PERIOD, Controller, State
 OVERRUNS_TO_HOLD = 3
 #: Lateness of a cycle above which the robot goes to HOLD [s]. The watchdog of the drives has the same timeout.
 GAP_TO_HOLD = 5e-3
-#: Largest time by which the loop may fall behind the monotonic clock within `DRIFT_CYCLES` cycles [s]. More leads to HOLD.
+#: The robot goes to HOLD if the loop loses more than this time [s] within `DRIFT_CYCLES` cycles.
 DRIFT_TO_HOLD = 5e-3
 #: Length of the window in which the time lost by the loop is measured [cycles].
 DRIFT_CYCLES = 50
@@ -50,7 +50,7 @@ class LockStep:
 
 
 class WallClock:
-    """Clock with absolute deadlines on the monotonic clock, one period apart.
+    """Clock with absolute deadlines, one period apart, on the monotonic clock.
 
     A cycle that is late by up to one period does not move the deadlines. A cycle that is late by more moves the
     deadlines, because a burst of catch-up cycles would send commands for old states.

@@ -46,9 +46,9 @@ class Envelope:
     """Reduction of the torque near the limits of position and velocity, see `limiter`."""
 
     look_ahead: float  # s, time for which the joint position is predicted, at constant velocity
-    #: Distance by which the predicted position must exceed a position limit before the outward torque is 0 [rad].
+    #: If the predicted position is outside a position limit by this angle [rad] or more, the outward torque is 0.
     position_margin: float
-    velocity_margin: float  # rad/s, speed above the velocity limit at which the accelerating torque is 0
+    velocity_margin: float  # rad/s, excess over the velocity limit at which the accelerating torque is 0
 
 
 @dataclass(frozen=True)
@@ -82,7 +82,7 @@ class Thresholds:
 
     supply_low: float  # V at a drive; below this voltage the battery is nearly empty
     supply_under: float  # V at a drive; below this voltage the drives may soon fail to hold
-    #: Walking is permitted while a hot drive has at least this share of the torque limit of the same drive in the other leg.
+    #: Walking is permitted while the torque limit of a hot drive is at least this share of the limit in the other leg.
     derated_imbalance: float
     full_assist_ramp: float  # s, time for the ramp of the assistance factor from 0 to 1 in FULL_ASSIST
     #: Largest angle outside a position limit that is still accepted [rad]. Beyond it, the joint is out of range.

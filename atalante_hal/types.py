@@ -54,7 +54,7 @@ class State:
     imu_accel: Vector  # (4, 3) m/s2, specific force
     foot_force: Vector  # (2, 4, 3) N, force on the foot at each force cell, in the foot frame
     vibration: Vector  # (8,) measured level, 0 to 1
-    valid: npt.NDArray[np.bool_]  # (messages,) True if the data is new, plausible and of a trusted sender, see `e2e`
+    valid: npt.NDArray[np.bool_]  # (messages,) True if the data is new, plausible and from a trusted sender, see `e2e`
     age: npt.NDArray[np.int64]  # (messages,) age of the data [cycles], counted from the SYNC that the message answers
     joints_valid: bool  # True if all twelve joint states are valid
     imu_rows: tuple[int, ...] = ()  # indices of the IMU messages in `valid` and `age`; empty if unknown

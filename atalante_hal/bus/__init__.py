@@ -26,7 +26,7 @@ class BusError(Exception):
 
 
 class BusAbsent(BusError):  # noqa: N818
-    """Error of a bus that cannot be opened: the interface is missing, down, without CAN FD or without a driver."""
+    """Error of a bus that cannot be opened: the interface is missing or down, or has no CAN FD or no driver."""
 
 
 class BusDown(BusError):  # noqa: N818
@@ -59,7 +59,7 @@ class Bus(Protocol):
 
     @property
     def dropped(self) -> int:
-        """Return the number of incoming frames, since the bus was opened, that were lost or are not valid CAN frames."""
+        """Return how many incoming frames were lost or invalid since the bus was opened."""
         ...
 
     def send(self, frames: Frames) -> None:

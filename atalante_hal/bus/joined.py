@@ -61,7 +61,7 @@ class JoinedBus:
         self._capacity = capacity
         self._batches = Batches()
         self._shares: dict[bytes, list[Share]] = {}
-        #: for each receive buffer that was passed so far: list of its slices `frames[i:]`
+        #: lists of the slices `frames[i:]`, one list for each receive buffer that was used so far
         self._tails: list[list[Frames]] = []
         self._turn = 0  # index of the channel to read first; changes in each call, so that a busy channel cannot block the others
         self._closed = False

@@ -37,9 +37,9 @@ _SERVING, _SLEEPING, _CLOSED = range(4, 7)
 #: Number of 64-bit header words of each bus end: one cache line.
 _END_WORDS = 8
 _HEADER_BYTES = mmap.PAGESIZE
-#: Time for which a bus end that waits for frames polls before it sleeps [s], longer than the computing time of a cycle.
+#: Polling time of a waiting bus end before it sleeps [s]. This time is longer than the computing time of a cycle.
 _POLL_TIME = 500e-6
-#: Number of waits that sleep without polling after a wait in which polling found no frame. This saves computing time.
+#: If polling finds no frame in a wait, the bus end does not poll in this number of further waits, to save computing time.
 _WAITS_WITHOUT_POLLING = 32
 #: Longest sleep of a waiting bus end before it reads the shared memory again [ms].
 #: A sleep must be limited, because a wake-up byte may arrive before the new value in the shared memory is visible.
@@ -87,7 +87,7 @@ class SharedBus:
         self._outgoing, self._incoming = queues[end], queues[1 - end]
         self._size = size
         self._sent = self._received = 0
-        self._waits_without_polling = 0  # number of the next waits that sleep without polling
+        self._waits_without_polling = 0  # number of further waits in which this end does not poll
         self._closed = False
         self._close_reason = ""  # why the other end was closed, as that end has reported
         self._stamps: Stamps = np.zeros(size // FRAME_BYTES, np.int64)
@@ -189,7 +189,7 @@ class SharedBus:
                 self._wake_peer()
 
     def run_step(self) -> None:
-        """Request a step of the server, and wait until the step is complete. Frames that the server sends stay queued.
+        """Request a step from the server, and wait until the step is complete. Frames that the server sends stay queued.
 
         Only the client in lock-step may call this method.
 
@@ -246,7 +246,7 @@ class SharedBus:
         return peers[_SENT] != received
 
     def _request(self) -> int:
-        """Publish the sent frames, and request a step of the other end. Return the number of requests so far."""
+        """Publish the sent frames, and request a step from the other end. Return the number of requests so far."""
         self._own[_SENT] = self._sent
         self._own[_REQUESTED] = requested = self._own[_REQUESTED] + 1
         if self._peers[_SLEEPING]:

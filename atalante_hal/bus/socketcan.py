@@ -38,7 +38,7 @@ LINK_DOWN: Final = errno.ENETDOWN
 LINK_REMOVED: Final = (errno.ENODEV, errno.ENXIO)
 #: Shortest time between two attempts to open a removed interface again [s].
 REOPEN_PERIOD: Final = 0.1
-#: Largest number of batches of queued frames that are received and dropped when the link is lost.
+#: When the link is lost, at most this number of batches of queued frames is received and dropped.
 DROPPED_BATCHES: Final = 64
 NO_ROOM = (errno.ENOBUFS, errno.EAGAIN)
 
@@ -288,7 +288,7 @@ class SocketCanBus:
         return self._link_error(code) or BusError(f"{self.name} cannot send: {reason}")
 
     def _link_error(self, code: int) -> BusDown | None:
-        """Return the error for the error code of an interface that is down or removed, and drop its queued frames; else None."""
+        """Return a `BusDown` and drop the queued frames if the interface is down or removed. Return None for other codes."""
         if code != LINK_DOWN and code not in LINK_REMOVED:
             return None
         self._drop_queued()

@@ -134,7 +134,7 @@ class Dtc(StrEnum):
     GAIT_INVALID = "GAIT_INVALID", _R.NOT_READY, _S.ERROR, "the gait was rejected"
 
 
-#: Codes with the reaction HOLD with which the HAL can still control the robot for some more steps.
+#: Codes whose reaction is HOLD, although the HAL can still control the robot for some more steps.
 _CONTROLLABLE = frozenset(
     {
         Dtc.E2E_REPEAT_RATE,
@@ -146,7 +146,7 @@ _CONTROLLABLE = frozenset(
         Dtc.OVERRUN,
     }
 )
-#: Codes with the reaction HOLD that permit some more steps only if the affected node is not a drive.
+#: Codes whose reaction is HOLD. From a drive they permit no further step, from other nodes they permit some more steps.
 #: The walking controller bridges the loss of an IMU or of a foot until the robot stands.
 _CONTROLLABLE_WITHOUT_SENSOR = frozenset(
     {

@@ -42,7 +42,7 @@ LATENCY = 2
 #: Peak of the pulse as a multiple of `Robot.breakaway`, in the order of LEG_JOINTS. FH and SH move a whole leg.
 PEAK = (6.0, 3.0, 6.0, 3.0, 3.0, 3.0)
 #: Stiffness and damping of the HAL's position control in the test, relative to those of a drive, in the order of LEG_JOINTS.
-#: The HAL's position control has more delay than that of a drive, so its gains for light joints must be lower.
+#: The HAL's position control has more delay than that of a drive. So the HAL's gains for light joints must be lower.
 STIFFNESS = (1.0, 1.0, 1.25, 0.5, 0.25, 0.25)
 DAMPING = (0.5, 0.5, 0.6, 0.25, 0.25, 0.25)
 #: Integral time of the HAL's position control, which holds the legs during the test [s].
@@ -52,7 +52,7 @@ TRAVEL = math.radians(1.5)
 #: A foot is loaded if its mean force during a test exceeds `LOAD * cell_free`, which is four times the noise of the mean.
 LOAD = 1.0 / 3.0
 #: A foot hit the floor if the sum of its forces in two consecutive cycles exceeds `HIT * cell_free`.
-#: `HIT * cell_free` is four times the noise of the sum. An impact that stops an ankle has at least 1.5 times this limit.
+#: `HIT * cell_free` is four times the noise of the sum. An impact that stops an ankle is at least 1.5 times this limit.
 HIT = 2.0
 #: Factor of the torque pulse in the second test of a joint near its end stop. The leg weight may press the joint onto the stop.
 BOOST = 6.0

@@ -22,7 +22,7 @@ from atalante_hal.wire.cia402 import DriveState
 SPEED: Final = 0.5
 #: Longest time between two reversals of an oscillation [cycles].
 INTERVAL: Final = 100
-#: Number of consecutive reversals at which a joint oscillates.
+#: A joint is regarded as oscillating after this number of consecutive reversals.
 REVERSALS: Final = 6
 
 

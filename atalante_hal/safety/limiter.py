@@ -63,7 +63,8 @@ _COUNT = len(JOINTS)
 #: Number of cycles after which a change of the commanded torque is visible in the measured acceleration.
 DELAY: Final = 3
 #: Smallest inertia that the torque of a joint accelerates while all other joints are free, in leg joint order [kg m2].
-#: `SMALLEST_INERTIA` is a lower bound over all poses of the empty exoskeleton, suspended or floating; no gait depends on it.
+#: `SMALLEST_INERTIA` is a lower bound over all poses of the empty exoskeleton, suspended or floating.
+#: The bound does not depend on the gait.
 SMALLEST_INERTIA: Final = (0.12, 0.14, 0.17, 0.11, 0.038, 0.038)
 #: Results of `limit`: all torques are unchanged, the torque of at least one joint was reduced, an input is not finite.
 _UNCHANGED, _CUT, _NOT_FINITE = range(3)
@@ -87,9 +88,9 @@ class JointLimits(NamedTuple):
     position_min: Vector  # (12,) lowest position [rad]
     position_max: Vector  # (12,) highest position [rad]
     velocity_max: Vector  # (12,) highest velocity [rad/s]
-    look_ahead: float  # time for which the position is predicted, at constant velocity [s]
+    look_ahead: float  # prediction time of the position [s], at constant velocity
     position_margin: float  # distance outside a position limit at which the torque is zero [rad]
-    velocity_margin: float  # speed above `velocity_max` at which the torque is zero [rad/s]
+    velocity_margin: float  # excess over `velocity_max` at which the torque is zero [rad/s]
     inertia: Vector  # (12,) smallest effective inertia of each joint [kg m2]
     period: float  # duration of a cycle [s]
     filter_lag: float  # delay of the low-pass of the reported velocity [s]

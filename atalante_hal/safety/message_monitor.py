@@ -39,14 +39,14 @@ from atalante_hal.wire.process_image import NEVER, ReceiveImage
 #: Result of the E2E check of a rejected message -> diagnostic that becomes pending.
 PENDING = {
     Check.REPEATED: Dtc.E2E_REPEATED,
-    Check.CONFLICT: Dtc.E2E_REPEATED,  # if its message has no other frame in the cycle; otherwise see `rivals_of`
+    Check.CONFLICT: Dtc.E2E_REPEATED,  # if the message has no second frame in the cycle; otherwise see `rivals_of`
     Check.WRONG_SEQUENCE: Dtc.E2E_SEQUENCE,
     Check.CRC: Dtc.E2E_CRC,
     Check.LENGTH: Dtc.FRAME_LENGTH,
     Check.RANGE: Dtc.SIGNAL_RANGE,
     Check.INVALID: Dtc.SIGNAL_RANGE,
 }
-#: Diagnostic that is confirmed when a message times out, by the last check result of the message.
+#: Last check result of a message -> diagnostic that is confirmed when the message times out.
 CONFIRMED = {
     **PENDING,
     Check.OK: Dtc.NODE_LATE,
@@ -67,7 +67,7 @@ _DISTURBANCES = {
     Check.RANGE: Dtc.SIGNAL_RANGE,
     Check.INVALID: Dtc.SIGNAL_RANGE,
 }
-#: In a walk on the ground, HOLD follows when the age of the data of a joint reaches this multiple of the message timeout.
+#: In a walk on the ground, HOLD follows when the data age of a joint reaches this multiple of the message timeout.
 BRIEF_TIMEOUTS = 2
 
 

@@ -35,10 +35,10 @@ from atalante_hal.wire.e2e import SETTLED, Check, Qualification, qualify
 from atalante_hal.wire.frame import Frames
 from atalante_hal.wire.process_image import ReceiveImage
 
-#: Maximum duration of FINISH_STEP [cycles]. The rest of a step, a stop step and the weight shift back take less time.
+#: Maximum duration of FINISH_STEP [cycles]. The rest of a step, a stop step and the weight shift back together are shorter.
 FINISH_STEP_CYCLES = 6000
 
-#: If a drive has not reported QUICK STOP this time after the command QUICK_STOP [cycles], the command was lost.
+#: If a drive does not report QUICK STOP within this time [cycles] after the command QUICK_STOP, the command was lost.
 #: The answer to a command takes two cycles, and frames may be late by four cycles.
 RECALL_CYCLES = 6
 
@@ -126,7 +126,7 @@ class SafetyMonitor:
         self._steady = False
         self._reports: list[Finding] = []  # faults that loop and controller reported since the last `evaluate`
         self._acknowledged = False  # True if START was pressed in this cycle
-        #: Leaky bucket of each drive with a far lower torque limit than the same drive of the other leg; no entry: empty bucket.
+        #: Leaky bucket of each drive whose torque limit is far lower than in the other leg. No entry means an empty bucket.
         self._weak: dict[str, Qualification] = {}
         self._ending = False
         self._duplicate_found = False  # True if another HAL was detected while this HAL was in OFF or READY
@@ -177,7 +177,7 @@ class SafetyMonitor:
         return found
 
     def accept(self, frames: Frames) -> list[int]:
-        """Process all frames except the 1 ms messages to the HAL: status messages, emergencies and unknown frames.
+        """Process status messages, emergencies and unknown frames: all frames that are not 1 ms messages to the HAL.
 
         Args:
             frames: received frames, shape (n,).

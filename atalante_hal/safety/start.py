@@ -26,7 +26,7 @@ ENABLE_CYCLES = 200
 STALLED_CYCLES = 10
 #: Prefix of the event text for a refused START.
 REFUSED = "START refused: "
-#: End of the sentence with the reason for FINISH_STEP and the HOLD after it, if the operator ended a walk on the ground.
+#: When the operator ends a walk on the ground, the stated reason for FINISH_STEP and for the next HOLD ends with this text.
 WALK_ENDS = ", so the walk ends on both feet"
 _S = SupervisorState
 #: States in which START only acknowledges faults. An acknowledged fault may stay active for some cycles.

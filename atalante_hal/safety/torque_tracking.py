@@ -23,7 +23,7 @@ from atalante_hal.robot import JOINTS
 from atalante_hal.safety.diagnostics import Dtc, Finding
 from atalante_hal.types import Vector
 
-#: Number of cycles in which a sent torque counts: four lost commands, four late cycles, and four cycles for the drive's answer.
+#: A drive may report a sent torque up to this number of cycles later: 4 lost commands, 4 late cycles, 4 cycles for its answer.
 SPAN: Final = 12
 #: Largest distance of a reported torque from the range of the sent torques, relative to the breakaway torque of the joint.
 TOLERANCE: Final = 0.2

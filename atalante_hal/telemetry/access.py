@@ -33,7 +33,7 @@ class AccessError(RuntimeError):
 class Access:
     """Files that restrict the access to the endpoint. Without these files, every client may subscribe."""
 
-    certificate: Path | None = None  # PEM certificate of the publisher; the endpoint uses TLS only if it is given
+    certificate: Path | None = None  # PEM certificate of the publisher; the endpoint uses TLS only with a certificate
     private_key: Path | None = None  # PEM private key of the publisher; only the owner of the file may have access
     client_ca: Path | None = None  # PEM certificate of the authority that signs the certificates of the subscribers
     users: Path | None = None  # file of lines "name:password", one per user; only the owner of the file may have access

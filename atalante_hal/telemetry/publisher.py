@@ -26,7 +26,7 @@ from atalante_hal.telemetry.schema import encoding
 from atalante_hal.telemetry.sink import EVENTS, SinkError
 
 DEFAULT_HOST, DEFAULT_PORT = "127.0.0.1", 7447
-#: Number of ports that are tried if no endpoint is configured, so that several demos can run on one machine.
+#: If no endpoint is configured, this number of ports is tried. So several demos can run on one machine.
 PORTS_TRIED = 16
 #: Number of events cached for late subscribers.
 EVENTS_KEPT = 256
@@ -105,7 +105,7 @@ class Publisher(Closing):
         self.messages += 1
 
     def begin_run(self, number: int, about: Mapping[str, object]) -> None:
-        """Do nothing at the begin of a run, because every `SystemState` message contains the number of the run.
+        """Do nothing when a run begins, because every `SystemState` message contains the number of the run.
 
         Args:
             number: Ignored.

@@ -181,7 +181,7 @@ GOOD_CYCLE = 1
 FULL = 64
 #: Number of consecutive good cycles after which a message is trusted. Until then the inputs of a pendant are ignored.
 REQUALIFY = 16
-#: Increase of the counter that detects two senders (see `suspect`) in a cycle with frames of two senders; a quarter of `FULL`.
+#: In a cycle with frames of two senders, the counter of `suspect` rises by this number, a quarter of `FULL`.
 RIVAL_CYCLE = 16
 
 
@@ -217,7 +217,7 @@ def qualify(before: Qualification, *, good: bool, timed_out: bool = False) -> Qu
 
 
 def suspect(evidence: int, *, rival: bool) -> int:
-    """Return the new value of the counter that detects two senders of one message, at the end of a cycle.
+    """Return the counter that detects two senders of one message, as updated at the end of a cycle.
 
     Args:
         evidence: counter after the previous cycle, 0 to `FULL`.

@@ -67,7 +67,8 @@ _FOREIGN = -1
 NEVER = 1 << 30
 #: Lowest age at which an answer to a SYNC is rejected as replayed [cycles].
 LATEST = 16
-#: A frame whose counter is ahead of the expected counter by half a counter period or more is regarded as old, except after a gap.
+#: Half a counter period. A frame is regarded as old if its counter is at least this far ahead of the expected counter.
+#: After a gap of this number of cycles, a counter does not show whether a frame is old.
 _HALF_TURN = 128
 
 
@@ -200,7 +201,7 @@ class ReceiveImage:
         return self.accept_each(frames, count, tag)
 
     def refuse(self, row: int) -> None:
-        """Reject a row that `accept` just committed, because its values are implausible: restore its previous values and age.
+        """Reject a row whose values are implausible after `accept` committed them: restore the previous values and age.
 
         Args:
             row: row of the message; its age becomes one cycle more than before `accept`.
@@ -538,7 +539,7 @@ class TransmitImage:
         rows = len(self.codec.messages)
         self._counters: Words = np.zeros(rows, np.int64)
         self._singles = [self.frames[row : row + 1] for row in range(rows)]
-        # `specialised` calls each function once, which leaves every alive counter at 0xFF. So the first sent frame has counter 0.
+        # `specialised` calls each function once. These calls leave every alive counter at 0xFF, so the first frame has 0.
         self._protect = specialised(protect, self._octets, self._spans, self._counters)
         self._seal = specialised(seal, self.values, self.codec.table, self._words, self._spans, self._counters, 0xFF)
 

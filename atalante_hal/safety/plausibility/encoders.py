@@ -36,7 +36,7 @@ from atalante_hal.wire.process_image import NEVER
 
 #: Number of consecutive jumps after which the diagnostic is confirmed.
 JUMPS_TO_CONFIRM = 5
-#: Number of consecutive values above the top speed after which the overspeed is confirmed. A single one may be a small jump.
+#: Overspeed is confirmed after this number of consecutive values above the top speed. One fast value may be a small jump.
 OVERSPEED_TO_CONFIRM = 2
 #: Number of consecutive wrong velocities after which the diagnostic is raised.
 VELOCITY_SAMPLES = 3
@@ -77,7 +77,7 @@ class EncoderChecks:
         self.jumps = [0] * len(JOINTS)
         self._jump_of: dict[int, float] = {}  # size of the last jump of the encoder, by joint index [rad]
         self._lost: dict[int, Lost] = {}
-        #: Velocity [rad/s], and number of consecutive values above the top speed, of each joint that is too fast, by joint index.
+        #: Joints that are too fast: joint index -> velocity [rad/s], number of consecutive values above the top speed.
         self.too_fast: dict[int, tuple[float, int]] = {}
         self._top_speed = robot.top_speed
         #: Position of each joint that is outside its range, by joint index [rad].

@@ -125,7 +125,7 @@ def largest(readings: Vector) -> float:
 
 
 def _end_of_range(codec: Codec, name: str) -> float:
-    """Return the reading at and above which an IMU signal is saturated: maximum of the signal minus half its resolution."""
+    """Return the smallest reading of a saturated IMU signal: maximum of the signal minus half of its resolution."""
     signal = next(signal for _, signal in codec.signals if signal.name == name)
     return signal.maximum - 0.5 * signal.factor
 

@@ -42,7 +42,7 @@ from atalante_hal.wire.process_image import NEVER
 DRIFT_SAMPLES = 4
 #: Number of consecutive samples after which a stuck encoder is reported.
 STANDSTILL_SAMPLES = 2
-#: Largest drift of the IMUs per sample that the standstill check tolerates [rad]; more than 10 times the drift without a fault.
+#: The standstill check tolerates this drift of the IMUs per sample [rad]. Intact IMUs drift less than a tenth as much.
 _IMU_DRIFT = 2e-5
 #: Largest change per sample of the estimated heading drift between pelvis IMU and tibia IMU [rad].
 #: A leg is sampled every 32 cycles, so this limit corresponds to 3e-4 rad/s.
@@ -62,7 +62,7 @@ class _Comparison(NamedTuple):
 
     angles: tuple[float, float, float]  # leg angles from the IMUs: FH, TH and the sum SH + SK [rad]
     errors: tuple[float, float, float]  # encoder angles minus IMU angles [rad]
-    uncertainty: float = 0.0  # largest part of `errors` due to encoder and IMU values of different cycles [rad]
+    uncertainty: float = 0.0  # largest error [rad] that arises if encoder and IMU values are from different cycles
 
 
 class Legs:

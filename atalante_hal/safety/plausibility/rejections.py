@@ -22,7 +22,7 @@ _NODES = (*JOINT_NODES, *IMU_NODES)
 
 
 class Rejections:
-    """Leaky bucket of each sensor. A sensor is the index of a joint, or the number of joints plus the index of an IMU."""
+    """Leaky bucket of each sensor. A sensor index is a joint index, or the number of joints plus an IMU index."""
 
     def __init__(self) -> None:
         #: Bucket and last diagnostic of each sensor, by sensor index. A sensor without an entry has an empty bucket.

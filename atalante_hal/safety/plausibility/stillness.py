@@ -46,7 +46,7 @@ from atalante_hal.wire.process_image import NEVER, ReceiveImage
 STUCK_CYCLES = 50
 #: Longest time from the first repeated reading of a gyro or force cell to its detection as frozen [cycles].
 FROZEN_CYCLES = 100
-#: If a shank turns by this angle above a loaded foot, the readings of the ankle encoders must change [rad].
+#: If a shank turns by this angle [rad] above a loaded foot, the readings of the ankle encoders must change.
 _TURN = 0.01
 #: Upper bound of the inertia about any joint [kg m2], including the knee of a leg that carries robot and patient.
 _INERTIA = 100.0
@@ -54,13 +54,13 @@ _INERTIA = 100.0
 _AT_REST = 3
 #: Angle after which the encoder reading of a turning joint must have changed [rad]: 20 counts of a motor encoder.
 _DRIVEN = 1e-5
-#: A joint closer to a position limit than this distance is regarded as being at its end stop [rad].
+#: A joint whose distance to a position limit is below this angle [rad] is regarded as being at its end stop.
 _AT_STOP = 0.005
 _NEVER = 1 << 30
 #: Indices of the ankles in JOINTS, and for each ankle the index of its foot in FEET and of its shank IMU in IMUS.
 _ANKLES = [JOINTS.index(f"{side}_{joint}") for side in SIDES for joint in ("SA", "HA")]
 _FOOT_OF = [0, 0, 1, 1]
-#: For each joint: index in FEET of the foot that stops its motion when the foot is on the ground; -1 for joints above the ankle.
+#: For each ankle joint: index in FEET of the foot that stops the joint when the foot is on the ground; -1 for other joints.
 _HELD_BY = tuple(_FOOT_OF[_ANKLES.index(joint)] if joint in _ANKLES else -1 for joint in range(len(JOINTS)))
 _SHANK_OF = [IMUS.index(f"{side}_tibia") for side in SIDES for _ in ("SA", "HA")]
 
@@ -81,7 +81,7 @@ class Drive(NamedTuple):
     """
 
     cycles: Vector  # number of cycles since the encoder reading last changed
-    rest: Vector  # torque that held the joint when it came to rest [Nm], at the end of the first `_AT_REST` cycles
+    rest: Vector  # torque [Nm] after the first `_AT_REST` cycles, when the joint came to rest
     low: Vector  # lowest torque [Nm]
     high: Vector  # highest torque [Nm]
     momentum: Vector  # angular momentum that the torque would cause [Nm s]
@@ -129,7 +129,7 @@ class Stillness:
         )
         self._encoders_same, self._no_encoder = self._same[codec.slice("Position")], bytes(len(JOINTS))
         self._breakaway = robot.breakaway
-        self._loaded = 2.0 * robot.sensors.cell_free  # a foot with more than this vertical force is on the ground [N]
+        self._loaded = 2.0 * robot.sensors.cell_free  # a foot with more than this vertical force [N] is on the ground
         self._interval = every * period
         self._drive = Drive(*np.zeros((6, len(JOINTS))))
         #: Joints with a constant encoder reading despite a large torque, see the module docstring.
@@ -142,7 +142,7 @@ class Stillness:
         self._follow = specialised(follow, *self._readings)
         for joint in range(len(JOINTS)):
             release(self._drive, joint)
-        #: Turn of the shank since the reading of each ankle encoder last changed, while its foot is loaded, shape (4, 3) [rad].
+        #: For each ankle of a loaded foot: turn of the shank since the encoder reading last changed, shape (4, 3) [rad].
         self._turn = np.zeros((len(_ANKLES), 3))
         self._to_joint: Vector = robot.polarity / robot.gear
         self._low_stop, self._high_stop = robot.position_min + _AT_STOP, robot.position_max - _AT_STOP
