@@ -56,7 +56,7 @@ class GaitReference:
         self._basis[0, :, :_N], self._basis[0, :, _N:] = c0[:end, None], c0d[:end, None]
         self._basis[1, :, :_N], self._basis[1, :, _N:] = c1[:end, None], c1d[:end, None]
         self._added = np.zeros_like(self._basis)
-        # `_angles` contains s(0) twice and `_rates` s'(0) twice: for the added angles s, then for the added speeds s'.
+        # `_angles` contains s(0) twice, for the added angles s and the added speeds s'. `_rates` contains s'(0) twice.
         self._angles, self._rates = np.zeros(2 * _N), np.zeros(2 * _N)
 
     def start_step(self, stance: int, position: Vector, velocity: Vector) -> Deviation:

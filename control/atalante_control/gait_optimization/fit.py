@@ -34,7 +34,7 @@ from atalante_hal.types import Vector
 HIDDEN = (64, 64)
 ITERATIONS = 1500  # largest number of L-BFGS iterations
 RESOLUTION = math.radians(0.003)  # rad, largest rms error caused by the principal directions that are left out
-JUMP_KEPT = 0.4  # fraction of the speed jump of each gait at the stance change that the fit keeps
+JUMP_KEPT = 0.4  # the fit keeps this fraction of the speed jump that each gait has at the stance change
 END_WEIGHT = 40.0  # weight of the samples at start and end of a step; the other samples have weight 1
 ACCELERATION_WEIGHT = 5e-2  # s2, weight of an acceleration error [rad/s2] relative to an angle error [rad]
 #: Root mean square of the learnt coordinates after scaling. L-BFGS stops if an iteration reduces the squared error by less than

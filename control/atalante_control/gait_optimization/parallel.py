@@ -18,7 +18,7 @@ _Task = TypeVar("_Task")
 _Result = TypeVar("_Result")
 #: Timeout of the connection to a dask scheduler.
 _CONNECT_TIMEOUT: Final = "10s"
-#: Number of unexpected ends of a process after which each further call gets processes of its own.
+#: After this number of unexpected ends of a process, each further call gets processes of its own.
 #: If each call has processes of its own, only the calls that end their process have no result.
 _SHARED_LOSSES: Final = 3
 _REMEDY: Final = "repeat the command, if necessary with fewer --jobs"

@@ -162,7 +162,7 @@ def responses(policy: BackupPolicy, loop: SampledLoop, mobility: float, cycles: 
 
 
 def _powers(a: Vector, b: Vector, outputs: Vector, cycles: int) -> tuple[Vector, Vector]:
-    """Return the free response C A^n and the impulse response C A^(n-1) b for n from 0 to `cycles`; the latter is 0 at n = 0.
+    """Return the free response C A^n and the impulse response C A^(n-1) b (0 at n = 0) for n from 0 to `cycles`.
 
     Args:
         a: matrix A, shape (m, m).

@@ -138,7 +138,7 @@ class PromiseLimits:
         return sorted(found, key=lambda limit: limit.scale)
 
     def largest(self, xi: float) -> float:
-        """Return the largest disturbance torques that can be certified, as a multiple of the requested ones; at most 0 if none.
+        """Return the largest certifiable disturbance torques as a multiple of the requested torques; at most 0 if none.
 
         Args:
             xi: assistance factor in [0, 1].
@@ -189,7 +189,7 @@ def _limit(room: Vector, reach: Vector, steps: int, what: str) -> Limit:
 
 
 class _Horizon:
-    """Condition on the requested torques, times a factor: one cycle after the prediction ends, the error is within the guide.
+    """Condition on a multiple of the requested torques: one cycle after the prediction, the error is within the guide.
 
     At the end of the horizon, fast motions have decayed. The error one cycle beyond the horizon is therefore the error at the
     end of the horizon times a factor, plus a remainder. The remainder is a linear combination of the errors in two earlier
@@ -206,7 +206,7 @@ class _Horizon:
         beyond = prediction.beyond * SIZES
         self._factor = (beyond * rows[-1]).sum(axis=1) / (rows[-1] ** 2).sum(axis=1)
         remainder = beyond - self._factor[:, None] * rows[-1]
-        #: two predicted cycles, as numbers of cycles after the start, and the weights of their errors in the remainder
+        #: two predicted cycles (counted from the start), and the weight of the error of each of them in the remainder
         self._pairs: list[tuple[tuple[int, int], Vector]] = []
         for near, far in ((0.1, 0.3), (0.25, 0.5), (0.4, 0.7)):
             lags = round(near * self.cycles), round(far * self.cycles)

@@ -175,7 +175,7 @@ class GuideFilter:
         return self.tables.guards[0].state.copy()
 
     def errors_ahead(self) -> Vector:
-        """Return the tracking errors of hip and knee predicted in the last cycle without disturbance, shape (n, 2) [rad]."""
+        """Return the tracking errors of hip and knee that the last cycle predicted for no disturbance, shape (n, 2) [rad]."""
         return np.asarray(self.prediction.ahead @ (self.prediction.compress @ self.state))
 
     def uncertainty(self) -> Vector:
@@ -196,7 +196,7 @@ class GuideFilter:
 
 
 def tail(inverse: Vector) -> Vector:
-    """Return 1 / width of the narrowest guide between each cycle and `TAIL_CYCLES` cycles later, increased by a margin.
+    """Return for each cycle 1 / width at the narrowest point within the next `TAIL_CYCLES` cycles, plus a margin.
 
     Args:
         inverse: 1 / distance to the guide for each cycle, shape (n, m) [1/rad].

@@ -17,12 +17,12 @@ from atalante_hal.types import Vector
 
 Pair = tuple[float, float]
 
-#: The kernel uses 1 - STEEPNESS * (1 - x) instead of a ratio x = torque / limit or x = speed / limit. Both are 1 at the limit.
+#: The kernel converts a ratio x = torque / limit or x = speed / limit to 1 - STEEPNESS * (1 - x), which is 1 at x = 1.
 #: The gait alone needs most of the allowed torque and speed, so the gate must rise only close to the limits of torque and speed.
 STEEPNESS = 4.0
 #: Number of elements of the compressed state, from which the predicted errors are computed.
 COMPRESSED = 5
-#: Number of consecutive predicted cycles that share one bound in `Block.slack` of the effect of model errors.
+#: Number of consecutive predicted cycles for which `Block.slack` has one common bound of the effect of model errors.
 SLACK_CYCLES = 10
 #: Number of start cycles in a block. Predictions that start in the same block use the same row of `GuideTables.reach`.
 START_CYCLES = 4

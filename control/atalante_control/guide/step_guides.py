@@ -26,9 +26,9 @@ from atalante_hal.types import Vector
 _MIDDLE = math.radians(30.0)
 #: Indices of SH and SK of the left leg. SH and SK have the same limits in both legs.
 _ASSISTED = [LEG_JOINTS.index("SH"), LEG_JOINTS.index("SK")]
-#: Largest half-width of a guide, at assistance factor 0 [rad], see `half_width`.
+#: Largest half-width of a guide [rad]. It applies at assistance factor 0, see `half_width`.
 _WIDEST = math.radians(7.5)
-#: Fraction of the largest possible disturbance torques that is certified if no filter withstands the requested torques.
+#: If no filter withstands the requested torques, this fraction of the largest possible torques is certified.
 #: With the fraction 1, the backup torque would have weight 1 even without a disturbance.
 _USED = 0.95
 #: Number of decimal digits to which the assistance factor is rounded; the CAN signal has the same resolution.
@@ -36,7 +36,7 @@ _DIGITS = 4
 
 
 class Choice(NamedTuple):
-    """Guide filter of a step, and the disturbance torques for which it is certified, as a fraction of the requested ones."""
+    """Guide filter of a step, and its certified disturbance torques as a fraction of the requested torques."""
 
     guide: GuideFilter
     promise: float
@@ -83,7 +83,7 @@ class StepGuides:
             self.at(percent / 100)
 
     def at(self, xi: float) -> Choice:
-        """Return the softest filter that withstands the requested disturbance torques, or else the one that withstands most.
+        """Return the softest filter that withstands the requested disturbance torques, or else the filter that withstands most.
 
         Args:
             xi: assistance factor in [0, 1].

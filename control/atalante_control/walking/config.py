@@ -72,9 +72,9 @@ class WalkConfig:
     #: With the smaller value `alpha`, the re-centring of the heavy leg would need more torque than the drives have.
     #: All other joints use `alpha`, because the robot would fall if they were re-centred as slowly as sagittal hip and knee.
     guided_alpha: float = 0.5
-    #: s, time after the start of a guided step in which the smallest allowed weight of the backup torque falls from 1 to 0
+    #: s, first part of a guided step, in which the smallest allowed weight of the backup torque falls from 1 to 0
     engage: float = 0.02
-    release: float = 0.03  # s, time after a guided step in which the baseline takes over sagittal hip and knee
+    release: float = 0.03  # s, after a guided step, the baseline takes over sagittal hip and knee within this time
 
     @classmethod
     def literal(cls) -> WalkConfig:

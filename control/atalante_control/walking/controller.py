@@ -58,7 +58,7 @@ from atalante_hal.types import Command, State, SupervisorState, Vector
 _N, _LEG = len(JOINTS), len(LEG_JOINTS)
 _SH, _SK = LEG_JOINTS.index("SH"), LEG_JOINTS.index("SK")
 _PELVIS, _TORSO = IMUS.index("pelvis"), IMUS.index("torso")
-#: Smallest distance from its position limits to which foot placement may move a joint of the swing leg [rad].
+#: Foot placement keeps each joint of the swing leg at least this angle [rad] away from its position limits.
 _MARGIN = math.radians(1.0)
 #: Largest valid age of the message of an IMU or a foot [cycles], equal to the timeout of these messages in the DBC.
 _SENSOR_AGE = 10

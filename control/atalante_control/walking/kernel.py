@@ -82,7 +82,7 @@ class Sensed:
     """Results of the first half of a cycle, `sense`: loads, kinematics, attitude."""
 
     load: Annotated[Vector, 2]  # N, filtered vertical force on the left and the right foot
-    #: N, the smaller of filtered and unfiltered vertical force, which drops without delay when a foot leaves the ground
+    #: N, the smaller of filtered and unfiltered vertical force. It drops without delay when a foot leaves the ground.
     bearing: Annotated[Vector, 2]
     heading: Annotated[Vector, 2]  # rad, heading of each foot without the toe-out
     step: Annotated[Vector, 3]  # m, position of the right sole relative to the left sole, world axes
@@ -204,7 +204,7 @@ def _velocity(point: Vector, sole: Vector, sole_velocity: Vector, gyro: Vector) 
 
 
 def start(measured: Measured, table: PhaseTable, parts: Parts) -> None:
-    """Store the deviations of the measured motion at the start of a phase, from which the re-centring starts.
+    """Store the deviations of the measured motion at the start of a phase. The re-centring starts from these deviations.
 
     Args:
         measured: measurements of the cycle.
@@ -329,7 +329,7 @@ def _assist(cycle: int, measured: Measured, assistance: Assistance, parts: Parts
 
 
 def _place(cycle: int, table: PhaseTable, config: PlacementConfig, gain: float, parts: Parts) -> None:
-    """Update the offset of the landing and the phase rate, and shift the desired position of the swing foot.
+    """Update the phase rate and the offset of the landing, and shift the desired position of the swing foot.
 
     Args:
         cycle: cycles since the start of the phase.

@@ -35,7 +35,7 @@ _FH, _SH, _SK = (LEG_JOINTS.index(name) for name in ("FH", "SH", "SK"))
 _SHIFTING = (_FH, _SH, _SK)
 #: Number of joints from the pelvis to the ankle.
 _LINKS = LEG_JOINTS.index("SA") + 1
-#: m3, determinant of the ankle Jacobian below which the foot is not shifted further; a straight leg has determinant 0
+#: m3, smallest determinant of the ankle Jacobian with which the foot is shifted further; a straight leg has determinant 0
 _SINGULAR = 1e-3
 _FASTEST = 3.0  # rad/s, largest desired speed of a joint that shifts the foot
 
@@ -43,19 +43,19 @@ _FASTEST = 3.0  # rad/s, largest desired speed of a joint that shifts the foot
 class PlacementConfig(NamedTuple):
     """Parameters of foot placement and step timing."""
 
-    #: m, up to this predicted DCM error at the landing, the foot placement does not change; infinity: no placement and no timing
+    #: m, largest predicted DCM error at the landing that is ignored; infinity switches placement and timing off
     dead_zone: float = 0.015
     forward: float = 0.15  # m, largest offset of a landing forwards and backwards
     outward: float = 0.16  # m, largest offset of a landing away from the stance foot
     inward: float = 0.02  # m, largest offset of a landing towards the stance foot
     slowest: float = 0.5  # smallest phase rate
     fastest: float = 1.4  # largest phase rate
-    #: s, time after the start of a step in which the DCM error is ignored, because the new stance foot is not yet at rest
+    #: s, first part of a step, in which the DCM error is ignored, because the new stance foot is not yet at rest
     settled: float = 0.08
-    #: s, time before the nominal landing in which the phase rate returns to 1; `late_landing` then gives the offset
+    #: s, last time span before the nominal landing: the phase rate returns to 1, and `late_landing` gives the offset
     frozen: float = 0.05
     #: m, largest DCM error (forward, sideways) whose growth the ankle stabiliser can stop, as measured.
-    #: These errors are smaller than the limits of the stabiliser, because the PIDs of the stance leg act against its shift.
+    #: These errors are smaller than the limits of the stabiliser, because the PIDs of the stance leg act against the shift.
     capacity: Pair = (0.10, 0.044)
     bandwidth: float = 25.0  # rad/s, natural frequency of the critically damped filter of the landing offset
     speed: float = 1.2  # m/s, largest rate of change of the landing offset
@@ -247,6 +247,6 @@ def _ankle(placement: Placement, links: Records[Link], first: int, desired: Vect
 
 
 def _column(placement: Placement, ankle: Vector3, joint: int) -> Vector3:
-    """Return the velocity of the ankle at a unit speed of a joint of the leg [m]."""
+    """Return the derivative of the ankle position with respect to the angle of a leg joint [m]."""
     origin = placement.origin[joint]
     return cross(placement.axis[joint], (ankle[0] - origin[0], ankle[1] - origin[1], ankle[2] - origin[2]))
