@@ -53,7 +53,7 @@ class DriveParameters:
     supply: float = 48.0  # nominal supply voltage [V]
     hold_below: float = 40.0  # supply voltage below which a drive starts its local hold [V]
     jump_speed: float = (
-        20.0  # highest plausible joint speed from two samples; a faster change is an encoder error [rad/s]
+        20.0  # highest plausible joint speed from two samples [rad/s]; a faster change is an encoder error
     )
     off_below: float = 20.0  # lowest supply voltage at which the power stage works [V]
     rest_speed: float = 0.05  # joint speed below which the controlled lowering of a leg ends [rad/s]
