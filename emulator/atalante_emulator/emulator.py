@@ -356,7 +356,7 @@ class Emulator:
                 self.drives.hold(leg, TWO_SENDERS)
 
     def _cycle_without_sync(self) -> bool:
-        """Run a cycle without answers if an injected fault removed the SYNC. Return whether a cycle was run."""
+        """If an injected fault removed the SYNC, run a cycle in which no node answers. Return whether a cycle was run."""
         lost = self._link is not None and self._link.synced
         if lost:
             for leg in range(len(SIDES)):

@@ -76,7 +76,7 @@ class Mechanics:
         return body
 
     def complete(self, emulator: Emulator) -> None:
-        """Add wearer, crane and virtual operator to the emulator. Skip those that the description does not contain.
+        """Add wearer, crane and virtual operator to the emulator, if the description contains them.
 
         Args:
             emulator: emulator with the body of `make_body`.

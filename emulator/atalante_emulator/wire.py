@@ -58,7 +58,7 @@ class Wire:
 
     @property
     def idle(self) -> bool:
-        """Whether no flood is active and no frame waits for the bus."""
+        """True if no flood is active and no frame waits for the bus."""
         return not (self._babbles or self._from_hal or self._from_nodes)
 
     def load(self, bus: str) -> float:

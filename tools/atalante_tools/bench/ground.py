@@ -14,7 +14,7 @@ from atalante_hal.robot import load_robot
 from atalante_tools.bench.measure import Block, Effort, Measurement, require
 from atalante_tools.session.body import describe, no_banner
 
-#: Joint angles of a standing pose with level soles below the centre of mass [rad].
+#: Joint angles of a standing pose [rad]. The soles are level and below the centre of mass.
 _STANDING: Final = np.array([0.0, 0.0, -0.2, 0.45, -0.25, 0.0] * 2)
 #: Stiffness [Nm/rad] and damping [Nm s/rad] with which the joints hold the standing pose.
 _KP: Final = np.array([9000, 4000, 6000, 6000, 4000, 2500] * 2)

@@ -1,4 +1,4 @@
-"""Benchmarks of the guide filter, the emulator, and the whole stack on the suspended robot and on the ground."""
+"""Benchmarks of the guide filter, the emulator, and the whole stack. The robot is suspended or walks on the ground."""
 
 from __future__ import annotations
 

@@ -29,7 +29,7 @@ class Family:
 
     @property
     def length(self) -> int:
-        """Return the payload length of the messages, bytes."""
+        """Return the payload length of the messages [bytes]."""
         return self.codec.layout.length
 
 

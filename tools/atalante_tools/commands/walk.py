@@ -67,7 +67,7 @@ def _protocol(_ctx: click.Context, _param: click.Parameter, text: str | None) ->
     "--protocol",
     callback=_protocol,
     metavar="A,B,C",
-    help="Numbers of steps: A with full assistance, B in which Xi falls to --xi, and C with --xi. Replaces --steps.",
+    help="A steps with full assistance, then B steps in which Xi falls to --xi, then C steps with --xi. Replaces --steps.",
 )
 @click.option(
     "--wearer",

@@ -86,7 +86,7 @@ def run_host_test(build: Build, program: Path, images: int, seed: int) -> int:
 
 
 def makefile(build: Build) -> str:
-    """Return a Makefile that compiles the host test and runs it on the file of test vectors, without Python."""
+    """Return a Makefile that compiles the host test and runs the test on the file of test vectors. Python is not needed."""
     sources = " ".join(_sources(build))
     return f"""\
 # `make test` compares the generated C code with the test vectors of the Python codec, with sanitizers.

@@ -102,7 +102,7 @@ class Extremes:
 
     speed: Extreme  # joint velocity as a share of its limit
     torque_step: Extreme  # change of the commanded torque in one cycle [Nm]
-    sag: Extreme  # motion between START and the end of the start [deg]
+    sag: Extreme  # motion from START to ACTIVE, or in the first `_SETTLED` cycles [deg]
     lost: Extreme  # motion since the first cycle in HOLD or a more severe state [deg]
 
 

@@ -60,7 +60,7 @@ class CheckOptions:
     law: Law  # control law of the assisted joints
 
     def effort(self) -> Effort:
-        """Return the numbers of steps for each guide, and whether to search for the smallest push that leaves the guide."""
+        """Return the numbers of steps for each guide, and whether to search for the smallest push that moves a joint out."""
         from atalante_tools.guide.promise_check import COMPLETE, QUICK
 
         effort = QUICK if self.quick else COMPLETE
@@ -70,7 +70,7 @@ class CheckOptions:
         )
 
     def task(self) -> dict[str, Any]:
-        """Return the options that affect the verdict of each guide. They are stored in the file of the results."""
+        """Return the options that affect the verdict of each guide. The file of the results stores these options."""
         return {
             "conditions": self.conditions,
             "effort": asdict(self.effort()),
@@ -263,7 +263,7 @@ def verdicts_table(verdicts: Sequence[Verdict]) -> str:
 @command.command(name="random", short_help="Search for pushes that move a joint out of a random guide.")
 @click.option("--count", type=click.IntRange(1), default=300, show_default=True, metavar="N", help="Number of shapes.")
 @click.option(
-    "--first", type=click.IntRange(0), default=0, show_default=True, metavar="N", help="Number of the first shape."
+    "--first", type=click.IntRange(0), default=0, show_default=True, metavar="N", help="Index of the first shape."
 )
 @click.option(
     "--steps",

@@ -45,7 +45,7 @@ LOG = (
 )
 #: Number of features that the direction of a push can depend on: e / q_bound of hip and knee, then e' / `RATE` of hip and knee.
 FEATURES = 4
-#: Speed by which the rates e' are divided in the features [rad/s].
+#: The features contain the rates e' divided by this speed [rad/s].
 RATE = 0.5
 
 
@@ -59,18 +59,18 @@ class Push(NamedTuple):
 class Start(NamedTuple):
     """State of the leg at the stance change."""
 
-    deviation: Pair  # rad, q - q_nom of SH and SK
-    rate: Pair  # rad/s, q' - q_nom' of SH and SK
-    carried: Pair  # Nm, torque before the stance change minus the torque that the nominal motion needs
-    ahead: Pair  # rad/s, true minus measured speed of SH and SK, due to the lag of the velocity filter
+    deviation: Pair  # q - q_nom of SH and SK [rad]
+    rate: Pair  # q' - q_nom' of SH and SK [rad/s]
+    carried: Pair  # torque before the stance change minus the torque that the nominal motion needs [Nm]
+    ahead: Pair  # true minus measured speed of SH and SK [rad/s], due to the lag of the velocity filter
 
 
 class Goal(NamedTuple):
     """Desired motion of the plant, and the guide around this motion."""
 
-    q: Vector  # (cycles + 1, 2) rad, q_des
-    qd: Vector  # (cycles + 1, 2) rad/s, q_des'
-    bounds: Vector  # (2, cycles + 1, 2) rad, distance from q_des to the upper and to the lower edge of the guide
+    q: Vector  # q_des [rad], shape (cycles + 1, 2)
+    qd: Vector  # q_des' [rad/s], shape (cycles + 1, 2)
+    bounds: Vector  # distances from q_des to the upper and lower edge of the guide [rad], shape (2, cycles + 1, 2)
 
 
 class Walked(NamedTuple):
@@ -79,7 +79,7 @@ class Walked(NamedTuple):
     ratio: float  # largest |e| / q_bound
     cycle: int  # cycle with the largest ratio
     joint: int  # joint with the largest ratio |e| / q_bound: 0 for the hip, 1 for the knee
-    log: Vector  # (cycles + 1, len(LOG)), values of each cycle; zero after the end of the step
+    log: Vector  # values of each cycle, zero after the end of the step, shape (cycles + 1, len(LOG))
 
 
 @dataclass(frozen=True)
@@ -206,11 +206,11 @@ class Episode(NamedTuple):
     plant: Plant
     goal: Goal
     push: Push
-    box: Vector  # (2,) Nm, largest push at hip and knee
-    noise: Vector  # (cycles + 1, 4) random numbers from `noise_of`
-    before: Vector  # (2,) Nm, torque before the stance change
-    other: Vector  # (24,) angles [rad], then speeds [rad/s] of all joints; values of hip and knee are not used
-    log: Vector  # (cycles + 1, len(LOG)) values of each cycle, overwritten by `walk_step`
+    box: Vector  # largest push at hip and knee [Nm], shape (2,)
+    noise: Vector  # random numbers from `noise_of`, shape (cycles + 1, 4)
+    before: Vector  # torque before the stance change [Nm], shape (2,)
+    other: Vector  # angles [rad], then speeds [rad/s] of all joints, shape (24,); hip and knee are not used
+    log: Vector  # values of each cycle, overwritten by `walk_step`, shape (cycles + 1, len(LOG))
 
 
 def noise_of(cycles: int, condition: Condition, generator: np.random.Generator) -> Vector:

@@ -49,7 +49,7 @@ class Condition:
     delay: int = 0  # additional cycles until a command acts
 
     def __str__(self) -> str:
-        """Return the deviations as text, for example "friction +20 %, 1 ms delay"; "as modelled" without a deviation."""
+        """Return the deviations as text, for example "friction +20 %, 1 ms delay". The text for no deviation is "as modelled"."""
         parts = [f"{name} {100.0 * (getattr(self, name) - 1.0):+.0f} %" for name in ("friction", "mass")
                  if getattr(self, name) != 1.0]  # fmt: skip
         parts += [f"encoder noise {self.noise:g} rad"] * (self.noise > 0.0)
@@ -62,18 +62,19 @@ class Condition:
 class Plant(NamedTuple):
     """Constants of the plant, for compiled functions. Index 0 is the hip, index 1 the knee."""
 
-    mass: Vector  # (3, 3) kg m2, rows: M11, M12, M22; columns: coefficients of 1, cos q_SK, sin q_SK
-    #: (2, 4) Nm, gravity torques of hip and knee (rows): coefficients of cos and sin of q_SH, cos and sin of q_SH + q_SK.
+    #: Mass matrix [kg m2], shape (3, 3). Rows: M11, M12, M22. Columns: coefficients of 1, cos q_SK, sin q_SK.
+    mass: Vector
+    #: Gravity torques [Nm], shape (2, 4). Rows: hip, knee. Columns: coefficients of cos and sin of q_SH, then of q_SH + q_SK.
     weight: Vector
-    coulomb: Vector  # (2,) Nm, dry friction
-    viscous: Vector  # (2,) Nm s/rad, viscous friction
-    friction_speed: float  # rad/s, speed at which dry friction reaches 76 % of its full value
-    tracking: float  # share of the difference between command and motor torque that the motor removes in a cycle
+    coulomb: Vector  # dry friction [Nm], shape (2,)
+    viscous: Vector  # viscous friction [Nm s/rad], shape (2,)
+    friction_speed: float  # speed at which dry friction reaches 76 % of its full value [rad/s]
+    tracking: float  # share by which the difference between command and motor torque falls in a cycle
     keep: float  # weight of the old value in the velocity filter, 0 to 1
-    torque_max: Vector  # (2,) Nm, torque limit of the limiter
-    torque_step: Vector  # (2,) Nm, largest change of the command in a cycle
-    velocity_max: Vector  # (2,) rad/s, speed above which the limiter reduces the torque
-    velocity_margin: float  # rad/s, range of speed above `velocity_max` in which the limiter reduces the torque to zero
+    torque_max: Vector  # torque limit of the limiter [Nm], shape (2,)
+    torque_step: Vector  # largest change of the command in a cycle [Nm], shape (2,)
+    velocity_max: Vector  # speed above which the limiter reduces the torque [rad/s], shape (2,)
+    velocity_margin: float  # at `velocity_max` plus this speed, the limiter has reduced the torque to zero [rad/s]
     delay: int  # additional cycles until a command acts
     loss: float  # probability that the measurement of a cycle is lost, and that the command of a cycle is lost
 

@@ -90,7 +90,7 @@ def gaits_of(options: WalkOptions, robot: Robot) -> tuple[Patient, WalkGaits]:
 
 @cache
 def solved_gaits(subject: Subject) -> WalkGaits:
-    """Return the gaits of a subject with the default limits of the joints. They are solved once per process.
+    """Return the gaits of a subject with the default limits of the joints. The gaits are solved once per process.
 
     Args:
         subject: Patient and step.

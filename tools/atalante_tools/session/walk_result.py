@@ -38,7 +38,7 @@ class WalkResult:
     promise_hip_nm: float | None
     #: certified torque at SK [Nm], see `promise_hip_nm`; None without certificate
     promise_knee_nm: float | None
-    max_ratio: float | None  # largest tracking error as a fraction of the guide; None if no step was guided
+    max_ratio: float | None  # largest tracking error as a fraction of the guide width; None if no step was guided
     inside: float | None  # fraction of the guided time with both joints inside the guide; None if no step was guided
     outside_cycles: int  # guided cycles with a joint outside the guide
     filter_active: float | None  # fraction of the guided time with the guide filter active; None if no step was guided

@@ -1,4 +1,4 @@
-"""Command `atalante trial`: experiments of the paper, and walks with faults, pushes and errors, with virtual subjects.
+"""Command `atalante trial`: experiments of the paper with virtual subjects, and walks with faults, pushes and model errors.
 
 experiment -> trials (`plan`) -> results in files (`run`, `store`) -> findings -> report.html
 """
@@ -55,7 +55,7 @@ class Walking:
 
 
 def _running(experiment: str) -> Callable[[_Command], _Command]:
-    """Return a decorator that adds the options of all experiments, passed as the argument `running`."""
+    """Return a decorator that adds the options of all experiments. The command gets their values as the argument `running`."""
     options = [
         click.option("--out", type=click.Path(path_type=Path, file_okay=False), default=f"runs/{experiment}", show_default=True,
                      metavar="DIR", help="Folder for report.html, report.md and one file per trial. A trial with a valid "
@@ -72,7 +72,7 @@ def _running(experiment: str) -> Callable[[_Command], _Command]:
 
 
 def _walking() -> Callable[[_Command], _Command]:
-    """Return a decorator that adds the options of the experiments on the ground, passed as the argument `walking`."""
+    """Return a decorator that adds the options of the experiments on the ground. The command gets the argument `walking`."""
     options = [
         click.option("--shape", type=click.Choice(("constant", "pinched")), default="constant", show_default=True,
                      help="Shape of the guide. The guide of the paper is constant."),

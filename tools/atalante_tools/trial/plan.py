@@ -45,7 +45,7 @@ QUICK_MASSES: Final = (58.0, 75.0)
 MASS_SHARE: Final = (0.9, 1.1)
 FRICTION: Final = (0.25, 0.8)
 DELAY_MAX: Final = 1
-#: Probability of a lost frame, force of a push [N], and number of steps with one push at a random time.
+#: Probability of a lost frame, force of a push [N], and number of steps in which one push comes at a random time.
 LOSS: Final = 0.01
 PUSH: Final = 100.0
 PUSH_STEPS: Final = 10

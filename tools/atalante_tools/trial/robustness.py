@@ -147,7 +147,7 @@ class Pushes:
 
 
 class SafeEnding:
-    """End of a robust walk, called once per cycle. A robot that has fallen is observed for `_FALLEN` more cycles.
+    """End condition of a walk, called once per cycle. A robot that has fallen is observed for `_FALLEN` more cycles.
 
     Attributes:
         outcome: "stood", "fell", "hold" or "fault".

@@ -30,7 +30,7 @@ _SPONTANEOUS = {(s, f) for s in DriveState for f in (_S.FAULT_REACTION_ACTIVE, _
 LEGAL = {(int(state), int(after)) for (state, _), after in TRANSITIONS.items()} | {
     (int(a), int(b)) for a, b in _SPONTANEOUS
 }
-#: Pairs (state, controlword) without a required response: the quick stop is not acknowledged, or the cause of a fault persists.
+#: Pairs (state, controlword) to which a drive need not respond: unacknowledged quick stop, or fault whose cause persists.
 EXEMPT = {(int(_S.QUICK_STOP_ACTIVE), int(_C.ENABLE_OPERATION)), (int(_S.FAULT), int(_C.FAULT_RESET))}
 _NOTHING = -1
 
@@ -66,7 +66,7 @@ class _CommandField:
 
     row: int  # index of the command message in the plan
     index: int  # index of the field in the fields of its message
-    joint: str  # joint in the name of the signal; empty: the name has no joint
+    joint: str  # joint in the name of the signal; empty if the name has no joint
     receivers: tuple[str, ...]  # nodes that receive the field
 
 

@@ -14,7 +14,7 @@ from atalante_tools.canlog.validate.buses import ChannelMap
 from atalante_tools.canlog.validate.findings import Findings
 from atalante_tools.canlog.validate.project import Project
 
-#: Minimum length of an error frame with delimiter and intermission, bits.
+#: Minimum length of an error frame with delimiter and intermission [bit].
 _ERROR_BITS = 17
 
 

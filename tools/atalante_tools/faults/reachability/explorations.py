@@ -59,7 +59,7 @@ class Operator(NamedTuple):
 
 
 class Presses(NamedTuple):
-    """START presses counted by the search `moves`: presses that changed no state yet, and whether a START is in progress."""
+    """Memory of the search `moves`: number of START presses that changed no state yet, and whether a START is in progress."""
 
     received: int = 0  # number of presses; two stands for two or more
     started: bool = False

@@ -57,8 +57,8 @@ class Reception(NamedTuple):
     dead_man: bool = True  # whether the dead-man switch is pressed in the last accepted frame
     request: int = Request.START  # `Request` of the last accepted frame
     evaluated: int = _LATEST  # source of the RequestCounter that `Pendant.evaluate` read last
-    rogue: bool = False  # the last accepted frame has the RequestCounter of a second sender
-    stored: bool = False  # a START is stored until the pendant is trusted
+    rogue: bool = False  # whether the last accepted frame has the RequestCounter of a second sender
+    stored: bool = False  # whether a START is stored until the pendant is trusted
     trusted: bool = True
     own_request: int = Request.START  # `Request` of the last intact frame of the pendant itself
 
@@ -228,7 +228,7 @@ class HalSteps:
         return after, Inputs(pendant.dead_man, stop, pendant.started)
 
     def _without_press(self, state: Reception) -> Reception:
-        """Return the state of the reception after a change of the supervisor state, which drops a stored START.
+        """Return the state of the reception after a change of the supervisor state. The change drops a stored START.
 
         Args:
             state: state before the change.

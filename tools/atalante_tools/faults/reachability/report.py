@@ -1,4 +1,4 @@
-"""Report of the exhaustive searches: `python -m atalante_tools.faults.reachability.report` prints it as a Markdown table."""
+"""Report of the exhaustive searches: `python -m atalante_tools.faults.reachability.report` prints a Markdown table."""
 
 from __future__ import annotations
 

@@ -113,7 +113,7 @@ class _Shared(NamedTuple):
     """
 
     question: Vector  # `_CYCLE`, `_ATTITUDE` or `_STANCE`, shape (1,)
-    dial: Vector  # number of turns of the dial, and assistance factor (NaN: None), shape (2,)
+    dial: Vector  # number of changes of the dial so far, and assistance factor (NaN: None), shape (2,)
     pushes: Vector  # whether the pelvis is pushed, shape (1,)
     wrench: Vector  # force [N] and moment [Nm] on the pelvis, shape (6,)
     answer: Vector  # attitude or stance, shape (4,)
