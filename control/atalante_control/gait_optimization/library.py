@@ -51,7 +51,7 @@ class Grid:
 
     The levels of a parameter are listed in ascending order. A grid of six parameters has too many points to solve all of them.
     Therefore the library contains `size` points: all combinations of smallest and largest levels, and points of a
-    low-discrepancy sequence. The sequence has no gaps and no repetitions, so a larger `size` only adds points.
+    low-discrepancy sequence, which fills the grid evenly. A larger `size` only adds points.
 
     Raises:
         ValueError: If there are fewer than three levels, levels are not ascending, the size is too small, or a subject is out of

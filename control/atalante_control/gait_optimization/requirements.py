@@ -21,7 +21,7 @@ class Requirements:
     force_min: float = 300.0  # N, smallest vertical ground force
     sole_share: float = 0.6  # fraction of the sole in which the centre of pressure must be
     #: Fraction of the rectangle between the force cells in which the centre of pressure must be at the nodes. Between two nodes,
-    #: and in the gaits of the network, the centre of pressure is up to 3 mm farther outside.
+    #: and in the gaits of the network, the centre of pressure is up to 3.2 mm farther outside.
     cell_share: float = 0.7
     yaw_lever: float = 0.03  # m, largest ratio of yaw moment about the sole centre to vertical ground force
     #: Required height of the swing sole at mid-swing [m]. At other times this height is multiplied by sin(pi t / T)^2.
