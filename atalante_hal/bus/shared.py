@@ -37,9 +37,9 @@ _SERVING, _SLEEPING, _CLOSED = range(4, 7)
 #: Number of 64-bit header words of each bus end: one cache line.
 _END_WORDS = 8
 _HEADER_BYTES = mmap.PAGESIZE
-#: Polling time of a waiting bus end before it sleeps [s]. This time is longer than the computing time of a cycle.
+#: A waiting bus end polls for this time [s] before it sleeps. The time is longer than the computing time of a cycle.
 _POLL_TIME = 500e-6
-#: If polling finds no frame in a wait, the bus end does not poll in this number of further waits, to save computing time.
+#: After a wait in which polling found no frame, the bus end does not poll in this number of waits.
 _WAITS_WITHOUT_POLLING = 32
 #: Longest sleep of a waiting bus end before it reads the shared memory again [ms].
 #: A sleep must be limited, because a wake-up byte may arrive before the new value in the shared memory is visible.

@@ -76,7 +76,7 @@ CONTROL = np.dtype(
         ("padding", "u4"),
     ]
 )
-STAMP_ONLY = 32  # size of the control messages without drop counter [bytes]
+STAMP_ONLY = 32  # size of the control messages [bytes] if there is no drop counter
 
 
 class SocketCanBus:

@@ -146,7 +146,7 @@ _CONTROLLABLE = frozenset(
         Dtc.OVERRUN,
     }
 )
-#: Codes whose reaction is HOLD. From a drive they permit no further step, from other nodes they permit some more steps.
+#: Codes whose reaction is HOLD. These codes permit some more steps, except if the affected node is a drive.
 #: The walking controller bridges the loss of an IMU or of a foot until the robot stands.
 _CONTROLLABLE_WITHOUT_SENSOR = frozenset(
     {

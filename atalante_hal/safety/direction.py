@@ -52,7 +52,7 @@ TRAVEL = math.radians(1.5)
 #: A foot is loaded if its mean force during a test exceeds `LOAD * cell_free`, which is four times the noise of the mean.
 LOAD = 1.0 / 3.0
 #: A foot hit the floor if the sum of its forces in two consecutive cycles exceeds `HIT * cell_free`.
-#: `HIT * cell_free` is four times the noise of the sum. An impact that stops an ankle is at least 1.5 times this limit.
+#: `HIT * cell_free` is four times the noise of the sum. An impact that stops an ankle is at least 1.5 times as large.
 HIT = 2.0
 #: Factor of the torque pulse in the second test of a joint near its end stop. The leg weight may press the joint onto the stop.
 BOOST = 6.0

@@ -44,9 +44,9 @@ RESTARTS = 3
 _KILLED = 0.1
 #: Time limit for the subprocess to end its Zenoh session, after it has printed its summary [s].
 _SESSION_END = 2.0
-#: Time limit [s] until a restarted subprocess must be ready, see `tend`.
+#: A restarted subprocess must be ready within this time [s], see `tend`.
 _RESTART = 30.0
-#: Time limit [s] until the first subprocess must be ready, possibly during a run.
+#: The first subprocess must be ready within this time [s], possibly during a run.
 #: A subprocess that is not ready in time is ended, and `tend` starts another one.
 _JOIN = 60.0
 
@@ -190,7 +190,7 @@ class TelemetryProcess(Closing):
         self._recordings: list[str] = []  # names of the recording files begun so far
         self._last_endpoint: str | None = None  # last endpoint in use; None before the first endpoint was opened
         self._restarting: threading.Thread | None = None  # thread that starts or restarts the subprocess
-        self._progress = (0, 0.0)  # records read by the subprocess, and time of the last change of this number [s]
+        self._progress = (0, 0.0)  # number of records read so far, and time of the last change of this number [s]
         meta = {
             "layout": layout.to_json(),
             "diagnostics": list(diagnostics),

@@ -539,7 +539,7 @@ class TransmitImage:
         rows = len(self.codec.messages)
         self._counters: Words = np.zeros(rows, np.int64)
         self._singles = [self.frames[row : row + 1] for row in range(rows)]
-        # `specialised` calls each function once. These calls leave every alive counter at 0xFF, so the first frame has 0.
+        # `specialised` calls each function once. The calls leave every alive counter at 0xFF, so the first counter sent is 0.
         self._protect = specialised(protect, self._octets, self._spans, self._counters)
         self._seal = specialised(seal, self.values, self.codec.table, self._words, self._spans, self._counters, 0xFF)
 

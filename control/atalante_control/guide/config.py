@@ -50,4 +50,4 @@ class StepGuideConfig:
             if not 0.0 <= getattr(self, name) <= 1.0:
                 raise ValueError(f"intensity of {name} must be between 0 and 1, got {getattr(self, name)!r}")
         if list(self.gentler) != sorted(self.gentler) or not all(0.0 < part < 1.0 for part in self.gentler):
-            raise ValueError(f"`gentler` must be ascending fractions in (0, 1) of `stiffness`, got {self.gentler!r}")
+            raise ValueError(f"`gentler` must be fractions of `stiffness` in (0, 1), ascending, got {self.gentler!r}")

@@ -66,7 +66,7 @@ class HandOver:
     rate: float = 0.25  # rad/s, largest speed deviation |s'(0)| of sagittal hip and knee
     #: Nm, largest torques of sagittal hip and knee that the carry-over adds at the start of a step
     torque: Pair = (25.0, 13.0)
-    #: rad/s2, largest joint acceleration before the stance change. It falsifies the velocity measured after the change.
+    #: rad/s2, largest joint acceleration before the stance change. It distorts the velocity measured after the change.
     acceleration: float = 20.0
 
     def __post_init__(self) -> None:

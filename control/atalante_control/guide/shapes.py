@@ -26,7 +26,7 @@ _CHECKED_FACTORS = np.linspace(0.0, 1.0, 21).tolist()
 
 
 def half_width(xi: float) -> float:
-    """Return the half-width of the guide without a shape, 0.5 + 7 (1 - Xi) degrees at assistance factor Xi [rad].
+    """Return the half-width [rad] of the guide without a shape: 0.5 + 7 (1 - Xi) degrees at the assistance factor Xi.
 
     Args:
         xi: assistance factor in [0, 1].

@@ -60,7 +60,7 @@ class WalkConfig:
     landing_timeout: float = 0.4
     load_bandwidth: float = 35.0  # Hz, cut-off frequency of the low-pass of the vertical foot forces
     observer_bandwidth: float = 2.0  # rad/s, natural frequency of the attitude observer
-    loaded: float = 0.3  # load at and above which a standing foot counts as loaded, as a fraction of the weight
+    loaded: float = 0.3  # smallest load with which a standing foot counts as loaded, as a fraction of the weight
     #: loads at which the stance gains are fully applied (standing, walking), as fractions of the weight
     full_gains: Pair = (0.25, 0.5)
     settle: float = 1.0  # s, time for which both feet must be loaded before the robot walks

@@ -21,8 +21,8 @@ class ImpactConfig:
     impact_force: float = 80.0  # N, smallest vertical force on the swing foot at an impact
     #: N, force below which the swing foot has left the ground; an impact is accepted only afterwards
     release_force: float = 30.0
-    debounce: int = 5  # number of consecutive cycles with at least `impact_force` after which an impact is detected
-    earliest: float = 0.5  # fraction of the step duration before which impacts are ignored
+    debounce: int = 5  # an impact is detected after this number of consecutive cycles with at least `impact_force`
+    earliest: float = 0.5  # impacts are ignored before this fraction of the step duration
 
     def __post_init__(self) -> None:
         if not 0.0 <= self.release_force < self.impact_force < math.inf:

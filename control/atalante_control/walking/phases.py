@@ -36,7 +36,7 @@ class Facts(NamedTuple):
     elapsed: int  # cycles since the start of the phase
     nominal: int  # nominal duration of the phase in cycles
     rest: int  # cycles to wait after a weight shift
-    timeout: int  # cycles from the nominal end of a step until the step ends without a detected landing
+    timeout: int  # a step without a detected landing ends this number of cycles after its nominal end
     landed: bool  # the swing foot has landed
     loaded: bool  # both feet have carried load for long enough
     stopping: bool  # the walk must end
