@@ -74,6 +74,7 @@ class Sensors:
     quaternion_error: float  # largest difference between the squared norm of a quaternion and 1
     cell_free: float  # N, largest vertical force at which a cell is regarded as unloaded
     cell_twist: float  # N, largest difference between the vertical forces on the two diagonals of a foot's cells
+    sole_tilt: float  # rad, largest tilt of a sole on the floor, from the ankle encoders and the tibia IMU
 
 
 @dataclass(frozen=True)
@@ -180,6 +181,7 @@ _TABLES = {
         "quaternion_error": _Key(1, 1e-4, 0.5, "without unit"),
         "cell_free": _Key(1, 1.0, 1000.0, "N"),
         "cell_twist": _Key(1, 1.0, 1000.0, "N"),
+        "sole_tilt": _Key(1, 0.001, 1.0, "rad"),
     },
     "thresholds": {
         "supply_low": _Key(1, 5.0, 100.0, "V"),

@@ -97,8 +97,13 @@ class Dtc(StrEnum):
     IMU_INVALID = "IMU_INVALID", _R.FULL_ASSIST, _S.WARNING, "an IMU reports that it has no valid value"
     IMU_SATURATED = "IMU_SATURATED", _R.FULL_ASSIST, _S.WARNING, "an IMU reading is at the end of its measuring range"
     IMU_STUCK = "IMU_STUCK", _R.FULL_ASSIST, _S.WARNING, "the gyro reading of an IMU does not change"
-    FOOT_CELL = "FOOT_CELL", _R.FULL_ASSIST, _S.WARNING, "a force cell contradicts the other cells of its foot"
-    CONTACT_IMPLAUSIBLE = "CONTACT_IMPLAUSIBLE", _R.HOLD, _S.ERROR, "neither foot reports a load on the ground"
+    FOOT_CELL = "FOOT_CELL", _R.FULL_ASSIST, _S.WARNING, "a force cell contradicts the other cells or the posture"
+    CONTACT_IMPLAUSIBLE = (
+        "CONTACT_IMPLAUSIBLE",
+        _R.HOLD,
+        _S.ERROR,
+        "the load on the feet contradicts ground and posture",
+    )
     TORQUE_DIRECTION = "TORQUE_DIRECTION", _R.LOWER, _S.ERROR, "a joint moves against its torque, or does not follow it"
     TORQUE_TRACKING = "TORQUE_TRACKING", _R.LOWER, _S.ERROR, "a drive reports another torque than that of its command"
     HOLD_UNSTABLE = "HOLD_UNSTABLE", _R.LOWER, _S.ERROR, "a joint oscillates although its drive holds its position"

@@ -2,8 +2,31 @@
 
 from __future__ import annotations
 
-_PLAUSIBILITY = ("finding", "encoders", "imus", "legs", "feet", "stillness", "unchecked", "rejections", "plausibility")
-_PLAUSIBILITY_TESTS = ("encoders", "imus", "legs", "feet", "stillness", "rejections", "plausibility", "ridden_through")
+_PLAUSIBILITY = (
+    "finding",
+    "encoders",
+    "imus",
+    "legs",
+    "feet",
+    "support",
+    "soles",
+    "stillness",
+    "unchecked",
+    "rejections",
+    "plausibility",
+)
+_PLAUSIBILITY_TESTS = (
+    "encoders",
+    "imus",
+    "legs",
+    "feet",
+    "support",
+    "soles",
+    "stillness",
+    "rejections",
+    "plausibility",
+    "ridden_through",
+)
 #: Part of the safety core -> files of the part, and the tests that must detect a change of these files.
 CORE = {
     "e2e": (("atalante_hal/wire/e2e.py",), ("hal/wire/test_e2e.py", "hal/wire/test_process_image.py")),

@@ -1,15 +1,19 @@
 """Foot checks, which detect faulty force cells and an impossible loss of ground contact.
 
-*Cell.* A sole is a rigid plate on four equal cells. Its load has three degrees of freedom: the force and two moments. So the two
-diagonals of the cells carry equal vertical forces: FL + RR = FR + RL, also where a cell is pulled. A fault of one cell changes
-the difference by the error of the cell. A difference above `cell_twist` for `CELL_CYCLES` is a fault. The faulty cell is known
-if it is the only cell with load, or the only cell without load. The module `stillness` detects a cell with an exactly constant
-reading sooner.
+*Cell.* A sole is a rigid plate on four equal cells. Its load has three degrees of freedom: the force and two moments. So the
+two diagonals of the cells carry equal vertical forces: FL + RR = FR + RL, also where a cell is pulled. A fault of one cell
+changes the difference by the error of the cell. A difference above `cell_twist` for `CELL_CYCLES` is a fault. The faulty cell
+is known if it is the only cell with load, or the only cell without load. The module `stillness` detects a cell with an exactly
+constant reading sooner.
 
-*Contact.* Walking has no flight phase. So a robot that stood on the ground cannot swing both feet. The check is armed after both
-feet have carried load together for `STANDING_CYCLES`. This does not happen while the robot hangs on a crane that sets it down.
-The check is disarmed if the robot has been lifted for `LIFTED_CYCLES`. A robot that was lifted is in HOLD and requires a new
-START.
+*Pull.* The floor cannot pull a foot. So the sum of cells that do not contradict each other cannot be below minus twice
+`cell_free` for `CELL_CYCLES`. This reveals cells that all have the wrong sign, as soon as the foot is on the ground, and a
+negative offset, as soon as the foot is without load.
+
+*Contact.* Walking has no flight phase. So a robot that stood on the ground cannot swing both feet. The check is armed after
+both feet have carried load together for `STANDING_CYCLES`. This does not happen while the robot hangs on a crane that sets it
+down. The check is disarmed if the robot has been lifted for `LIFTED_CYCLES`. A robot that was lifted is in HOLD and requires a
+new START.
 """
 
 from __future__ import annotations
@@ -54,6 +58,8 @@ class FootChecks:
         self._contradicts = [0] * len(FEET)
         #: Foot -> difference of the forces on its two diagonals [N], and index of the faulty cell (None if it is unknown).
         self._twisted: dict[int, tuple[float, int | None]] = {}
+        self._pulls = [0] * len(FEET)  # time for which the floor has seemed to pull each foot [cycles]
+        self._pulled: dict[int, float] = {}  # foot -> sum of its vertical forces [N], if the floor seems to pull it
 
     def evaluate(self, updated: tuple[bool, bool]) -> bool:
         """Check the vertical forces of both feet.
@@ -66,7 +72,7 @@ class FootChecks:
             Whether a cell or the ground contact is implausible.
         """
         lifted = self._swinging >= LIFTED_CYCLES
-        if lifted and self._forces.dot(self._forces) <= self._free_squared and not any(self._contradicts):
+        if lifted and self._forces.dot(self._forces) <= self._free_squared and not any(self._contradicts + self._pulls):
             return False
         on_ground = []
         for foot, cells in enumerate(self._force[:, :, 2].tolist()):
@@ -81,7 +87,7 @@ class FootChecks:
             self._armed = True
         elif self._swinging >= LIFTED_CYCLES:
             self._armed = False
-        return bool(self._twisted) or self._both_swing()
+        return bool(self._twisted or self._pulled) or self._both_swing()
 
     @property
     def cells(self) -> Iterator[tuple[int, int]]:
@@ -100,10 +106,19 @@ class FootChecks:
                 self._twisted[foot] = twist, _deviating_cell(carries)
         else:
             self._twisted.pop(foot, None)
+        load, pulled = sum(cells), abs(twist) <= self._twist and sum(cells) < -2.0 * self._free
+        self._pulls[foot] = self._pulls[foot] + self._every if pulled else 0
+        if self._pulls[foot] >= CELL_CYCLES:
+            self._pulled.setdefault(foot, load)
+        else:
+            self._pulled.pop(foot, None)
 
     def findings(self) -> tuple[Finding, ...]:
         """Return the current findings of the foot checks."""
-        cells = tuple(_contradicting(foot, *twisted) for foot, twisted in self._twisted.items())
+        cells = (
+            *(_contradicting(foot, *twisted) for foot, twisted in self._twisted.items()),
+            *(_pulling(foot, load) for foot, load in self._pulled.items()),
+        )
         return (*cells, _BOTH_SWING) if self._both_swing() else cells
 
 
@@ -126,6 +141,11 @@ def _contradicting(foot: int, twist: float, cell: int | None) -> Finding:
     return Finding(Dtc.FOOT_CELL, FOOT_NODES[foot], twist, True, text)
 
 
+def _pulling(foot: int, load: float) -> Finding:
+    text = f"the force cells of the {FEET[foot]} foot report {load:.0f} N in total, but the floor cannot pull"
+    return Finding(Dtc.FOOT_CELL, FOOT_NODES[foot], load, True, text)
+
+
 _BOTH_SWING = Finding(
-    Dtc.CONTACT_IMPLAUSIBLE, FOOT_NODES[0], float(SWING_CYCLES), True, Dtc.CONTACT_IMPLAUSIBLE.meaning
+    Dtc.CONTACT_IMPLAUSIBLE, FOOT_NODES[0], float(SWING_CYCLES), True, "neither foot reports a load on the ground"
 )

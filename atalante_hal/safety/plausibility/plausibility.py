@@ -1,7 +1,7 @@
 """Schedule of the plausibility checks in each cycle.
 
-    process image -> one slow check in turn (standstill, velocity, feet, legs, monitor of checks that lack data) -> jump, range,
-    IMUs -> state
+    process image -> one slow check in turn (standstill, velocity, feet, legs, support, soles, monitor of checks that lack data)
+    -> jump, range, IMUs -> state
 
 Each cycle checks the encoders and the IMUs, and runs at most one slow check. If the new values of a joint or an IMU
 fail a check, they are rejected: the process image keeps the previous values, and the age of these values grows. The
@@ -22,7 +22,9 @@ from atalante_hal.safety.plausibility.finding import JOINT_NODES, Ages, Rows, si
 from atalante_hal.safety.plausibility.imus import Imus
 from atalante_hal.safety.plausibility.legs import Legs
 from atalante_hal.safety.plausibility.rejections import Rejections
+from atalante_hal.safety.plausibility.soles import Soles
 from atalante_hal.safety.plausibility.stillness import Stillness
+from atalante_hal.safety.plausibility.support import Support
 from atalante_hal.safety.plausibility.unchecked import Unchecked
 from atalante_hal.types import Vector
 from atalante_hal.wire.e2e import Check
@@ -32,7 +34,7 @@ from atalante_hal.wire.process_image import NEVER, ReceiveImage
 FEET = 4
 #: Interval of the standstill check, of the velocity check, and of the monitor of checks that lack data [cycles].
 SLOW = 16
-#: Period of the schedule of all slow checks [cycles]. Each leg is checked once per period.
+#: Period of the schedule of all slow checks [cycles]. Each leg, each sole and the support are checked once per period.
 _PERIOD = 32
 _FRESH = int(Check.SOME_LOST)
 
@@ -59,6 +61,8 @@ class Plausibility:
         self._stillness = Stillness(robot, image, now, before, SLOW, period)
         self._legs = Legs(robot, now, self._stillness.constant_samples, period)
         self._feet = FootChecks(robot, now, FEET)
+        self._support = Support(robot, now, _PERIOD)
+        self._soles = Soles(robot, now)
         self._rows = Rows(codec)
         self._rejections = Rejections()
         self._unchecked = Unchecked(self._rows, image.check, SLOW)
@@ -86,8 +90,10 @@ class Plausibility:
         turns[0::SLOW] = [self._sample] * (_PERIOD // SLOW)
         turns[2::SLOW] = [self._check_velocity] * (_PERIOD // SLOW)
         turns[4::SLOW] = [self._check_unchecked] * (_PERIOD // SLOW)
+        turns[6] = self._support.evaluate
         turns[1::FEET] = [self._check_feet] * (_PERIOD // FEET)
         turns[8], turns[24] = self._legs.check_left, self._legs.check_right
+        turns[10], turns[26] = self._soles.check_left, self._soles.check_right
         return turns
 
     def check(self) -> tuple[Finding, ...]:
@@ -198,6 +204,8 @@ class Plausibility:
             *self._legs.findings(),
             *self._stillness.findings(),
             *self._feet.findings(),
+            *self._support.findings(),
+            *self._soles.findings(),
             *self._unchecked.findings(),
         )
         if often := self._rejections.findings():

@@ -47,15 +47,28 @@ def _stuck(node: str, cycles: int) -> tuple[Fault, ...]:
     return Fault("encoder_stuck", node, 0, cycles), Fault("reset", node, cycles + 30, 3)
 
 
+#: Vertical force on each cell of a foot that stands on its toes [N].
+_ON_TOES: Final = (290.0, 290.0, 10.0, 10.0)
+
+
 def _standing(foot: str, cycles: int) -> tuple[Fault, ...]:
-    """Return faults that simulate a foot on the ground. The force changes every 50 cycles, because a constant force is a fault.
+    """Return faults that simulate a foot that stands on its toes.
+
+    The soles of the robot in the air are not level, so it cannot stand on its whole sole. The forces change every 50 cycles,
+    because a constant force is a fault.
 
     Args:
         foot: name of the foot node.
         cycles: duration [cycles].
     """
     return tuple(
-        Fault("value", f"{foot}_STATE", start, 50, **{f"{cell}_ForceZ": 150.0 + start / 50 % 2 for cell in CELLS})
+        Fault(
+            "value",
+            f"{foot}_STATE",
+            start,
+            50,
+            **{f"{cell}_ForceZ": force + start / 50 % 2 for cell, force in zip(CELLS, _ON_TOES, strict=True)},
+        )
         for start in range(0, cycles, 50)
     )
 
@@ -187,6 +200,20 @@ SCENARIOS: Final = (
                 ("the left foot lifts", 600, 550),
                 ("the right foot lifts", 550, 600),
             )
+        ),
+    ),
+    Scenario(
+        "F76",
+        tuple(
+            Case(f"{foot}, all cells -200 N", (Fault("cell_offset", foot, 0, 300, force=-200.0),), node=foot)
+            for foot in _FEET
+        ),
+    ),
+    Scenario(
+        "F77",
+        tuple(
+            Case(f"{foot}, all cells +200 N", (Fault("cell_offset", foot, 0, 1000, force=200.0),), node=foot)
+            for foot in _FEET
         ),
     ),
     Scenario(

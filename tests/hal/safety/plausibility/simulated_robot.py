@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 import pinocchio
@@ -24,6 +24,8 @@ from atalante_hal.wire.process_image import ReceiveImage
 MESSAGES = [m for m in atalante_dbc.load().received_by("HAL") if m.cycle_ms == 1]
 CODEC = Codec(MESSAGES)
 ROBOT = load_robot()
+#: Robot whose soles may have any tilt, because the ankles of the simulated robot do not hold its soles level.
+UNEVEN = replace(ROBOT, sensors=replace(ROBOT.sensors, sole_tilt=1.0))
 PERIOD = 1e-3  # s
 #: Motor angle per joint angle, with the sign of the polarity.
 GEAR = ROBOT.gear * ROBOT.polarity
@@ -94,7 +96,7 @@ class SimulatedRobot:
     def __post_init__(self) -> None:
         self.image = ReceiveImage(MESSAGES, np.zeros(CODEC.size))
         self.now = signals_of(CODEC, self.image.values)
-        self.checks = Plausibility(ROBOT, self.image, PERIOD)
+        self.checks = Plausibility(UNEVEN, self.image, PERIOD)
         self.attitudes = attitudes(MIDDLE)
         self.run(1)
 

@@ -141,7 +141,9 @@ class TestFeetAlone:
         for mirrored in (False, True):
             feet = TwoFeet()
             cells = [-force for force in forces] if mirrored else forces
-            assert [feet.evaluate(LOADED, cells) for _ in range(256)] == [False] * 255 + [found]
+            assert not any(feet.evaluate(LOADED, cells) for _ in range(255))
+            feet.evaluate(LOADED, cells)
+            assert any("diagonals" in finding.text for finding in feet.checks.findings()) == found
 
     @pytest.mark.parametrize(
         ("forces", "cell"),
@@ -168,6 +170,42 @@ class TestFeetAlone:
         # The faulty cell may become known later, when the foot is in the air.
         feet.evaluate([0.0, 300.0, 0.0, 0.0], LOADED)
         assert list(feet.checks.cells) == [(0, 1 if cell is None else cell)]
+
+    @pytest.mark.parametrize("foot", [0, 1])
+    def test_foot_that_the_floor_seems_to_pull_is_reported_after_256_cycles_in_a_row(self, foot: int):
+        feet, free = TwoFeet(), ROBOT.sensors.cell_free
+        pulled, allowed, twisted = ([LOADED, LOADED] for _ in range(3))
+        pulled[foot], allowed[foot] = [-free / 2.0 - 0.1] * 4, [-free / 2.0] * 4
+        twisted[foot] = [-CELL_TWIST - 300.0, -100.0, -100.0, -100.0]
+        for _ in range(2):
+            assert [feet.evaluate(*pulled) for _ in range(257)] == [False] * 255 + [True] * 2
+            text = f"the force cells of the {FEET[foot]} foot report -120 N in total, but the floor cannot pull"
+            node = f"FOOT_{FEET[foot].upper()}"
+            assert feet.checks.findings() == (
+                Finding(Dtc.FOOT_CELL, node, pytest.approx(4.0 * pulled[foot][0]), True, text),
+            )
+            assert list(feet.checks.cells) == []
+            feet.evaluate(*([-110.0] * 4 if f == foot else LOADED for f in (0, 1)))
+            assert only(feet.checks.findings()).value == pytest.approx(4.0 * pulled[foot][0])  # the first value is kept
+            assert not feet.evaluate(*allowed)
+            assert feet.checks.findings() == ()
+        assert not any(feet.evaluate(*allowed) for _ in range(300))
+        feet.evaluate(*twisted)
+        for _ in range(300):
+            feet.evaluate(*twisted)
+        assert ["diagonals" in finding.text for finding in feet.checks.findings()] == [True]
+
+    def test_pulled_foot_is_checked_until_it_is_without_load(self):
+        feet = TwoFeet()
+        assert [feet.evaluate([-31.0] * 4, UNLOADED) for _ in range(256)] == [False] * 255 + [True]
+        assert not feet.evaluate(UNLOADED, UNLOADED)
+        assert feet.checks.findings() == ()
+
+    def test_interrupted_pull_is_counted_from_zero(self):
+        feet = TwoFeet()
+        for _ in range(3):
+            assert not any(feet.evaluate([-200.0] * 4, LOADED) for _ in range(255))
+            assert not feet.evaluate(LOADED, LOADED)
 
     def test_interrupted_contradiction_is_counted_from_zero(self):
         feet = TwoFeet()

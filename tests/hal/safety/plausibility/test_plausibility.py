@@ -16,7 +16,9 @@ from atalante_hal.safety.plausibility.feet import FootChecks
 from atalante_hal.safety.plausibility.finding import measured, signals_of
 from atalante_hal.safety.plausibility.imus import Imus
 from atalante_hal.safety.plausibility.legs import Legs
+from atalante_hal.safety.plausibility.soles import Soles
 from atalante_hal.safety.plausibility.stillness import Stillness
+from atalante_hal.safety.plausibility.support import Support
 from atalante_hal.safety.plausibility.unchecked import Unchecked
 from atalante_hal.wire.process_image import ReceiveImage
 
@@ -81,6 +83,9 @@ def test_each_slow_check_runs_in_its_scheduled_cycle(monkeypatch: pytest.MonkeyP
         (Legs, "check_left"),
         (Legs, "check_right"),
         (FootChecks, "evaluate"),
+        (Support, "evaluate"),
+        (Soles, "check_left"),
+        (Soles, "check_right"),
         (Unchecked, "evaluate"),
     ):
         monkeypatch.setattr(owner, name, lambda *_, name=f"{owner.__name__}.{name}": bool(made.append(name)))
@@ -90,7 +95,9 @@ def test_each_slow_check_runs_in_its_scheduled_cycle(monkeypatch: pytest.MonkeyP
     expected = {0: "Stillness.sample", 2: "EncoderChecks.check_velocity", 4: "Unchecked.evaluate"}
     expected |= {cycle + 16: name for cycle, name in expected.items()}
     expected |= {8: "Legs.check_left", 24: "Legs.check_right"}
+    expected |= {10: "Soles.check_left", 26: "Soles.check_right"}
     expected |= dict.fromkeys(range(1, 32, 4), "FootChecks.evaluate")
+    expected[6] = "Support.evaluate"
     for cycle in range(64):
         assert checks.check() == ()
         assert made == ([expected[cycle % 32]] if cycle % 32 in expected else [])

@@ -16,6 +16,7 @@ from dataclasses import dataclass
 import numpy as np
 import pinocchio
 import pytest
+from simulated_robot import UNEVEN
 
 import atalante_dbc
 from atalante_control.model import ExoskeletonParameters, pinocchio_model, urdf
@@ -117,7 +118,7 @@ class Line:
         self.disturb = undisturbed
         self.transmit, self.receive = TransmitImage(MESSAGES), ReceiveImage(MESSAGES)
         self.sent = signals_of(self.transmit.codec, self.transmit.values)
-        self.checks = Plausibility(ROBOT, self.receive, PERIOD)
+        self.checks = Plausibility(UNEVEN, self.receive, PERIOD)
         self.cycles = 0
         self.before = self.transmit.frames.copy()
         self.standing = False

@@ -1,0 +1,128 @@
+"""Robot on the ground: faults of feet and ankle encoders are found, and a healthy robot stands and starts again."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+
+from atalante_control.gait.subject import Subject
+from atalante_control.model import Patient
+from atalante_control.walking.controller import WalkController
+from atalante_emulator.bodies import ENGINES
+from atalante_emulator.faults import Fault
+from atalante_emulator.mechanics import Ground, Mechanics
+from atalante_emulator.pendant import Operator
+from atalante_hal.robot import FEET
+from atalante_hal.safety.events import Event
+from atalante_hal.types import Controller, State, SupervisorState
+from atalante_tools.console.options import Target
+from atalante_tools.session.body import describe
+from atalante_tools.session.pose_hold import PoseHold
+from atalante_tools.session.rig import open_hal
+from atalante_tools.session.walk_options import gaits_of_subject
+
+S = SupervisorState
+STANDING = [0.0, 0.0, -0.2, 0.45, -0.25, 0.0] * 2
+PATIENT = Patient(75.0, 1.75)
+#: Length [m] and duration [s] of the walking step.
+STEP = (0.16, 0.8)
+
+
+class Run:
+    """Run of a controller on the ground, with the event that ends it and the load on both feet in each cycle."""
+
+    def __init__(
+        self,
+        robot,
+        controller: Controller,
+        pose: list[float],
+        faults: tuple[Fault, ...],
+        ends: str,
+        *,
+        engine: str = "mujoco",
+        cycles: int = 4000,
+        presses: dict[int, str] | None = None,
+    ) -> None:
+        self.states: list[SupervisorState] = []
+        #: Vertical force on each foot, and difference of the diagonals of its cells, in each cycle [N].
+        self.forces: list[tuple[list[float], list[float]]] = []
+        self.found: Event | None = None
+        operator = Operator()
+        with open_hal(
+            Target("embedded", "", lockstep=True, engine=engine), robot=robot, seed=3, pose=pose, operator=operator,
+            controller_fields=controller.telemetry_fields, faults=faults,
+            mechanics=Mechanics(describe(robot, None, PATIENT), engine, Ground()),
+        ) as rig:  # fmt: skip
+            seen = 0
+
+            def over(state: State) -> bool:
+                nonlocal seen
+                if press := (presses or {}).get(state.cycle):
+                    getattr(operator, press)()
+                self.states.append(state.supervisor)
+                force = state.foot_force[:, :, 2]
+                self.forces.append((force.sum(axis=1).tolist(), (force @ [1.0, -1.0, -1.0, 1.0]).tolist()))
+                new = rig.hal.events.since(seen)
+                seen = rig.hal.events.count
+                self.found = next((event for event in new if event.code == ends), None)
+                return self.found is not None or state.cycle >= cycles
+
+            rig.run(controller, until=over)
+            self.codes = {event.code for event in rig.hal.events}
+
+
+@pytest.mark.parametrize("cell", ["RL", "all"])
+@pytest.mark.parametrize("foot", range(2))
+def test_f76_wrong_sign_of_cells_is_found_when_the_robot_is_set_down(robot, cell: str, foot: int) -> None:
+    fault = Fault("cell_inverted", f"FOOT_{FEET[foot].upper()}", cell=cell)
+    run = Run(robot, PoseHold(robot), STANDING, (fault,), "FOOT_CELL")
+    assert S.ACTIVE in run.states  # nothing was found in the air
+    assert run.found is not None
+    assert FEET[foot] in run.found.text
+    assert ("cannot pull" if cell == "all" else "diagonals") in run.found.text
+    wrong = [load[foot] < -120.0 if cell == "all" else abs(twist[foot]) > 80.0 for load, twist in run.forces]
+    assert wrong[-1]
+    assert len(wrong) - wrong.index(True) <= 270  # the load sways about its limit while the crane lowers the robot
+
+
+def test_f78_exchanged_feet_are_found_before_the_first_step(robot) -> None:
+    controller = WalkController(robot, PATIENT, gaits_of_subject(Subject(PATIENT, *STEP), robot), 4)
+    fault = Fault("sensor_swapped", "FOOT_LEFT", other="FOOT_RIGHT")
+    run = Run(robot, controller, controller.standing_pose.tolist(), (fault,), "CONTACT_IMPLAUSIBLE", cycles=5000)
+    assert run.found is not None
+    assert "the feet are exchanged: the robot leans" in run.found.text
+    assert (controller.statistics.steps, run.states[-1]) == (0, S.HOLD)
+    assert all(min(load) > 50.0 for load, _ in run.forces[-128:])  # both feet are still on the ground
+
+
+@pytest.mark.parametrize(
+    ("joint", "rate"), [("LEFT_SA", 2.5), ("RIGHT_SA", -2.5), ("LEFT_HA", -2.5), ("RIGHT_HA", 2.5)]
+)
+def test_f79_drift_of_an_ankle_encoder_is_found_while_the_robot_stands(robot, joint: str, rate: float) -> None:
+    fault = Fault("encoder_drift", joint, 3500, rate=math.radians(rate))
+    run = Run(robot, PoseHold(robot), STANDING, (fault,), "ENC_DRIFT", cycles=5000)
+    assert run.found is not None
+    side, name = joint.split("_")
+    assert run.found.text.startswith(
+        f"encoder of {side.lower()}_{name}: the {side.lower()} sole lies flat on the floor"
+    )
+    assert run.found.cycle - 3500 < 1400
+    assert S.FULL_ASSIST in run.states
+
+
+@pytest.mark.parametrize("engine", ENGINES)
+def test_robot_that_stands_in_hold_can_start_again(robot, engine: str) -> None:
+    run = Run(
+        robot,
+        PoseHold(robot),
+        STANDING,
+        (),
+        "never",
+        engine=engine,
+        cycles=4600,
+        presses={3000: "hold", 4500: "start"},
+    )
+    assert run.states[4400] is S.HOLD
+    assert run.states[-1] is S.ACTIVE
+    assert run.codes <= {"READY", "DIRECTIONS_PROVEN", "ACTIVE", "TORQUE_SATURATED", "OPERATOR_STOP", "HOLD"}
