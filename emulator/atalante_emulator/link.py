@@ -59,15 +59,23 @@ class _Disturbance:
         """Apply the fault to a frame. Return the frames that replace this frame on the bus, each of shape (1,).
 
         Args:
-            frame: frame to which the fault is applied, shape (1,). It may be changed.
+            frame: frame of a message of the fault, shape (1,). It may be changed.
             cycle: number of the cycle.
         """
-        message = self.messages.get(_id(frame))
-        if message is None:
-            return (frame,)
-        if self.random.random() >= self._chance:
-            return (frame,)
-        return self._effect(self, frame, message, cycle)
+        return self.changed(frame, cycle) if self.strikes() else (frame,)
+
+    def strikes(self) -> bool:
+        """Draw whether the fault affects the next frame of its messages."""
+        return self.random.random() < self._chance
+
+    def changed(self, frame: Frames, cycle: int) -> Sequence[Frames]:
+        """Return the frames that replace a frame of the messages of the fault, each of shape (1,).
+
+        Args:
+            frame: frame that the fault affects, shape (1,). It may be changed.
+            cycle: number of the cycle.
+        """
+        return self._effect(self, frame, self.messages[_id(frame)], cycle)
 
     def due(self, cycle: int) -> list[Frames]:
         """Return the delayed frames that must be delivered by now, each of shape (1,), and remove these frames from `late`.
@@ -236,6 +244,7 @@ class FaultyBus(WrappedBus):
             if fault.kind in LINK_KINDS
         ]
         self._active: list[_Disturbance] = []
+        self._acting: dict[int, list[_Disturbance]] = {}  # identifier -> active faults of this message
         self._syncs = {m.frame_id for m in network.messages if m.name.startswith("SYNC_")}
         self._from_hal = {m.frame_id for m in network.sent_by("HAL")}
         self._for_nodes: list[Frames] = []  # frames of the HAL that the nodes have not received yet
@@ -291,20 +300,34 @@ class FaultyBus(WrappedBus):
         cycle = self._clock()
         if cycle != self._cycle:
             self._cycle = cycle
-            self._active = [d for d in self._all if d.from_cycle <= cycle < d.fault.end]
+            active = [d for d in self._all if d.from_cycle <= cycle < d.fault.end]
+            if active != self._active:
+                self._active, self._acting = active, {}
+                for disturbance in active:
+                    for can_id in disturbance.messages:
+                        self._acting.setdefault(can_id, []).append(disturbance)
         return self._active
 
     def _passed(self, frames: Frames, *, from_hal: bool) -> list[Frames]:
-        """Apply all active faults to each frame. Return the frames that are sent in this cycle, each of shape (1,)."""
+        """Apply all active faults to each frame. Return the frames that are sent in this cycle."""
         passing: list[Frames] = []
+        unchanged = 0  # first row of the frames before this row that pass unchanged
         for row, can_id in enumerate(frames["can_id"].tolist()):
-            copies, ids = [frames[row : row + 1].copy()], {can_id}
-            for disturbance in self._active:
-                if not ids.isdisjoint(disturbance.messages):
-                    copies = [after for frame in copies for after in disturbance.frames(frame, self._cycle)]
-                    ids = {_id(frame) for frame in copies}
-            passing += copies
-        return passing if self.wire.idle else self.wire.carry(passing, from_hal=from_hal)
+            acting = self._acting.get(can_id, ())
+            for number, disturbance in enumerate(acting, 1):
+                if disturbance.strikes():
+                    passing.append(frames[unchanged:row].copy())
+                    copies = disturbance.changed(frames[row : row + 1].copy(), self._cycle)
+                    for later in acting[number:]:
+                        copies = [after for frame in copies for after in later.frames(frame, self._cycle)]
+                    passing += copies
+                    unchanged = row + 1
+                    break
+        passing.append(frames[unchanged:].copy())
+        if self.wire.idle:
+            return passing
+        single = [part[row : row + 1] for part in passing for row in range(len(part))]
+        return self.wire.carry(single, from_hal=from_hal)
 
     def _begin_cycle(self) -> None:
         """Send delayed frames that are due, and frames that faults add. Only the first call in a cycle has an effect."""
