@@ -41,7 +41,7 @@ from atalante_tools.trial.plan import (
     sweep_trials,
 )
 from atalante_tools.trial.pushes import largest_push
-from atalante_tools.trial.robustness import robust_walk
+from atalante_tools.trial.robustness import bus_faults, robust_walk
 from atalante_tools.trial.run import run_trial
 from atalante_tools.trial.store import compute, path_of, stored
 
@@ -266,7 +266,8 @@ def test_robust_trials_are_drawn_from_the_seed_within_their_ranges() -> None:
     trials = [t for t in robust_trials(100, 60, 0, "mujoco") if isinstance(t, RobustTrial)]
     assert trials == robust_trials(100, 60, 0, "mujoco") != robust_trials(100, 60, 1, "mujoco")
     assert trials[:10] == robust_trials(10, 60, 0, "mujoco")
-    assert {trial.delay for trial in trials} == {0, 1}
+    assert {sum(trial.delay) for trial in trials} == {0, 1, 2, 3}
+    assert all(set(trial.delay) <= {0, 1} for trial in trials)
     assert all(0.9 <= t.mass_share <= 1.1 and 0.25 <= t.friction <= 0.8 for t in trials)
     assert all(len(t.pushes) == 6 and all(0.0 <= time < 48.0 for time, _ in t.pushes) for t in trials)
     assert len({trial.seed for trial in trials}) == 100
@@ -276,7 +277,7 @@ def robust_trial(steps: int) -> RobustTrial:
     """Return a trial of the default subject, whose gaits are in a file, with a push in the first step."""
     trial = robust_trials(1, steps, 0, "mujoco")[0]
     assert isinstance(trial, RobustTrial)
-    return replace(trial, mass=SUBJECT.mass, height=SUBJECT.height, pushes=((0.4, 90.0),), delay=1, loss=0.001)
+    return replace(trial, mass=SUBJECT.mass, height=SUBJECT.height, pushes=((0.4, 90.0),), delay=(1, 1, 1), loss=0.001)
 
 
 def test_robust_walk_is_pushed_and_its_recording_is_readable(tmp_path: Path) -> None:
@@ -285,6 +286,17 @@ def test_robust_walk_is_pushed_and_its_recording_is_readable(tmp_path: Path) -> 
     assert (result["outcome"], result["steps"], result["safe"], result["pushes"]) == ("stood", 1, True, 1)
     assert result["max_dcm_error_m"] > 1.5 * robust_walk(replace(trial, force=0.0))["max_dcm_error_m"]
     assert (tmp_path / "walk.mcap").stat().st_size > 10_000
+
+
+def test_delay_of_a_robust_walk_applies_to_cyclic_states_and_commands() -> None:
+    trial = robust_trials(1, 3, 0, "mujoco")[0]
+    assert isinstance(trial, RobustTrial)
+    faults = bus_faults(replace(trial, delay=(1, 2, 0)))
+    late = {fault.target: fault["by"] for fault in faults if fault.kind == "delay"}
+    assert late["LEFT_SK_STATE"] == late["IMU_PELVIS_STATE"] == late["PENDANT_STATE"] == 1
+    assert late["COMMAND_LEFT_LEG"] == late["COMMAND_RIGHT_LEG"] == 2
+    assert not any(name.startswith(("SYNC", "HAPTICS_COMMAND")) or name.endswith("STATUS") for name in late)
+    assert not [fault for fault in bus_faults(replace(trial, delay=(0, 0, 1))) if fault.kind == "delay"]
 
 
 def test_robot_that_cannot_start_ends_the_trial(monkeypatch: pytest.MonkeyPatch) -> None:

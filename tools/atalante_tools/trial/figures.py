@@ -46,11 +46,11 @@ def robustness(results: Sequence[Result]) -> bytes:
         results: results of `robust` trials.
     """
     figure, axis = plt.subplots(figsize=(6.0, 4.2))
-    for delay in sorted({r["trial"]["delay"] for r in results}):
+    for delay in sorted({sum(r["trial"]["delay"]) for r in results}):
         for stood, marker in ((True, "o"), (False, "x")):
-            of = [r["trial"] for r in results if r["trial"]["delay"] == delay and (r["outcome"] == "stood") is stood]
+            of = [r["trial"] for r in results if sum(r["trial"]["delay"]) == delay and (r["outcome"] == "stood") is stood]
             if of:
-                label = f"{'stood' if stood else 'did not stand'}, motors {delay} ms late"
+                label = f"{'stood' if stood else 'did not stand'}, control loop {delay} ms late"
                 axis.scatter([t["mass_share"] for t in of], [t["friction"] for t in of], marker=marker, label=label)
     axis.set_xlabel("true mass / known mass of the patient")
     axis.set_ylabel("friction")

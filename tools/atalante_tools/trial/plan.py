@@ -41,10 +41,12 @@ TREADMILL_TIME: Final = 300
 SWEEP_SUBJECT: Final = (75.0, 1.75)
 #: Masses of the subjects of `assist --quick` [kg].
 QUICK_MASSES: Final = (58.0, 75.0)
-#: Ranges of the random parameters of `robustness`: true mass / known mass, friction, delay [ms].
+#: Ranges of the random parameters of `robustness`: true mass / known mass, friction.
 MASS_SHARE: Final = (0.9, 1.1)
 FRICTION: Final = (0.25, 0.8)
-DELAY_MAX: Final = 1
+#: Parts of the control loop of `robustness` that can be a cycle late: state messages, command messages, motors. Messages that are
+#: later would time out after fewer lost frames than the fault matrix intends: four in a row if the messages are one cycle late.
+LATE_PARTS: Final = 3
 #: Probability of a lost frame, force of a push [N], and number of steps in which one push comes at a random time.
 LOSS: Final = 0.01
 PUSH: Final = 100.0
@@ -113,7 +115,7 @@ class RobustTrial:
     height: float  # m
     mass_share: float  # true mass of the patient / known mass
     friction: float  # between soles and floor
-    delay: int  # constant delay of the motor torques [ms]
+    delay: tuple[int, int, int]  # cycles by which state messages, command messages and motor torques are late
     loss: float  # probability that a frame is lost, on all buses
     pushes: tuple[tuple[float, float], ...]  # time since the first periodic step [s] and direction [deg] of each push
     force: float  # N, of each push
@@ -282,10 +284,23 @@ def robust_trials(count: int, steps: int, seed: int, engine: str) -> list[Trial]
         trials.append(
             RobustTrial(
                 number, patient.mass, patient.height, round(draw.uniform(*MASS_SHARE), 4), round(draw.uniform(*FRICTION), 3),
-                draw.randint(0, DELAY_MAX), LOSS, pushes, PUSH, steps, 1000 * seed + number, engine,
+                _delay(draw), LOSS, pushes, PUSH, steps, 1000 * seed + number, engine,
             )
         )  # fmt: skip
     return trials
+
+
+def _delay(draw: random.Random) -> tuple[int, int, int]:
+    """Return random delays of the state messages, the command messages and the motors, 0 or 1 each [cycles].
+
+    The sum is uniformly distributed from 0 to `LATE_PARTS`.
+
+    Args:
+        draw: source of the random numbers.
+    """
+    late = draw.sample(range(LATE_PARTS), draw.randint(0, LATE_PARTS))
+    state, command, motor = (int(part in late) for part in range(LATE_PARTS))
+    return state, command, motor
 
 
 def push_trials(

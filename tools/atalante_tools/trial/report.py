@@ -47,7 +47,7 @@ EXPERIMENTS: Final = {
     "robustness": (
         "Robustness",
         "The emulated robot differs at random from the model of the controller: mass of the patient, friction of the floor, late "
-        "motors. Its buses lose frames, and it is pushed at the pelvis. All parameters of a trial are in its result.",
+        "messages and motors. Its buses lose frames, and it is pushed at the pelvis. All parameters of a trial are in its result.",
     ),
     "pushes": (
         "Pushes",
@@ -178,7 +178,7 @@ def _trials(results: Sequence[Result]) -> tuple[list[str], list[list[str]]]:
         ("patient [kg]", lambda r: _number(r["trial"]["mass"], 0) if "mass_share" in r["trial"] else "-"),
         ("true mass / known mass", lambda r: _number(r["trial"].get("mass_share"), 2)),
         ("friction", lambda r: _number(r["trial"].get("friction"), 2)),
-        ("motor delay [ms]", lambda r: str(r["trial"].get("delay", "-"))),
+        ("delay of states, commands, motors [ms]", lambda r: _delays(r["trial"].get("delay", ()))),
         ("state at the end", lambda r: r.get("state", "-")),
         ("largest push [N]", lambda r: _number(r.get("largest_push_n"), 0)),
         ("end of the last walk", lambda r: r.get("end", "-")),
@@ -190,6 +190,10 @@ def _trials(results: Sequence[Result]) -> tuple[list[str], list[list[str]]]:
 
 def _distinct(values: Iterable[str]) -> str:
     return ", ".join(dict.fromkeys(values)) or "-"
+
+
+def _delays(delays: Sequence[int]) -> str:
+    return ", ".join(map(str, delays)) or "-"
 
 
 def _number(value: float | None, digits: int) -> str:

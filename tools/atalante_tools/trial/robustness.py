@@ -1,7 +1,7 @@
 """Walk of a robot that differs from its model, with lost frames and pushes: `trial -> rig in lock-step -> result`.
 
 The controller knows the nominal patient. The emulated robot carries a patient with another mass and stands on a floor with random
-friction. Its motors react late, its buses lose frames, and it is pushed at the pelvis.
+friction. Its messages and motors are late, its buses lose frames, and it is pushed at the pelvis.
 """
 
 from __future__ import annotations
@@ -101,19 +101,26 @@ def robust_walk(trial: RobustTrial, recording: Path | None = None) -> dict[str, 
 
 def _parameters(trial: RobustTrial) -> EmulatorParameters:
     """Return the parameters of the emulated nodes of a robot on the ground, with motors that react late."""
-    drive = replace(GROUND_PARAMETERS.drive, motor=MotorParameters(dead_time=trial.delay))
+    drive = replace(GROUND_PARAMETERS.drive, motor=MotorParameters(dead_time=trial.delay[2]))
     return replace(GROUND_PARAMETERS, drive=drive)
 
 
 def bus_faults(trial: RobustTrial) -> list[Fault]:
-    """Return the faults of the bus: random loss of frames on all buses, in both directions.
+    """Return the faults of the bus: random loss of frames on all buses, in both directions, and late cyclic messages.
 
     Args:
-        trial: trial with the probability of a loss.
+        trial: trial with the probability of a loss and the delays.
     """
     import atalante_dbc
 
-    return [Fault("drop", bus, _BEGINS, None, p=trial.loss) for bus in atalante_dbc.load().buses]
+    network = atalante_dbc.load()
+    states = [message.name for message in network.received_by("HAL") if message.cycle_ms == 1]
+    commands = [message.name for message in network.sent_by("HAL") if message.name.startswith("COMMAND_")]
+    late = [(name, by) for names, by in zip((states, commands), trial.delay[:2], strict=True) for name in names if by]
+    return [
+        *(Fault("drop", bus, _BEGINS, None, p=trial.loss) for bus in network.buses),
+        *(Fault("delay", name, _BEGINS, None, by=by) for name, by in late),
+    ]
 
 
 class Pushes:
