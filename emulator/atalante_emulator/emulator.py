@@ -106,9 +106,9 @@ class Emulator:
         """
         parameters = parameters or EmulatorParameters()
         self.network, self.body, self.bus, self.operator = network, body, bus, operator
+        self._robot, self._seed = robot, seed
         self._link: FaultyBus | None = None
-        if any(fault.kind in LINK_KINDS for fault in faults):
-            self.bus = self._link = FaultyBus(bus, network, faults, lambda: self.cycle, seed=seed)
+        self._node_faults: NodeFaults | None = None
         self.cycle = 0
         self.frames_lost = 0  # number of frames lost because the transmit queue of the bus was full
         self.before_send: list[Callable[[int, Vector], None]] = []
@@ -122,14 +122,26 @@ class Emulator:
         self._bind_commands()
         self._build_nodes(robot, parameters)
         self._noise = SensorNoise(seed, self._tx.codec, self.drives, self._imus, self._feet)
-        self._node_faults: NodeFaults | None = None
+        self.inject(faults)
+        self._sample_next()
+
+    def inject(self, faults: Sequence[Fault]) -> None:
+        """Add faults to a robot that has none yet.
+
+        Args:
+            faults: faults to inject. They must begin at least two cycles later, because the next frames are already computed.
+
+        Raises:
+            FaultError: If the target or a signal of a fault is not in the network.
+        """
+        if any(fault.kind in LINK_KINDS for fault in faults):
+            self.bus = self._link = FaultyBus(self.bus, self.network, faults, lambda: self.cycle, seed=self._seed)
         if any(fault.kind in NODE_KINDS or fault.kind in SENSOR_KINDS for fault in faults):
             self._node_faults = NodeFaults(
-                faults, network, robot, self._tx.codec, self.drives, self._heartbeats, self._emergencies
+                faults, self.network, self._robot, self._tx.codec, self.drives, self._heartbeats, self._emergencies
             )
             if self._node_faults.rewrites:
                 self.before_send.append(self._node_faults.rewrite)
-        self._sample_next()
 
     @property
     def signals(self) -> Codec:

@@ -1,6 +1,6 @@
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from functools import partial
 
 import numpy as np
@@ -10,6 +10,7 @@ from atalante_dbc import Network
 from atalante_emulator.bodies.pybullet_body import PyBulletBody
 from atalante_emulator.drive import WATCHDOG
 from atalante_emulator.emulator import Emulator
+from atalante_emulator.faults import Fault
 from atalante_emulator.pendant import Operator
 from atalante_hal.bus import Bus
 from atalante_hal.bus.joined import JoinedBus
@@ -101,11 +102,13 @@ Setup = tuple[Master, Emulator]
 def make(network: Network, robot: Robot, urdf_text: str) -> Iterator[Callable[..., Setup]]:
     bodies: list[PyBulletBody] = []
 
-    def build(*, seed: int = 0, operator: Operator | None = None, ground: float | None = None) -> Setup:
+    def build(
+        *, seed: int = 0, operator: Operator | None = None, ground: float | None = None, faults: Sequence[Fault] = ()
+    ) -> Setup:
         ours, theirs = lockstep_pair()
         bodies.append(PyBulletBody(urdf_text, ground=ground))
         bodies[-1].reset(CROUCHED)
-        emulator = Emulator(network, robot, bodies[-1], theirs, seed=seed, operator=operator)
+        emulator = Emulator(network, robot, bodies[-1], theirs, seed=seed, operator=operator, faults=faults)
         ours.step = emulator.poll
         return Master(network, robot, ours), emulator
 
@@ -136,6 +139,24 @@ class TestDeterminism:
 
     def test_another_seed_gives_other_bytes(self, make: Callable[..., Setup]) -> None:
         assert walk(make(seed=5), 50) != walk(make(seed=6), 50)
+
+    def test_faults_injected_before_their_start_give_the_same_bytes(self, make: Callable[..., Setup]) -> None:
+        faults = [
+            Fault("drop", "left_leg", 42, 20, p=0.3),
+            Fault("encoder_stuck", "LEFT_SK", 42, 20),
+            Fault("imu_saturated", "IMU_PELVIS", 42, 20),
+        ]
+        known = walk(make(seed=5, faults=faults), 80)
+        setup = make(seed=5)
+        sync, (master, emulator) = setup[0].sync, setup
+
+        def inject_then_sync(hal_state: int = 0) -> None:
+            if emulator.cycle == 40:
+                emulator.inject(faults)
+            sync(hal_state)
+
+        master.sync = inject_then_sync  # type: ignore[method-assign]
+        assert walk(setup, 80) == known != walk(make(seed=5), 80)
 
 
 class TestCycle:

@@ -196,7 +196,7 @@ def test_report_contains_every_finding_and_requests_nothing(experiment: str, tmp
 
 
 def robust_result(number: int, outcome: str = "stood", *, safe: bool = True) -> Result:
-    trial = RobustTrial(number, 75.0, 1.75, 1.05, 0.5, 2, 0.01, ((1.0, 90.0),), 100.0, 60, number, "mujoco")
+    trial = RobustTrial(number, 75.0, 1.75, 1.05, 0.5, (1, 0, 1), 0.01, ((1.0, 90.0),), 100.0, 60, number, "mujoco")
     return {
         "trial": fields(trial), "versions": VERSIONS, "outcome": outcome, "steps": 60, "state": "ACTIVE", "safe": safe,
         "max_dcm_error_m": 0.05, "diagnostics": {}, "true_lateral_m": 0.1,

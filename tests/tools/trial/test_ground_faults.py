@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -14,8 +15,8 @@ from atalante_tools.cli import cli
 from atalante_tools.faults.catalogue import SCENARIOS
 from atalante_tools.faults.matrix import load_matrix
 from atalante_tools.trial.fault_findings import NO_FALL, NO_FALL_IN_DOUBLE_SUPPORT, fault_findings
-from atalante_tools.trial.fault_plan import PERMANENT, fault_trials
-from atalante_tools.trial.fault_run import diagnosed, longest_without
+from atalante_tools.trial.fault_plan import DOUBLE_SUPPORT, PERMANENT, fault_trials
+from atalante_tools.trial.fault_run import diagnosed, longest_without, run_fault
 
 #: Fault whose cases all begin at power-on.
 POWER_ON = "F53"
@@ -23,7 +24,7 @@ POWER_ON = "F53"
 
 def result(id_: str, case: str = "a case", **run: Any) -> dict[str, Any]:
     given = {
-        "moment": 0.5,
+        "moment": "phase 0.5",
         "outcome": "fell",
         "state": "HOLD",
         "codes": ["NODE_TIMEOUT"],
@@ -62,7 +63,9 @@ def test_bisection_returns_the_horizon_if_the_robot_never_falls() -> None:
         ("F56", {"case": "HOLD"}, True),
         ("F56", {"case": "HOLD", "codes": []}, False),
         ("F16", {}, True),
-        ("F16", {"moment": None}, False),
+        ("F16", {"moment": "weight shift"}, False),
+        ("F41", {"moment": "standing"}, False),
+        ("F41", {"moment": "phase 0"}, True),
         ("F22", {}, True),
         ("F22", {"codes": []}, False),
         ("F22", {"state": "ACTIVE"}, False),
@@ -103,12 +106,22 @@ def test_fault_at_power_on_is_refused(tmp_path: Path) -> None:
     assert "F53 begins at power-on, not during a walk" in outcome.output
 
 
+def test_f41_robot_with_both_feet_on_the_ground_stands_when_the_hal_is_killed() -> None:
+    (trial,) = fault_trials(("F41",), False, 0, "mujoco")
+    moments = tuple(moment for moment in trial.moments if moment in DOUBLE_SUPPORT)
+    runs = run_fault(replace(trial, moments=moments))["runs"]
+    assert [run["moment"] for run in runs] == list(moments)
+    assert {run["outcome"] for run in runs} == {"hold"}
+    (swing,) = run_fault(replace(trial, moments=("phase 0.5",)))["runs"]
+    assert (swing["outcome"], swing["state"], swing["codes"][0]) == ("fell", "HOLD", "CYCLE_GAP")
+
+
 def test_command_injects_a_fault_and_writes_the_report(tmp_path: Path) -> None:
     arguments = ["trial", "faults", "F05", "--quick", "--jobs", "1", "--out", str(tmp_path), "--json"]
     outcome = CliRunner().invoke(cli, arguments)
     assert outcome.exit_code == 0, outcome.output
     trial, finding = (json.loads(line) for line in outcome.stdout.splitlines())
-    assert [run["outcome"] for run in trial["runs"]] == ["stood", "stood"]
+    assert [run["outcome"] for run in trial["runs"]] == ["walked", "walked"]
     assert all("E2E_REPEATED" in run["codes"] for run in trial["runs"])
     assert (finding["id"], finding["passed"]) == ("F05", True)
-    assert "double support" in (tmp_path / "report.html").read_text()
+    assert "weight shift" in (tmp_path / "report.html").read_text()

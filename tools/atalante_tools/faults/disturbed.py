@@ -30,10 +30,19 @@ class HostFaults:
     """Host faults of a case, with their timing in HAL cycles."""
 
     def __init__(self, faults: Sequence[HostFault], begins: int) -> None:
-        self._faults, self._begins = faults, begins
+        self.schedule(faults, begins)
         self.cycle = 0  # current HAL cycle, set by the runner
         #: First HAL cycle in which a fault was active; None if no fault was active yet.
         self.first_active: int | None = None
+
+    def schedule(self, faults: Sequence[HostFault], begins: int) -> None:
+        """Replace the faults.
+
+        Args:
+            faults: new faults. Their `start` counts from `begins`.
+            begins: HAL cycle in which the case begins.
+        """
+        self._faults, self._begins = faults, begins
 
     def of(self, *kinds: str) -> HostFault | None:
         """Return the first active fault of one of the given kinds, or None.
@@ -67,9 +76,19 @@ class TimedStimuli:
             stimuli: faults and operator actions. Their `start` counts from the start of the case.
             begins: HAL cycle in which the case begins, from 1.
         """
-        self.faults = [one.starting(begins - 1 + one.start) for one in stimuli if isinstance(one, Fault)]
-        self.host_faults = HostFaults([one for one in stimuli if isinstance(one, HostFault)], begins)
         self.presses: defaultdict[int, list[str]] = defaultdict(list)
+        self.host_faults = HostFaults((), begins)
+        self.schedule(stimuli, begins)
+
+    def schedule(self, stimuli: Sequence[Stimulus], begins: int) -> None:
+        """Replace the faults, and add the actions of the operator.
+
+        Args:
+            stimuli: faults and operator actions. Their `start` counts from `begins`.
+            begins: HAL cycle in which the case begins, from 1.
+        """
+        self.faults = [one.starting(begins - 1 + one.start) for one in stimuli if isinstance(one, Fault)]
+        self.host_faults.schedule([one for one in stimuli if isinstance(one, HostFault)], begins)
         for one in stimuli:
             if isinstance(one, OperatorAction):
                 self.presses[begins + one.start].append(one.kind)

@@ -168,16 +168,18 @@ def sweep(days: int, walking: Walking, running: Running, as_json: bool) -> None:
 def faults(ids: tuple[str, ...], running: Running, as_json: bool) -> None:
     """Inject each fault, or the faults with the given IDs, into walks on the ground with a passive wearer.
 
-    Each case of the fault matrix begins at nine moments: in double support before the walk, and at eight phases of a step. The
-    report states which walks end in a fall, and why. For permanent faults, it states the longest duration without a fall.
+    Each case of the fault matrix begins at ten moments: at eight phases of a step, and in double support before and after the
+    steps. The report states which walks end in a fall, and why. For permanent faults, it states the longest duration without
+    a fall.
     """
     from atalante_tools.console.names import find
-    from atalante_tools.faults.catalogue import SCENARIOS
     from atalante_tools.trial.fault_findings import fault_findings
     from atalante_tools.trial.fault_plan import QUICK_IDS, fault_trials
+    from atalante_tools.trial.ground_cases import FAULT_IDS
 
-    known = list(SCENARIOS)
-    chosen = [known[find(id_, known, "fault with a scenario")] for id_ in ids] or (QUICK_IDS if running.quick else ())
+    chosen = [FAULT_IDS[find(id_, FAULT_IDS, "fault with a case")] for id_ in ids] or (
+        QUICK_IDS if running.quick else ()
+    )
     trials = fault_trials(chosen, running.quick, running.seed, running.engine)
     if without := [id_ for id_ in chosen if id_ not in {trial.id for trial in trials}]:
         raise click.UsageError(f"{without[0]} begins at power-on, not during a walk")

@@ -8,6 +8,7 @@ from itertools import groupby
 from typing import Any, Final
 
 from atalante_tools.faults.matrix import load_matrix
+from atalante_tools.trial.fault_plan import DOUBLE_SUPPORT, NO_FRAMES
 from atalante_tools.trial.findings import Finding, Result
 
 #: Fault ID -> regular expression for the names of the cases in which the robot must not fall.
@@ -24,8 +25,8 @@ NO_FALL: Final = {
     "F56": "STOP|dead-man|pendant",
     **dict.fromkeys(("F63", "F64", "F65"), ""),
 }
-#: IDs of the faults in which the bus of the HAL fails. The robot must not fall if such a fault begins in double support.
-NO_FALL_IN_DOUBLE_SUPPORT: Final = frozenset({"F15", "F16"})
+#: IDs of the faults that end the frames of the HAL. The robot must not fall if such a fault begins in double support.
+NO_FALL_IN_DOUBLE_SUPPORT: Final = NO_FRAMES
 
 
 def fault_findings(results: Sequence[Result]) -> list[Finding]:
@@ -69,7 +70,7 @@ def _wrong_fall(id_: str, case: str, run: dict[str, Any]) -> bool:
     if run["outcome"] != "fell":
         return False
     required = (id_ in NO_FALL and re.match(NO_FALL[id_], case)) or (
-        id_ in NO_FALL_IN_DOUBLE_SUPPORT and run["moment"] is None
+        id_ in NO_FALL_IN_DOUBLE_SUPPORT and run["moment"] in DOUBLE_SUPPORT
     )
     return bool(required) or not run["codes"] or run["state"] == "ACTIVE"
 
@@ -80,7 +81,7 @@ def _by_case(falls: Sequence[tuple[str, dict[str, Any]]]) -> list[tuple[str, lis
 
 def _moments(falls: Sequence[dict[str, Any]]) -> str:
     """Return a text about the falls in one case: starts of the fault, end states, first diagnostics and reason."""
-    moments = ", ".join(moment_name(run["moment"]) for run in falls)
+    moments = ", ".join(run["moment"] for run in falls)
     states = ", ".join(dict.fromkeys(run["state"] for run in falls))
     codes = ", ".join(dict.fromkeys(run["codes"][0] if run["codes"] else "no diagnostic" for run in falls))
     return f"at {moments} ({states}; {codes}; {falls[0]['reason'] or 'no reason'})"
@@ -96,13 +97,4 @@ def _longest(result: Result) -> str:
     if not limited:
         return "is not limited"
     cycles, moment = min(limited, key=lambda one: one[0])
-    return f"{cycles} cycles (at {moment_name(moment)})"
-
-
-def moment_name(moment: float | None) -> str:
-    """Return the name of the point of a walk at which a fault begins.
-
-    Args:
-        moment: phase of the step; None means in double support.
-    """
-    return "double support" if moment is None else f"phase {moment:g}"
+    return f"{cycles} cycles (at {moment})"

@@ -1,8 +1,8 @@
-"""Trials of the experiment `faults`: each case of the fault matrix, injected at nine points of a walk on the ground.
+"""Trials of the experiment `faults`: each case of the fault matrix, injected at several moments of a walk on the ground.
 
-    scenarios of the fault matrix -> trials
+    cases of the fault matrix -> trials
 
-A trial is one case at all moments, so its start-up is paid once.
+A trial is one case at all its moments.
 """
 
 from __future__ import annotations
@@ -10,11 +10,36 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import ClassVar, Final
+from typing import ClassVar, Final, NamedTuple
 
-#: Phases of the second step of the walk at which a fault begins. None is the weight shift before the walk, in double support.
-MOMENTS: Final = (None, *(k / 8 for k in range(8)))
-QUICK_MOMENTS: Final = (None, 0.375)
+
+class Moment(NamedTuple):
+    """Moment of the walk at which a fault begins: a time after the start of a phase of the walk."""
+
+    phase: str  # name of a member of `atalante_control.walking.phases.Phase`
+    step: int  # number of steps before the phase
+    share: float  # time since the first cycle of the phase / nominal duration of a step
+
+
+#: Steps of a walk before its stop step.
+STEPS: Final = 2
+#: Moments at which each fault begins, by name. Both feet carry load in the weight shifts before and after the steps.
+MOMENTS: Final = {
+    "weight shift": Moment("SHIFT", 0, 0.75),
+    **{f"phase {k / 8:g}": Moment("STEP", STEPS - 1, k / 8) for k in range(8)},
+    "shift back": Moment("BACK", STEPS, 0.25),
+}
+QUICK_MOMENTS: Final = ("weight shift", "phase 0.375")
+#: Further moments with both feet on the ground, for the faults that end the frames of the HAL.
+FURTHER_MOMENTS: Final = {
+    "standing": Moment("SHIFT", 0, 0.0),
+    "start of the first step": Moment("START", 0, 0.0),
+    "landing of the stop step": Moment("BACK", STEPS, 0.0),
+}
+#: Names of the moments with both feet on the ground.
+DOUBLE_SUPPORT: Final = frozenset({"weight shift", "shift back", *FURTHER_MOMENTS})
+#: Faults that end the frames of the HAL on a bus or on all buses.
+NO_FRAMES: Final = frozenset({"F15", "F16", "F41"})
 #: Faults of `--quick`.
 QUICK_IDS: Final = ("F05", "F56")
 #: Value of `FaultTrial.index` for the permanent case of a scenario.
@@ -29,7 +54,7 @@ class FaultTrial:
     id: str  # fault ID, as in the fault matrix
     index: int  # index of the case in its scenario, or `PERMANENT`
     case: str  # name of the case
-    moments: tuple[float | None, ...]  # of `MOMENTS`
+    moments: tuple[str, ...]  # names of `MOMENTS` and `FURTHER_MOMENTS`
     mass: float  # kg, of the wearer
     height: float  # m, of the wearer
     seed: int
@@ -43,10 +68,10 @@ class FaultTrial:
 
 
 def fault_trials(ids: Sequence[str], quick: bool, seed: int, engine: str) -> list[FaultTrial]:
-    """Return the trials of the given faults. Cases that begin at power-on or at another phase than `MID_SWING` are left out.
+    """Return the trials of the given faults.
 
     Args:
-        ids: fault IDs. With none, all faults with a scenario.
+        ids: fault IDs. With none, all faults with a case.
         quick: whether only the first case of each fault is tried, at two moments.
         seed: seed of the experiment, which is added to the seed of each case.
         engine: physics engine of the emulated robot.
@@ -54,25 +79,20 @@ def fault_trials(ids: Sequence[str], quick: bool, seed: int, engine: str) -> lis
     import atalante_tools.faults
     import atalante_tools.session
     from atalante_control.gait.subject import STUDY_PATIENTS
-    from atalante_tools.faults.catalogue import SCENARIOS
-    from atalante_tools.faults.scenario import MID_SWING
+    from atalante_tools.trial.ground_cases import FAULT_IDS, ground_cases
     from atalante_tools.trial.plan import SWEEP_SUBJECT, source_hash
 
     patient = next(patient for patient in STUDY_PATIENTS if patient.mass == SWEEP_SUBJECT[0])
     sources = source_hash([Path(next(iter(one.__path__))) for one in (atalante_tools.faults, atalante_tools.session)])
-    trials = []
-    for id_ in ids or SCENARIOS:
-        scenario = SCENARIOS[id_]
-        cases = [(index, case) for index, case in enumerate(scenario.cases) if case.phase == MID_SWING]
-        if quick:
-            cases = cases[:1]
-        elif scenario.permanent is not None:
-            cases.append((PERMANENT, scenario.permanent))
-        trials += [
-            FaultTrial(
-                id_, index, case.name, QUICK_MOMENTS if quick else MOMENTS, patient.mass, patient.height,
-                seed + case.seed, engine, sources,
-            )
-            for index, case in cases
-        ]  # fmt: skip
-    return trials
+    return [
+        FaultTrial(
+            id_, index, case.name, QUICK_MOMENTS if quick else _moments(id_), patient.mass, patient.height,
+            seed + case.seed, engine, sources,
+        )
+        for id_ in ids or FAULT_IDS
+        for index, case in list(ground_cases(id_).items())[: 1 if quick else None]
+    ]  # fmt: skip
+
+
+def _moments(id_: str) -> tuple[str, ...]:
+    return (*MOMENTS, *(FURTHER_MOMENTS if id_ in NO_FRAMES else ()))

@@ -1,53 +1,65 @@
 """Run the trials of the experiment `faults`: `trial -> a walk for each start of the fault -> outcomes, diagnostics, durations`.
 
-A first walk without a fault gives the cycles of the moments. All walks with the same seed are equal until the fault begins.
+A first walk without a fault gives the cycles of the moments. All walks with the same seed are equal until the fault begins, so a
+second walk branches off shortly before each moment, and each fault continues a copy of this walk.
 """
 
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import cache
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any, Final, NamedTuple
+
+import numpy as np
 
 from atalante_control.gait.subject import Subject
 from atalante_control.model import Patient
 from atalante_control.walking.controller import WalkController
 from atalante_control.walking.phases import Phase
+from atalante_emulator.emulator import Emulator
 from atalante_emulator.mechanics import Ground, Mechanics
 from atalante_emulator.pendant import Operator
 from atalante_emulator.wearer import LimbParameters
 from atalante_hal.loop import run
-from atalante_hal.robot import load_robot
+from atalante_hal.robot import IMUS, load_robot
 from atalante_hal.types import PERIOD, State, SupervisorState
 from atalante_tools.console.stop_request import check_stop, deferred
 from atalante_tools.faults.absence import Absence
-from atalante_tools.faults.catalogue import SCENARIOS
 from atalante_tools.faults.disturbed import DisturbedBus, DisturbedClock, DisturbedController, TimedStimuli
 from atalante_tools.faults.matrix import load_matrix
 from atalante_tools.faults.scenario import Case, Stimulus
 from atalante_tools.faults.tasks import HORIZON, limited
-from atalante_tools.faults.verdict import exception_sentence
+from atalante_tools.faults.verdict import WALKING, exception_sentence
 from atalante_tools.session.body import describe
-from atalante_tools.session.rig import open_hal
+from atalante_tools.session.rig import Rig, open_hal
 from atalante_tools.session.walk_observation import AFTERMATH, Observation
 from atalante_tools.session.walk_options import solved_gaits
-from atalante_tools.trial.fault_plan import PERMANENT, FaultTrial
+from atalante_tools.trial.branch import Branch, Continuation, branch
+from atalante_tools.trial.fault_plan import FURTHER_MOMENTS, MOMENTS, PERMANENT, STEPS, FaultTrial
+from atalante_tools.trial.ground_cases import ground_cases
 from atalante_tools.trial.lockstep import target
 from atalante_tools.trial.plan import STEP
 
 if TYPE_CHECKING:
     from atalante_hal.safety.events import Event
 
-#: Steps of a walk before its stop step, and index of the step in which the fault begins (0 is the first step).
-_STEPS, _FAULTY_STEP = 2, 1
-#: Cycles from the start of the weight shift to a fault in double support.
-_SHIFTED: Final = 600
+#: Cycles from a branch of the walk to its moment. The first frames of a fault are computed one cycle before it begins.
+_LEAD: Final = 5
 #: Cycles for which the HAL is observed after a fall.
 _FALLEN: Final = 300
 #: Cycles after which a walk ends in any case. A walk without a fault lasts about 10000 cycles.
 _LONGEST: Final = 20_000
+#: The robot is at rest if its pelvis and its joints have been slower than these speeds [m/s, rad/s] for this time [cycles], and
+#: each foot carries a load of at least this force [N].
+_STILL, _RESTED, _LOADED = 0.01, 500, 50.0
+#: The robot walks on if two steps have ended after the fault, and this time has passed since [cycles].
+_WALKED: Final = 400
+_LANDINGS: Final = 2
+#: Phases of the walk that begin with the landing of a foot.
+_LANDED: Final = frozenset({Phase.STEP, Phase.STOP, Phase.BACK})
+_PELVIS: Final = IMUS.index("pelvis")
 #: Resolution of the longest duration of a fault without a fall [cycles].
 RESOLUTION: Final = 10
 
@@ -56,13 +68,33 @@ RESOLUTION: Final = 10
 class FaultRun:
     """Result of one walk with a fault."""
 
-    moment: float | None  # of `FaultTrial.moments`
-    outcome: str  # "stood" (walked to the end), "hold" (stopped upright), "fell" or "exception"
+    moment: str  # of `FaultTrial.moments`
+    #: "walked" (two steps after the fault, or to the end), "hold" (stopped upright), "fell" or "exception"
+    outcome: str
     state: str  # state of the HAL at the end
     #: diagnostics since the first faulty cycle, except information, in the order of their first report
     codes: tuple[str, ...]
     detected: int | None  # cycles from the first faulty cycle to the diagnostic of the fault matrix, both included
     reason: str  # reason that the HAL states for its last state, or the exception
+    fallen: int | None = None  # cycles from the start of the case to the fall
+
+
+class _Request(NamedTuple):
+    """Case that continues a walk from a branch."""
+
+    stimuli: tuple[Stimulus, ...]  # faults and actions of the operator
+    begins: int  # HAL cycle in which the case begins
+    ends: int | None  # first cycle after all faults and actions, counted from `begins`; None if one is permanent
+
+
+class _Answer(NamedTuple):
+    """Result of a walk that has been continued with a case."""
+
+    outcome: str
+    state: SupervisorState
+    reason: str
+    fallen: int | None  # HAL cycle of the fall
+    events: tuple[Event, ...]  # all events of the HAL
 
 
 def run_fault(trial: FaultTrial) -> dict[str, Any]:
@@ -71,33 +103,37 @@ def run_fault(trial: FaultTrial) -> dict[str, Any]:
     Args:
         trial: trial to run.
     """
-    scenario = SCENARIOS[trial.id]
-    permanent = trial.index == PERMANENT
-    case = scenario.permanent if permanent else scenario.cases[trial.index]
-    assert case is not None
+    case = ground_cases(trial.id)[trial.index]
     runs: list[FaultRun] = []
     longest: list[int | None] = []
     for moment in trial.moments:
         runs.append(_run(trial, case, moment))
-        if permanent:
-            longest.append(_longest(trial, case, moment) if runs[-1].outcome == "fell" else None)
-        check_stop()
-    fell = sum(one.outcome == "fell" for one in runs)
+        if trial.index == PERMANENT:
+            longest.append(_longest(trial, case, runs[-1]) if runs[-1].outcome == "fell" else None)
     return {
         "outcome": "computed",
-        "fell": fell,
+        "fell": sum(one.outcome == "fell" for one in runs),
         "runs": [asdict(one) for one in runs],
         "longest": longest,  # longest duration of a permanent fault without a fall [cycles]; None: no fall
     }
 
 
-def _longest(trial: FaultTrial, case: Case, moment: float | None) -> int:
-    """Return the longest duration of a permanent fault without a fall [cycles], by bisection."""
+def _longest(trial: FaultTrial, case: Case, permanent: FaultRun) -> int:
+    """Return the longest duration of a fault without a fall [cycles], by bisection.
+
+    Args:
+        trial: trial of the case.
+        case: case with a permanent fault.
+        permanent: walk with this case, which ended in a fall.
+    """
+    assert permanent.fallen is not None
+    fatal = permanent.fallen
 
     def falls(cycles: int) -> bool:
-        check_stop()
+        if cycles >= fatal:  # until the fall, there is no difference to the permanent fault
+            return True
         stimuli = tuple(limited(stimulus, cycles) for stimulus in case.stimuli)
-        return _run(trial, replace(case, stimuli=stimuli), moment).outcome == "fell"
+        return _run(trial, replace(case, stimuli=stimuli), permanent.moment).outcome == "fell"
 
     return longest_without(falls, HORIZON, RESOLUTION)
 
@@ -121,20 +157,17 @@ def longest_without(falls: Callable[[int], bool], horizon: int, resolution: int)
     return survived
 
 
-def _run(trial: FaultTrial, case: Case, moment: float | None) -> FaultRun:
-    """Walk with a fault that begins at a given point of the walk."""
-    shift, step = _cycles(trial.mass, trial.height, trial.seed, trial.engine)
-    begins = shift + _SHIFTED if moment is None else step + round(moment * STEP[1] / PERIOD)
-    walk = _Walk(case.stimuli, begins)
-    try:
-        walk.execute(trial.mass, trial.height, trial.seed, trial.engine)
-    except Exception as error:  # noqa: BLE001 - any exception of the stack is a finding
-        return FaultRun(moment, "exception", "-", (), None, exception_sentence(error))
+def _run(trial: FaultTrial, case: Case, moment: str) -> FaultRun:
+    """Walk with a fault that begins at a moment."""
+    check_stop()
+    begins, walk = _branches(trial.mass, trial.height, trial.seed, trial.engine)[moment]
+    answer: _Answer = walk.ask(_Request(case.stimuli, begins, case.ends))
     first = begins + case.first_faulty
-    events = [event for event in walk.events if event.cycle >= first]
+    events = [event for event in answer.events if event.cycle >= first]
     expected = case.dtc if case.dtc is not None else load_matrix()[trial.id].dtc
     codes, detected = diagnosed(events, expected, first)
-    return FaultRun(moment, walk.outcome, walk.state.name, codes, detected, walk.reason)
+    fallen = None if answer.fallen is None else answer.fallen - begins
+    return FaultRun(moment, answer.outcome, answer.state.name, codes, detected, answer.reason, fallen)
 
 
 def diagnosed(events: Sequence[Event], expected: str, first: int) -> tuple[tuple[str, ...], int | None]:
@@ -155,44 +188,60 @@ def diagnosed(events: Sequence[Event], expected: str, first: int) -> tuple[tuple
 
 
 @cache
-def _cycles(mass: float, height: float, seed: int, engine: str) -> tuple[int, int]:
-    """Return the first cycles of the weight shift and of the faulty step in a walk without a fault.
+def _branches(mass: float, height: float, seed: int, engine: str) -> dict[str, tuple[int, Branch]]:
+    """Return the first cycle of each moment, and a branch of a walk shortly before this cycle.
+
+    Args:
+        mass: mass of the wearer [kg].
+        height: height of the wearer [m].
+        seed: seed of the sensor noise.
+        engine: physics engine of the emulated robot.
 
     Raises:
         RuntimeError: If the robot does not walk to the end although there is no fault.
     """
-    walk = _Walk((), 1)
+    walk = _Walk(())
     walk.execute(mass, height, seed, engine)
-    if walk.outcome != "stood":
+    if walk.outcome != "walked":
         raise RuntimeError(f"a robot without fault must walk to the end, got {walk.outcome}: {walk.reason}")
-    return walk.begins[Phase.SHIFT, 0], walk.begins[Phase.STEP, _FAULTY_STEP]
+    begins = {
+        name: walk.begins[Phase[moment.phase], moment.step] + round(moment.share * STEP[1] / PERIOD)
+        for name, moment in (MOMENTS | FURTHER_MOMENTS).items()
+    }
+    trunk = _Walk(cycle - _LEAD for cycle in begins.values())
+    trunk.execute(mass, height, seed, engine)
+    return {name: (cycle, trunk.branches[cycle - _LEAD]) for name, cycle in begins.items()}
 
 
 class _Walk:
-    """Walk on the ground with faults.
+    """Walk on the ground.
 
     Attributes:
-        begins: first cycle of each phase and step.
-        events: events of the HAL.
+        begins: first cycle of each phase, by the phase and the number of steps before it.
+        branches: branches of the walk, by their cycles.
         outcome: how the walk ended, as in `FaultRun`.
-        state: last state of the HAL.
-        reason: reason of this state.
+        reason: reason of the last state.
     """
 
-    def __init__(self, stimuli: Sequence[Stimulus], begins: int) -> None:
-        """Prepare the walk with its faults.
+    def __init__(self, forks: Iterable[int]) -> None:
+        """Prepare the walk.
 
         Args:
-            stimuli: faults and actions of the operator.
-            begins: HAL cycle in which the case begins, from 1.
+            forks: cycles at whose end the walk branches off. With any, the walk ends after the last one.
         """
-        self._stimuli = TimedStimuli(stimuli, begins)
+        self._forks = set(forks)
         self.begins: dict[tuple[Phase, int], int] = {}
-        self.events: list[Event] = []
-        self.outcome, self.state, self.reason = "hold", SupervisorState.OFF, ""
+        self.branches: dict[int, Branch] = {}
+        self.outcome, self.reason = "hold", ""
+        self._state = SupervisorState.OFF
+        self._fallen: int | None = None  # cycle of the fall
+        self._events: list[Event] = []
+        self._continuation: Continuation | None = None
+        self._stimuli = TimedStimuli((), 1)
+        self._ends: int | None = None  # first cycle after the faults; None if there is none, or a permanent one
 
     def execute(self, mass: float, height: float, seed: int, engine: str) -> None:
-        """Walk until the robot stands, has stopped or has fallen.
+        """Walk until the robot stands, walks on after the fault, has stopped or has fallen. A continued walk ends the process.
 
         Args:
             mass: mass of the wearer [kg].
@@ -202,7 +251,7 @@ class _Walk:
         """
         robot, patient, operator = load_robot(), Patient(mass, height), Operator()
         gaits = solved_gaits(Subject(patient, *STEP))
-        walk = WalkController(robot, patient, gaits, _STEPS)
+        walk = WalkController(robot, patient, gaits, STEPS)
         with open_hal(
             target(engine),
             robot=robot,
@@ -213,37 +262,94 @@ class _Walk:
             controller_fields=walk.telemetry_fields,
             gait_hash=gaits.step.hash32,
             mechanics=Mechanics(describe(robot, None, patient), engine, Ground(), LimbParameters()),
-            faults=self._stimuli.faults,
         ) as rig:
-            hal, observation, host_faults = rig.hal, Observation(rig, walk, None), self._stimuli.host_faults
-            hal.bus = DisturbedBus(hal.bus, host_faults)
-            host_faults.cycle = 1
-            copied, halted, fallen, started = 0, 0, 0, False
+            try:
+                self._walk(rig, walk, operator)
+            except Exception as error:
+                if self._continuation is None:
+                    raise
+                self.outcome, self.reason = "exception", exception_sentence(error)
+            finally:
+                if self._continuation is not None:
+                    self._finish(self._continuation)
 
-            def record() -> None:
-                nonlocal copied
-                self.begins.setdefault((walk.phase, walk.statistics.steps), hal.state.cycle)
-                self.events += hal.events.since(copied)
-                copied = hal.events.count
+    def _walk(self, rig: Rig, walk: WalkController, operator: Operator) -> None:
+        """Run the loop of the HAL until the walk is over."""
+        assert rig.emulator is not None
+        hal, emulator, host_faults = rig.hal, rig.emulator, self._stimuli.host_faults
+        observation = Observation(rig, walk, None)
+        hal.bus = DisturbedBus(hal.bus, host_faults)
+        host_faults.cycle = 1
+        copied, started, halted, resting, after_fall, landings, landed = 0, False, 0, 0, 0, 0, 0
 
-            def over(state: State) -> bool:
-                nonlocal halted, fallen, started
-                self._stimuli.prepare(state.cycle + 1, operator)
-                self.state = state.supervisor
-                if observation.check():
-                    self.outcome = "fell"
-                    fallen += 1
-                    self.reason = self.reason or hal.reason
-                    return fallen > _FALLEN
-                started = started or hal.moving
-                halted += started and not hal.moving
-                self.reason = hal.reason
-                if hal.moving and walk.done:
-                    self.outcome = "stood"
+        def record() -> None:
+            nonlocal copied, landings, landed
+            cycle = hal.state.cycle
+            if (walk.phase, walk.statistics.steps) not in self.begins:
+                self.begins[walk.phase, walk.statistics.steps] = cycle
+                if walk.phase in _LANDED and self._ends is not None and cycle > self._ends:
+                    landings, landed = landings + 1, cycle
+            self._events += hal.events.since(copied)
+            copied = hal.events.count
+
+        def over(state: State) -> bool:
+            nonlocal started, halted, resting, after_fall
+            if state.cycle in self._forks and self._branch_off(state.cycle, emulator):
+                return True
+            self._stimuli.prepare(state.cycle + 1, operator)
+            self._state = state.supervisor
+            if observation.check():
+                if self._fallen is None:
+                    self.outcome, self.reason, self._fallen = "fell", self.reason or hal.reason, state.cycle
+                after_fall += 1
+                return after_fall > _FALLEN
+            started = started or hal.moving
+            self.reason = hal.reason
+            if hal.moving:
+                walks_on = landings >= _LANDINGS and state.cycle - landed >= _WALKED
+                if walk.done or (walks_on and state.supervisor in WALKING):
+                    self.outcome = "walked"
                     return True
-                return halted > AFTERMATH or state.cycle > _LONGEST
+                return state.cycle > _LONGEST
+            halted += started
+            resting = resting + 1 if started and _still(emulator) else 0
+            return resting > _RESTED or halted > AFTERMATH or state.cycle > _LONGEST
 
-            assert rig.emulator is not None
-            clock = Absence(DisturbedClock(host_faults), rig.emulator)
-            with deferred():
-                run(hal, DisturbedController(walk, host_faults), clock, until=over, record=record)
+        clock = Absence(DisturbedClock(host_faults), emulator)
+        with deferred():
+            run(hal, DisturbedController(walk, host_faults), clock, until=over, record=record)
+
+    def _branch_off(self, cycle: int, emulator: Emulator) -> bool:
+        """Branch off, and return whether the walk ends here because no further branch follows.
+
+        In a continued walk, inject the case of the request.
+
+        Args:
+            cycle: number of the last cycle.
+            emulator: emulated robot.
+        """
+        one = branch()
+        if isinstance(one, Branch):
+            self.branches[cycle] = one
+            return len(self.branches) == len(self._forks)
+        request: _Request = one.request
+        self._continuation, self._forks = one, set()
+        self._stimuli.schedule(request.stimuli, request.begins)
+        self._ends = None if request.ends is None else request.begins + request.ends
+        emulator.inject(self._stimuli.faults)
+        return False
+
+    def _finish(self, continuation: Continuation) -> None:
+        """Send the result of a continued walk, and end the process."""
+        try:
+            continuation.finish(_Answer(self.outcome, self._state, self.reason, self._fallen, tuple(self._events)))
+        finally:
+            continuation.abandon()
+
+
+def _still(emulator: Emulator) -> bool:
+    """Return whether the robot stands on both feet and hardly moves."""
+    body = emulator.body
+    loads = body.sole_force[:, :, 2].sum(axis=1)
+    moves = max(np.abs(body.imu[_PELVIS, 4:]).max(), np.abs(body.velocity).max())
+    return bool(loads.min() > _LOADED and moves < _STILL)

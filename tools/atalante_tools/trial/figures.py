@@ -46,9 +46,10 @@ def robustness(results: Sequence[Result]) -> bytes:
         results: results of `robust` trials.
     """
     figure, axis = plt.subplots(figsize=(6.0, 4.2))
-    for delay in sorted({sum(r["trial"]["delay"]) for r in results}):
+    kinds = [(sum(r["trial"]["delay"]), r["outcome"] == "stood") for r in results]
+    for delay in sorted({delay for delay, _ in kinds}):
         for stood, marker in ((True, "o"), (False, "x")):
-            of = [r["trial"] for r in results if sum(r["trial"]["delay"]) == delay and (r["outcome"] == "stood") is stood]
+            of = [r["trial"] for r, kind in zip(results, kinds, strict=True) if kind == (delay, stood)]
             if of:
                 label = f"{'stood' if stood else 'did not stand'}, control loop {delay} ms late"
                 axis.scatter([t["mass_share"] for t in of], [t["friction"] for t in of], marker=marker, label=label)

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import base64
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from html import escape
 from pathlib import Path
 from typing import Any, Final
 
 from atalante_tools.console.html import html_table, page
 from atalante_tools.console.terminal import print_message
+from atalante_tools.trial.fault_table import fault_table
 from atalante_tools.trial.findings import Finding, Result, condition
 
 #: Title of each experiment, and an explanation of its numbers.
@@ -35,9 +36,9 @@ EXPERIMENTS: Final = {
     ),
     "faults": (
         "Faults during walks on the ground",
-        "Each case of the fault matrix begins at nine moments of a walk with a passive wearer: in double support, during the "
-        "weight shift before the walk, and at eight phases of the second step. A robot has fallen if its pelvis leans by more "
-        "than 35 degrees. The longest duration of a permanent fault without a fall is found by bisection.",
+        "Each case of the fault matrix begins at ten moments of a walk with a passive wearer: at eight phases of the second "
+        "step, and in the weight shifts before and after the steps, in which both feet carry load. A robot has fallen if its "
+        "pelvis leans by more than 35 degrees. The longest duration of a permanent fault without a fall is found by bisection.",
     ),
     "protocol": (
         "Full and then partial assistance",
@@ -47,7 +48,7 @@ EXPERIMENTS: Final = {
     "robustness": (
         "Robustness",
         "The emulated robot differs at random from the model of the controller: mass of the patient, friction of the floor, late "
-        "messages and motors. Its buses lose frames, and it is pushed at the pelvis. All parameters of a trial are in its result.",
+        "messages and motors. Its buses lose frames, and it is pushed at the pelvis. Each result contains all parameters.",
     ),
     "pushes": (
         "Pushes",
@@ -151,18 +152,12 @@ def _findings(findings: Sequence[Finding]) -> str:
 
 def _trials(results: Sequence[Result]) -> tuple[list[str], list[list[str]]]:
     """Return headings and rows of the table of trials. A column without values is left out."""
+    if results and all(r["trial"]["kind"] == "fault" for r in results):
+        return fault_table(results)
     columns: list[tuple[str, Callable[[Result], str]]] = [
         ("trial", lambda r: r["trial"]["name"]),
         ("outcome", lambda r: r["outcome"]),
         ("steps", lambda r: str(r.get("steps", "-"))),
-        ("case", lambda r: r["trial"].get("case", "-")),
-        ("falls", lambda r: f"{r['fell']} of {len(r['runs'])}" if "runs" in r else "-"),
-        ("state", lambda r: _distinct(one["state"] for one in r.get("runs", ()))),
-        ("first diagnostic", lambda r: _distinct(one["codes"][0] for one in r.get("runs", ()) if one["codes"])),
-        (
-            "detected [cycles]",
-            lambda r: _distinct(str(one["detected"]) for one in r.get("runs", ()) if one["detected"]),
-        ),
         (
             "longest without a fall [cycles]",
             lambda r: ", ".join("-" if n is None else str(n) for n in r.get("longest") or ()) or "-",
@@ -186,10 +181,6 @@ def _trials(results: Sequence[Result]) -> tuple[list[str], list[list[str]]]:
     ]
     filled = [(head, cells) for head, value in columns if set(cells := [value(r) for r in results]) != {"-"}]
     return [head for head, _ in filled], [list(row) for row in zip(*(cells for _, cells in filled), strict=True)]
-
-
-def _distinct(values: Iterable[str]) -> str:
-    return ", ".join(dict.fromkeys(values)) or "-"
 
 
 def _delays(delays: Sequence[int]) -> str:

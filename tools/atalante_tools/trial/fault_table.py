@@ -1,0 +1,37 @@
+"""Table of the experiment `faults`: `results -> one row per fault and kind of outcome, one column per moment`."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any, Final
+
+from atalante_tools.trial.fault_plan import FURTHER_MOMENTS, MOMENTS
+
+#: Words of the outcomes of a walk.
+_WORDS: Final = {"walked": "walks", "hold": "stops", "fell": "FALLS", "exception": "ERROR"}
+
+
+def fault_table(results: Sequence[dict[str, Any]]) -> tuple[list[str], list[list[str]]]:
+    """Return headings and rows. Cases of a fault with equal outcomes share a row.
+
+    Args:
+        results: results of `fault` trials.
+    """
+    tried = {run["moment"] for result in results for run in result["runs"]}
+    moments = [name for name in MOMENTS | FURTHER_MOMENTS if name in tried]
+    rows: dict[tuple[str, tuple[str, ...]], list[str]] = {}
+    for result in results:
+        outcomes = {run["moment"]: _WORDS[run["outcome"]] for run in result["runs"]}
+        cells = (*(outcomes.get(name, "-") for name in moments), _survived(result))
+        rows.setdefault((result["trial"]["id"], cells), []).append(result["trial"]["case"])
+    head = ["fault", "cases", *moments, "longest without a fall [cycles]"]
+    return head, [[id_, ", ".join(cases), *cells] for (id_, cells), cases in rows.items()]
+
+
+def _survived(result: dict[str, Any]) -> str:
+    """Return the range of the longest durations without a fall, over the moments at which the permanent fault leads to a fall."""
+    survived = [cycles for cycles in result["longest"] if cycles is not None]
+    if not survived:
+        return "-"
+    low, high = min(survived), max(survived)
+    return str(low) if low == high else f"{low} to {high}"

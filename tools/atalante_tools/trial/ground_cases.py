@@ -1,0 +1,31 @@
+"""Cases of the experiment `faults`: those of the fault matrix, and cases that need a robot on the ground."""
+
+from __future__ import annotations
+
+from typing import Final
+
+from atalante_tools.faults.catalogue import SCENARIOS
+from atalante_tools.faults.scenario import MID_SWING, Case, HostFault
+from atalante_tools.trial.fault_plan import PERMANENT
+
+#: Faults whose proof is not a scenario, but which a walk on the ground can meet: the cases of each. A killed HAL sends no frames.
+#: After the given time, the run continues with a HAL in HOLD, whose frames do not move the drives.
+_GROUND_CASES: Final = {"F41": (Case("no frames for 6 s", (HostFault("late", 0, 1, 6.0),), dtc="CYCLE_GAP"),)}
+#: IDs of all faults with a case.
+FAULT_IDS: Final = tuple(sorted({*SCENARIOS, *_GROUND_CASES}))
+
+
+def ground_cases(id_: str) -> dict[int, Case]:
+    """Return the cases of a fault that can begin at any moment of a walk, by their indices.
+
+    Cases that begin at power-on or at another phase than `MID_SWING` are left out.
+
+    Args:
+        id_: fault ID, one of `FAULT_IDS`.
+    """
+    scenario = SCENARIOS.get(id_)
+    cases = _GROUND_CASES[id_] if scenario is None else scenario.cases
+    chosen = {index: case for index, case in enumerate(cases) if case.phase == MID_SWING}
+    if scenario is not None and scenario.permanent is not None:
+        chosen[PERMANENT] = scenario.permanent
+    return chosen
