@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import subprocess
 from dataclasses import replace
 from typing import Any
 
@@ -13,10 +14,10 @@ from click.testing import CliRunner
 from atalante_tools import bench
 from atalante_tools.bench import catalogue, wire
 from atalante_tools.bench.catalogue import BENCHMARKS, Benchmark
-from atalante_tools.bench.measure import BenchmarkError, Effort, Measurement, require, timed
+from atalante_tools.bench.measure import BenchmarkError, Effort, Measurement, median, require, timed
 from atalante_tools.cli import cli
 
-KEYS = ["name", "value", "unit", "baseline", "baseline_value", "ratio"]
+KEYS = ["name", "value", "unit", "baseline", "baseline_value", "ratio", "ratios"]
 #: Target ratio of each benchmark.
 TARGETS = {
     "hal_cycle": 1 / 7,
@@ -59,6 +60,7 @@ def test_json_line_has_the_documented_keys(benchmark: Benchmark, lines: dict[str
         assert math.isfinite(line[key])
         assert line[key] > 0.0
     assert line["ratio"] == pytest.approx(line["value"] / line["baseline_value"], rel=1e-12)
+    assert line["ratios"] == [line["ratio"]]
 
 
 def test_targets_have_the_specified_values() -> None:
@@ -69,7 +71,7 @@ def test_selected_benchmarks_are_printed_as_a_table() -> None:
     result = CliRunner().invoke(cli, ["bench", "--quick", "ring_write", "E2E_CHECK"])
     assert result.exit_code == 0
     head, *rows = result.stdout.splitlines()
-    assert head.split()[:6] == ["benchmark", "value", "baseline", "unit", "ratio", "target"]
+    assert head.split()[:7] == ["benchmark", "value", "baseline", "unit", "ratio", "spread", "target"]
     assert [row.split()[0] for row in rows] == ["ring_write", "e2e_check"]
     assert "0.0200" in rows[0]
     assert "ring_write (1 of 2)" in result.stderr
@@ -93,10 +95,55 @@ def test_without_a_compiler_the_values_are_null(monkeypatch: pytest.MonkeyPatch)
     result = CliRunner().invoke(cli, ["bench", "--quick", "--json", "decode_cycle"])
     assert result.exit_code == 0
     line = json.loads(result.stdout)
-    assert [line[key] for key in KEYS if key != "baseline"] == ["decode_cycle", None, "us", None, None]
+    assert [line[key] for key in KEYS if key != "baseline"] == ["decode_cycle", None, "us", None, None, [None]]
     assert "not measured: install gcc" in result.stderr
     (decode,) = (b for b in BENCHMARKS if b.name == "decode_cycle")
     assert "not measured" in bench.row(decode, decode.run(Effort(quick=True)))
+
+
+def test_median_of_the_processes_counts_and_the_table_shows_their_spread(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    benchmark = replace(BENCHMARKS[0], processes=3)
+    measured = iter([Measurement(3e-6, 20e-6), Measurement(1e-6, 10e-6), Measurement(2e-6, 10e-6)])
+    monkeypatch.setattr(catalogue, "BENCHMARKS", (benchmark,))
+    monkeypatch.setattr(bench, "in_new_process", lambda _: next(measured))
+    result = CliRunner().invoke(cli, ["bench", "--json", benchmark.name])
+    line = json.loads(result.stdout)
+    assert (line["value"], line["baseline_value"]) == pytest.approx((3.0, 20.0))
+    assert line["ratios"] == pytest.approx([0.1, 0.15, 0.2])
+    measured = iter([Measurement(2e-6, 10e-6)] * 2 + [Measurement(1e-6, 10e-6)])
+    result = CliRunner().invoke(cli, ["bench", benchmark.name])
+    assert "0.2000  0.1000 to 0.2000  0.1429  MISSED" in result.stdout
+
+
+def test_one_missing_time_gives_no_ratio() -> None:
+    assert median([Measurement(None, 1.0), Measurement(2.0, 1.0)]).ratio is None
+
+
+def test_benchmark_in_a_new_process_has_a_value_and_a_baseline(monkeypatch: pytest.MonkeyPatch) -> None:
+    (e2e_check,) = (b for b in BENCHMARKS if b.name == "e2e_check")
+    run, commands = subprocess.run, list[list[str]]()
+
+    def quick(command: list[str], **options: Any) -> Any:
+        commands.append(command)
+        return run([*command, "--quick"], **options)
+
+    monkeypatch.setattr(subprocess, "run", quick)
+    measured = bench.in_new_process(e2e_check)
+    assert commands[0][-3:] == ["--one-process", "--json", "e2e_check"]
+    assert measured.ratio is not None
+    assert 1e-7 < measured.value < 1e-3  # type: ignore[operator]
+
+
+def test_failure_in_a_new_process_makes_the_benchmark_invalid() -> None:
+    with pytest.raises(BenchmarkError, match="code 2"):
+        bench.in_new_process(replace(BENCHMARKS[0], name="no such benchmark"))
+
+
+def test_every_number_of_processes_is_odd() -> None:
+    assert all(benchmark.processes % 2 == 1 for benchmark in BENCHMARKS)
+    assert BENCHMARKS[0].processes > 1
 
 
 @pytest.fixture
@@ -109,7 +156,7 @@ def idle(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.mark.usefixtures("idle")
 def test_invalid_benchmark_exits_with_1() -> None:
-    result = CliRunner().invoke(cli, ["bench", "hal_cycle"])
+    result = CliRunner().invoke(cli, ["bench", "--one-process", "hal_cycle"])
     assert result.exit_code == 1
     assert "the benchmark hal_cycle is invalid: nothing was done" in result.stderr
     assert result.stdout == ""

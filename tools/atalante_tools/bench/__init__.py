@@ -23,12 +23,18 @@ if TYPE_CHECKING:
 @click.command()
 @click.argument("names", metavar="[NAME]...", nargs=-1)
 @click.option("--quick", is_flag=True, help="Run only a few rounds per benchmark, to check that all benchmarks work.")
+@click.option(
+    "--one-process",
+    is_flag=True,
+    help="Do not repeat a benchmark in several processes. --quick never repeats a benchmark.",
+)
 @json_option
-def command(names: tuple[str, ...], quick: bool, as_json: bool) -> None:
+def command(names: tuple[str, ...], quick: bool, one_process: bool, as_json: bool) -> None:
     """Measure the speed of the stack against baselines and print the ratios of the median times.
 
     The measured function and the baseline run alternately in short blocks. Absolute times depend on the machine and the
-    load of the machine, so only the ratio is comparable. Every benchmark checks the computed results. The exit code is
+    load of the machine, so only the ratio is comparable. A ratio that depends on the process is the median of several processes,
+    and the report shows the lowest and the highest ratio. Every benchmark checks the computed results. The exit code is
     1 if a result is wrong. The report shows each missed target, but a missed target does not change the exit code.
 
     \b
@@ -36,12 +42,14 @@ def command(names: tuple[str, ...], quick: bool, as_json: bool) -> None:
              atalante bench --json hal_cycle decode_cycle
     """
     from atalante_tools.bench.catalogue import BENCHMARKS
-    from atalante_tools.bench.measure import BenchmarkError, Effort
+    from atalante_tools.bench.measure import BenchmarkError, Effort, median
 
     known = [benchmark.name for benchmark in BENCHMARKS]
     chosen = [BENCHMARKS[find(name, known, "benchmark")] for name in dict.fromkeys(names)] or list(BENCHMARKS)
     progress = Progress()
-    rows: list[tuple[str, ...]] = [("benchmark", "value", "baseline", "unit", "ratio", "target", "", "baseline is")]
+    rows: list[tuple[str, ...]] = [
+        ("benchmark", "value", "baseline", "unit", "ratio", "spread", "target", "", "baseline is")
+    ]
     for number, benchmark in enumerate(chosen, start=1):
         check_stop()
         label = f"{benchmark.name} ({number} of {len(chosen)})"
@@ -52,7 +60,11 @@ def command(names: tuple[str, ...], quick: bool, as_json: bool) -> None:
 
         progress.show(f"{label}: preparing")
         try:
-            measured = benchmark.run(Effort(quick, show))
+            if quick or one_process or benchmark.processes == 1:
+                measured = benchmark.run(Effort(quick, show))
+            else:
+                progress.clear()
+                measured = median([in_new_process(benchmark) for _ in range(benchmark.processes)])
         except BenchmarkError as error:
             progress.clear()
             raise Failed(f"the benchmark {benchmark.name} is invalid: {error}") from error
@@ -66,6 +78,36 @@ def command(names: tuple[str, ...], quick: bool, as_json: bool) -> None:
         click.echo(table(rows))
 
 
+def in_new_process(benchmark: Benchmark) -> Measurement:
+    """Run a benchmark in a new process, which prints its progress.
+
+    Args:
+        benchmark: benchmark to run.
+
+    Raises:
+        BenchmarkError: If the process fails. The process prints the reason.
+    """
+    import json
+    import subprocess
+    import sys
+
+    from atalante_tools.bench.measure import Measurement, require
+
+    check_stop()
+    program = [sys.executable, "-c", "from atalante_tools.entry import main; main()"]
+    done = subprocess.run(
+        [*program, "bench", "--one-process", "--json", benchmark.name], stdout=subprocess.PIPE, text=True, check=False
+    )
+    check_stop()
+    require(done.returncode == 0, f"its process ended with the code {done.returncode}")
+    result = json.loads(done.stdout)
+    value, baseline = (
+        None if figure is None else figure / benchmark.per_second
+        for figure in (result["value"], result["baseline_value"])
+    )
+    return Measurement(value, baseline)
+
+
 def line(benchmark: Benchmark, measured: Measurement) -> dict[str, Any]:
     """Return a benchmark as a JSON object; a value that was not measured is null."""
     return {
@@ -75,6 +117,7 @@ def line(benchmark: Benchmark, measured: Measurement) -> dict[str, Any]:
         "baseline": benchmark.baseline,
         "baseline_value": _in_unit(benchmark, measured.baseline),
         "ratio": measured.ratio,
+        "ratios": measured.ratios or (measured.ratio,),
     }
 
 
@@ -93,6 +136,7 @@ def row(benchmark: Benchmark, measured: Measurement) -> tuple[str, ...]:
         *("-" if figure is None else f"{figure:.3f}" for figure in figures),
         benchmark.unit,
         "-" if ratio is None else f"{ratio:.4f}",
+        f"{measured.ratios[0]:.4f} to {measured.ratios[-1]:.4f}" if measured.ratios else "-",
         "-" if target is None else f"{target:.4f}",
         verdict,
         benchmark.baseline,

@@ -1,7 +1,8 @@
 """Measurement of a benchmark: the median times of a measured function and a baseline, which run alternately in blocks.
 
 Absolute times depend on the machine and the load of the machine. The measured function and the baseline run under the
-same conditions, so the ratio of the two times is comparable between machines.
+same conditions, so the ratio of the two times is comparable between machines. Times also depend on the memory layout of the
+process, so a benchmark of a few microseconds is repeated in several processes.
 """
 
 from __future__ import annotations
@@ -9,8 +10,8 @@ from __future__ import annotations
 import gc
 import statistics
 import time
-from collections.abc import Callable
-from dataclasses import dataclass, field
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
 from typing import Final
 
 #: Number of blocks of the measured function in a normal run, large enough for a robust median. The baseline has as many blocks.
@@ -37,11 +38,25 @@ class Measurement:
     value: float | None
     baseline: float | None
     remarks: tuple[str, ...] = ()
+    ratios: tuple[float, ...] = ()  # ratio of each process, in ascending order; empty if all times are of this process
 
     @property
     def ratio(self) -> float | None:
         """Return the measured time divided by the baseline time, or None if one of these times was not measured."""
         return None if self.value is None or not self.baseline else self.value / self.baseline
+
+
+def median(measured: Sequence[Measurement]) -> Measurement:
+    """Return the measurement with the median ratio, and the ratios of all measurements.
+
+    Args:
+        measured: measurements of the same benchmark in an odd number of processes.
+    """
+    ordered = sorted((one.ratio, number) for number, one in enumerate(measured) if one.ratio is not None)
+    if len(ordered) < len(measured):  # a time was not measured
+        return measured[0]
+    _, number = ordered[len(ordered) // 2]
+    return replace(measured[number], ratios=tuple(ratio for ratio, _ in ordered))
 
 
 @dataclass(frozen=True)
