@@ -218,11 +218,25 @@ def test_bus_timing_of_the_embedded_robot_is_a_usage_error() -> None:
     assert "--bus requires an interface and a channel" in result.stderr
 
 
+class StoppingBus(WrappedBus):
+    """Bus on which no frame arrives. The stop signal arrives in the third `receive`."""
+
+    def __init__(self, bus: Bus, stop: StopRequest) -> None:
+        super().__init__(bus)
+        self.calls, self._stop = 0, stop
+
+    def receive(self, frames: Frames, timeout: float = 0.0) -> int:
+        self.calls += 1
+        if self.calls == 3:
+            self._stop.ask(2)
+        return 0
+
+
 def test_a_stop_request_ends_the_measurement(network: Network) -> None:
-    ours, _ = lockstep_pair()
     stop = StopRequest()
-    stop.ask(2)
-    doctor.listen(ours, BusTiming(network), 60.0, stop)
+    bus = StoppingBus(lockstep_pair()[0], stop)
+    doctor.listen(bus, BusTiming(network), 5.0, stop)
+    assert bus.calls == 3
 
 
 @pytest.mark.parametrize(
