@@ -53,7 +53,7 @@ def _follow(velocity: Vector, drive_state: Vector, swings: Swings, driven: tuple
             swings.reversals[i] += int(swings.direction[i] != 0)
             swings.direction[i], swings.age[i] = direction, 0
         oscillates |= swings.reversals[i] >= REVERSALS
-    return oscillates
+    return bool(oscillates)
 
 
 class HoldStability:

@@ -61,7 +61,7 @@ def _compare(sent: Vector, limit: Vector, reported: Vector, tolerance: Vector, t
         within = low <= reported[i] <= high
         tracking.wrong[i] = tracking.wrong[i] + 1 if complete and not within else 0
         deviates |= tracking.wrong[i] >= CONFIRM
-    return deviates
+    return bool(deviates)
 
 
 class TorqueTracking:

@@ -7,7 +7,7 @@ import pytest
 
 from atalante_hal.robot import JOINTS
 from atalante_hal.safety.diagnostics import Dtc, Finding
-from atalante_hal.safety.hold_stability import INTERVAL, REVERSALS, SPEED, HoldStability
+from atalante_hal.safety.hold_stability import INTERVAL, REVERSALS, SPEED, HoldStability, _follow
 from atalante_hal.wire.cia402 import DriveState
 
 KNEE = JOINTS.index("left_SK")
@@ -109,3 +109,8 @@ def test_restart_forgets_the_motion() -> None:
     oscillate(check, REVERSALS - 1)
     check.restart()
     assert oscillate(check, REVERSALS - 1) == ()
+
+
+def test_kernel_reports_no_oscillation_of_joints_at_rest() -> None:
+    zero, check = np.zeros(len(JOINTS)), HoldStability()
+    assert _follow(zero, zero, check._swings, check._driven) is False

@@ -7,7 +7,7 @@ import pytest
 
 from atalante_hal.robot import JOINTS
 from atalante_hal.safety.diagnostics import Dtc, Finding
-from atalante_hal.safety.torque_tracking import CONFIRM, SPAN, TOLERANCE, TorqueTracking
+from atalante_hal.safety.torque_tracking import CONFIRM, SPAN, TOLERANCE, TorqueTracking, _compare
 
 KNEE = JOINTS.index("left_SK")
 BREAKAWAY = np.linspace(2.0, 24.0, len(JOINTS))
@@ -101,3 +101,9 @@ def test_finding_names_joint_and_torques() -> None:
         found = check.check(sent, limit, reported)
     text = "left_SK reports a torque of -30.0 Nm, which must follow the command of 30.0 Nm"
     assert found == (Finding(Dtc.TORQUE_TRACKING, "LEFT_SK", -30.0, True, text),)
+
+
+def test_kernel_reports_no_deviation_if_the_torques_follow() -> None:
+    zero, tracking = np.zeros(len(JOINTS)), TorqueTracking(BREAKAWAY)._tracking
+    limit = np.full(len(JOINTS), LIMIT)
+    assert [_compare(zero, limit, zero, TOLERANCE * BREAKAWAY, tracking) for _ in range(SPAN)] == [False] * SPAN
