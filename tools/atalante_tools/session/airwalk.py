@@ -6,7 +6,6 @@ guide shape -> certificate (printed) -> steps -> recording, summary.json, figure
 from __future__ import annotations
 
 import functools
-import os
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import asdict, dataclass, field
@@ -32,6 +31,7 @@ from atalante_tools.session.recording import (
     require_complete_log,
     require_format,
     start_telemetry,
+    telemetry_cores,
 )
 from atalante_tools.session.run_folder import Result, results_table, run_folder, write_summary
 from atalante_tools.session.shapes import guide_shapes
@@ -164,11 +164,15 @@ def _walk_all(
     import atalante_dbc
     from atalante_hal.robot import load_robot
     from atalante_hal.telemetry.child import TelemetryChild
+    from atalante_tools.session.embedded import EmbeddedRobot, cores_are_idle
 
     with ExitStack() as stack:
+        parallel = target.embedded and cores_are_idle(
+            telemetry_cores(outputs)
+        )  # before the telemetry process loads a core
         # start the subprocesses early: they import their modules while this process creates the controllers
-        robot_process = _start_robot(target, stack)
         telemetry_child = stack.enter_context(TelemetryChild())
+        robot_process = stack.enter_context(EmbeddedRobot(target.engine)) if parallel else None
         network, robot = atalante_dbc.load(), load_robot()
         exoskeleton, gait, controllers = _controllers(options.law.config(), options.subject, robot, shapes)
         if not target.lockstep:
@@ -179,7 +183,8 @@ def _walk_all(
         last = [*controllers][-1]
         for name, controller in controllers.items():
             with _open(target, options, network, robot, controller, gait.hash32, robot_process, exoskeleton) as rig:
-                robot_process = _start_robot(target, stack) if name != last else None
+                if parallel and name != last:
+                    robot_process = stack.enter_context(EmbeddedRobot(target.engine))
                 if telemetry is None:
                     # The certificates are printed after the bus was opened. If the bus is missing, only the error is printed.
                     certificates = {shape: walking.certificate(options.xi) for shape, walking in controllers.items()}
@@ -267,18 +272,6 @@ def _controllers(
     if subject is not None:  # the gait is valid, because the controllers accepted it
         print_message(f"gait of the network: {subject}; the exoskeleton is empty")
     return exoskeleton, gait, controllers
-
-
-#: With at least this number of processor cores, the embedded robot runs in a process of its own.
-_CORES = 3
-
-
-def _start_robot(target: Target, stack: ExitStack) -> EmbeddedRobot | None:
-    """Start the emulated robot in a subprocess. Return None for a real robot or a computer with too few cores."""
-    from atalante_tools.session.embedded import EmbeddedRobot
-
-    robot_process = target.embedded and len(os.sched_getaffinity(0)) >= _CORES
-    return stack.enter_context(EmbeddedRobot(target.engine)) if robot_process else None
 
 
 def _open(

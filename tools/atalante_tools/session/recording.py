@@ -74,6 +74,22 @@ class Outputs:
     outlet: Mapping[str, Any]  # fields of `TelemetryConfig` from the telemetry file
 
 
+#: Recording rate above which the telemetry process needs a processor core of its own [Hz].
+_LIGHT_RATE: Final = 100
+
+
+def telemetry_cores(outputs: Outputs | None) -> int:
+    """Return the number of processor cores that the telemetry process keeps busy in lock-step.
+
+    For a recording at 100 Hz it needs a quarter of the computing time of the HAL. For a CAN log or a recording of every cycle
+    it needs more than the HAL.
+
+    Args:
+        outputs: Outputs of the telemetry process; None means no telemetry process.
+    """
+    return int(outputs is not None and (outputs.can_log is not None or outputs.record_rate > _LIGHT_RATE))
+
+
 def outlet_of(telemetry: Path | None) -> Mapping[str, Any]:
     """Read the telemetry file. Return no fields if there is none.
 

@@ -26,6 +26,7 @@ from atalante_tools.session.recording import (
     require_complete_log,
     require_format,
     start_telemetry,
+    telemetry_cores,
 )
 from atalante_tools.session.run_folder import run_folder
 from atalante_tools.session.walk_observation import Observation
@@ -71,7 +72,7 @@ def _robot_process_wanted(target: Target, options: WalkOptions, outputs: Outputs
         return target.embedded and bool(options.robot_process)
     from atalante_tools.session.embedded import cores_are_idle
 
-    return cores_are_idle(others=0 if outputs is None else 1)
+    return cores_are_idle(telemetry_cores(outputs))
 
 
 def _outputs(options: WalkOptions) -> Outputs | None:
