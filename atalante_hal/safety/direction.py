@@ -7,8 +7,10 @@ At a start, drive state, position and reported torque do not show these faults. 
 holds the pose, and evaluates the motion.
 
 *Pulse.* The pulse has the shape of the second derivative of sin(pi x)^4. So a free inertia moves away and back, and is then at
-rest in its initial position. The pulse moves a joint towards the middle of its range. Its peak is `PEAK` times `breakaway`, which
-exceeds the dry friction. The joints of a group hardly move each other. Both legs are tested at the same time.
+rest in its initial position. Its peak is `PEAK` times `breakaway`, which exceeds the dry friction. The joints of a group hardly
+move each other. Both legs are tested at the same time, with opposite pulses. So the encoder of the other leg moves against the
+torque, and exchanged encoders of both legs are noticed. The pulse moves the left joint towards the middle of its range. A joint
+near its end stop is the exception: it and its twin both move towards the middle, and their exchange may not be noticed.
 
 *Pose.* A position control with a share of the drive's gains holds the pose, because the drives do not hold it in this time. With
 a wrong sign, this control pushes its joint away. A joint that moves by more than `TRAVEL` ends the start.
@@ -151,6 +153,9 @@ class DirectionProof:
         """
         self._anchor[:], self._base[:] = position, torque
         self._sign[:] = np.where(position < self._middle, 1.0, -1.0)
+        left, right = np.split((position < self._low) | (position > self._high), len(SIDES))
+        ours, theirs = np.split(self._sign, len(SIDES))
+        theirs[:] = np.where(left | right, theirs, -ours)
         self._trials = [0] * len(JOINTS)
         self.failed = []
         self._tests = [

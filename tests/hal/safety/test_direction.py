@@ -65,13 +65,15 @@ class Joints:
         self.position, self.velocity = MIDDLE.copy(), np.zeros(12)
         self._pending = [np.zeros(12)] * (LATENCY - 1)
         self.weight = np.zeros(12)  # torque of the weight [Nm]
+        self.encoder = np.arange(12)  # joint that each encoder measures
 
     def run(self, force: np.ndarray = NO_FORCE, cycles: int = 500, within: range = MOST) -> tuple[str, int]:
-        self.proof.begin(self.position, np.zeros(12))
+        encoder = self.encoder
+        self.proof.begin(self.position[encoder], np.zeros(12))
         for cycle in range(cycles):
             if not self.proof.running:
                 return "", cycle
-            torque = self.proof.torque(self.position, self.velocity)
+            torque = self.proof.torque(self.position[encoder], self.velocity[encoder])
             self.proof.sent(torque)
             self._pending.append(torque)
             self.velocity = self.velocity + PERIOD * (self.strength * self._pending.pop(0) + self.weight) / INERTIA
@@ -79,7 +81,9 @@ class Joints:
             stopped = (self.position < ROBOT.position_min) | (self.position > ROBOT.position_max)
             self.position = np.clip(self.position, ROBOT.position_min, ROBOT.position_max)
             self.velocity[stopped] = 0.0
-            if failure := self.proof.evaluate(self.position, force if (cycle - 16) % 19 in within else NO_FORCE):
+            if failure := self.proof.evaluate(
+                self.position[encoder], force if (cycle - 16) % 19 in within else NO_FORCE
+            ):
                 return failure, cycle
         raise AssertionError("the test of the directions must end")
 
@@ -126,6 +130,26 @@ def test_reversed_motor_fails_also_under_load(joints: Joints, joint: int, force:
     failure, _ = joints.run(force)
     assert failure.startswith((f"{JOINTS[joint]} moves against its torque", f"{JOINTS[joint]} moved by "))
     assert joints.proof.failed == [joint]
+
+
+@pytest.mark.parametrize("joint", range(6), ids=JOINTS[:6])
+def test_exchanged_encoders_of_both_legs_fail(joints: Joints, joint: int):
+    """The torque pulses of both legs are opposite, so the encoder of the other leg moves against the torque."""
+    joints.encoder[[joint, joint + 6]] = joint + 6, joint
+    failure = joints.run()[0]
+    assert failure.startswith((f"{JOINTS[joint]} moves against its torque", f"{JOINTS[joint]} moved by "))
+    assert not joints.proof.proven[[joint, joint + 6]].any()
+
+
+@pytest.mark.parametrize("pressed", [KNEE, KNEE + 6])
+@pytest.mark.parametrize("stop", ["position_min", "position_max"])
+def test_pulses_of_both_legs_move_a_joint_at_its_end_stop_towards_the_middle(pressed: int, stop: str):
+    proof, anchor = DirectionProof(ROBOT), MIDDLE.copy()
+    anchor[pressed] = getattr(ROBOT, stop)[pressed]
+    anchor[KNEE + 6 if pressed == KNEE else KNEE] += 0.1 if stop == "position_max" else -0.1
+    proof.begin(anchor, np.zeros(12))
+    away = -1.0 if stop == "position_max" else 1.0
+    assert proof._sign[[KNEE, KNEE + 6]].tolist() == [away, away]
 
 
 def test_joint_that_does_not_move_under_load_stays_untested(joints: Joints):
@@ -194,14 +218,16 @@ def test_new_test_of_the_directions_has_not_begun():
     assert not proof.proven.any()
 
 
-def test_torque_is_pose_control_and_pulse_towards_the_middle():
+def test_torque_is_pose_control_and_pulse_that_is_opposite_in_both_legs():
     rng, proof = np.random.default_rng(1), DirectionProof(ROBOT)
     anchor = MIDDLE + np.tile([0.1, -0.1, -0.1, 0.1], 3)
     anchor[0] = MIDDLE[0]
     base, (kp, kd) = rng.normal(size=12), pose_gains(ROBOT)
     tested = [JOINTS.index(f"{side}_{name}") for side in ("left", "right") for name in ("FH", "SH")]
     peak = np.zeros(12)
-    peak[tested] = (np.where(anchor < MIDDLE, 1.0, -1.0) * np.array(PEAK * 2) * ROBOT.breakaway)[tested]
+    sign = np.where(anchor < MIDDLE, 1.0, -1.0)
+    sign[6:] = -sign[:6]
+    peak[tested] = (sign * np.array(PEAK * 2) * ROBOT.breakaway)[tested]
     proof.begin(anchor, base)
     for cycle in range(32):
         position, velocity = anchor + 1e-3 * rng.normal(size=12), 0.1 * rng.normal(size=12)

@@ -33,11 +33,11 @@ _RESTARTED: Final = {
 }
 
 
-def _start_with(name: str, node: str, share: float) -> Case:
-    """Return a test case of the first START, in which a motor produces `share` times the torque that its drive measures."""
+def _start_with(name: str, node: str, fault: Fault | float) -> Case:
+    """Return a test case of the first START with a fault, or with a motor that produces `fault` times the torque measured."""
     return Case(
         name,
-        (Fault("torque_weak", node, 0, share=share),),
+        (fault if isinstance(fault, Fault) else Fault("torque_weak", node, 0, share=fault),),
         phase=None,
         detected=450,
         reacted=450,
@@ -256,6 +256,14 @@ SCENARIOS: Final = (
         (
             *(_start_with(f"LEFT_{joint} reversed", f"LEFT_{joint}", -1.0) for joint in LEG_JOINTS),
             *(_start_with(f"LEFT_{joint} dead", f"LEFT_{joint}", 0.0) for joint in ("SK", "SA", "HA")),
+            *(
+                _start_with(
+                    f"encoders of {joint} exchanged",
+                    f"LEFT_{joint}",
+                    Fault("encoder_swapped", f"LEFT_{joint}", other=f"RIGHT_{joint}"),
+                )
+                for joint in ("SA", "HA")
+            ),
         ),
     ),
     # The position control of the knee's drive becomes unstable when its motor is eight cycles late.
