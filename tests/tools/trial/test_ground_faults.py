@@ -69,6 +69,7 @@ def test_bisection_returns_the_horizon_if_the_robot_never_falls() -> None:
         ("F22", {}, True),
         ("F22", {"codes": []}, False),
         ("F22", {"state": "ACTIVE"}, False),
+        ("F22", {"state": "FULL_ASSIST"}, False),
         ("F22", {"outcome": "exception"}, False),
     ],
 )

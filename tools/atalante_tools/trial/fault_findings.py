@@ -33,7 +33,7 @@ def fault_findings(results: Sequence[Result]) -> list[Finding]:
     """Return one finding per fault.
 
     With a fault and a case of `NO_FALL`, no run may end in a fall. With another fault, each fall must have a diagnostic and a
-    robot that is no longer ACTIVE. With no fault may the HAL raise an exception.
+    robot that is neither ACTIVE nor FULL_ASSIST any more. With no fault may the HAL raise an exception.
 
     Args:
         results: results of `fault` trials.
@@ -72,7 +72,7 @@ def _wrong_fall(id_: str, case: str, run: dict[str, Any]) -> bool:
     required = (id_ in NO_FALL and re.match(NO_FALL[id_], case)) or (
         id_ in NO_FALL_IN_DOUBLE_SUPPORT and run["moment"] in DOUBLE_SUPPORT
     )
-    return bool(required) or not run["codes"] or run["state"] == "ACTIVE"
+    return bool(required) or not run["codes"] or run["state"] in ("ACTIVE", "FULL_ASSIST")
 
 
 def _by_case(falls: Sequence[tuple[str, dict[str, Any]]]) -> list[tuple[str, list[dict[str, Any]]]]:
