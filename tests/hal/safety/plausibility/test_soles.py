@@ -111,7 +111,9 @@ def test_foot_stands_flat_if_the_centre_of_pressure_is_away_from_the_edges(cells
 
 
 @SIDES
-@pytest.mark.parametrize("cells", [[400.0, 400.0, 0.0, 0.0], [0.0, 0.0, 0.0, 0.0]], ids=["on its toes", "in the air"])
+@pytest.mark.parametrize(
+    "cells", [[400.0, 400.0, 0.0, 0.0], [0.0, 0.0, 0.0, 0.0], [59.0, 59.0, 59.0, 59.0]], ids=["toes", "air", "light"]
+)
 def test_foot_that_does_not_stand_flat_may_be_tilted(foot: int, cells: list[float]):
     robot = Standing()
     robot.error(SA + 6 * foot, 0.1)
@@ -140,17 +142,36 @@ def test_interrupted_tilt_is_counted_from_zero():
         assert not robot.found(1)
 
 
+@SIDES
+def test_level_sole_under_a_tilted_shank_is_accepted(foot: int):
+    """The shank is tilted forwards and sideways, and Newton's method finds the angles of the ankle for a level sole."""
+    robot, position = Standing(), np.zeros(12)
+    position[6 * foot], position[SA - 2 + 6 * foot] = 0.1, 0.25
+    tibia = attitudes(position)[2 + foot]
+    toe_out, ankle = TOE_OUT if foot == 0 else -TOE_OUT, np.zeros(2)
+    for _ in range(5):
+        tilt, step = np.array(sole_tilt(tibia.tolist(), *ankle, toe_out)), 1e-6
+        slopes = [np.array(sole_tilt(tibia.tolist(), *(ankle + step * axis), toe_out)) - tilt for axis in np.eye(2)]
+        ankle -= np.linalg.solve(np.array(slopes).T / step, tilt)
+    robot.now.quaternion[2 + foot] = tibia
+    robot.error(SA + 6 * foot, ankle[0])
+    robot.error(HA + 6 * foot, ankle[1])
+    assert not robot.found(20)
+
+
+@SIDES
 @pytest.mark.parametrize(("sensor", "index"), [("joint", SA), ("joint", HA), ("imu", 2), ("foot", 0)])
-def test_foot_is_not_checked_with_old_values(sensor: str, index: int):
+def test_foot_is_not_checked_with_old_values(foot: int, sensor: str, index: int):
     robot = Standing()
-    robot.error(SA, 0.1)
+    robot.error(SA + 6 * foot, 0.1)
     ages = Ages(np.zeros(12, np.int64), np.zeros(4, np.int64), np.zeros(2, np.int64))
-    getattr(ages, sensor)[index] = NEVER
+    age, index = getattr(ages, sensor), index + (6 if sensor == "joint" else 1) * foot
+    age[index] = NEVER
     assert robot.run(20, ages) == [(False, False)] * 20
-    getattr(ages, sensor)[index] = NEVER - 1
-    assert robot.run(SOLE_SAMPLES, ages)[-1] == (True, True)
-    getattr(ages, sensor)[index] = NEVER
-    robot.error(SA, 0.0)
+    age[index] = NEVER - 1
+    assert robot.run(SOLE_SAMPLES, ages)[-1] == (foot == 0, True)
+    age[index] = NEVER
+    robot.error(SA + 6 * foot, 0.0)
     assert robot.run(1, ages) == [(True, True)]  # the finding remains
 
 

@@ -144,6 +144,9 @@ class TestWeight:
         for _ in range(3):
             assert not any(legs.run(WEIGHT_CYCLES - 1, *wrong))
             assert not any(legs.run(1, 700.0, 700.0))
+        for _ in range(3):
+            assert not any(legs.run(WEIGHT_CYCLES - 1, *wrong))
+            assert not any(legs.run(1, 0.0, 0.0))
         assert not any(legs.run(300, *wrong[::-1]))
         assert not any(legs.run(300, *((1000.0, 0.0) if side > 0.0 else (0.0, 1000.0))))
 
