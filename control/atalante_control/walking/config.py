@@ -10,6 +10,7 @@ from atalante_control.guide.config import StepGuideConfig
 from atalante_control.guide.disturbance import HandOver
 from atalante_control.joint.pid import PidGains
 from atalante_control.walking.contact import ImpactConfig
+from atalante_control.walking.lean import LeanConfig
 from atalante_control.walking.placement import PlacementConfig
 
 Pair = tuple[float, float]
@@ -45,6 +46,7 @@ class WalkConfig:
     stabiliser: float = 2.5
     shift_limit: Pair = (0.12, 0.05)  # m, largest shifts of the centre of pressure: along the walk, sideways
     placement: PlacementConfig = field(default_factory=PlacementConfig)  # foot placement and step timing
+    lean: LeanConfig = field(default_factory=LeanConfig)  # lean of the trunk
     flat_foot: bool = True  # whether the ankle of the swing leg holds the sole level
     #: m/s, downward speed of the swing foot after the nominal end of a step: normal step, stop step
     reach_speed: Pair = (0.3, 0.03)

@@ -44,6 +44,7 @@ from atalante_control.walking.kernel import (
     start,
 )
 from atalante_control.walking.kinematics import Kinematics
+from atalante_control.walking.lean import Lean
 from atalante_control.walking.phases import STEPPING, WALKING, Facts, Phase, next_phase
 from atalante_control.walking.placement import Placement
 from atalante_control.walking.reference import PhaseTable, Reach, shift_tables, step_table
@@ -134,6 +135,7 @@ class WalkController:
             walking_gains=config.full_gains[1] * weight,
             gains=np.array([[2 * g.kp, 2 * g.kd, np.array(2 * g.ki) * PERIOD] for g in (swing, stance)]),
             placement=config.placement,
+            lean=config.lean,
         )
         self._stabiliser = Stabiliser(
             config.stabiliser, *config.shift_limit, flat_feet(exoskeleton)[LEFT].geometry[2], exoskeleton.toe_out
@@ -151,6 +153,7 @@ class WalkController:
         placed = zeros(Placement, 1)
         placements: Records[Placement] = placed
         placements[0].low[:], placements[0].high[:] = _range(robot, config)
+        leans: Records[Lean] = zeros(Lean, 1)
         #: Row of the phase table and its change per cycle, shape (1,). Fields of arrays are read faster than fields of records.
         self._clock, self._pace = placed["clock"], placed["pace"]
         outputs: Records[Outputs] = zeros(Outputs, 1)
@@ -179,6 +182,7 @@ class WalkController:
             sensed=sensed,
             balances=balances,
             placements=placements,
+            leans=leans,
             outputs=outputs,
             telemetry=telemetry,
         )

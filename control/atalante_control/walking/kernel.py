@@ -22,10 +22,12 @@ from atalante_control.structured import Records
 from atalante_control.walking.attitude import Attitude, observe
 from atalante_control.walking.dcm import Balance, Stabiliser, ankle_torques, dcm, pressure_shift
 from atalante_control.walking.kinematics import Chain, move
+from atalante_control.walking.lean import Lean, LeanConfig, follow_lean, lean_target
 from atalante_control.walking.placement import (
     Motion,
     Placement,
     PlacementConfig,
+    ankle_position,
     follow,
     landing,
     late_landing,
@@ -38,7 +40,7 @@ from atalante_hal.robot import JOINTS, LEG_JOINTS, SIDES
 from atalante_hal.types import Vector
 
 _LEG = len(LEG_JOINTS)
-_TH, _SH, _SK, _SA, _HA = (LEG_JOINTS.index(name) for name in ("TH", "SH", "SK", "SA", "HA"))
+_FH, _TH, _SH, _SK, _SA, _HA = (LEG_JOINTS.index(name) for name in ("FH", "TH", "SH", "SK", "SA", "HA"))
 _ANKLES = (_SA, _HA)
 #: s, time constant with which the downward speed of a swing foot rises after the nominal end of a step
 _REACH_RISE = 0.03
@@ -97,6 +99,7 @@ class Constants(NamedTuple):
     walking_gains: float  # N, while walking: load of the stance foot at which its ankle has full stance gains
     gains: Vector  # (2, 3, 12) gains of swing leg and stance leg: Kp [Nm/rad], Kd [Nm s/rad], Ki times the cycle time [Nm/rad]
     placement: PlacementConfig  # parameters of foot placement and step timing
+    lean: LeanConfig  # parameters of the lean
 
 
 class Assistance(NamedTuple):
@@ -120,6 +123,7 @@ class Parts(NamedTuple):
     sensed: Records[Sensed]  # (1,)
     balances: Records[Balance]  # (1,)
     placements: Records[Placement]  # (1,)
+    leans: Records[Lean]  # (1,)
     outputs: Records[Outputs]  # (1,) results
     telemetry: Records[Telemetry]  # (1,) telemetry of the cycle
 
@@ -212,7 +216,8 @@ def start(measured: Measured, table: PhaseTable, parts: Parts) -> None:
         parts: arrays of the parts; `stages`, `placements` and `ankles` are updated.
     """
     stage, placement, n = parts.stages[0], parts.placements[0], len(measured.q)
-    placement.clock, placement.pace = 0.0, 1.0
+    placement.clock, placement.pace, placement.held = 0.0, 1.0, 0.0
+    parts.leans[0].angle, parts.leans[0].speed = 0.0, 0.0
     placement.target[:], placement.offset[:], placement.speed[:], placement.change[:] = 0.0, 0.0, 0.0, 0.0
     for joint in range(n):
         stage.deviation[joint] = measured.q[joint] - table.rows[0, joint]
@@ -266,7 +271,7 @@ def act(
         balance.error[k] = balance.dcm[k] - table.dcm[row, k]
     swing = 1 - stage.stance
     if stage.placed:
-        _place(cycle, table, constants.placement, stabiliser.gain, parts)
+        _place(cycle, table, constants, stabiliser.gain, parts)
     if stage.flat and not stage.double:
         attitude, gyro = _tibia(swing, measured, parts)
         write_level_ankle(parts.ankles[swing], table.recentring, cycle, attitude, gyro, desired)
@@ -328,17 +333,17 @@ def _assist(cycle: int, measured: Measured, assistance: Assistance, parts: Parts
         torque[knee] += assistance.fade[cycle - last] * stage.excess[1]
 
 
-def _place(cycle: int, table: PhaseTable, config: PlacementConfig, gain: float, parts: Parts) -> None:
-    """Update the phase rate and the offset of the landing, and shift the desired position of the swing foot.
+def _place(cycle: int, table: PhaseTable, constants: Constants, gain: float, parts: Parts) -> None:
+    """Update lean, offset of the landing and phase rate, and apply them to the desired motion.
 
     Args:
         cycle: cycles since the start of the phase.
         table: table of the phase.
-        config: parameters of foot placement and step timing.
+        constants: parameters of foot placement, step timing and lean.
         gain: gain of the ankle stabiliser.
-        parts: arrays of the parts; `placements` and `outputs` are updated.
+        parts: arrays of the parts; `placements`, `leans` and `outputs` are updated.
     """
-    stage, balance, placement = parts.stages[0], parts.balances[0], parts.placements[0]
+    stage, balance, placement, config = parts.stages[0], parts.balances[0], parts.placements[0], constants.placement
     last, swing = len(table.rows) - 1, 1 - stage.stance
     remaining, rate, row = (last - placement.clock) * PERIOD, placement.pace, int(min(placement.clock, float(last)))
     error, side = (balance.error[0], balance.error[1]), -1.0 if swing else 1.0
@@ -351,19 +356,41 @@ def _place(cycle: int, table: PhaseTable, config: PlacementConfig, gain: float, 
         motion = Motion(error, nominal, final, table.frequency * remaining, side)
         placement.target[0], placement.target[1], rate = landing(config, gain, motion)
     follow(config, placement, rate)
-    if placement.offset[0] == 0.0 and placement.offset[1] == 0.0:
-        return
-    rotation, heading = parts.attitudes[0].rotation, balance.heading
+    lean, target = parts.leans[0], lean_target(constants.lean, error[1], balance.dcm[1], side)
+    follow_lean(constants.lean, lean, target)
+    desired, hip = parts.outputs[0].desired, stage.stance * _LEG + _FH
+    desired[hip] = min(max(desired[hip] + lean.angle, placement.low[hip]), placement.high[hip])
+    desired[len(desired) // 2 + hip] += lean.speed
+    if placement.held > 0.0 or target != 0.0 or rate != 1.0 or placement.target[0] != 0.0 or placement.target[1] != 0.0:
+        placement.held = min(1.0, placement.held + PERIOD / config.hold)
+        _hold_foot(row, table, parts)
+
+
+def _hold_foot(row: int, table: PhaseTable, parts: Parts) -> None:
+    """Move the desired position of the swing ankle to its position relative to the stance foot.
+
+    Args:
+        row: current row of the table.
+        table: table of the phase.
+        parts: arrays of the parts; `placements` and `outputs` are updated.
+    """
+    stage, placement, desired = parts.stages[0], parts.placements[0], parts.outputs[0].desired
+    rotation, heading = parts.attitudes[0].rotation, parts.balances[0].heading
+    swing, late = 1 - stage.stance, placement.clock - (len(table.rows) - 1)
     c, s = math.cos(heading), math.sin(heading)
-    x = c * placement.offset[0] - s * placement.offset[1]
-    y = s * placement.offset[0] + c * placement.offset[1]
-    shift = (
-        rotation[0, 0] * x + rotation[1, 0] * y,
-        rotation[0, 1] * x + rotation[1, 1] * y,
-        rotation[0, 2] * x + rotation[1, 2] * y,
+    x, y, z = table.ankle[row, 0] + placement.offset[0], table.ankle[row, 1] + placement.offset[1], table.ankle[row, 2]
+    if late > 0.0:
+        z -= table.lowering * _lowered(late, table.lowering_cycles)[0]
+    x, y = c * x - s * y, s * x + c * y
+    sole, first = parts.chain.soles[stage.stance].position, parts.chain.soles[swing].link - _LEG + 1
+    ankle = ankle_position(placement, parts.chain.links, first, desired)
+    share = placement.held**2 * (3.0 - 2.0 * placement.held)
+    goal = (
+        ankle[0] + share * (rotation[0, 0] * x + rotation[1, 0] * y + rotation[2, 0] * z + sole[0] - ankle[0]),
+        ankle[1] + share * (rotation[0, 1] * x + rotation[1, 1] * y + rotation[2, 1] * z + sole[1] - ankle[1]),
+        ankle[2] + share * (rotation[0, 2] * x + rotation[1, 2] * y + rotation[2, 2] * z + sole[2] - ankle[2]),
     )
-    first = parts.chain.soles[swing].link - _LEG + 1
-    shift_foot(placement, parts.chain.links, first, parts.outputs[0].desired, swing * _LEG, shift)
+    shift_foot(placement, parts.chain.links, first, desired, swing * _LEG, goal)
 
 
 def _desired(cycle: int, placement: Placement, table: PhaseTable, stage: Stage, desired: Vector) -> int:
@@ -398,15 +425,24 @@ def _desired(cycle: int, placement: Placement, table: PhaseTable, stage: Stage, 
     desired[leg + _TH] += stage.steering * x**3 * (10.0 - 15.0 * x + 6.0 * x * x)
     desired[n + leg + _TH] += stage.steering * pace * 30.0 * x * x * (1.0 - x) ** 2 / (last * PERIOD)
     if clock > last:
-        # The speed of the foot rises slowly. A sudden rise would turn a foot that already touches the ground with one corner.
-        time = min(clock - last, float(table.reach_cycles)) * PERIOD
-        moving = 1.0 - math.exp(-time / _REACH_RISE)
-        time -= _REACH_RISE * moving
-        moving = moving if clock - last < table.reach_cycles else 0.0
+        time, moving = _lowered(clock - last, table.reach_cycles)
         for joint, speed in ((_SH, table.reach[0]), (_SK, table.reach[1])):
             desired[leg + joint] += speed * time
             desired[n + leg + joint] += speed * moving
     return row
+
+
+def _lowered(cycles: float, longest: int) -> tuple[float, float]:
+    """Return the duration of the downward motion of a late swing foot at full speed [s], and its present share of this speed.
+
+    Args:
+        cycles: cycles since the nominal end of the step, above 0.
+        longest: number of cycles after which the motion ends.
+    """
+    # The speed of the foot rises slowly. A sudden rise would turn a foot that already touches the ground with one corner.
+    time = min(cycles, float(longest)) * PERIOD
+    moving = 1.0 - math.exp(-time / _REACH_RISE)
+    return time - _REACH_RISE * moving, moving if cycles < longest else 0.0
 
 
 def _set_gains(constants: Constants, stage: Stage, load: Vector, pids: Records[PidRecord]) -> None:

@@ -7,10 +7,16 @@ at the nominal landing.
 
 The predicted error beyond a dead zone is removed in two ways, see `landing`:
 
-- Step timing. In a short step, the lateral DCM moves outwards less than in a long step. The phase rate is the quotient of the
-  nominal time to the landing and the time in which the lateral DCM reaches its nominal value at a landing.
 - Foot placement. The landing is shifted by the error of the DCM at the landing. The DCM is then at its nominal position relative
   to the new stance foot.
+- Step timing. The error depends on the time of the landing, because the DCM moves outwards during a step. Of the possible phase
+  rates, the one with the lowest cost is used. The cost consists of the shift of the landing, the shift that the limits do not
+  permit, and the change of the step duration. (After M. Khadiv et al., Walking control based on step timing adaptation, IEEE
+  Transactions on Robotics 36, 2020. There a quadratic program has the same aim. One unknown needs no solver.)
+
+A push also moves and tilts the pelvis. With the joint angles of the gait, the swing foot would move with it, sideways, forwards
+and away from the floor. From the first reaction until the landing, the ankle of the swing leg is therefore held at its position
+relative to the stance foot (`shift_foot`): the nominal position plus the offset.
 
 While the predicted error is inside the dead zone, the offset is exactly 0 and the phase rate exactly 1.
 """
@@ -23,7 +29,7 @@ from typing import Annotated, NamedTuple
 from atalante_control.gait.gait import PERIOD
 from atalante_control.structured import Records
 from atalante_control.walking.kinematics import Link, turn_link
-from atalante_control.walking.rotation import cross, rotated
+from atalante_control.walking.rotation import cross, dot, rotated
 from atalante_hal.robot import LEG_JOINTS
 from atalante_hal.types import Vector
 
@@ -37,6 +43,7 @@ _SHIFTING = (_FH, _SH, _SK)
 _LINKS = LEG_JOINTS.index("SA") + 1
 #: m3, smallest determinant of the ankle Jacobian with which the foot is shifted further; a straight leg has determinant 0
 _SINGULAR = 1e-3
+_RATES = 32  # number of ratios between neighbouring phase rates of which the cost is computed
 _FASTEST = 3.0  # rad/s, largest desired speed of a joint that shifts the foot
 
 
@@ -46,20 +53,24 @@ class PlacementConfig(NamedTuple):
     #: m, largest predicted DCM error at the landing that is ignored; infinity switches placement and timing off
     dead_zone: float = 0.015
     forward: float = 0.15  # m, largest offset of a landing forwards and backwards
-    outward: float = 0.16  # m, largest offset of a landing away from the stance foot
+    outward: float = 0.22  # m, largest offset of a landing away from the stance foot
     inward: float = 0.02  # m, largest offset of a landing towards the stance foot
     slowest: float = 0.5  # smallest phase rate
-    fastest: float = 1.4  # largest phase rate
-    #: s, first part of a step, in which the DCM error is ignored, because the new stance foot is not yet at rest
+    fastest: float = 1.6  # largest phase rate
+    #: s, time after the start of a step in which the DCM error is ignored, because the new stance foot is not yet at rest
     settled: float = 0.08
     #: s, last time span before the nominal landing: the phase rate returns to 1, and `late_landing` gives the offset
     frozen: float = 0.05
-    #: m, largest DCM error (forward, sideways) whose growth the ankle stabiliser can stop, as measured.
-    #: These errors are smaller than the limits of the stabiliser, because the PIDs of the stance leg act against the shift.
-    capacity: Pair = (0.10, 0.044)
+    #: m, largest DCM error (forward, sideways) whose growth the robot can stop. Forwards it is smaller than the limit of the
+    #: ankle stabiliser, because the PIDs of the stance leg act against its shift. Sideways it is larger, because the trunk leans.
+    capacity: Pair = (0.10, 0.08)
     bandwidth: float = 25.0  # rad/s, natural frequency of the critically damped filter of the landing offset
     speed: float = 1.2  # m/s, largest rate of change of the landing offset
     acceleration: float = 25.0  # m/s2, largest acceleration of the landing offset
+    #: weight of the squared part of the needed offset that the limits of the offset do not permit, relative to the squared offset
+    missed: float = 30.0
+    timing: float = 0.03  # m, offset with the same cost as a landing that is 1 / w earlier or later
+    hold: float = 0.1  # s, time in which the reference of the swing foot changes from the pelvis to the stance foot
     slew: float = 15.0  # 1/s, largest change of the phase rate per second
 
 
@@ -68,6 +79,8 @@ class Placement:
 
     clock: float  # cycles, current row of the phase table, not rounded to an integer
     pace: float  # phase rate: progress of the step in one cycle, in nominal cycles
+    #: share of the stance foot in the reference of the swing foot: 0, the joint angles of the gait; 1, the position in the gait
+    held: float
     target: Annotated[Vector, 2]  # m, requested offset of the landing in the walking frame
     offset: Annotated[Vector, 2]  # m, current offset of the swing foot in the walking frame
     speed: Annotated[Vector, 2]  # m/s, speed of the offset
@@ -124,35 +137,65 @@ def beyond(value: float, zone: float) -> float:
 def landing(config: PlacementConfig, gain: float, motion: Motion) -> tuple[float, float, float]:
     """Return the offset of the landing in the walking frame, forwards and to the left [m], and the phase rate.
 
-    Between now and the landing the centre of pressure c is taken as constant, so that xi(t) = c + (xi - c) exp(w t).
-    The value of c is the one with which the nominal DCM reaches its value at the nominal landing.
+    The phase rate is the one with the lowest cost among 1 and `_RATES` + 1 rates in geometric order. It may jump between two
+    cycles. `follow` limits the changes of offset and phase rate.
 
     Args:
         config: parameters.
         gain: gain of the ankle stabiliser.
         motion: DCM and its prediction.
     """
-    growth, side = math.exp(motion.exponent), motion.side
-    x = beyond(predicted(motion.error[0], gain, config.capacity[0], motion.exponent), config.dead_zone)
-    y = beyond(predicted(motion.error[1], gain, config.capacity[1], motion.exponent), config.dead_zone)
+    x, y = _needed(config, gain, motion, 1.0)
     if x == 0.0 and y == 0.0:
         return 0.0, 0.0, 1.0
-    # sideways distance from the centre of pressure c to the nominal DCM xi at the nominal landing, xi(T) - c
-    outward = side * (motion.final[1] - motion.nominal[1]) * growth / (growth - 1.0)
-    rate, distance = 1.0, outward + side * y
-    if y != 0.0 and outward > 0.0:
-        exponent = math.inf if distance <= 0.0 else motion.exponent + math.log(outward / distance)
-        rate = config.fastest
-        if exponent * config.fastest > motion.exponent:
-            rate = max(motion.exponent / exponent, config.slowest)
-    later = math.exp(motion.exponent / rate - motion.exponent)
-    offset_x = x * later
-    offset_y = distance * later - outward
+    least, best = _cost(config, gain, motion, 1.0), 1.0
+    for k in range(_RATES + 1):
+        rate = config.slowest * (config.fastest / config.slowest) ** (k / _RATES)
+        cost = _cost(config, gain, motion, rate)
+        if cost < least:
+            least, best = cost, rate
+    x, y = _needed(config, gain, motion, best)
+    x, y = _permitted(config, motion.side, x, y)
+    return x, y, best
+
+
+def _needed(config: PlacementConfig, gain: float, motion: Motion, rate: float) -> Pair:
+    """Return the offset of the landing with which the DCM is at its nominal position relative to the new stance foot [m].
+
+    Sideways, the centre of pressure c of the nominal motion is taken as constant until the landing, so that
+    xi(t) = c + (xi - c) exp(w t). The value of c is the one with which the nominal DCM reaches its value at the nominal landing.
+    Forwards, the ankle makes the DCM follow a faster or slower step.
+
+    Args:
+        config: parameters.
+        gain: gain of the ankle stabiliser.
+        motion: DCM and its prediction.
+        rate: phase rate until the landing.
+    """
+    exponent, growth = motion.exponent / rate, math.exp(motion.exponent)
+    centre = (motion.nominal[1] * growth - motion.final[1]) / (growth - 1.0)
+    moved = centre + (motion.nominal[1] - centre) * math.exp(exponent) - motion.final[1] if rate != 1.0 else 0.0
     return (
-        min(max(offset_x, -config.forward), config.forward),
-        side * min(max(offset_y, -config.inward), config.outward),
-        rate,
+        beyond(predicted(motion.error[0], gain, config.capacity[0], exponent), config.dead_zone),
+        moved + beyond(predicted(motion.error[1], gain, config.capacity[1], exponent), config.dead_zone),
     )
+
+
+def _permitted(config: PlacementConfig, side: float, x: float, y: float) -> Pair:
+    """Return an offset of the landing within its limits [m]."""
+    return (
+        min(max(x, -config.forward), config.forward),
+        side * min(max(side * y, -config.inward), config.outward),
+    )
+
+
+def _cost(config: PlacementConfig, gain: float, motion: Motion, rate: float) -> float:
+    """Return the cost of a phase rate [m2]."""
+    x, y = _needed(config, gain, motion, rate)
+    forward, left = _permitted(config, motion.side, x, y)
+    missed = (x - forward) ** 2 + (y - left) ** 2
+    time = config.timing * (motion.exponent / rate - motion.exponent)
+    return forward * forward + left * left + config.missed * missed + time * time
 
 
 def late_landing(config: PlacementConfig, error: Pair, side: float) -> Pair:
@@ -163,10 +206,8 @@ def late_landing(config: PlacementConfig, error: Pair, side: float) -> Pair:
         error: measured minus nominal DCM in the walking frame [m].
         side: direction from stance foot to swing foot: 1 left, -1 right.
     """
-    return (
-        min(max(beyond(error[0], 2.0 * config.dead_zone), -config.forward), config.forward),
-        side * min(max(side * beyond(error[1], 2.0 * config.dead_zone), -config.inward), config.outward),
-    )
+    zone = 2.0 * config.dead_zone
+    return _permitted(config, side, beyond(error[0], zone), beyond(error[1], zone))
 
 
 def follow(config: PlacementConfig, placement: Placement, rate: float) -> None:
@@ -187,9 +228,9 @@ def follow(config: PlacementConfig, placement: Placement, rate: float) -> None:
 
 
 def shift_foot(
-    placement: Placement, links: Records[Link], first: int, desired: Vector, leg: int, shift: Vector3
+    placement: Placement, links: Records[Link], first: int, desired: Vector, leg: int, goal: Vector3
 ) -> None:
-    """Shift the desired position of the swing ankle by one Newton step per cycle for frontal hip, sagittal hip and knee.
+    """Move the desired position of the swing ankle towards a goal by one Newton step for frontal hip, sagittal hip and knee.
 
     The attitude of the foot is not considered, because the ankle holds the sole level.
 
@@ -199,37 +240,39 @@ def shift_foot(
         first: index of the first link of the swing leg.
         desired: q_des [rad], then q_des' [rad/s], shape (24,); the elements of FH, SH and SK of the swing leg are updated.
         leg: index of the first joint of the swing leg.
-        shift: shift of the ankle in the axes of the pelvis [m].
+        goal: position of the ankle in the pelvis frame [m].
     """
-    change, count = placement.change, len(desired) // 2
-    before = _ankle(placement, links, first, desired)
     for k in range(3):
-        desired[leg + _SHIFTING[k]] += change[k]
-    now = _ankle(placement, links, first, desired)
-    missing = (
-        before[0] + shift[0] - now[0],
-        before[1] + shift[1] - now[1],
-        before[2] + shift[2] - now[2],
-    )
+        desired[leg + _SHIFTING[k]] += placement.change[k]
+    now = ankle_position(placement, links, first, desired)
+    missing = goal[0] - now[0], goal[1] - now[1], goal[2] - now[2]
     a, b, c = _column(placement, now, _FH), _column(placement, now, _SH), _column(placement, now, _SK)
-    bc, ca, ab = cross(b, c), cross(c, a), cross(a, b)
+    bc = cross(b, c)
     determinant = a[0] * bc[0] + a[1] * bc[1] + a[2] * bc[2]
     if abs(determinant) < _SINGULAR:
         return
-    for k in range(3):
-        row = bc if k == 0 else ca if k == 1 else ab
-        step = (row[0] * missing[0] + row[1] * missing[1] + row[2] * missing[2]) / determinant
-        joint = leg + _SHIFTING[k]
-        least, most = (-_FASTEST - desired[count + joint]) * PERIOD, (_FASTEST - desired[count + joint]) * PERIOD
-        angle = desired[joint] + min(max(step, min(least, 0.0)), max(most, 0.0))
-        angle = min(max(angle, placement.low[joint]), placement.high[joint])
-        step = angle - desired[joint]
-        desired[joint] = angle
-        desired[count + joint] += step / PERIOD
-        change[k] += step
+    # A joint that reaches its limit leaves a part of the shift to the joints after it, in the least-squares sense.
+    moved = _step(placement, desired, leg, 0, dot(bc, missing) / determinant)
+    missing = missing[0] - moved * a[0], missing[1] - moved * a[1], missing[2] - moved * a[2]
+    bb, bd, dd = dot(b, b), dot(b, c), dot(c, c)
+    moved = _step(placement, desired, leg, 2, (bb * dot(c, missing) - bd * dot(b, missing)) / (bb * dd - bd * bd))
+    missing = missing[0] - moved * c[0], missing[1] - moved * c[1], missing[2] - moved * c[2]
+    _step(placement, desired, leg, 1, dot(b, missing) / bb)
 
 
-def _ankle(placement: Placement, links: Records[Link], first: int, desired: Vector) -> Vector3:
+def _step(placement: Placement, desired: Vector, leg: int, k: int, step: float) -> float:
+    """Change the desired angle of a shifting joint within the limits of its angle and its speed, and return the change [rad]."""
+    joint, rate = leg + _SHIFTING[k], len(desired) // 2 + leg + _SHIFTING[k]
+    least, most = (-_FASTEST - desired[rate]) * PERIOD, (_FASTEST - desired[rate]) * PERIOD
+    angle = desired[joint] + min(max(step, min(least, 0.0)), max(most, 0.0))
+    step = min(max(angle, placement.low[joint]), placement.high[joint]) - desired[joint]
+    desired[joint] += step
+    desired[rate] += step / PERIOD
+    placement.change[k] += step
+    return step
+
+
+def ankle_position(placement: Placement, links: Records[Link], first: int, desired: Vector) -> Vector3:
     """Return the position of the ankle in the pelvis frame [m]. Write joint positions and axes into `placement`."""
     rotation, position = placement.rotation, (0.0, 0.0, 0.0)
     for i in range(3):

@@ -33,11 +33,16 @@ class PhaseTable(NamedTuple):
     rows: Vector  # (n + 1, 24) q_nom [rad], then q_nom' [rad/s]
     feedforward: Vector  # (n + 1, 12) Nm, u_f
     dcm: Vector  # (n + 1, 2) m, nominal DCM
+    #: (n + 1, 3) m, nominal position of the ankle of the swing leg relative to the centre of the stance sole, walking frame
+    ankle: Vector
     frequency: float  # rad/s, natural frequency w of the pendulum
     recentring: Vector  # (m, 4) re-centring rows of all joints without a guide, see `flat_foot.recentring_rows`
     guided: Vector  # (m, 4) re-centring rows of sagittal hip and knee of the swing leg, which a guide can assist
     reach: Vector  # (2,) rad/s, speeds of hip and knee of the swing leg that lower the swing foot after the last cycle
-    reach_cycles: int  # number of cycles in which the swing foot is lowered after the last row
+    lowering: float  # m/s, speed of the swing foot with the joint speeds `reach`
+    reach_cycles: int  # number of cycles in which the joints of the swing leg lower the foot after the last row
+    #: number of cycles in which a foot is lowered that is held relative to the stance foot; its knee can end the motion earlier
+    lowering_cycles: int
 
 
 class Reach(NamedTuple):
@@ -64,12 +69,13 @@ def step_table(
     """
     table = (gait if stance == RIGHT else gait.mirrored()).tables()
     yaw = -toe_out if stance == RIGHT else toe_out
-    centre, speed = np.zeros((2, gait.cycles + 1, 3))
+    centre, speed, ankle = np.zeros((3, gait.cycles + 1, 3))
     heading, upright = about_z(yaw), about_z(0.0)
     # Views of the records that `update` overwrites. Creating a view of a field takes longer than the computation of a cycle.
     sole, body = kinematics.chain.soles[stance], kinematics.chain.centre[0]
     rotation, position, linear, angular = sole.rotation, sole.position, sole.linear, sole.angular
     body_position, body_velocity = body.position, body.velocity
+    joint = kinematics.chain.links[kinematics.chain.soles[1 - stance].link - 1].origin
     for cycle, (q, qd) in enumerate(zip(table.q, table.qd, strict=True)):
         kinematics.update(q, qd)
         upright = _product(heading, rotation.T)  # rotation from pelvis to walking frame
@@ -77,16 +83,30 @@ def step_table(
         # The sole rests on the ground, so the centre of mass has the same velocity relative to the sole as in the world.
         relative = body_velocity - linear - np.array(cross(angular, lever))
         centre[cycle], speed[cycle] = upright @ lever, upright @ relative
+        ankle[cycle] = upright @ (joint - position)
     frequency = math.sqrt(GRAVITY / float(centre[:, 2].mean()))
     swing = 1 - stance
     rates = reach.speed * _reach(table.q[-1], swing, kinematics, upright)
-    rates *= min(1.0, reach.rate / float(np.abs(rates).max()))
+    slower = min(1.0, reach.rate / float(np.abs(rates).max()))
+    rates *= slower
     bend = float(table.q[-1, swing * _LEG + _SK]) - reach.knee
     time = min(reach.time, max(0.0, bend) / abs(float(rates[1])))
     rows = np.hstack([table.q, table.qd])
     recentring, guided = (recentring_rows(Deadbeat(gait.duration, alpha), len(rows)) for alpha in alphas)
     dcm = (centre + speed / frequency)[:, :2].copy()
-    return PhaseTable(rows, table.uf.copy(), dcm, frequency, recentring, guided, rates, round(time / PERIOD))
+    return PhaseTable(
+        rows,
+        table.uf.copy(),
+        dcm,
+        ankle,
+        frequency,
+        recentring,
+        guided,
+        rates,
+        slower * reach.speed,
+        round(time / PERIOD),
+        round(reach.time / PERIOD),
+    )
 
 
 def shift_tables(shift: Shift, duration: float, alpha: float) -> tuple[PhaseTable, PhaseTable]:
@@ -110,7 +130,10 @@ def shift_tables(shift: Shift, duration: float, alpha: float) -> tuple[PhaseTabl
         dcm = (centre + velocity / frequency)[:, :2].copy()
         feedforward = np.ascontiguousarray(bezier(shift.feedforward, part))
         rows = np.hstack([q, qd])
-        tables.append(PhaseTable(rows, feedforward, dcm, frequency, recentring, recentring, np.zeros(2), 0))
+        ankle = np.zeros((len(rows), 3))
+        tables.append(
+            PhaseTable(rows, feedforward, dcm, ankle, frequency, recentring, recentring, np.zeros(2), 0.0, 0, 0)
+        )
     return tables[0], tables[1]
 
 

@@ -67,3 +67,8 @@ def rotated(matrix: Vector, v: Vector | Vector3) -> Vector3:
 def cross(a: Vector | Vector3, b: Vector | Vector3) -> Vector3:
     """Return the cross product of two vectors of three elements."""
     return a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]
+
+
+def dot(a: Vector | Vector3, b: Vector | Vector3) -> float:
+    """Return the scalar product of two vectors of three elements."""
+    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]

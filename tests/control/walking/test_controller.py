@@ -11,6 +11,7 @@ from atalante_control.gait.walk import DEFAULT_WALK, load_walk
 from atalante_control.model import ExoskeletonParameters, Patient, urdf
 from atalante_control.walking.config import WalkConfig
 from atalante_control.walking.controller import WalkController
+from atalante_control.walking.lean import LeanConfig
 from atalante_control.walking.phases import Phase
 from atalante_control.walking.placement import PlacementConfig
 from atalante_control.walking.telemetry import TELEMETRY_FIELDS
@@ -120,7 +121,8 @@ def elapsed_of(controller: WalkController) -> float:
 
 def pushed(dead_zone: float, direction: float, force: float) -> bool:
     """Push the pelvis for 0.2 s from phase 0.2 of the second step; return whether the robot walks three more steps."""
-    config = WalkConfig(placement=PlacementConfig(dead_zone=dead_zone))
+    lean = LeanConfig() if math.isfinite(dead_zone) else LeanConfig(gain=0.0)
+    config = WalkConfig(placement=PlacementConfig(dead_zone=dead_zone), lean=lean)
     controller = WalkController(ROBOT, PATIENT, WALK, 100, config)
     body = make_body("mujoco", urdf(ExoskeletonParameters(), ROBOT, PATIENT), free=True, ground=0.0)
     angle, cycles = math.radians(direction), 0
@@ -142,7 +144,7 @@ def pushed(dead_zone: float, direction: float, force: float) -> bool:
 
 
 @pytest.mark.parametrize(("direction", "force"), [(90.0, 210.0), (270.0, 180.0)], ids=["left", "right"])
-def test_robot_withstands_a_push_only_with_foot_placement_and_step_timing(direction: float, force: float) -> None:
+def test_robot_withstands_a_push_only_with_foot_placement_step_timing_and_lean(direction: float, force: float) -> None:
     assert pushed(PlacementConfig().dead_zone, direction, force)
     assert not pushed(math.inf, direction, force)
 

@@ -40,6 +40,24 @@ def test_joints_stay_within_their_limits_while_a_late_foot_moves_down(patient: P
     assert last > ROBOT.position_min[knee]
 
 
+@pytest.mark.parametrize("stance", [LEFT, RIGHT])
+def test_swing_ankle_moves_by_two_steps_and_starts_and_ends_at_the_height_of_a_standing_foot(stance: int) -> None:
+    side = 1.0 if stance == RIGHT else -1.0
+    ankle = table(STUDY_PATIENTS[4], Reach(0.3, CONFIG.reach_rate, CONFIG.reach_time, CONFIG.reach_knee), stance).ankle
+    assert ankle[-1, 0] - ankle[0, 0] == pytest.approx(2 * 0.16, abs=0.01)
+    assert np.all(side * ankle[:, 1] > 0.1)
+    assert ankle[[0, -1], 2] == pytest.approx(-ExoskeletonParameters().sole_centre[1], abs=0.003)
+    assert ankle[:, 2].max() - ankle[0, 2] > 0.04
+
+
+def test_speed_of_the_late_foot_is_reduced_with_the_speeds_of_its_joints() -> None:
+    patient, rate, time, knee = STUDY_PATIENTS[0], CONFIG.reach_rate, CONFIG.reach_time, CONFIG.reach_knee
+    fast, slow = (table(patient, Reach(speed, rate, time, knee), RIGHT) for speed in (0.3, 0.01))
+    assert slow.lowering == 0.01
+    assert 0.01 < fast.lowering < 0.3
+    assert fast.reach / fast.lowering == pytest.approx(slow.reach / slow.lowering)
+
+
 def test_bound_of_the_speed_keeps_the_direction_and_a_slow_motion() -> None:
     patient, rate, time, knee = STUDY_PATIENTS[0], CONFIG.reach_rate, CONFIG.reach_time, CONFIG.reach_knee
     fast, slow = (table(patient, Reach(speed, rate, time, knee), RIGHT) for speed in (0.3, 0.01))

@@ -1,0 +1,67 @@
+"""Lean of the trunk against sideways pushes: `DCM error -> lean -> offset of the frontal hip (FH) of the stance leg`.
+
+The ankle moves the centre of pressure only within the sole. If the divergent component of motion (DCM, `walking.dcm`) is moved
+beyond the edge of the sole, the ankle alone cannot stop it. A trunk that accelerates its rotation in the direction of the push
+moves the ground force further than the sole reaches. A lean by the angle a moves the DCM back by about J w^2 a / (m g), with the
+moment of inertia J of the rotating parts about the hip, the natural frequency w and the weight m g. The first part of the motion
+counts most, because a DCM error grows with exp(w t). The trunk therefore leans fast and returns slowly.
+
+A push to the side of the stance foot makes the trunk lean over the stance foot, as long as the DCM is near the stance sole or
+outside. A push to the side of the swing foot makes the trunk lean a little to that side, which also lowers the swing foot.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+from atalante_control.gait.gait import PERIOD
+
+
+class LeanConfig(NamedTuple):
+    """Parameters of the lean."""
+
+    gain: float = 6.0  # rad/m, lean per DCM error beyond the dead zone; 0: no lean
+    dead_zone: float = 0.02  # m, sideways DCM error up to which the trunk does not lean
+    #: m, the trunk leans over the stance foot while the DCM is at most this far from the middle of its sole on the inner side
+    inside: float = 0.015
+    outward: float = 0.22  # rad, largest lean over the stance foot
+    inward: float = 0.08  # rad, largest lean to the side of the swing foot
+    rise: float = 14.0  # rad/s, natural frequency of the critically damped filter while the lean grows
+    fall: float = 5.0  # rad/s, the same while the lean decreases
+    acceleration: float = 25.0  # rad/s2, largest acceleration of the lean
+
+
+class Lean:
+    """State of the lean in the current step."""
+
+    angle: float  # rad, lean to the left
+    speed: float  # rad/s, speed of the lean
+
+
+def lean_target(config: LeanConfig, error: float, dcm: float, side: float) -> float:
+    """Return the requested lean to the left [rad].
+
+    Args:
+        config: parameters.
+        error: sideways DCM error, positive to the left [m].
+        dcm: sideways position of the DCM relative to the middle of the stance sole, positive to the left [m].
+        side: direction from stance foot to swing foot: 1 left, -1 right.
+    """
+    outward = min(-side * error - config.dead_zone, config.inside - side * dcm)
+    if outward > 0.0:
+        return -side * min(config.gain * outward, config.outward)
+    return side * min(max(config.gain * (side * error - config.dead_zone), 0.0), config.inward)
+
+
+def follow_lean(config: LeanConfig, lean: Lean, target: float) -> None:
+    """Move the lean towards its target, with limited acceleration.
+
+    Args:
+        config: parameters.
+        lean: state; updated.
+        target: requested lean [rad].
+    """
+    w = config.rise if abs(target) > abs(lean.angle) else config.fall
+    pull = w * w * (target - lean.angle) - 2.0 * w * lean.speed
+    lean.speed += PERIOD * min(max(pull, -config.acceleration), config.acceleration)
+    lean.angle += PERIOD * lean.speed
