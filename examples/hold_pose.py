@@ -1,4 +1,4 @@
-"""Run your own controller: it holds the pose that the robot has when the operator presses START.
+"""Run your own controller. This controller holds the pose that the robot has when the operator presses START.
 
 Run it:  python examples/hold_pose.py                       on an emulated robot, for two seconds of robot time
          python examples/hold_pose.py socketcan vcan0       on a robot or an emulator on a CAN bus

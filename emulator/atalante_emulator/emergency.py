@@ -26,7 +26,8 @@ COMMAND_TIMEOUT: Final = 0x8250  # command timed out
 _REGISTER: Final = {0x2: 0x03, 0x3: 0x05, 0x4: 0x09, 0x7: 0x21, 0x8: 0x11}
 _GENERIC: Final = 0x01
 
-# Ages of a warning [calls of `Errors.advance`]: at _ENDED the warning ends, at _REPEATABLE it may be reported again.
+# Two ages of a warning [calls of `Errors.advance`]: the warning ends at the first age. The same warning may be reported
+# again at the second age.
 _ENDED, _REPEATABLE = 2, 3
 
 
@@ -41,8 +42,8 @@ class FaultReaction(Enum):
 def reaction_to(code: int) -> FaultReaction:
     """Return the reaction of a drive to an error.
 
-    A drive cannot hold its joint without supply voltage, or with an error of motor current, temperature or encoder. So these
-    errors lead to the lowering of the joint.
+    A drive cannot hold its joint without supply voltage, or with an error of motor current, temperature or encoder.
+    After such an error, the drive lowers its joint.
 
     Args:
         code: emergency error code.

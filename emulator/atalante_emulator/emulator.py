@@ -48,9 +48,9 @@ from atalante_hal.wire.process_image import ReceiveImage, TransmitImage
 _RECEIVE_BUDGET = 128
 #: Capacity of the transmit buffer [frames]. The nodes send 19 cyclic frames per cycle, slow messages and emergencies.
 _BATCH = 128
-#: The nodes reject a received command frame with one of these E2E check results.
+#: The nodes reject a command frame if the result of its E2E check is one of these values.
 _REJECTED = (Check.CRC, Check.LENGTH, Check.RANGE, Check.INVALID)
-#: Half the period of the alive counter.
+#: Half the period of the alive counter [cycles].
 _HALF_TURN = 128
 #: After the first SYNC of a cycle, the emulator waits at most this time for the SYNCs on the other buses [s].
 _SYNC_SKEW = 200e-6
@@ -94,7 +94,7 @@ class Emulator:
         Args:
             network: nodes and messages of the DBC.
             robot: joint properties that the nodes use.
-            body: mechanics of the robot. The emulator steps it, and the caller closes it.
+            body: mechanics of the robot. The emulator advances the body, and the caller closes the body.
             bus: bus on which the nodes of all buses send and receive. A `JoinedBus` combines several channels.
             seed: seed of all random numbers: sensor noise, biases and random faults.
             operator: emulated operator of the pendant. None if another process runs the pendant node.
@@ -183,8 +183,8 @@ class Emulator:
         self._whole = [self._tx.frames]
         #: For each leg: index of its SYNC message in the list of SYNC messages.
         self._leg_syncs = [[m.name for m in syncs].index(f"SYNC_{side.upper()}_LEG") for side in SIDES]
-        #: Answers to SYNC that are sent if a SYNC arrives late, in the order of the SYNC messages.
-        #: The answers are copied in each cycle that has missing or late frames.
+        #: One answer per SYNC message. If a SYNC arrives late, the nodes send this answer. In a cycle with missing or
+        #: late frames, all answers are copied.
         self._answered = self._shares
         batch = new_frames(_BATCH)
         self._batch = batch.view(np.uint8).data
@@ -338,8 +338,8 @@ class Emulator:
     def _check_delays(self) -> None:
         """Measure the delay of each valid new command, and reject commands that are late by `WATCHDOG` cycles or more.
 
-        The HAL sends a command and the SYNC of the next cycle with the same alive counter. So their difference is the delay of
-        the command in cycles. It is negative if the SYNC is missing.
+        The HAL sends a command and the SYNC of the next cycle with the same alive counter. So the delay of a command
+        is SYNC counter minus command counter [cycles]. The delay is negative if the SYNC is missing.
         """
         for leg, (sync, command) in enumerate(self._leg_rows):
             if self._rx.check[command] <= Check.SOME_LOST:

@@ -37,7 +37,7 @@ class EngineDynamics(Closing):
         self._client = pybullet.connect(pybullet.DIRECT)
         try:
             self._body = load_urdf(urdf, self._client)
-            self._free = load_urdf(urdf, self._client, fixed=False)  # PyBullet reports mass 0 for a fixed base
+            self._free = load_urdf(urdf, self._client, fixed=False)  # a fixed base would have mass 0
         except ValueError:
             self.close()
             raise

@@ -44,13 +44,13 @@ class Kind:
 
 
 def _number(low: float, high: float, unit: str = "", *, default: float | None = None) -> Parameter:
-    """Return the definition of a parameter: a number in [low, high]."""
+    """Return the definition of a parameter whose value is a number in [low, high]."""
     text = f"a number from {low:g} to {high:g}" + (f" {unit}" if unit else "")
     return Parameter(text, lambda value: _is_number(value) and low <= value <= high, default)
 
 
 def _whole(low: int, high: int, *, default: int | None = None) -> Parameter:
-    """Return the definition of a parameter: an integer in [low, high]."""
+    """Return the definition of a parameter whose value is an integer in [low, high]."""
     return Parameter(
         f"an integer from {low} to {high}", lambda value: type(value) is int and low <= value <= high, default
     )

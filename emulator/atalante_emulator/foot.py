@@ -24,7 +24,7 @@ def _share(plate: Vector, sole_force: Vector, force: Vector) -> None:
     """Compute the forces of the cells of both feet from the forces on the corners of the soles.
 
     Args:
-        plate: matrix of each foot, shape (2, 12, 12).
+        plate: matrix for each foot: cell forces = matrix times corner forces, shape (2, 12, 12).
         sole_force: forces on the corners, shape (2, 4, 3) [N].
         force: output for the forces of the cells, shape (2, 4, 3) [N].
     """

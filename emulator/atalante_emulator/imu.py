@@ -21,11 +21,11 @@ from atalante_hal.types import PERIOD, Vector
 class ImuParameters:
     """Noise, bias and temperature of the emulated IMUs. Noise and bias are given per axis. The sample rate is 1 kHz."""
 
-    gyro_noise: float = 3.9e-3  # noise density 0.01 deg/s/sqrt(Hz) times the root of the bandwidth 500 Hz [rad/s rms]
+    gyro_noise: float = 3.9e-3  # noise [rad/s rms]: density 0.01 deg/s/sqrt(Hz) times the square root of 500 Hz
     gyro_bias: float = 5.2e-5  # standard deviation of the bias over all devices [rad/s], equal to 0.003 deg/s
     accel_noise: float = 0.05  # noise [m/s2 rms]
     accel_bias: float = 0.02  # standard deviation of the bias over all devices [m/s2]
-    attitude_error: float = 0.0  # slowly changing error of the attitude about each axis of the world [rad rms]
+    attitude_error: float = 0.0  # slowly changing attitude error about each world axis [rad rms]
     attitude_time: float = 10.0  # time constant of the attitude error [s]
     heading_drift: float = 0.0  # constant drift of the heading, standard deviation over all devices [rad/s]
     temperature: float = 32.0  # constant temperature of all IMUs [degC]
@@ -34,7 +34,7 @@ class ImuParameters:
 class ImuSignals(NamedTuple):
     """Signals in the state frames of the IMUs. `Imus.sample` updates the signals."""
 
-    quaternion: Vector  # attitude, wxyz from sensor to world with w >= 0, shape (4, 4)
+    quaternion: Vector  # attitudes as quaternions wxyz from sensor to world frame, w >= 0, shape (4, 4)
     gyro: Vector  # angular rate in the sensor frame, shape (4, 3) [rad/s]
     accel: Vector  # specific force in the sensor frame, upwards at rest, shape (4, 3) [m/s2]
 

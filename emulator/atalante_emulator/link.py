@@ -59,26 +59,26 @@ class _Disturbance:
         """Apply the fault to a frame. Return the frames that replace this frame on the bus, each of shape (1,).
 
         Args:
-            frame: frame of a message of the fault, shape (1,). It may be changed.
+            frame: frame of a target message of the fault, shape (1,). The function may change this frame.
             cycle: number of the cycle.
         """
         return self.changed(frame, cycle) if self.strikes() else (frame,)
 
     def strikes(self) -> bool:
-        """Draw whether the fault affects the next frame of its messages."""
+        """Draw at random whether the fault affects the next frame of its target messages."""
         return self.random.random() < self._chance
 
     def changed(self, frame: Frames, cycle: int) -> Sequence[Frames]:
-        """Return the frames that replace a frame of the messages of the fault, each of shape (1,).
+        """Return the frames that replace an affected frame on the bus, each of shape (1,).
 
         Args:
-            frame: frame that the fault affects, shape (1,). It may be changed.
+            frame: frame that the fault affects, shape (1,). The function may change this frame.
             cycle: number of the cycle.
         """
         return self._effect(self, frame, self.messages[_id(frame)], cycle)
 
     def due(self, cycle: int) -> list[Frames]:
-        """Return the delayed frames that must be delivered by now, each of shape (1,), and remove these frames from `late`.
+        """Remove the delayed frames that are due from `late`, and return these frames, each of shape (1,).
 
         Args:
             cycle: number of the cycle.
@@ -311,7 +311,7 @@ class FaultyBus(WrappedBus):
     def _passed(self, frames: Frames, *, from_hal: bool) -> list[Frames]:
         """Apply all active faults to each frame. Return the frames that are sent in this cycle."""
         passing: list[Frames] = []
-        unchanged = 0  # first row of the frames before this row that pass unchanged
+        unchanged = 0  # all frames from this row to the current row pass unchanged
         for row, can_id in enumerate(frames["can_id"].tolist()):
             acting = self._acting.get(can_id, ())
             for number, disturbance in enumerate(acting, 1):

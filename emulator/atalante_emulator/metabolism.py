@@ -1,13 +1,13 @@
 """Metabolism of the emulated patient: `muscle work, muscle torque -> metabolic rate -> O2, CO2 -> measured metabolic rate`.
 
-The muscles of `patient.ActivePatient` have a cost in addition to the rate of quiet standing:
+The metabolic rate M is the rate of quiet standing plus the rate of the muscles of `patient.ActivePatient`:
 
     M = m standing + P+ / positive + P- / negative + activation * |u|
 
 P+ is the power of muscles that shorten, P- the magnitude of the power of muscles that lengthen, |u| the sum of the magnitudes of
 the muscle torques. The oxygen uptake and the carbon dioxide output follow the metabolic rate with first-order lags. The
-respirometer measures both with noise. `brockway` computes the measured metabolic rate from both, as in the experiments of
-Gurriet et al. (RA-L 2020).
+respirometer measures oxygen uptake and carbon dioxide output with noise. From these measurements, `brockway` computes
+the measured metabolic rate, as in the experiments of Gurriet et al. (RA-L 2020).
 """
 
 from __future__ import annotations

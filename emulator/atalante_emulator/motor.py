@@ -67,7 +67,7 @@ class Motors:
         self._tracking = 1.0 - math.exp(-PERIOD / parameters.current_loop)
         self._motors = np.zeros((8, len(JOINTS)))
         self.wanted, self._joint = self._motors[_WANTED], self._motors[_JOINT]
-        #: Cycles until a new setpoint reaches the current loop of each motor, and the setpoints of the last cycles.
+        #: Time until a new setpoint reaches the current loop of each motor [cycles].
         self._dead_time = np.full(len(JOINTS), parameters.dead_time)
         self._late = parameters.dead_time > 0  # whether any setpoint is delayed
         self._setpoints = np.zeros((MOST_LATE + 1, len(JOINTS)))
@@ -115,7 +115,7 @@ class Motors:
 
         Args:
             motor: index of the motor.
-            cycles: additional time [cycles], at most `MOST_LATE` together with the dead time of all motors.
+            cycles: additional time [cycles]. Additional time plus dead time must be at most `MOST_LATE`.
         """
         self._dead_time[motor] = self._parameters.dead_time + cycles
         self._late = bool(self._dead_time.any())

@@ -7,8 +7,8 @@ is `wearer.PassiveWearer` alone: limbs without muscle torque.
 
 After each step, the learned torque u is updated with the perceived error e: `u <- f u + g e`. This model describes motor
 adaptation as a greedy minimisation of error and effort: without error, the effort decays (Emken, Benitez, Sideris, Bobrow,
-Reinkensmeyer, "Motor adaptation as a greedy optimization of error and effort", J. Neurophysiol. 97, 2007). The parameters do not
-depend on the trial.
+Reinkensmeyer, "Motor adaptation as a greedy optimization of error and effort", J. Neurophysiol. 97, 2007). All
+experiments use the same parameters.
 """
 
 from __future__ import annotations
@@ -51,7 +51,7 @@ class ActiveParameters:
     #: Largest joint angle error that the patient does not perceive [rad].
     #: The threshold at hip and knee is one to two degrees (Domingo, Lam, J. NeuroEng. Rehabil. 11, 2014).
     threshold: float = math.radians(1.0)
-    #: Learning rate: the patient adds `learning` times `gain` times the perceived error to the torque in the leg's next step.
+    #: Learning rate. Each step adds `learning` times `gain` times the perceived error to the learned torque of the leg.
     learning: float = 0.1
     forgetting: float = 0.95  # f: fraction of the learned torque that remains in the next step of the same leg
     noise: float = 0.1  # standard deviation of the torque as a fraction of the torque (signal-dependent noise)
@@ -60,7 +60,7 @@ class ActiveParameters:
     #: Largest voluntary torque in the weaker direction of each joint (flexion), as a fraction of mass times gravity times height.
     #: Source: Anderson, Madigan, Nussbaum, J. Biomech. 40, 2007.
     strength: Pair = (0.113, 0.087)
-    fraction: float = 1.0  # strength of this patient as a fraction of an able-bodied person
+    fraction: float = 1.0  # strength of this patient as a fraction of the strength of an able-bodied person
 
     def __post_init__(self) -> None:
         for name in ("delay", "noise_time", "activation"):
@@ -94,9 +94,9 @@ class ActivePatient:
     Attributes:
         muscle: Torques of the muscles in the last cycle, shape (12,) [Nm].
         strength: Largest magnitudes of the muscle torques of SH and SK [Nm].
-        positive_work: Work of the muscles on the joints (concentric) since the creation [J].
-        negative_work: Magnitude of the work of the joints on the muscles (eccentric) since the creation [J].
-        impulse: Integral of the magnitudes of the muscle torques since the creation [Nm s].
+        positive_work: Work of the muscles on the joints (concentric) since the start [J].
+        negative_work: Magnitude of the work of the joints on the muscles (eccentric) since the start [J].
+        impulse: Integral of the magnitudes of the muscle torques since the start [Nm s].
     """
 
     def __init__(self, body: Body, task: ActiveTask, limbs: LimbParameters | None = None) -> None:

@@ -39,7 +39,7 @@ class Operator:
     In HOLD the emulated operator does not press START. Call `start()` to end HOLD.
     """
 
-    #: In READY, the operator presses START each time this number of cycles has passed.
+    #: Time in READY after which the operator presses START, and then presses START again [cycles].
     REACTION = 200
 
     def __init__(self, assistance_factor: float | None = None, *, starts: bool = True) -> None:

@@ -24,7 +24,7 @@ class Benchmark:
     unit: str
     baseline: str  # description of the baseline
     target: float | None = None  # largest accepted ratio of the measured time to the baseline; None means no target
-    processes: int = 1  # odd number of processes in which the benchmark is repeated; the median ratio counts
+    processes: int = 1  # odd number of processes that run the benchmark; the result is the median ratio
 
     @property
     def per_second(self) -> float:

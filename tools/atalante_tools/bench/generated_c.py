@@ -79,11 +79,11 @@ class GeneratedC:
         return self._inside.value
 
     def decode(self, frames: Frames, out: Vector, repetitions: int) -> float:
-        """Decode all frames into `out`. Repeat the decoding `repetitions` times, and return the mean time [s]."""
+        """Decode all frames into `out`. Decode `repetitions` times, and return the mean time of one decoding [s]."""
         return _seconds(self._decode, frames, out, repetitions)
 
     def encode(self, values: Vector, frames: Frames, repetitions: int) -> float:
-        """Encode `values` into all frames. Repeat the encoding `repetitions` times, and return the mean time [s]."""
+        """Encode `values` into all frames. Encode `repetitions` times, and return the mean time of one encoding [s]."""
         return _seconds(self._encode, frames, values, repetitions)
 
 

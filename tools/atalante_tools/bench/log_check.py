@@ -1,6 +1,6 @@
 """Benchmarks of the CAN log validator, with other decoders as baselines.
 
-The log has 1.3 million frames. It repeats a short recording of the emulated robot in the state ACTIVE. The copied
+The log has 1.3 million frames. The log repeats a short recording of the emulated robot in the state ACTIVE. The copied
 frames get new alive counters and CRCs, because otherwise the validator would report repeated frames.
 """
 

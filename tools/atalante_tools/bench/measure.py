@@ -38,7 +38,7 @@ class Measurement:
     value: float | None
     baseline: float | None
     remarks: tuple[str, ...] = ()
-    ratios: tuple[float, ...] = ()  # ratio of each process, in ascending order; empty if all times are of this process
+    ratios: tuple[float, ...] = ()  # ratio of each process, in ascending order; empty if measured in this process
 
     @property
     def ratio(self) -> float | None:
@@ -47,7 +47,7 @@ class Measurement:
 
 
 def median(measured: Sequence[Measurement]) -> Measurement:
-    """Return the measurement with the median ratio, and the ratios of all measurements.
+    """Return the measurement with the median ratio. Its field `ratios` contains the ratios of all measurements.
 
     Args:
         measured: measurements of the same benchmark in an odd number of processes.

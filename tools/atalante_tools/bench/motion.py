@@ -35,7 +35,8 @@ from atalante_tools.session.walk_options import DEFAULT_PATIENT, DEFAULT_STEP
 POSE: Final = 0.15
 #: Number of cycles from power-on to the start of the measurement. The robot starts to walk within these cycles.
 _BEFORE_WALKING: Final = 3000
-#: Number of cycles from power-on to the measurement on the ground. The robot is first lowered and shifts its weight.
+#: Number of cycles from power-on to the measurement on the ground. Before the measurement, the crane lowers the
+#: robot, and the robot shifts its weight.
 _BEFORE_STEPPING: Final = 8000
 #: While the robot walks, the upward axis of the pelvis must have at least this vertical component.
 _UPRIGHT: Final = 0.95
@@ -150,7 +151,7 @@ def lockstep_walk(engine: str) -> Callable[[Effort], Measurement]:
 
 
 def _against_real_time(stack: _Stack) -> Measurement:
-    """Return the median wall time of the blocks for one simulated second. The baseline is real time, 1 s."""
+    """Return the wall time for one simulated second, as the median of all blocks. The baseline is real time, 1 s."""
     ordered = [block / (_BLOCK * PERIOD) for block in sorted(stack.blocks)]
     seconds, undisturbed = statistics.median(ordered), ordered[len(ordered) // 10]
     # Another process on the same physical core almost halves the speed, so the remark also reports the fastest blocks.

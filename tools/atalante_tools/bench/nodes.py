@@ -219,7 +219,7 @@ class RecordedBus:
         self._into, self._into_memory = recording.frames, self._memory
         self._syncs = len(syncs(walk().network))
         self._synced = False
-        self._prepared: list[bytes] = []  # frames of each prepared cycle, in reverse order
+        self._prepared: list[bytes] = []  # frames of the prepared cycles, last cycle first
 
     def prepare(self, cycles: int) -> None:
         """Prepare the frames of the next cycles, so that `receive` only has to copy the frames."""

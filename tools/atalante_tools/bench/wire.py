@@ -37,7 +37,8 @@ def hal_cycle(effort: Effort) -> Measurement:
     recording = Recording(walk())
     nodes, baseline = VirtualNodes(recording), PythonCanHal(walk(), recording, FilterOnly(walk()))
 
-    # Processor time, because a block of the baseline takes so long that other processes run during it on a loaded machine.
+    # Both blocks measure processor time. A block of the baseline is long, so on a loaded machine the wall time would
+    # include the time of other processes.
     def hal_block() -> float:
         recorded.bus.prepare(_BLOCK)
         start = time.thread_time()

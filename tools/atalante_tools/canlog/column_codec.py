@@ -237,7 +237,7 @@ def _integer_type(field: Field) -> Any:
 def _byte_table(followed_by: int) -> npt.NDArray[np.uint16]:
     """Return the contribution of one payload byte to the CRC, for each value of this byte. Shape (256,).
 
-    The contribution is the CRC with start value 0 over this byte and a zero in place of each byte that follows.
+    The contribution is the CRC of this byte followed by `followed_by` zero bytes, computed with start value 0.
 
     Args:
         followed_by: number of bytes that follow in the CRC calculation, in the payload and in the Data ID.
@@ -248,7 +248,9 @@ def _byte_table(followed_by: int) -> npt.NDArray[np.uint16]:
 
 @cache
 def _pair_table(followed_by: int) -> npt.NDArray[np.uint16]:
-    """Return the contribution of two adjacent payload bytes to the CRC, for each little-endian value. Shape (65536,).
+    """Return the contribution of each pair of adjacent payload bytes to the CRC. Shape (65536,).
+
+    The index into the result is the pair as a little-endian number.
 
     Args:
         followed_by: number of bytes that follow the two bytes in the CRC calculation, in the payload and in the Data ID.

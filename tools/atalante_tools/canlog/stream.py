@@ -99,7 +99,7 @@ def sort(chunk: Chunk, rows: Rows, indices: npt.NDArray[np.intp] | None) -> Stre
     """Sort the frames of a chunk by message.
 
     Args:
-        chunk: frames of the log, n of them.
+        chunk: n frames of the log.
         rows: for each frame, the index of its message in the plan, shape (n,).
         indices: indices of the frames to keep, shape (k,); None means all frames.
     """

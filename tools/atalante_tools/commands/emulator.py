@@ -171,7 +171,7 @@ def run(emulator: Emulator, target: Target, is_over: Callable[[], bool]) -> None
 
 
 def end_condition(stop: StopRequest, emulator: Emulator, bus: Line) -> Callable[[], bool]:
-    """Return the end condition of the emulator. Each call of the end condition also prints the status line if it is due.
+    """Return the end condition of the emulator. Each call of the end condition also prints the status line if due.
 
     Args:
         stop: Stop request of the process.

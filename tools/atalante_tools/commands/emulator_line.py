@@ -21,7 +21,7 @@ from atalante_tools.session.takeover import PendantReader, Takeover
 #: The emulated pendant resumes sending after this time without a frame of another pendant [cycles].
 #: `PENDANT_QUIET` is longer than `QUIET_CYCLES`, so that a pendant in another process resumes before the emulated pendant.
 PENDANT_QUIET: Final = 12
-#: This number of received frames of one emulated message, with increasing counters, proves another robot on the bus.
+#: Another robot is on the bus if this number of frames of one emulated message is received with increasing counters.
 ROBOT_FRAMES: Final = 3
 
 

@@ -1,7 +1,7 @@
 """Joint of the drive under test, and the CiA 402 state machine that the drive must have (IEC 61800-7-201).
 
 This module does not use the transition table of `atalante_hal.wire.cia402`. The emulated drive uses that table, so a test with
-the same table would not detect an error in it.
+the same table would not detect an error in the table.
 """
 
 from __future__ import annotations

@@ -74,10 +74,12 @@ def ignores_invalid_codes(tester: NodeTester) -> Outcome:
 
 
 def ignores(bad: Callable[[Axis, int], Frames], *, may_hold: bool = False) -> Callable[[NodeTester], Outcome]:
-    """Return a test with defective commands: two must have no effect, ten in a row must latch the position hold.
+    """Return a test with defective commands.
+
+    Two defective commands must have no effect. Ten defective commands in a row must latch the position hold.
 
     Args:
-        bad: function that returns a defective command for an axis, called with the number of the command.
+        bad: function that returns a defective command for an axis, called with the command's index.
         may_hold: whether two defective commands may already latch the position hold.
     """
 

@@ -9,7 +9,7 @@ import click
 
 
 def find(typed: str, names: Sequence[str], kind: str) -> int:
-    """Return the index in `names` of a name that the user typed. Upper and lower case are equal.
+    """Return the index in `names` of a name that the user typed. Upper and lower case need not match.
 
     Args:
         typed: Name as the user typed it.

@@ -4,7 +4,7 @@
 
 A library may catch and discard an exception that a signal handler raises. Examples are a callback of compiled code and a failed
 evaluation in an optimiser. Therefore the request is stored, and `check` raises `Stopped` again before the robot moves. This
-module has few imports, because the signals are not handled yet while it is imported.
+module has few imports, because no signal is handled before the import of this module ends.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ TYPE_CHECKING = False  # replaces `typing.TYPE_CHECKING`, because the import of 
 if TYPE_CHECKING:
     from types import FrameType
 
-#: Difference between the exit code after a signal and the signal number (shell convention).
+#: The exit code after a signal is this number plus the signal number (shell convention).
 SIGNALLED = 128
 _SIGNALS = (signal.SIGINT, signal.SIGTERM)
 
@@ -172,8 +172,8 @@ def ended_by(end: Callable[[], None]) -> Iterator[StopRequest]:
 def deferred() -> Iterator[None]:
     """Delay the exception `Stopped` inside the block until the next call of `check_stop`.
 
-    Use this block around compiled code, which may replace the exception. Outside of the other blocks of this module, signals keep
-    their handlers, so worker processes still ignore Ctrl-C.
+    Use this block around compiled code, which may replace the exception. If no other block of this module is active,
+    this block does not change the signal handlers. So worker processes still ignore Ctrl-C.
     """
     if _request is None:
         yield

@@ -106,7 +106,7 @@ class Progress:
         Args:
             done: Number of finished parts, at least 1.
             total: Number of all parts.
-            unit: What a part is called, in the plural.
+            unit: Plural noun for the parts, such as "steps".
         """
         if self.due():
             full = _BAR * done // total

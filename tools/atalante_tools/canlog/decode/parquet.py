@@ -6,7 +6,7 @@
 | channel, message, signal | names |
 | value | physical value, float64 |
 | integer | exact integer if float64 cannot hold every value of the signal, otherwise null |
-| text | name of the value in the value table, null without a name |
+| text | name of the value in the value table, null if the value has no name |
 
 The rows of one signal are contiguous. Therefore `pandas.read_parquet(file, filters=[("signal", "==", "Position")])` reads only
 a small part of the file.

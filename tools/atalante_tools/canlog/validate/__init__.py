@@ -152,7 +152,7 @@ def _prepare(options: Options) -> tuple[Plan, Project]:
     """Load the DBC and the rules file.
 
     Raises:
-        click.UsageError: If no message in the DBC is sent by the node, or the rules file names a bus that is not in the
+        click.UsageError: If the node sends no message of the DBC, or the rules file names a bus that is not in the
             DBC.
     """
     from atalante_dbc import DBC_FILE

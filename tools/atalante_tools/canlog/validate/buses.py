@@ -1,4 +1,4 @@
-"""Assignment of log channels to the buses of the DBC, and of each message to the channel that should carry it."""
+"""Bus of each log channel, and expected channel of each message."""
 
 from __future__ import annotations
 

@@ -162,8 +162,8 @@ def unseen_signals(validator: Validator) -> list[tuple[Layout, str]]:
 def _is_checked(validator: Validator, layout: Layout, field: Field) -> bool:
     """Return whether a rule can reject a value of the field.
 
-    A rule can do so if the field has a limited range, an invalid code or a value table, or if the field is a hash, or a
-    multiplexer with unused codes.
+    Such a field has a limited range, an invalid code or a value table. A hash and a multiplexer with unused codes are
+    also such fields.
     """
     if is_limited(field) or is_enumeration(field) or field.invalid_raw is not None:
         return True

@@ -107,7 +107,10 @@ class Counters:
         self._seen = np.zeros(len(plan.layouts), np.bool_)
 
     def steps(self, stream: Stream) -> Steps:
-        """Return the counter increment at each frame; `NO_STEP`: no counter or no previous frame. Shape (n,)."""
+        """Return the counter increment at each frame. Shape (n,).
+
+        The increment is `NO_STEP` if the frame has no counter or no previous frame.
+        """
         counters = stream.frames.view(np.uint8).reshape(-1, FRAME_BYTES)[:, HEADER_BYTES + COUNTER_BYTE].copy()
         steps = counter_steps(counters, stream.before(counters, self._last))
         steps[stream.starts[~self._seen[stream.present]]] = NO_STEP

@@ -150,7 +150,7 @@ class Findings:
             )
 
     def add_whole(self, rule: str, row: int, first: int, last: int, *, shown: float, count: int = 1) -> None:
-        """Add one violation by one message, which lasts from the time stamp `first` to the time stamp `last` [ns]."""
+        """Add one violation by one message. The violation lasts from time stamp `first` to time stamp `last` [ns]."""
         worst = _text(shown, RULE_OF[rule].worst, "")
         self._merge(
             Finding(

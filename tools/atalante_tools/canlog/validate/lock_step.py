@@ -131,8 +131,8 @@ class LockStepClock:
         Args:
             channel: clock state of the channel, which is updated.
             cycle: cycle number in the SYNC.
-            wall: time stamp of the SYNC on the wall clock [ns].
-            wall_before: time stamp of the frame before the SYNC on the wall clock [ns].
+            wall: wall-clock time stamp of the SYNC [ns].
+            wall_before: wall-clock time stamp of the frame before the SYNC [ns].
         """
         period = int(self._plan.cycle_ns[channel.sync])
         if self._origin is None:

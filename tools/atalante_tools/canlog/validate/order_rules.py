@@ -106,7 +106,7 @@ class OrderRules:
         The rule counts the state frames of one node per cycle. If a cycle with two frames precedes a cycle without a frame,
         the second frame was received before its SYNC. If a cycle without a frame precedes a cycle with two frames, the
         first of the two frames was late. If a SYNC is missing in the log, a cycle also has two state frames, but then the
-        cycles before and after it have one state frame each, and nothing is reported.
+        previous and the next cycle have one state frame each, and nothing is reported.
 
         Args:
             bus: bus of the state message.

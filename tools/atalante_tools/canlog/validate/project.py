@@ -1,6 +1,6 @@
 """Rules file of a project (TOML): thresholds, silenced rules with a reason, and the bus of each channel.
 
-The loader rejects unknown keys and values of the wrong type.
+The loader rejects unknown keys, and values of the wrong type.
 
 [cycle-jitter]
 p99 = 0.4

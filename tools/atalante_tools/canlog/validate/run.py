@@ -108,7 +108,7 @@ def listen(
     progress: Callable[[int], None] = lambda frames: None,
     notice: Callable[[str], None] = lambda message: None,
 ) -> Report:
-    """Check the frames of one or more open buses until `stopped` returns True. Send nothing.
+    """Check the frames of one or more open buses until `stopped` returns True. This function sends no frames.
 
     After the loss of a link, the check continues when the link is back. The report contains a finding for each channel
     that lost its link.

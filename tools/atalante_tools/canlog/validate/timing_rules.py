@@ -261,7 +261,7 @@ class TimingRules:
             return
         first, last = int(self._first[row]), int(self._last[row])
         mean = self._sum[row] / count
-        # Report only if both the mean and the median deviate, as with a wrong cycle time.
+        # A wrong cycle time changes the mean and the median, so report only if both deviate.
         # A long gap changes only the mean interval, and the rule cycle-gap reports the gap.
         if (
             count >= self._mean_intervals

@@ -266,9 +266,10 @@ def _codes_within(minimum: float, maximum: float, factor: float, offset: float, 
 def is_enumeration(named: Field) -> bool:
     """Return whether the value table names all valid values of the field.
 
-    Some value tables name only a few special values of a number, so they do not restrict the other values. A table with
-    at least two names is considered complete if it names the minimum and the maximum of the range, or, for a field without
-    a range, if it names the value 0. If every raw code has a name, the result is False, because no value can be wrong.
+    Some value tables name only a few special values of a number, so they do not restrict the other values. For a
+    field with a range, a table is considered complete if it names the minimum and the maximum of the range. For a field
+    without a range, a table is considered complete if it names the value 0. A complete table has at least two names.
+    If every raw code has a name, the result is False, because no value can be wrong.
     """
     if len(named.choices) < 2 or named.kind == "float" or named.factor != 1 or named.offset != 0:
         return False
