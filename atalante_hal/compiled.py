@@ -35,9 +35,10 @@ Function = TypeVar("Function", bound=Callable[..., Any])
 P = ParamSpec("P")
 R = TypeVar("R")
 
-#: Name of a file in the cache folder of a function that creates arrays, so it cannot be compiled without reference counts.
+#: Name of a file that marks the cache folder of a function that creates arrays.
+#: Such a function cannot be compiled without reference counts.
 _MARK = "creates-arrays"
-#: For each function given to `specialised`: whether it creates arrays.
+#: Whether each function that was given to `specialised` creates arrays.
 _CREATES_ARRAYS: dict[Callable[..., Any], bool] = {}
 
 
@@ -82,7 +83,7 @@ def specialised(function: Callable[P, R], *args: P.args, **kwargs: P.kwargs) -> 
     if not counted:
         try:
             return cast(Callable[P, R], _machine_code(function, args, False))
-        except _numba().core.errors.NumbaError:  # the function creates an array, or it is wrong
+        except _numba().core.errors.NumbaError:  # the function creates an array or contains an error
             _CREATES_ARRAYS[function] = True
             _mark(function)
     return cast(Callable[P, R], _machine_code(function, args, True))
@@ -92,7 +93,7 @@ def _machine_code(function: Callable[..., Any], args: tuple[Any, ...], counted: 
     """Compile a function, call it once, and return its machine code for the types of the arguments."""
     dispatcher = _compiled(function, counted)
     dispatcher(*args)
-    if len(dispatcher.overloads) == 1:  # that of this call; finding it by the types of its arguments takes longer
+    if len(dispatcher.overloads) == 1:  # a search by the types of the arguments takes longer
         (only,) = dispatcher.overloads.values()
         return only.entry_point
     return dispatcher.get_overload(tuple(dispatcher.typeof_pyval(arg) for arg in args))

@@ -239,10 +239,10 @@ class Hal:
     def _follow_drives(self) -> None:
         """Set the start value of the rate limit to the torques that the drives report.
 
-        While any drive is off, the commands are 0: a drive that is off produces no torque, and a drive that holds its position
-        ignores its command. As soon as all drives produce torque, each drive gets the torque that it reports as its command, so
-        that no joint sags before the controller's first torque. The first call of a start, and every call while a drive is off,
-        apply only the torque limit. All other calls apply all limits.
+        While any drive is off, the commands are 0: a drive that is off produces no torque, and a drive that holds its
+        position ignores its command. As soon as all drives produce torque, the command of each drive is the torque that
+        the drive reports. So no joint sags before the controller's first torque. The first call of a start, and every
+        call while a drive is off, apply only the torque limit. All other calls apply all limits.
         """
         on = powered(self.state.drive_state)
         torque = np.where(on, self.state.torque, 0.0)

@@ -84,7 +84,7 @@ class WallClock:
 
 
 class Drift:
-    """Measurement of how far the loop fell behind the monotonic clock within the last `DRIFT_CYCLES` cycles."""
+    """Measurement of the time that the loop lost against the clock within the last `DRIFT_CYCLES` cycles."""
 
     def __init__(self) -> None:
         self._lost = 0.0
@@ -131,7 +131,7 @@ class Statistics:
         """Return a percentile of the cycle costs.
 
         Args:
-            percentile: Share of the cycles that did not exceed the returned cost, 0 to 100 [%].
+            percentile: Share [%] of the cycles whose cost is at most the returned cost, 0 to 100.
 
         Returns:
             Cost [s] with a resolution of 1 us. A result of 10 ms means 10 ms or more.

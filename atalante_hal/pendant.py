@@ -43,8 +43,8 @@ def demand_of(signals: Sequence[float]) -> Demand:
 def safest(demands: Iterable[Demand]) -> Demand:
     """Combine dead-man switch, stop request and hold request of several frames into the safest `Demand`.
 
-    The combined dead-man switch is pressed only if it is pressed in every frame. One frame with STOP is sufficient for STOP, and
-    one frame with HOLD for HOLD.
+    The combined dead-man switch is pressed only if it is pressed in every frame. One frame with a stop request
+    results in a stop request, and one frame with a hold request results in a hold request.
 
     Args:
         demands: Demands of the frames, at least one.

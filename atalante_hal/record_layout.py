@@ -13,7 +13,7 @@ class Layout:
     """Names and slices of the fields of a record, in order.
 
     Args:
-        fields: (name, length) of each field, in order.
+        fields: Name and length of each field, in order.
 
     Raises:
         ValueError: If a name is repeated or a length is not positive.

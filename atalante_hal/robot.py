@@ -64,17 +64,17 @@ class Derating:
 class Sensors:
     """Tolerances that sensors without a fault meet, and load thresholds of the force cells, see `plausibility`."""
 
-    #: Largest mean difference between the reported velocity and the filtered encoder velocity [rad/s at the joint].
+    #: Largest mean difference [rad/s at the joint] between the reported velocity and the filtered encoder velocity.
     velocity_error: float
     velocity_bandwidth: float  # Hz, cut-off frequency of the low-pass of the reported velocity
-    #: Largest difference between the tibia attitudes from the encoders and from the IMUs, about each axis [rad].
+    #: Largest difference [rad] about each axis between the tibia attitude from the encoders and that from the IMUs.
     attitude_error: float
     attitude_change: float  # rad, largest change of the attitude difference while an encoder reading is constant
     misalignment: float  # rad, allowance added to `attitude_change` for each rad by which the leg turns
     quaternion_error: float  # largest difference between the squared norm of a quaternion and 1
     cell_free: float  # N, largest vertical force at which a cell is regarded as unloaded
     cell_twist: float  # N, largest difference between the vertical forces on the two diagonals of a foot's cells
-    sole_tilt: float  # rad, largest tilt of a sole on the floor, from the ankle encoders and the tibia IMU
+    sole_tilt: float  # rad, largest tilt of a sole on the floor, computed from the ankle encoders and the tibia IMU
 
 
 @dataclass(frozen=True)
@@ -86,7 +86,7 @@ class Thresholds:
     #: Walking is permitted while the torque limit of a hot drive is at least this share of the limit in the other leg.
     derated_imbalance: float
     full_assist_ramp: float  # s, time for the ramp of the assistance factor from 0 to 1 in FULL_ASSIST
-    #: Largest angle outside a position limit that is still accepted [rad]. Beyond it, the joint is out of range.
+    #: Largest accepted angle [rad] outside a position limit. A joint beyond this angle is out of range.
     position_tolerance: float
     #: Largest torque that a drive may report while it is off [Nm]. A drive that is on may exceed its limit by this torque.
     idle_torque: float

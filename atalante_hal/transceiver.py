@@ -171,7 +171,7 @@ class Transceiver:
         except BusError as error:
             self._find(Dtc.BUS_DOWN, True, 0.0, f"the bus {self.bus.name} cannot receive: {error}")
             count = first
-            if cycle is not None:  # The pause keeps lock-step cycles on a failing bus from running as fast as possible.
+            if cycle is not None:  # Without a pause, lock-step cycles on a failing bus would run as fast as possible.
                 time.sleep(min(patience, _DOUBTFUL_PATIENCE))
         if self.tap is not None:
             self.tap.received(scratch[first:] if first else scratch, count - first)
@@ -232,7 +232,7 @@ class Transceiver:
         self._bus_off = 0
 
     def faults(self) -> list[Finding]:
-        """Return the faults since the last call, and a bus-off that is not acknowledged. Call this once per cycle."""
+        """Return the faults since the last call, and any bus-off until it is acknowledged. Call this once per cycle."""
         self._refused = self._refused + 1 if self._full_this_cycle else 0
         self._full_this_cycle = False
         self._floods = self._floods + 1 if any(finding.dtc is Dtc.BUS_FLOOD for finding in self._found) else 0

@@ -12,7 +12,7 @@ import numpy.typing as npt
 
 Vector = npt.NDArray[np.float64]
 
-#: Period of the SYNC message, and of the control loop [s].
+#: Period [s] of the SYNC message and of the control loop.
 PERIOD = 1e-3
 
 
@@ -85,11 +85,14 @@ class Controller(Protocol):
 
     @property
     def telemetry(self) -> Vector:
-        """Return the controller's values to record. The array is the same in every cycle, and `update` overwrites it."""
+        """Return the values of the controller that are recorded.
+
+        The array is the same in every cycle, and `update` overwrites the array.
+        """
 
     @property
     def telemetry_fields(self) -> Sequence[tuple[str, int]]:
-        """Return (name, length) of each field of `telemetry`, in order."""
+        """Return the name and the length of each field of `telemetry`, in order."""
 
     def reset(self, state: State) -> None:
         """Prepare for a motion. The loop calls this before the first `update` of each motion.

@@ -72,7 +72,7 @@ class Adapter:
 
     @property
     def configuration(self) -> str:
-        """Return the section `[default]` of ~/can.conf that sets the bit timing; empty if no section is required."""
+        """Return the section `[default]` for ~/can.conf, which sets the bit timing; empty if none is required."""
         return "\n".join(["[default]", *(f"{key} = {value}" for key, value in self.options)]) if self.options else ""
 
 
@@ -240,7 +240,7 @@ ADAPTERS: Final = {adapter.name: adapter for adapter in _ADAPTERS}
 
 
 def refusal(interface: str, *, one_process: bool = False) -> str:
-    """Return why an interface cannot connect a HAL with a robot; an empty text if there is no such reason.
+    """Return the reason why an interface cannot connect a HAL with a robot; an empty text if it can.
 
     Args:
         interface: Name of the interface in python-can.

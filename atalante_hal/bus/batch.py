@@ -1,7 +1,8 @@
 """Byte views of frame arrays, cached for each array that is passed to `Bus.send()` or `Bus.receive()`.
 
-Creating a byte view of an array takes longer than copying the frames of a cycle, so the views are cached. The header words of
-each valid batch are cached, too: the next batch has the same headers in most cycles, and then needs no check.
+Creating a byte view of an array takes longer than copying the frames of a cycle, so the views are cached. The header
+words of each valid batch are cached, too. In most cycles the next batch has the same header words, and a batch with
+cached header words needs no check.
 """
 
 from __future__ import annotations
@@ -22,7 +23,7 @@ from atalante_hal.wire.frame import (
     as_words,
 )
 
-#: Largest number of cached arrays, and of batches whose header words are cached.
+#: Largest number of cached arrays. At most the same number of batches have cached header words.
 #: A HAL or an emulator uses about five arrays and five batches.
 REMEMBERED = 64
 CLASSIC_LENGTHS = tuple(range(9))

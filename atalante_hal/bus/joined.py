@@ -63,7 +63,8 @@ class JoinedBus:
         self._shares: dict[bytes, list[Share]] = {}
         #: lists of the slices `frames[i:]`, one list for each receive buffer that was used so far
         self._tails: list[list[Frames]] = []
-        self._turn = 0  # index of the channel to read first; changes in each call, so that a busy channel cannot block the others
+        #: index of the channel that is read first; changes in each call, so that no busy channel blocks the others
+        self._turn = 0
         self._closed = False
         self._failure: BusError | None = None  # error that a channel raised in the current call of `receive`
         self._down: dict[int, str] = {}  # error message of each lost channel, by `id()` of its bus object

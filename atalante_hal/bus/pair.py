@@ -137,7 +137,7 @@ class PairBus:
         self._head = self._tail = 0
 
     def _move_to_start(self) -> int:
-        """Move the queued frames to the start of the queue, and return the offset where the queued frames end [bytes]."""
+        """Move the queued frames to the start of the queue, and return the offset [bytes] of their end."""
         size = self._tail - self._head
         self._queue[:size] = self._queue[self._head : self._tail]
         self._head = 0

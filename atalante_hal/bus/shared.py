@@ -1,7 +1,7 @@
 """Embedded bus between two processes, in shared memory. The module `pair` is the variant within one process.
 
 Each end has a queue, which only this end writes and only the other end reads. The writer stores the frames and then its
-frame counter. The reader reads only the frames that the counter includes. This requires that stores become visible in
+frame counter. The reader reads only frames that are already counted. This requires that stores become visible in
 program order, as on x86-64. A waiting end polls the counter for a short time and then sleeps until the other end wakes it
 with a byte through a socket pair. If the other process terminates for any reason, the kernel closes its socket, and this
 end raises `BusDown`. Polling saves time only if the two processes run on different cores.
@@ -32,14 +32,14 @@ from atalante_hal.wire.frame import FRAME_BYTES, Frames
 
 #: Indices of the counters of each bus end: frames sent, frames received, calls of `step` requested, calls of `step` completed.
 _SENT, _RECEIVED, _REQUESTED, _COMPLETED = range(4)
-#: Indices of the flags of each bus end. A flag is 1 while the end serves, sleeps or is closed.
+#: Indices of the flags of each bus end. The flags are 1 while the end serves, while it sleeps, and when it is closed.
 _SERVING, _SLEEPING, _CLOSED = range(4, 7)
 #: Number of 64-bit header words of each bus end: one cache line.
 _END_WORDS = 8
 _HEADER_BYTES = mmap.PAGESIZE
 #: A waiting bus end polls for this time [s] before it sleeps. The time is longer than the computing time of a cycle.
 _POLL_TIME = 500e-6
-#: After a wait in which polling found no frame, the bus end does not poll in this number of waits.
+#: After a wait in which polling found no frame, the bus end sleeps without polling in this number of waits.
 _WAITS_WITHOUT_POLLING = 32
 #: Longest sleep of a waiting bus end before it reads the shared memory again [ms].
 #: A sleep must be limited, because a wake-up byte may arrive before the new value in the shared memory is visible.
@@ -170,7 +170,7 @@ class SharedBus:
         return count
 
     def serve(self, step: Callable[[], object]) -> None:
-        """Serve the other end of the bus: call `step` for each of its requests, until the bus is down.
+        """Serve the other end of the bus: call `step` for each request of the other end, until the bus is down.
 
         Args:
             step: Function that receives the queued frames and sends the answers. While it runs, `receive` does not wait.

@@ -36,7 +36,7 @@ ERROR_FRAMES = 0x0001 | 0x0004 | 0x0040 | 0x0100
 LINK_DOWN: Final = errno.ENETDOWN
 #: Error codes of a call on a socket whose interface was removed. The kernel does not bind such a socket again.
 LINK_REMOVED: Final = (errno.ENODEV, errno.ENXIO)
-#: Shortest time between two attempts to open a removed interface again [s].
+#: Shortest time [s] between two attempts to open a removed interface again.
 REOPEN_PERIOD: Final = 0.1
 #: When the link is lost, at most this number of batches of queued frames is received and dropped.
 DROPPED_BATCHES: Final = 64

@@ -1,8 +1,9 @@
 """Table of the diagnostic trouble codes (DTCs), each with its reaction, severity and meaning.
 
-`message monitor and other checks -> fault memory -> state machine`: the checks raise codes, and the state machine acts on the
-worst reaction of the confirmed codes. A code is pending while the fault can be tolerated (a lost frame, a late cycle). It is
-confirmed when the fault exceeds its limit. Only a confirmed code causes a reaction. The fault matrix uses the same names.
+`message monitor and other checks -> fault memory -> state machine`: the checks raise codes, and the state machine acts
+on the worst reaction of the confirmed codes. A code is pending while the fault can be tolerated (a lost frame, a late
+cycle). The code is confirmed when the fault exceeds its limit. Only a confirmed code causes a reaction. The fault
+matrix uses the same names.
 """
 
 from __future__ import annotations
@@ -171,7 +172,7 @@ def permits_walk_end(dtc: Dtc, drive: bool) -> bool:
     """Return whether a walking robot may end its walk on both feet (FINISH_STEP) although a diagnostic demands HOLD.
 
     A robot that stops within a step falls, because it stands on one foot and moves. So HOLD is delayed if the HAL still
-    receives the joints and the drives still follow the HAL.
+    receives the joint values and the drives still follow the HAL.
 
     Args:
         dtc: confirmed diagnostic.

@@ -6,11 +6,12 @@ A motor with exchanged phases and a drive with a wrong sign push a joint in the 
 At a start, drive state, position and reported torque do not show these faults. So the HAL adds a torque pulse to the torque that
 holds the pose, and evaluates the motion.
 
-*Pulse.* The pulse has the shape of the second derivative of sin(pi x)^4. So a free inertia moves away and back, and is then at
-rest in its initial position. Its peak is `PEAK` times `breakaway`, which exceeds the dry friction. The joints of a group hardly
-move each other. Both legs are tested at the same time, with opposite pulses. So the encoder of the other leg moves against the
-torque, and exchanged encoders of both legs are noticed. The pulse moves the left joint towards the middle of its range. A joint
-near its end stop is the exception: it and its twin both move towards the middle, and their exchange may not be noticed.
+*Pulse.* The pulse has the shape of the second derivative of sin(pi x)^4. So a free inertia moves away and back, and is
+then at rest in its initial position. Its peak is `PEAK` times `breakaway`, which exceeds the dry friction. The joints
+of a group hardly move each other. Both legs are tested at the same time, with opposite pulses. So the encoder of the
+other leg moves against the torque, and exchanged encoders of both legs are noticed. The pulse moves the left joint
+towards the middle of its range. A joint near its end stop is the exception: this joint and the same joint of the other
+leg both move towards the middle. Then an exchange of their encoders may not be noticed.
 
 *Pose.* A position control with a share of the drive's gains holds the pose, because the drives do not hold it in this time. With
 a wrong sign, this control pushes its joint away. A joint that moves by more than `TRAVEL` ends the start.
@@ -43,8 +44,9 @@ GROUPS = ((("FH", "SH"), 32), (("TH", "SA"), 16), (("SK", "HA"), 16))
 LATENCY = 2
 #: Peak of the pulse as a multiple of `Robot.breakaway`, in the order of LEG_JOINTS. FH and SH move a whole leg.
 PEAK = (6.0, 3.0, 6.0, 3.0, 3.0, 3.0)
-#: Stiffness and damping of the HAL's position control in the test, relative to those of a drive, in the order of LEG_JOINTS.
-#: The HAL's position control has more delay than that of a drive. So the HAL's gains for light joints must be lower.
+#: Stiffness and damping of the HAL's position control in the test, relative to the drive's gains, in the order of
+#: LEG_JOINTS. The HAL's position control has more delay than that of a drive. So the HAL's gains for light joints must
+#: be lower.
 STIFFNESS = (1.0, 1.0, 1.25, 0.5, 0.25, 0.25)
 DAMPING = (0.5, 0.5, 0.6, 0.25, 0.25, 0.25)
 #: Integral time of the HAL's position control, which holds the legs during the test [s].
@@ -60,8 +62,9 @@ HIT = 2.0
 BOOST = 6.0
 #: Number of unsuccessful tests of a joint after which the joint has failed.
 TRIALS = 2
-#: Smallest mobility that proves that a joint follows its torque, in the order of LEG_JOINTS [1/(kg m2)].
-#: `MOBILITY` is about half of the smallest mobility of the suspended robot: straight or bent legs, empty or with 110 kg patient.
+#: Smallest mobility [1/(kg m2)] that proves that a joint follows its torque, in the order of LEG_JOINTS.
+#: `MOBILITY` is about half of the smallest mobility of the suspended robot. The smallest mobility is that of four
+#: cases: straight or bent legs, without a patient or with a patient of 110 kg.
 MOBILITY = (0.045, 0.23, 0.075, 0.56, 4.6, 6.8)
 
 
@@ -198,7 +201,7 @@ class DirectionProof:
         self._torque.append(torque.copy())
 
     def evaluate(self, position: Vector, force: Vector) -> str:
-        """Record this cycle, evaluate the motion of the tested joints, and return why the start must end.
+        """Record this cycle, evaluate the motion of the tested joints, and return the reason why the start must end.
 
         Args:
             position: joint positions, shape (12,) [rad].

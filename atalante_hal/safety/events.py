@@ -1,6 +1,6 @@
 """Events, such as diagnostics and state changes, packed as records of a separate ring buffer.
 
-Events are rare and small. With their own ring they are not dropped when the telemetry stream is full.
+Events are rare and small. Events have their own ring, so no event is dropped when the telemetry stream is full.
 """
 
 from __future__ import annotations

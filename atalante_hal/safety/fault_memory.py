@@ -168,7 +168,8 @@ class FaultMemory:
     def walk_ends(self, drives: Collection[str]) -> frozenset[Dtc]:
         """Return those confirmed codes with which a walking robot may end its walk before HOLD, see `permits_walk_end`.
 
-        A code is left out if it does not permit this for one of the nodes for which it is confirmed.
+        A code may be confirmed for several nodes. The code is left out if it does not permit this for one of these
+        nodes.
 
         Args:
             drives: DBC names of the drives.

@@ -24,7 +24,8 @@ from atalante_hal.wire.process_image import NEVER, ReceiveImage
 
 #: Values of the signal NodeState (CiA 301): 0 after the node has started, 5 in normal operation.
 BOOT_UP, OPERATIONAL = 0, 5
-#: Highest `Check` result of a frame with new data. It is an integer, because numpy compares enum members ten times slower.
+#: Highest `Check` result of a frame with new data. The constant is an integer, because numpy compares enum members ten
+#: times slower.
 _FRESH = int(Check.SOME_LOST)
 
 
@@ -80,7 +81,8 @@ class Heartbeats:
         #: `_notices` also contains an entry with error code 0 for each frame of an error passive node.
         self._notices: list[tuple[str, Dtc, int]] = []
         self._reset: set[str] = set()  # nodes that restarted since the last `evaluate`
-        #: For each row of the process image: counter that detects two senders of the message, 0 to `FULL`. Default 0.
+        #: Counters that detect two senders of a message, by row of the process image. Each counter is between 0 and
+        #: `FULL`.
         self._evidence: defaultdict[int, int] = defaultdict(int)
         #: Nodes that sent a boot-up message. The safety monitor empties this set after each use.
         self.booted: set[str] = set()

@@ -11,12 +11,13 @@ braking. The envelope is not a controller: without braking a joint reaches its e
 `position_margin` outside the position limit. It must withstand the torque that presses a resting joint against it. A gait may
 use the full range.
 
-*Acceleration.* A light joint exceeds its velocity limit before a measured velocity shows it, because the torque changes at a
-finite rate and because a measurement is old. So the envelope also limits the predicted velocity, at which the joint arrives if
-the torque falls from u to zero at `torque_rate_max`. The prediction assumes the measured acceleration, and in addition the
-acceleration that the torque change of the last `DELAY` cycles causes on the smallest inertia of the joint. Let x be the velocity
-v without the low-pass of the drive, and a the change of x in one cycle, divided by the period T. Let o be the torque sent
-`DELAY` cycles ago, and J the smallest inertia. A positive torque is at most U, the largest u >= 0 with
+*Acceleration.* A light joint exceeds its velocity limit before a measured velocity shows it, because the torque changes
+at a finite rate and because a measurement is old. So the envelope also limits the predicted velocity. The joint reaches
+this velocity if the torque falls from u to zero at `torque_rate_max`. The prediction assumes the measured acceleration,
+and in addition the acceleration that the torque change of the last `DELAY` cycles causes on the smallest inertia of the
+joint. Let x be the velocity v without the low-pass of the drive, and a the change of x in one cycle, divided by the
+period T. Let o be the torque sent `DELAY` cycles ago, and J the smallest inertia. A positive torque is at most U, the
+largest u >= 0 with
 
     (a + max(0, u - o) / J) (DELAY T + u / (2 torque_rate_max)) <= max(0, velocity_max - x)
 
@@ -62,11 +63,12 @@ from atalante_hal.types import Vector
 _COUNT = len(JOINTS)
 #: Number of cycles after which a change of the commanded torque is visible in the measured acceleration.
 DELAY: Final = 3
-#: Smallest inertia that the torque of a joint accelerates while all other joints are free, in leg joint order [kg m2].
+#: Smallest inertia [kg m2] that the torque of a joint accelerates while all other joints are free, in leg joint order.
 #: `SMALLEST_INERTIA` is a lower bound over all poses of the empty exoskeleton, suspended or floating.
 #: The bound does not depend on the gait.
 SMALLEST_INERTIA: Final = (0.12, 0.14, 0.17, 0.11, 0.038, 0.038)
-#: Results of `limit`: all torques are unchanged, the torque of at least one joint was reduced, an input is not finite.
+#: Results of `limit`: 0 if all torques are unchanged, 1 if at least one torque was reduced, 2 if an input is not
+#: finite.
 _UNCHANGED, _CUT, _NOT_FINITE = range(3)
 
 
@@ -241,7 +243,7 @@ def limit(
 
 
 def highest_torque(room: float, acceleration: float, oldest: float, inertia: float, delay: float, fall: float) -> float:
-    """Return U, the largest torque in one direction with which the predicted velocity stays within its limit [Nm].
+    """Return U [Nm], the largest torque in one direction with which the predicted velocity stays within its limit.
 
     Args:
         room: difference between the velocity limit and the velocity [rad/s].

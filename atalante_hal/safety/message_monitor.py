@@ -75,7 +75,7 @@ class MessageMonitor:
     """Monitor of the cyclic messages in the 1 ms process image.
 
     The pendant message is monitored like all other messages, but its timeout confirms no diagnostic. If the pendant
-    message is lost, the robot stops as after the request STOP.
+    message is lost, the robot stops as it does after the request STOP.
     """
 
     def __init__(self, network: Network, image: ReceiveImage) -> None:
@@ -91,7 +91,7 @@ class MessageMonitor:
         self._confirms = [kind != "pendant" for kind in kinds]
         self._needed = [row for row, kind in enumerate(kinds) if kind != "pendant"]
         self.qualification = [Qualification()] * len(messages)
-        #: For each row: counter that detects two senders of its message, 0 to `FULL`.
+        #: Counters that detect two senders of a message, by row. Each counter is between 0 and `FULL`.
         self._evidence = [0] * len(messages)
         #: Leaky bucket of each disturbance, by row and diagnostic. A disturbance without an entry has an empty bucket.
         self._disturbed: dict[tuple[int, Dtc], Qualification] = {}
@@ -109,7 +109,7 @@ class MessageMonitor:
         return all(self.qualification[row].trusted for row in self._needed)
 
     def is_trusted(self, row: int) -> bool:
-        """Return whether the sender of a message is trusted, by the row of the message."""
+        """Return whether the sender of the message in a row is trusted."""
         return self.qualification[row].trusted
 
     def in_time(self, row: int) -> bool:

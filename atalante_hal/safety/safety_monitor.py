@@ -35,7 +35,8 @@ from atalante_hal.wire.e2e import SETTLED, Check, Qualification, qualify
 from atalante_hal.wire.frame import Frames
 from atalante_hal.wire.process_image import ReceiveImage
 
-#: Maximum duration of FINISH_STEP [cycles]. The rest of a step, a stop step and the weight shift back together are shorter.
+#: Maximum duration of FINISH_STEP [cycles]. The rest of a step, a stop step and the weight shift back take less time in
+#: total.
 FINISH_STEP_CYCLES = 6000
 
 #: If a drive does not report QUICK STOP within this time [cycles] after the command QUICK_STOP, the command was lost.

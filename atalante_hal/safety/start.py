@@ -26,7 +26,8 @@ ENABLE_CYCLES = 200
 STALLED_CYCLES = 10
 #: Prefix of the event text for a refused START.
 REFUSED = "START refused: "
-#: When the operator ends a walk on the ground, the stated reason for FINISH_STEP and for the next HOLD ends with this text.
+#: Last words of the reason for FINISH_STEP and of the reason for the next HOLD if the operator ends a walk on the
+#: ground.
 WALK_ENDS = ", so the walk ends on both feet"
 _S = SupervisorState
 #: States in which START only acknowledges faults. An acknowledged fault may stay active for some cycles.
@@ -176,7 +177,7 @@ def missing_text(missing: Collection[str]) -> str:
 
 
 def entry_text(state: SupervisorState, missing: Collection[str], stop_requested: bool) -> str:
-    """Return one sentence that explains why the HAL entered a state, for a state entered without a diagnostic.
+    """Return one sentence that explains why the HAL entered a state without a diagnostic.
 
     Args:
         state: state that was entered.

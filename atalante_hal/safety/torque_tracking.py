@@ -1,7 +1,8 @@
 """Check that each drive produces the torque that the HAL sends: `torques sent, torques reported -> findings`.
 
 A drive that stays in OPERATION ENABLED may still produce another torque: a power stage that is off, exchanged phases, or a
-wrong current. If its torque measurement works, its state frames show it while the drive state does not.
+wrong current. If the drive measures its torque correctly, the reported torque shows the fault. The drive state does not
+show the fault.
 
 *Range.* A drive follows a command within two milliseconds. It repeats its last command for up to four cycles, and its frame
 may be late by four cycles. So a reported torque must lie in the range of the torques sent in the last `SPAN` cycles. The drive
@@ -27,7 +28,7 @@ from atalante_hal.types import Vector
 SPAN: Final = 12
 #: Largest distance of a reported torque from the range of the sent torques, relative to the breakaway torque of the joint.
 TOLERANCE: Final = 0.2
-#: Number of consecutive cycles with a wrong torque at which a drive does not follow its command.
+#: A drive is reported after this number of consecutive cycles with a wrong torque.
 CONFIRM: Final = 5
 
 

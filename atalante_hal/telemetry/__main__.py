@@ -168,7 +168,7 @@ def _leave_realtime() -> None:
 
 
 def _import_outlets() -> None:
-    """Import the modules of the sinks, so that they open quickly. A package that is missing is reported later."""
+    """Import the modules of the sinks, so that the sinks open quickly. A package that is missing is reported later."""
     for name in ("messages", "recorder", "publisher"):
         with contextlib.suppress(ImportError):
             importlib.import_module(f"atalante_hal.telemetry.{name}")

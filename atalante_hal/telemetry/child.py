@@ -2,9 +2,9 @@
 
     TelemetryChild() -> configure(...) -> reports (JSON lines)
 
-The subprocess imports its modules while the caller still prepares the session, and waits for its configuration. It is a new
-interpreter (`python -m atalante_hal.telemetry`), not a fork. It has its own process group, so Ctrl-C in the terminal does not
-end it.
+While the caller still prepares the session, the subprocess imports its modules and waits for its configuration. The
+subprocess is a new interpreter (`python -m atalante_hal.telemetry`), not a fork. It has its own process group, so
+Ctrl-C in the terminal does not end the subprocess.
 """
 
 from __future__ import annotations
@@ -29,8 +29,8 @@ RINGS = RECORDS, EVENTS, FRAMES = "records", "events", "frames"
 class TelemetryChild(Closing):
     """Telemetry subprocess.
 
-    The subprocess inherits the files of the rings. If the session does not exist yet, this object creates the files, still
-    empty. The session later takes them over with `take_files`.
+    The subprocess inherits the files of the rings. If the session does not exist yet, this object creates
+    empty files. The session later takes over these files with `take_files`.
 
     Attributes:
         pid: Process id.
@@ -40,7 +40,7 @@ class TelemetryChild(Closing):
         """Start the subprocess.
 
         Args:
-            files: Name -> file descriptor of each ring of the session. None: the session does not exist yet.
+            files: Name -> file descriptor of each ring of the session; None if the session does not exist yet.
         """
         self._files: dict[str, int] = {}  # files of the ring buffers, until `take_files` passes them to a session
         if files is None:

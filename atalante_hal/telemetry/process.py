@@ -32,7 +32,7 @@ from atalante_hal.telemetry.ring import RingWriter
 
 CYCLES_PER_SECOND = 1000
 CYCLE_NS = 1_000_000_000 // CYCLES_PER_SECOND
-#: Gap in log time between two runs in lock-step [ns], which separates the runs in a plot.
+#: Gap [ns] in log time between two runs in lock-step. The gap separates the runs in a plot.
 RUN_GAP_NS = 1_000_000_000
 
 
@@ -42,11 +42,11 @@ HANGS_AFTER = 2.0
 RESTARTS = 3
 #: Time between two attempts of `close` to kill a subprocess that is still starting [s].
 _KILLED = 0.1
-#: Time limit for the subprocess to end its Zenoh session, after it has printed its summary [s].
+#: The subprocess must end its Zenoh session within this time [s] after it has printed its summary.
 _SESSION_END = 2.0
 #: A restarted subprocess must be ready within this time [s], see `tend`.
 _RESTART = 30.0
-#: The first subprocess must be ready within this time [s], possibly during a run.
+#: The first subprocess must be ready within this time [s]. A run may begin earlier.
 #: A subprocess that is not ready in time is ended, and `tend` starts another one.
 _JOIN = 60.0
 
@@ -69,11 +69,11 @@ class TelemetryConfig:
     stream_rate: int = 100  # Hz in robot time, publishing rate of each stream
     loop_rate: int = 10  # Hz in robot time, rate of the messages with loop statistics
     recording: Path | None = None  # MCAP file; None if nothing is recorded
-    record_rate: int = 100  # Hz in robot time, recording rate of each stream; 1000: every cycle
+    record_rate: int = 100  # Hz in robot time, recording rate of each stream; at 1000, every cycle is recorded
     can_log: Path | None = None  # log file of all CAN frames; the file suffix determines the format; None for no log
-    lock_step: bool = False  # True: virtual time, and the loop waits for recorder and CAN log
+    lock_step: bool = False  # True for virtual time, in which the loop waits for recorder and CAN log
     #: Capacity of the ring of cycle records and of the ring of CAN frames [records].
-    #: The ring of cycle records gets one record per cycle, the ring of CAN frames gets fewer on average.
+    #: The ring of cycle records gets one record per cycle. The ring of CAN frames gets fewer records on average.
     slots: int = 1024
     patience: float = 5.0  # s, longest wait of the loop for the recorder or the CAN log in lock-step
     certificate: Path | None = None  # TLS certificate, see `access.Access`
@@ -251,7 +251,7 @@ class TelemetryProcess(Closing):
         """Start the subprocess in a thread and wait until the subprocess is ready.
 
         Args:
-            timeout: Longest wait [s]. If it is exceeded, the thread continues in the background.
+            timeout: Longest wait [s]. After this time, the thread continues in the background.
 
         Raises:
             TelemetryError: If the start fails within the timeout.

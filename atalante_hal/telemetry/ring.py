@@ -42,7 +42,7 @@ _READ, _LOST, _READER_PID, _KEPT = range(16, 20)
 _HEADER_BYTES = 256
 
 _WRITER_BYTE, _READER_BYTE = 0, 1  # offsets of the bytes that writer and reader lock
-#: number of attempts to lock a byte, because `_held` of the other end also locks it for some microseconds
+#: number of attempts to lock a byte, because `_held` of the other end also locks the byte for some microseconds
 _LOCK_TRIES = 50
 
 _WAIT = 0.0002  # s, polling period
@@ -193,7 +193,7 @@ class RingWriter(_Ring, Closing):
         self._count = 0
         self._slots = slots
         self._size, self._stride = record_size, stride
-        self._begin = self._offset = data  # offsets of the first slot and of the next record in the file [bytes]
+        self._begin = self._offset = data  # offsets [bytes] in the file: first slot, next record
         self._end = data + stride * slots
         self._limit = slots - 1 if lossless else sys.maxsize
 

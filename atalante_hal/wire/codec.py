@@ -52,7 +52,7 @@ class SignalTable(NamedTuple):
 
 @lru_cache(maxsize=4096)
 def group_of(signal: str) -> str:
-    """Return the quantity in a signal name, without the prefix and the axis: Force for `FL_ForceZ`."""
+    """Return the quantity in a signal name, without the prefix and the axis, such as Force for `FL_ForceZ`."""
     return signal.rsplit("_", 1)[-1].rstrip("WXYZ")
 
 

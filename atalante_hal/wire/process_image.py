@@ -67,7 +67,8 @@ _FOREIGN = -1
 NEVER = 1 << 30
 #: Lowest age at which an answer to a SYNC is rejected as replayed [cycles].
 LATEST = 16
-#: Half a counter period. A frame is regarded as old if its counter is at least this far ahead of the expected counter.
+#: Half a counter period. The counter wraps around, so a frame whose counter is at least this far ahead of the expected
+#: counter is regarded as old.
 #: After a gap of this number of cycles, a counter does not show whether a frame is old.
 _HALF_TURN = 128
 
@@ -482,8 +483,8 @@ def classify_frame(words: Words, row: int, offset: int, e2e: E2EState, tag: int,
             return _CONFLICT
         result = _CONFLICT
     elif tag != _NO_TAG and not back:
-        # Reject a frame that answers no recent SYNC, or an earlier SYNC than the last accepted frame.
-        # A rejected frame does not change the expected counter.
+        # Reject a frame that answers no recent SYNC, and a frame that answers a SYNC before that of the last accepted
+        # frame. A rejected frame does not change the expected counter.
         backwards = expected[row] != NOTHING and counter - expected[row] + 1 & 0xFF >= _HALF_TURN
         if not in_time or backwards:
             return _WRONG_SEQUENCE
@@ -573,7 +574,7 @@ class TransmitImage:
         return self._octets.tobytes()
 
     def seal_prepared(self, prepared: bytes) -> Frames:
-        """Add counter and CRC to frames that `prepare` encoded earlier, so that later faults in the values cannot affect them.
+        """Add counter and CRC to frames that `prepare` encoded earlier. Later faults in the values have no effect.
 
         Args:
             prepared: result of `prepare`.

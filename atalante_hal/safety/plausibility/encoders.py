@@ -1,10 +1,11 @@
 """Encoder checks, which compare each position with the previous position, its limits and the reported velocity.
 
-*Jump.* Between two good values that are n cycles apart, a position changes by at most n * top_speed * period plus 3 sigma of
-the encoder noise. `Robot.top_speed` is the speed from which the limiter permits no accelerating torque, so every motion that
-the limiter permits is accepted. A value that changed by more is not used. After `JUMPS_TO_CONFIRM` such values in a row it is
-confirmed that the encoder has lost its reference. The encoder is used again when its value jumps back to the expected
-position, or when its drive has restarted (see `reference`). The expected position includes the motion since the jump.
+*Jump.* Between two good values that are n cycles apart, a position changes by at most n * top_speed * period plus 3
+sigma of the encoder noise. `Robot.top_speed` is the speed from which the limiter permits no accelerating torque, so
+every motion that the limiter permits is accepted. A value that changed by more is not used. After `JUMPS_TO_CONFIRM`
+such values in a row, the loss of the encoder's reference is confirmed. The encoder is used again when its value jumps
+back to the expected position, or when its drive has restarted (see `reference`). The expected position includes the
+motion since the jump.
 
 *Overspeed.* A change that is too large is real motion, and no jump, if the encoder already moved at more than half of
 top_speed in the same direction in the cycle before, and if its velocity grew by at most top_speed (`continues`). Such a
@@ -116,7 +117,10 @@ class EncoderChecks:
         return not (self.outside or self.too_fast) and self._within_reach(*self._positions)
 
     def follow(self) -> None:
-        """Advance the low-pass of all joints by one cycle. All joints must have good positions of this and the last cycle."""
+        """Advance the low-pass of all joints by one cycle.
+
+        All joints must have good positions in this cycle and in the last one.
+        """
         self._low_pass(*self._motion)
 
     def accept(self, joint: int, cycles: int) -> bool:
@@ -209,7 +213,7 @@ class EncoderChecks:
             self.outside[joint] = position * self._polarity[joint] / self._gear[joint]
 
     def check_velocity(self, age: Cycles | None) -> bool:
-        """Compare the reported velocities with the encoder velocities. Both have passed the same low-pass.
+        """Compare the reported velocities with the encoder velocities. All velocities have passed the same low-pass.
 
         Args:
             age: age of the values of each joint [cycles], shape (12,). A joint with an age of `NEVER` or more is not
@@ -297,7 +301,7 @@ class EncoderChecks:
 
 
 def continues(mean: float, speed: float, top_speed: float) -> bool:
-    """Return whether a motion above the top speed continues a fast motion, so that it is real.
+    """Return whether a motion above the top speed is real, because it continues a fast motion.
 
     Args:
         mean: mean velocity since the last good position [rad/s].
@@ -342,7 +346,7 @@ def within_reach(position: Vector, before: Vector, reach: Vector, low: Vector, h
 
 
 def low_pass(motion: Motion, filtered: Vector, deviation: Vector, speed: Vector, keep: float, period: float) -> None:
-    """Advance the low-pass of the encoder velocities by one cycle, as the drives do.
+    """Advance the low-pass of the encoder velocities by one cycle. The drives use the same low-pass.
 
     Args:
         motion: new and previous positions, and reported velocities.

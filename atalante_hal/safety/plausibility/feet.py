@@ -24,7 +24,7 @@ from atalante_hal.robot import CELLS, FEET, Robot
 from atalante_hal.safety.diagnostics import Dtc, Finding
 from atalante_hal.safety.plausibility.finding import FOOT_NODES, Signals
 
-#: Time after which a cell that contradicts the other cells is reported as faulty [cycles].
+#: A cell is reported as faulty after it has contradicted the other cells for this time [cycles].
 CELL_CYCLES = 256
 #: After both feet have carried load together for this time [cycles], a swing of both feet is implausible.
 STANDING_CYCLES = 500

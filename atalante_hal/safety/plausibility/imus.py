@@ -14,7 +14,7 @@ from atalante_hal.safety.plausibility.finding import IMU_NODES, Signals
 from atalante_hal.types import Vector
 from atalante_hal.wire.codec import Codec
 
-#: Time without good values after which the diagnostic of the IMU is confirmed [cycles].
+#: Time [cycles] without good values after which the diagnostic of the IMU is confirmed.
 IMU_CYCLES = 10
 
 
@@ -31,7 +31,7 @@ class Imus:
         self._now = now
         self._gyro_end, self._accel_end = (_end_of_range(codec, signal) for signal in ("GyroX", "AccelX"))
         self._norm_error = robot.sensors.quaternion_error
-        #: Norm of the quaternion of each IMU that does not have unit norm, by IMU index.
+        #: Norm of each quaternion that does not have unit norm, by IMU index.
         self.no_attitude: dict[int, float] = {}
         #: Largest reading of each saturated IMU, by IMU index [rad/s or m/s2].
         self.saturated: dict[int, float] = {}

@@ -44,7 +44,7 @@ DRIFT_SAMPLES = 4
 STANDSTILL_SAMPLES = 2
 #: The standstill check tolerates this drift of the IMUs per sample [rad]. Intact IMUs drift less than a tenth as much.
 _IMU_DRIFT = 2e-5
-#: Largest change per sample of the estimated heading drift between pelvis IMU and tibia IMU [rad].
+#: Largest change [rad] of the estimated heading drift between pelvis IMU and tibia IMU in one sample.
 #: A leg is sampled every 32 cycles, so this limit corresponds to 3e-4 rad/s.
 _HEADING_DRIFT = 1e-5
 _PELVIS = IMUS.index("pelvis")
@@ -187,7 +187,9 @@ class Legs:
 
 
 def hip_angles(pelvis: list[float], tibia: list[float]) -> tuple[float, float, float]:
-    """Return the hip and knee angles FH, TH and SH + SK of the rotation Rx Rz Ry from the tibia frame to the pelvis frame [rad].
+    """Return the hip and knee angles FH, TH and SH + SK [rad].
+
+    The rotation from the tibia frame to the pelvis frame is Rx(FH) Rz(TH) Ry(SH + SK).
 
     Args:
         pelvis: attitude of the pelvis IMU, quaternion wxyz, sensor to world, of unit norm within the resolution of its signals.
@@ -200,7 +202,7 @@ def hip_angles(pelvis: list[float], tibia: list[float]) -> tuple[float, float, f
     x = a * f - b * e - c * h + d * g
     y = a * g + b * h - c * e - d * f
     z = a * h - b * g + c * f - d * e
-    sine = 2.0 * (w * z - x * y)  # sine of the transverse hip angle: minus element (0, 1) of the rotation matrix
+    sine = 2.0 * (w * z - x * y)  # sine of the transverse hip angle: element (0, 1) of the rotation matrix times -1
     th = math.asin(max(-1.0, min(1.0, sine)))
     sagittal = math.atan2(2.0 * (x * z + w * y), 1.0 - 2.0 * (y * y + z * z))
     fh = math.atan2(2.0 * (y * z + w * x), 1.0 - 2.0 * (x * x + z * z))

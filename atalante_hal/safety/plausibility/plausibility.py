@@ -76,7 +76,7 @@ class Plausibility:
         self._turns = self._build_turns()
         self._cycle = 0
         self.findings: tuple[Finding, ...]
-        #: Findings at the last check of all rows. If `findings` differs from these findings, all rows are checked.
+        #: Findings at the last check of all rows. If `findings` has changed since then, all rows are checked.
         self._evaluated: tuple[Finding, ...]
         self.findings = self._evaluated = ()
 
@@ -222,7 +222,7 @@ class Plausibility:
             self._force[cell] = 0.0
 
     def _restore_cells(self) -> None:
-        """Restore the measured forces of faulty cells in feet without new values, because the foot checks need them."""
+        """Restore the measured forces of faulty cells in feet without new values. The foot checks need these forces."""
         for (foot, cell), force in self._measured_forces.items():
             if self._image.check[self._rows.foot[foot]] > _FRESH:
                 self._force[foot, cell] = force

@@ -24,8 +24,9 @@ from atalante_hal.wire.process_image import NEVER
 SOLE_SAMPLES = 4
 #: Load above which a foot may be flat, as a multiple of `cell_free`.
 _LOAD = 4.0
-#: Largest distance of the centre of pressure of a flat foot from the middle of the cells: along the foot and across it, in units
-#: of the distance of a cell from the middle. The edges of the sole are at 1.1 and 2.0.
+#: Largest offset of the centre of pressure from the middle of the cells if a foot is flat: along the foot, across the
+#: foot. The unit is the distance of a cell from the middle. In this unit, the edges of the sole are at 1.1 along the
+#: foot and at 2.0 across the foot.
 _CENTRE = (0.8, 1.4)
 #: Outward rotation of the foot about the vertical axis of the tibia [rad].
 TOE_OUT = math.radians(8.0)

@@ -42,9 +42,9 @@ from atalante_hal.safety.plausibility.finding import (
 from atalante_hal.types import Vector
 from atalante_hal.wire.process_image import NEVER, ReceiveImage
 
-#: Longest time from the first repeated reading of an encoder to its detection as stuck [cycles].
+#: A stuck encoder is detected at most this time [cycles] after its first repeated reading.
 STUCK_CYCLES = 50
-#: Longest time from the first repeated reading of a gyro or force cell to its detection as frozen [cycles].
+#: A frozen gyro or force cell is detected at most this time [cycles] after its first repeated reading.
 FROZEN_CYCLES = 100
 #: If a shank turns by this angle [rad] above a loaded foot, the readings of the ankle encoders must change.
 _TURN = 0.01
@@ -191,7 +191,7 @@ class Stillness:
         return newer[self._row_of]
 
     def _follow_shanks(self) -> None:
-        """Update the turn of each shank since the encoder reading of its ankle last changed."""
+        """Update the angles by which each shank turned since the encoder reading of its ankle last changed."""
         on_ground = (self._now.force[:, :, 2].sum(axis=1) > self._loaded)[_FOOT_OF]
         self._turn += self._now.gyro[_SHANK_OF] * self._interval
         self._turn[~on_ground | (self.constant_samples[_ANKLES] <= 1)] = 0.0

@@ -22,9 +22,9 @@ from atalante_hal.robot import FEET, IMUS, JOINTS, SIDES, Robot
 from atalante_hal.safety.diagnostics import Dtc, Finding
 from atalante_hal.safety.plausibility.finding import FOOT_NODES, Ages, Signals
 
-#: Time for which a loaded foot must be too high before it is reported [cycles].
+#: A loaded foot is reported after it has been too high for this time [cycles].
 HEIGHT_CYCLES = 64
-#: Time for which the load must be on the wrong leg before it is reported [cycles].
+#: The load is reported after it has been on the wrong leg for this time [cycles].
 WEIGHT_CYCLES = 128
 #: Mean length of thigh and shank [m]; both are adjusted to the patient.
 _SEGMENT = 0.4
@@ -33,9 +33,9 @@ ANKLE_DISTANCE = 0.188
 #: Height above the other foot at which a foot cannot carry load [m]. In walks of eight patients, a loaded foot is at most
 #: 0.01 m above the other one, and a swinging foot is up to 0.09 m above it.
 _HEIGHT = 0.04
-#: Lean above which the load must be on the leg towards which the robot leans [rad].
+#: If the robot leans to one side by more than this angle [rad], the load must be on the leg of this side.
 _LEAN = 0.05
-#: Difference of the loads as a share of their sum, above which the load is clearly on one leg.
+#: The load is clearly on one leg if the difference of both loads is above this share of their sum.
 _SHARE = 0.3
 _PELVIS = IMUS.index("pelvis")
 _TIBIAE = [IMUS.index(f"{side}_tibia") for side in SIDES]
@@ -125,7 +125,8 @@ def posture_of(pelvis: Sequence[float], tibiae: Sequence[Sequence[float]], knees
     length = math.hypot(left_x, left_y)
     drops, lean = [], 0.0
     for (w, x, y, z), knee in zip(tibiae, knees, strict=True):
-        # Axis z of the shank in the world, and world component z of axis z of the thigh, which is turned by minus the knee angle.
+        # Axis z of the shank in the world, then world component z of axis z of the thigh. The thigh is the shank turned
+        # by minus the knee angle.
         shank_x, shank_y, shank_z = 2.0 * (x * z + w * y), 2.0 * (y * z - w * x), 1.0 - 2.0 * (x * x + y * y)
         thigh_z = math.cos(knee) * shank_z - math.sin(knee) * 2.0 * (x * z - w * y)
         drops.append(_SEGMENT * (thigh_z + shank_z))

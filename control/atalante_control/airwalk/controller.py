@@ -160,7 +160,7 @@ class AirwalkController:
     def desired(self) -> Vector:
         """Return q_des [rad], then q_des' [rad/s] of the most recent cycle, shape (24,).
 
-        Cycles of the start motion do not change them.
+        Cycles of the start motion do not change these values.
         """
         return self._outputs.desired
 

@@ -26,7 +26,7 @@ class Telemetry:
     gate: Annotated[Vector, 2]  # weight of the backup torque, the same value for both joints; published as `lambda`
     filter_active: Annotated[Vector, 2]  # 1 while the guide filter is active, else 0; the same for both joints
     step: float  # number of completed right-stance steps
-    phase: float  # t / T
+    phase: float  # t / T, time since the start of the step divided by the step duration
     stance: float  # 0 left, 1 right
     assistance_factor: float  # Xi of this step
 

@@ -34,10 +34,10 @@ LEG_SEGMENTS = ("thigh", "shank")  # body segments whose length is an input
 OUTPUTS = len(JOINTS) * (DEGREE + 1)
 LAYERS_MAX = 4
 WIDTH_MAX = 128  # largest number of neurons of a layer
-#: Largest accepted angle jump at the stance change [rad], due to rounding errors in the weights of the last layer.
+#: Largest accepted angle jump [rad] at the stance change. Rounding errors in the weights of the last layer cause jumps.
 _PERIODICITY_DEFECT = 1e-9
 _ANGLE_MAX = 2.0 * np.pi  # rad, largest accepted absolute value of a control point
-_ROUNDING = 1e-9  # relative tolerance of the range for rounding errors of a ratio of lengths
+_ROUNDING = 1e-9  # relative tolerance of the range limits, because a ratio of lengths has rounding errors
 
 
 class NetworkError(ValueError):
@@ -153,7 +153,7 @@ def subject_of(inputs: Sequence[float]) -> Subject:
 
 
 def periodicity() -> Vector:
-    """Return the matrix A with A c = 0 if the gait with the control points c is continuous at the stance change, shape (24, 96).
+    """Return the matrix A of the conditions A c = 0 for continuity at the stance change, shape (24, 96).
 
     c is the vector of the control points of all joints, shape (96,). The first 12 rows of A are the conditions on the angles, the
     last 12 rows are the conditions on the slopes.
