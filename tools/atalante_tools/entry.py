@@ -19,7 +19,7 @@ def main() -> NoReturn:
     """Run the command line and end the process with its exit code.
 
     Raises:
-        SystemExit: Always. After a stop signal, its code is that of the signal, otherwise that of the command.
+        SystemExit: Always. The exit code is that of the stop signal if one arrived, otherwise that of the command.
     """
     code: object = 0
     with interruptible() as stop:

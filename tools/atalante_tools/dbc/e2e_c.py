@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 
 def crc_table() -> list[int]:
-    """Return the CRC-16/CCITT (polynomial 0x1021) of each byte value, 256 entries."""
+    """Return the table of the CRC-16/CCITT (polynomial 0x1021): one CRC for each of the 256 byte values."""
     table = []
     for byte in range(256):
         value = byte << 8

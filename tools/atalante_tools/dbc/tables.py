@@ -49,7 +49,7 @@ def signal_rows(network: Network) -> list[Row]:
 
 
 def load_rows(network: Network, bus: str) -> list[Row]:
-    """Return one row with the worst-case bus load per message, the largest load first.
+    """Return one row per message with its worst-case bus load. The message with the largest load comes first.
 
     The period of a cyclic message is its cycle time. The shortest period of an event message is its inhibit time.
 

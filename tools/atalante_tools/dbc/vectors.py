@@ -7,7 +7,8 @@ contains the messages of the `Build` in DBC order:
 - message that the node receives: payload, u8 flag (1: every signal is in range), f64 value of each decoded signal;
 - message that the node sends: f64 value of each signal after the E2E header (NaN: invalid code), encoded payload.
 
-The received payloads of the images 5, 7, 9, ... have random bits; all other payloads are encoded from signal values.
+In the images 5, 7, 9, ..., the payloads that the node receives have random bits. All other payloads are encoded from
+signal values.
 The alive counter is the low byte of the image number, which starts at 0.
 """
 
@@ -59,7 +60,7 @@ class Vectors:
         self._order = self._stream_order()
 
     def _stream_order(self) -> npt.NDArray[np.intp]:
-        """Return the order of the output bytes, as indices into the concatenated arrays of one set of payloads."""
+        """Return, for each byte of an image, the index of this byte in the concatenated arrays of `images`."""
         build, codec = self._build, self._codec
         rows = len(build.messages)
         parts = (FRAME_BYTES * rows, FRAME_BYTES * rows, 8 * codec.size, 8 * codec.size, rows)
@@ -86,7 +87,7 @@ class Vectors:
         return HEADER.pack(MAGIC, self._build.network.hash32, images)
 
     def images(self, count: int) -> Iterator[bytes]:
-        """Yield images, which are sets of payloads, with minimum, maximum, invalid and then random signal values.
+        """Yield images. The first three contain minimum, maximum and invalid signal values; all others random values.
 
         Call this only once per instance, because a second call would continue the counters and the random numbers.
         """
@@ -96,7 +97,7 @@ class Vectors:
             yield np.concatenate([part.view(np.uint8) for part in parts])[self._order].tobytes()
 
     def examples(self) -> Iterator[dict[str, Any]]:
-        """Yield JSON objects with minimum, maximum, invalid and random signal values.
+        """Yield JSON objects of four images, which contain minimum, maximum, invalid and random signal values.
 
         Call this only once per instance, because a second call would continue the counters and the random numbers.
         """

@@ -20,7 +20,7 @@ class Absence:
     """Lock-step clock of the HAL, which advances the emulated robot while the HAL sends no SYNC."""
 
     def __init__(self, clock: DisturbedClock, emulator: Emulator) -> None:
-        """Start with equal times of the HAL and the robot.
+        """Start the cycle counts of HAL and robot at 0.
 
         Args:
             clock: clock that injects the delays of the loop.
@@ -33,7 +33,7 @@ class Absence:
         self._alone = 0  # cycles of the robot since the last SYNC
 
     def wait(self) -> float:
-        """Move the robot until the start of this cycle. Return the delay of this cycle [s]."""
+        """Advance the robot to the start of the current HAL cycle. Return the delay [s] of this HAL cycle."""
         late = self._clock.wait()
         if self._emulator.cycle > self._seen:
             self._alone = 0

@@ -1,4 +1,4 @@
-"""All scenarios by fault ID. Each row of the fault matrix FAULTS.md with the proof `scenario` has one scenario."""
+"""All scenarios by fault ID. A row of the fault matrix FAULTS.md has one scenario if its proof is `scenario`."""
 
 from __future__ import annotations
 

@@ -38,7 +38,7 @@ def guide_kept(run: Observation) -> str | None:
 
 
 def guide_regained(run: Observation) -> str | None:
-    """Check that an assisted joint left its guide, and that all assisted joints are inside their guides at the end.
+    """Check that an assisted joint left its guide, and that all assisted joints are inside at the end of the run.
 
     Args:
         run: observation of the run.
@@ -120,7 +120,7 @@ def start_is_rejected(run: Observation) -> str | None:
 
 
 def nothing_sags(run: Observation) -> str | None:
-    """Check that no joint moves by more than 1 deg between the operator's START after the fault and the state ACTIVE.
+    """Check that no joint moves by more than 1 deg from the operator's START after the fault until the state ACTIVE.
 
     If the robot does not become ACTIVE, the check ends 40 cycles after START.
 
@@ -137,7 +137,7 @@ def nothing_sags(run: Observation) -> str | None:
 
 
 def encoders_keep_their_reference(run: Observation) -> str | None:
-    """Check that no encoder jump is reported, because then the HAL would not use the encoder until its drive restarts.
+    """Check that no encoder jump is reported. After a jump, the HAL would not use the encoder until its drive restarts.
 
     Args:
         run: observation of the run.
@@ -159,7 +159,7 @@ def no_joint_is_too_fast(run: Observation) -> str | None:
 
 
 def start_fails_and_names_the_hip(run: Observation) -> str | None:
-    """Check that START soon fails with an event that names the left sagittal hip, and that all other drives then hold.
+    """Check that START soon fails with an event that names the left sagittal hip, and that all other drives hold then.
 
     Args:
         run: observation of the run.

@@ -69,7 +69,10 @@ class _Leg:
         )
 
     def consecutive(self) -> npt.NDArray[np.bool_]:
-        """Return whether each frame and the frame of the next cycle both enable a drive. Shape (n - 1, 6)."""
+        """Return for each frame and joint whether this frame and the frame of the next cycle both enable the drive.
+
+        Shape (n - 1, 6).
+        """
         enabled = self.word == Controlword.ENABLE_OPERATION
         return np.asarray(enabled[1:] & enabled[:-1] & (np.diff(self.cycle) == 1)[:, None])
 
@@ -140,7 +143,7 @@ class Commands:
     def violations(self, robot: Robot) -> list[str]:
         """Return one sentence per foreign identifier, and one sentence per leg for each kind of violation.
 
-        The kinds are a too large torque, torque limit or torque change, and a torque with QUICK STOP.
+        The four kinds are: torque too large, torque limit too large, torque change too large, torque with QUICK STOP.
 
         Args:
             robot: torque limits of the joints.
@@ -171,7 +174,7 @@ class Commands:
 
 
 def _decode(words: npt.NDArray[np.uint64], signal: Signal) -> Vector:
-    """Return the physical values of a signal, shape (n,), from the 64-bit words of the payloads, shape (n, 8)."""
+    """Return the physical values of a signal, shape (n,). `words` are the payloads as 64-bit words, shape (n, 8)."""
     raw = words[:, signal.start // 64] >> np.uint64(signal.start % 64) & np.uint64((1 << signal.length) - 1)
     values = raw.astype(np.int64)
     if signal.signed:

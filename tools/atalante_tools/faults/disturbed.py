@@ -64,7 +64,7 @@ class TimedStimuli:
     """Faults and operator actions of a case that begins in a given HAL cycle.
 
     Attributes:
-        faults: faults of the emulated robot, with their start in its cycles.
+        faults: faults of the emulated robot. Their `start` counts in cycles of the robot.
         host_faults: faults of the computer that runs the HAL.
         presses: actions of the operator, by HAL cycle. More actions can be added.
     """

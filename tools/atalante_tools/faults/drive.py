@@ -34,7 +34,10 @@ _RESTARTED: Final = {
 
 
 def _start_with(name: str, node: str, fault: Fault | float) -> Case:
-    """Return a test case of the first START with a fault, or with a motor that produces `fault` times the torque measured."""
+    """Return a test case in which the first START fails.
+
+    If `fault` is a number, the motor of the node produces `fault` times the torque that the drive reports.
+    """
     return Case(
         name,
         (fault if isinstance(fault, Fault) else Fault("torque_weak", node, 0, share=fault),),

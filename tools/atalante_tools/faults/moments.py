@@ -1,14 +1,14 @@
-"""Single faults and random pairs of faults that begin at other times than in the fault matrix, from power-on to the restart.
+"""Single faults and random pairs of faults that begin at any time from power-on to the restart, not only during a walk.
 
     case of the matrix, moment -> run with a schedule of START and STOP -> safety checks, measured extremes
 
 The fault matrix states the reaction to a fault during a walk. At other moments, and for pairs, no reaction is prescribed for each
-fault. These runs check what must be true for all of them:
+fault. The runs check what must be true for every fault at every moment:
 
 - no torque, position, velocity or torque rate beyond its limit;
 - no command that lets a drive produce torque before the operator pressed START;
 - no change to a less severe state without the operator, after the robot has walked;
-- no joint moves by more than `SAG_MAX` between START and the end of the start;
+- no joint moves by more than `SAG_MAX` from START until the start is complete;
 - no exception.
 """
 
@@ -65,7 +65,7 @@ class Schedule:
     """Times of a run, in HAL cycles."""
 
     begins: int  # first faulty cycle
-    starts: tuple[int, ...]  # cycles in which the operator presses START, before the end of the fault
+    starts: tuple[int, ...]  # cycles before the end of the fault in which the operator presses START
     stop: int | None = None  # cycle in which the operator presses STOP
 
 
@@ -102,7 +102,7 @@ class Extremes:
 
     speed: Extreme  # joint velocity as a share of its limit
     torque_step: Extreme  # change of the commanded torque in one cycle [Nm]
-    sag: Extreme  # motion from START to ACTIVE, or in the first `_SETTLED` cycles [deg]
+    sag: Extreme  # motion [deg] from START to ACTIVE, or in the first `_SETTLED` cycles after START
     lost: Extreme  # motion since the first cycle in HOLD or a more severe state [deg]
 
 
@@ -123,12 +123,12 @@ class MomentTask:
     """Task to run cases of the fault matrix that begin `delays` cycles after a `Moment`."""
 
     moment: Moment
-    cases: tuple[tuple[str, int], ...]  # fault ID, index of the case in its scenario
-    delays: tuple[int, ...] = (0,)  # for each case
+    cases: tuple[tuple[str, int], ...]  # for each case: its fault ID and its index in the scenario
+    delays: tuple[int, ...] = (0,)  # for each case: cycles from the moment to its start
     engine: str = PYBULLET
 
     def __call__(self) -> MomentVerdict:
-        """Run the cases and check what must be true for every fault, whenever it begins."""
+        """Run the cases, and check what must be true for every fault at every moment."""
         chosen = [SCENARIOS[id_].cases[index] for id_, index in self.cases]
         names = tuple(f"{id_} {case.name}" for (id_, _), case in zip(self.cases, chosen, strict=True))
         stimuli = tuple(shifted(s, d) for case, d in zip(chosen, self.delays, strict=True) for s in case.stimuli)
@@ -140,7 +140,7 @@ class MomentTask:
             return MomentVerdict(self.moment, names, "-", False, None, (exception_sentence(error),))
         extremes, before = _extremes(run, plan.starts), run.last_before_start
         failures = [*limit_violations(run), *_premature(run, plan.starts[0])]
-        if self.moment in (Moment.WALKING, Moment.HOLD):  # a later START may improve the state
+        if self.moment in (Moment.WALKING, Moment.HOLD):  # at the other moments, START may improve the state
             failures += automatic_improvements(run, before)
         if extremes.sag.value > SAG_MAX:
             sag = f"{extremes.sag.value:.2f} deg of {extremes.sag.joint}"
@@ -209,7 +209,7 @@ def _extremes(run: Observation, starts: Sequence[int]) -> Extremes:
 
     Args:
         run: observation of the run.
-        starts: cycles in which the operator pressed START, before the end of the fault.
+        starts: cycles before the end of the fault in which the operator pressed START.
     """
     count = len(JOINTS)
     sag, lost, held = np.zeros(count), np.zeros(count), None

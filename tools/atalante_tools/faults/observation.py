@@ -46,7 +46,7 @@ class Observation:
     velocity: Vector  # true joint velocities [rad/s], shape (cycles, 12)
     temperature: Vector  # reported temperature of the drives [degC], shape (cycles, 12)
     age: npt.NDArray[np.int64]  # data age of each message in the HAL [cycles], shape (cycles, messages)
-    #: largest distance of an assisted joint outside its guide [rad], shape (cycles,); negative inside
+    #: largest distance [rad] by which an assisted joint is outside its guide, shape (cycles,); negative: all are inside
     guide_exit: Vector
     messages: tuple[str, ...]  # name of the message in each column of `age`
 
@@ -60,7 +60,7 @@ class Observation:
 
     @property
     def last_before_start(self) -> int:
-        """Return the last cycle before START was pressed after the fault; without this START, the last cycle of the run."""
+        """Return the cycle before the operator's START after the fault, or the last cycle if there is no such START."""
         return (self.pressed or self.last + 1) - 1
 
     @property

@@ -136,7 +136,7 @@ class Summary:
         return "\n\n".join(parts) + "\n"
 
     def _moments(self) -> str:
-        """Return a table of the largest values: first a row for each `Moment` with all its runs, then a row for each fault."""
+        """Return a table of the largest values: first one row per `Moment` (all its runs), then one row per fault."""
         single = [run for run in self.moments if len(run.faults) == 1]
         pairs = [run for run in self.moments if len(run.faults) > 1]
         groups = [(f"all, {moment}", [run for run in single if run.moment == moment]) for moment in Moment]

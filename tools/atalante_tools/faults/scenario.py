@@ -86,7 +86,7 @@ class Case:
     detected: int | None = None  # time limit for the diagnostic [cycles]; None means as in the fault matrix
     reacted: int | None = None  # time limit for the reaction [cycles]; None means as in the fault matrix
     node: str | None = None  # node that the diagnostic must name; None means any node
-    recovers: bool = True  # whether START after the fault must lead to ACTIVE; if not, START must not lead to ACTIVE
+    recovers: bool = True  # True: START after the fault must lead to ACTIVE; False: it must not
     #: cycles between the end of the fault and START; for a permanent fault, between the time limit of the reaction and START
     observed: int = 60
     seed: int = 0  # seed of the random numbers in the emulator

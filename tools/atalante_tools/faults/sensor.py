@@ -54,8 +54,8 @@ _ON_TOES: Final = (290.0, 290.0, 10.0, 10.0)
 def _standing(foot: str, cycles: int) -> tuple[Fault, ...]:
     """Return faults that simulate a foot that stands on its toes.
 
-    The soles of the robot in the air are not level, so it cannot stand on its whole sole. The forces change every 50 cycles,
-    because a constant force is a fault.
+    The soles of a robot in the air are not level, so a foot cannot stand on its whole sole. The forces change every 50
+    cycles, because a constant force is a fault.
 
     Args:
         foot: name of the foot node.

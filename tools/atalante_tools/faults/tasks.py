@@ -171,7 +171,7 @@ class Scope:
 
 
 def plan(ids: Sequence[str], scope: Scope, engine: str = PYBULLET) -> list[Task]:
-    """Return the tasks of a campaign, ordered so that the long tasks come first.
+    """Return the tasks of a campaign. The long tasks come first.
 
     Args:
         ids: IDs of the scenarios.
@@ -206,7 +206,7 @@ def run_task(task: Task) -> Result:
 
 
 def _cycles_until_stop(case: Case, cycles: int) -> int | None:
-    """Run a permanent fault for `cycles` cycles; return the cycles until the walk stopped, or None if the walk continued."""
+    """Run a permanent fault for `cycles` cycles. Return the cycles until the walk stopped; None if it continued."""
     shortened = replace(case, stimuli=tuple(limited(stimulus, cycles) for stimulus in case.stimuli))
     run = observe(shortened, cycles, recovery=False)
     for cycle in range(run.first, run.last + 1):
@@ -220,7 +220,7 @@ def _case_of(id_: str, name: str) -> Case:
 
 
 def limited(stimulus: Stimulus, cycles: int) -> Stimulus:
-    """Return the fault or action; limit its duration to `cycles` cycles if it is permanent."""
+    """Return the fault or action. If it is permanent, its duration is limited to `cycles` cycles."""
     if stimulus.cycles is not None:
         return stimulus
     if isinstance(stimulus, Fault):

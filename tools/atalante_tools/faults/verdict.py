@@ -160,7 +160,7 @@ def automatic_improvements(run: Observation, until: int) -> list[str]:
 
     Args:
         run: observation of the run.
-        until: last cycle to check; the operator must not act before it.
+        until: last cycle to check. The operator must not act before this cycle.
     """
     for cycle in range(run.first + 1, until + 1):
         if run.state(cycle) < run.state(cycle - 1):

@@ -131,7 +131,7 @@ class _Sticks:
         self._trunk = np.array([[-0.05, 0.0, 0.0], [-0.05, 0.0, 0.55]])  # in the pelvis frame [m]
 
     def points(self, pose: Vector) -> dict[str, Vector]:
-        """Return the polylines of trunk and legs, shape (n, 3) [m], for the joint angles `pose`, shape (12,) [rad]."""
+        """Return the polylines [m] of trunk and legs, shape (n, 3), for the joint angles `pose` [rad], shape (12,)."""
         model, data = self._articulated.model, self._data
         q = pinocchio.neutral(model)
         q[self._articulated.q] = pose

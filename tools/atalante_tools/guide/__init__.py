@@ -1,7 +1,8 @@
 """Command `atalante guide`: search for pushes that move a joint out of a certified virtual guide.
 
-The promise of a guide is a torque at hip and knee. The certificate of the guide states that no push up to this torque moves a
-joint out of the guide. The adversary is a search for a push up to this torque that does move a joint out of the guide.
+The promise of a guide is one torque at the hip and one torque at the knee. The certificate of the guide states that no
+push up to these torques moves a joint out of the guide. The adversary searches for a push up to these torques that
+nevertheless moves a joint out of the guide.
 """
 
 from __future__ import annotations

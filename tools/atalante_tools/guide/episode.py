@@ -153,7 +153,7 @@ class IdealLeg:
         return Goal(q + d * self._s[0] + r * self._s[1], qd + d * self._sd[0] + r * self._sd[1], self.bounds)
 
     def walk(self, plant: Plant, start: Start, push: Push, box: Pair, noise: Vector) -> Walked:
-        """Walk one step from the stance change to its end.
+        """Simulate one walking step, from the stance change to the end of the step.
 
         Args:
             plant: constants of the plant.
@@ -233,7 +233,7 @@ def noise_of(cycles: int, condition: Condition, generator: np.random.Generator) 
 def walk_step(
     episode: Episode, leg: Vector, measured: Measured, guide: GuideTables, parts: Parts
 ) -> tuple[float, int, int]:
-    """Walk one step of the plant.
+    """Simulate one walking step on the ideal plant.
 
     Args:
         episode: inputs, and the log that is written.

@@ -5,13 +5,13 @@ r"""Ideal plant for the search for the worst push: hip and knee of one swing leg
 .. math:: m\,[M(q) \ddot q + c(q, \dot q) + g(q)] + f\,r(\dot q) = u + d
 
 with the sagittal hip and knee (SH, SK) as coordinates q, the real joint torques u of the drives, the push d, the friction torque
-r of the model, and the factors m of mass and f of friction. The mass matrix M depends only on the knee angle. It is
+r of the model, the mass factor m and the friction factor f. The mass matrix M depends only on the knee angle. It is
 :math:`A + B \cos q_{SK} + C \sin q_{SK}`, because both axes are parallel. The velocity-dependent torque c follows from the
 derivatives of M. The gravity torque g is linear in the sine and cosine of the hip angle and of the sum of both angles. All
 coefficients are fitted to Pinocchio's rigid-body dynamics of the whole exoskeleton. The other ten joints rest at their mean
 angles of the step.
 
-Each cycle of 1 ms samples the encoders and computes a command. The command acts one cycle later, or more with `Condition.delay`.
+Each cycle of 1 ms samples the encoders and computes a command. The command acts 1 + `Condition.delay` cycles later.
 """
 
 from __future__ import annotations
@@ -154,7 +154,7 @@ def _least_squares(basis: list[list[float]], values: list[Any]) -> tuple[Vector,
 
 
 def inverse_dynamics(constants: Plant, q: Vector, qd: Vector, qdd: Vector) -> Vector:
-    """Return the joint torques that accelerate the leg, including gravity and friction, shape (2,) [Nm].
+    """Return the joint torques [Nm] for the accelerations `qdd`, including gravity and friction, shape (2,).
 
     Args:
         constants: constants of the plant.
@@ -230,7 +230,7 @@ def _acceleration(
 
 
 def limited(constants: Plant, joint: int, requested: float, last: float, velocity: float) -> float:
-    """Return the command after the limits of torque, speed and torque rate [Nm].
+    """Return the command [Nm] after the limits of torque, speed and torque rate.
 
     Args:
         constants: constants of the plant.

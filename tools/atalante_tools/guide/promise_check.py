@@ -1,10 +1,11 @@
 """Check of a guide: search for the worst push, and comparison with the certified torques. `gait, shape, Xi -> Verdict`.
 
-The promise of a guide is a torque at hip and knee. The search (class `Adversary`) uses pushes up to these torques, unless
-`Task.push` gives other limits. At the start of a step, the leg deviates from the nominal motion. The hand-over box (`HandOver`)
-is the range of start deviations for which the promise holds. The steps of the search start in the centre and in corners of this
-box. The search runs on the ideal plant. Then the worst pushes are repeated on the emulated robot, together with constant pushes,
-pushes that follow the error or its rate, and pushes that switch at random.
+The promise of a guide is one torque at the hip and one torque at the knee. The search (class `Adversary`) uses pushes
+up to these torques, unless `Task.push` gives other limits. At the start of a step, the leg deviates from the nominal
+motion. The hand-over box (`HandOver`) is the range of start deviations for which the promise holds. The steps of the
+search start in the centre and in corners of this box. The search runs on the ideal plant. Then the worst pushes are
+repeated on the emulated robot, together with constant pushes, pushes that follow the error or its rate, and pushes that
+switch at random.
 """
 
 from __future__ import annotations
@@ -49,13 +50,13 @@ PATIENTS: Final = (
     (67.0, 1.68, 0.18, 0.9), (70.0, 1.75, 0.15, 0.9), (73.0, 1.70, 0.10, 0.8), (76.0, 1.80, 0.15, 1.0),
     (80.0, 1.75, 0.18, 0.9), (84.0, 1.80, 0.12, 0.9), (88.0, 1.85, 0.15, 0.9), (91.0, 1.85, 0.15, 0.9),
 )  # fmt: skip
-#: Steps start from this number of corners of the hand-over box, which is the range of start deviations.
+#: Number of corners of the hand-over box (range of start deviations) in which steps start.
 _CORNERS: Final = 64
 #: Lag of the measured velocity of a drive [s], caused by the low-pass filter and by the sampling (half a cycle).
 _VELOCITY_LAG: Final = 2.0e-3
 #: The search for `Verdict.left_at` tries pushes up to this multiple of the certified torques.
 LARGEST_FACTOR: Final = 6.0
-#: For each multiple of the certified torques, the search for `Verdict.left_at` walks this share of `Effort.steps`.
+#: For each multiple of the certified torques, the search for `Verdict.left_at` simulates this share of `Effort.steps`.
 _SHARE: Final = 0.1
 
 
@@ -90,9 +91,9 @@ class Verdict:
     xi: float
     gait: str
     certified: bool
-    #: largest push at the hip: `Task.push`, else the certified torque [Nm]; None if there is neither
+    #: largest push at the hip [Nm]: `Task.push` if given, otherwise the certified torque; None if there is neither
     promise_hip_nm: float | None
-    #: largest push at the knee: `Task.push`, else the certified torque [Nm]; None if there is neither
+    #: largest push at the knee [Nm]: `Task.push` if given, otherwise the certified torque; None if there is neither
     promise_knee_nm: float | None
     worst_ratio: float | None  # largest |e| / q_bound of plant and robot; None if no step was walked
     steps: int  # number of steps on plant and robot
@@ -216,7 +217,7 @@ def check(setup: Setup, controller: AirwalkController, xi: float, task: Task) ->
 
 
 def _on_robot(robot: PushedRobot, box: Pair, found: Sequence[Tried], task: Task) -> RobotWalk:
-    """Walk on the robot in all conditions, with the worst pushes found on the plant and with the pushes of `_robot_pushes`."""
+    """Let the robot walk in all conditions under the worst pushes from the plant and the pushes of `_robot_pushes`."""
     conditions, seed = task.conditions, task.seed
     cycles = len(found[0].push.signs)
     pushes = [one.push for one in found[:6]] + _robot_pushes(cycles, np.random.default_rng(seed))

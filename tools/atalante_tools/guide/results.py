@@ -26,7 +26,7 @@ class Results:
 
         Args:
             path: JSON-lines file. If None, the verdicts are not stored.
-            task: values that determine a verdict, apart from gait, shape and assistance factor; they must be JSON values.
+            task: JSON values that determine a verdict, apart from gait, shape and assistance factor.
 
         Raises:
             ValueError: If the file contains the results of another task, or a line that is not a verdict.

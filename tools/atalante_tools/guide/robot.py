@@ -46,7 +46,7 @@ class RobotStep(NamedTuple):
 
     ratio: float  # largest |e| / q_bound
     push: int  # index of the push in the list of pushes
-    log: Vector  # (cycles, n) with the columns `episode.LOG`, values of each cycle
+    log: Vector  # values of each cycle, shape (cycles, n); the columns are `episode.LOG`
 
 
 @dataclass(frozen=True)
@@ -80,7 +80,7 @@ class PushedRobot:
 
         Args:
             box: largest push at hip and knee [Nm].
-            pushes: pushes of the swing leg; they are repeated if there are more steps.
+            pushes: pushes of the swing leg, one per step. The list is repeated if there are more steps.
             condition: deviation of the robot from the model.
             steps: number of steps of both legs.
             seed: seed of sensor noise, lost frames and pushes of the stance leg.
@@ -135,7 +135,7 @@ class _Hand:
         """Set the pushes of the next cycle.
 
         Args:
-            rig: rig of the walk, after a cycle.
+            rig: rig of the walk. Its last cycle is complete.
         """
         hal, controller, emulator = rig.hal, self._controller, rig.emulator
         assert emulator is not None

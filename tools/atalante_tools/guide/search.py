@@ -2,10 +2,11 @@
 
 The search knows the equation of motion but not the control law. It has three stages:
 
-1. *Guesses.* Constant pushes. Pushes that follow the sign of the error, or of the rate of the error (pumping). Pushes that switch
-   at random. Bang-bang pushes, which increase the error of one joint at one time as much as possible: at each earlier time, their
-   sign is the sign of the effect that an impulse at this time has on that error. The effect is computed for a linear loop, whose
-   stiffness and damping are identified from the worst step so far.
+1. *Guesses.* Constant pushes. Pushes that follow the sign of the error, or of the rate of the error (pumping). Pushes
+   that switch at random. Bang-bang pushes. A bang-bang push makes the error of one joint at a chosen time as large as
+   possible. At each earlier time, the push has the direction in which an impulse increases this error. The effect of an
+   impulse is computed for a linear loop. The stiffness and damping of the loop are identified from the worst step so
+   far.
 2. *Beam search.* Every 40 ms, each kept push is continued in each of the four `DIRECTIONS`. The pushes with the largest predicted
    deviation are kept.
 3. *Local search.* One of the pushes with the largest |e| / q_bound is changed a little: its switching times, its feedback, the
@@ -44,7 +45,7 @@ _PARENTS: Final = 6
 
 
 class Tried(NamedTuple):
-    """Step of the plant that the search has walked: its inputs and its result."""
+    """Walking step that the search has simulated on the plant: inputs and result."""
 
     ratio: float  # largest |e| / q_bound
     kind: str  # origin of the push
@@ -60,7 +61,7 @@ class Adversary:
     """Search for the worst push in one guide at one assistance factor.
 
     Attributes:
-        steps: number of steps walked.
+        steps: number of simulated steps.
         tried: worst steps so far, the worst first.
     """
 
@@ -77,7 +78,7 @@ class Adversary:
         self._plants: dict[Condition, Plant] = {c: self.setup.plant(c) for c in self.conditions}
 
     def search(self, box: Pair, budget: int) -> Tried:
-        """Walk about `budget` steps with pushes up to the limits `box`, and return the worst step.
+        """Simulate about `budget` steps with pushes up to the limits `box`, and return the worst step.
 
         Args:
             box: largest push at hip and knee [Nm].
@@ -94,7 +95,7 @@ class Adversary:
         return self.tried[0]
 
     def leaving_factor(self, box: Pair, largest: float, budget: int) -> float | None:
-        """Find the smallest multiple of `box` with a push that moves a joint out of the guide. The accuracy is 5 %.
+        """Find the smallest multiple of `box` at which a push moves a joint out of the guide. The accuracy is 5 %.
 
         Return None if no such push was found up to the multiple `largest`.
 

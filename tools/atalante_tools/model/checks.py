@@ -29,7 +29,7 @@ class ModelCheck:
 
 
 def model_checks(parameters: ExoskeletonParameters, robot: Robot, patient: Patient | None) -> Iterator[ModelCheck]:
-    """Check total mass, mirror symmetry, positive inertias, and that Pinocchio and PyBullet agree on the URDF.
+    """Check total mass, mirror symmetry, positive inertias, and the agreement of Pinocchio and PyBullet on the URDF.
 
     Args:
         parameters: parameters of the exoskeleton.

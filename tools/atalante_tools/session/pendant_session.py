@@ -30,7 +30,7 @@ POLL_TIMEOUT: Final = 0.02
 #: Number of SYNCs that a new pendant answers with the signals of the older pendant. In this time the older pendant stops sending.
 #: If the signals of the two pendants differed, the HAL would hold the robot after four cycles.
 COPY_SYNCS: Final = 20
-#: Number of SYNCs that `atalante pendant stop` and `atalante pendant hold` answer, 0.5 s.
+#: Number of SYNCs that `atalante pendant stop` and `atalante pendant hold` answer (0.5 s).
 PRESS_SYNCS: Final = 500
 #: Number of SYNCs answered with STOP at the end of `pendant start` and `pendant xi`.
 STOP_SYNCS: Final = 20
@@ -56,7 +56,7 @@ class Session:
 
         Args:
             node: Pendant node on its bus.
-            target: Bus named in the messages.
+            target: Bus. Its name is printed in the messages.
             stop: Stop request of the process.
             keyboard: Reader of the lines that the user types.
             now: Clock [s].

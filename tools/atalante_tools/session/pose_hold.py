@@ -44,7 +44,8 @@ def minimum_jerk(phase: float) -> tuple[float, float]:
 class PoseHold:
     """PD controller with gravity compensation, which holds a pose with the stiffness of the drives.
 
-    Its damping is that of `pose_gains`, because with the damping of the drives the delay of the HAL makes light joints unstable.
+    The damping is that of `pose_gains`. With the damping of the drives, the delay of the HAL would make light joints
+    unstable.
 
     Attributes:
         telemetry: Reference angles, shape (12,) [rad].
@@ -73,7 +74,7 @@ class PoseHold:
         self.telemetry = np.zeros_like(robot.hold_kp)
 
     def reset(self, state: State) -> None:
-        """Set the reference to the measured pose, and start the motion there.
+        """Set the reference to the measured pose, and start the motion from this pose.
 
         Args:
             state: Measured state of the robot.

@@ -21,7 +21,8 @@ if TYPE_CHECKING:
     from atalante_hal.telemetry.process import Recording, TelemetryProcess, TelemetrySummary
     from atalante_tools.session.rig import Rig
 
-#: Longest wait for the telemetry process before a run on the wall clock [s]. If ready later, this process joins the run.
+#: Longest wait for the telemetry process before a run on the wall clock [s]. A process that is ready
+#: later joins the run at that time.
 _TELEMETRY_WAIT: Final = 5.0
 #: Period of the check of the telemetry process [cycles].
 _TEND_CYCLES: Final = 250
@@ -81,8 +82,8 @@ _LIGHT_RATE: Final = 100
 def telemetry_cores(outputs: Outputs | None) -> int:
     """Return the number of processor cores that the telemetry process keeps busy in lock-step.
 
-    For a recording at 100 Hz it needs a quarter of the computing time of the HAL. For a CAN log or a recording of every cycle
-    it needs more than the HAL.
+    For a recording at 100 Hz, the process needs a quarter of the computing time of the HAL. For a CAN log or a
+    recording of every cycle, the process needs more computing time than the HAL.
 
     Args:
         outputs: Outputs of the telemetry process; None means no telemetry process.

@@ -74,9 +74,10 @@ class Rig:
     ) -> Statistics:
         """Run the control loop on the clock of the target. The run ends in HOLD.
 
-        On the wall clock, the process requests real-time priority and locked memory. After a stop signal, the HAL rejects every
-        START and changes to HOLD. Further signals do not interrupt this. The function `until` must read the stop request. With
-        `on_stop`, only the second signal has this effect.
+        On the wall clock, the process requests real-time priority and locked memory. After the first stop signal, the
+        HAL rejects every START and changes to HOLD. Further signals do not interrupt this change. If `on_stop` is
+        given, the first signal only calls `on_stop`, and the second signal leads to HOLD. The function `until` must
+        read the stop request.
 
         Args:
             controller: Controller that computes the command of every cycle.
@@ -138,7 +139,7 @@ def open_hal(
         robot_process: Subprocess for the embedded robot, which is closed after the block. Its operator presses START when the
             HAL is in READY. If None, the embedded robot runs in this process.
         mechanics: Engine, exoskeleton, wearer and ground of the embedded robot. None means an empty exoskeleton with default leg
-            lengths that is suspended at its pelvis, in the engine of the target.
+            lengths that is suspended at its pelvis and simulated in the engine of the target.
 
     Raises:
         ValueError: If both `operator` and `robot_process` are given.
@@ -251,8 +252,8 @@ class Watch:
         Args:
             rig: Rig of the run.
             stop: Stop request of the process.
-            done: Returns whether the run is complete; called in each cycle in ACTIVE.
-            describe: Returns the progress line in ACTIVE.
+            done: Function that returns whether the run is complete. It is called in each cycle in ACTIVE.
+            describe: Function that returns the progress line in ACTIVE.
             resumes: Whether the run continues when the operator presses START in HOLD. If False, HOLD ends the run.
         """
         self._rig, self._stop, self._done, self._describe = rig, stop, done, describe

@@ -113,8 +113,9 @@ class OperatorPath:
         """Prepare the steps of the HAL.
 
         Args:
-            receives_like: path that receives the same frames in the same way. Its stored results are used, because reception is
-                the longest part of a search. None means that nothing is stored yet.
+            receives_like: path that receives the same frames in the same way. The new path uses the stored results of
+                this path, because reception is the longest part of a search. None means that there are no stored
+                results.
         """
         self._steps = HalSteps()
         self._received: Callable[[Reception, Operator], _Receptions]
@@ -191,8 +192,8 @@ class OperatorPath:
         Args:
             before: state of the safety monitor.
             inputs: inputs of the operator.
-            suspended: True if the robot does not walk on the ground, where STOP, the dead-man switch and a lost pendant end the
-                walk first.
+            suspended: True if the robot does not walk on the ground. A walk on the ground is finished before STOP, a
+                released dead-man switch or a lost pendant leads to HOLD.
         """
         results: dict[_Decided, Environment] = {}
         for environment in environments(before, suspended):
@@ -203,7 +204,7 @@ class OperatorPath:
         return results
 
     def _command(self, state: Supervision, prevented: bool) -> tuple[bool, bool]:
-        """Return whether the HAL sends ENABLE OPERATION to a drive, and whether the HAL is still enabling drives afterwards."""
+        """Return whether the HAL sends ENABLE OPERATION to a drive, and whether the HAL continues to enable drives."""
         sent = [self._steps.command(state, prevented, drive, "torque") for drive in DriveState]
         return any(word == ENERGISING for word, _ in sent), sent[0][1]
 
@@ -231,8 +232,8 @@ def environments(before: Supervision, suspended: bool = False) -> Iterator[Envir
 def arrivals(before: Reception, operator: Operator) -> Iterator[tuple[PendantFrame, ...]]:
     """Yield all sets of pendant frames that can arrive in a cycle.
 
-    Frames arrive in time, lost, doubled, late, damaged, or together with a frame of a second sender. The first set contains one
-    frame that arrives in time.
+    A frame can be in time, lost, doubled, late, damaged, or arrive together with a frame of a second sender. The first
+    set contains one frame that is in time.
 
     Args:
         before: state of the reception.

@@ -155,8 +155,8 @@ class HalSteps:
     def _receive(self, before: Reception, frames: tuple[PendantFrame, ...]) -> tuple[tuple[Reception, Inputs], ...]:
         """Return the possible results of a cycle in which frames of the pendant arrive.
 
-        `own_request` belongs to the pendant, not to the HAL. It is therefore computed here, so that the HAL runs only once for
-        states that differ only in it.
+        `own_request` belongs to the pendant, not to the HAL. This value is therefore computed here. The HAL then runs
+        only once for states that differ only in `own_request`.
 
         Args:
             before: state before the cycle.
@@ -171,7 +171,8 @@ class HalSteps:
     def _process(self, before: Reception, frames: tuple[PendantFrame, ...]) -> tuple[tuple[Reception, Inputs], ...]:
         """Return the possible results of the HAL, with `own_request` 0.
 
-        Counters that a state does not contain are set to each value that gives another result, see the tests.
+        A state does not contain all counters of the HAL. The other counters are set to each value that gives another
+        result, see the tests.
 
         Args:
             before: state before the cycle.
@@ -355,7 +356,7 @@ def _own_request(before: Reception, own: list[int], after: Reception) -> int:
     Args:
         before: state before the cycle.
         own: requests of the frames that the pendant itself sent in this cycle.
-        after: state after the cycle, whose last accepted frame is not older than the timeout.
+        after: state after the cycle. Its last accepted frame has not timed out.
     """
     return (before.own_request, *own)[-1] if after.rogue else after.request
 

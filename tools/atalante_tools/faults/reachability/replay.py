@@ -24,13 +24,13 @@ class NotReplayable(ValueError):  # noqa: N818
 
 
 def case_of(cycles: Sequence[Cycle]) -> Case:
-    """Convert a counterexample that begins with a walking robot to a test case.
+    """Convert a counterexample to a test case. The robot must walk at the start of the counterexample.
 
     Args:
         cycles: inputs of each cycle.
 
     Raises:
-        NotReplayable: If an input has no operator action and no fault.
+        NotReplayable: If neither an operator action nor a fault can cause an input.
     """
     stimuli: list[Stimulus] = []
     dead_man = True
@@ -55,13 +55,13 @@ def case_of(cycles: Sequence[Cycle]) -> Case:
 
 
 def drive_case_of(trace: Sequence[tuple[DriveCycle, DriveStep]]) -> Case:
-    """Convert a counterexample of a drive to a test case, starting with the cycle after the drive was enabled.
+    """Convert a counterexample of a drive to a test case. The case starts in the cycle after the drive was enabled.
 
     Args:
         trace: inputs and state of each cycle.
 
     Raises:
-        NotReplayable: If an input is no loss of a command.
+        NotReplayable: If an input is not the loss of a command.
     """
     states = [step.drive.state for _, step in trace]
     enabled = states.index(DriveState.OPERATION_ENABLED)

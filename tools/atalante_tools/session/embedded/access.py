@@ -48,8 +48,8 @@ class Access(Protocol):
         """Push the pelvis with the wrench that a function returns.
 
         Args:
-            wrench: Function that returns force [N] and moment [Nm] on the pelvis, in world axes, shape (6,). It is called after
-                the HAL has begun a cycle and before the body moves, at least once per cycle.
+            wrench: Function that returns force [N] and moment [Nm] on the pelvis, in world axes, shape (6,). The
+                function is called after the HAL has begun a cycle and before the body moves, at least once per cycle.
         """
 
     def assist(self, factor: float | None) -> None:
@@ -60,7 +60,7 @@ class Access(Protocol):
         """
 
     def attitude(self) -> tuple[float, float, float, float]:
-        """Return the true attitude of the pelvis after the last cycle, as a quaternion xyzw to the world."""
+        """Return the true attitude of the pelvis after the last cycle, as quaternion xyzw from pelvis to world axes."""
 
     def stance(self) -> Stance:
         """Return the true position of the feet after the last cycle."""
