@@ -9,8 +9,8 @@ results, and a virtual machine can use the cache of its host.
 
 *Reference counts.* By default, numba counts the references to each array that a function passes to another function, because
 the last user of an array must free it. The counting takes most of the time of a kernel that calls small functions. Therefore
-`specialised` compiles a function without reference counts. numba refuses this for a function that creates an array, which
-is then compiled with reference counts.
+`specialised` compiles a function without reference counts. numba refuses this for a function that creates an array.
+Such a function is compiled with reference counts.
 """
 
 from __future__ import annotations

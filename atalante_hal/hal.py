@@ -49,8 +49,8 @@ class Hal:
         bus: Open bus. The caller owns it and closes it.
         patience: Longest wait for the nodes' answers to a SYNC [s]. On the wall clock it must be well below the period of 1 ms.
             In lock-step with another process it should be long, so that a run has the same result on a slow machine.
-        assistance_factor: Assistance factor Xi in [0, 1], used until the pendant sets another.
-        controller_fields: (name, length) of each field the controller records, see `types.Controller`.
+        assistance_factor: Assistance factor Xi in [0, 1], used until the pendant sets another factor.
+        controller_fields: Name and length of each field that the controller records, see `types.Controller`.
         gait_hash: CRC-32 of the gait that the controller uses, sent in HAL_STATUS.
         tap: Receiver of a copy of every frame that is sent or received, for a CAN log; None if there is no log.
 

@@ -98,7 +98,7 @@ class Drift:
                 because another diagnostic reports it.
 
         Returns:
-            Increase of the delay within the window [s].
+            Increase of the delay [s] within the window.
         """
         if PERIOD < late <= GAP_TO_HOLD:
             self._lost += late

@@ -95,7 +95,8 @@ class Pendant:
             qualifying: True if the pendant is in time but not qualified yet. Then a press of START is stored until the
                 pendant is qualified.
             new: True if a frame was accepted in this cycle. START is evaluated only in such a cycle. Without a new frame, the
-                signals may still be those of an earlier cycle with further frames, and then may come from a second sender.
+                signals are those of an earlier cycle. If that cycle had further frames, the signals may come from a
+                second sender.
             further_frames: Values of the process image for each further valid frame of this cycle, see
                 `ReceiveImage.decode_further_frames`. All frames of the cycle are combined as in `safest`. START is not
                 evaluated in a cycle with further frames.

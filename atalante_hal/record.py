@@ -29,7 +29,7 @@ class Record:
 
     Args:
         codec: Codec of the 1 ms messages, whose values are a part of the record.
-        controller_fields: (name, length) of each field the controller records, see `types.Controller`.
+        controller_fields: Name and length of each field that the controller records, see `types.Controller`.
     """
 
     def __init__(self, codec: Codec, controller_fields: Sequence[tuple[str, int]]) -> None:

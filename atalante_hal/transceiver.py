@@ -156,9 +156,9 @@ class Transceiver:
             count: Number of frames already in `scratch`.
             cycle: Process image of the expected messages. With None, the call does not wait for messages.
             patience: Longest wait for the expected messages [s]. If the last batch, which contains the SYNC, was not sent, the
-                call waits at most 0.1 s. If no missing node has answered the previous n SYNCs, the call waits at most
-                `patience` / 2^n, or 0.1 s if this is longer. So in lock-step, a dead node does not cause the full wait in every
-                cycle before it times out.
+                call waits at most 0.1 s. If none of the missing nodes answered the previous n SYNCs, the call waits at
+                most `patience` / 2^n, or 0.1 s if this is longer. So in lock-step, a dead node does not cause the full
+                wait in every cycle before it times out.
 
         Returns:
             Number of frames now in `scratch`.

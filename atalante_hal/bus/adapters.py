@@ -48,9 +48,10 @@ class Adapter:
         setup: Shell command that sets the bit timing, for a backend that does not set it.
         stamps: Clock that gives the receive timestamps: the clock of the adapter (hardware), of the kernel, or of the
             process (software).
-        reports_can_fd: Whether `can.BusABC.protocol` of a bus that was opened for CAN FD is CAN FD. If False, `PythonCanBus`
-            does not check `protocol`, and relies on `can_fd`.
-        unusable: Reason why the interface cannot connect a HAL and a robot in two processes. Empty if it can.
+        reports_can_fd: Whether the backend reports CAN FD in `can.BusABC.protocol` after a bus was opened for CAN FD.
+            If False, `PythonCanBus` does not check `protocol`, and relies on `can_fd`.
+        unusable: Reason why the interface cannot connect a HAL and a robot in two processes. Empty if the interface
+            can.
         note: Further information for the operator.
         tried: Test that was run on this interface with this project.
         source: Where the facts come from.

@@ -8,23 +8,25 @@ holds the pose, and evaluates the motion.
 
 *Pulse.* The pulse has the shape of the second derivative of sin(pi x)^4. So a free inertia moves away and back, and is
 then at rest in its initial position. Its peak is `PEAK` times `breakaway`, which exceeds the dry friction. The joints
-of a group hardly move each other. Both legs are tested at the same time, with opposite pulses. So the encoder of the
-other leg moves against the torque, and exchanged encoders of both legs are noticed. The pulse moves the left joint
-towards the middle of its range. A joint near its end stop is the exception: this joint and the same joint of the other
-leg both move towards the middle. Then an exchange of their encoders may not be noticed.
+of a group hardly move each other. Both legs are tested at the same time, with opposite pulses. If the encoders of both
+legs are exchanged, each encoder moves against the torque of its joint, and the exchange is noticed. The pulse moves the
+left joint towards the middle of its range. A joint near its end stop is the exception: this joint and the same joint of
+the other leg both move towards the middle. Then an exchange of their encoders may not be noticed.
 
-*Pose.* A position control with a share of the drive's gains holds the pose, because the drives do not hold it in this time. With
-a wrong sign, this control pushes its joint away. A joint that moves by more than `TRAVEL` ends the start.
+*Pose.* A position control with a share of the drive's gains holds the pose, because the drives do not hold the pose
+during the test. With a wrong sign, this control pushes its joint away. A joint that moves by more than `TRAVEL` ends
+the start.
 
-*Result.* The mobility of a joint is the inverse of its effective inertia: the least-squares fit of the position by the double
-integral of the sent torque and a polynomial of time. A joint with a mobility of at least `MOBILITY` follows its torque. A
-mobility of at most -`MOBILITY` is a wrong sign. A joint between these limits does not follow its torque. A disturbance may
-spoil a test, so a joint fails only after `TRIALS` tests. The legs of a suspended robot whose drives are off sink onto their end
-stops within some seconds, and their weight presses joints onto them. So the pulse of a repeated test is `BOOST` times larger for
-a joint within the position tolerance of its limit. If its foot carries load, the joint may be blocked. A foot that only touches
-the floor hits it during the pulse, and the impact stops the ankle. An impact lasts one or two cycles, so it hardly changes the
-mean force. A joint whose foot carried load or hit the floor stays untested, and the next start tests it again. A joint that
-passed is not tested again until its drive restarts, because the wiring of a motor does not change while its drive is on.
+*Result.* The mobility of a joint is the inverse of its effective inertia: the least-squares fit of the position by the
+double integral of the sent torque and a polynomial of time. A joint with a mobility of at least `MOBILITY` follows its
+torque. A mobility of at most -`MOBILITY` shows a wrong sign. A joint between these limits does not follow its torque. A
+disturbance may spoil a test, so a joint fails only after `TRIALS` tests. The legs of a suspended robot whose drives are
+off sink onto their end stops within some seconds, and their weight presses joints onto them. So the pulse of a repeated
+test is `BOOST` times larger for a joint within the position tolerance of its limit. If the foot of a leg carries load,
+the joint may be blocked. A foot that only touches the floor hits the floor during the pulse, and the impact stops the
+ankle. An impact lasts one or two cycles, so it hardly changes the mean force. A joint whose foot carried load or hit
+the floor stays untested, and the next start tests it again. A joint that passed is not tested again until its drive
+restarts, because the wiring of a motor does not change while its drive is on.
 """
 
 from __future__ import annotations

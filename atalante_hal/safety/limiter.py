@@ -3,13 +3,13 @@
     requested torque -> derated torque limit, envelope of position and velocity -> torque rate -> torque sent
 
 *Envelope.* The limit of a torque that acts towards a position limit depends on the predicted position of the joint: the
-position after the time `look_ahead` at the current velocity. The torque limit is full while the predicted position is inside
-the position limit, and falls to zero over a distance of `position_margin` outside this limit. In the same way the limit of a
-torque in the direction of the velocity falls to zero between `velocity_max` and `velocity_max + velocity_margin`. A torque in
-the opposite direction brakes the joint and keeps the full limit. So the envelope never reverses a torque and never weakens
-braking. The envelope is not a controller: without braking a joint reaches its end stop. The end stop is at most
-`position_margin` outside the position limit. It must withstand the torque that presses a resting joint against it. A gait may
-use the full range.
+position after the time `look_ahead` at the current velocity. The torque limit is full while the predicted position is
+inside the position limit, and falls to zero over a distance of `position_margin` outside this limit. In the same way
+the limit of a torque in the direction of the velocity falls to zero between `velocity_max` and
+`velocity_max + velocity_margin`. A torque in the opposite direction brakes the joint and keeps the full limit. So the
+envelope never reverses a torque and never weakens braking. The envelope is not a controller: without braking a joint
+reaches its end stop. The end stop is at most `position_margin` outside the position limit. The end stop must withstand
+the torque of a joint that rests against it. A gait may use the full range.
 
 *Acceleration.* A light joint exceeds its velocity limit before a measured velocity shows it, because the torque changes
 at a finite rate and because a measurement is old. So the envelope also limits the predicted velocity. The joint reaches
@@ -200,8 +200,8 @@ def limit(
         limits: constant limits of the joints.
         torque_limit: current torque limit, shape (12,) [Nm].
         last: torque sent in the last cycle, shape (12,) [Nm]; overwritten with the torque to be sent in this cycle.
-        past: torques sent in the last `DELAY` cycles, newest first [Nm], then the velocity of the last cycle as reported and
-            without low-pass [rad/s], NaN if unknown. Shape (DELAY + 2, 12); updated.
+        past: torques sent in the last `DELAY` cycles, newest first [Nm], then two velocities of the last cycle [rad/s]:
+            as reported, and without the low-pass; NaN if unknown. Shape (DELAY + 2, 12); updated.
         cut: True for each joint whose torque differs from the requested torque, shape (12,); overwritten.
 
     Returns:

@@ -122,7 +122,8 @@ class MessageMonitor:
         Args:
             cycle: number of the current cycle.
             memory: fault memory in which diagnostics are raised.
-            tolerant: indices in SIDES of the legs in which a brief timeout of a joint ends the walk and not the motion.
+            tolerant: indices in SIDES of the legs in which a brief timeout of a joint leads to FINISH_STEP instead of
+                HOLD.
         """
         image = self._image
         checks, ages = image.check.tolist(), image.age.tolist()

@@ -2,8 +2,8 @@
 
 The suffix determines the format: `.log` (candump), `.asc`, `.blf`, `.log.gz` or `.asc.gz`. Each bus of the network is a channel.
 In `.log` and `.log.gz` the channel is the name of the bus (left_leg). In the other formats the channel is the number of the
-bus in the order of the DBC, starting at 1. Two logs of the same frames are identical in `.log` and in `.blf`. They differ in
-`.asc` and `.gz`, because such files contain the date of writing.
+bus in the order of the DBC, starting at 1. In `.log` and `.blf`, two logs of the same frames are identical. In `.asc`
+and `.gz`, they differ, because such files contain the date of writing.
 """
 
 from __future__ import annotations

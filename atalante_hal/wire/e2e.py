@@ -60,7 +60,7 @@ def crc(protected: bytes | memoryview, data_id: bytes) -> int:
     """Return the CRC of a frame.
 
     Args:
-        protected: payload after the CRC field, to its end.
+        protected: rest of the payload after the CRC field.
         data_id: result of `data_id_bytes`.
     """
     return crc_hqx(data_id, crc_hqx(protected, CRC_START))

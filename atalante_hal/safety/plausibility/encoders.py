@@ -17,7 +17,7 @@ confirmed.
 *Velocity.* The drive reports the encoder velocity after a low-pass with the cut-off frequency `velocity_bandwidth`. The check
 applies the same low-pass to the encoder positions. So the delay of the filter causes no difference, also in fast motions. The
 mean difference of two consecutive samples may exceed `velocity_error` for a few cycles, but not for `VELOCITY_SAMPLES` samples
-in a row. A late or lost frame changes the time between two positions, which the low-pass takes into account.
+in a row. A late or lost frame changes the time between two positions. The low-pass takes this time into account.
 """
 
 from __future__ import annotations
@@ -249,8 +249,8 @@ class EncoderChecks:
         Args:
             error: sum of the last two velocity deviations of each joint, which is twice their mean [rad/s, motor side].
             right: whether the deviation of each joint is within its limit.
-            compared: whether each joint was compared; None if all joints were. A joint that was not compared keeps its
-                count.
+            compared: whether each joint was compared; None if all joints were compared. A joint that was not compared
+                keeps its count.
         """
         self._wrong = [
             wrong if compared is not None and not compared[joint] else 0 if right[joint] else wrong + 1

@@ -3,8 +3,8 @@
 *Cell.* A sole is a rigid plate on four equal cells. Its load has three degrees of freedom: the force and two moments. So the
 two diagonals of the cells carry equal vertical forces: FL + RR = FR + RL, also where a cell is pulled. A fault of one cell
 changes the difference by the error of the cell. A difference above `cell_twist` for `CELL_CYCLES` is a fault. The faulty cell
-is known if it is the only cell with load, or the only cell without load. The module `stillness` detects a cell with an exactly
-constant reading sooner.
+is known if it is the only cell with load, or the only cell without load. A cell whose reading is exactly
+constant is detected earlier, by the module `stillness`.
 
 *Pull.* The floor cannot pull a foot. So the sum of cells that do not contradict each other cannot be below minus twice
 `cell_free` for `CELL_CYCLES`. This reveals cells that all have the wrong sign, as soon as the foot is on the ground, and a

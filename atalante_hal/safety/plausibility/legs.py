@@ -4,14 +4,14 @@ Four joints of a leg lie between the pelvis IMU and the tibia IMU: frontal, tran
 knee (FH, TH, SH, SK). At zero angles their axes are x, z, y and y. So the attitude of the tibia relative to the pelvis
 is Rx(FH) Rz(TH) Ry(SH + SK). The two IMUs give these three angles, and the four encoders must agree with them.
 
-*Drift.* An encoder that drifts at the rate `d` [rad/s] is detected `DRIFT_SAMPLES` samples after the time `attitude_error / d`. A
-drift of more than 0.035 rad/s is detected within 1000 cycles, and a slower drift takes longer. Some drifts cannot be
-detected, and some drifting encoders cannot be distinguished. The foot has no IMU, so a drift of SA or HA is detected only on
-the ground, by the module `soles`. Opposite drifts of SH and SK cancel and are not detected, and a drift of SH cannot be
-distinguished from a drift of SK. A drift of an IMU has the same effect as a drift of an encoder. The heading of an IMU without a
-fault also drifts, without a limit, but this affects only TH. The check of TH therefore estimates the heading drift and subtracts
-it. The estimate changes by at most `_HEADING_DRIFT` per sample. It also follows a drift of the encoder of TH that is slower than
-this, so such a drift is not detected.
+*Drift.* An encoder that drifts at the rate `d` [rad/s] is detected `DRIFT_SAMPLES` samples after the time
+`attitude_error / d`. A drift of more than 0.035 rad/s is detected within 1000 cycles, and a slower drift takes longer.
+Some drifts cannot be detected, and some drifting encoders cannot be distinguished. The foot has no IMU, so a drift of
+SA or HA is detected only on the ground, by the module `soles`. Opposite drifts of SH and SK cancel and are not
+detected, and a drift of SH cannot be distinguished from a drift of SK. A drift of an IMU has the same effect as a drift
+of an encoder. The heading of an IMU without a fault also drifts, without a limit, but this affects only TH. The check
+of TH therefore subtracts an estimate of the heading drift. The estimate changes by at most `_HEADING_DRIFT` per sample.
+The estimate also follows a slower drift of the encoder of TH, so such a drift is not detected.
 
 *Standstill.* While the reading of an encoder is constant and its joint is at rest, the difference between encoders and
 IMUs about the axis of the joint is also constant. If the joint moves while its encoder is stuck, this difference changes by

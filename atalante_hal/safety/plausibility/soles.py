@@ -110,7 +110,8 @@ def sole_tilt(tibia: Sequence[float], sa: float, ha: float, toe_out: float) -> t
         toe_out: rotation of the foot about the vertical axis of the tibia, positive to the left [rad].
 
     Returns:
-        Component along the foot, about the angle error of SA, and component across the foot, each in the range -1 to 1.
+        Component along the foot and component across the foot, each from -1 to 1. The first component is approximately
+        the angle error of SA in rad.
     """
     w, i, j, k = tibia
     # Upward direction in the axes of the tibia.

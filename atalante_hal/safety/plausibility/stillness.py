@@ -10,9 +10,10 @@ more than twice the dry friction of the joint. Second, the joint is not at its e
 any torque. A stuck encoder of a joint without torque is not detected here until the joint is driven. The module `legs` detects
 some of these encoders with the IMUs.
 
-*Ankles.* The ankles of a foot on the ground move the whole robot, whose inertia is some thousand times that of the foot. A torque
-that varies fast then does not move them. But the sole is at rest, so an ankle moves when its shank turns. For an ankle with a
-loaded foot, the first condition is therefore that the shank has turned by `_TURN` since the reading last changed.
+*Ankles.* The ankles of a foot on the ground move the whole robot, whose inertia is some thousand times that of the
+foot. A torque that varies fast then does not move the ankles. But the sole is at rest, so an ankle moves when its shank
+turns. For an ankle with a loaded foot, the first condition is therefore that the shank has turned by `_TURN` since the
+reading last changed.
 
 *Large torque.* A controller that drives a joint with a stuck encoder accelerates the joint by a large torque within a few
 cycles. So the larger the torque, the sooner a constant reading is reported. A joint whose reading has been

@@ -9,7 +9,7 @@ other leg. If the other leg carries clearly more for `WEIGHT_CYCLES`, the two fe
 weight is first shifted, before the first step. Both feet are then on the ground, so the robot can hold.
 
 The height of a foot above the other one is computed with the mean length of thigh and shank. Legs of other lengths, the ankles
-and the attitude errors change it by a small part of `_HEIGHT`.
+and the attitude errors change the computed height by a small part of `_HEIGHT`.
 """
 
 from __future__ import annotations
@@ -69,8 +69,8 @@ class Support:
         """Compare the load on both feet with the posture.
 
         Args:
-            ages: ages of the sensor values. Without new values of all these sensors, the load is not compared. None if all values
-                are of this cycle.
+            ages: ages of the sensor values. The load is compared only if all these sensors have new values. None if all
+                values are of this cycle.
 
         Returns:
             Whether a load is implausible.
