@@ -32,8 +32,9 @@ _FLOAT_BITS = (16, 32, 64)
 _E2E_HEADER = {"Crc": (0, 16), "Counter": (16, 8)}
 #: Values of GenMsgSendType for cyclic messages, in lower case. The empty text stands for a missing GenMsgSendType.
 _CYCLIC = ("", "cyclic", "cyclicx", "periodic", "fixedperiodic", "fixed_periodic")
-# J1939: an identifier with a PDU format below _PDU2 contains a destination address, which is not part of the parameter group.
-# _PGN_PEER is the mask of the group in identifiers with a destination address, _PGN_BROADCAST in all other identifiers.
+# J1939: an identifier with a PDU format below `_PDU2` contains a destination address, which is not part of the
+# parameter group. `_PGN_PEER` is the mask of the parameter group in these identifiers. `_PGN_BROADCAST` is the mask in
+# all other identifiers.
 _PGN_PEER, _PGN_BROADCAST, _PDU2 = 0x03FF0000, 0x03FFFF00, 240
 _QUOTED = re.compile(r'"[^"]*"')
 _WRITTEN = re.compile(r"\bBO_\s+(\d+)\s+(\w+)\s*:|\bSG_\s+(\w+)\s+(M|m\d+M?)?\s*:")

@@ -29,7 +29,8 @@ def load(path: Path | None = None) -> Network:
     """Load and check a DBC file.
 
     Args:
-        path: DBC file. With None, the network of the robot is returned. It is cached on disk, and read once per process.
+        path: DBC file. With None, the network of the robot is returned. This network is cached on disk, and read once
+            per process.
 
     Raises:
         DbcError: If the file cannot be parsed or violates a rule, see `atalante_dbc.parser`.

@@ -28,7 +28,8 @@ class Senders:
 
         Args:
             frames: all frames received in the cycle, in the order of reception, shape (n,). Other messages are ignored.
-            cycle: number of the cycle. If the previous call was not in the previous cycle, its frames are not compared.
+            cycle: number of the cycle. The frames are compared with the frames of the previous call only if that call
+                was in the previous cycle.
         """
         if self._last_cycle != cycle - 1:
             self._last = None

@@ -22,7 +22,8 @@ DELAY: Final = 2.0
 #: Stiffness and damping of the sling per kg of the robot. The weight of the robot stretches the sling by 25 mm.
 STIFFNESS: Final = 400.0  # N/m per kg
 DAMPING: Final = 28.0  # N s/m per kg
-#: The sling turns the pelvis upright: rotational stiffness and damping per kg of the robot, at full weight on the sling.
+#: Rotational stiffness and damping with which the sling turns the pelvis upright, per kg of the robot, with the full
+#: weight on the sling.
 RIGHTING: Final = 100.0  # Nm/rad per kg
 ATTITUDE_DAMPING: Final = 1.5  # Nm s/rad per kg
 #: Slack of the sling at which lowering ends [m]. The pelvis of a walking robot rises by less, so the sling stays slack.

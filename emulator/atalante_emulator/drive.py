@@ -7,8 +7,8 @@ The drives are the last safety layer. They react to errors without the HAL, in o
 
 - Local hold. Causes: the last valid command is `WATCHDOG` cycles old, no SYNC for `WATCHDOG` cycles, two senders of one
   command, low supply voltage. The drive stays in QUICK STOP ACTIVE until the HAL acknowledges the hold, and its motor holds the
-  present position of its own encoder. If the encoder jumps during the hold, the setpoint jumps with it, so the joint does not
-  move.
+  present position of its own encoder. If the encoder jumps during the hold, the setpoint jumps by the same angle, so
+  the joint does not move.
 - Lowering. Causes: over-temperature, over-current, encoder error. The drive cannot hold the joint. It enters FAULT REACTION
   ACTIVE and then FAULT. The power stage is off, and the brake lets the joint sink slowly. The same brake acts in every drive
   whose power stage is off, so the HAL can lower a joint with DISABLE_VOLTAGE.
@@ -30,9 +30,9 @@ from atalante_hal.robot import JOINTS, LEG_JOINTS, SIDES, Robot
 from atalante_hal.types import PERIOD, Vector
 from atalante_hal.wire.cia402 import AUTOMATIC, Controlword, DriveState, next_state
 
-#: Timeout of the commands, and of SYNC [cycles]. At a timeout, an enabled drive starts its local hold.
+#: Timeout of the commands and of SYNC [cycles]. At a timeout, an enabled drive starts its local hold.
 WATCHDOG: Final = 5
-#: Period of the temperature update, and of the check whether lowered joints are at rest [cycles].
+#: Period of two tasks [cycles]: update of the temperatures, and check whether lowered joints are at rest.
 SLOW_CYCLES: Final = 100
 #: Names of the drive nodes, in the order of JOINTS.
 NODES: Final = tuple(joint.upper() for joint in JOINTS)
@@ -115,7 +115,8 @@ class Drives:
         self.encoders = Encoders(robot, parameters.velocity_bandwidth, signals.position, signals.velocity)
         self.motors = Motors(robot, parameters.motor, signals.torque, signals.temperature)
         self._slow_phase = 0
-        #: The last evaluated controlwords, if they changed nothing; equal controlwords are not evaluated again. Empty otherwise.
+        #: Last evaluated controlwords if this evaluation changed nothing, else empty. Equal controlwords are not
+        #: evaluated again.
         self._steady = b""
         self._hold_at = np.zeros(len(JOINTS))  # setpoint of the local hold of each drive [rad]
         self._target, self._limit = np.zeros((2, len(JOINTS)))
@@ -145,7 +146,7 @@ class Drives:
     ) -> None:
         """Latch the last valid command and run the watchdog and the state machines.
 
-        Every call of `drive` reads the arrays `target` and `limit` until the next command.
+        Until the next command, every call of `drive` reads the arrays `target` and `limit`.
 
         Args:
             fresh: per leg, whether a valid new command arrived since the last cycle.
@@ -172,7 +173,7 @@ class Drives:
         """Return the joint torques of the next `PERIOD`.
 
         Args:
-            velocity: true joint velocities, shape (12,) [rad/s]. The friction depends on them.
+            velocity: true joint velocities, shape (12,) [rad/s]. The friction depends on these velocities.
 
         Returns:
             Joint torques, shape (12,) [Nm].
@@ -348,7 +349,7 @@ class Drives:
             self._steady = words
 
     def _apply_controlword(self, drive: int, word: int) -> bool:
-        """Apply a controlword to a drive. Return whether it changed the drive state or acknowledged an error."""
+        """Apply a controlword to a drive. Return whether the word changed the drive state or acknowledged an error."""
         state, latched = self.state[drive], self.latched[drive]
         after = next_state(state, word, latched=latched)
         if self.errors.any_persists(drive) and (state is DriveState.FAULT or after is DriveState.OPERATION_ENABLED):

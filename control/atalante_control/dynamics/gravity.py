@@ -2,8 +2,8 @@
 
 Statics of a tree of links, as in the recursive Newton-Euler algorithm (Featherstone, Rigid Body Dynamics Algorithms, 5.3). The
 outward pass computes the direction of gravity in each link. The inward pass starts at the feet and sums the forces and moments
-that hold the links. The joint torque is the component of this moment about the joint axis. The tree of links comes from the
-Pinocchio model, which is also the reference in the tests.
+that hold the links. The joint torque is the component of the summed moment about the joint axis. The tree of links
+comes from the Pinocchio model, which is also the reference in the tests.
 """
 
 from __future__ import annotations
@@ -39,14 +39,14 @@ class LinkRecord:
     rotation: Annotated[Vector, (3, 3)]  # rotation matrix from link to parent
     down: Annotated[Vector, 3]  # m/s2, gravitational acceleration
     force: Annotated[Vector, 3]  # N, force that holds the link and its descendants
-    moment: Annotated[Vector, 3]  # Nm, moment that holds the link and its descendants, about the joint
+    moment: Annotated[Vector, 3]  # Nm, moment about the joint; `force` and `moment` hold the link and its descendants
 
 
 class Gravity:
     """Gravity torques u_g of the empty exoskeleton, suspended at the pelvis.
 
     Attributes:
-        links: records of the pelvis and all links for `hold`, each parent before its children.
+        links: records for `hold`: first the pelvis, then the other links, each after its parent.
     """
 
     def __init__(self, articulated: ArticulatedModel) -> None:
@@ -67,7 +67,7 @@ class Gravity:
             pelvis: attitude measured by the pelvis IMU, unit quaternion wxyz, pelvis to world.
 
         Returns:
-            Torques, shape (12,) [Nm], overwritten by the next call.
+            Torques, shape (12,) [Nm]. The next call overwrites this array.
         """
         w, x, y, z = pelvis
         self._hold(self.links, position, (w, x, y, z), self._torque)

@@ -3,14 +3,15 @@
 `gait (solver or network) -> torques of the gait -> feedforward u_f of the gait file`. The stance sole is flat on the ground and
 at rest.
 
-The model has a floating pelvis. Its motion follows from the joint motion, because the stance foot does not move: if V is the
-twist of the foot in the pelvis frame, the twist of the pelvis is -V. One recursive Newton-Euler pass gives the wrench f on the
-floating pelvis. Only the ground can apply this wrench, so the ground wrench is f. The joint torques are the torques of this pass
-minus J^T f, where J is the Jacobian of the foot in the pelvis frame. This solves the equation of motion of the pelvis exactly.
+The pelvis of the model floats. The stance foot does not move, so the joint motion determines the motion of the pelvis:
+if V is the twist of the foot in the pelvis frame, the twist of the pelvis is -V. One recursive Newton-Euler pass gives
+the wrench f on the floating pelvis. Only the ground can apply this wrench, so the ground wrench is f. The joint torques
+are the torques of this pass minus J^T f, where J is the Jacobian of the foot in the pelvis frame. The result satisfies
+the equation of motion of the pelvis exactly.
 
-The torque of a gait is the sum u_g + u_f. The gravity torque u_g is that of the *empty* exoskeleton suspended at its pelvis. The
-controller adds u_g in every cycle (joint idealization). The feedforward u_f in the gait file is the remainder: the weight of the
-patient, the load of standing on one leg, and the inertia.
+The torque of a gait is the sum u_g + u_f. u_g is the gravity torque of the *empty* exoskeleton suspended at its pelvis.
+The controller adds u_g in every cycle (joint idealization). The feedforward u_f in the gait file is the remainder: the
+weight of the patient, the load of standing on one leg, and the inertia.
 """
 
 from __future__ import annotations
@@ -28,7 +29,7 @@ from atalante_hal.types import Vector
 
 #: Names of the links of stance foot and swing foot in the right-stance step of a `Gait`.
 STANCE_FOOT, SWING_FOOT = (f"{side}_{LEG_LINKS['HA']}" for side in reversed(SIDES))
-#: Number of samples of a step to which the control points of the feedforward are fitted.
+#: Number of samples per step. The control points of the feedforward are fitted to these samples.
 _SAMPLES = 33
 
 

@@ -18,7 +18,7 @@ from atalante_control.model import ArticulatedModel, ExoskeletonParameters, pino
 from atalante_hal.robot import JOINTS, Robot
 from atalante_hal.types import Vector
 
-_SAMPLES = 33  # number of samples of a step to which the control points are fitted
+_SAMPLES = 33  # number of samples per step for the fit of the control points
 _SAGITTAL_ANKLES = np.array([float(joint.endswith("_SA")) for joint in JOINTS])
 _LEVEL = (1.0, 0.0, 0.0, 0.0)  # attitude of a level pelvis, unit quaternion wxyz
 
@@ -41,8 +41,8 @@ def check_suspended(
 ) -> None:
     """Raise `GaitError` if the suspended exoskeleton would exceed a limit while it follows a gait.
 
-    The torque limits apply to the sum of feedforward u_f and gravity torque u_g with a level pelvis. A gait without u_f gets the
-    u_f of `suspended_gait`.
+    The torque limits apply to the sum of feedforward u_f and gravity torque u_g. The gravity torque is computed for a
+    level pelvis. A gait without u_f gets the u_f of `suspended_gait`.
 
     Args:
         gait: right-stance step that repeats, of any source.

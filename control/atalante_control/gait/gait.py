@@ -34,7 +34,7 @@ SIGN = np.array(MIRROR_SIGN * len(SIDES), dtype=np.float64)
 POSITION_JUMP = math.radians(0.1)  # rad, largest accepted jump of a joint angle between two motions
 VELOCITY_JUMP = 0.05  # rad/s, largest accepted jump of a joint speed between two motions
 DURATION_RANGE = (0.3, 3.0)  # s, shortest and longest step
-ROUNDING = 1e-9  # rad, rad/s or Nm, tolerance of the limit checks for rounding errors
+ROUNDING = 1e-9  # rad, rad/s or Nm, tolerance for rounding errors in the limit checks
 
 _REQUIRED = ("format", "name", "duration", "joints")
 _OPTIONAL = ("feedforward", "parameters", "solver")
@@ -48,7 +48,7 @@ class GaitError(ValueError):
 
 @dataclass(frozen=True)
 class StepTables:
-    """Step sampled in every control cycle from 0 to T inclusive. The arrays have shape (N + 1, 12) and are read-only."""
+    """Samples of a step, one per control cycle from 0 to T. The arrays have shape (N + 1, 12) and are read-only."""
 
     q: Vector  # rad
     qd: Vector  # rad/s
@@ -64,7 +64,7 @@ class Gait:
     duration: float  # s, T
     coefficients: Vector  # (12, 8) rad, Bezier control points in the order of JOINTS
     feedforward: Vector | None = None  # (12, 8) Nm, Bezier control points of the feedforward u_f, without gravity
-    parameters: Mapping[str, float] = field(default_factory=dict)  # parameters of patient and step by name
+    parameters: Mapping[str, float] = field(default_factory=dict)  # name -> parameter of patient or step
     solver: Mapping[str, Any] = field(default_factory=dict)  # report of the solver, for information only
 
     @property
@@ -177,16 +177,17 @@ def load_gait(path: Path, robot: Robot) -> Gait:
     """Read a gait file (JSON) and check it against the limits of the robot.
 
     Required keys: `format` ("atalante-gait/1"), `name`, `duration` [s], and `joints` with 8 Bezier control points [rad] of the
-    right-stance step for each of JOINTS. Optional keys: `feedforward` with 8 control points [Nm] for each of JOINTS, without
-    gravity; `parameters`, an object of numbers; `solver`, any object.
+    right-stance step for each of JOINTS. Optional keys: `feedforward` (torque without gravity) with 8 control points
+    [Nm] for each of JOINTS; `parameters`, an object of numbers; `solver`, any object.
 
     Args:
         path: path of the gait file.
         robot: limits of the joints.
 
     Raises:
-        GaitError: If a key is unknown, missing or malformed, if a value is not finite, if the discontinuity at the stance change
-            exceeds 0.1 degrees or 0.05 rad/s, or if a position, speed or feedforward exceeds a limit of the robot.
+        GaitError: If a key is unknown, missing or malformed, if a value is not finite, if an angle jumps by more than
+            0.1 degrees or a speed by more than 0.05 rad/s at the stance change, or if a position, speed or feedforward
+            exceeds a limit of the robot.
     """
     gait = gait_from(read_object(path), str(path))
     check_gait(gait, robot, str(path))
@@ -294,7 +295,7 @@ def check_gait(
     Angles, speeds and torques are compared with their limits in every cycle and at every extremum between cycles.
 
     Args:
-        gait: gait to check; its left-stance step is checked too.
+        gait: gait to check; the left-stance step of the gait is checked too.
         robot: limits of the joints.
         where: start of the error message, for example the name of the file.
         gravity: function from a pose (12,) [rad] to the torque (12,) [Nm] that the controller adds to the feedforward. The torque
@@ -316,7 +317,7 @@ def check_jump(end: tuple[Vector, Vector], start: tuple[Vector, Vector], where: 
         end: angles [rad] and speeds [rad/s] of the joints at the end of the first motion, each of shape (12,).
         start: angles [rad] and speeds [rad/s] of the joints at the start of the second motion, each of shape (12,).
         where: start of the error message, for example the name of the file.
-        instant: words for the error message that state where the motions meet, such as "at the stance change".
+        instant: part of the error message that states where the motions meet, such as "at the stance change".
 
     Raises:
         GaitError: If a jump exceeds `POSITION_JUMP` or `VELOCITY_JUMP`. The message states the joint with the largest jump.
@@ -340,7 +341,7 @@ def check_step(
     """Raise `GaitError` if a step is malformed or beyond a limit of the robot. Continuity is not checked.
 
     Args:
-        gait: step to check; its left-stance step is checked too.
+        gait: step to check; the mirrored step is checked too.
         robot: limits of the joints.
         where: start of the error message, as in `check_gait`.
         gravity: gravity torques, as in `check_gait`.
@@ -472,7 +473,7 @@ def _read_only(array: Vector) -> Vector:
 
 
 def step_over(cycle: int, cycles: int) -> bool:
-    """Return whether a step is over because its nominal duration has passed.
+    """Return whether the nominal duration of a step has passed.
 
     Args:
         cycle: cycles since the stance change.

@@ -1,9 +1,9 @@
 """Re-centring ("deadbeat" in the paper): a cubic that leads from the pose at a stance change to the nominal trajectory.
 
 `stance change -> (q - q_nom, q' - q_nom') -> s(t) -> q_des(t) = q_nom(t) + s(t)`. The tracking error is exactly zero at the step
-change. After the fraction alpha of the step duration T, the desired trajectory is the nominal trajectory. s is linear in
-the deviations: `s(t) = s(0) c0(t) + s'(0) c1(t)`. The guide filter can therefore compute the responses to the basis cubics c0
-and c1 in advance.
+change. At the time alpha T after the stance change, the desired trajectory reaches the nominal trajectory (T is the
+step duration). s is linear in the deviations: `s(t) = s(0) c0(t) + s'(0) c1(t)`. The guide filter can therefore compute
+the responses to the basis cubics c0 and c1 in advance.
 
 The paper calls this polynomial a deadbeat. It is a reference trajectory, not a finite-time (deadbeat) control law.
 """
@@ -48,13 +48,14 @@ class Deadbeat:
         return np.array([[1.0, 0.0, -3.0, 2.0], [0.0, self.end, -2.0 * self.end, self.end]])
 
     def basis(self, time: Vector) -> tuple[Vector, Vector, Vector]:
-        """Return c0 and c1 with their first and second time derivatives. All of them are zero after the time alpha T.
+        """Return c0 and c1 with their first and second time derivatives. After the time alpha T all values are zero.
 
         Args:
             time: time since the stance change, shape (n,) [s], at least 0.
 
         Returns:
-            Three arrays of shape (2, n), rows c0 and c1. Units of c0 are 1, 1/s, 1/s2; units of c1 are s, 1, 1/s.
+            Values, first derivatives and second derivatives, each of shape (2, n). Row 0 is for c0 [1, 1/s, 1/s2], row
+            1 for c1 [s, 1, 1/s].
         """
         x = time / self.end
         inside = x < 1.0

@@ -69,7 +69,7 @@ def patient_of(parameters: Mapping[str, float]) -> Patient:
     """Return the patient of a gait.
 
     Args:
-        parameters: parameters of the gait. The leg lengths may be missing, the patient then has those of Winter's table.
+        parameters: parameters of the gait. If leg lengths are missing, the leg lengths of Winter's table are used.
 
     Raises:
         KeyError: If mass or height is missing.

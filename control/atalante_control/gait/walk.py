@@ -35,9 +35,9 @@ DEFAULT_WALK = Path(__file__).parents[1] / "gaits" / "walk.json"
 class WalkGaits(NamedTuple):
     """Right-stance steps of a walk. The mirrored steps are the left-stance steps."""
 
-    start: Gait  # begins at rest with the weight on the right foot, and ends as the periodic step ends
+    start: Gait  # begins at rest with the weight on the right foot; has the same end as the periodic step
     step: Gait  # periodic step
-    stop: Gait  # begins as the periodic step begins, and ends at rest with the weight on the stance foot
+    stop: Gait  # has the same start as the periodic step; ends at rest with the weight on the stance foot
 
     @property
     def hash32(self) -> int:

@@ -1,6 +1,6 @@
 """Gait optimization: a nonlinear program computes each step (partial hybrid zero dynamics).
 
 `links -> symbolic dynamics (CasADi) -> step problem (NLP, built once) -> solve (IPOPT) -> Gait`. `verify` checks the gait
-independently with Pinocchio. This package does not run on the robot. No other package imports CasADi, which the pip
-extra `gaits` installs.
+independently with Pinocchio. This package does not run on the robot. No other package imports CasADi. The pip extra
+`gaits` installs CasADi.
 """

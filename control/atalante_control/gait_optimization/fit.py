@@ -1,15 +1,16 @@
 """Fit of the gait network to a library of gaits: `gaits -> principal directions -> perceptron -> GaitNetwork`.
 
-The 96 control points depend on each other, so the perceptron does not learn them directly. It learns the coordinates along the
-few directions in which the library varies. The last layer includes the linear map from these coordinates to the control points.
+The 96 control points depend on each other, so the perceptron does not learn them directly. The perceptron learns the
+coordinates along the few directions in which the library varies. The last layer includes the linear map from these
+coordinates to the control points.
 
 1. *Periodic gaits.* The angles are exactly continuous at the stance change, which leaves 84 dimensions. The speeds jump slightly
-   at the impact. The fit keeps the fraction `JUMP_KEPT` of this jump, as a compromise between a smooth walk and the accelerations
-   of the solved gait.
+   at the impact. The fit keeps the fraction `JUMP_KEPT` of this speed jump. A smaller fraction gives a smoother walk, a
+   larger fraction keeps the accelerations closer to the solved gait.
 2. *Weighted errors.* The distance between two gaits is the deviation of their angles and accelerations along the step. The
    accelerations determine the feedforward. The ends of the step have a larger weight, because the foot lands there. The
-   perceptron learns the principal directions of the library in this metric. The least important directions are omitted: as many
-   as together cause an rms error of at most `RESOLUTION`.
+   perceptron learns the principal directions of the library in this metric. The least important directions are omitted.
+   Together they cause an rms error of at most `RESOLUTION`.
 """
 
 from __future__ import annotations
@@ -33,16 +34,16 @@ from atalante_hal.types import Vector
 
 HIDDEN = (64, 64)
 ITERATIONS = 1500  # largest number of L-BFGS iterations
-RESOLUTION = math.radians(0.003)  # rad, largest rms error caused by the principal directions that are left out
+RESOLUTION = math.radians(0.003)  # rad, largest rms error caused by the omitted principal directions
 JUMP_KEPT = 0.4  # the fit keeps this fraction of the speed jump that each gait has at the stance change
 END_WEIGHT = 40.0  # weight of the samples at start and end of a step; the other samples have weight 1
 ACCELERATION_WEIGHT = 5e-2  # s2, weight of an acceleration error [rad/s2] relative to an angle error [rad]
 #: Root mean square of the learnt coordinates after scaling. L-BFGS stops if an iteration reduces the squared error by less than
 #: 2e-9. For coordinates of size 1 this is too early.
 TARGET_SIZE = 10.0
-ALPHA = 1e-5  # penalty on the squared weights of the network; it smooths the gaits between the grid points
+ALPHA = 1e-5  # penalty on the squared weights of the network; the penalty smooths the gaits between the grid points
 SEED = 1  # seed of the initial weights
-_SAMPLES = 41  # number of samples of a step at which two gaits are compared
+_SAMPLES = 41  # number of samples per step in the comparison of two gaits
 
 
 class Fit(NamedTuple):
@@ -59,7 +60,7 @@ def fit(gaits: Sequence[Gait], grid: Grid, *, hidden: Sequence[int] = HIDDEN, it
 
     Args:
         gaits: gaits with the parameters of their subjects.
-        grid: grid of the library; its smallest and largest levels become the range of the network.
+        grid: grid of the library; the smallest and largest grid levels become the range of the network.
         hidden: number of neurons of each hidden layer.
         iterations: largest number of L-BFGS iterations.
     """

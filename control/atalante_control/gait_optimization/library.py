@@ -1,12 +1,13 @@
-"""Library of gaits for points of a grid of subjects, solved in parallel. An interrupted computation can be resumed.
+"""Library of gaits, solved in parallel, one per subject on a grid. An interrupted computation can be resumed.
 
-`Grid, solve -> one file for each gait`. `atalante_control.gait_optimization.fit` reads the files. No gait is solved from the gait
-of another patient, so a gait depends only on the parameters of its own subject. Other gaits, the number of processes and
-interruptions have no effect. The small error of the fit shows that the optimiser finds similar local minima for similar
-subjects. Failures are recorded in files.
+`Grid, solve -> one file for each gait`. `atalante_control.gait_optimization.fit` reads the files. The gait of another
+patient is never the initial guess. A gait therefore depends only on the parameters of its own subject. Other gaits, the
+number of processes and interruptions have no effect. The small error of the fit shows that the optimiser finds similar
+local minima for similar subjects. Failures are recorded in files.
 
-A file counts as a solved gait only if its content has the stored checksum, the parameters of its subject, the status `solved` and
-the version of the code that is installed. Any other file is rejected with a reason, and its gait is solved again.
+A file counts as a solved gait only if four conditions hold: the content matches the stored checksum, the parameters
+match the subject, the status is `solved`, and the stored code version is the installed version. Any other file is
+rejected with a reason, and its gait is solved again.
 """
 
 from __future__ import annotations
@@ -33,7 +34,7 @@ from atalante_control.gait_optimization.verify import Verifier
 from atalante_hal.robot import Robot, load_robot
 
 FORMAT = "atalante-library/2"
-_ROOT_ITERATIONS = 60  # number of fixed-point iterations after which the root of the sequence is exact to rounding
+_ROOT_ITERATIONS = 60  # number of fixed-point iterations; the root of the sequence is then exact except for rounding
 LEVELS_MIN = 3  # smallest number of grid levels of a parameter; a network fitted to 2 levels has an error of 10 degrees
 
 Index = tuple[int, ...]
@@ -107,7 +108,8 @@ class Grid:
         shape = np.array(self.shape)
         if math.prod(self.shape) <= self.size:
             return list(product(*map(range, self.shape)))
-        # Additive recurrence with the powers of the root g of g^(d + 1) = g + 1, the golden ratio for d = 1.
+        # Additive recurrence: its constants are powers of the root g of g^(d + 1) = g + 1. For d = 1, g is the golden
+        # ratio.
         root = 2.0
         for _ in range(_ROOT_ITERATIONS):
             root = (1.0 + root) ** (1.0 / (len(shape) + 1))
@@ -157,14 +159,14 @@ class Library:
         self.grid = grid or found or Grid()
 
     def gait(self, index: Index) -> Gait | None:
-        """Return the gait of a point of the grid, or None if there is no file. The limits of the robot are not checked here.
+        """Return the gait of a grid point, or None if there is no file. The limits of the robot are not checked here.
 
         Args:
             index: index of the level of each parameter.
 
         Raises:
-            GaitError: If the file is not valid, has another content than was written, or was made for another subject or by
-                another version of the code.
+            GaitError: If the file is not valid, if its content was changed after writing, or if it was made for another
+                subject or by another version of the code.
         """
         path = self._path("gaits", index)
         if not path.exists():
@@ -228,7 +230,7 @@ class Library:
             solve: function that solves one gait, defined at module level.
             jobs: number of processes on this computer.
             cluster: address of a dask scheduler; its workers are used instead of processes on this computer.
-            on_lost: function that receives a message when a process has ended unexpectedly, see `fan_out`.
+            on_lost: function called with a message when a process has ended unexpectedly, see `fan_out`.
 
         Raises:
             FanOutError: If the calls cannot be distributed, see `fan_out`. If processes ended unexpectedly, the gaits without a
@@ -282,7 +284,7 @@ class Library:
 
 
 def solve_subject(subject: Subject) -> SolvedGait:
-    """Solve the gait of a subject, and verify it with Pinocchio. After a failure there is a second start.
+    """Solve the gait of a subject, and verify it with Pinocchio. If the solver fails, it starts a second time.
 
     Args:
         subject: patient and step parameters.
@@ -291,7 +293,7 @@ def solve_subject(subject: Subject) -> SolvedGait:
 
 
 def solve_compiled(subject: Subject) -> SolvedGait:
-    """Solve and verify the gait of a subject with compiled functions. The result is the same as that of `solve_subject`.
+    """Solve and verify the gait of a subject with compiled functions. The result is the same as with `solve_subject`.
 
     The functions are compiled once per computer. The computation of a gait then takes half the time.
 

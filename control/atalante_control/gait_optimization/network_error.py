@@ -1,7 +1,7 @@
 """Error of the gait network: deviations from solved gaits of the same subjects, and the limits of these deviations.
 
-`GaitNetwork, newly solved gaits -> one Deviation per subject -> findings against the limits`. The subjects are not on the grid
-of the library, because the fit is always good on the grid.
+`GaitNetwork, newly solved gaits -> one Deviation per subject -> findings against the limits`. The subjects lie between
+the grid points of the library, because the fit is always good at the grid points.
 """
 
 from __future__ import annotations
@@ -25,8 +25,8 @@ class Deviation(NamedTuple):
     """Deviation of the gait of the network from the solved gait, for one subject."""
 
     angles: Vector  # (n, 12) rad, absolute deviation of the joint angles along the step
-    landing_position: float  # m, deviation of the position of the swing foot in the stance foot frame, at the landing
-    landing_attitude: float  # rad, deviation of the attitude of the swing foot in the stance foot frame, at the landing
+    landing_position: float  # m, position deviation of the swing foot at the landing, in the stance foot frame
+    landing_attitude: float  # rad, attitude deviation of the swing foot at the landing, in the stance foot frame
     position_defect: float  # rad, largest jump of a joint angle at the stance change
     speed_defect: float  # rad/s, largest jump of a joint speed at the stance change
     feedforward: float  # rms of the feedforward difference, relative to the rms of the solved feedforward
@@ -34,7 +34,7 @@ class Deviation(NamedTuple):
 
 
 class Finding(NamedTuple):
-    """Line of the report: one error with its limit."""
+    """One error with its limit, a line of the report."""
 
     name: str
     value: float

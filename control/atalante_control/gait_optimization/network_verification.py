@@ -1,7 +1,8 @@
 """Verification of the gaits of the gait network: `GaitNetwork, random subjects -> checks of each gait -> worst value per check`.
 
-No gait is solved. The checks are those of a solved gait, at the samples of `Verifier`, between the nodes of the optimiser too.
-Only the tolerances differ: the network meets the equality constraints of the optimiser approximately.
+No gait is solved. A gait of the network gets the same checks as a solved gait, at all samples of `Verifier`. These
+samples also lie between the nodes of the optimiser. Only the tolerances differ: the gaits of the network satisfy the
+equality constraints of the optimiser approximately.
 """
 
 from __future__ import annotations
@@ -17,7 +18,7 @@ from atalante_hal.robot import Robot
 
 
 class WorstCheck(NamedTuple):
-    """Line of the report: the largest value of one check over all gaits, and the number of gaits that fail the check."""
+    """Line of the report: largest value of one check over all gaits, and number of gaits that fail this check."""
 
     name: str
     value: float

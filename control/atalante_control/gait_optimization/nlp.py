@@ -54,7 +54,7 @@ NAMES = ("nlp_f", "nlp_g", "nlp_grad_f", "nlp_jac_g", "nlp_hess_l")
 
 
 class _Block(NamedTuple):
-    """Expression that is repeated for several groups of unknowns. It is a cost if it has weights, else a constraint."""
+    """Expression that is repeated for several groups of unknowns: a cost if it has weights, else a constraint."""
 
     expression: Symbol  # SX
     x: Symbol  # SX symbols of the unknowns of one repetition, shape (n,)
@@ -177,7 +177,7 @@ class NonlinearProgram:
 
 
 class _Entries(NamedTuple):
-    """Function that returns the nonzero entries of a sparse matrix, and the row and column of each entry."""
+    """Function for the nonzero entries of a sparse matrix, with the row and column of each entry."""
 
     function: Any  # casadi.Function
     rows: Indices  # row index of each entry
@@ -185,7 +185,7 @@ class _Entries(NamedTuple):
 
 
 def _derivatives(block: _Block, p: Symbol) -> tuple[Any, _Entries, _Entries]:
-    """Return functions for the expression, its Jacobian, and the upper triangle of its Hessian weighted with multipliers."""
+    """Return three functions: expression, Jacobian, and upper triangle of the Hessian weighted with multipliers."""
     lam = casadi.SX.sym("lam", block.expression.shape[0])
     slopes = casadi.jacobian(block.expression, block.x)
     curvature = casadi.triu(casadi.hessian(casadi.dot(lam, block.expression), block.x)[0])
@@ -195,7 +195,8 @@ def _derivatives(block: _Block, p: Symbol) -> tuple[Any, _Entries, _Entries]:
         ("hessian", curvature, [block.x, p, lam]),
     ):
         rows, columns = matrix.sparsity().get_triplet()
-        # Elimination of common subexpressions would save only 3 % of the operations, but take most of the build time.
+        # Common subexpressions are not eliminated. This would save only 3 % of the operations, but take most of the
+        # build time.
         function = casadi.Function(name, arguments, [casadi.vertcat(*matrix.nonzeros())])
         entries.append(_Entries(function, np.array(rows, np.intp), np.array(columns, np.intp)))
     return casadi.Function("values", [block.x, p], [block.expression]), entries[0], entries[1]

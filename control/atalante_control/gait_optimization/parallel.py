@@ -18,8 +18,8 @@ _Task = TypeVar("_Task")
 _Result = TypeVar("_Result")
 #: Timeout of the connection to a dask scheduler.
 _CONNECT_TIMEOUT: Final = "10s"
-#: After this number of unexpected ends of a process, each further call gets processes of its own.
-#: If each call has processes of its own, only the calls that end their process have no result.
+#: If processes have ended unexpectedly this many times, each further call gets processes of its own. Then only a call
+#: that ends its own process has no result.
 _SHARED_LOSSES: Final = 3
 _REMEDY: Final = "repeat the command, if necessary with fewer --jobs"
 _LOKY_THREAD: Final = "ExecutorManagerThread"
@@ -52,9 +52,10 @@ def fan_out(
         jobs: number of processes on this computer. With 1, the calls run in this process.
         cluster: address of a dask scheduler such as tcp://127.0.0.1:8786. The project must be installed on its workers.
         patience: longest time between two results [s], or None for no limit. On a cluster there is no limit.
-        on_lost: function that receives a message when a process of this computer has ended unexpectedly, for example for lack of
-            memory. The calls without a result are then repeated in new processes. After 3 such ends, they are called one at a
-            time, and a call that ends its process again is not repeated. If None, no call is repeated.
+        on_lost: function called with a message when a process of this computer has ended unexpectedly, for example for
+            lack of memory. The calls without a result are then repeated in new processes. After 3 unexpected ends,
+            these calls run one at a time. A call that ends its process again is not repeated. If None, no call is
+            repeated.
 
     Raises:
         FanOutError: If joblib or dask is missing, or the scheduler does not respond.
@@ -118,9 +119,10 @@ def _numbered(call: Callable[[_Task], _Result], number: int, task: _Task) -> tup
 
 @contextmanager
 def _without_ctrl_c() -> Iterator[None]:
-    """Ignore Ctrl-C inside the `with` block. Child processes started inside the block also ignore Ctrl-C; the parent ends them.
+    """Ignore Ctrl-C inside the `with` block. Child processes started inside the block ignore it too.
 
-    The signal is ignored and not blocked, because the resource tracker of joblib unblocks the signal for later processes.
+    The parent process ends the child processes. The signal is ignored and not blocked, because the resource tracker of
+    joblib unblocks the signal for later processes.
     """
     before = signal.signal(signal.SIGINT, signal.SIG_IGN)
     try:

@@ -30,7 +30,7 @@ class Watch(casadi.Callback):
         self.construct("watch", {})
 
     def get_n_in(self) -> int:
-        """Return the number of inputs of the callback, which are the outputs of the solver."""
+        """Return the number of inputs of the callback. The inputs are the outputs of the solver."""
         return int(casadi.nlpsol_n_out())
 
     def get_n_out(self) -> int:
@@ -42,7 +42,7 @@ class Watch(casadi.Callback):
         return str(casadi.nlpsol_out(index))
 
     def get_sparsity_in(self, index: int) -> Any:
-        """Return the sparsity of an input of the callback. Parameter multipliers are not computed, so their vector is empty."""
+        """Return the sparsity of an input of the callback. The vector of parameter multipliers is empty."""
         name, rows = self.get_name_in(index), len(self._bounds[0])
         length = {"f": 1, "x": self._unknowns, "lam_x": self._unknowns, "g": rows, "lam_g": rows}.get(name, 0)
         return casadi.Sparsity.dense(length, 1 if length else 0)

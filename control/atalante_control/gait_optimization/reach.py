@@ -1,7 +1,8 @@
 """Check before the optimisation that a landing pose exists: `problem, subject -> None, or reason why no pose exists`.
 
-The search finds a pose with both feet flat on the ground, one step length apart, with soft joint limits. If a joint must leave
-its range, the joint with the largest violation is reported as the reason why there is no gait.
+The search finds a pose with both feet flat on the ground, one step length apart. In the search the joint limits are
+soft. If a joint must leave its range, the joint with the largest violation is reported as the reason why there is no
+gait.
 """
 
 from __future__ import annotations

@@ -20,8 +20,8 @@ class Requirements:
     friction: float = 0.5  # largest ratio of horizontal to vertical ground force
     force_min: float = 300.0  # N, smallest vertical ground force
     sole_share: float = 0.6  # fraction of the sole in which the centre of pressure must be
-    #: Fraction of the rectangle between the force cells in which the centre of pressure must be at the nodes. Between two nodes,
-    #: and in the gaits of the network, the centre of pressure is up to 3.2 mm farther outside.
+    #: Fraction of the rectangle between the force cells in which the centre of pressure must be at the nodes. The
+    #: centre of pressure can be up to 3.2 mm outside this area between two nodes, and in gaits of the network.
     cell_share: float = 0.7
     yaw_lever: float = 0.03  # m, largest ratio of yaw moment about the sole centre to vertical ground force
     #: Required height of the swing sole at mid-swing [m]. At other times this height is multiplied by sin(pi t / T)^2.
@@ -36,14 +36,14 @@ class Requirements:
     #: m/s, range of the vertical speed of each corner of the landing sole, upwards positive
     corner_speed: tuple[float, float] = -0.03, 0.0
     corner_slide: float = (
-        0.025  # m/s, largest forward speed and largest lateral speed of each corner of the landing sole
+        0.025  # m/s, limit of the forward speed and of the lateral speed of each corner of the landing sole
     )
     #: Largest jump of a joint speed at the impact [rad/s].
-    #: The fit error of the gait network increases the speed jump. The increased jump must stay below VELOCITY_JUMP.
+    #: The fit error of the gait network adds to this jump. The sum must stay below VELOCITY_JUMP.
     impact_jump: float = 0.6 * VELOCITY_JUMP
     sinking: float = 0.01  # m/s, largest downward speed of the rear foot after the impact
-    # The cost is the sum of squared torques [(100 Nm)^2] plus the weighted sums of the squares below.
-    # Without the weights of tilt and pressure, similar subjects get very different swing motions.
+    # The cost is the sum of squared torques [(100 Nm)^2] plus three sums of squares with the weights below. Without the
+    # weights of tilt and pressure, similar subjects get very different swing motions.
     acceleration_weight: float = 3e-3  # weight of the squared joint accelerations [(rad/s2)^2]
     tilt_weight: float = 5.0  # weight of the squared tilt of the swing sole [rad^2]
     pressure_weight: float = 20.0  # weight of the squared ground moment about the sole centre [(1500 Nm)^2]

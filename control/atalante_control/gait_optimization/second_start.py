@@ -1,7 +1,7 @@
 """Second start of the optimiser after a failure: `subject, attempt -> gait, or reason of both failures`.
 
-The second initial guess is the solved gait of the same patient with a moderate step. The result therefore depends only on the
-parameters of the subject, as with one start.
+The second initial guess is the solved gait of the same patient with a moderate step. The result therefore depends only
+on the parameters of the subject, as it does without a second start.
 """
 
 from __future__ import annotations
@@ -40,8 +40,8 @@ def solve_with_second_start(subject: Subject, attempt: Attempt) -> SolvedGait:
         attempt: function that solves a gait.
 
     Returns:
-        The gait. After two failures it is the last iterate of the first attempt. The status then states the reasons of both
-        failures, and the joints that are at a limit in this iterate.
+        The gait. After two failures, the gait is the last iterate of the first attempt. The status then states the
+        reasons of both failures. It also names the joints that are at a limit in this iterate.
     """
     first = attempt(subject, None)
     if first.solved or first.iterations == 0:
@@ -65,7 +65,7 @@ def solve_with_second_start(subject: Subject, attempt: Attempt) -> SolvedGait:
 
 
 def joints_at_limits(solved: SolvedGait) -> list[str]:
-    """Return the joints that are at a limit in the last iterate of the optimiser, each with the quantity that is limited.
+    """Return the joints at a limit in the last iterate of the optimiser. Each text names joint and quantity.
 
     Args:
         solved: result of the optimiser.
@@ -88,7 +88,7 @@ def joints_at_limits(solved: SolvedGait) -> list[str]:
 
 
 def with_status(solved: SolvedGait, status: str) -> SolvedGait:
-    """Return a result with another status, in the result and in the record of its gait.
+    """Return a copy of a result with another status. The status is also replaced in `gait.solver`.
 
     Args:
         solved: result of the optimiser.

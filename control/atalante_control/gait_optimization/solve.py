@@ -1,7 +1,7 @@
 """Solver of one step: `subject -> initial guess or similar gait -> IPOPT -> gait with constraint violations in SI units`.
 
-The nonlinear program of each kind of step is built once per process and used for every subject. A warm start is faster. In all
-cases tried, solves with and without a warm start converged to the same gait.
+The nonlinear program of each kind of step is built once per process and used for every subject. A warm start is faster.
+In all cases tried, the gait was the same with and without a warm start.
 """
 
 from __future__ import annotations
@@ -76,9 +76,9 @@ def solve(
         warm_start: gait of a similar subject as the initial guess. If None, the initial guess is the result of `guess`.
         kind: kind of step, `periodic`, `start` or `stop`.
         progress: function to call at each iteration, or None for no progress report.
-        machine_code: whether compiled functions are used. The first use on a computer takes about 15 s for the compilation, which
-            saves time only if many gaits are solved.
-        around: periodic gait before a stop step or after a start step. If None, the gait of the subject is solved first.
+        machine_code: whether compiled functions are used. The compilation takes about 15 s at the first use on a
+            computer, so it saves time only if many gaits are solved.
+        around: periodic gait before a stop step or after a start step. If None, this gait is solved first.
 
     Returns:
         The gait. If the solver failed, the gait is the last iterate and the status names the violated constraint.

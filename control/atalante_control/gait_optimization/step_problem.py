@@ -3,8 +3,8 @@
 `Chain, Requirements -> constraints of nodes, ends of the step and impact -> NonlinearProgram`, built once per kind of step.
 Subject, step length and duration are parameters. Bezier control points determine the motion. The unknowns of a node are the
 joint angles, their first and second derivatives with respect to the phase, the torques and the ground wrench. Linear equations
-connect the unknowns of a node to the control points. The equations of motion connect the unknowns of the same node. The unknowns
-are redundant, which keeps the equations short and the matrix sparse.
+connect the unknowns of a node to the control points. The equations of motion connect the unknowns of the same node. The
+redundant unknowns keep the equations short and the matrix sparse.
 
 Stance foot and swing foot are flat rigid bodies on flat ground. The stance foot does not move. Every step is fully
 actuated, so no zero dynamics remain in the partial hybrid zero dynamics. The impact map connects the end of a step with
@@ -153,7 +153,7 @@ class StepProblem:
         """Return the largest violation of each group of constraints, in the SI unit of the group.
 
         Args:
-            unknowns: result of `self.unknowns()`, so torques and ground forces follow from the motion.
+            unknowns: result of `self.unknowns()`. The torques and ground forces therefore follow from the motion.
             rows: values of g at these unknowns.
             bounds: lower and upper bounds of g.
             duration: duration of the step [s].
@@ -291,7 +291,7 @@ class StepProblem:
         return wrench[3:] * _MOMENT - casadi.cross(casadi.DM([x, 0.0, z]), wrench[:3] * _FORCE)
 
     def _ground(self, wrench: Symbol) -> list[Rows]:
-        """Return the constraints of friction cone, centre of pressure and yaw moment, each as a force of at least 0."""
+        """Return the constraints of friction cone, centre of pressure and yaw moment, written as forces >= 0."""
         requirements, exo = self.requirements, self.exoskeleton
         force, moment = wrench[:3] * _FORCE, self._pressure_moment(wrench)
         length, width = exo.sole_size
@@ -394,9 +394,9 @@ class StepProblem:
     def _add_impact(self) -> None:
         """Add the impact map, which connects the speeds at the end of a step with the speeds at the start of the next step.
 
-        In the mirrored robot the landing foot is the stance foot. The impact changes the twist of this foot to zero, and the
-        joint speeds to the speeds at the start of the next step. The joint impulses are zero. The ground impulse is upwards.
-        The downward speed of the rear foot is limited.
+        In the mirrored robot the landing foot is the stance foot. After the impact the twist of this foot is zero, and
+        the joint speeds are the speeds at the start of the next step. The joint impulses are zero. The ground impulse
+        is upwards. The downward speed of the rear foot is limited.
         """
         requirements, program, duration = self.requirements, self.program, self._duration
         q0, v0, q1, v1 = (casadi.SX.sym(name, _N) for name in ("q0", "v0", "q1", "v1"))

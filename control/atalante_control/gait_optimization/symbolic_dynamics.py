@@ -1,10 +1,10 @@
 """Symbolic kinematics and inverse dynamics of the robot standing on its right foot, in CasADi.
 
-`links of the model -> bodies -> Chain (topology, masses and lengths as parameters) -> expressions for the program`. The tree of
-the model is rooted at the pelvis, but the right foot is at rest. The recursion therefore starts at the right foot. It goes up the
-stance leg against the direction of the joints, then down the swing leg. The algorithm is Featherstone's recursive Newton-Euler
-algorithm in link frames. Accelerations are those of the frame origins and include gravity. The root frame is that of the stance
-foot.
+`links of the model -> bodies -> Chain (topology, masses and lengths as parameters) -> expressions for the program`. The
+root of the model is the pelvis, but the right foot is at rest. The recursion therefore starts at the right foot. It
+goes up the stance leg from child to parent, then down the swing leg from parent to child. The algorithm is
+Featherstone's recursive Newton-Euler algorithm in link frames. An acceleration of a link is the acceleration of its
+frame origin, including gravity. The root frame is the stance foot frame.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ class Body:
     parent: str  # name of the parent link
     joint: int  # index of the joint in JOINTS; -1 for the pelvis, which has no joint
     origin: Vector3  # m, position of the joint in the frame of the parent link
-    yaw: float  # rad, angle about the z axis of the parent link, from the parent frame to the link frame at joint angle 0
+    yaw: float  # rad, rotation from parent frame to link frame about the z axis, at joint angle 0
     axis: Vector3  # joint axis in the frame of the link
     mass: float  # kg
     moment: Vector3  # kg m, mass times position of the centre of mass
@@ -114,7 +114,8 @@ class Chain:
         """Build the chain from a reference robot.
 
         Args:
-            reference: links of the reference robot. They define the topology, the axes, and the masses and lengths that are zero.
+            reference: links of the reference robot. They define the topology, the axes, and which masses and lengths
+                are zero.
         """
         self.bodies = bodies(reference)
         numbers = _numbers(self.bodies)
@@ -243,7 +244,7 @@ class Chain:
         return casadi.vertcat(*torque), Wrench(force[self.root], moment[self.root])
 
     def _joint(self, child: int, q: Symbol) -> tuple[Symbol, Symbol, Symbol]:
-        """Return the rotation from child to parent, the joint origin in the parent frame, and the axis in the child frame."""
+        """Return rotation from child to parent, joint position in the parent frame, and axis in the child frame."""
         body = self.bodies[child]
         norm = math.hypot(*body.axis)
         axis = np.array(body.axis) / norm

@@ -1,9 +1,10 @@
 """Independent verification of a gait: `gait, patient -> Pinocchio -> checks of joints, ground forces and impact`.
 
 The verification shares no code with the optimiser. Polynomials are evaluated by de Casteljau's algorithm, and the model is the
-URDF. The pelvis is a floating base. Its motion follows from the stance foot, which is at rest. Torques and ground wrench come
-from the recursive Newton-Euler algorithm. The impact is computed with the KKT system of the floating robot. The step is sampled
-every few milliseconds, which is finer than the nodes of the optimiser.
+URDF. The pelvis is a floating base. The stance foot is at rest, so the joint motion determines the motion of the
+pelvis. Torques and ground wrench come from the recursive Newton-Euler algorithm. The impact is computed with the KKT
+system of the floating robot. The step is sampled every few milliseconds, which is finer than the nodes of the
+optimiser.
 """
 
 from __future__ import annotations
@@ -27,7 +28,7 @@ _SLIDING = 1.0  # Ns, accepted impact impulse above the friction limit; 1 Ns cha
 _SLIDE = 0.04  # m/s, accepted horizontal speed of a corner of the sole at the landing
 _DROP = 0.035  # m/s, accepted downward speed of a corner of the sole at the landing
 _LIFT = 0.005  # m/s, accepted upward speed of a corner of the sole at the landing
-_SHORTFALL = 2e-3  # m, accepted difference of the height of the swing sole to the intended height
+_SHORTFALL = 2e-3  # m, the swing sole may be this much lower than the intended height
 _SINKING = 1e-3  # m, accepted depth of the swing sole below the ground at the start of the swing
 
 
@@ -40,7 +41,7 @@ class Tolerances(NamedTuple):
     impact_speed: float  # rad/s, error of a joint speed after the impact
 
 
-#: Tolerances of a solved step: those of the equality constraints of the optimiser.
+#: Tolerances of a solved step, equal to the tolerances of the equality constraints of the optimiser.
 EXACT = Tolerances(1e-6, 1e-6, 1e-6, 1e-6)
 #: Tolerances of a step of the gait network. The network interpolates solved steps, so it meets these conditions approximately.
 INTERPOLATED = Tolerances(1e-3, math.radians(0.3), POSITION_JUMP, VELOCITY_JUMP)
@@ -261,7 +262,7 @@ class Verifier:
         ]
 
     def _landing(self, q: Vector, tolerances: Tolerances) -> list[GaitCheck]:
-        """Return the checks that the left foot is flat on the ground, and that its toe-out mirrors that of the right foot."""
+        """Return the checks of the landing pose: left foot flat on the ground, toe-out mirrored from the right foot."""
         stance, swing, _ = self._poses(q)
         relative = stance.actInv(swing)
         turned = self._forward() @ self._forward()

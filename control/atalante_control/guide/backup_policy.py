@@ -5,17 +5,17 @@ the responses. The backup torque is
 
 .. math:: u_B = u_i + M(q)(\ddot q_{des} - K_v e - D_v \dot e), \qquad e = q - q_{des},
 
-where the torque :math:`u_i` compensates gravity, friction, centrifugal and Coriolis torques. The acceleration of the desired
-trajectory is part of the backup torque, so the error has no forced response: :math:`\ddot e = -K_v e - D_v \dot e + M^{-1} d`
-under a disturbance torque d. The gains :math:`K_v = M_0^{-1} \mathrm{diag}(k)` are computed with the mass matrix :math:`M_0` at
-a knee angle in the middle of the swing.
-A constant disturbance d deflects each joint by about d / k. The `stiffness` k is therefore the stiffness of the real joint, and
-not of a mode. The gains :math:`D_v = 2 \zeta \sqrt{K_v}` have the eigenvectors of Kv. The loop therefore consists of two modes,
-one with large and one with small inertia ("heavy" and "light").
+where the torque :math:`u_i` compensates gravity, friction, centrifugal and Coriolis torques. The backup torque contains
+the desired acceleration, so the desired motion causes no error. Under a disturbance torque d, the error satisfies
+:math:`\ddot e = -K_v e - D_v \dot e + M^{-1} d`. The gains :math:`K_v = M_0^{-1} \mathrm{diag}(k)` are computed with
+the mass matrix :math:`M_0` at a knee angle in the middle of the swing. A constant disturbance d deflects each joint by
+about d / k. The `stiffness` k is therefore the stiffness of the real joint, and not of a mode.
+The gains :math:`D_v = 2 \zeta \sqrt{K_v}` have the eigenvectors of Kv. The loop therefore consists of two modes, one
+with large and one with small inertia ("heavy" and "light").
 
 The controller is sampled. The state (z, z', v, m, p) of a mode contains the error z, the true rate z', the measured rate v behind
-the low-pass of the drive, the acceleration m that the motor exerts, and the acceleration p of the last command. `responses`
-computes the exact motion of this loop, cycle by cycle.
+the low-pass of the drive, the acceleration m caused by the motor torque, and the acceleration p of the last command.
+`responses` computes the exact motion of this loop, cycle by cycle.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ from atalante_hal.types import Vector
 
 Pair = tuple[float, float]
 
-#: Number of elements of the state x: five quantities, each with an element for the sagittal hip and then an element for the knee.
+#: Number of elements of the state x. The state has five quantities, each with two elements: sagittal hip, then knee.
 #: 1. Tracking error e = q - q_des [rad].
 #: 2. True error rate e' [rad/s].
 #: 3. Measured error rate e', after the low-pass of the drives [rad/s].
@@ -119,9 +119,9 @@ class BackupPolicy:
 class Responses(NamedTuple):
     """Predicted motion of sagittal hip and knee under the backup policy, 0 to n cycles after the prediction starts.
 
-    The rows of each array are SH and SK. `error`, `rate` and `feedback` are matrices to be multiplied by a state x with `STATES`
-    elements. The arrays whose names begin with `pushed` are matrices to be multiplied by an acceleration of SH and SK that acts
-    during the first cycle only.
+    The rows of each array are SH and SK. To get the predicted motion, multiply `error`, `rate` and `feedback` by a
+    state x with `STATES` elements. Multiply the `pushed` arrays by an acceleration of SH and SK that acts only during
+    the first cycle.
     """
 
     error: Vector  # (n + 1, 2, 10) matrix from the state to the predicted error e [rad]

@@ -5,33 +5,36 @@ at most `knee` Nm on the sagittal knee (SK), at the same time and in any directi
 model by 20 %, and the mass and inertia of the leg by 10 %. The loop may have one more cycle of delay than the model. The step may
 start with any deviation inside the hand-over box (`HandOver`). The running filter is built for exactly this promise.
 
-**Why it holds.** Let r be the largest ratio of error to width in the prediction that starts at the true state of the leg, under
-the backup policy and the worst of these disturbances. Let h = 1 - r^2. Three conditions are sufficient.
+**Why it holds.** A prediction starts at the true state of the leg, under the backup policy and the worst of these
+disturbances. Let r be the largest ratio of error to width in this prediction, and h = 1 - r^2. Three conditions are
+sufficient.
 
 1. *Start.* Re-centring sets the error to zero at the start of a step. In every cycle, the error that can arise since the start
    must be below the width. Disturbances, the torque carried over the stance change and the unknown part of the velocity cause
    this error. So h is at least 0 at the start. The same condition bounds the predicted torque and speed, so the drives do not
    saturate and the limiter does not act.
-2. *Backup.* If the gate is 1, the leg follows the backup policy. Then h does not fall, because the current prediction already
-   includes every disturbance of the prediction from the next cycle. Each new prediction adds one cycle at the end of the horizon.
-   This cycle must not be the worst cycle. At the end of the horizon the free motion has decayed. The error there follows from the
-   errors in earlier cycles of the prediction, and must be smaller than the width minus the effect of the disturbances.
+2. *Backup.* If the gate is 1, the leg follows the backup policy. Then h does not fall, because all disturbances in the
+   prediction of the next cycle are already in the current prediction. Each new prediction adds one cycle at the end of
+   the horizon. This cycle must not be the worst cycle. At the end of the horizon the free motion has decayed. The error
+   in the added cycle therefore follows from the errors in earlier cycles of the prediction. It must be smaller than the
+   width minus the effect of the disturbances.
 3. *Gate.* Let g be the effect on r of one cycle without backup torque. Near h = 0 the gate is at least 1 - 3 h. A cycle with this
    gate lowers 1 - r by at most 6 g (1 - r). So r stays below 1 if 6 g is at most 1. If the intensity of u_i or u_f is below 1,
-   the torque that is not compensated in this cycle is part of g. The tests check this for the shape `constant`, at zero
-   intensities. In the other shapes of the package 6 g reaches 1.4 if the smallest width of a step is taken as the width. This
-   estimate is too large by an unknown factor, because these guides are wider in most cycles. For these shapes condition 3 is not
-   proved. It is supported only by `atalante guide check`, which searches for pushes that break a promise.
+   the torque that is not compensated in this cycle is part of g. The tests check that 6 g is at most 1 for the shape
+   `constant`, at zero intensities. In the other shapes of the package 6 g reaches 1.4 if the smallest width of a step
+   is taken as the width. This estimate is too large by an unknown factor, because these guides are wider in most
+   cycles. For these shapes condition 3 is not proved. It is supported only by `atalante guide check`, which searches
+   for pushes that break a promise.
 
 The filter does not know the true state, so it uses bounds. Errors of inertia and delay change the rows of the prediction
 (`Prediction.slack`), and the measured velocity lags behind the true velocity (part of `Prediction.reach`). So the h of the
 filter is at most the true h, and the gate is at least as large as the proof requires.
 
 All bounds are linear in the promise. The largest possible promise is therefore a multiple of the requested promise. The certified
-promise is the smaller of the largest possible and the requested promise. It does not depend on the intensities of idealization
-u_i and feedforward u_f. The backup torque includes u_i and u_f completely, so conditions 1 and 2 do not depend on the
-intensities. A torque that is not compensated acts only while the gate is below 1, so it affects only condition 3. At zero
-intensities this torque increases 6 g by less than 0.2 in each shape of the package.
+promise is the smaller of the largest possible and the requested promise. The certified promise does not depend on the
+intensities of idealization u_i and feedforward u_f. The backup torque includes u_i and u_f completely, so conditions 1
+and 2 do not depend on the intensities. A torque that is not compensated acts only while the gate is below 1, so it
+affects only condition 3. At zero intensities this torque increases 6 g by less than 0.2 in each shape of the package.
 """
 
 from __future__ import annotations
@@ -78,9 +81,9 @@ class Certificate:
     xi: float
     certified: bool  # whether the guide is certified for any disturbance torques
     reason: str  # sentence that states what limits the certified torques, or why there are none
-    #: certified disturbance torques, for which the running filter is built; None if there are none
+    #: certified disturbance torques, for which the running filter is built; None without certified torques
     promise: JointTorque | None
-    #: largest disturbance torques for which a filter with these gains could be certified; None if there are none
+    #: largest disturbance torques for which a filter with these gains could be certified; None without such torques
     largest: JointTorque | None
     #: smallest fraction of the guide width that remains free under the certified torques; negative without certified torques
     margin: float
@@ -138,7 +141,7 @@ class PromiseLimits:
         return sorted(found, key=lambda limit: limit.scale)
 
     def largest(self, xi: float) -> float:
-        """Return the largest certifiable disturbance torques as a multiple of the requested torques; at most 0 if none.
+        """Return the largest certifiable torques as a multiple of the requested torques; at most 0 if there are none.
 
         Args:
             xi: assistance factor in [0, 1].
@@ -192,8 +195,8 @@ class _Horizon:
     """Condition on a multiple of the requested torques: one cycle after the prediction, the error is within the guide.
 
     At the end of the horizon, fast motions have decayed. The error one cycle beyond the horizon is therefore the error at the
-    end of the horizon times a factor, plus a remainder. The remainder is a linear combination of the errors in two earlier
-    cycles, and any two cycles may be chosen. Each of these errors is at most the width minus the effect of the disturbances.
+    end of the horizon times a factor, plus a remainder. The remainder is a linear combination of the errors in any two
+    earlier cycles. Each of these errors is at most the width minus the effect of the disturbances.
 
     Attributes:
         cycles: number of predicted cycles.

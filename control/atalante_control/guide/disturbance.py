@@ -12,8 +12,9 @@ Each of these torques may have any sign in any cycle. The largest error that the
 
 .. math:: D(k, n) = \sum_{i=k}^{n-1} \max_{M} |G(n - i) M^{-1}| \, p_i,
 
-with the response G to an acceleration that lasts one cycle, the bound p, and every mass matrix M that the leg can have in
-cycle i inside the guide. `spread` computes this sum for each start cycle k and each number n - k of cycles ahead.
+where G is the response to an acceleration that lasts one cycle, and p is the bound. The maximum is over all mass
+matrices M that the leg can have in cycle i inside the guide. `spread` computes this sum for each start cycle k and each
+number n - k of cycles ahead.
 """
 
 from __future__ import annotations
@@ -83,7 +84,8 @@ class HandOver:
             values: values of s, s' or s'' for s(0) = 1 rad (first row) and for s'(0) = 1 rad/s (second row), shape (2, n).
 
         Returns:
-            Shape (n,). s is linear in the deviations, so a corner of the box is the worst case.
+            Largest absolute values, shape (n,). s is linear in the deviations, so a corner of the box is the worst
+            case.
         """
         return np.asarray(np.abs(values).T @ [self.deviation, self.rate])
 
@@ -151,7 +153,8 @@ class Leg(NamedTuple):
         Args:
             mismatch: errors of the model.
             hand_over: largest deviations at the start of a step.
-            blend: factor of the torque that is carried over the stance change, in each cycle since then, shape (m,).
+            blend: factor of the torque that is carried over the stance change, one value per cycle from the change on,
+                shape (m,).
         """
         moved = hand_over.largest(self.deadbeat.basis(self.time)[2])
         needed = np.abs(self.torque()) + np.abs(self.masses(self.q[:, 1])).sum(axis=2) * moved[:, None]
@@ -186,19 +189,19 @@ class Grid(NamedTuple):
 
 
 def spread(effect: Effect, mobilities: Vector, bounds: Vector, grid: Grid, ahead: Vector) -> Vector:
-    """Compute the largest outputs caused by disturbances that begin at each start cycle or at the start of the step.
+    """Compute the largest outputs that disturbances cause, for predictions from each start cycle and for the step.
 
-    The first result is written to `ahead`, the second result is returned. In both results, columns 0 and 1 are the effects of
-    the budget on the two outputs, and columns 2 and 3 are the effects of the requested promise. Each effect is a sum of absolute
-    values.
+    `ahead` receives the outputs if disturbances begin at a start cycle. The returned array contains the outputs if
+    disturbances begin at the start of the step. In both arrays, columns 0 and 1 are the effects of the budget on the
+    two outputs, and columns 2 and 3 are the effects of the requested promise. Each effect is a sum of absolute values.
 
     Args:
         effect: effect of a disturbance on the outputs.
         mobilities: inverse mass matrices of each cycle, shape (n, postures, 2, 2).
         bounds: torque bounds of SH and SK (rows), budget and requested promise (columns), in each cycle, shape (n, 2, 2) [Nm].
         grid: start cycles, and numbers of cycles ahead, of the predictions in `ahead`.
-        ahead: shape (blocks, lags, 4). Each element is raised to the largest output of its start cycles, for its number of cycles
-            ahead. Predictions past the end of `bounds` are left out.
+        ahead: shape (blocks, lags, 4), changed in place. The new element is the maximum of the old element and of the
+            outputs for all start cycles in the block. Predictions past the end of `bounds` are left out.
 
     Returns:
         The largest output in each cycle due to the disturbances since cycle 0, without the response `hidden`, shape (n, 4).

@@ -175,18 +175,18 @@ class GuideFilter:
         return self.tables.guards[0].state.copy()
 
     def errors_ahead(self) -> Vector:
-        """Return the tracking errors of hip and knee that the last cycle predicted for no disturbance, shape (n, 2) [rad]."""
+        """Return the last prediction: tracking errors of hip and knee if no disturbance acts, shape (n, 2) [rad]."""
         return np.asarray(self.prediction.ahead @ (self.prediction.compress @ self.state))
 
     def uncertainty(self) -> Vector:
-        """Return how much `errors_ahead` can change if inertia or delay of the model are wrong, shape (n, 2) [rad]."""
+        """Return how much `errors_ahead` can change if the inertia or the delay is wrong, shape (n, 2) [rad]."""
         x = self.state
         size = np.abs(np.concatenate([x[:2], x[2:4] - x[4:6], x[4:]]))
         return np.repeat(self.prediction.slack @ size, SLACK_CYCLES, axis=0)[: len(self.prediction.ahead)]
 
     @property
     def h(self) -> float:
-        """Return h of the last cycle: at least 0 if the backup policy can keep both joints inside (safe backward image)."""
+        """Return h of the last cycle. h >= 0 if the backup policy can keep both joints inside (safe backward image)."""
         return float(self.tables.guards[0].h)
 
     @property

@@ -22,7 +22,8 @@ Pair = tuple[float, float]
 STEEPNESS = 4.0
 #: Number of elements of the compressed state, from which the predicted errors are computed.
 COMPRESSED = 5
-#: Number of consecutive predicted cycles for which `Block.slack` has one common bound of the effect of model errors.
+#: Number of consecutive predicted cycles in a `Block`. `Block.slack` bounds the effect of model errors in all these
+#: cycles.
 SLACK_CYCLES = 10
 #: Number of start cycles in a block. Predictions that start in the same block use the same row of `GuideTables.reach`.
 START_CYCLES = 4
@@ -49,7 +50,7 @@ class Guard:
     motor: Annotated[Vector, 2]  # Nm, estimated torques of the motors
     lag: Annotated[Vector, 2]  # rad/s, estimated true velocity minus measured velocity
     state: Annotated[Vector, STATES]  # state of the last cycle, see `backup_policy`
-    #: absolute values of the elements of `state`, but the true e' is replaced by the true minus the measured e'
+    #: absolute values of the elements of `state`, with true minus measured e' in place of the true e'
     magnitude: Annotated[Vector, STATES]
     compression: Annotated[Vector, (COMPRESSED, STATES)]  # matrix from the state to the compressed state
     compressed: Annotated[Vector, COMPRESSED]  # compressed state of the last cycle
@@ -82,7 +83,8 @@ class Few:
     """Prediction of torque and speed a fixed number of cycles ahead, see `prediction.FEW`."""
 
     lag: int  # number of cycles ahead
-    #: matrix from the state to the predicted backup accelerations [rad/s2] of hip and knee, then to their predicted e' [rad/s]
+    #: matrix from the state to four predictions: backup acceleration [rad/s2] of hip and knee, e' [rad/s] of hip and
+    #: knee
     ahead: Annotated[Vector, (STATES, 4)]
     #: matrix from `Guard.magnitude` to the largest change of the predicted e' of hip and knee that model errors can cause [rad/s]
     slack: Annotated[Vector, (STATES, 2)]
@@ -96,12 +98,15 @@ class GuideTables(NamedTuple):
     lags: Records[Lag]  # (lags,)
     blocks: Records[Block]  # (blocks,)
     few: Records[Few]  # (rows,) predictions of torque and speed, in ascending order of `Few.lag`
-    #: (starts, lags, 4) largest errors of sagittal hip and knee due to model errors, then due to the requested disturbances [rad]
+    #: (starts, lags, 4) rad, largest errors of sagittal hip and knee.
+    #: Columns 0 and 1: due to model errors. Columns 2 and 3: due to the requested disturbances.
     reach: Vector
     highest: Vector  # (starts, blocks, 4) maximum of `reach` over each block of cycles ahead [rad]
     #: (starts, rows, 12) largest effects of disturbances on the torques [Nm] and speeds [rad/s] of sagittal hip and knee.
-    #: Columns 0 to 3: torques and speeds due to model errors. Columns 4 to 7: the same due to the requested disturbances.
-    #: Columns 8 to 11: speeds with the worst inertia and delay, due to model errors and then due to the requested disturbances.
+    #: Columns 0 to 3: torques and speeds due to model errors.
+    #: Columns 4 to 7: torques and speeds due to the requested disturbances.
+    #: Columns 8 and 9: speeds due to model errors, with the worst inertia and delay.
+    #: Columns 10 and 11: speeds due to the requested disturbances, with the worst inertia and delay.
     few_reach: Vector
     step: Vector  # (horizon + 1, COLUMNS) values of each cycle of the step; the column numbers are defined below
 
@@ -145,7 +150,7 @@ def leg_state(hip: int, q: Vector, qd: Vector, desired: Vector, sent: Vector, gr
         hip: index of SH of the swing leg in JOINTS; SK is the next joint.
         q: joint angles, shape (12,) [rad].
         qd: joint speeds, shape (12,) [rad/s].
-        desired: q_des in its first 12 elements [rad].
+        desired: array whose first 12 elements are q_des [rad].
         sent: torques sent in the last cycle, shape (12,) [Nm].
         gravity: gravity torques of SH and SK [Nm].
     """
@@ -237,7 +242,7 @@ def _acceleration(hip: float, knee: float, m: tuple[float, float, float], row: V
 def largest_ratio(guide: GuideTables, cycle: int) -> float:
     """Return the largest of the predicted error / width, torque / limit and speed / limit under the backup policy.
 
-    The effect of the disturbances is included. The last two are converted with the slope `STEEPNESS`.
+    The effect of the disturbances is included. The ratios of torque and speed are converted with the slope `STEEPNESS`.
 
     Args:
         guide: tables of the guide filter; `Guard.state` must contain the state of the current cycle.
@@ -259,9 +264,9 @@ def largest_ratio(guide: GuideTables, cycle: int) -> float:
 def _error_ratio(guide: GuideTables, cycle: int) -> float:
     """Return the largest predicted error / width.
 
-    Most cycles ahead need not be predicted. `bound_blocks` computes a ratio for each block that no cycle of the block exceeds.
-    The block with the largest bound is predicted first. A block whose bound is at most the largest ratio found so far cannot
-    contain a larger ratio.
+    Most cycles ahead need not be predicted. `bound_blocks` computes an upper bound of the ratio for each block. The
+    block with the largest bound is predicted first. A block whose bound is at most the largest ratio found so far
+    cannot contain a larger ratio.
     """
     guard, step, reach = guide.guards[0], guide.step, guide.reach[cycle // START_CYCLES]
     promise, size, y0, y1, y2, y3, y4 = guard.promise, guard.magnitude, *_compressed(guard)
@@ -299,7 +304,7 @@ def _compressed(guard: Guard) -> tuple[float, float, float, float, float]:
 
 
 def bound_blocks(guide: GuideTables, cycle: int, blocks: int) -> int:
-    """Compute `Block.ratio`, the bound of error / width, of each block, and return the index of the block with the largest ratio.
+    """Compute `Block.ratio`, the bound of error / width, for each block. Return the index of the largest ratio.
 
     In a block, a predicted error differs from `Block.middle` times the compressed state y by at most `Block.spread` times abs(y).
     The disturbances add at most `GuideTables.highest`, and no width is below the width in the columns `NEAR`.
@@ -338,8 +343,8 @@ def _few_ratio(guide: GuideTables, cycle: int, least: float) -> float:
     Args:
         guide: tables of the guide filter.
         cycle: cycles since the stance change.
-        least: ratio below which the exact result is not needed. If the exact result is below it, the returned result may be
-            smaller than the exact result.
+        least: ratio below which the exact result is not needed. If the exact result is below `least`, the returned
+            result may be smaller than the exact result.
     """
     guard, step, reach = guide.guards[0], guide.step, guide.few_reach[cycle // START_CYCLES]
     x, size, promise = guard.state, guard.magnitude, guard.promise
@@ -380,7 +385,7 @@ def gate(h: float, xi: float) -> float:
     """Return the gate lambda of the paper: (1 + (Xi^10 - 1) h)^3, clamped to [0, 1]; 1 outside the safe backward image (h < 0).
 
     Args:
-        h: function that is at least 0 inside the safe backward image, at most 1.
+        h: safe backward image function, at most 1; h is at least 0 inside the safe backward image.
         xi: assistance factor in [0, 1].
     """
     if h <= 0.0:

@@ -4,12 +4,12 @@ This law is for comparisons with the paper. Its certificate contains no certifie
 inside the guide under any disturbance torque.
 Each joint is treated as a separate inertia, J q'' = u_v + u_f + u_ext. The backup torque u_b is the PD part of the baseline PID.
 In each cycle the motion under u_b is integrated to the end of the step twice: with the largest and with the smallest constant
-u_ext. h is the smaller result of the two predictions, and
+u_ext. h is the smaller of the two results, and
 
     lambda = (1 + (Xi^10 - 1) h)^3,   lambda_d = -zeta dh/dt,   u_v = (lambda + (1 - lambda) lambda_d) u_b.
 
-lambda is 1 for h < 0, where the paper defines no torque. Beyond this, neither lambda nor lambda_d is limited or filtered.
-`docs/reference/paper.md` lists what the coupled filter does instead, and why.
+lambda is 1 for h < 0, where the paper defines no torque. Apart from this, neither lambda nor lambda_d is limited or
+filtered. `docs/reference/paper.md` lists what the coupled filter does instead, and why.
 """
 
 from __future__ import annotations
@@ -122,7 +122,7 @@ class LiteralGuide:
 
 
 def no_promise(shape: str, xi: float) -> Certificate:
-    """Return a certificate for no disturbance torque, because the control law follows the paper literally.
+    """Return a certificate without certified torques, as the control law follows the paper literally.
 
     Args:
         shape: name of the shape.
@@ -137,7 +137,8 @@ def assistive_torque(tables: LiteralTables, guard: Guard, cycle: int, leg: LegSt
 
     Args:
         tables: tables of the literal law.
-        guard: record of the guide filter. The smaller h, the larger gate and the guide are written to it, for the telemetry.
+        guard: record of the guide filter. For the telemetry, this record receives the minimum of h and the maximum of
+            the gate over both joints, and the guide.
         cycle: cycles since the stance change. A number above the length of the step is replaced by this length.
         leg: measurements of the swing leg.
         rates: q_des' of SH and SK [rad/s].

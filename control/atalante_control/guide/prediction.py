@@ -53,7 +53,7 @@ class Assumptions:
 
 
 class StartReach(NamedTuple):
-    """Largest effects, in each cycle of a step, of disturbances that act since the start of the step.
+    """Largest effects of disturbances in each cycle of a step. The disturbances act from the start of the step on.
 
     Columns 0 and 1 are the effect of the model errors (`Leg.budget`) on SH and SK. Columns 2 and 3 are the effect of the chosen
     certified torques on SH and SK.
@@ -78,14 +78,14 @@ class Prediction:
         compress: matrix from the state to the compressed state, shape (COMPRESSED, STATES).
         ahead: matrices from the compressed state to the predicted errors e of SH and SK, shape (lags, 2, COMPRESSED).
         beyond: matrix from the state to the errors one cycle beyond the horizon, shape (2, STATES).
-        slack: largest change of the predicted errors by model errors, per unit of each element of `Guard.magnitude`, for each
-            block of `SLACK_CYCLES` cycles ahead, shape (blocks, 2, STATES).
+        slack: largest change of the predicted errors that model errors can cause, per unit of each element of
+            `Guard.magnitude`, for each block of `SLACK_CYCLES` cycles ahead, shape (blocks, 2, STATES).
         reach: `GuideTables.reach`.
         few_ahead: matrices from the state to the predicted feedback [rad/s2] of SH and SK and the predicted e' [rad/s] of SH and
             SK, `FEW` cycles ahead, shape (rows, 4, STATES).
         few_reach: `GuideTables.few_reach`.
-        few_slack: largest change of e' ahead by model errors, per unit of each element of `Guard.magnitude`, shape
-            (rows, 2, STATES).
+        few_slack: largest change of the predicted e' that model errors can cause, per unit of each element of
+            `Guard.magnitude`, shape (rows, 2, STATES).
         start: largest effect of the disturbances since the start of a step.
         torque: torque that the leg needs along the nominal trajectory, shape (n, 2) [Nm].
         mass: mass matrix along the nominal trajectory, shape (n, 2, 2) [kg m2].
@@ -98,7 +98,8 @@ class Prediction:
             policy: gains of the backup policy.
             leg: swing leg along the nominal trajectory, to the end of the overlap.
             assumptions: assumptions of the promise for which the tables are computed.
-            blend: factor of the torque that is carried over the stance change, in each cycle since then, shape (m,).
+            blend: factor of the torque that is carried over the stance change, one value per cycle from the change on,
+                shape (m,).
             width: largest width of the guides for which the tables are used [rad].
         """
         self.policy, self.leg, self.assumptions = policy, leg, assumptions
@@ -178,7 +179,8 @@ def prediction_of(policy: BackupPolicy, leg: Leg, assumptions: Assumptions, blen
         policy: gains of the backup policy.
         leg: swing leg along the nominal trajectory, to the end of the overlap.
         assumptions: assumptions of the promise for which the tables are computed.
-        blend: factor of the torque that is carried over the stance change, in each cycle since then, shape (m,).
+        blend: factor of the torque that is carried over the stance change, one value per cycle from the change on,
+            shape (m,).
         width: largest width of the guides for which the tables are used [rad].
     """
     parts = [leg.time, leg.q, leg.qd, leg.qdd, leg.gravity, leg.inertia.fit, blend]

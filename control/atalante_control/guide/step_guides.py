@@ -83,7 +83,7 @@ class StepGuides:
             self.at(percent / 100)
 
     def at(self, xi: float) -> Choice:
-        """Return the softest filter that withstands the requested disturbance torques, or else the filter that withstands most.
+        """Return the softest filter for the requested torques; if there is none, the filter for the largest torques.
 
         Args:
             xi: assistance factor in [0, 1].
@@ -117,7 +117,7 @@ class StepGuides:
 
 
 def filter_config(config: StepGuideConfig, robot: Robot) -> GuideConfig:
-    """Return the parameters of the guide filters. The limits of torque and speed follow from the limits of sagittal hip and knee.
+    """Return the parameters of the guide filters. The limits follow from the limits of SH and SK of the robot.
 
     Args:
         config: reserves, gains and intensities.

@@ -31,7 +31,7 @@ Vector3 = tuple[float, float, float]
 
 _SA, _HA = LEG_JOINTS.index("SA"), LEG_JOINTS.index("HA")
 _STOP_MARGIN = math.radians(1.0)  # rad, smallest distance between a target and the joint limit
-_STOP_FADE = math.radians(3.0)  # rad, distance from the joint limit; closer to the limit, the target rate is reduced
+_STOP_FADE = math.radians(3.0)  # rad, closer than this to the joint limit, the target rate is reduced
 _PELVIS = IMUS.index("pelvis")
 _TIBIAE = tuple(IMUS.index(f"{side}_tibia") for side in SIDES)
 _IMU_AGE = 10  # cycles, largest valid age of an IMU message, equal to the timeout of the message in the DBC

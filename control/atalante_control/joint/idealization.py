@@ -1,6 +1,6 @@
 """Joint idealization: torques u_i with which an assisted joint moves like a free inertia. `q, q', u_g -> u_i`.
 
-The law of the paper is u_i = k_d sign(q') + k_v q' + u_g. This module decides three points:
+The law of the paper is u_i = k_d sign(q') + k_v q' + u_g. This module differs from the paper in three points:
 
 - The paper prints sign(q) and k_v q. Friction opposes the velocity, so this module uses q'.
 - The sign is smoothed to tanh(q' / v_s). At rest, noise changes the sign of the measured velocity from cycle to cycle. Without

@@ -47,7 +47,7 @@ class LegGains:
 class PidGains:
     """PID gains of stance leg and swing leg, and the limit of the integral torque.
 
-    The defaults are those for walking on the ground, where the stance leg carries the robot.
+    The defaults are for walking on the ground, where the stance leg carries the robot.
     """
 
     stance: LegGains = LegGains(
@@ -63,8 +63,9 @@ class PidGains:
     integral_limit: float = 10.0  # Nm
 
 
-#: Gains for the suspended robot. Its stance leg carries no load, so TH, SK, SA and HA of this leg have the swing leg gains.
-#: With the gains for the ground, the knee and ankle of a suspended robot would oscillate, because they move small inertias.
+#: Gains for the suspended robot. The stance leg carries no load, so TH, SK, SA and HA of this leg have the swing leg
+#: gains. With the gains for the ground, the knee and ankle of a suspended robot would oscillate, because they move
+#: small inertias.
 AIR_GAINS = PidGains(
     stance=LegGains(
         kp=(3000.0, 720.0, 3000.0, 900.0, 300.0, 180.0),
@@ -117,7 +118,8 @@ class Pid:
 
         Args:
             stance: stance leg, LEFT or RIGHT.
-            share: share of the baseline in the torque of each joint, in [0, 1], shape (12,). It multiplies the integral gains.
+            share: share of the baseline in the torque of each joint, in [0, 1], shape (12,). The share multiplies the
+                integral gains.
         """
         gains = self.records[0].gains
         gains[:] = self._gains_of[stance]
@@ -133,7 +135,7 @@ class Pid:
             sent: torque command of the previous cycle after the limiter, shape (12,) [Nm]; None if the limiter changed nothing.
 
         Returns:
-            u_t, shape (12,) [Nm], overwritten by the next call.
+            u_t, shape (12,) [Nm]. The next call overwrites this array.
         """
         self._kernel(self.records, desired, q, qd, self.requested if sent is None else sent, self._torque)
         return self._torque

@@ -21,7 +21,7 @@ LEG_LINKS = dict(zip(LEG_JOINTS, ("frontal_hip", "transverse_hip", "thigh", "sha
 
 @dataclass(frozen=True)
 class ExoskeletonParameters:
-    """Dimensions and masses of an Atalante-like exoskeleton. They describe the left side; the right side is its mirror image.
+    """Dimensions and masses of an Atalante-like exoskeleton, for the left side. The right side is the mirror image.
 
     Joint offsets, axes, masses, sole and sensor positions are rounded public numbers. The positions of the masses in their links
     are assumptions of this project. Thigh and shank are adjusted to the patient.
@@ -50,7 +50,7 @@ class ExoskeletonParameters:
     sole_centre: tuple[float, float] = (0.06, -0.165)  # m, x and z of the sole centre relative to the ankle
     cell_x: tuple[float, float] = (0.178, -0.064)  # m, x of front and rear force cells relative to the ankle
     cell_y: float = 0.027  # m, lateral distance of the force cells from the middle of the foot
-    pad_radius: float = 0.005  # m, radius of the contact sphere in each corner of the sole; it touches the sole plane
+    pad_radius: float = 0.005  # m, radius of the sphere in each corner of the sole; the spheres touch the sole plane
     pad_mass: float = 0.0015  # kg, mass of each contact sphere, subtracted from the mass of the foot
 
     torso_imu: Vector3 = (-0.14, 0.0, 0.50)  # m, position of the torso IMU in the pelvis frame

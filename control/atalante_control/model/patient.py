@@ -1,6 +1,6 @@
 """Patient as a set of rigid segments: `mass, height (, thigh, shank) -> Winter's table -> mass properties of a segment`.
 
-`exoskeleton.links` fuses these bodies into the links of the exoskeleton.
+`exoskeleton.links` fuses these segments into the links of the exoskeleton.
 """
 
 from __future__ import annotations

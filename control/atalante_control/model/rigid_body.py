@@ -82,7 +82,7 @@ class Link:
     parent: str  # name of the parent link, or "" for the root
     joint: str | None  # one of `JOINTS`, or None if the link is fixed to its parent
     origin: Vector3  # m, position of the joint in the frame of the parent link
-    yaw: float  # rad, angle about the z axis of the parent link, from the parent frame to the link frame at joint angle 0
+    yaw: float  # rad, rotation from parent frame to link frame about the z axis, at joint angle 0
     axis: Vector3  # joint axis in the frame of the link; unused for a fixed link
     inertia: Inertia
     boxes: tuple[Box, ...] = ()  # shapes for viewers

@@ -2,9 +2,9 @@ r"""Velocity-aided attitude observer: `gyro, accelerometer, velocity of the IMU 
 
 The gyro drifts, and the accelerometer of a walking robot measures much more than gravity. The observer therefore compares the
 integral of the specific force with a measured velocity of the IMU. This velocity follows from the joint angles, the joint speeds
-and the gyro, because a sole on the ground is at rest. With the rotation :math:`\hat R` from pelvis to world, the specific
-force a, the angular velocity :math:`\omega`, the gravitational acceleration :math:`g_b = \hat R^T g` and the velocity error
-:math:`\tilde v = v - \hat v`, all in the axes of the pelvis:
+and the gyro, because a sole on the ground is at rest. Let :math:`\hat R` be the rotation from pelvis to world. All
+vectors are in the axes of the pelvis: the specific force a, the angular velocity :math:`\omega`, the gravitational
+acceleration :math:`g_b = \hat R^T g` and the velocity error :math:`\tilde v = v - \hat v`. The observer is
 
 .. math:: \dot{\hat v} = a - \omega \times \hat v + g_b + 2 w \tilde v, \quad
           \dot{\hat R} = \hat R\,[\omega + (w / |g|)^2\,\tilde v \times g_b]_\times

@@ -15,7 +15,8 @@ from atalante_control.walking.placement import PlacementConfig
 
 Pair = tuple[float, float]
 
-#: Default steering gains: 0.5 rad per rad of heading, 0.15 rad per m of sideways deviation, at most 3 degrees per step.
+#: Default steering gains: 0.5 rad per rad of heading error, 0.15 rad per m of sideways deviation, at most 3 degrees per
+#: step.
 STEERING = 0.5, 0.15, math.radians(3.0)
 
 _NO_INTEGRAL = (0.0,) * 6
@@ -56,7 +57,8 @@ class WalkConfig:
     #: With an almost straight leg, `reach_rate` makes the foot slower than `reach_speed`.
     reach_rate: float = 2.5
     reach_knee: float = 0.05  # rad, smallest knee angle while a late swing foot moves down
-    #: Steering by an offset of the transverse hip: gain per heading [rad/rad], gain per sideways deviation [rad/m], limit [rad].
+    #: Steering by an offset of the transverse hip: gain on the heading error [rad/rad], gain on the sideways deviation
+    #: [rad/m], limit [rad].
     steering: tuple[float, float, float] = STEERING
     #: s, time after the nominal end of a step at which the step ends if no landing is detected
     landing_timeout: float = 0.4
@@ -84,7 +86,8 @@ class WalkConfig:
 
         In the periodic steps, the baseline controller is the PID with re-centring, impact detection and flat foot. It has no
         gravity torque, no feedforward, no ankle stabiliser and no steering. Below Xi = 1, `guide.literal` drives SH and SK of the
-        swing leg. Standing, weight shifts, start step and stop step are those of `WalkConfig`, because the paper has none.
+        swing leg. Standing, weight shifts, start step and stop step are those of `WalkConfig`, because the paper does
+        not define them.
         """
         return cls(literal_law=True, gains=PidGains(), steering=(0.0, 0.0, 0.0))
 

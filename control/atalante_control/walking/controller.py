@@ -5,8 +5,8 @@
 A walk begins and ends with standing: weight shift, start step, periodic steps, stop step, weight shift back (`walking.phases`).
 The controller uses only measurements from the bus. The torque is the sum of the PID torque, the gravity torque u_g, the
 feedforward u_f and the torque of the ankle stabiliser. In a periodic step with Xi < 1, the sagittal hip and knee (SH, SK) of the
-swing leg get the torque of the guide filter alone until the nominal end of the step. The start step and the stop step are always
-fully assisted. As in the air, Xi changes only at a stance change.
+swing leg get only the torque of the guide filter until the nominal end of the step. The start step and the stop step
+are always fully assisted. As in the air, Xi changes only at a stance change.
 """
 
 from __future__ import annotations
@@ -63,7 +63,8 @@ _PELVIS, _TORSO = IMUS.index("pelvis"), IMUS.index("torso")
 _MARGIN = math.radians(1.0)
 #: Largest valid age of the message of an IMU or a foot [cycles], equal to the timeout of these messages in the DBC.
 _SENSOR_AGE = 10
-#: Share of the weight by which the load on the stance foot changes while the other foot swings, because the robot accelerates.
+#: Change of the load on the stance foot while the other foot swings, as a fraction of the weight. The robot
+#: accelerates, so the load is not exactly the weight.
 _LOAD_ERROR = 0.15
 
 
@@ -161,7 +162,7 @@ class WalkController:
         self.telemetry: Vector = telemetry.view(np.float64)
         self._record = telemetry[0]
         guarded = [name for name, width in TELEMETRY_FIELDS for _ in range(width)].index("error")
-        #: Fields `error`, `q_bound`, `h` and `gate` of the telemetry, which follow each other, shape (6,).
+        #: Consecutive fields `error`, `q_bound`, `h` and `gate` of the telemetry, shape (6,).
         self._guarded = self.telemetry[guarded : guarded + 6]
         self._stage, self._load, self._step, self._heading = (
             stages[0],
@@ -304,7 +305,7 @@ class WalkController:
             state: measured state of the robot.
 
         Returns:
-            The command, overwritten by the next call.
+            The command. The next call overwrites the same object.
         """
         self._measure(state)
         self._sense(self._measured, self._table, self._constants, self._stabiliser, self._parts)
@@ -327,7 +328,7 @@ class WalkController:
             state: measured state of the robot.
 
         Raises:
-            TypeError: If an array is not a contiguous array of float64, because the kernels do not check the type.
+            TypeError: If an array is not a contiguous array of float64. The kernels do not check the type.
         """
         sent = self._sent if state.torque_sent is None else state.torque_sent
         for imu, position in self._imus.items():
@@ -377,7 +378,8 @@ class WalkController:
         load = self._load.tolist()
         self._loaded = self._loaded + 1 if min(load) >= self._carrying else 0
         if phase in STEPPING:
-            # `cycle` is the row of the phase table. With a phase rate of 1 (no step timing), it is the number of cycles.
+            # `cycle` is the row of the phase table. With a phase rate of 1 (no step timing), this row is the number of
+            # cycles.
             cycle = int(self._clock[0] + self._pace[0])
             landed = self._landed = self._impact.update(load[1 - self._stance], cycle / nominal)
         steps = self.statistics.steps + (phase is Phase.STEP)

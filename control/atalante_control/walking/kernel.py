@@ -84,7 +84,8 @@ class Sensed:
     """Results of the first half of a cycle, `sense`: loads, kinematics, attitude."""
 
     load: Annotated[Vector, 2]  # N, filtered vertical force on the left and the right foot
-    #: N, the smaller of filtered and unfiltered vertical force. It drops without delay when a foot leaves the ground.
+    #: N, the smaller of filtered and unfiltered vertical force. The smaller force drops without delay when a foot
+    #: leaves the ground.
     bearing: Annotated[Vector, 2]
     heading: Annotated[Vector, 2]  # rad, heading of each foot without the toe-out
     step: Annotated[Vector, 3]  # m, position of the right sole relative to the left sole, world axes
@@ -302,8 +303,9 @@ def act(
 def _assist(cycle: int, measured: Measured, assistance: Assistance, parts: Parts) -> None:
     """Replace the torques of sagittal hip and knee of the swing leg by the torques of the guide filter.
 
-    After the nominal end of the step, the baseline controller lowers the foot. `Stage.excess`, the difference of both torques in
-    the last guided cycle, is added to its torque and fades out with `fade`, so the command is continuous.
+    After the nominal end of the step, the baseline controller lowers the foot. `Stage.excess` is the difference of both
+    torques in the last guided cycle. This difference is added to the torque of the baseline controller and fades out
+    with `fade`, so the command is continuous.
 
     Args:
         cycle: cycles since the start of the step.

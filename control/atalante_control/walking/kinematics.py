@@ -1,7 +1,8 @@
 """Kinematics of the soles and of the centre of mass, relative to the pelvis: `joint angles and speeds -> Soles, Centre`.
 
 All results are in the axes of the pelvis frame and relative to the origin of this frame. They describe the motion relative to the
-pelvis. The attitude of the pelvis comes from the attitude observer, and its velocity from a sole at rest (`walking.attitude`).
+pelvis. The attitude of the pelvis comes from the attitude observer. The velocity of the pelvis follows from a sole at
+rest (`walking.attitude`).
 """
 
 from __future__ import annotations
@@ -99,7 +100,7 @@ class Kinematics:
             velocity: joint speeds, shape (12,) [rad/s].
 
         Returns:
-            The records, overwritten by the next call.
+            The records. The next call overwrites them.
         """
         self._move(self.chain, position, velocity)
         return self.chain

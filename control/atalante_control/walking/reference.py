@@ -62,7 +62,8 @@ def step_table(
     Args:
         gait: right-stance step.
         stance: stance leg, LEFT or RIGHT; for LEFT the mirrored step is sampled.
-        alphas: end of the re-centring, as a fraction of the step duration: of all joints, and of the joints that a guide assists.
+        alphas: two ends of the re-centring, as fractions of the step duration: for the joints without a guide, and for
+            the joints that a guide can assist.
         reach: downward motion of the swing foot after the last cycle.
         kinematics: kinematics of the robot with the patient.
         toe_out: toe-out of the left foot, positive to the left [rad].

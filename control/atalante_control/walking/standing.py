@@ -24,7 +24,7 @@ _LEG = len(LEG_JOINTS)
 _ITERATIONS = 50  # largest number of iterations of the inverse kinematics for a pose
 _TOLERANCE = 1e-10  # m or rad, largest accepted error of the inverse kinematics
 _LARGEST = 0.2  # rad, largest change of a joint angle in one iteration
-_POINTS = 31  # number of poses along a weight shift; the Bezier control points are fitted to them
+_POINTS = 31  # number of poses along a weight shift; the Bezier control points are fitted to these poses
 
 
 class Stance(NamedTuple):

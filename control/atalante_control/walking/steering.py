@@ -26,7 +26,8 @@ class Steering:
         """Set the gains of the steering.
 
         Args:
-            gains: TH offset per heading [rad/rad], TH offset per sideways deviation [rad/m], and largest TH offset [rad].
+            gains: TH offset per heading error [rad/rad], TH offset per sideways deviation [rad/m], and largest TH
+                offset [rad].
         """
         self._gains = gains
         self.feet: Vector = np.zeros((2, 2))

@@ -101,7 +101,7 @@ class Body(Protocol):
         """
 
     def motion(self, link: str) -> Motion:
-        """Return the true pose and velocity of a link. Emulated nodes must not use them; crane, virtual operator and tests may.
+        """Return the true pose and velocity of a link, for crane, virtual operator and tests, not for emulated nodes.
 
         Args:
             link: name of the link in the URDF.
@@ -129,7 +129,7 @@ def make_body(
     Args:
         engine: one of `ENGINES`.
         urdf: text of the URDF, not a path.
-        free: whether the pelvis is free to move. False fixes it at the origin.
+        free: whether the pelvis is free to move. With False, the pelvis is fixed at the origin.
         ground: height of the floor in the world [m]. None if there is no floor.
         friction: coefficient of friction between soles and floor.
 

@@ -102,7 +102,7 @@ class MuJoCoBody:
 
         Args:
             urdf: text of the URDF, not a path.
-            free: whether the pelvis is free to move. False fixes it at the origin.
+            free: whether the pelvis is free to move. With False, the pelvis is fixed at the origin.
             ground: height of the floor in the world [m]. None if there is no floor.
             friction: coefficient of friction between soles and floor.
             contact: contact model. With None, the default values of `Contact` are used.
@@ -127,7 +127,7 @@ class MuJoCoBody:
         q = model.jnt_qposadr[model.joint(JOINTS[0]).id]
         self._q = data.qpos[q : q + len(JOINTS)]
         self._torque = data.qfrc_applied[first : first + len(JOINTS)]
-        self._body_of: dict[str, int] = {}  # MuJoCo's numbers of the links that `motion` was called for
+        self._body_of: dict[str, int] = {}  # MuJoCo's index of each link for which `motion` was called
         pelvis = model.body(PELVIS).id
         self._wrench = data.xfrc_applied[pelvis]
         self._sensed = _Sensed(self._q, data.qvel[first : first + len(JOINTS)], *_views(data.sensordata))

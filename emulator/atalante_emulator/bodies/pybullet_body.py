@@ -68,7 +68,7 @@ class PyBulletBody:
 
         Args:
             urdf: text of the URDF, not a path.
-            free: whether the pelvis is free to move. False fixes it at the origin.
+            free: whether the pelvis is free to move. With False, the pelvis is fixed at the origin.
             ground: height of the floor in the world [m]. None if there is no floor.
             friction: coefficient of friction between soles and floor.
 
@@ -152,8 +152,8 @@ class PyBulletBody:
             pybullet.changeDynamics(self._body, pad, lateralFriction=friction, **client)
 
     def _link_states(self, links: Sequence[int]) -> Any:
-        # The argument after `links` requests velocities, and the next one the forward kinematics.
-        # Without forward kinematics, PyBullet returns the poses of the previous time step.
+        # The argument after `links` requests velocities. The next argument requests the forward kinematics. Without
+        # forward kinematics, PyBullet returns the poses of the previous time step.
         return pybullet.getLinkStates(self._body, links, 1, 1, physicsClientId=self._client)
 
     def reset(self, position: Sequence[float], base: Pose | None = None) -> None:
