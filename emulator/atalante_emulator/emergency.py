@@ -136,7 +136,7 @@ class Errors:
         return self._active[node].get(code, False)
 
     def clear(self, node: int) -> None:
-        """Remove all errors of a node without a report, because the node restarts.
+        """Remove all errors of a node that restarts. The node does not report this removal.
 
         Args:
             node: index of the node.

@@ -126,7 +126,7 @@ class Emulator:
         self._sample_next()
 
     def inject(self, faults: Sequence[Fault]) -> None:
-        """Add faults to a robot that has none yet.
+        """Add faults to an emulator that has no faults yet.
 
         Args:
             faults: faults to inject. They must begin at least two cycles later, because the next frames are already computed.
@@ -350,7 +350,9 @@ class Emulator:
                     self._rx.refuse(command)
 
     def _check_commands(self, checks: list[int], count: int) -> None:
-        """Report lost and rejected commands to the drives of each leg. Start a local hold if two nodes send commands to a leg.
+        """Inform the drives of each leg about lost and rejected commands.
+
+        If two nodes send commands to a leg, the drives of this leg start their local hold.
 
         Args:
             checks: value of `Check` of each row of the process image.

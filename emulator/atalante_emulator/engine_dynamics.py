@@ -22,7 +22,7 @@ Pose = tuple[Sequence[float], Sequence[float]]  # position [m], quaternion xyzw
 class EngineDynamics(Closing):
     """Dynamics of a robot with a fixed pelvis in PyBullet. Joint vectors are in the order of `JOINTS`.
 
-    As a context manager, it disconnects from PyBullet at the end of the block.
+    The object is a context manager, which disconnects from PyBullet at the end of the `with` block.
     """
 
     def __init__(self, urdf: str) -> None:

@@ -26,7 +26,7 @@ class Haptics:
         self._parameters = parameters
 
     def advance(self, level: Vector, silence: int, cycles: int) -> None:
-        """Advance the amplitudes by some cycles, with the exact solution of da/dt = (level - a) / rise_time.
+        """Advance the amplitudes a by a number of cycles, with the exact solution of da/dt = (level - a) / rise_time.
 
         Args:
             level: last valid command, shape (8,), 0 to 1.

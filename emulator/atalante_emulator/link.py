@@ -215,8 +215,8 @@ class FaultyBus(WrappedBus):
     """Bus of the emulated nodes with injected communication faults.
 
     Delayed frames, and frames that a fault adds, are sent when the SYNC of their cycle arrives. The nodes receive these frames
-    before the frames of the HAL, and the HAL receives them before the answers of the nodes. Added frames reach both the HAL and
-    the nodes, except error frames, which reach only the HAL.
+    before the frames of the HAL. The HAL receives these frames before the answers of the nodes. Added frames reach
+    both the HAL and the nodes, except error frames, which reach only the HAL.
     """
 
     def __init__(

@@ -46,7 +46,7 @@ def _advance(
 
     Args:
         velocity: true joint velocities, shape (12,) [rad/s].
-        setpoint: setpoints of the motor torques that reach the current loops, shape (12,) [Nm].
+        setpoint: motor torque setpoints that now reach the current loops, shape (12,) [Nm].
         motors: motor array, shape (8, 12). Its joint torques are updated.
         tracking: share of the torque deviation that the current loop removes per `PERIOD`.
         friction_speed: joint speed at which dry friction reaches 76 % of its full value [rad/s].

@@ -118,7 +118,10 @@ class NodeFaults:
         self._drives.enable_delay[_drive(nodes)] = fault["by"] if cycle < fault.end else 0
 
     def _reset(self, fault: Fault, nodes: Nodes, cycle: int) -> None:
-        """Keep a drive in reset during the fault, and boot the node at the end. Meanwhile `link` drops the frames of the node."""
+        """Keep a drive in reset during the fault, and boot the node at the end of the fault.
+
+        During the fault, `link` drops the frames of the node.
+        """
         (node,) = nodes
         if cycle == fault.end:
             self._heartbeats.boot(node, cycle)

@@ -38,7 +38,9 @@ def ground_tick(effort: Effort) -> Measurement:
 
 
 def _standing(body: Body) -> Block:
-    """Put a robot on the floor, and return a function that simulates `_STEPS` steps and returns the mean time per step [s].
+    """Put a robot on the floor, and return a timed block. The block simulates `_STEPS` steps.
+
+    The result of the block is the mean time per step [s].
 
     Args:
         body: robot with a free pelvis.

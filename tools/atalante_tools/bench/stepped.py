@@ -1,6 +1,6 @@
 """Simulation of the tracking errors of hip and knee, cycle by cycle. The guide filter predicts the same errors from tables.
 
-The integration is the reference for a check of the tables, and the baseline of the benchmark `filter_tick`.
+The simulation is the reference for a check of the tables, and the baseline of the benchmark `filter_tick`.
 
 This module is not part of the control loop. It simulates the control loop with the backup policy (`guide.backup_policy`) as
 controller, cycle by cycle. The simulated loop includes the delay of the command by one cycle, the motor, the leg, and the
@@ -23,7 +23,7 @@ class SteppedRollout:
         """Copy the gains of the backup policy, and the coefficients of the motor and of the velocity filter.
 
         Args:
-            guide: guide filter whose prediction is integrated.
+            guide: guide filter whose prediction is simulated cycle by cycle.
         """
         self._stiffness, self._damping = guide.prediction.policy.gains()
         loop = guide.prediction.assumptions.loop

@@ -1,8 +1,8 @@
 """Codec for logs and for any DBC. It decodes many frames of one message in one call, and computes E2E CRCs.
 
-The codec of the control loop (`codec.Codec`) decodes all messages of one cycle and requires that no signal crosses a
-64-bit word. The codec in this module decodes many frames of one message. It supports Intel and Motorola layouts,
-signals across 64-bit words, 64-bit signals, IEEE floats and multiplexed signals. The decoded values are equal to those
+The codec of the control loop (`codec.Codec`) decodes all messages of one cycle and requires that each signal lies in
+one 64-bit word. The codec in this module decodes many frames of one message, with Intel and Motorola layouts, signals
+across two 64-bit words, 64-bit signals, IEEE floats and multiplexed signals. The decoded values are equal to the values
 of cantools.
 """
 

@@ -135,9 +135,10 @@ class Plan:
         return rows
 
     def rows_in_other_format(self, can_ids: npt.NDArray[np.uint32]) -> Rows:
-        """Return for each identifier the index of the message with the same number in the other identifier format. Shape (n,).
+        """Return the index of the message with the same number in the other identifier format. Shape (n,).
 
-        The two formats are 11 bits and 29 bits. The index is `UNKNOWN` if the DBC has no such message.
+        The number of an 11-bit identifier is searched among the 29-bit identifiers of the DBC, and vice versa.
+        The index is `UNKNOWN` if the DBC has no such message.
         """
         numbers = can_ids & np.uint32(_ALL_BITS)
         short = self._standard[np.where(numbers < _STANDARD, numbers, 0)]

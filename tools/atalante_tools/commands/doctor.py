@@ -305,7 +305,7 @@ def _measure(target: Target, seconds: float, as_json: bool) -> None:
 
 
 def listen(bus: Bus, timing: BusTiming, seconds: float, stop: StopRequest) -> None:
-    """Receive frames for some seconds and measure their times.
+    """Receive frames for some seconds, and measure the time from SYNC to each frame.
 
     Args:
         bus: Bus to listen to.

@@ -181,7 +181,7 @@ def end_condition(stop: StopRequest, emulator: Emulator, bus: Line) -> Callable[
     progress = Progress(period=STATUS_PERIOD)
     has_pendant = emulator.operator is not None
     alone = True
-    received = 0  # number of frames at the last status line
+    received = 0  # number of frames received before the last status line
 
     def is_over() -> bool:
         nonlocal has_pendant, alone, received

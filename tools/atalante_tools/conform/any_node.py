@@ -27,7 +27,8 @@ _HEARTBEAT_CYCLES, _ANSWER_CYCLES = 520, 200
 _MEAN, _SINGLE = 0.1, 0.5
 #: The flood test sends `_FLOOD` random frames in each of `_FLOOD_CYCLES` cycles. The bus load stays below 100 %.
 _FLOOD, _FLOOD_CYCLES = 6, 100
-#: Payload bits of SYNC in the CRC, the HAL state and the cycle number. Each damaged SYNC has one of these bits flipped.
+#: Bits of the SYNC payload that belong to CRC, HAL state or cycle number. In each damaged SYNC, one of these bits is
+#: flipped.
 _DAMAGED: Final = (0, 5, 10, 15, *range(24, 32), *range(48, 56))
 #: Number of wrong SYNCs sent for each kind of defect.
 _WRONG: Final = len(_DAMAGED)

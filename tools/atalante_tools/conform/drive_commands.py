@@ -148,7 +148,7 @@ def latches(tester: NodeTester) -> Outcome:
 def latches_late_commands(tester: NodeTester) -> Outcome:
     """Test DRIVE-24: commands whose delay grows step by step lead to QUICK STOP ACTIVE.
 
-    Each step is a pause of `TOLERATED` cycles, which alone has no effect.
+    Each step is a pause of `TOLERATED` cycles. A single pause has no effect.
     """
     axis = Axis(tester)
     axis.enable()

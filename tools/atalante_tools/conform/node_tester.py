@@ -72,7 +72,10 @@ class LockStep:
         self._silent = 0
 
     def next_cycle(self, *, sync: bool, listen: Callable[[float], None]) -> None:
-        """Start the next cycle without a wait. From the `WATCHDOG`-th cycle in a row without SYNC, also advance the node."""
+        """Start the next cycle without a wait.
+
+        From the `WATCHDOG`-th consecutive cycle without SYNC, also advance the node.
+        """
         self._silent = 0 if sync else self._silent + 1
         if self._silent >= self._watchdog:
             self._emulator.idle()

@@ -2,9 +2,10 @@
 
     signal -> handler -> StopRequest: the handler raises `Stopped`, or a loop reads `wanted`
 
-A library may catch and discard an exception that a signal handler raises. Examples are a callback of compiled code and a failed
-evaluation in an optimiser. Therefore the request is stored, and `check` raises `Stopped` again before the robot moves. This
-module has few imports, because no signal is handled before the import of this module ends.
+A library may catch and discard an exception that a signal handler raises. For example, compiled code discards an
+exception in a callback, and an optimiser counts the exception as a failed evaluation. Therefore the request is stored,
+and `check` raises `Stopped` again before the robot moves. This module has few imports, because no signal is handled
+before the import of this module ends.
 """
 
 from __future__ import annotations

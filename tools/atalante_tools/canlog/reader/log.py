@@ -1,7 +1,7 @@
 """Reader of CAN logs in chunks of frames: an array parser for candump logs, and python-can for all other formats.
 
-The chunk size limits the memory that a log of any length needs. The reader returns all readable frames. It describes
-unreadable parts of a log in remarks, which the validator reports as findings.
+The required memory depends on the chunk size, not on the length of the log. The reader returns all readable frames. For
+unreadable parts of a log, the reader adds remarks. The validator reports each remark as a finding.
 """
 
 from __future__ import annotations

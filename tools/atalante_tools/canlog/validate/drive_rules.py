@@ -233,7 +233,7 @@ def _command_fields(plan: Plan, command: str) -> list[_CommandField]:
 
 
 def _drive(row: int, node: str, commands: Sequence[_CommandField]) -> _Drive:
-    """Create a drive. Its controlword is the first command field for the same node and joint.
+    """Create a drive. The controlword of the drive is the first command field for the same node and joint.
 
     Args:
         row: index of the state message in the plan.

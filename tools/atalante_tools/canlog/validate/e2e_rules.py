@@ -75,7 +75,7 @@ class CrcRules:
     ) -> None:
         """Report wrong CRCs.
 
-        If a CRC matches the Data ID of another message, the frame is reported with a wrong identifier.
+        If a CRC matches the Data ID of another message, the report says that the identifier of the frame is wrong.
 
         Args:
             of: index of the message of each frame in the plan, shape (k,).

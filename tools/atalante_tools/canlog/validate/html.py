@@ -205,7 +205,7 @@ def _gap_plot(result: Report) -> str:
 
 
 def _histograms(result: Report) -> list[str]:
-    """Plot interval histograms: first of the messages with timing findings, then of the messages with the widest histograms."""
+    """Plot interval histograms. Messages with timing findings come first, then messages with wide histograms."""
     validator = result.validator
     reported = {f.message for f in result.findings if f.rule in _TIMING}
     rows = [r for r in np.flatnonzero(validator.timing.intervals > 0).tolist() if validator.plan.cycle_ns[r] > 0]

@@ -37,7 +37,7 @@ _SPACING_NS, _LAST = 1000, 0.7
 class _Channel:
     """State of the clock for one channel after the last frame on this channel."""
 
-    #: Plan index of the first SYNC message that was received on this channel; -1: no SYNC yet.
+    #: Plan index of the first SYNC message that was received on this channel; -1 before the first SYNC.
     #: The clock reads the cycle number from this message.
     sync: int = -1
     cycle: int = 0  # cycle number of the last SYNC

@@ -83,8 +83,8 @@ class TimingRules:
         Args:
             stream: valid frames of the chunk, sorted by message, shape (n,).
             steps: result of `e2e_rules.Counters.steps`, shape (n,).
-            rejected_before: number of rejected frames between the previous and this valid frame of the message, shape
-                (n,); None if no frame was rejected.
+            rejected_before: number of rejected frames between each valid frame and the previous valid frame of the same
+                message, shape (n,); None if no frame was rejected.
         """
         if not len(stream):
             return
@@ -199,7 +199,7 @@ class TimingRules:
         bins = np.minimum(np.maximum(share * BINS_A_CYCLE, 0.0), float(BINS - 1)).astype(np.int64)
         bins += (np.arange(len(stream.present)) * BINS).repeat(stream.stops - stream.starts)
         # Exclude the intervals with lost, repeated or rejected frames from the statistics.
-        # Keep the intervals of messages without an alive counter (`NO_STEP`), because lost frames are not detectable there.
+        # Keep the intervals of messages without an alive counter (`NO_STEP`), because a loss is not detectable.
         incomplete = (
             odd[steps[odd] >= REPEATED]
             if rejected_before is None

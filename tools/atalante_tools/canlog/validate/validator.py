@@ -118,8 +118,8 @@ class Validator:
             indices: index of each rejected frame in the chunk, shape (k,).
 
         Returns:
-            Number of rejected frames between the previous and this valid frame, shape (n,); None if no frame was
-            rejected.
+            Number of rejected frames between each valid frame and the previous valid frame of the same message, shape
+            (n,); None if no frame was rejected.
         """
         if not len(rows) and not bool(self._pending.any()):
             return None
