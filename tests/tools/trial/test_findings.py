@@ -239,13 +239,18 @@ def test_protocol_needs_certified_guides_and_no_alarm() -> None:
     walks = [
         {**walk_result(75.0, False, 0.5, net=0.0, error=1.0), "diagnostics": {"TORQUE_SATURATED": 4}} for _ in range(20)
     ]
-    assert verdicts(protocol_findings(walks)) == {"protocol-contained": True, "protocol-certified": True}
+    assert verdicts(protocol_findings(walks)) == {
+        "protocol-contained": True,
+        "protocol-certified": True,
+        "protocol-diagnostics": True,
+    }
     walks[0]["certified"] = False
     assert verdicts(protocol_findings(walks))["protocol-certified"] is True
     walks[1]["certified"] = False
     assert verdicts(protocol_findings(walks))["protocol-certified"] is False
     alarmed = [*walks[2:], {**walks[2], "diagnostics": {"ENC_DRIFT": 1}}]
-    assert verdicts(protocol_findings(alarmed))["protocol-certified"] is False
+    assert verdicts(protocol_findings(alarmed))["protocol-certified"] is True
+    assert verdicts(protocol_findings(alarmed))["protocol-diagnostics"] is False
     assert verdicts(protocol_findings([{**walks[2], "outcome": "fell"}]))["protocol-contained"] is False
 
 

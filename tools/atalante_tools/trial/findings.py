@@ -133,18 +133,24 @@ def sweep_findings(results: Sequence[Result]) -> list[Finding]:
 
 
 def protocol_findings(results: Sequence[Result]) -> list[Finding]:
-    """Return the findings of `protocol`: whether all walks end standing, inside the guide, and with certified guides.
+    """Return the findings of `protocol`: walks end standing and inside the guide, guides are certified, no fault is reported.
 
     Args:
         results: results of `walk` trials.
     """
-    found = [_contained("protocol-contained", results)]
-    claim = "the guides have a promise, and no fault is reported"
     certified, alarms = sum(bool(r["certified"]) for r in results), _alarms(results)
-    promised = f"{certified} of {len(results)} guides with a promise, at least {CERTIFIED:.0%} wanted"
-    text = f"{promised}; other diagnostics: {alarms or 'none'}"
-    passed = certified >= CERTIFIED * len(results) and not alarms if results else None
-    return [*found, Finding("protocol-certified", claim, text, passed)]
+    share = f"{certified} of {len(results)} guides with a promise, at least {CERTIFIED:.0%} wanted"
+    return [
+        _contained("protocol-contained", results),
+        Finding(
+            "protocol-certified", "the guides have a promise", share,
+            certified >= CERTIFIED * len(results) if results else None,
+        ),
+        Finding(
+            "protocol-diagnostics", "no fault is reported", alarms or "no diagnostic",
+            not alarms if results else None,
+        ),
+    ]  # fmt: skip
 
 
 def robust_findings(results: Sequence[Result]) -> list[Finding]:
