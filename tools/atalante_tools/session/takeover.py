@@ -64,7 +64,7 @@ class Takeover:
         self._free_from = 0  # first cycle in which this pendant may stop sending
         self._quiet_from = 0  # cycle from which the time without frames of other pendants is counted
         self._received_at = -MAX_DELTA - 1  # cycle in which the newest frame of another pendant was received
-        self._received = 0  # number of frames of another pendant, with gaps of at most `MAX_DELTA` cycles between them
+        self._received = 0  # number of frames of another pendant since the last gap of more than `MAX_DELTA` cycles
 
     @property
     def present(self) -> bool:
@@ -125,7 +125,8 @@ class PendantReader:
         tag: Counter that an answer to the last SYNC contains, 0 to 255.
         hal_state: Signal HalState of the last SYNC.
         gaps: Number of rejected SYNCs. After a gap, SYNCs are rejected until enough consecutive SYNCs were received.
-        other: Signal name -> value in the last frame with which another pendant answered a SYNC. Empty before the first one.
+        other: Signal name -> value in the last frame with which another pendant answered a SYNC. Empty before the first
+            such frame.
     """
 
     def __init__(self, network: Network, takeover: Takeover) -> None:

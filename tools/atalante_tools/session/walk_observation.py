@@ -41,7 +41,7 @@ class Observation:
         self.fell = False
         self._rig, self._controller, self._push = rig, controller, push
         self._push_begun: int | None = None  # cycle in which the push began
-        self._squares, self._count = 0.0, 0  # sum of the squared attitude errors [rad2], and their number
+        self._squares, self._count = 0.0, 0  # sum [rad2] and number of the squared attitude errors
         self._origin: Stance | None = None
         if push is not None and rig.access is not None:
             rig.access.push(self._wrench)
@@ -72,11 +72,11 @@ class Observation:
 
     @property
     def attitude_rms_deg(self) -> float | None:
-        """Return the root mean square of the error of the estimated vertical during the walk [deg]; None if not known."""
+        """Return the root mean square error [deg] of the estimated vertical during the walk; None if unknown."""
         return round(math.degrees(math.sqrt(self._squares / self._count)), 3) if self._count else None
 
     def true_deviation(self) -> dict[str, Any]:
-        """Return the fields of `WalkResult` for the true deviation from the start line; the values are None if not known."""
+        """Return the fields of `WalkResult` for the true deviation from the start line. Unknown values are None."""
         access, lateral, yaw = self._rig.access, None, None
         if access is not None and self._origin is not None and not self.fell:
             with suppress(BusDown):

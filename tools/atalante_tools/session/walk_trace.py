@@ -86,7 +86,7 @@ def foot_prints(columns: Mapping[str, Vector]) -> list[tuple[int, float, float, 
 
 
 def draw(columns: Mapping[str, Vector], picture: Path) -> None:
-    """Draw foot prints with the divergent component of motion (DCM), and the errors of SH and SK as fractions of the guide.
+    """Draw foot prints with the divergent component of motion (DCM), and error / guide width of SH and SK.
 
     Args:
         columns: Samples of `WalkTrace.columns`.
@@ -129,7 +129,7 @@ def _draw_ground(axis: Any, columns: Mapping[str, Vector]) -> None:
 
 
 def _dcm_on_ground(columns: Mapping[str, Vector]) -> Vector:
-    """Return the DCM in the axes of the walking line, shape (n, 2) [m]; NaN outside the steps."""
+    """Return the DCM [m] in the axes of the walking line, shape (n, 2); NaN outside the steps."""
     from atalante_control.walking.phases import STEPPING
 
     stance = columns["stance"][:, 0].astype(int)

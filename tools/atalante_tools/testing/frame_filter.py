@@ -56,7 +56,8 @@ class Fault:
 class FrameFilter(WrappedBus):
     """Bus that applies faults to frames. Without a fault, the bus passes all frames on.
 
-    The filter does not change the list of time stamps. If a frame is dropped or delayed, the following stamps no longer match.
+    The filter does not change the list of time stamps. If a frame is dropped or delayed, the stamps of the following
+    frames are wrong.
 
     Args:
         bus: wrapped bus, owned by the caller.

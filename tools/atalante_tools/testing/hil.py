@@ -1,6 +1,7 @@
 """Parts of the pytest fixtures: the bus with a robot, the HAL loop in steps, and a recording of all frames.
 
-An emulated robot runs in lock-step with the HAL. On a CAN interface it is polled before every `receive` of the HAL.
+An emulated robot runs in lock-step with the HAL. On a CAN interface, the emulated robot is polled before every
+`receive` of the HAL.
 """
 
 from __future__ import annotations
@@ -33,7 +34,7 @@ if TYPE_CHECKING:
 _POLL: Final = 0.01
 #: Time to listen on a CAN interface before the emulated robot uses it [s]. The interface is free if no frame arrives.
 _QUIET: Final = 0.15
-#: Largest number of frames in a recording, about 30 s.
+#: Largest number of frames in a recording (about 30 s).
 KEPT: Final = 600_000
 #: In a recording, the time stamps of consecutive frames of one cycle differ by this time [ns].
 _FRAME_NS: Final = 20_000

@@ -2,8 +2,8 @@
 
     run --fork--> waiting process --fork per request--> continued run -> answer
 
-The operating system copies the memory of the process only where it changes, so a branch is cheaper than a repetition of the run
-until its moment. Equal requests lead to equal runs, because all time is virtual.
+The operating system copies the memory of the process only where it changes, so a branch is cheaper than a repetition of
+the run until that moment. Equal requests lead to equal runs, because all time is virtual.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from typing import Any
 
 
 class Branch:
-    """Branch of a run, as the process that made the run uses it."""
+    """Access to a branch, for the process from which the branch was made."""
 
     def __init__(self, channel: Connection) -> None:
         self._channel = channel
@@ -39,7 +39,7 @@ class Branch:
 
 
 class Continuation:
-    """Continued run, as its own process uses it. The process must end by `finish` or `abandon`.
+    """Continued run, inside its own process. This process must end with `finish` or `abandon`.
 
     Attributes:
         request: how the run continues.
@@ -74,7 +74,7 @@ class _NoAnswer:
 def branch() -> Branch | Continuation:
     """Branch off at this point of the run. In the calling process, return the branch and let the run continue.
 
-    Each request to the branch lets this function return a second time, in another process and with a `Continuation`.
+    For each request to the branch, this function returns once more: in a new process, with a `Continuation`.
     """
     ours, theirs = Pipe()
     if _fork():
@@ -94,13 +94,13 @@ def branch() -> Branch | Continuation:
                 theirs.send(_NoAnswer(status))
     except EOFError:  # the process of the run has closed the branch, or has ended
         os._exit(0)
-    except BaseException:  # noqa: BLE001 - no error may return into the run, which the calling process continues
+    except BaseException:  # noqa: BLE001 - an error must not reach the code of the run in this copy
         os._exit(1)
     return Continuation(request, theirs)
 
 
 def _fork() -> int:
     with warnings.catch_warnings():
-        # Python 3.12 warns of forks beside the idle threads of the numeric libraries. A branch uses no thread.
+        # Python 3.12 warns if a process forks while the numeric libraries have idle threads. A branch uses no thread.
         warnings.simplefilter("ignore", DeprecationWarning)
         return os.fork()

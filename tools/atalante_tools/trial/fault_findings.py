@@ -32,8 +32,8 @@ NO_FALL_IN_DOUBLE_SUPPORT: Final = NO_FRAMES
 def fault_findings(results: Sequence[Result]) -> list[Finding]:
     """Return one finding per fault.
 
-    With a fault and a case of `NO_FALL`, no run may end in a fall. With another fault, each fall must have a diagnostic and a
-    robot that is neither ACTIVE nor FULL_ASSIST any more. With no fault may the HAL raise an exception.
+    If `NO_FALL` contains the fault and the case, no run may end in a fall. In all other cases, the HAL must report a
+    diagnostic for each fall, and must have left ACTIVE and FULL_ASSIST. The HAL must not raise an exception in any run.
 
     Args:
         results: results of `fault` trials.
@@ -88,7 +88,7 @@ def _moments(falls: Sequence[dict[str, Any]]) -> str:
 
 
 def _longest(result: Result) -> str:
-    """Return the longest fault duration without a fall as text, for the worst start of the fault."""
+    """Return as text the longest fault duration without a fall, at the moment with the shortest such duration."""
     limited = [
         (cycles, run["moment"])
         for cycles, run in zip(result["longest"], result["runs"], strict=True)

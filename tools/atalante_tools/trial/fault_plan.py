@@ -48,15 +48,15 @@ PERMANENT: Final = -1
 
 @dataclass(frozen=True)
 class FaultTrial:
-    """Trial of one case of a fault scenario, with one walk for each point at which the fault begins."""
+    """Trial of one case of a fault scenario, with one walk for each moment at which the fault begins."""
 
     kind: ClassVar[str] = "fault"
     id: str  # fault ID, as in the fault matrix
     index: int  # index of the case in its scenario, or `PERMANENT`
     case: str  # name of the case
     moments: tuple[str, ...]  # names of `MOMENTS` and `FURTHER_MOMENTS`
-    mass: float  # kg, of the wearer
-    height: float  # m, of the wearer
+    mass: float  # mass of the wearer [kg]
+    height: float  # height of the wearer [m]
     seed: int
     engine: str
     sources: str  # hash of the scenarios and of the rig
@@ -71,7 +71,7 @@ def fault_trials(ids: Sequence[str], quick: bool, seed: int, engine: str) -> lis
     """Return the trials of the given faults.
 
     Args:
-        ids: fault IDs. With none, all faults with a case.
+        ids: fault IDs; empty means all faults with a case.
         quick: whether only the first case of each fault is tried, at two moments.
         seed: seed of the experiment, which is added to the seed of each case.
         engine: physics engine of the emulated robot.

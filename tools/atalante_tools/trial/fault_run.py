@@ -45,22 +45,24 @@ from atalante_tools.trial.plan import STEP
 if TYPE_CHECKING:
     from atalante_hal.safety.events import Event
 
-#: Cycles from a branch of the walk to its moment. The first frames of a fault are computed one cycle before it begins.
+#: Cycles from a branch of the walk to the moment of the fault. The first faulty frames are computed one cycle
+#: before this moment.
 _LEAD: Final = 5
 #: Cycles for which the HAL is observed after a fall.
 _FALLEN: Final = 300
-#: Cycles after which a walk ends in any case. A walk without a fault lasts about 10000 cycles.
+#: Cycles after which a walk ends at the latest. A walk without a fault lasts about 10000 cycles.
 _LONGEST: Final = 20_000
 #: The robot is at rest if its pelvis and its joints have been slower than these speeds [m/s, rad/s] for this time [cycles], and
 #: each foot carries a load of at least this force [N].
 _STILL, _RESTED, _LOADED = 0.01, 500, 50.0
-#: The robot walks on if two steps have ended after the fault, and this time has passed since [cycles].
+#: The robot is considered to walk on if it still walks this time [cycles] after the second landing (`_LANDINGS`) that
+#: follows the fault.
 _WALKED: Final = 400
 _LANDINGS: Final = 2
 #: Phases of the walk that begin with the landing of a foot.
 _LANDED: Final = frozenset({Phase.STEP, Phase.STOP, Phase.BACK})
 _PELVIS: Final = IMUS.index("pelvis")
-#: Resolution of the longest duration of a fault without a fall [cycles].
+#: Largest accepted error [cycles] of the measured fault duration that the robot survives without a fall.
 RESOLUTION: Final = 10
 
 
@@ -68,7 +70,7 @@ RESOLUTION: Final = 10
 class FaultRun:
     """Result of one walk with a fault."""
 
-    moment: str  # of `FaultTrial.moments`
+    moment: str  # one of `FaultTrial.moments`
     #: "walked" (two steps after the fault, or to the end), "hold" (stopped upright), "fell" or "exception"
     outcome: str
     state: str  # state of the HAL at the end
@@ -98,7 +100,7 @@ class _Answer(NamedTuple):
 
 
 def run_fault(trial: FaultTrial) -> dict[str, Any]:
-    """Run the walks of a trial, one for each point at which the fault begins, and return the result.
+    """Run the walks of a trial, one for each moment at which the fault begins, and return the result.
 
     Args:
         trial: trial to run.
@@ -114,7 +116,7 @@ def run_fault(trial: FaultTrial) -> dict[str, Any]:
         "outcome": "computed",
         "fell": sum(one.outcome == "fell" for one in runs),
         "runs": [asdict(one) for one in runs],
-        "longest": longest,  # longest duration of a permanent fault without a fall [cycles]; None: no fall
+        "longest": longest,  # longest fault duration without a fall [cycles]; None: no fall with the permanent fault
     }
 
 
@@ -130,7 +132,7 @@ def _longest(trial: FaultTrial, case: Case, permanent: FaultRun) -> int:
     fatal = permanent.fallen
 
     def falls(cycles: int) -> bool:
-        if cycles >= fatal:  # until the fall, there is no difference to the permanent fault
+        if cycles >= fatal:  # a fault that lasts until the fall acts like the permanent fault
             return True
         stimuli = tuple(limited(stimulus, cycles) for stimulus in case.stimuli)
         return _run(trial, replace(case, stimuli=stimuli), permanent.moment).outcome == "fell"
@@ -144,7 +146,7 @@ def longest_without(falls: Callable[[int], bool], horizon: int, resolution: int)
     The robot must not fall without a fault. A longer fault must not be easier to survive than a shorter one.
 
     Args:
-        falls: whether the robot falls with a fault of this duration [cycles].
+        falls: function that returns whether the robot falls with a fault of the given duration [cycles].
         horizon: longest duration [cycles].
         resolution: largest accepted error of the result [cycles].
     """
@@ -227,7 +229,8 @@ class _Walk:
         """Prepare the walk.
 
         Args:
-            forks: cycles at whose end the walk branches off. With any, the walk ends after the last one.
+            forks: cycles at whose end the walk branches off. If there are any, the walk ends after the last of
+                these cycles.
         """
         self._forks = set(forks)
         self.begins: dict[tuple[Phase, int], int] = {}
@@ -238,7 +241,7 @@ class _Walk:
         self._events: list[Event] = []
         self._continuation: Continuation | None = None
         self._stimuli = TimedStimuli((), 1)
-        self._ends: int | None = None  # first cycle after the faults; None if there is none, or a permanent one
+        self._ends: int | None = None  # first cycle after the faults; None: no fault, or a permanent fault
 
     def execute(self, mass: float, height: float, seed: int, engine: str) -> None:
         """Walk until the robot stands, walks on after the fault, has stopped or has fallen. A continued walk ends the process.

@@ -29,7 +29,7 @@ def fault_table(results: Sequence[dict[str, Any]]) -> tuple[list[str], list[list
 
 
 def _survived(result: dict[str, Any]) -> str:
-    """Return the range of the longest durations without a fall, over the moments at which the permanent fault leads to a fall."""
+    """Return the range of the longest durations without a fall. Moments without a fall are left out."""
     survived = [cycles for cycles in result["longest"] if cycles is not None]
     if not survived:
         return "-"

@@ -178,7 +178,7 @@ def sweep_in_time(results: Sequence[Result]) -> bytes:
     """Draw metabolic rates and tracking errors in the order of the trials (figure "up and down" of the paper).
 
     Args:
-        results: results of the sweep that ended, with those of the treadmill.
+        results: results of the sweep trials that ended, including the treadmill trials.
     """
     ordered = sorted(
         results, key=lambda r: (r["trial"]["order"].split("-")[0], r["trial"]["kind"] == "walk", r["trial"]["order"])

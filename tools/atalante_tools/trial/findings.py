@@ -19,14 +19,15 @@ from atalante_tools.faults.false_alarms import EXPECTED
 
 Result = dict[str, Any]
 
-#: Phases at which steps are compared with each other. Early landings end a step after about 0.9.
+#: Phases at which steps are compared with each other. An early landing ends a step at a phase of about 0.9.
 _PHASES: Final = np.linspace(0.1, 0.8, 29)
 
 #: Two metabolic rates count as equal if their means differ by at most this fraction of the rate of quiet standing.
 SAME: Final = 0.02
 STANDING: Final = 1.44  # metabolic rate of quiet standing [W/kg]
 #: A quantity has a falling trend if its rank correlation with the assistance factor is between -1 and -`TREND`.
-#: `ASYMMETRY` is the largest mean difference between a day's k-th trial and k-th trial from the end, as a fraction of the range.
+#: `ASYMMETRY` is the largest mean difference between the k-th trial and the k-th last trial of a day, relative to the
+#: range.
 TREND, ASYMMETRY = 0.8, 0.25
 #: Largest coefficient of variation of the baseline metabolic rates of a sweep.
 VARIATION: Final = 0.05
@@ -221,7 +222,7 @@ def normalised(result: Result) -> float:
 
 
 def step_variation(result: Result) -> float:
-    """Return how much e / q_bound varies from step to step: standard deviation over the last steps, mean over phases and joints.
+    """Return the standard deviation of e / q_bound over the last steps, averaged over phases and joints.
 
     Args:
         result: result of a guided walk.
@@ -325,7 +326,7 @@ def _trend(id_: str, claim: str, walks: Sequence[Result], value: Callable[[Resul
 
 
 def _symmetry(id_: str, claim: str, walks: Sequence[Result], value: Callable[[Result], float]) -> Finding:
-    """Return the finding that the k-th trial and the k-th trial from the end of a day have nearly the same value."""
+    """Return the finding that the k-th trial and the k-th last trial of a day have nearly the same value."""
     days: dict[str, list[Result]] = {}
     for walk in walks:
         days.setdefault(walk["trial"]["order"].split("-")[0], []).append(walk)

@@ -1,7 +1,7 @@
 """Trials of the experiments: `experiment, options -> list of trials`. Each trial has a key.
 
-The key is a hash of the parameters of the trial and of the versions of everything that computes it, so a stored result is used
-again only if a new run would give the same result.
+The key is a hash of the parameters of the trial and of the versions of all software that computes the trial. A stored
+result is therefore used again only if a new run would give the same result.
 """
 
 from __future__ import annotations
@@ -44,10 +44,12 @@ QUICK_MASSES: Final = (58.0, 75.0)
 #: Ranges of the random parameters of `robustness`: true mass / known mass, friction.
 MASS_SHARE: Final = (0.9, 1.1)
 FRICTION: Final = (0.25, 0.8)
-#: Parts of the control loop of `robustness` that can be a cycle late: state messages, command messages, motors. Messages that are
-#: later would time out after fewer lost frames than the fault matrix intends: four in a row if the messages are one cycle late.
+#: Parts of the control loop of `robustness` that can be a cycle late: state messages, command messages, motors.
+#: Messages that are one cycle late time out after four lost frames in a row. Messages that are later would time out
+#: after fewer lost frames than the fault matrix intends.
 LATE_PARTS: Final = 3
-#: Probability of a lost frame, force of a push [N], and number of steps in which one push comes at a random time.
+#: Probability of a lost frame, force of a push [N], and number of steps per push. The time of a push within
+#: these steps is random.
 LOSS: Final = 0.01
 PUSH: Final = 100.0
 PUSH_STEPS: Final = 10
@@ -85,8 +87,8 @@ class WalkTrial:
     """Walk of a virtual subject on the ground, with the protocol of the paper."""
 
     kind: ClassVar[str] = "walk"
-    mass: float  # kg, of the subject
-    height: float  # m, of the subject
+    mass: float  # mass of the subject [kg]
+    height: float  # height of the subject [m]
     active: bool  # whether the muscles of the subject track the gait
     xi: float  # assistance factor after the transition
     protocol: tuple[int, int, int]  # steps with full assistance, in the transition, and with `xi`
@@ -112,13 +114,13 @@ class RobustTrial:
     kind: ClassVar[str] = "robust"
     number: int
     mass: float  # mass of the patient in the model of the controller [kg]
-    height: float  # m
+    height: float  # height of the patient [m]
     mass_share: float  # true mass of the patient / known mass
-    friction: float  # between soles and floor
+    friction: float  # coefficient of friction between soles and floor
     delay: tuple[int, int, int]  # cycles by which state messages, command messages and motor torques are late
     loss: float  # probability that a frame is lost, on all buses
     pushes: tuple[tuple[float, float], ...]  # time since the first periodic step [s] and direction [deg] of each push
-    force: float  # N, of each push
+    force: float  # force of each push [N]
     steps: int
     seed: int
     engine: str
@@ -136,9 +138,9 @@ class PushTrial:
     kind: ClassVar[str] = "push"
     direction: float  # direction of the push [deg]: 0 is forwards, 90 is to the left
     phase: float  # phase of a right-stance step at which the push begins
-    forces: tuple[float, ...]  # N, in rising order
-    mass: float  # kg, of the wearer
-    height: float  # m, of the wearer
+    forces: tuple[float, ...]  # forces of the pushes [N], in rising order
+    mass: float  # mass of the wearer [kg]
+    height: float  # height of the wearer [m]
     seed: int
     engine: str
 
@@ -156,8 +158,8 @@ class TreadmillTrial:
     """
 
     kind: ClassVar[str] = "treadmill"
-    mass: float  # kg, of the subject
-    speed: float  # m/s
+    mass: float  # mass of the subject [kg]
+    speed: float  # walking speed [m/s]
     seconds: int
     seed: int
     order: str
@@ -217,7 +219,7 @@ def assist_trials(setting: WalkSetting, masses: Sequence[float] = ()) -> list[Tr
 
     Args:
         setting: what all walks share.
-        masses: masses of the subjects [kg]. With none, all eight subjects.
+        masses: masses of the subjects [kg]; empty means all eight subjects.
     """
     return protocol_trials(setting, (1.0, PARTIAL), masses)
 
@@ -228,7 +230,7 @@ def sweep_trials(setting: WalkSetting, factors: Sequence[float], days: int) -> l
     Args:
         setting: what all walks share.
         factors: assistance factors in their order.
-        days: number of days. Days differ by their seeds alone.
+        days: number of days. Only the seeds differ between the days.
     """
     from atalante_control.model import Patient
 
@@ -248,7 +250,7 @@ def protocol_trials(setting: WalkSetting, factors: Sequence[float], masses: Sequ
     Args:
         setting: what all walks share.
         factors: assistance factors after the transition.
-        masses: masses of the subjects [kg]. With none, all eight subjects.
+        masses: masses of the subjects [kg]; empty means all eight subjects.
     """
     from atalante_control.gait.subject import STUDY_PATIENTS
 

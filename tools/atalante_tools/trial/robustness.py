@@ -134,7 +134,7 @@ class Pushes:
         """Prepare the pushes.
 
         Args:
-            controller: controller of the walk. The time of the pushes counts from its first periodic step.
+            controller: controller of the walk. The time of the pushes counts from the first periodic step.
             trial: trial with times, directions and force.
         """
         self._controller, self._force, self._pushes = controller, trial.force, trial.pushes
