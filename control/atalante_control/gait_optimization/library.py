@@ -332,7 +332,7 @@ def _solve(solve: Solve, task: tuple[Index, Subject]) -> tuple[Index, SolvedGait
 
 
 def _status(path: Path) -> str:
-    """Return the reason in the record of a failure. A damaged record gives the reason why it cannot be read."""
+    """Return the reason in the record of a failure. If the record is damaged, return why it cannot be read."""
     try:
         return str(read_object(path)["status"])
     except GaitError as error:

@@ -104,7 +104,7 @@ class Verifier:
     def loads(self, q: Vector, qd: Vector, qdd: Vector) -> tuple[Vector, Vector]:
         """Return joint torques (12,) [Nm] and ground wrench (6,) [N, Nm] of one state.
 
-        The wrench is at the origin and in the axes of the stance foot.
+        The wrench acts at the origin of the stance foot. Its components are in the axes of this foot.
 
         Args:
             q: joint angles, shape (12,) [rad].
@@ -298,7 +298,7 @@ class Verifier:
         return np.asarray(configuration)
 
     def _standing(self, q: Vector, qd: Vector) -> tuple[Vector, Vector, Vector]:
-        """Return configuration and speed of the floating robot whose right foot is at rest, and the Jacobian of this foot."""
+        """Return configuration and speed of the floating robot with its right foot at rest, and the foot's Jacobian."""
         model, joints = self._articulated.model, self._articulated.v
         configuration, speed = self._on_right_foot(q), np.zeros(model.nv)
         speed[joints] = qd

@@ -134,7 +134,7 @@ class Responses(NamedTuple):
 
 
 def responses(policy: BackupPolicy, loop: SampledLoop, mobility: float, cycles: int, delay: int = 1) -> Responses:
-    """Compute how the sampled loop responds to its initial state and to a unit acceleration, in each cycle.
+    """Compute the responses of the sampled loop in each cycle: to the initial state, and to a unit acceleration.
 
     Args:
         policy: gains of the backup policy.

@@ -176,12 +176,12 @@ def _pair(torque: Vector) -> JointTorque | None:
 
 
 def _limit(room: Vector, reach: Vector, steps: int, what: str) -> Limit:
-    """Return the largest multiple of the requested torques whose effect, plus the effect of the model errors, is at most `room`.
+    """Return the largest multiple of the requested torques for which the whole effect is at most `room`.
 
     Args:
         room: largest permitted effect on SH and SK in each cycle, shape (n, 2).
-        reach: columns 0 and 1: effect of model errors on SH and SK; columns 2 and 3: effect of the requested torques on SH
-            and SK, to be multiplied by the scale; shape (n, 4).
+        reach: shape (n, 4). Columns 0 and 1: effect of the model errors on SH and SK. Columns 2 and 3: effect of the
+            requested torques on SH and SK, multiplied by the multiple. The whole effect is the sum of both.
         steps: number of cycles of a step. All of them are checked.
         what: start of the message; joint and phase are appended.
     """

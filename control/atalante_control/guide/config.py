@@ -35,7 +35,7 @@ class StepGuideConfig:
     idealization: float = 1.0  # intensity of the joint idealization u_i in [0, 1] while the backup torque has weight 0
     feedforward: float = 1.0  # intensity of the feedforward u_f in [0, 1] while the backup torque has weight 0
     #: Counter value above which the controller reports that the leg has left a certified guide.
-    #: The counter for `outside_cycles` rises by 1 in each cycle with h < 0, and falls by 1 in every other cycle, but not below 0.
+    #: The counter rises by 1 in each cycle with h < 0. In every other cycle it falls by 1, but not below 0.
     outside_cycles: int = 150
     active: float = 0.05  # weight of the backup torque above which the filter is considered active
 

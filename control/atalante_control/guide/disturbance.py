@@ -67,7 +67,8 @@ class HandOver:
     rate: float = 0.25  # rad/s, largest speed deviation |s'(0)| of sagittal hip and knee
     #: Nm, largest torques of sagittal hip and knee that the carry-over adds at the start of a step
     torque: Pair = (25.0, 13.0)
-    #: rad/s2, largest joint acceleration before the stance change. It distorts the velocity measured after the change.
+    #: rad/s2, largest joint acceleration before the stance change. The acceleration distorts the velocity measured
+    #: after the change.
     acceleration: float = 20.0
 
     def __post_init__(self) -> None:
@@ -123,8 +124,8 @@ class Leg(NamedTuple):
         """Return the friction torque along the nominal trajectory, shape (n, 2) [Nm].
 
         Args:
-            margin: speed that is added to the absolute value of the velocity [rad/s]. If it is not 0, the result is the absolute
-                value of the friction torque.
+            margin: speed that is added to the absolute value of the velocity [rad/s]. If the margin is not 0, the
+                result is the absolute value of the friction torque.
         """
         speed = np.abs(self.qd) + margin if margin else self.qd
         coulomb, viscous = (np.array(row[2:4]) for row in (self.friction.coulomb, self.friction.viscous))
@@ -189,7 +190,7 @@ class Grid(NamedTuple):
 
 
 def spread(effect: Effect, mobilities: Vector, bounds: Vector, grid: Grid, ahead: Vector) -> Vector:
-    """Compute the largest outputs that disturbances cause, for predictions from each start cycle and for the step.
+    """Compute the largest outputs that disturbances cause: from each start cycle on, and from the start of the step on.
 
     `ahead` receives the outputs if disturbances begin at a start cycle. The returned array contains the outputs if
     disturbances begin at the start of the step. In both arrays, columns 0 and 1 are the effects of the budget on the

@@ -264,9 +264,10 @@ def _reference(prediction: Prediction) -> tuple[list[Vector], Vector]:
     """Return the reference of the step without re-centring, and the change of the reference by the re-centring.
 
     Returns:
-        The reference: acceleration (ahead by the command lag), velocity after the low-pass of the drives, velocity, and torque;
-        each of shape (n, 2). The change, shape (2, 4, n, 1). Axis 0: change for s(0) = 1 rad, then for s'(0) = 1 rad/s. Axis 1:
-        acceleration (ahead by the command lag), velocity after the low-pass, velocity, acceleration. Axis 2: cycles.
+        The reference consists of four arrays of shape (n, 2): acceleration (ahead by the command lag), velocity after
+            the low-pass of the drives, velocity, torque. The change is one array of shape (2, 4, n, 1). Axis 0: change
+            for s(0) = 1 rad, change for s'(0) = 1 rad/s. Axis 1: acceleration (ahead by the command lag), velocity
+            after the low-pass, velocity, acceleration. Axis 2: cycles.
     """
     leg, loop = prediction.leg, prediction.assumptions.loop
     time, lag = leg.time, loop.command_lag

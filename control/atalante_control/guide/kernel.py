@@ -40,7 +40,8 @@ class Guard:
     keep: float  # weight of the old value in the low-pass of the measured velocity
     zeta: float  # s, gain of lambda_d, which increases the gate while h decreases
     smoothing: float  # weight of the new value in the low-pass filter of dh/dt
-    #: largest decrease of the gate (weight of the backup torque) per cycle, so that the gate does not oscillate
+    #: largest decrease of the gate (weight of the backup torque) per cycle; this limit prevents oscillations of the
+    #: gate
     release: float
     idealization: float  # intensity of the joint idealization u_i in [0, 1]
     feedforward: float  # intensity of the feedforward u_f in [0, 1]
@@ -117,7 +118,8 @@ VELOCITY = 6  # columns 6 and 7 of `step`: velocity of q_des after the low-pass 
 BASE = 8  # columns 8 and 9 of `step`: torque that moves the leg along q_des [Nm]
 MASS = 10  # columns 10 to 12 of `step`: mass matrix M11, M12 and M22 along q_des [kg m2]
 SPEED = 13  # columns 13 and 14 of `step`: velocity of q_des [rad/s]
-#: Column 15 of `step`: lower bound of the gate. It is 1 at the start of a step, when the filter takes over the joints.
+#: Column 15 of `step`: lower bound of the gate. The bound is 1 at the start of a step, when the filter takes over the
+#: joints.
 FLOOR = 15
 #: Columns 16 to 19 of `step`: maximum of columns 0 to 3 over the next `TAIL_CYCLES` cycles, plus a margin [1/rad].
 TAIL = 16

@@ -58,7 +58,7 @@ class Inertia:
         return Inertia(self.mass, mirrored(self.centre), (xx, -xy, xz, yy, -yz, zz))
 
     def fused(self, other: Inertia) -> Inertia:
-        """Return the mass properties of this body and a second body that are fixed to each other (parallel axis theorem).
+        """Return the mass properties of this body together with a second body (parallel axis theorem).
 
         Args:
             other: mass properties of the second body in the same link frame.

@@ -63,7 +63,7 @@ class AttitudeObserver:
         self.reset((1.0, 0.0, 0.0, 0.0))
 
     def reset(self, quaternion: Sequence[float]) -> None:
-        """Set the attitude to a measured attitude without its heading, and the velocity to zero.
+        """Set the attitude to a measured attitude without heading. Set the velocity to zero.
 
         Args:
             quaternion: attitude of the pelvis IMU, unit quaternion wxyz, pelvis to world.

@@ -25,8 +25,9 @@ _NO_INTEGRAL = (0.0,) * 6
 WALK_GAINS = PidGains(
     stance=replace(PidGains().stance, ki=_NO_INTEGRAL), swing=replace(PidGains().swing, ki=_NO_INTEGRAL)
 )
-#: Parameters of the guide on the ground, stiffer than in the air, because the leg with the patient is heavier than the empty leg.
-#: The hand-over box (deviations at a stance change for which the guide is certified) covers the deviations at the landings.
+#: Parameters of the guide on the ground. The guide is stiffer than in the air, because the leg with the patient is
+#: heavier than the empty leg. The hand-over box (deviations at a stance change for which the guide is certified) covers
+#: the deviations at the landings.
 WALK_GUIDE = StepGuideConfig(stiffness=(4500.0, 3300.0), hand_over=HandOver(deviation=math.radians(1.0), rate=0.3))
 
 
@@ -84,10 +85,10 @@ class WalkConfig:
     def literal(cls) -> WalkConfig:
         """Return the parameters with which the periodic steps follow the paper literally, for comparisons.
 
-        In the periodic steps, the baseline controller is the PID with re-centring, impact detection and flat foot. It has no
-        gravity torque, no feedforward, no ankle stabiliser and no steering. Below Xi = 1, `guide.literal` drives SH and SK of the
-        swing leg. Standing, weight shifts, start step and stop step are those of `WalkConfig`, because the paper does
-        not define them.
+        In the periodic steps, the baseline controller is the PID with re-centring, impact detection and flat foot. This
+        controller has no gravity torque, no feedforward, no ankle stabiliser and no steering. Below Xi = 1,
+        `guide.literal` drives SH and SK of the swing leg. Standing, weight shifts, start step and stop step are those
+        of `WalkConfig`, because the paper does not define them.
         """
         return cls(literal_law=True, gains=PidGains(), steering=(0.0, 0.0, 0.0))
 

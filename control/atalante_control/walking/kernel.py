@@ -157,7 +157,8 @@ def sense(measured: Measured, table: PhaseTable, constants: Constants, stabilise
         sensed.bearing[side] = min(force, load[side])
     move(parts.chain, measured.q, measured.qd)
 
-    # A foot that has just landed may bounce, so the stance foot is the reference as long as it carries load.
+    # A foot that has just landed may bounce, so the stance foot is the reference as long as the stance foot carries
+    # load.
     base = stage.stance
     if stage.double and load[base] < 0.1 * (load[0] + load[1]):
         base = 1 - base
@@ -369,7 +370,7 @@ def _place(cycle: int, table: PhaseTable, constants: Constants, gain: float, par
 
 
 def _hold_foot(row: int, table: PhaseTable, parts: Parts) -> None:
-    """Move the desired position of the swing ankle to its position relative to the stance foot.
+    """Move the desired swing ankle to its nominal position relative to the stance foot, plus the landing offset.
 
     Args:
         row: current row of the table.
@@ -435,7 +436,7 @@ def _desired(cycle: int, placement: Placement, table: PhaseTable, stage: Stage, 
 
 
 def _lowered(cycles: float, longest: int) -> tuple[float, float]:
-    """Return the duration of the downward motion of a late swing foot at full speed [s], and its present share of this speed.
+    """Return lowered distance / full speed [s] and present speed / full speed of a late swing foot.
 
     Args:
         cycles: cycles since the nominal end of the step, above 0.

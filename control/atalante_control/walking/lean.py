@@ -22,12 +22,13 @@ class LeanConfig(NamedTuple):
 
     gain: float = 6.0  # rad/m, lean per DCM error beyond the dead zone; 0: no lean
     dead_zone: float = 0.02  # m, sideways DCM error up to which the trunk does not lean
-    #: m, the trunk leans over the stance foot while the DCM is at most this far from the middle of its sole on the inner side
+    #: m, the trunk leans over the stance foot only if the DCM is less than this distance inwards of the stance sole
+    #: centre
     inside: float = 0.015
     outward: float = 0.22  # rad, largest lean over the stance foot
     inward: float = 0.08  # rad, largest lean to the side of the swing foot
     rise: float = 14.0  # rad/s, natural frequency of the critically damped filter while the lean grows
-    fall: float = 5.0  # rad/s, the same while the lean decreases
+    fall: float = 5.0  # rad/s, natural frequency of the filter while the lean decreases
     acceleration: float = 25.0  # rad/s2, largest acceleration of the lean
 
 

@@ -1,22 +1,23 @@
 """Foot placement and step timing against pushes: `DCM error -> offset of the landing, phase rate -> shifted swing foot`.
 
-DCM is the divergent component of motion (`walking.dcm`). Let e be its error, w the natural frequency, k the gain of the ankle
-stabiliser and L the largest shift of the centre of pressure by the ankle. The ankle changes e by e' = w (e - sat(k e, L)), where
-sat limits k e to L. An error below L decays, and a larger error grows with exp(w t). `predicted` is the solution of this equation
-at the nominal landing.
+DCM is the divergent component of motion (`walking.dcm`). Let e be the DCM error, w the natural frequency, k the gain of
+the ankle stabiliser and L the largest shift of the centre of pressure by the ankle. With the ankle stabiliser, e obeys
+e' = w (e - sat(k e, L)), where sat limits k e to the range from -L to L. An error below L decays, and a larger error
+grows with exp(w t). `predicted` is the solution of this equation at the nominal landing.
 
 The predicted error beyond a dead zone is removed in two ways, see `landing`:
 
 - Foot placement. The landing is shifted by the error of the DCM at the landing. The DCM is then at its nominal position relative
   to the new stance foot.
-- Step timing. The error depends on the time of the landing, because the DCM moves outwards during a step. Of the possible phase
-  rates, the one with the lowest cost is used. The cost consists of the shift of the landing, the shift that the limits do not
-  permit, and the change of the step duration. (After M. Khadiv et al., Walking control based on step timing adaptation, IEEE
-  Transactions on Robotics 36, 2020. There a quadratic program has the same aim. One unknown needs no solver.)
+- Step timing. The error depends on the time of the landing, because the DCM moves outwards during a step. The phase
+  rate with the lowest cost is used. The cost consists of the shift of the landing, the shift that the limits do not
+  permit, and the change of the step duration. (After M. Khadiv et al., Walking control based on step timing adaptation,
+  IEEE Transactions on Robotics 36, 2020. They solve a quadratic program. Here the phase rate is the only unknown, so no
+  solver is needed.)
 
-A push also moves and tilts the pelvis. With the joint angles of the gait, the swing foot would move with it, sideways, forwards
-and away from the floor. From the first reaction until the landing, the ankle of the swing leg is therefore held at its position
-relative to the stance foot (`shift_foot`): the nominal position plus the offset.
+A push also moves and tilts the pelvis. With the joint angles of the gait, the swing foot would move with the pelvis:
+sideways, forwards and away from the floor. From the first reaction until the landing, the ankle of the swing leg is
+therefore held at its position relative to the stance foot (`shift_foot`): the nominal position plus the offset.
 
 While the predicted error is inside the dead zone, the offset is exactly 0 and the phase rate exactly 1.
 """
@@ -43,7 +44,7 @@ _SHIFTING = (_FH, _SH, _SK)
 _LINKS = LEG_JOINTS.index("SA") + 1
 #: m3, smallest determinant of the ankle Jacobian with which the foot is shifted further; a straight leg has determinant 0
 _SINGULAR = 1e-3
-_RATES = 32  # number of ratios between neighbouring phase rates of which the cost is computed
+_RATES = 32  # the cost is computed for this number of phase rates plus one, in geometric order
 _FASTEST = 3.0  # rad/s, largest desired speed of a joint that shifts the foot
 
 
@@ -59,15 +60,17 @@ class PlacementConfig(NamedTuple):
     fastest: float = 1.6  # largest phase rate
     #: s, time after the start of a step in which the DCM error is ignored, because the new stance foot is not yet at rest
     settled: float = 0.08
-    #: s, last time span before the nominal landing: the phase rate returns to 1, and `late_landing` gives the offset
+    #: s, in this last part before the nominal landing, the phase rate returns to 1 and `late_landing` gives the offset
     frozen: float = 0.05
-    #: m, largest DCM error (forward, sideways) whose growth the robot can stop. Forwards it is smaller than the limit of the
-    #: ankle stabiliser, because the PIDs of the stance leg act against its shift. Sideways it is larger, because the trunk leans.
+    #: m, largest DCM error (forward, sideways) whose growth the robot can stop. The forward error is smaller than the
+    #: limit of the ankle stabiliser, because the PIDs of the stance leg act against the stabiliser. The sideways error
+    #: is larger than the limit, because the trunk leans.
     capacity: Pair = (0.10, 0.08)
     bandwidth: float = 25.0  # rad/s, natural frequency of the critically damped filter of the landing offset
     speed: float = 1.2  # m/s, largest rate of change of the landing offset
     acceleration: float = 25.0  # m/s2, largest acceleration of the landing offset
-    #: weight of the squared part of the needed offset that the limits of the offset do not permit, relative to the squared offset
+    #: cost weight of the squared missing offset (needed minus permitted offset), relative to the squared permitted
+    #: offset
     missed: float = 30.0
     timing: float = 0.03  # m, offset with the same cost as a landing that is 1 / w earlier or later
     hold: float = 0.1  # s, time in which the reference of the swing foot changes from the pelvis to the stance foot
@@ -79,7 +82,7 @@ class Placement:
 
     clock: float  # cycles, current row of the phase table, not rounded to an integer
     pace: float  # phase rate: progress of the step in one cycle, in nominal cycles
-    #: share of the stance foot in the reference of the swing foot: 0, the joint angles of the gait; 1, the position in the gait
+    #: reference of the swing foot: 0 for the joint angles of the gait, 1 for the position relative to the stance foot
     held: float
     target: Annotated[Vector, 2]  # m, requested offset of the landing in the walking frame
     offset: Annotated[Vector, 2]  # m, current offset of the swing foot in the walking frame
@@ -137,8 +140,8 @@ def beyond(value: float, zone: float) -> float:
 def landing(config: PlacementConfig, gain: float, motion: Motion) -> tuple[float, float, float]:
     """Return the offset of the landing in the walking frame, forwards and to the left [m], and the phase rate.
 
-    The phase rate is the one with the lowest cost among 1 and `_RATES` + 1 rates in geometric order. It may jump between two
-    cycles. `follow` limits the changes of offset and phase rate.
+    The candidates for the phase rate are 1 and `_RATES` + 1 rates in geometric order. The rate with the lowest cost is
+    returned. This rate may jump between two cycles. `follow` limits the changes of offset and phase rate.
 
     Args:
         config: parameters.
@@ -163,8 +166,8 @@ def _needed(config: PlacementConfig, gain: float, motion: Motion, rate: float) -
     """Return the offset of the landing with which the DCM is at its nominal position relative to the new stance foot [m].
 
     Sideways, the centre of pressure c of the nominal motion is taken as constant until the landing, so that
-    xi(t) = c + (xi - c) exp(w t). The value of c is the one with which the nominal DCM reaches its value at the nominal landing.
-    Forwards, the ankle makes the DCM follow a faster or slower step.
+    xi(t) = c + (xi - c) exp(w t). With this c, the nominal DCM moves from its present value to its value at the nominal
+    landing. Forwards, the ankle makes the DCM follow a faster or slower step.
 
     Args:
         config: parameters.
@@ -251,7 +254,7 @@ def shift_foot(
     determinant = a[0] * bc[0] + a[1] * bc[1] + a[2] * bc[2]
     if abs(determinant) < _SINGULAR:
         return
-    # A joint that reaches its limit leaves a part of the shift to the joints after it, in the least-squares sense.
+    # If a joint reaches its limit, the next joints move the rest of the shift (least squares).
     moved = _step(placement, desired, leg, 0, dot(bc, missing) / determinant)
     missing = missing[0] - moved * a[0], missing[1] - moved * a[1], missing[2] - moved * a[2]
     bb, bd, dd = dot(b, b), dot(b, c), dot(c, c)

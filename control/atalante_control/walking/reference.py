@@ -39,9 +39,10 @@ class PhaseTable(NamedTuple):
     recentring: Vector  # (m, 4) re-centring rows of all joints without a guide, see `flat_foot.recentring_rows`
     guided: Vector  # (m, 4) re-centring rows of sagittal hip and knee of the swing leg, which a guide can assist
     reach: Vector  # (2,) rad/s, speeds of hip and knee of the swing leg that lower the swing foot after the last cycle
-    lowering: float  # m/s, speed of the swing foot with the joint speeds `reach`
+    lowering: float  # m/s, downward speed of the swing foot at the joint speeds `reach`
     reach_cycles: int  # number of cycles in which the joints of the swing leg lower the foot after the last row
-    #: number of cycles in which a foot is lowered that is held relative to the stance foot; its knee can end the motion earlier
+    #: number of cycles for lowering a foot that is held relative to the stance foot; the knee can end this motion
+    #: earlier
     lowering_cycles: int
 
 
