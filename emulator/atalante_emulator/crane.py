@@ -1,8 +1,8 @@
 """Crane of an emulated robot: suspends the robot above the floor until the drives are enabled, then lowers it onto its feet.
 
 The sling is a spring between the hook and the pelvis. It pulls upwards only. While the sling is under tension, the crane also
-keeps the pelvis upright and holds its horizontal position and heading constant. These forces and moments are proportional to the
-tension, up to the weight of the robot. A slack sling exerts no force.
+keeps the pelvis upright and holds its horizontal position and heading constant. These forces and moments grow in
+proportion to the tension, until the tension equals the weight of the robot. A slack sling exerts no force.
 """
 
 from __future__ import annotations

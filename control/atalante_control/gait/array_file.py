@@ -104,7 +104,7 @@ def _checked_directory(archive: zipfile.ZipFile, allowed: Collection[str], size_
 
 
 def _member(archive: zipfile.ZipFile, member: zipfile.ZipInfo) -> bytes:
-    """Return the content of a member after a check that it has the declared size. zipfile checks the CRC-32."""
+    """Check that the content of a member has the declared size, and return the content. zipfile checks the CRC-32."""
     with archive.open(member) as stream:
         # `read()` without a limit would decompress the whole member, even if it is larger than declared.
         content = stream.read(member.file_size + 1)

@@ -1,9 +1,9 @@
 """Virtual guide filter of the coupled sagittal hip and knee (SH, SK) of the swing leg.
 
 `measured motion -> function h of the safe backward image -> gate -> torques`. In each cycle the filter predicts the motion under
-the backup policy for the next `Assumptions.horizon` cycles, and adds the largest effect of all disturbances. The closer the
-prediction comes to the guide, to the torque limit or to the speed limit, the larger is the share of the backup torque. The two
-joints share one h and one gate, because a torque at one joint accelerates both joints.
+the backup policy for the next `Assumptions.horizon` cycles, and adds the largest effect of all disturbances. The share
+of the backup torque grows as the prediction comes closer to the guide, to the torque limit or to the speed limit. The
+two joints share one h and one gate, because a torque at one joint accelerates both joints.
 """
 
 from __future__ import annotations

@@ -26,7 +26,7 @@ from atalante_hal.types import Vector
 _MIDDLE = math.radians(30.0)
 #: Indices of SH and SK of the left leg. SH and SK have the same limits in both legs.
 _ASSISTED = [LEG_JOINTS.index("SH"), LEG_JOINTS.index("SK")]
-#: Largest half-width of a guide [rad]. It applies at assistance factor 0, see `half_width`.
+#: Largest half-width of a guide [rad]. This width applies at assistance factor 0, see `half_width`.
 _WIDEST = math.radians(7.5)
 #: If no filter withstands the requested torques, this fraction of the largest possible torques is certified.
 #: With the fraction 1, the backup torque would have weight 1 even without a disturbance.

@@ -472,7 +472,7 @@ def _range(robot: Robot, config: WalkConfig) -> tuple[Vector, Vector]:
 
 
 def _fading(duration: float) -> Vector:
-    """Return one factor per cycle, which falls from 1 to 0 within a duration [s] along a half cosine."""
+    """Return a factor for each cycle. The factors fall from 1 to 0 along a half cosine within a duration [s]."""
     factors: Vector = 0.5 + 0.5 * np.cos(math.pi * np.arange(round(duration / PERIOD)) * (PERIOD / duration))
     return factors
 

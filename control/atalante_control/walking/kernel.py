@@ -215,7 +215,7 @@ def start(measured: Measured, table: PhaseTable, parts: Parts) -> None:
     Args:
         measured: measurements of the cycle.
         table: table of the new phase.
-        parts: arrays of the parts; `stages`, `placements` and `ankles` are updated.
+        parts: arrays of the parts; `stages`, `placements`, `leans` and `ankles` are updated.
     """
     stage, placement, n = parts.stages[0], parts.placements[0], len(measured.q)
     placement.clock, placement.pace, placement.held = 0.0, 1.0, 0.0
@@ -261,7 +261,7 @@ def act(
         constants: constants of the kernel.
         stabiliser: parameters of the ankle stabiliser.
         assistance: guide of the swing leg; read if `Stage.assisted`.
-        parts: arrays of the parts; updated, and the results are written to `outputs` and `telemetry`.
+        parts: arrays of the parts; updated. The results are in `outputs` and `telemetry`.
     """
     stage, sensed, balance, output = parts.stages[0], parts.sensed[0], parts.balances[0], parts.outputs[0]
     desired, torque, n = output.desired, output.torque, len(measured.q)
@@ -442,7 +442,8 @@ def _lowered(cycles: float, longest: int) -> tuple[float, float]:
         cycles: cycles since the nominal end of the step, above 0.
         longest: number of cycles after which the motion ends.
     """
-    # The speed of the foot rises slowly. A sudden rise would turn a foot that already touches the ground with one corner.
+    # The speed of the foot rises slowly. If one corner of the foot already touches the ground, a sudden rise would turn
+    # the foot.
     time = min(cycles, float(longest)) * PERIOD
     moving = 1.0 - math.exp(-time / _REACH_RISE)
     return time - _REACH_RISE * moving, moving if cycles < longest else 0.0

@@ -95,8 +95,8 @@ class Body(Protocol):
         """Set the external wrench on the pelvis link. The wrench acts in every time step until the next call.
 
         Args:
-            force: force in world axes, shape (3,) [N]. It acts at the centre of mass of the pelvis link, which includes the trunk
-                of the wearer.
+            force: force in world axes, shape (3,) [N]. The force acts at the centre of mass of the pelvis link. This
+                link includes the trunk of the wearer.
             moment: moment in world axes, shape (3,) [Nm].
         """
 
