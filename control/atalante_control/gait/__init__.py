@@ -1,1 +1,1 @@
-"""Gaits, the subjects for which they are computed, and the re-centring of the joint trajectories at a stance change."""
+"""Gaits, the subjects of the gaits, and the re-centring of the joint trajectories at a stance change."""

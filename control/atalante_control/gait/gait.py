@@ -157,7 +157,7 @@ def control_points(phase: Vector, values: Vector) -> Vector:
 
 
 def power_basis(coefficients: Vector) -> Vector:
-    """Convert Bezier control points to coefficients in powers of the phase, lowest power first.
+    """Convert Bezier control points to the coefficients of the powers of the phase, lowest power first.
 
     Args:
         coefficients: control points, shape (m, d + 1).

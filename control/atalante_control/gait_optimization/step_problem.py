@@ -303,7 +303,7 @@ class StepProblem:
         def within(value: Symbol, lever: float) -> Symbol:
             return casadi.vertcat(force[2] - value / lever, force[2] + value / lever)
 
-        # A difference of squares is smooth everywhere. Divided by the scale of the force, it has the unit N.
+        # A difference of squares is smooth everywhere. The division by the scale of the force gives the unit N.
         cone = (force[2] ** 2 - (force[0] ** 2 + force[1] ** 2) / requirements.friction**2) / _FORCE
         return [
             _positive("ground friction", "N", _FORCE, cone),

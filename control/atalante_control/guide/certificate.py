@@ -181,7 +181,7 @@ def _limit(room: Vector, reach: Vector, steps: int, what: str) -> Limit:
     Args:
         room: largest permitted effect on SH and SK in each cycle, shape (n, 2).
         reach: shape (n, 4). Columns 0 and 1: effect of the model errors on SH and SK. Columns 2 and 3: effect of the
-            requested torques on SH and SK, multiplied by the multiple. The whole effect is the sum of both.
+            requested torques on SH and SK. The whole effect is columns 0 and 1 plus the multiple of columns 2 and 3.
         steps: number of cycles of a step. All of them are checked.
         what: start of the message; joint and phase are appended.
     """
