@@ -21,7 +21,7 @@ _RAW = re.compile(r"(0[xX][0-9a-fA-F]{1,16}|\d{1,20})?")
 
 
 def wrong_values(text: str) -> Iterator[tuple[int, str]]:
-    """Yield (line number, problem) for each invalid value, and for each value without an earlier attribute definition."""
+    """Yield (line number, problem) for each invalid value and for each value without an earlier definition."""
     definitions: dict[str, tuple[str, str]] = {}
     for number, line in enumerate(text.splitlines(), start=1):
         if match := _DEFINITION.match(line):
