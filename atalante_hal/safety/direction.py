@@ -17,16 +17,19 @@ the other leg both move towards the middle. Then an exchange of their encoders m
 during the test. With a wrong sign, this control pushes its joint away. A joint that moves by more than `TRAVEL` ends
 the start.
 
-*Result.* The mobility of a joint is the inverse of its effective inertia: the least-squares fit of the position by the
-double integral of the sent torque and a polynomial of time. A joint with a mobility of at least `MOBILITY` follows its
-torque. A mobility of at most -`MOBILITY` shows a wrong sign. A joint between these limits does not follow its torque. A
-disturbance may spoil a test, so a joint fails only after `TRIALS` tests. The legs of a suspended robot whose drives are
-off sink onto their end stops within some seconds, and their weight presses joints onto them. So the pulse of a repeated
-test is `BOOST` times larger for a joint within the position tolerance of its limit. If the foot of a leg carries load,
-the joint may be blocked. A foot that only touches the floor hits the floor during the pulse, and the impact stops the
-ankle. An impact lasts one or two cycles, so it hardly changes the mean force. A joint whose foot carried load or hit
-the floor stays untested, and the next start tests it again. A joint that passed is not tested again until its drive
-restarts, because the wiring of a motor does not change while its drive is on.
+*Result.* The mobility of a joint is the inverse of its effective inertia: the least-squares fit of the position by
+the double integral of the sent torque and a polynomial of time. The joints of a test share the delay of their
+torques, so the delay is the one that explains their motions best, all together. Motions against the torque do not
+count: a foot that bounces off the floor may move as if its torque were late and reversed. A joint with a mobility of
+at least `MOBILITY` follows its torque. A mobility of at most -`MOBILITY` shows a wrong sign. A joint between these
+limits does not follow its torque. A disturbance may spoil a test, so a joint fails only after `TRIALS` tests. The
+legs of a suspended robot whose drives are off sink onto their end stops within some seconds, and their weight presses
+joints onto them. So the pulse of a repeated test is `BOOST` times larger for a joint within the position tolerance of
+its limit. If the foot of a leg carries load, the joint may be blocked. A foot that only touches the floor hits the
+floor during the pulse, and the impact stops the ankle. An impact lasts one or two cycles, so it hardly changes the
+mean force. A joint whose foot carried load or hit the floor stays untested, and the next start tests it again. A
+joint that passed is not tested again until its drive restarts, because the wiring of a motor does not change while
+its drive is on.
 """
 
 from __future__ import annotations
@@ -42,8 +45,11 @@ from atalante_hal.types import PERIOD, Vector
 
 #: Joints of a leg that are tested at the same time, and duration of their pulse [cycles].
 GROUPS = ((("FH", "SH"), 32), (("TH", "SA"), 16), (("SK", "HA"), 16))
-#: Delay from the command of a torque to the first position that shows its effect [cycles].
+#: Delay from the command of a torque to the first position that shows its effect, if bus and motors are not late [cycles].
 LATENCY = 2
+#: Delays that are tried [cycles]: states, commands and motors may be late by three cycles in total. A delay that is
+#: longer by one more cycle would look like a wrong sign, because the pulse of 16 cycles changes its sign every four cycles.
+LATENCIES = tuple(range(LATENCY, LATENCY + 4))
 #: Peak of the pulse as a multiple of `Robot.breakaway`, in the order of LEG_JOINTS. FH and SH move a whole leg.
 PEAK = (6.0, 3.0, 6.0, 3.0, 3.0, 3.0)
 #: Stiffness and damping of the HAL's position control in the test, relative to the drive's gains, in the order of
@@ -93,26 +99,34 @@ def pose_gains(robot: Robot) -> tuple[Vector, Vector]:
     return robot.hold_kp * np.array(STIFFNESS * both), robot.hold_kd * np.array(DAMPING * both)
 
 
-def mobility_of(torque: Vector, position: Vector) -> Vector:
-    """Return the mobility of each joint, which is the inverse of its effective inertia.
+def mobilities_of(torque: Vector, position: Vector) -> tuple[Vector, Vector]:
+    """Return the mobility of each joint, which is the inverse of its effective inertia, for each delay in `LATENCIES`.
+
+    A wrong delay makes the mobility of a light joint several times too small.
 
     Args:
         torque: torque sent in each cycle, shape (n, joints) [Nm].
         position: position in each cycle, measured before the torque was sent, shape (n, joints) [rad].
 
     Returns:
-        Mobility, shape (joints,) [1/(kg m2)]; 0 for a joint whose torque did not change.
+        Mobility [1/(kg m2)], 0 for a joint whose torque did not change, and the share of the motion that each delay
+        explains, from 0 to 1. The shape of both is (delays, joints).
     """
     count = len(position)
-    acting = np.zeros_like(torque)
-    acting[LATENCY:] = torque[:-LATENCY] - torque[0]
-    response = np.cumsum(np.cumsum(acting, axis=0), axis=0) * PERIOD**2
-    # Remove the cubic polynomials of time from the response, because a joint may also move without a pulse.
+    response = np.zeros((len(LATENCIES), *torque.shape))
+    for delayed, latency in zip(response, LATENCIES, strict=True):
+        delayed[latency:] = torque[:-latency] - torque[0]
+    response = response.cumsum(axis=1).cumsum(axis=1) * PERIOD**2
+    # Remove the cubic polynomials of time from response and motion, because a joint may also move without a pulse.
     free = np.linalg.qr(np.vander(np.linspace(-1.0, 1.0, count), 4))[0]
     response -= free @ (free.T @ response)
-    power = (response**2).sum(axis=0)
-    mobility: Vector = (response * (position - position[0])).sum(axis=0) / np.where(power > 0.0, power, np.inf)
-    return mobility
+    motion = position - position[0]
+    motion -= free @ (free.T @ motion)
+    power, total = (response**2).sum(axis=1), (motion**2).sum(axis=0)
+    moved = (response * motion).sum(axis=1)
+    mobility: Vector = moved / np.where(power > 0.0, power, np.inf)
+    explained: Vector = moved * mobility / np.where(total > 0.0, total, np.inf)
+    return mobility, explained
 
 
 class DirectionProof:
@@ -145,6 +159,9 @@ class DirectionProof:
         #: Joints of each test that is still to be done, and duration of its pulse [cycles].
         self._tests: list[tuple[list[int], int]] = []
         self._trials = [0] * len(JOINTS)
+        #: Index in `LATENCIES` of the delay that the first test of the present group found. A repeated test has fewer joints
+        #: and one of them may be faulty, so it uses the same delay.
+        self._delay = 0
         self._position: list[Vector] = []  # joint positions in each cycle of the current test
         self._force: list[Vector] = []  # vertical force of each foot in each cycle of the current test
         self._torque: list[Vector] = []  # sent torques in each cycle of the current test
@@ -226,7 +243,10 @@ class DirectionProof:
         joints, duration = self._tests[0]
         if len(self._position) <= duration + LATENCY:
             return ""
-        self.mobility[joints] = mobility_of(np.array(self._torque)[:, joints], np.array(self._position)[:, joints])
+        mobility, explained = mobilities_of(np.array(self._torque)[:, joints], np.array(self._position)[:, joints])
+        if not any(self._trials[joint] for joint in joints):
+            self._delay = int(np.argmax(np.where(mobility > 0.0, explained, 0.0).sum(axis=1)))
+        self.mobility[joints] = mobility[self._delay]
         return self._evaluate_test(joints, duration)
 
     def _evaluate_test(self, joints: Sequence[int], duration: int) -> str:

@@ -9,13 +9,14 @@ from atalante_hal.robot import JOINTS, load_robot
 from atalante_hal.safety.direction import (
     BOOST,
     GROUPS,
+    LATENCIES,
     LATENCY,
     MOBILITY,
     PEAK,
     TRAVEL,
     TRIALS,
     DirectionProof,
-    mobility_of,
+    mobilities_of,
     pose_gains,
     pulse,
 )
@@ -44,17 +45,35 @@ def test_pulse_moves_a_free_inertia_away_and_back(duration: int):
     assert np.cumsum(velocity).min() >= -1e-9
 
 
-@pytest.mark.parametrize("inertia", [0.05, -2.0, 8.0])
-def test_mobility_is_that_of_the_simulated_inertia_despite_its_weight(inertia: float):
+def motion(latency: int, inertia: float) -> tuple[np.ndarray, np.ndarray]:
+    """Return pulse and position of an inertia that moves in a field of gravity and follows its torque after a delay."""
     torque = np.array([[20.0 * pulse(cycle, 32)] for cycle in range(35)])
-    acting = np.concatenate([np.zeros((LATENCY, 1)), torque[:-LATENCY]])
+    acting = np.concatenate([np.zeros((latency, 1)), torque[:-latency]])
     falls = 0.3 + 0.2 * np.linspace(0.0, 1.0, 35)[:, None] ** 2
-    position = falls + np.cumsum(np.cumsum(acting, axis=0), axis=0) * PERIOD**2 / inertia
-    assert mobility_of(torque, position) == pytest.approx([1.0 / inertia], rel=1e-6)
+    return torque, falls + np.cumsum(np.cumsum(acting, axis=0), axis=0) * PERIOD**2 / inertia
+
+
+@pytest.mark.parametrize("latency", LATENCIES)
+@pytest.mark.parametrize("inertia", [0.05, -2.0, 8.0])
+def test_mobility_is_that_of_the_simulated_inertia_despite_its_weight_and_delay(inertia: float, latency: int):
+    mobility, explained = mobilities_of(*motion(latency, inertia))
+    row = LATENCIES.index(latency)
+    assert mobility.shape == explained.shape == (len(LATENCIES), 1)
+    assert mobility[row] == pytest.approx([1.0 / inertia], rel=1e-6)
+    assert explained[row] == pytest.approx([1.0], rel=1e-6)
+    assert np.delete(explained, row).max() < 0.97
 
 
 def test_mobility_of_a_joint_without_torque_change_is_zero():
-    assert mobility_of(np.full((20, 1), 5.0), np.linspace(0.0, 1.0, 20)[:, None] ** 5).tolist() == [0.0]
+    mobility, explained = mobilities_of(np.full((20, 1), 5.0), np.linspace(0.0, 1.0, 20)[:, None] ** 5)
+    assert not mobility.any()
+    assert not explained.any()
+
+
+def test_motion_of_a_joint_that_stands_still_is_not_explained():
+    mobility, explained = mobilities_of(motion(LATENCY, 1.0)[0], np.full((35, 1), 0.2))
+    assert np.abs(mobility).max() < 1e-12
+    assert np.isfinite(explained).all()
 
 
 class Joints:
@@ -63,9 +82,13 @@ class Joints:
     def __init__(self, proof: DirectionProof) -> None:
         self.proof, self.strength = proof, np.ones(12)
         self.position, self.velocity = MIDDLE.copy(), np.zeros(12)
-        self._pending = [np.zeros(12)] * (LATENCY - 1)
+        self.delay(0)
         self.weight = np.zeros(12)  # torque of the weight [Nm]
         self.encoder = np.arange(12)  # joint that each encoder measures
+
+    def delay(self, late: int) -> None:
+        """Let all torques act some cycles later."""
+        self._pending = [np.zeros(12)] * (LATENCY - 1 + late)
 
     def run(self, force: np.ndarray = NO_FORCE, cycles: int = 500, within: range = MOST) -> tuple[str, int]:
         encoder = self.encoder
@@ -100,6 +123,22 @@ def test_every_joint_with_the_right_sign_passes_with_its_mobility(joints: Joints
     assert joints.proof.mobility == pytest.approx(1.0 / INERTIA, rel=0.05)
     assert joints.proof.report().startswith(f"effective inertia [kg m2]: left_FH {INERTIA[0]:.1f}")
     assert "not tested" not in joints.proof.report()
+
+
+@pytest.mark.parametrize("late", range(1, len(LATENCIES)))
+def test_joints_pass_although_their_torque_acts_late(joints: Joints, late: int):
+    joints.delay(late)
+    assert joints.run() == ("", ONCE)
+    assert joints.proof.mobility == pytest.approx(1.0 / INERTIA, rel=0.2)
+
+
+@pytest.mark.parametrize("late", range(1, len(LATENCIES)))
+@pytest.mark.parametrize("joint", range(6), ids=JOINTS[:6])
+def test_reversed_motor_fails_although_its_torque_acts_late(joints: Joints, joint: int, late: int):
+    joints.delay(late)
+    joints.strength[joint] = -1.0
+    failure, _ = joints.run()
+    assert failure.startswith(f"{JOINTS[joint]} moves against its torque") or "deg in the test" in failure
 
 
 def test_joints_that_passed_are_not_tested_again_until_their_drive_restarts(joints: Joints):
