@@ -33,9 +33,10 @@ def command(names: tuple[str, ...], quick: bool, one_process: bool, as_json: boo
     """Measure the speed of the stack against baselines and print the ratios of the median times.
 
     The measured function and the baseline run alternately in short blocks. Absolute times depend on the machine and the
-    load of the machine, so only the ratio is comparable. A ratio that depends on the process is the median of several processes,
-    and the report shows the lowest and the highest ratio. Every benchmark checks the computed results. The exit code is
-    1 if a result is wrong. The report shows each missed target, but a missed target does not change the exit code.
+    load of the machine, so only the ratio is comparable. If a ratio differs between processes, the benchmark runs in
+    several processes. The report shows the median, the lowest and the highest ratio. Every benchmark checks the computed
+    results. The exit code is 1 if a result is wrong. The report shows each missed target, but a missed target does not
+    change the exit code.
 
     \b
     Example: atalante bench

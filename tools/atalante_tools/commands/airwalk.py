@@ -24,8 +24,8 @@ def command(shape: str, target: Target, options: Options, as_json: bool) -> None
 
     The robot starts when the operator presses START (`atalante pendant start`). The operator may change the assistance
     factor at any time. After a HOLD the command waits for the next START and counts the steps from 0 again. With -i embedded
-    the command ends after a HOLD. After the steps or Ctrl-C the robot is in HOLD. If a fault ends the command, the robot stays in
-    FAULT.
+    the command ends after a HOLD. After the last step, or after Ctrl-C, the robot is in HOLD. If a fault ends the command, the
+    robot stays in FAULT.
 
     \b
     Example: atalante emulator -i socketcan -c vcan0     (in another terminal)

@@ -23,7 +23,7 @@ def command(shape: tuple[str, ...], engine: str, options: Options, as_json: bool
 
     The demo runs HAL, emulator, controller, telemetry (Zenoh, loopback only) and recording. Before the run it prints the
     certificate of each guide. After the run it prints the largest tracking error as a fraction of the distance to the edge of
-    the guide: above 1.00, a joint left the guide.
+    the guide. If the fraction is above 1.00, a joint left the guide.
 
     \b
     Example: atalante demo

@@ -27,7 +27,7 @@ for_option = click.option(
     "seconds",
     type=Between(0.01, 86400.0),
     metavar="SECONDS",
-    help="Duration of the command [s]. At its end, STOP is pressed.  [default: until Ctrl-C]",
+    help="Duration of the command [s]. At the end, the command presses STOP.  [default: until Ctrl-C]",
 )
 
 

@@ -155,11 +155,11 @@ def command(
     target: Target,
     as_json: bool,
 ) -> None:
-    """Walk on the ground with a patient, in a real or an emulated robot. The walk starts and ends in standing.
+    """Walk on the ground with a patient, in a real or an emulated robot.
 
-    After the operator has pressed START, a crane lowers the emulated robot onto its feet. The robot shifts its weight, walks,
-    and stops on both feet. Ctrl-C ends the walk with a stop step. A second Ctrl-C ends the command at once. The exit code is 1
-    if the robot falls.
+    The robot stands at the start and at the end of the walk. After the operator has pressed START, a crane lowers the emulated
+    robot onto its feet. The robot shifts its weight, walks, and stops on both feet. Ctrl-C ends the walk with a stop step. A
+    second Ctrl-C ends the command at once. The exit code is 1 if the robot falls.
 
     \b
     Example: atalante walk --steps 40 --mass 75 --height 1.75

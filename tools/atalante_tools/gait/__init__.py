@@ -108,15 +108,15 @@ command.add_command(solve)
     "--size",
     type=int,
     metavar="N",
-    help="Number of gaits: the corners of the grid, and points that fill the grid evenly. A larger number keeps the points of a "
-    "smaller number.  [default: 1000]",
+    help="Number of gaits: the corners of the grid, and points that fill the grid evenly. A larger number adds points and keeps "
+    "all others.  [default: 1000]",
 )
 @json_option
 def library(out: Path, jobs: int, machine_code: bool, cluster: str | None, as_json: bool, **grid_options: Any) -> None:
     """Solve gaits of a grid of patients, step lengths and step durations, and write a file per gait to DIR/gaits.
 
-    After an interruption, the same command solves the missing gaits. It also solves gaits again whose files are damaged, were
-    made by another version of the code, or belong to another subject. Failed gaits are listed on stderr and in DIR/failed, and
+    After an interruption, the same command solves the missing gaits. It also solves a gait again if its file is damaged, was
+    made by another version of the code, or belongs to another subject. Failed gaits are listed on stderr and in DIR/failed, and
     the next call retries them. The exit code is 1 if a gait failed.
 
     \b
@@ -265,8 +265,8 @@ def check(file: Path | None, count: int, seed: int, as_json: bool) -> None:
 def verify(file: Path | None, count: int, seed: int, as_json: bool) -> None:
     """Verify the gaits of the network for random subjects with Pinocchio. The exit code is 1 if a gait fails a check.
 
-    Checked are joint angles, speeds and torques, ground forces, centre of pressure, friction, clearance of the swing foot, the
-    landing at the corners of the sole, and the impact, at 201 samples per step. No gait is solved.
+    The checks cover joint angles, speeds and torques, ground forces, centre of pressure, friction, clearance of the swing foot,
+    the landing at the corners of the sole, and the impact. Each step has 201 samples. No gait is solved.
 
     \b
     Example: atalante gait verify

@@ -47,8 +47,8 @@ def solve(
 ) -> None:
     """Optimise the gait of a patient. If there is no gait, the exit code is 1 and stderr names the violated constraint.
 
-    After a failure, a periodic step is solved again from the gait of the same patient with a moderate step. If it fails too,
-    stderr also names the joints that are at a limit.
+    If a periodic step fails, it is solved again. The second solve starts from the gait of the same patient with a moderate step.
+    If the second solve fails too, stderr also names the joints that are at a limit.
 
     The solved gait is verified with Pinocchio, independently of the optimiser. Torques are in Nm, angles in degrees.
 

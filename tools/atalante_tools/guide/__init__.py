@@ -34,7 +34,8 @@ FACTORS = (0.0, 0.25, 0.5, 0.75, 0.9, 0.95, 0.99)
 def command() -> None:
     """Search for pushes that move a joint out of a virtual guide, on an ideal plant and on the emulated robot.
 
-    The promise of a guide is a torque at hip and knee. Pushes up to this torque must leave both joints inside the guide.
+    The promise of a guide is one torque at the hip and one torque at the knee. Pushes up to these torques must leave both joints
+    inside the guide.
 
     \b
     Example: atalante guide check --shape constant --xi 0.5 --quick
@@ -96,9 +97,9 @@ _CHECK_OPTIONS = [
     click.option("--push", type=(Between(0.0, 500.0), Between(0.0, 500.0)), default=None, metavar="HIP KNEE",
                  help="Largest push at hip and knee [Nm].  [default: the certified torques of the guide]"),
     click.option("--steps", type=click.IntRange(1), metavar="N",
-                 help="Steps on the ideal plant per guide.  [default: 1500, with --quick 60]"),
+                 help="Steps on the ideal plant per guide.  [default: 1500; with --quick: 60]"),
     click.option("--robot-steps", type=click.IntRange(0), metavar="N",
-                 help="Steps on the emulated robot per guide.  [default: 60, with --quick 0]"),
+                 help="Steps on the emulated robot per guide.  [default: 60; with --quick: 0]"),
     click.option("--seed", type=SEED, default=0, show_default=True, metavar="N", help="Seed of the search and of the noise."),
     click.option("--quick", is_flag=True,
                  help="Run a short search: only on the ideal plant, and only pushes up to the certified torques."),

@@ -1,4 +1,4 @@
-"""Walk of `atalante walk` on the ground, with a patient in the exoskeleton. The walk starts and ends in standing.
+"""Walk of `atalante walk` on the ground, with a patient in the exoskeleton. The robot stands at the start and at the end.
 
 gaits of the subject -> walking controller -> rig on the ground -> progress, outcome
 """

@@ -98,8 +98,8 @@ def command() -> None:
 
     The experiments `protocol`, `robustness`, `pushes` and `faults` are not in the paper.
 
-    The report, one HTML file (and its findings as Markdown), contains tables, figures, and each finding of the paper with its
-    statistic and its verdict. A verdict of FAIL is a result, not an error of the command. Each trial is stored in a file of its
+    The report is one HTML file with tables, figures and findings. Each finding has a statistic and a verdict. report.md contains
+    the findings as Markdown. A verdict of FAIL is a result, not an error of the command. Each trial is stored in a file of its
     own as soon as it has ended. After an interruption, the same command runs only the missing trials.
 
     \b
@@ -196,7 +196,7 @@ def faults(ids: tuple[str, ...], running: Running, as_json: bool) -> None:
 @_walking()
 @_running("protocol")
 def protocol(masses: tuple[float, ...], literal: bool, walking: Walking, running: Running, as_json: bool) -> None:
-    """Walk 112 steps with full assistance, 38 in the transition and 225 with Xi = 0.5 or 0.
+    """Walk 112 steps with full assistance, 38 steps of transition and 225 steps with Xi = 0.5 or Xi = 0.
 
     Eight subjects walk, each passive and active.
     """

@@ -42,8 +42,8 @@ EXPERIMENTS: Final = {
     ),
     "protocol": (
         "Full and then partial assistance",
-        "Virtual subjects walk on the ground with full assistance, then with the assistance factor of the trial. Each walk "
-        "starts and ends in standing.",
+        "Virtual subjects walk on the ground with full assistance, then with the assistance factor of the trial. The robot "
+        "stands at the start and at the end of each walk.",
     ),
     "robustness": (
         "Robustness",

@@ -64,7 +64,8 @@ _options = options_as(
         click.option(
             "--lockstep",
             is_flag=True,
-            help="The live bus runs in lock-step: take times from the cycle number in SYNC.  [default: wall clock]",
+            help="Use this option if the live bus runs in lock-step. The times are then computed from the cycle number in SYNC.  "
+            "[default: wall clock]",
         ),
         click.option(
             "--for",
