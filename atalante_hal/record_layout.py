@@ -24,8 +24,10 @@ class Layout:
         self._slices: dict[str, slice] = {}
         offset = 0
         for name, length in self.fields:
-            if name in self._slices or length <= 0:
-                raise ValueError(f"field {name!r} must have a unique name and a positive length, got length {length}")
+            if name in self._slices:
+                raise ValueError(f"field {name!r} is defined twice: give each field a unique name")
+            if length <= 0:
+                raise ValueError(f"field {name!r} must have a length of at least 1, got {length}")
             self._slices[name] = slice(offset, offset + length)
             offset += length
         #: Length of the whole vector.

@@ -90,7 +90,7 @@ class Batches:
     def _add(self, frames: Frames) -> Batch:
         if not isinstance(frames, np.ndarray) or frames.dtype != FRAME or frames.ndim != 1:
             raise TypeError(
-                "frames must be a one-dimensional array of frame.FRAME records, as frame.new_frames(n) creates"
+                "frames must be a one-dimensional array of frame.FRAME records: create it with frame.new_frames(n)"
             )
         if not frames.flags.c_contiguous:
             raise TypeError("frames must be contiguous, got a strided slice: pass its copy()")

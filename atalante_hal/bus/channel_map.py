@@ -33,7 +33,7 @@ def parse_channel_map(text: str, buses: Sequence[str]) -> dict[str, str]:
         )
     if "=" not in text:
         if len(entries) > 1:
-            raise ChannelMapError(f"channel map {text!r} must assign a channel to each bus; write {example}")
+            raise ChannelMapError(f"channel map {text!r} assigns no bus to a channel; write {example}")
         return dict.fromkeys(buses, entries[0])
     channels: dict[str, str] = {}
     for entry in entries:

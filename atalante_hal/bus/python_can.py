@@ -219,5 +219,7 @@ def _open(interface: str, channel: str, options: dict[str, Any]) -> can.BusABC:
         ) from error
     if bus.protocol is can.CanProtocol.CAN_20 and reports_can_fd(interface):
         bus.shutdown()
-        raise BusAbsent(f"{interface}:{channel} must support CAN FD, got classic CAN only: use another interface")
+        raise BusAbsent(
+            f"{interface}:{channel} supports classic CAN only, but CAN FD is required: use another interface"
+        )
     return bus

@@ -147,7 +147,9 @@ def _open(path: Path) -> can.io.generic.MessageReader:
     suffixes = [suffix.lower() for suffix in path.suffixes]
     kind = suffixes[-2] if len(suffixes) > 1 and suffixes[-1] == ".gz" else path.suffix.lower()
     if kind in WITHOUT_FD:
-        raise LogUnreadable(f"{path}: python-can's {kind} logs do not keep CAN FD frames; record .log, .asc or .blf")
+        raise LogUnreadable(
+            f"{path}: python-can's {kind} logs cannot store CAN FD frames completely; record the log as .log, .asc or .blf"
+        )
     if kind not in can.io.player.MESSAGE_READERS:
         raise LogUnreadable(
             f"{path}: the log format must be .log (candump -L), .asc or .blf, got {kind or 'no suffix'!r}"
@@ -166,7 +168,8 @@ def _open(path: Path) -> can.io.generic.MessageReader:
     if isinstance(reader, can.BLFReader) and reader.file_size > size:
         reader.stop()
         raise LogUnreadable(
-            f"{path} is truncated: it must have {reader.file_size} bytes as its header states, got {size}; copy it again"
+            f"{path} is truncated: its header states {reader.file_size} bytes, but the file has {size} bytes; "
+            "copy the file again"
         )
     return reader
 

@@ -350,8 +350,8 @@ def require_channel(channel: str) -> None:
         raw = socket.socket(socket.AF_CAN, socket.SOCK_RAW, socket.CAN_RAW)
     except OSError as error:
         raise BusAbsent(
-            f"this kernel has no SocketCAN ({error.strerror}): type `modprobe can-raw`, or use a kernel that has it "
-            f"(`make test-vcan` boots one), and {doctor}"
+            f"this kernel has no SocketCAN ({error.strerror}): load it with `modprobe can-raw`, or use a kernel with SocketCAN "
+            f"(`make test-vcan` boots one); {doctor}"
         ) from error
     with raw:
         if not is_present(channel):

@@ -238,8 +238,10 @@ class DirectionProof:
             excess = self._kp * np.abs(travel - np.roll(travel, len(LEG_JOINTS)))
             joint = int(far[np.argmax(excess[far])])
             self._fail(far.tolist())
-            moved = f"{math.degrees(travel[joint]):.1f} deg"
-            return f"{JOINTS[joint]} moved by {moved} in the test of its direction; must be within {math.degrees(TRAVEL):.1f} deg"
+            moved, most = (f"{math.degrees(angle):.1f} deg" for angle in (travel[joint], TRAVEL))
+            return (
+                f"{JOINTS[joint]} moved by {moved} in the test of its direction; each joint may move by at most {most}"
+            )
         joints, duration = self._tests[0]
         if len(self._position) <= duration + LATENCY:
             return ""

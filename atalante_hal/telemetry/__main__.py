@@ -88,7 +88,7 @@ class Outlets:
         except ImportError as error:
             if config.recording is not None:
                 raise SinkError(f"a recording needs {error.name}: {_INSTALL}", "RECORD_STOPPED") from error
-            self.notices.append(f"nothing is published, {error.name} is missing: {_INSTALL}")
+            self.notices.append(f"nothing is published, because {error.name} is missing: {_INSTALL}")
             return None
         return Encoder(Layout.from_json(meta["layout"]), meta["diagnostics"])
 

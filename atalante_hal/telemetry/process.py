@@ -274,7 +274,9 @@ class TelemetryProcess(Closing):
         self._restarting.start()
         self._restarting.join(timeout)
         if not result:
-            self.notices = ("the telemetry process is not ready yet: the run starts without it and it joins later",)
+            self.notices = (
+                "the telemetry process is not ready yet: the run starts now, and telemetry begins when the process is ready",
+            )
         elif isinstance(result[0], TelemetryError):
             raise result[0]
         else:

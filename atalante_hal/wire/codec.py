@@ -133,12 +133,15 @@ class Codec:
             group: name of the quantity, see `group_of`.
 
         Raises:
-            KeyError: If there is no such quantity, or if it is signed in one message and unsigned in another.
+            KeyError: If there is no such quantity, or if it is signed in one signal and unsigned in another.
         """
         found = [i for i, name in enumerate(self._groups) if name == group]
-        if not found or found[-1] - found[0] + 1 != len(found):
-            valid = ", ".join(dict.fromkeys(self._groups))
-            raise KeyError(f"the quantity must be one of {valid}, and contiguous in the decoded values, got {group!r}")
+        if not found:
+            raise KeyError(f"the quantity must be one of {', '.join(dict.fromkeys(self._groups))}, got {group!r}")
+        if found[-1] - found[0] + 1 != len(found):
+            raise KeyError(
+                f"the values of the quantity {group!r} must be contiguous, but it is signed in one signal and unsigned in another"
+            )
         return slice(found[0], found[-1] + 1)
 
     def template(self) -> Frames:

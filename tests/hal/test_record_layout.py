@@ -31,9 +31,16 @@ def test_layout_is_unchanged_by_json(fields: list[tuple[str, int]]) -> None:
     assert all(back[name] == layout[name] for name in layout)
 
 
-@pytest.mark.parametrize("fields", [[("q", 1), ("q", 1)], [("q", 0)], [("q", -1)]])
-def test_duplicate_name_or_length_below_one_is_rejected(fields: list[tuple[str, int]]) -> None:
-    with pytest.raises(ValueError, match="'q'"):
+@pytest.mark.parametrize(
+    ("fields", "sentence"),
+    [
+        ([("q", 1), ("q", 1)], "field 'q' is defined twice"),
+        ([("q", 0)], "field 'q' must have a length of at least 1, got 0"),
+        ([("q", -1)], "field 'q' must have a length of at least 1, got -1"),
+    ],
+)
+def test_duplicate_name_or_length_below_one_is_rejected(fields: list[tuple[str, int]], sentence: str) -> None:
+    with pytest.raises(ValueError, match=sentence):
         Layout(fields)
 
 

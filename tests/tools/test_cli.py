@@ -228,7 +228,7 @@ def test_every_known_error_is_an_exception_class() -> None:
         (
             ["jog", "left_SK", "--to", "5", "-i", "socketcan", "-c", "a,b"],
             2,
-            "must assign a channel to each bus",
+            "assigns no bus to a channel",
         ),
         (["jog", "left_SK", "--to", "5", "-i", "socketcan"], 2, "socketcan requires a channel: -c vcan0"),
         (["status", "-i", "socketcan", "-c", "nocan7"], 3, "atalante doctor"),

@@ -187,7 +187,7 @@ def save_network(network: GaitNetwork, path: Path) -> None:
     try:
         _network(arrays)
     except ArrayFileError as error:
-        raise NetworkError(f"{path} is not written; the network must be valid: {error}") from error
+        raise NetworkError(f"{path} is not written, because the network is not valid: {error}") from error
     write_arrays(path, arrays)
 
 
@@ -253,7 +253,8 @@ def _network(arrays: Mapping[str, npt.NDArray[Any]]) -> GaitNetwork:
     width = len(INPUTS)
     if low.shape != (width,) or high.shape != (width,) or not (low < high).all():
         raise ArrayFileError(
-            f"the arrays 'low' and 'high' must be {width} numbers each, low below high, got {low} and {high}"
+            f"the arrays 'low' and 'high' must have {width} numbers each, and each number of 'low' must be below that of 'high'; "
+            f"got low = {low}, high = {high}"
         )
     if depth > LAYERS_MAX:
         raise ArrayFileError(f"the network must have at most {LAYERS_MAX} layers, got {depth}")

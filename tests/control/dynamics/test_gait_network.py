@@ -177,7 +177,8 @@ def test_saved_network_is_loaded_bit_for_bit(tmp_path: Path) -> None:
         ({"surprise": np.zeros(3)}, "'surprise.npy' is not a valid member"),
         ({"bias_1": None}, "bias_1 is missing"),
         ({"weights_3": np.zeros((6, 5))}, "weights_2 is missing"),
-        ({"low": np.zeros(3)}, "the arrays 'low' and 'high' must be 6 numbers"),
+        ({"low": np.full(6, 100.0)}, r"below that of 'high'; got low = \[100\. .*\], high = \["),
+        ({"low": np.zeros(3)}, "the arrays 'low' and 'high' must have 6 numbers each"),
         ({"weights_0": np.full((6, 5), np.nan)}, "weights_0 must be an array of finite 64-bit floats"),
         ({"weights_0": np.full((6, 5), np.inf)}, "weights_0 must be an array of finite 64-bit floats"),
         ({"weights_0": np.full((6, 5), "1.0")}, "weights_0 must be an array of finite 64-bit floats"),
@@ -218,7 +219,7 @@ def test_invalid_network_is_not_saved(tmp_path: Path) -> None:
         network, layers=(*network.layers[:-1], Layer(network.layers[-1].weights, np.full(OUTPUTS, np.inf)))
     )
     with pytest.raises(
-        NetworkError, match=r"npz is not written; the network must be valid: bias_1 must be an array of finite"
+        NetworkError, match=r"npz is not written, because the network is not valid: bias_1 must be an array of finite"
     ):
         save_network(infinite, tmp_path / "network.npz")
     assert not list(tmp_path.iterdir())

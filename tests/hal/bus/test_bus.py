@@ -443,7 +443,11 @@ def test_full_virtual_bus_reports_the_number_of_sent_frames() -> None:
     [
         ("pigeon", {}, "no CAN interface 'pigeon'; use one of .*socketcan.*virtual"),
         ("pcan", {}, "cannot open pcan:x for CAN FD: .*atalante doctor -i pcan"),
-        ("virtual", {"protocol": can.CanProtocol.CAN_20}, "virtual:x must support CAN FD, got classic CAN only"),
+        (
+            "virtual",
+            {"protocol": can.CanProtocol.CAN_20},
+            "virtual:x supports classic CAN only, but CAN FD is required",
+        ),
     ],
 )
 def test_error_at_opening_names_the_valid_choices(interface: str, options: dict[str, object], sentence: str) -> None:
@@ -490,8 +494,8 @@ def broken_logs(folder: Path) -> dict[str, tuple[Path, str]]:
         "folder": (folder, "the log format must be"),
         "suffix": (folder / "run.pcap", "the log format must be .log .*, got '.pcap'"),
         "no suffix": (folder / "run", "the log format must be"),
-        "csv": (folder / "run.csv", "do not keep CAN FD frames; record .log, .asc or .blf"),
-        "db": (folder / "run.db", "do not keep CAN FD frames"),
+        "csv": (folder / "run.csv", "cannot store CAN FD frames completely; record the log as .log, .asc or .blf"),
+        "db": (folder / "run.db", "cannot store CAN FD frames completely"),
     }
     for suffix, path in whole.items():
         cut, empty, noise = (folder / f"{name}{suffix}" for name in ("cut", "empty", "noise"))
@@ -558,7 +562,7 @@ def test_channel_map_accepts_the_buses_in_any_order() -> None:
     [
         ("", "empty entry; write one channel for all"),
         ("left_leg=can0,,right_leg=can1", "empty entry"),
-        ("can0,can1", "must assign a channel to each bus"),
+        ("can0,can1", "assigns no bus to a channel"),
         ("left_leg=can0,can1", "must be BUS=CHANNEL, got 'can1'"),
         ("left_leg=", "must be BUS=CHANNEL"),
         ("left_arm=can0", "must be one of left_leg, right_leg, left_sense, right_sense, got 'left_arm'"),

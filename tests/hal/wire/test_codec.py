@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import cantools
 import numpy as np
 import pytest
@@ -169,8 +171,17 @@ def test_unknown_name_error_lists_the_valid_names():
     codec = Codec(MESSAGES)
     with pytest.raises(KeyError, match="SYNC_LEFT_LEG"):
         codec.index("LEFT_KNEE", "Position")
-    with pytest.raises(KeyError, match="TargetTorque"):
+    with pytest.raises(KeyError, match=r"the quantity must be one of TargetTorque, Position, .*Angle"):
         codec.slice("Angle")
+
+
+def test_quantity_with_and_without_sign_is_rejected_if_it_is_not_contiguous():
+    message = next(m for m in NETWORK.messages if m.name == "LEFT_FH_STATE")
+    signals = tuple(replace(s, signed=s.name != "Position") for s in message.signals)
+    codec = Codec([message, replace(message, signals=signals)])
+    assert codec.slice("Velocity").stop - codec.slice("Velocity").start == 2
+    with pytest.raises(KeyError, match="the values of the quantity 'Position' must be contiguous"):
+        codec.slice("Position")
 
 
 def read_one(codec: Codec, row: int, frames, offset: int = 0) -> int:

@@ -327,8 +327,8 @@ def test_a_recording_with_a_gap_fails_the_run_and_is_counted(tmp_path: Path, mon
     old, new = endpoints
     assert old != new
     assert done.stderr.index(f"telemetry on Zenoh at {old}") < done.stderr.index(f"telemetry on Zenoh at {new}")
-    problem = f"one file with every cycle, got recording.mcap, recording-1.mcap with {missing} cycles missing"
-    assert done.stderr.splitlines()[-1] == f"atalante: the recording must be {problem}"
+    problem = f"the recording is incomplete: {missing} cycles are missing in recording.mcap, recording-1.mcap"
+    assert done.stderr.splitlines()[-1] == f"atalante: {problem}"
 
 
 def test_a_run_of_one_step_reports_no_tracking_error(tmp_path: Path):
@@ -360,7 +360,7 @@ def test_a_run_starts_without_the_telemetry_process(tmp_path: Path, monkeypatch:
     monkeypatch.setattr(TelemetryProcess, "start", start_as_on_the_wall_clock)
     done = CliRunner().invoke(cli, ["airwalk", "--steps", "1", "--json", "--out", str(tmp_path / "run")])
     assert done.exit_code == 0, done.stderr
-    late = "the telemetry process is not ready yet: the run starts without it and it joins later"
+    late = "the telemetry process is not ready yet: the run starts now, and telemetry begins when the process is ready"
     assert done.stderr.index(late) < done.stderr.index("ACTIVE on")
     recording = json.loads(done.stdout.splitlines()[-1])
     assert recording == {"recording": {"files": ["recording.mcap"], "complete": True, "missing_cycles": 0}}

@@ -1,4 +1,4 @@
-"""Outputs of a run that need a processor core of their own."""
+"""Outputs of a run that need a processor core of their own, and the error of an incomplete recording."""
 
 from __future__ import annotations
 
@@ -6,7 +6,9 @@ from pathlib import Path
 
 import pytest
 
-from atalante_tools.session.recording import Outputs, telemetry_cores
+from atalante_hal.telemetry.process import Recording
+from atalante_tools.console.outcome import Failed
+from atalante_tools.session.recording import Outputs, require_complete, telemetry_cores
 
 
 @pytest.mark.parametrize(
@@ -20,3 +22,23 @@ from atalante_tools.session.recording import Outputs, telemetry_cores
 )
 def test_can_log_and_fast_recording_need_a_core_for_telemetry(outputs: Outputs | None, cores: int) -> None:
     assert telemetry_cores(outputs) == cores
+
+
+@pytest.mark.parametrize(
+    ("files", "missing", "sentence"),
+    [
+        ((), 3, "the recording has no file"),
+        (("recording.mcap",), 3, "the recording is incomplete: 3 cycles are missing in recording.mcap"),
+        (("recording.mcap", "recording-1.mcap"), 0, "the recording is split: recording.mcap, recording-1.mcap"),
+        (("recording.mcap",), 0, "the recording is incomplete: recording.mcap may have no index"),
+    ],
+)
+def test_incomplete_recording_is_rejected_with_its_reason(files: tuple[str, ...], missing: int, sentence: str) -> None:
+    with pytest.raises(Failed) as refusal:
+        require_complete(Recording(files, complete=False, missing_cycles=missing))
+    assert str(refusal.value) == sentence
+
+
+def test_run_without_a_recording_or_with_a_complete_recording_is_accepted() -> None:
+    require_complete(None)
+    require_complete(Recording(("recording.mcap",), complete=True, missing_cycles=0))

@@ -154,7 +154,9 @@ class Axis:
         for controlword in ROUTES[goal]:
             state = LEGAL[state, controlword][1]
             if self.follow(controlword, state) is None:
-                raise NotTested(f"the drive must reach {state.name} within {FOLLOW} cycles, but it did not")
+                raise NotTested(
+                    f"the drive must reach {state.name} within {FOLLOW} cycles, but the drive did not reach this state"
+                )
 
     def enable(self) -> None:
         """Bring the drive to OPERATION ENABLED with a torque command of 0.

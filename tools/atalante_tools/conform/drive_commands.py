@@ -214,4 +214,6 @@ def _latch(axis: Axis) -> None:
     axis.enable()
     received = axis.tester.states(axis.tester.idle(4 * LATCHED))
     if not received or state_of(received[-1]) != _S.QUICK_STOP_ACTIVE:
-        raise NotTested("the drive must latch the hold without commands, but it did not; see DRIVE-13")
+        raise NotTested(
+            "the drive must latch its position hold if no commands arrive, but the drive did not latch; see DRIVE-13"
+        )

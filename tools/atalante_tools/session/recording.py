@@ -130,13 +130,18 @@ def require_complete(recording: Recording | None) -> None:
         recording: Recording of the run. None: no recording.
 
     Raises:
-        Failed: If cycles are missing or the file is truncated. The message contains the files and the number of missing cycles.
+        Failed: If there is no file, if cycles are missing, if the recording has several files, or if its file is truncated.
     """
-    if recording is not None and not recording.complete:
-        raise Failed(
-            f"the recording must be one file with every cycle, got {', '.join(recording.files) or 'no file'} "
-            f"with {recording.missing_cycles} cycles missing"
-        )
+    if recording is None or recording.complete:
+        return
+    files = ", ".join(recording.files)
+    if not files:
+        raise Failed("the recording has no file")
+    if recording.missing_cycles:
+        raise Failed(f"the recording is incomplete: {recording.missing_cycles} cycles are missing in {files}")
+    if len(recording.files) > 1:
+        raise Failed(f"the recording is split: {files}")
+    raise Failed(f"the recording is incomplete: {files} may have no index")
 
 
 def require_complete_log(can_log: Path | None, complete: bool) -> None:

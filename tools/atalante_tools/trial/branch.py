@@ -34,7 +34,9 @@ class Branch:
         self._channel.send(request)
         answer = self._channel.recv()
         if isinstance(answer, _NoAnswer):
-            raise RuntimeError(f"the process of the continued run must answer, it ended with status {answer.status}")
+            raise RuntimeError(
+                f"the process of the continued run must answer, but it ended with status {answer.status}"
+            )
         return answer
 
 
