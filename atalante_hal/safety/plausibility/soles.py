@@ -47,7 +47,8 @@ class Soles:
     def __init__(self, robot: Robot, now: Signals) -> None:
         self._now, self._loaded, self._tilt = now, _LOAD * robot.sensors.cell_free, robot.sensors.sole_tilt
         self._to_joint = (robot.polarity / robot.gear).tolist()
-        self._samples = [0 for _ in SIDES]  # number of consecutive samples in which each flat sole was tilted
+        #: For each sole: number of consecutive samples in which the sole is tilted although its forces show flat contact.
+        self._samples = [0 for _ in SIDES]
         self._found: dict[int, Finding] = {}
 
     def check_left(self, ages: Ages | None) -> bool:

@@ -165,7 +165,7 @@ class Scope:
 
     endurance: bool  # endurance runs
     pairs: bool  # the pairs of `REPRESENTATIVES` during a walk
-    moments: bool  # runs in which each case begins at each `Moment` from power-on to the restart
+    moments: bool  # one run for each combination of a case and a `Moment` at which the case begins
     random_pairs: int  # number of random pairs of cases that begin at random times
     seed: int  # seed of the random pairs
 

@@ -45,7 +45,7 @@ class Condition:
     friction: float = 1.0  # true friction as a multiple of the compensated friction
     mass: float = 1.0  # true mass as a multiple of the mass in the model; scales inertia and weight
     noise: float = 0.0  # noise of the joint encoders [rad rms]
-    loss: float = 0.0  # probability that the measurement of a cycle is lost, and that the command of a cycle is lost
+    loss: float = 0.0  # probability of losing the measurement of a cycle; the same probability holds for the command
     delay: int = 0  # additional cycles until a command acts
 
     def __str__(self) -> str:
@@ -76,7 +76,7 @@ class Plant(NamedTuple):
     velocity_max: Vector  # speed above which the limiter reduces the torque [rad/s], shape (2,)
     velocity_margin: float  # at `velocity_max` plus this speed, the limiter has reduced the torque to zero [rad/s]
     delay: int  # additional cycles until a command acts
-    loss: float  # probability that the measurement of a cycle is lost, and that the command of a cycle is lost
+    loss: float  # probability of losing the measurement of a cycle; the same probability holds for the command
 
 
 def plant(

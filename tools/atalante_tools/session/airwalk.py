@@ -167,9 +167,8 @@ def _walk_all(
     from atalante_tools.session.embedded import EmbeddedRobot, cores_are_idle
 
     with ExitStack() as stack:
-        parallel = target.embedded and cores_are_idle(
-            telemetry_cores(outputs)
-        )  # before the telemetry process loads a core
+        # The idle cores are counted before the telemetry process starts, because this process keeps a core busy.
+        parallel = target.embedded and cores_are_idle(telemetry_cores(outputs))
         # start the subprocesses early: they import their modules while this process creates the controllers
         telemetry_child = stack.enter_context(TelemetryChild())
         robot_process = stack.enter_context(EmbeddedRobot(target.engine)) if parallel else None

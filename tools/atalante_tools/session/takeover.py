@@ -23,7 +23,7 @@ from atalante_hal.wire.process_image import ReceiveImage
 
 #: Shortest time for which a new pendant sends before it may stop [cycles]. The older pendant stops sending in this time.
 TAKEOVER_CYCLES: Final = 50
-#: Shortest time for which a pendant that resumed sending must send before it may stop again [cycles].
+#: After a pendant has resumed sending, it must send for at least this time before it may stop again [cycles].
 RETRY_CYCLES: Final = 8
 #: Upper limit of the random time that is added to `TAKEOVER_CYCLES` or `RETRY_CYCLES` [cycles].
 DRAW_CYCLES: Final = 50

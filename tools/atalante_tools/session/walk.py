@@ -58,7 +58,7 @@ def walk(target: Target, options: WalkOptions, *, as_json: bool) -> None:
     with ExitStack() as stack:
         if options.out is not None:
             stack.enter_context(run_folder(options.out))
-        # The idle cores are counted before the telemetry process loads a core.
+        # The idle cores are counted before the telemetry process starts, because this process keeps a core busy.
         two_processes = _robot_process_wanted(target, options, outputs)
         # start the subprocesses early: they import their modules while this process creates the controller
         child = None if outputs is None else stack.enter_context(TelemetryChild())

@@ -244,7 +244,9 @@ class _Walk:
         self._ends: int | None = None  # first cycle after the faults; None: no fault, or a permanent fault
 
     def execute(self, mass: float, height: float, seed: int, engine: str) -> None:
-        """Walk until the robot stands, walks on after the fault, has stopped or has fallen. A continued walk ends the process.
+        """Walk until the outcome is known: the robot stands, has fallen, has left ACTIVE, or walks on after the fault.
+
+        The process of a `Continuation` ends in this call.
 
         Args:
             mass: mass of the wearer [kg].
