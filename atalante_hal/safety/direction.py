@@ -110,12 +110,12 @@ def mobilities_of(torque: Vector, position: Vector) -> tuple[Vector, Vector]:
 
     Returns:
         Mobility [1/(kg m2)], 0 for a joint whose torque did not change, and the share of the motion that each delay
-        explains, from 0 to 1. The shape of both is (delays, joints).
+        explains, from 0 to 1, with the sign of the mobility. The shape of both is (delays, joints).
     """
     count = len(position)
     response = np.zeros((len(LATENCIES), *torque.shape))
-    for delayed, latency in zip(response, LATENCIES, strict=True):
-        delayed[latency:] = torque[:-latency] - torque[0]
+    for row, latency in enumerate(LATENCIES):
+        response[row, latency:] = torque[:-latency] - torque[0]
     response = response.cumsum(axis=1).cumsum(axis=1) * PERIOD**2
     # Remove the cubic polynomials of time from response and motion, because a joint may also move without a pulse.
     free = np.linalg.qr(np.vander(np.linspace(-1.0, 1.0, count), 4))[0]
@@ -125,7 +125,7 @@ def mobilities_of(torque: Vector, position: Vector) -> tuple[Vector, Vector]:
     power, total = (response**2).sum(axis=1), (motion**2).sum(axis=0)
     moved = (response * motion).sum(axis=1)
     mobility: Vector = moved / np.where(power > 0.0, power, np.inf)
-    explained: Vector = moved * mobility / np.where(total > 0.0, total, np.inf)
+    explained: Vector = moved * np.abs(mobility) / np.where(total > 0.0, total, np.inf)
     return mobility, explained
 
 
@@ -161,7 +161,7 @@ class DirectionProof:
         self._trials = [0] * len(JOINTS)
         #: Index in `LATENCIES` of the delay that the first test of the present group found. A repeated test has fewer joints
         #: and one of them may be faulty, so it uses the same delay.
-        self._delay = 0
+        self._delay: int
         self._position: list[Vector] = []  # joint positions in each cycle of the current test
         self._force: list[Vector] = []  # vertical force of each foot in each cycle of the current test
         self._torque: list[Vector] = []  # sent torques in each cycle of the current test
@@ -247,7 +247,7 @@ class DirectionProof:
             return ""
         mobility, explained = mobilities_of(np.array(self._torque)[:, joints], np.array(self._position)[:, joints])
         if not any(self._trials[joint] for joint in joints):
-            self._delay = int(np.argmax(np.where(mobility > 0.0, explained, 0.0).sum(axis=1)))
+            self._delay = int(np.argmax(np.maximum(explained, 0.0).sum(axis=1)))
         self.mobility[joints] = mobility[self._delay]
         return self._evaluate_test(joints, duration)
 
