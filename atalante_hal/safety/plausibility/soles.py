@@ -102,7 +102,7 @@ def stands_flat(cells: Sequence[float], loaded: float) -> bool:
 
 
 def sole_tilt(tibia: Sequence[float], sa: float, ha: float, toe_out: float) -> tuple[float, float]:
-    """Return the horizontal components of the upward direction in the axes of a sole, which are 0 if the sole is level.
+    """Return the components of the upward direction along the axes of a sole that lie in its plane; 0 if the sole is level.
 
     Args:
         tibia: attitude of the tibia, quaternion wxyz, sensor to world.

@@ -190,7 +190,7 @@ class Grid(NamedTuple):
 
 
 def spread(effect: Effect, mobilities: Vector, bounds: Vector, grid: Grid, ahead: Vector) -> Vector:
-    """Compute the largest outputs that disturbances cause: from each start cycle on, and from the start of the step on.
+    """Compute the largest outputs due to disturbances that begin at each start cycle, or at the start of the step.
 
     `ahead` receives the outputs if disturbances begin at a start cycle. The returned array contains the outputs if
     disturbances begin at the start of the step. In both arrays, columns 0 and 1 are the effects of the budget on the

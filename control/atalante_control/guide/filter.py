@@ -196,7 +196,9 @@ class GuideFilter:
 
 
 def tail(inverse: Vector) -> Vector:
-    """Return for each cycle 1 / width at the narrowest point of the guide within the next `TAIL_CYCLES` cycles, plus a margin.
+    """Return for each cycle the inverse width of the guide at its narrowest point in the next `TAIL_CYCLES` cycles.
+
+    A margin is added to the inverse width.
 
     Args:
         inverse: 1 / distance to the guide for each cycle, shape (n, m) [1/rad].

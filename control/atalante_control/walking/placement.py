@@ -51,7 +51,7 @@ _FASTEST = 3.0  # rad/s, largest desired speed of a joint that shifts the foot
 class PlacementConfig(NamedTuple):
     """Parameters of foot placement and step timing."""
 
-    #: m, largest predicted DCM error at the landing that is ignored; infinity switches placement and timing off
+    #: m, a DCM error that is predicted for the landing is ignored up to this value; infinity: no placement, no timing
     dead_zone: float = 0.015
     forward: float = 0.15  # m, largest offset of a landing forwards and backwards
     outward: float = 0.22  # m, largest offset of a landing away from the stance foot
@@ -62,9 +62,9 @@ class PlacementConfig(NamedTuple):
     settled: float = 0.08
     #: s, in this last part before the nominal landing, the phase rate returns to 1 and `late_landing` gives the offset
     frozen: float = 0.05
-    #: m, largest DCM error (forward, sideways) whose growth the robot can stop. The forward error is smaller than the
-    #: limit of the ankle stabiliser, because the PIDs of the stance leg act against the stabiliser. The sideways error
-    #: is larger than the limit, because the trunk leans.
+    #: m, largest DCM error (forward, sideways) whose growth the robot can stop. The forward value is below the
+    #: limit of the ankle stabiliser, because the PIDs of the stance leg act against the stabiliser. The sideways value
+    #: is above this limit, because the trunk leans.
     capacity: Pair = (0.10, 0.08)
     bandwidth: float = 25.0  # rad/s, natural frequency of the critically damped filter of the landing offset
     speed: float = 1.2  # m/s, largest rate of change of the landing offset

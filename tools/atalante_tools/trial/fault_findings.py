@@ -88,7 +88,7 @@ def _moments(falls: Sequence[dict[str, Any]]) -> str:
 
 
 def _longest(result: Result) -> str:
-    """Return as text the longest fault duration without a fall, at the moment with the shortest such duration."""
+    """Return as text the longest duration of the fault that makes the robot fall at no moment, and the worst moment."""
     limited = [
         (cycles, run["moment"])
         for cycles, run in zip(result["longest"], result["runs"], strict=True)

@@ -45,7 +45,7 @@ QUICK_MASSES: Final = (58.0, 75.0)
 MASS_SHARE: Final = (0.9, 1.1)
 FRICTION: Final = (0.25, 0.8)
 #: Parts of the control loop of `robustness` that can be a cycle late: state messages, command messages, motors.
-#: Messages that are one cycle late time out after four lost frames in a row. Messages that are later would time out
+#: If messages are one cycle late, they time out after four lost frames in a row. Messages that are later would time out
 #: after fewer lost frames than the fault matrix intends.
 LATE_PARTS: Final = 3
 #: Probability of a lost frame, force of a push [N], and number of steps per push. The time of a push within
