@@ -122,7 +122,8 @@ def start_is_rejected(run: Observation) -> str | None:
 def nothing_sags(run: Observation) -> str | None:
     """Check that no joint moves by more than 1 deg while the robot starts again after the fault.
 
-    The time from START of the operator until ACTIVE is checked. If the robot does not become ACTIVE, the check ends 40 cycles after START.
+    The time from START of the operator until ACTIVE is checked. If the robot does not become ACTIVE, the check ends 40
+    cycles after START.
 
     Args:
         run: observation of the run.
