@@ -159,9 +159,9 @@ class DirectionProof:
         #: Joints of each test that is still to be done, and duration of its pulse [cycles].
         self._tests: list[tuple[list[int], int]] = []
         self._trials = [0] * len(JOINTS)
-        #: Index in `LATENCIES` of the delay that the first test of the present group found. A repeated test has fewer joints
-        #: and one of them may be faulty, so it uses the same delay.
-        self._delay: int
+        #: Index in `LATENCIES` of the delay that the last test of more than two joints found. A test of one or two joints uses
+        #: this delay, because these joints may be faulty, and a reversed motor may look like a late motor.
+        self._delay = 0
         self._position: list[Vector] = []  # joint positions in each cycle of the current test
         self._force: list[Vector] = []  # vertical force of each foot in each cycle of the current test
         self._torque: list[Vector] = []  # sent torques in each cycle of the current test
@@ -246,7 +246,7 @@ class DirectionProof:
         if len(self._position) <= duration + LATENCY:
             return ""
         mobility, explained = mobilities_of(np.array(self._torque)[:, joints], np.array(self._position)[:, joints])
-        if not any(self._trials[joint] for joint in joints):
+        if len(joints) > len(SIDES):
             self._delay = int(np.argmax(np.maximum(explained, 0.0).sum(axis=1)))
         self.mobility[joints] = mobility[self._delay]
         return self._evaluate_test(joints, duration)

@@ -141,6 +141,23 @@ def test_reversed_motor_fails_although_its_torque_acts_late(joints: Joints, join
     assert failure.startswith(f"{JOINTS[joint]} moves against its torque") or "deg in the test" in failure
 
 
+@pytest.mark.parametrize("joint", range(6), ids=JOINTS[:6])
+def test_reversed_motor_fails_again_in_a_second_start(joints: Joints, joint: int):
+    """In a second start, only this joint is tested."""
+    joints.strength[joint] = -1.0
+    assert joints.run()[0]
+    joints.position, joints.velocity = MIDDLE.copy(), np.zeros(12)
+    joints.proof.proven[:] = np.arange(12) != joint
+    failure, _ = joints.run()
+    assert failure.startswith(JOINTS[joint])
+
+
+def test_single_joint_is_tested_with_the_delay_of_a_bus_without_delay(joints: Joints):
+    joints.proof.proven[:] = np.arange(12) != ANKLE
+    assert joints.run() == ("", GROUPS[1][1] + LATENCY + 1)
+    assert joints.proof.mobility[ANKLE] == pytest.approx(1.0 / INERTIA[ANKLE], rel=0.05)
+
+
 def test_joints_that_passed_are_not_tested_again_until_their_drive_restarts(joints: Joints):
     joints.run()
     assert joints.run() == ("", 0)
