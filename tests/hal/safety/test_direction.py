@@ -64,6 +64,13 @@ def test_mobility_is_that_of_the_simulated_inertia_despite_its_weight_and_delay(
     assert np.abs(np.delete(explained, row)).max() < 0.97
 
 
+def test_explained_shares_of_joints_with_different_motions_are_independent():
+    torque, small = motion(LATENCY, 8.0)
+    _, large = motion(LATENCY, 0.05)
+    _, explained = mobilities_of(np.hstack([torque, torque]), np.hstack([small, large]))
+    assert explained[0] == pytest.approx([1.0, 1.0], rel=1e-6)
+
+
 def test_mobility_of_a_joint_without_torque_change_is_zero():
     mobility, explained = mobilities_of(np.full((20, 1), 5.0), np.linspace(0.0, 1.0, 20)[:, None] ** 5)
     assert not mobility.any()
