@@ -102,6 +102,15 @@ def test_calls_of_a_specialised_function_keep_the_reference_count_of_an_array() 
     assert sys.getrefcount(values) == before
 
 
+def run_twice(script: str, folder: Path) -> list[subprocess.CompletedProcess[str]]:
+    """Run a script in two processes, one after the other, with the folder as working directory and as folder of the cache."""
+    command, environment = [sys.executable, "-c", script], {"XDG_CACHE_HOME": str(folder), "PATH": "/usr/bin:/bin"}
+    return [
+        subprocess.run(command, cwd=folder, env=environment, capture_output=True, text=True, check=True)
+        for _ in range(2)
+    ]
+
+
 def test_second_process_does_not_compile_a_function_that_creates_arrays_again(tmp_path: Path) -> None:
     (tmp_path / "kernel.py").write_text("def double(x):\n    return 2.0 * x\n")
     script = (
@@ -109,17 +118,7 @@ def test_second_process_does_not_compile_a_function_that_creates_arrays_again(tm
         "from atalante_hal.compiled import specialised; from kernel import double\n"
         "print(specialised(double, numpy.ones(1))(numpy.ones(1)))"
     )
-    logs = [
-        subprocess.run(
-            [sys.executable, "-c", script],
-            cwd=tmp_path,
-            env={"XDG_CACHE_HOME": str(tmp_path), "PATH": "/usr/bin:/bin"},
-            capture_output=True,
-            text=True,
-            check=True,
-        ).stderr.splitlines()
-        for _ in range(2)
-    ]
+    logs = [done.stderr.splitlines() for done in run_twice(script, tmp_path)]
     assert logs == [["compiling kernel.double"] * 2, []]  # first without, then with reference counts
 
 
@@ -240,17 +239,7 @@ def test_second_process_loads_the_function_from_the_cache(tmp_path: Path) -> Non
         "from atalante_hal.compiled import compiled; from kernel import square; f = compiled(square); f(3.0);"
         "print(sum(f.stats.cache_hits.values()))"
     )
-    hits = [
-        subprocess.run(
-            [sys.executable, "-c", script],
-            cwd=tmp_path,
-            env={"XDG_CACHE_HOME": str(tmp_path), "PATH": "/usr/bin:/bin"},
-            capture_output=True,
-            text=True,
-            check=True,
-        ).stdout.strip()
-        for _ in range(2)
-    ]
+    hits = [done.stdout.strip() for done in run_twice(script, tmp_path)]
     assert hits == ["0", "1"]
 
 

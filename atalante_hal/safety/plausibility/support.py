@@ -90,9 +90,8 @@ class Support:
         for foot, height in enumerate((posture.height, -posture.height)):
             raised = loaded[foot] and not loaded[1 - foot] and height > _HEIGHT
             self._too_high[foot] = self._too_high[foot] + self._every if raised else 0
-        self._wrong_leg = (
-            self._wrong_leg + self._every if all(loaded) and on_wrong_leg(posture.lean, left, right) else 0
-        )
+        wrong = all(loaded) and on_wrong_leg(posture.lean, left, right)
+        self._wrong_leg = self._wrong_leg + self._every if wrong else 0
         found = [_high(foot, posture.height) for foot in range(len(FEET)) if self._too_high[foot] >= HEIGHT_CYCLES]
         if self._wrong_leg >= WEIGHT_CYCLES:
             found.append(_exchanged(posture.lean, left, right))
@@ -118,10 +117,8 @@ def posture_of(pelvis: Sequence[float], tibiae: Sequence[Sequence[float]], knees
         knees: angles of the left and the right knee [rad].
     """
     w, x, y, z = pelvis
-    left_x, left_y = (
-        2.0 * (x * y - w * z),
-        1.0 - 2.0 * (x * x + z * z),
-    )  # horizontal part of the pelvis axis to the left
+    # Horizontal part of the pelvis axis to the left.
+    left_x, left_y = 2.0 * (x * y - w * z), 1.0 - 2.0 * (x * x + z * z)
     length = math.hypot(left_x, left_y)
     drops, lean = [], 0.0
     for (w, x, y, z), knee in zip(tibiae, knees, strict=True):
