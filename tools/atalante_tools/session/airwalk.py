@@ -164,11 +164,10 @@ def _walk_all(
     import atalante_dbc
     from atalante_hal.robot import load_robot
     from atalante_hal.telemetry.child import TelemetryChild
-    from atalante_tools.session.embedded import EmbeddedRobot, cores_are_idle
+    from atalante_tools.session.embedded import EmbeddedRobot, robot_process_wanted
 
     with ExitStack() as stack:
-        # The idle cores are counted before the telemetry process starts, because this process keeps a core busy.
-        parallel = target.embedded and cores_are_idle(telemetry_cores(outputs))
+        parallel = robot_process_wanted(target, telemetry_cores(outputs))
         # start the subprocesses early: they import their modules while this process creates the controllers
         telemetry_child = stack.enter_context(TelemetryChild())
         robot_process = stack.enter_context(EmbeddedRobot(target.engine)) if parallel else None

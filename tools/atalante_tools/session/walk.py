@@ -52,27 +52,17 @@ def walk(target: Target, options: WalkOptions, *, as_json: bool) -> None:
         Failed: If the robot fell or did not walk to the end, or the recording or the CAN log is incomplete.
     """
     from atalante_hal.telemetry.child import TelemetryChild
-    from atalante_tools.session.embedded import EmbeddedRobot
+    from atalante_tools.session.embedded import EmbeddedRobot, robot_process_wanted
 
     outputs = _outputs(options)
     with ExitStack() as stack:
         if options.out is not None:
             stack.enter_context(run_folder(options.out))
-        # The idle cores are counted before the telemetry process starts, because this process keeps a core busy.
-        two_processes = _robot_process_wanted(target, options, outputs)
+        two_processes = robot_process_wanted(target, telemetry_cores(outputs), options.robot_process)
         # start the subprocesses early: they import their modules while this process creates the controller
         child = None if outputs is None else stack.enter_context(TelemetryChild())
         robot = stack.enter_context(EmbeddedRobot(target.engine)) if two_processes else None
         _walk(target, options, robot, outputs, child, as_json=as_json)
-
-
-def _robot_process_wanted(target: Target, options: WalkOptions, outputs: Outputs | None) -> bool:
-    """Return whether the emulated robot gets its own process. If the user did not decide, the number of idle cores decides."""
-    if not target.embedded or options.robot_process is not None:
-        return target.embedded and bool(options.robot_process)
-    from atalante_tools.session.embedded import cores_are_idle
-
-    return cores_are_idle(telemetry_cores(outputs))
 
 
 def _outputs(options: WalkOptions) -> Outputs | None:

@@ -28,7 +28,7 @@ from atalante_hal.bus import BusDown
 from atalante_hal.bus.shared import SharedBus, descriptors
 from atalante_hal.closing import Closing
 from atalante_hal.robot import Robot
-from atalante_tools.console.options import PYBULLET
+from atalante_tools.console.options import PYBULLET, Target
 from atalante_tools.console.outcome import Failed
 from atalante_tools.session.body import require_engine
 from atalante_tools.session.embedded.access import RemoteAccess, access_memory
@@ -149,6 +149,19 @@ class EmbeddedRobot(Closing):
             self._child.wait()
         if self._child.stdin is not None:
             self._child.stdin.close()
+
+
+def robot_process_wanted(target: Target, others: int, chosen: bool | None = None) -> bool:
+    """Return whether an emulated robot gets its own process.
+
+    Call this before other processes of the run start, because these processes keep cores busy.
+
+    Args:
+        target: Bus and clock. Only an embedded robot can get its own process.
+        others: Number of other processes, see `cores_are_idle`.
+        chosen: Choice of the user. With None, the number of idle cores decides.
+    """
+    return target.embedded and (cores_are_idle(others) if chosen is None else chosen)
 
 
 def cores_are_idle(others: int, load: Path = _LOAD) -> bool:
