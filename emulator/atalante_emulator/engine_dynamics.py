@@ -49,7 +49,7 @@ class EngineDynamics(Closing):
         moving = [info[1].decode() for info in infos if info[2] == pybullet.JOINT_REVOLUTE]
         if missing := [name for name in JOINTS if name not in moving]:
             self.close()
-            raise ValueError(f"the URDF must have the joints {', '.join(JOINTS)}, but {missing[0]} is missing")
+            raise ValueError(f"the URDF must contain the joints {', '.join(JOINTS)}, got no joint {missing[0]}")
         self._order = [moving.index(name) for name in JOINTS]  # indices into PyBullet's joint vectors
         self._rows = [[info[1].decode() for info in infos].index(name) for name in JOINTS]  # PyBullet joint numbers
         self._links = range(len(infos))

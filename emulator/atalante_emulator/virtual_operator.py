@@ -49,7 +49,7 @@ class VirtualOperator:
             ValueError: If the largest force is not positive.
         """
         if not most > 0.0:
-            raise ValueError(f"the largest force of the virtual operator must be positive [N], got {most!r}")
+            raise ValueError(f"the largest force of the virtual operator must be above 0 N, got {most!r}")
         self._body, self._most, self._cycle = body, most, 0
         self._wrench = np.zeros(6)
         #: All interventions so far.

@@ -57,5 +57,5 @@ def test_pybullet_has_every_link_with_the_mass_of_the_urdf() -> None:
 
 
 def test_urdf_with_a_missing_joint_is_rejected_with_its_name() -> None:
-    with pytest.raises(ValueError, match=r"must have the joints .*, but right_HA is missing"):
+    with pytest.raises(ValueError, match=r"must contain the joints .*, got no joint right_HA"):
         EngineDynamics(urdf(EMPTY, ROBOT).replace('"right_HA"', '"spare"'))

@@ -82,9 +82,16 @@ def test_lowest_corner_of_a_tilted_sole_is_at_its_low_edge() -> None:
 
 
 @pytest.mark.parametrize("pad", ["left_foot_FL", "right_foot_RR"])
-def test_contact_pad_without_a_sphere_is_rejected(pad: str) -> None:
-    text = urdf(ExoskeletonParameters(), load_robot()).replace(f'"{pad}"', '"spare"')
-    with pytest.raises(ValueError, match=f"contact pad {pad}"):
+@pytest.mark.parametrize(
+    ("reference", "sentence"),
+    [
+        ("child link=", "must be the child link of a joint with an origin, got no such joint"),
+        ("link name=", "must be a link with a collision sphere, got no such link"),
+    ],
+)
+def test_contact_pad_without_a_joint_or_a_sphere_is_rejected(pad: str, reference: str, sentence: str) -> None:
+    text = urdf(ExoskeletonParameters(), load_robot()).replace(f'{reference}"{pad}"', f'{reference}"spare"')
+    with pytest.raises(ValueError, match=f"contact pad {pad} {sentence}"):
         read_soles(text)
 
 

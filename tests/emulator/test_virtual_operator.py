@@ -67,5 +67,5 @@ def test_interventions_with_a_pause_are_counted_separately(body: Body) -> None:
 
 
 def test_force_that_is_not_positive_is_rejected(body: Body) -> None:
-    with pytest.raises(ValueError, match="the largest force of the virtual operator must be positive"):
+    with pytest.raises(ValueError, match="the largest force of the virtual operator must be above 0 N"):
         VirtualOperator(body, 0.0)

@@ -210,7 +210,7 @@ class TestF55GaitInvalid:
     def test_f55_repeated_key_is_rejected(self, tmp_path: Path) -> None:
         path = tmp_path / "gait.json"
         path.write_text(AIRWALK_GAIT.read_text().replace("{", '{"duration": 0.8, ', 1))
-        assert "every key must occur once, got duration 2 times" in gait_rejection_of(path)
+        assert "key 'duration' must occur once, got it 2 times" in gait_rejection_of(path)
 
     @with_tmp_path
     @given(st.binary(max_size=200) | st.text(max_size=200).map(str.encode) | st.just(b"[" * 100_000))

@@ -251,19 +251,22 @@ def _network(arrays: Mapping[str, npt.NDArray[Any]]) -> GaitNetwork:
     layers = tuple(Layer(arrays[f"weights_{i}"], arrays[f"bias_{i}"]) for i in range(depth))
     low, high = arrays["low"], arrays["high"]
     width = len(INPUTS)
-    if low.shape != (width,) or high.shape != (width,) or not (low < high).all():
-        raise ArrayFileError(
-            f"the arrays 'low' and 'high' must have {width} numbers each, and each number of 'low' must be below that of 'high'; "
-            f"got low = {low}, high = {high}"
-        )
+    for name, bound in (("low", low), ("high", high)):
+        if bound.shape != (width,):
+            raise ArrayFileError(f"{name} must have shape ({width},), got shape {bound.shape}")
+    if (wrong := np.flatnonzero(low >= high)).size:
+        i = int(wrong[0])
+        raise ArrayFileError(f"low[{i}] must be below high[{i}] ({high[i]:g}), got {low[i]:g}")
     if depth > LAYERS_MAX:
         raise ArrayFileError(f"the network must have at most {LAYERS_MAX} layers, got {depth}")
     for i, (weights, bias) in enumerate(layers):
         columns = bias.size
-        if weights.shape != (width, columns) or bias.shape != (columns,) or not 1 <= columns <= WIDTH_MAX:
+        if bias.shape != (columns,) or not 1 <= columns <= WIDTH_MAX:
+            raise ArrayFileError(f"bias_{i} must have shape (n,) with n from 1 to {WIDTH_MAX}, got shape {bias.shape}")
+        if weights.shape != (width, columns):
             raise ArrayFileError(
-                f"weights_{i} must have shape ({width}, n) and bias_{i} shape (n,), with n from 1 to {WIDTH_MAX}, "
-                f"got shapes {weights.shape} and {bias.shape}"
+                f"weights_{i} must have shape ({width}, {columns}) for {width} inputs and {columns} numbers in bias_{i}, "
+                f"got shape {weights.shape}"
             )
         width = columns
     if width != OUTPUTS:

@@ -67,7 +67,7 @@ def read_arrays(path: Path, allowed: Collection[str], size_max: int) -> dict[str
     with path.open("rb") as stream:
         packed = stream.read(size_max + 1)
     if len(packed) > size_max:
-        raise ArrayFileError(f"the file must have at most {size_max} bytes, got more")
+        raise ArrayFileError(f"the file must have at most {size_max} bytes, got at least {len(packed)} bytes")
     try:
         with zipfile.ZipFile(io.BytesIO(packed)) as archive:
             members = _checked_directory(archive, allowed, size_max)
@@ -89,15 +89,19 @@ def _checked_directory(archive: zipfile.ZipFile, allowed: Collection[str], size_
         name = member.filename.removesuffix(_SUFFIX)
         if member.filename != name + _SUFFIX or name not in (CHECKSUM, *allowed):
             raise ArrayFileError(
-                f"{member.filename[:40]!r} is not a valid member; valid arrays are {', '.join(sorted(allowed))}"
+                f"each member of the archive must be one of {', '.join(n + _SUFFIX for n in sorted(allowed))}, "
+                f"got {member.filename[:40]!r}"
             )
         if name in members:
-            raise ArrayFileError(f"the archive must have one member {name}, got two")
+            raise ArrayFileError(f"member {member.filename!r} must occur once in the archive, got it twice")
         if member.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
-            raise ArrayFileError(f"{name} must be stored or deflated, got compression {member.compress_type}")
+            raise ArrayFileError(
+                f"compression method of {name} must be {zipfile.ZIP_STORED} (stored) or {zipfile.ZIP_DEFLATED} (deflated), "
+                f"got {member.compress_type}"
+            )
         members[name] = member
     if CHECKSUM not in members:
-        raise ArrayFileError(f"{CHECKSUM} is missing")
+        raise ArrayFileError(f"the archive must contain the member {CHECKSUM + _SUFFIX}, got none")
     if (declared := sum(member.file_size for member in members.values())) > size_max:
         raise ArrayFileError(f"the declared sizes of the arrays must sum to at most {size_max} bytes, got {declared}")
     return members
@@ -109,7 +113,9 @@ def _member(archive: zipfile.ZipFile, member: zipfile.ZipInfo) -> bytes:
         # `read()` without a limit would decompress the whole member, even if it is larger than declared.
         content = stream.read(member.file_size + 1)
     if len(content) != member.file_size:
-        raise ArrayFileError(f"{member.filename} must have the declared {member.file_size} bytes, got {len(content)}")
+        raise ArrayFileError(
+            f"{member.filename} must have the declared size of {member.file_size} bytes, got {len(content)} bytes"
+        )
     return content
 
 

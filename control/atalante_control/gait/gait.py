@@ -237,7 +237,7 @@ def gait_from(document: Mapping[str, Any], where: str) -> Gait:
         raise GaitError(f"{where}: format must be {FORMAT!r}, got {document['format']!r}")
     name, parameters, solver = document["name"], document.get("parameters", {}), document.get("solver", {})
     if not (isinstance(name, str) and name):
-        raise GaitError(f"{where}: name must be a text that is not empty, got {name!r}")
+        raise GaitError(f"{where}: name must be a non-empty text, got {name!r}")
     if not isinstance(parameters, dict) or not all(_is_number(value) for value in parameters.values()):
         raise GaitError(f"{where}: parameters must be an object of finite numbers, got {parameters!r}")
     if not isinstance(solver, dict):
@@ -369,7 +369,7 @@ def _check_form(gait: Gait, where: str) -> None:
         if len(wrong):
             joint, point = wrong[0]
             raise GaitError(
-                f"{where}: {key}.{JOINTS[joint]} must be finite, got {array[joint, point]} as control point {point}"
+                f"{where}: {key}.{JOINTS[joint]}[{point}] must be a finite number, got {array[joint, point]}"
             )
     # `np.float64` is a subclass of float, but `_check_duration` accepts only built-in numbers.
     _check_duration(float(gait.duration) if isinstance(gait.duration, float) else gait.duration, where)
@@ -424,7 +424,7 @@ def _check_duration(value: Any, where: str) -> float:
     """Check that a duration [s] is a whole number of cycles within `DURATION_RANGE`, and return it."""
     low, high = DURATION_RANGE
     if not (_is_number(value) and low <= value <= high):
-        raise GaitError(f"{where}: duration must be a number of seconds from {low} to {high}, got {value!r}")
+        raise GaitError(f"{where}: duration must be a number from {low} to {high} [s], got {value!r}")
     cycles = value / PERIOD
     if abs(cycles - round(cycles)) > 1e-6:
         raise GaitError(f"{where}: duration must be a whole number of milliseconds, got {value!r} s")
@@ -459,7 +459,7 @@ def _unique_keys(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
     if len(found) < len(pairs):
         names = [name for name, _ in pairs]
         repeated = next(name for name in names if names.count(name) > 1)
-        raise ValueError(f"every key must occur once, got {repeated} {names.count(repeated)} times")
+        raise ValueError(f"key {repeated!r} must occur once, got it {names.count(repeated)} times")
     return found
 
 

@@ -31,9 +31,11 @@ class Deadbeat:
 
     def __post_init__(self) -> None:
         if not (math.isfinite(self.duration) and self.duration > 0.0):
-            raise ValueError(f"step duration must be positive and finite [s], got {self.duration!r}")
+            raise ValueError(f"step duration must be finite and above 0 s, got {self.duration!r}")
         if not 0.0 < self.alpha <= 1.0:
-            raise ValueError(f"alpha of the re-centring must be a fraction of a step in (0, 1], got {self.alpha!r}")
+            raise ValueError(
+                f"alpha of the re-centring must be above 0 and at most 1 (fraction of the step duration), got {self.alpha!r}"
+            )
 
     @property
     def end(self) -> float:

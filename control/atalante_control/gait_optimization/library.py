@@ -69,10 +69,12 @@ class Grid:
 
     def __post_init__(self) -> None:
         for name, levels in zip(self.names(), self.axes(), strict=True):
-            if len(levels) < LEVELS_MIN or not all(a < b for a, b in pairwise(levels)):
-                raise ValueError(f"{name} must have at least {LEVELS_MIN} ascending levels, got {list(levels)}")
+            if len(levels) < LEVELS_MIN:
+                raise ValueError(f"{name} must have at least {LEVELS_MIN} levels, got {list(levels)}")
+            if not all(a < b for a, b in pairwise(levels)):
+                raise ValueError(f"levels of {name} must be in ascending order, got {list(levels)}")
             if len({f"{level:g}" for level in levels}) < len(levels):
-                raise ValueError(f"levels of {name} must differ in their first 6 digits, got {list(levels)}")
+                raise ValueError(f"levels of {name} must differ after rounding to 6 digits, got {list(levels)}")
         corners = self._corners()
         if self.size < len(corners):
             raise ValueError(

@@ -76,10 +76,10 @@ def bodies(links: Sequence[Link]) -> tuple[Body, ...]:
     inertia = {name: np.zeros((3, 3)) for name in carriers}
     for link in links:
         carrier, offset = (link.name, np.zeros(3)) if link.name in carriers else (link.parent, np.array(link.origin))
-        if carrier not in carriers or (carrier != link.name and link.yaw):
-            raise ValueError(
-                f"fixed link {link.name} must have yaw 0 and a moving parent, got yaw {link.yaw} and parent {link.parent}"
-            )
+        if carrier not in carriers:
+            raise ValueError(f"parent of the fixed link {link.name} must be a moving link, got {link.parent}")
+        if carrier != link.name and link.yaw:
+            raise ValueError(f"yaw of the fixed link {link.name} must be 0 rad, got {link.yaw!r} rad")
         centre = offset + np.array(link.inertia.centre)
         mass[carrier] += link.inertia.mass
         moment[carrier] += link.inertia.mass * centre
@@ -147,19 +147,21 @@ class Chain:
             links: links of the robot.
 
         Raises:
-            ValueError: If the topology of the robot differs from the reference.
+            ValueError: If name, parent, joint, yaw or axis of a body differs from the reference robot, or if a number is not zero
+                that is zero in the reference robot.
         """
         robot = bodies(links)
-        same = all(
-            (a.name, a.parent, a.joint, a.yaw, a.axis) == (b.name, b.parent, b.joint, b.yaw, b.axis)
-            for a, b in zip(robot, self.bodies, strict=True)
-        )
+        for body, reference in zip(robot, self.bodies, strict=True):
+            if (found := _structure(body)) != (expected := _structure(reference)):
+                raise ValueError(
+                    f"name, parent, joint, yaw and axis of body {reference.name} must be {expected} as in the reference robot, "
+                    f"got {found}"
+                )
         numbers = _numbers(robot).ravel()
         unused = np.delete(numbers, self._used)
-        if not same or unused.any():
+        if unused.any():
             raise ValueError(
-                "the robot must have the bodies and joint axes of the reference robot, and the same parameters must be zero; "
-                "got a different robot"
+                f"masses and lengths that are 0 in the reference robot must be 0, got {unused[unused != 0.0].tolist()}"
             )
         return np.asarray(numbers[self._used])
 
@@ -277,6 +279,10 @@ def _tensor(inertia: Inertia) -> Vector:
 def _symmetric(six: Symbol) -> Symbol:
     xx, xy, xz, yy, yz, zz = (six[i] for i in range(6))
     return casadi.vertcat(casadi.horzcat(xx, xy, xz), casadi.horzcat(xy, yy, yz), casadi.horzcat(xz, yz, zz))
+
+
+def _structure(body: Body) -> tuple[str, str, int, float, Vector3]:
+    return body.name, body.parent, body.joint, body.yaw, body.axis
 
 
 def _numbers(chain: Sequence[Body]) -> Vector:

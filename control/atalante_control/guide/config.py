@@ -42,7 +42,7 @@ class StepGuideConfig:
     def __post_init__(self) -> None:
         for name in ("stiffness", "damping", "promise"):
             if not all(math.isfinite(value) and value > 0.0 for value in getattr(self, name)):
-                raise ValueError(f"{name} must be two positive and finite numbers, got {getattr(self, name)!r}")
+                raise ValueError(f"each value of {name!r} must be finite and above 0, got {getattr(self, name)!r}")
         for name in ("torque_reserve", "speed_reserve"):
             if not (math.isfinite(getattr(self, name)) and getattr(self, name) >= 0.0):
                 raise ValueError(f"{name} must be finite and at least 0, got {getattr(self, name)!r}")
@@ -50,4 +50,6 @@ class StepGuideConfig:
             if not 0.0 <= getattr(self, name) <= 1.0:
                 raise ValueError(f"intensity of {name} must be between 0 and 1, got {getattr(self, name)!r}")
         if list(self.gentler) != sorted(self.gentler) or not all(0.0 < part < 1.0 for part in self.gentler):
-            raise ValueError(f"`gentler` must be fractions of `stiffness` in (0, 1), ascending, got {self.gentler!r}")
+            raise ValueError(
+                f"each value of 'gentler' must be above 0 and below 1, in ascending order, got {self.gentler!r}"
+            )

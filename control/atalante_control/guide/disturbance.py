@@ -50,7 +50,7 @@ class Mismatch:
     def __post_init__(self) -> None:
         for name in ("friction", "inertia"):
             if not 0.0 <= getattr(self, name) < 1.0:
-                raise ValueError(f"{name} of the mismatch must be a fraction in [0, 1), got {getattr(self, name)!r}")
+                raise ValueError(f"{name} of the mismatch must be at least 0 and below 1, got {getattr(self, name)!r}")
         if not all(0.0 <= value < math.inf for value in self.residual):
             raise ValueError(f"residual of the mismatch must be finite and at least 0 Nm, got {self.residual!r}")
 

@@ -39,7 +39,7 @@ def pinocchio_model(urdf_text: str, fixed_base: bool = True) -> ArticulatedModel
     else:
         model = pinocchio.buildModelFromXML(urdf_text, pinocchio.JointModelFreeFlyer())
     if missing := [name for name in JOINTS if not model.existJointName(name)]:
-        raise ValueError(f"the URDF must have the joints {', '.join(JOINTS)}; {missing[0]} is missing")
+        raise ValueError(f"the URDF must contain the joints {', '.join(JOINTS)}, got no joint {missing[0]}")
     ids = [model.getJointId(name) for name in JOINTS]
     q, v = np.array([model.idx_qs[i] for i in ids], np.intp), np.array([model.idx_vs[i] for i in ids], np.intp)
     return ArticulatedModel(model, q, v)

@@ -97,15 +97,14 @@ class WalkConfig:
             if not (math.isfinite(getattr(self, name)) and getattr(self, name) >= PERIOD):
                 raise ValueError(f"{name} must be at least one cycle ({PERIOD} s), got {getattr(self, name)!r}")
         if not 0.0 <= self.stabiliser <= 10.0:
-            raise ValueError(f"stabiliser must be a gain from 0 to 10, got {self.stabiliser!r}")
+            raise ValueError(f"stabiliser must be from 0 to 10 m/m, got {self.stabiliser!r}")
         placement = self.placement
-        if not 0.0 < placement.slowest <= 1.0 <= placement.fastest < math.inf:
-            raise ValueError(
-                f"placement.slowest must be in (0, 1] and placement.fastest at least 1, got {placement.slowest!r} and "
-                f"{placement.fastest!r}"
-            )
+        if not 0.0 < placement.slowest <= 1.0:
+            raise ValueError(f"placement.slowest must be above 0 and at most 1, got {placement.slowest!r}")
+        if not 1.0 <= placement.fastest < math.inf:
+            raise ValueError(f"placement.fastest must be finite and at least 1, got {placement.fastest!r}")
         if not (math.isfinite(placement.frozen) and placement.frozen >= PERIOD):
             raise ValueError(f"placement.frozen must be at least one cycle ({PERIOD} s), got {placement.frozen!r}")
         for name, part in (("loaded", self.loaded), ("full_gains[0]", self.full_gains[0])):
             if not 0.0 < part < 0.5:
-                raise ValueError(f"{name} must be in (0, 0.5), as a fraction of the weight, got {part!r}")
+                raise ValueError(f"{name} must be above 0 and below 0.5 (fraction of the weight), got {part!r}")

@@ -33,7 +33,7 @@ class ImpactConfig:
         if self.debounce < 1:
             raise ValueError(f"debounce must be at least 1 cycle, got {self.debounce!r}")
         if not 0.0 <= self.earliest <= 1.0:
-            raise ValueError(f"earliest must be a fraction of the step in [0, 1], got {self.earliest!r}")
+            raise ValueError(f"earliest must be from 0 to 1 (fraction of the step duration), got {self.earliest!r}")
 
 
 class ImpactDetector:

@@ -147,13 +147,18 @@ class Standing:
                 break
             q[leg] += np.clip(np.linalg.solve(self._jacobian(q, foot), error), -_LARGEST, _LARGEST)
         else:
-            raise GaitError("the weight shift must be within the reach of both legs, got a foot out of reach")
+            raise GaitError(
+                f"weight shift: the {SIDES[foot]} leg must reach its target within {_ITERATIONS} iterations, "
+                f"got an error of {np.abs(error).max():.2g} m or rad"
+            )
         low, high = self._robot.position_min, self._robot.position_max
         beyond = np.maximum(q - high, low - q)
         if beyond.max() > 0.0:
             joint = int(beyond.argmax())
             limits = f"{math.degrees(low[joint]):.4g} to {math.degrees(high[joint]):.4g} deg"
-            raise GaitError(f"weight shift: {JOINTS[joint]} must be {limits}, got {math.degrees(q[joint]):.4g} deg")
+            raise GaitError(
+                f"weight shift: angle of joints.{JOINTS[joint]} must be {limits}, got {math.degrees(q[joint]):.4g} deg"
+            )
         return q
 
     def _statics(self, q: Vector, rotation: Vector, shares: tuple[float, float], points: list[Vector]) -> Vector:

@@ -27,5 +27,5 @@ def find(names: Sequence[str], available: dict[str, int], noun: str) -> list[int
         ValueError: If a name is missing.
     """
     if missing := [name for name in names if name not in available]:
-        raise ValueError(f"the URDF must have the {noun}s {', '.join(names)}, but {missing[0]} is missing")
+        raise ValueError(f"the URDF must contain the {noun}s {', '.join(names)}, got no {noun} {missing[0]}")
     return [available[name] for name in names]

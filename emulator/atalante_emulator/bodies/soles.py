@@ -63,7 +63,7 @@ def read_soles(urdf: str) -> Soles:
     try:
         root = ET.fromstring(urdf)
     except ET.ParseError as error:
-        raise ValueError(f"the URDF must be XML: {error}") from error
+        raise ValueError(f"the URDF must be valid XML, got a text with an error: {error}") from error
     cell, corner = np.zeros((2, len(FEET), len(CELLS), 3))
     for i, foot in enumerate(FEET):
         for k, name in enumerate(CELLS):
@@ -71,8 +71,12 @@ def read_soles(urdf: str) -> Soles:
             mount = root.find(f"joint/child[@link='{pad}']/../origin")
             collision = root.find(f"link[@name='{pad}']/collision")
             sphere = None if collision is None else collision.find("geometry/sphere")
-            if mount is None or collision is None or sphere is None:
-                raise ValueError(f"the URDF must have the contact pad {pad} with a sphere, but {pad} is missing")
+            if mount is None:
+                raise ValueError(
+                    f"contact pad {pad} must be the child link of a joint with an origin, got no such joint"
+                )
+            if collision is None or sphere is None:
+                raise ValueError(f"contact pad {pad} must be a link with a collision sphere, got no such link")
             cell[i, k] = _numbers(mount)
             corner[i, k] = cell[i, k] + _numbers(collision.find("origin"))
             corner[i, k, 2] -= float(sphere.attrib["radius"])

@@ -110,5 +110,5 @@ def test_ground_force_includes_the_mass_of_the_patient() -> None:
 
 def test_urdf_without_a_joint_is_rejected() -> None:
     text = urdf(ExoskeletonParameters(), ROBOT).replace('"right_HA"', '"spare"')
-    with pytest.raises(ValueError, match="right_HA is missing"):
+    with pytest.raises(ValueError, match="got no joint right_HA"):
         StanceDynamics(text, urdf(ExoskeletonParameters(), ROBOT))

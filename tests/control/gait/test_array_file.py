@@ -214,7 +214,9 @@ def test_bzip2_and_lzma_archives_are_rejected(tmp_path: Path, method: int) -> No
     with zipfile.ZipFile(path, "w", method) as file:
         for name, content in members():
             file.writestr(name, content)
-    with pytest.raises(NetworkError, match=f"low must be stored or deflated, got compression {method}"):
+    with pytest.raises(
+        NetworkError, match=rf"compression method of low must be 0 \(stored\) or 8 \(deflated\), got {method}"
+    ):
         load_network(path)
 
 

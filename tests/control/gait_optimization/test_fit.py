@@ -221,7 +221,7 @@ class TestCommand:
     @pytest.mark.parametrize(
         ("arguments", "sentence"),
         [
-            (["library", "--out", "x", "--mass", "60,70"], "mass must have at least 3 ascending levels"),
+            (["library", "--out", "x", "--mass", "60,70"], "mass must have at least 3 levels, got"),
             (
                 ["library", "--out", "x", "--mass", "60,a"],
                 "levels must be numbers separated by commas (58,75,91), got '60,a'",

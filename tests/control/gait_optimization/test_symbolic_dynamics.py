@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import casadi
@@ -92,5 +93,14 @@ def test_fixed_links_are_merged_into_their_body() -> None:
 
 def test_robot_with_other_axes_is_rejected(chain: Chain) -> None:
     worn = links(ExoskeletonParameters(ha_axis=(1.0, 0.0, 0.0)), PATIENT)
-    with pytest.raises(ValueError, match="must have the bodies and joint axes of the reference robot"):
+    with pytest.raises(ValueError, match=r"axis of body \w+ must be .* as in the reference robot, got"):
+        chain.values(worn)
+
+
+def test_robot_with_another_zero_length_is_rejected(chain: Chain) -> None:
+    worn = [
+        replace(link, origin=(link.origin[0], 0.01, link.origin[2])) if link.joint == "left_SH" else link
+        for link in links(ExoskeletonParameters(), PATIENT)
+    ]
+    with pytest.raises(ValueError, match=r"that are 0 in the reference robot must be 0, got \[0\.01\]"):
         chain.values(worn)

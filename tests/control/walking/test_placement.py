@@ -196,16 +196,16 @@ def test_straight_leg_is_not_shifted() -> None:
 
 
 @pytest.mark.parametrize(
-    "placement",
+    ("placement", "sentence"),
     [
-        PlacementConfig(slowest=0.0),
-        PlacementConfig(slowest=1.1),
-        PlacementConfig(fastest=0.9),
-        PlacementConfig(fastest=math.inf),
-        PlacementConfig(frozen=0.0),
-        PlacementConfig(frozen=math.nan),
+        (PlacementConfig(slowest=0.0), "placement.slowest must be above 0 and at most 1, got 0.0"),
+        (PlacementConfig(slowest=1.1), "placement.slowest must be above 0 and at most 1, got 1.1"),
+        (PlacementConfig(fastest=0.9), "placement.fastest must be finite and at least 1, got 0.9"),
+        (PlacementConfig(fastest=math.inf), "placement.fastest must be finite and at least 1, got inf"),
+        (PlacementConfig(frozen=0.0), "placement.frozen must be at least one cycle"),
+        (PlacementConfig(frozen=math.nan), "placement.frozen must be at least one cycle"),
     ],
 )
-def test_invalid_parameter_is_rejected(placement: PlacementConfig) -> None:
-    with pytest.raises(ValueError, match="placement"):
+def test_invalid_parameter_is_rejected(placement: PlacementConfig, sentence: str) -> None:
+    with pytest.raises(ValueError, match=sentence):
         WalkConfig(placement=placement)
