@@ -152,7 +152,7 @@ _CONTROLLABLE = frozenset(
         Dtc.OVERRUN,
     }
 )
-#: Codes whose reaction is HOLD. These codes permit some more steps, except if the affected node is a drive.
+#: Codes whose reaction is HOLD. A walking robot may make some more steps before HOLD, except if the affected node is a drive.
 #: The walking controller bridges the loss of an IMU or of a foot until the robot stands.
 _CONTROLLABLE_WITHOUT_SENSOR = frozenset(
     {

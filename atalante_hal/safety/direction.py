@@ -7,11 +7,12 @@ At a start, drive state, position and reported torque do not show these faults. 
 holds the pose, and evaluates the motion.
 
 *Pulse.* The pulse has the shape of the second derivative of sin(pi x)^4. So a free inertia moves away and back, and is
-then at rest in its initial position. Its peak is `PEAK` times `breakaway`, which exceeds the dry friction. The joints
-of a group hardly move each other. Both legs are tested at the same time, with opposite pulses. If the encoders of both
-legs are exchanged, each encoder moves against the torque of its joint, and the exchange is noticed. The pulse moves the
-left joint towards the middle of its range. A joint near its end stop is the exception: this joint and the same joint of
-the other leg both move towards the middle. Then an exchange of their encoders may not be noticed.
+then at rest in its initial position. The peak of the pulse is `PEAK` times `breakaway`, which exceeds the dry friction.
+The joints of a leg that are tested at the same time hardly move each other. Both legs are tested at the same time, with
+opposite pulses. If the encoders of both legs are exchanged, each encoder moves against the torque of its joint, and the
+exchange is detected. The pulse moves the left joint towards the middle of its range. A joint near its end stop is the
+exception: this joint and the same joint of the other leg both move towards the middle. An exchange of the encoders of
+these two joints may not be detected.
 
 *Pose.* A position control with a share of the drive's gains holds the pose, because the drives do not hold the pose
 during the test. With a wrong sign, this control pushes its joint away. A joint that moves by more than `TRAVEL` ends
@@ -23,13 +24,13 @@ torques, so the delay is the one that explains their motions best, all together.
 count: a foot that bounces off the floor may move as if its torque were late and reversed. A joint with a mobility of
 at least `MOBILITY` follows its torque. A mobility of at most -`MOBILITY` shows a wrong sign. A joint between these
 limits does not follow its torque. A disturbance may spoil a test, so a joint fails only after `TRIALS` tests. The
-legs of a suspended robot whose drives are off sink onto their end stops within some seconds, and their weight presses
-joints onto them. So the pulse of a repeated test is `BOOST` times larger for a joint within the position tolerance of
-its limit. If the foot of a leg carries load, the joint may be blocked. A foot that only touches the floor hits the
-floor during the pulse, and the impact stops the ankle. An impact lasts one or two cycles, so it hardly changes the
-mean force. A joint whose foot carried load or hit the floor stays untested, and the next start tests it again. A
-joint that passed is not tested again until its drive restarts, because the wiring of a motor does not change while
-its drive is on.
+legs of a suspended robot whose drives are off sink onto their end stops within some seconds, and the leg weight presses
+joints onto the end stops. So the pulse of a repeated test is `BOOST` times larger for a joint within the position
+tolerance of its limit. If the foot of a leg carries load, the joints of the leg may be blocked. A foot that only touches
+the floor hits the floor during the pulse, and the impact stops the ankle. An impact lasts one or two cycles, so the
+impact hardly changes the mean force. A joint whose foot carried load or hit the floor stays untested, and the next start
+tests the joint again. A joint that passed is not tested again until its drive restarts, because the wiring of a motor
+does not change while its drive is on.
 """
 
 from __future__ import annotations
@@ -47,14 +48,14 @@ from atalante_hal.types import PERIOD, Vector
 GROUPS = ((("FH", "SH"), 32), (("TH", "SA"), 16), (("SK", "HA"), 16))
 #: Delay from the command of a torque to the first position that shows its effect, if bus and motors are not late [cycles].
 LATENCY = 2
-#: Delays that are tried [cycles]: states, commands and motors may be late by three cycles in total. A delay that is
-#: longer by one more cycle would look like a wrong sign, because the pulse of 16 cycles changes its sign every four cycles.
+#: Delays that are tried [cycles]: states, commands and motors may be late by three cycles in total. If they were late by
+#: four cycles, this would look like a wrong sign, because the pulse of 16 cycles changes its sign every four cycles.
 LATENCIES = tuple(range(LATENCY, LATENCY + 4))
 #: Peak of the pulse as a multiple of `Robot.breakaway`, in the order of LEG_JOINTS. FH and SH move a whole leg.
 PEAK = (6.0, 3.0, 6.0, 3.0, 3.0, 3.0)
 #: Stiffness and damping of the HAL's position control in the test, relative to the drive's gains, in the order of
-#: LEG_JOINTS. The HAL's position control has more delay than that of a drive. So the HAL's gains for light joints must
-#: be lower.
+#: LEG_JOINTS. The HAL's position control has more delay than the position control of a drive. So the HAL's gains for
+#: light joints must be lower.
 STIFFNESS = (1.0, 1.0, 1.25, 0.5, 0.25, 0.25)
 DAMPING = (0.5, 0.5, 0.6, 0.25, 0.25, 0.25)
 #: Integral time of the HAL's position control, which holds the legs during the test [s].
@@ -71,8 +72,8 @@ BOOST = 6.0
 #: Number of unsuccessful tests of a joint after which the joint has failed.
 TRIALS = 2
 #: Smallest mobility [1/(kg m2)] that proves that a joint follows its torque, in the order of LEG_JOINTS.
-#: `MOBILITY` is about half of the smallest mobility of the suspended robot. The smallest mobility is that of four
-#: cases: straight or bent legs, without a patient or with a patient of 110 kg.
+#: `MOBILITY` is about half of the smallest mobility of the suspended robot in four cases: straight or bent legs, each
+#: without a patient and with a patient of 110 kg.
 MOBILITY = (0.045, 0.23, 0.075, 0.56, 4.6, 6.8)
 
 

@@ -168,8 +168,8 @@ class FaultMemory:
     def walk_ends(self, drives: Collection[str]) -> frozenset[Dtc]:
         """Return those confirmed codes with which a walking robot may end its walk before HOLD, see `permits_walk_end`.
 
-        A code may be confirmed for several nodes. The code is left out if it does not permit this for one of these
-        nodes.
+        A code may be confirmed for several nodes. The code is left out if one of these nodes does not permit the end of
+        the walk.
 
         Args:
             drives: DBC names of the drives.

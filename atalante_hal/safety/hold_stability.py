@@ -1,8 +1,9 @@
 """Check that no joint oscillates while its drive holds its position: `velocity, drive state -> findings`.
 
 A drive that holds its position controls the joint by itself, and the HAL does not limit its torque. The joint oscillates if
-this control does not suit the joint: a wrong parameter, a loose gear, or a motor that reacts late. A joint oscillates if
-its velocity reverses again and again. A joint that is stopped in motion, pushed or carried reverses less often.
+the position control of the drive does not suit the joint. Causes are a wrong parameter, a loose gear, or a late motor.
+A joint counts as oscillating if its velocity reverses `REVERSALS` times in a row. A joint that is stopped in motion, pushed or
+carried reverses less often.
 """
 
 from __future__ import annotations
@@ -68,7 +69,7 @@ class HoldStability:
         self.restart()
 
     def restart(self) -> None:
-        """Forget all reversals, because the controller moved the joints until now."""
+        """Discard all counted reversals, because the controller moved the joints until now."""
         for record in self._swings:
             record[:] = 0
 

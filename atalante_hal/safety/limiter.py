@@ -24,7 +24,7 @@ largest u >= 0 with
 A negative torque has the mirrored limit. On the ground the measured accelerations are small, so the same torques are permitted as
 without this limit. A torque that brakes is limited only if it would accelerate the joint beyond the limit of the opposite
 direction. The prediction treats each joint alone: torques of other joints count only through the measured acceleration. In the
-first cycle after `restart` a and x - v are unknown and assumed to be 0; a is 0 in the second cycle, too.
+first cycle after `restart`, a and x - v are unknown and assumed to be 0. In the second cycle, a is still assumed to be 0.
 
 *Rate.* The torque changes by at most `torque_rate_max`, without exception. If the derating or the envelope reduces the limit
 below the torque of the last cycle, the torque approaches the new limit at this rate.
@@ -159,7 +159,7 @@ class Limiter:
         return _LIMITED[done]
 
     def derate(self, limit: Vector) -> None:
-        """Set the torque limit, but no higher than the maximum torque of the robot.
+        """Set the torque limit. A value above the maximum torque of the robot is clipped to the maximum torque.
 
         Args:
             limit: new torque limit, shape (12,) [Nm], at least 0.

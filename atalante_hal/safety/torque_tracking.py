@@ -4,10 +4,10 @@ A drive that stays in OPERATION ENABLED may still produce another torque: a powe
 wrong current. If the drive measures its torque correctly, the reported torque shows the fault. The drive state does not
 show the fault.
 
-*Range.* A drive follows a command within two milliseconds. It repeats its last command for up to four cycles, and its
-frame may be late by four cycles. So a reported torque must lie in the range of the torques sent in the last `SPAN`
-cycles. If the torque limit falls, the drive may limit the torque at once, but the HAL reduces the torque at the torque
-rate. The range then includes the torque limit. A torque may be outside the range by `TOLERANCE` times the breakaway
+*Range.* A drive follows a command within two milliseconds. If commands are lost, the drive repeats the last command for up to
+four cycles. The frame of the drive may be late by four cycles. So a reported torque must lie in the range of the torques sent in
+the last `SPAN` cycles. If the torque limit falls, the drive may limit the torque at once, but the HAL reduces the torque at the
+torque rate. The range then includes the torque limit. A torque may be outside the range by `TOLERANCE` times the breakaway
 torque of the joint. This tolerance is less than half of the dry friction of the joint.
 
 *Limits of the check.* A drive that reports the torque of its command but produces another torque passes.
@@ -84,7 +84,7 @@ class TorqueTracking:
         self.restart()
 
     def restart(self) -> None:
-        """Forget all torques, because the drives did not follow the controller until now."""
+        """Discard all stored torques, because the drives did not follow the controller until now."""
         for record in self._tracking:
             record[:] = 0
 

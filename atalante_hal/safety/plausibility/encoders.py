@@ -2,22 +2,23 @@
 
 *Jump.* Between two good values that are n cycles apart, a position changes by at most n * top_speed * period plus 3
 sigma of the encoder noise. `Robot.top_speed` is the speed from which the limiter permits no accelerating torque, so
-every motion that the limiter permits is accepted. A value that changed by more is not used. After `JUMPS_TO_CONFIRM`
-such values in a row, the loss of the encoder's reference is confirmed. The encoder is used again when its value jumps
+every motion that the limiter permits is accepted. A value with a larger change is rejected. After `JUMPS_TO_CONFIRM`
+rejected values in a row, the loss of the encoder's reference is confirmed. The encoder is used again when its value jumps
 back to the expected position, or when its drive has restarted (see `reference`). The expected position includes the
 motion since the jump.
 
-*Overspeed.* A change that is too large is real motion, and no jump, if the encoder already moved at more than half of
-top_speed in the same direction in the cycle before, and if its velocity grew by at most top_speed (`continues`). Such a
-value is used, so that the encoder keeps its reference. After `OVERSPEED_TO_CONFIRM` such values in a row the overspeed is
-confirmed.
+*Overspeed.* A larger change is real motion and not a jump if two conditions hold (`continues`). First, the encoder
+already moved in the same direction at more than half of top_speed in the cycle before. Second, the velocity grew by at
+most top_speed. A value that meets both conditions is used, so that the encoder keeps its reference. After
+`OVERSPEED_TO_CONFIRM` such values in a row, the overspeed is confirmed.
 
 *Range.* A joint must be within its position limits, extended by `position_tolerance`.
 
 *Velocity.* The drive reports the encoder velocity after a low-pass with the cut-off frequency `velocity_bandwidth`. The check
-applies the same low-pass to the encoder positions. So the delay of the filter causes no difference, also in fast motions. The
-mean difference of two consecutive samples may exceed `velocity_error` for a few cycles, but not for `VELOCITY_SAMPLES` samples
-in a row. A late or lost frame changes the time between two positions. The low-pass takes this time into account.
+applies the same low-pass to the velocities computed from the encoder positions. So the delay of the filter causes no difference,
+also in fast motions. The mean difference of two consecutive samples may exceed `velocity_error` for a few cycles, but not for
+`VELOCITY_SAMPLES` samples in a row. A late or lost frame changes the time between two positions. The low-pass takes this time
+into account.
 """
 
 from __future__ import annotations
@@ -37,7 +38,7 @@ from atalante_hal.wire.process_image import NEVER
 
 #: Number of consecutive jumps after which the diagnostic is confirmed.
 JUMPS_TO_CONFIRM = 5
-#: Overspeed is confirmed after this number of consecutive values above the top speed. One fast value may be a small jump.
+#: Overspeed is confirmed after this number of consecutive values above the top speed. A single such value may be a small jump.
 OVERSPEED_TO_CONFIRM = 2
 #: Number of consecutive wrong velocities after which the diagnostic is raised.
 VELOCITY_SAMPLES = 3

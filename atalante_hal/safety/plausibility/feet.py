@@ -6,14 +6,13 @@ changes the difference by the error of the cell. A difference above `cell_twist`
 is known if it is the only cell with load, or the only cell without load. A cell whose reading is exactly
 constant is detected earlier, by the module `stillness`.
 
-*Pull.* The floor cannot pull a foot. So the sum of cells that do not contradict each other cannot be below minus twice
-`cell_free` for `CELL_CYCLES`. This reveals cells that all have the wrong sign, as soon as the foot is on the ground, and a
-negative offset, as soon as the foot is without load.
+*Pull.* The floor cannot pull a foot. If the cells of a foot do not contradict each other, a sum of their forces below
+-2 `cell_free` for `CELL_CYCLES` is therefore a fault. The check detects two faults: a wrong sign of all cells, as soon as the
+foot is on the ground, and a negative offset of all cells, as soon as the foot carries no load.
 
 *Contact.* Walking has no flight phase. So a robot that stood on the ground cannot swing both feet. The check is armed after
-both feet have carried load together for `STANDING_CYCLES`. This does not happen while the robot hangs on a crane that sets it
-down. The check is disarmed if the robot has been lifted for `LIFTED_CYCLES`. A robot that was lifted is in HOLD and requires a
-new START.
+both feet have carried load together for `STANDING_CYCLES`. A robot that hangs on a crane and is set down does not arm the check.
+The check is disarmed if the robot has been lifted for `LIFTED_CYCLES`. A lifted robot is in HOLD and requires a new START.
 """
 
 from __future__ import annotations
@@ -28,7 +27,7 @@ from atalante_hal.safety.plausibility.finding import FOOT_NODES, Signals
 CELL_CYCLES = 256
 #: After both feet have carried load together for this time [cycles], a swing of both feet is implausible.
 STANDING_CYCLES = 500
-#: Longest plausible swing of both feet [cycles]. If a foot touches down late in a walk, both feet swing for 30 cycles.
+#: Longest plausible time in which both feet swing [cycles]. If a foot lands late in a walk, both feet swing for 30 cycles.
 SWING_CYCLES = 60
 #: After this time without ground contact [cycles], the robot is regarded as lifted on purpose.
 LIFTED_CYCLES = 140

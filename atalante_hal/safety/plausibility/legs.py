@@ -9,7 +9,7 @@ is Rx(FH) Rz(TH) Ry(SH + SK). The two IMUs give these three angles, and the four
 Some drifts cannot be detected, and some drifting encoders cannot be distinguished. The foot has no IMU, so a drift of
 SA or HA is detected only on the ground, by the module `soles`. Opposite drifts of SH and SK cancel and are not
 detected, and a drift of SH cannot be distinguished from a drift of SK. A drift of an IMU has the same effect as a drift
-of an encoder. The heading of an IMU without a fault also drifts, without a limit, but this affects only TH. The check
+of an encoder. The heading of an IMU without a fault also drifts without a limit. This heading drift affects only TH. The check
 of TH therefore subtracts an estimate of the heading drift. The estimate changes by at most `_HEADING_DRIFT` per sample.
 The estimate also follows a slower drift of the encoder of TH, so such a drift is not detected.
 
@@ -17,8 +17,8 @@ The estimate also follows a slower drift of the encoder of TH, so such a drift i
 IMUs about the axis of the joint is also constant. If the joint moves while its encoder is stuck, this difference changes by
 the motion of the joint. The check uses this change, so that a stuck encoder is detected long before the difference reaches
 `attitude_error`. The threshold also covers the effect of a misaligned IMU (`misalignment`) while the leg turns about
-another axis. If the readings of SH and SK are both constant, both are reported. Unlike the module `stillness`, this
-check needs no torque, so it also covers a joint that other joints move.
+another axis. If the readings of SH and SK are both constant, both are reported. Unlike the module `stillness`, the
+standstill check needs no torque, so it also covers a joint that other joints move.
 
 *Age.* Values from earlier cycles are extrapolated to this cycle with the velocity that the same message contains. The
 thresholds are extended by `velocity_error` times the age of the values.

@@ -1,13 +1,13 @@
 """Sole checks, which compare the ankle encoders of a foot on the floor with the IMU of its tibia.
 
-The foot has no IMU. But a foot that carries load stands on its whole sole, unless its centre of pressure is near an edge. So its
-sole is level. The attitude of the tibia and the angles of the sagittal and henke ankle (SA, HA) give the direction of the
-vertical in the axes of the sole. Its horizontal components are the tilt of the sole. A tilt above `sole_tilt` in `SOLE_SAMPLES`
-consecutive samples of a flat foot is an error of an ankle encoder or of the tibia IMU. The module `legs` compares this IMU with
-other encoders.
+The foot has no IMU. But a foot that carries load stands on its whole sole, unless its centre of pressure is near an edge. The
+sole is then level. The attitude of the tibia and the angles of the sagittal and henke ankle (SA, HA) give the direction of the
+vertical in the axes of the sole. The components of this direction in the plane of the sole are the tilt of the sole. A tilt above
+`sole_tilt` in `SOLE_SAMPLES` consecutive samples of a flat foot is an error of an ankle encoder or of the tibia IMU. The module
+`legs` compares the tibia IMU with other encoders.
 
-The larger component names the joint: an error of SA tilts the sole about its lateral axis, and an error of HA about its
-longitudinal axis. The check assumes a level floor. It is not possible for a suspended robot, because its soles are free.
+The larger component of the tilt names the joint: an error of SA tilts the sole about its lateral axis, and an error of HA about
+its longitudinal axis. The check assumes a level floor. A suspended robot cannot be checked, because its soles are free.
 """
 
 from __future__ import annotations
@@ -64,7 +64,7 @@ class Soles:
         return self._check(0, ages)
 
     def check_right(self, ages: Ages | None) -> bool:
-        """Check the right sole, as `check_left` checks the left one."""
+        """Check the right sole, see `check_left`."""
         return self._check(1, ages)
 
     def findings(self) -> tuple[Finding, ...]:

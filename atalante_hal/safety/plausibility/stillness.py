@@ -7,19 +7,19 @@ skips each signal that has no new value since the last sample. In addition, each
 *Torque.* The reading of an encoder may be constant because the joint is at rest. So an encoder is reported as stuck only under
 two conditions. First, the torque of the drive has varied by at least `breakaway` since the reading last changed. `breakaway` is
 more than twice the dry friction of the joint. Second, the joint is not at its end stop, because an end stop holds a joint against
-any torque. A stuck encoder of a joint without torque is not detected here until the joint is driven. The module `legs` detects
-some of these encoders with the IMUs.
+any torque. A stuck encoder of a joint without torque is not detected by this module until the joint is driven. The module `legs`
+detects some stuck encoders of joints without torque with the IMUs.
 
-*Ankles.* The ankles of a foot on the ground move the whole robot, whose inertia is some thousand times that of the
-foot. A torque that varies fast then does not move the ankles. But the sole is at rest, so an ankle moves when its shank
-turns. For an ankle with a loaded foot, the first condition is therefore that the shank has turned by `_TURN` since the
-reading last changed.
+*Ankles.* The ankles of a foot on the ground move the whole robot, whose inertia is some thousand times the inertia of
+the foot. A torque that varies fast then does not move the ankles. But the sole is at rest, so an ankle moves when its
+shank turns. For an ankle with a loaded foot, the first condition is therefore that the shank has turned by `_TURN` since
+the reading last changed.
 
 *Large torque.* A controller that drives a joint with a stuck encoder accelerates the joint by a large torque within a few
 cycles. So the larger the torque, the sooner a constant reading is reported. A joint whose reading has been
-constant for `_AT_REST` cycles is at rest, so its torque is in balance. From then on, each cycle computes how far the
-torque change beyond `breakaway` would have turned a joint with the inertia `_INERTIA`, which is larger than that of any
-joint. The encoder is stuck if this angle is at least `_DRIVEN`.
+constant for `_AT_REST` cycles is at rest, so its torque is in balance. In each later cycle, the check computes by which angle
+the torque change beyond `breakaway` would have turned a joint with the inertia `_INERTIA`, which is larger than the inertia
+of any joint. The encoder is stuck if this angle is at least `_DRIVEN`.
 """
 
 from __future__ import annotations

@@ -1,12 +1,13 @@
 """Support checks, which compare the load on each foot with the posture of the legs.
 
-*Height.* A foot that is clearly higher than the other one cannot carry load while the lower foot carries none. The attitude of
-a tibia and the angle of its knee give the height of the ankle below the hip. The check needs two loaded cells, as `feet` does. It
-detects a positive offset of all cells of a foot when a suspended robot lifts this foot, and exchanged feet in the first swing.
+*Height.* If one foot is clearly higher than the other foot, the higher foot cannot carry load while the lower foot carries no
+load. The attitude of a tibia and the angle of its knee give the height of the ankle below the hip. A foot counts as loaded if two
+of its cells are loaded, as in the module `feet`. The check detects a positive offset of all cells of a foot when a suspended
+robot lifts this foot, and exchanged feet in the first swing.
 
-*Weight.* While both feet carry load, the robot moves slowly, so the leg towards which the robot leans carries more than the
-other leg. If the other leg carries clearly more for `WEIGHT_CYCLES`, the two feet are exchanged. This is detected when the
-weight is first shifted, before the first step. Both feet are then on the ground, so the robot can hold.
+*Weight.* While both feet carry load, the robot moves slowly, so the leg towards which the robot leans carries more load than the
+other leg. If the other leg carries clearly more load for `WEIGHT_CYCLES`, the two feet are exchanged. The exchange is detected
+when the weight is first shifted, before the first step. Both feet are then on the ground, so the robot can hold.
 
 The height of a foot above the other one is computed with the mean length of thigh and shank. Legs of other lengths, the ankles
 and the attitude errors change the computed height by a small part of `_HEIGHT`.
@@ -31,7 +32,7 @@ _SEGMENT = 0.4
 #: Lateral distance of the ankles while both legs are parallel [m].
 ANKLE_DISTANCE = 0.188
 #: Height above the other foot at which a foot cannot carry load [m]. In walks of eight patients, a loaded foot is at most
-#: 0.01 m above the other one, and a swinging foot is up to 0.09 m above it.
+#: 0.01 m above the other foot, and a swinging foot is up to 0.09 m above the other foot.
 _HEIGHT = 0.04
 #: If the robot leans to one side by more than this angle [rad], the load must be on the leg of this side.
 _LEAN = 0.05
@@ -69,8 +70,8 @@ class Support:
         """Compare the load on both feet with the posture.
 
         Args:
-            ages: ages of the sensor values. The load is compared only if all these sensors have new values. None if all
-                values are of this cycle.
+            ages: ages of the sensor values. The load is compared only if all sensors of the check have new values. None if
+                all values are of this cycle.
 
         Returns:
             Whether a load is implausible.

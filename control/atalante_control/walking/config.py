@@ -42,17 +42,18 @@ class WalkConfig:
     gains: PidGains = WALK_GAINS
     impact: ImpactConfig = field(default_factory=ImpactConfig)
     alpha: float = 0.3  # end of the re-centring, as a fraction of the step duration
-    #: True: the torques of the periodic steps follow the paper literally, see `literal`. The guide is then not certified.
+    #: True: the periodic steps follow the control law of the paper literally, see `literal`. The guide is then not certified.
     literal_law: bool = False
     #: m/m, gain of the ankle stabiliser: shift of the centre of pressure / error of the divergent component of motion
     stabiliser: float = 2.5
     shift_limit: Pair = (0.12, 0.05)  # m, largest shifts of the centre of pressure: along the walk, sideways
-    placement: PlacementConfig = field(default_factory=PlacementConfig)  # foot placement and step timing
-    lean: LeanConfig = field(default_factory=LeanConfig)  # lean of the trunk
+    placement: PlacementConfig = field(default_factory=PlacementConfig)  # parameters of foot placement and step timing
+    lean: LeanConfig = field(default_factory=LeanConfig)  # parameters of the lean of the trunk
     flat_foot: bool = True  # whether the ankle of the swing leg holds the sole level
     #: m/s, downward speed of the swing foot after the nominal end of a step: normal step, stop step
     reach_speed: Pair = (0.3, 0.03)
-    #: s, longest downward motion of the swing foot after the nominal end of a step; `reach_knee` can end this motion earlier
+    #: s, longest duration of the downward motion of the swing foot after the nominal end of a step. `reach_knee` can end
+    #: the motion earlier.
     reach_time: float = 0.2
     #: rad/s, largest speed of sagittal hip and knee while a late swing foot moves down.
     #: With an almost straight leg, `reach_rate` makes the foot slower than `reach_speed`.
@@ -79,7 +80,8 @@ class WalkConfig:
     guided_alpha: float = 0.5
     #: s, first part of a guided step, in which the smallest allowed weight of the backup torque falls from 1 to 0
     engage: float = 0.02
-    release: float = 0.03  # s, after a guided step, the baseline takes over sagittal hip and knee within this time
+    #: s, time after a guided step in which the baseline controller takes over sagittal hip and knee of the leg that was guided
+    release: float = 0.03
 
     @classmethod
     def literal(cls) -> WalkConfig:
@@ -87,8 +89,8 @@ class WalkConfig:
 
         In the periodic steps, the baseline controller is the PID with re-centring, impact detection and flat foot. This
         controller has no gravity torque, no feedforward, no ankle stabiliser and no steering. Below Xi = 1,
-        `guide.literal` drives SH and SK of the swing leg. Standing, weight shifts, start step and stop step are those
-        of `WalkConfig`, because the paper does not define them.
+        `guide.literal` drives SH and SK of the swing leg. For standing, weight shifts, start step and stop step, the default
+        parameters of `WalkConfig` apply, because the paper does not define these phases.
         """
         return cls(literal_law=True, gains=PidGains(), steering=(0.0, 0.0, 0.0))
 

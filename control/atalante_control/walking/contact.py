@@ -19,7 +19,7 @@ class ImpactConfig:
     """
 
     impact_force: float = 80.0  # N, smallest vertical force on the swing foot at an impact
-    #: N, force below which the swing foot has left the ground; an impact is accepted only afterwards
+    #: N, force below which the swing foot has left the ground. An impact is accepted only after the force was below this value.
     release_force: float = 30.0
     debounce: int = 5  # an impact is detected after this number of consecutive cycles with at least `impact_force`
     earliest: float = 0.5  # impacts are ignored before this fraction of the step duration

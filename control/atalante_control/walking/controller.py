@@ -59,7 +59,7 @@ from atalante_hal.types import Command, State, SupervisorState, Vector
 _N, _LEG = len(JOINTS), len(LEG_JOINTS)
 _SH, _SK = LEG_JOINTS.index("SH"), LEG_JOINTS.index("SK")
 _PELVIS, _TORSO = IMUS.index("pelvis"), IMUS.index("torso")
-#: Foot placement keeps each joint of the swing leg at least this angle [rad] away from its position limits.
+#: Smallest distance [rad] of each desired joint angle of the swing leg from the position limits, kept by the foot placement.
 _MARGIN = math.radians(1.0)
 #: Largest valid age of the message of an IMU or a foot [cycles], equal to the timeout of these messages in the DBC.
 _SENSOR_AGE = 10
@@ -241,7 +241,7 @@ class WalkController:
         return self._steps_wanted
 
     def reached(self, step: int, phase: float) -> bool:
-        """Return whether the walk has reached a phase of a periodic step, or is beyond it.
+        """Return whether the walk has reached a phase of a periodic step. The result remains True after this phase.
 
         Args:
             step: index of the step, from 0.

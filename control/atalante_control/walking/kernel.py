@@ -157,8 +157,8 @@ def sense(measured: Measured, table: PhaseTable, constants: Constants, stabilise
         sensed.bearing[side] = min(force, load[side])
     move(parts.chain, measured.q, measured.qd)
 
-    # A foot that has just landed may bounce, so the stance foot is the reference as long as the stance foot carries
-    # load.
+    # `base` is the foot whose sole is assumed to be at rest. A foot that has just landed may bounce, so `base` is the
+    # stance foot as long as the stance foot carries load.
     base = stage.stance
     if stage.double and load[base] < 0.1 * (load[0] + load[1]):
         base = 1 - base
@@ -436,14 +436,14 @@ def _desired(cycle: int, placement: Placement, table: PhaseTable, stage: Stage, 
 
 
 def _lowered(cycles: float, longest: int) -> tuple[float, float]:
-    """Return lowered distance / full speed [s] and present speed / full speed of a late swing foot.
+    """Return two ratios of a late swing foot: lowered distance to full speed [s], and present speed to full speed.
 
     Args:
         cycles: cycles since the nominal end of the step, above 0.
         longest: number of cycles after which the motion ends.
     """
-    # The speed of the foot rises slowly. If one corner of the foot already touches the ground, a sudden rise would turn
-    # the foot.
+    # The downward speed of the foot rises slowly. If one corner of the foot already touches the ground, a sudden rise of
+    # the speed would turn the foot.
     time = min(cycles, float(longest)) * PERIOD
     moving = 1.0 - math.exp(-time / _REACH_RISE)
     return time - _REACH_RISE * moving, moving if cycles < longest else 0.0

@@ -1,8 +1,8 @@
 """Kinematics of the soles and of the centre of mass, relative to the pelvis: `joint angles and speeds -> Soles, Centre`.
 
-All results are in the axes of the pelvis frame and relative to the origin of this frame. They describe the motion relative to the
-pelvis. The attitude of the pelvis comes from the attitude observer. The velocity of the pelvis follows from a sole at
-rest (`walking.attitude`).
+All results are in the axes of the pelvis frame and relative to the origin of this frame. The results do not contain the motion of
+the pelvis in the world. The attitude of the pelvis comes from the attitude observer. The velocity of the pelvis follows from the
+sole that is at rest (`walking.attitude`).
 """
 
 from __future__ import annotations

@@ -60,11 +60,12 @@ class PlacementConfig(NamedTuple):
     fastest: float = 1.6  # largest phase rate
     #: s, time after the start of a step in which the DCM error is ignored, because the new stance foot is not yet at rest
     settled: float = 0.08
-    #: s, in this last part before the nominal landing, the phase rate returns to 1 and `late_landing` gives the offset
+    #: s, last part of the step before the nominal landing. In this part, the phase rate returns to 1, and `late_landing`
+    #: computes the offset of the landing.
     frozen: float = 0.05
-    #: m, largest DCM error (forward, sideways) whose growth the robot can stop. The forward value is below the
-    #: limit of the ankle stabiliser, because the PIDs of the stance leg act against the stabiliser. The sideways value
-    #: is above this limit, because the trunk leans.
+    #: m, largest DCM error (forward, sideways) whose growth the robot can stop. The forward value is below the forward
+    #: limit of the ankle stabiliser (`WalkConfig.shift_limit`), because the PIDs of the stance leg act against the
+    #: stabiliser. The sideways value is above the sideways limit, because the trunk leans.
     capacity: Pair = (0.10, 0.08)
     bandwidth: float = 25.0  # rad/s, natural frequency of the critically damped filter of the landing offset
     speed: float = 1.2  # m/s, largest rate of change of the landing offset
@@ -72,7 +73,8 @@ class PlacementConfig(NamedTuple):
     #: cost weight of the squared missing offset (needed minus permitted offset), relative to the squared permitted
     #: offset
     missed: float = 30.0
-    timing: float = 0.03  # m, offset with the same cost as a landing that is 1 / w earlier or later
+    #: m, offset of a landing with the same cost as a landing that is earlier or later by the time 1 / w
+    timing: float = 0.03
     hold: float = 0.1  # s, time in which the reference of the swing foot changes from the pelvis to the stance foot
     slew: float = 15.0  # 1/s, largest change of the phase rate per second
 

@@ -41,8 +41,7 @@ class PhaseTable(NamedTuple):
     reach: Vector  # (2,) rad/s, speeds of hip and knee of the swing leg that lower the swing foot after the last cycle
     lowering: float  # m/s, downward speed of the swing foot at the joint speeds `reach`
     reach_cycles: int  # number of cycles in which the joints of the swing leg lower the foot after the last row
-    #: number of cycles for lowering a foot that is held relative to the stance foot; the knee can end this motion
-    #: earlier
+    #: largest number of cycles in which a foot that is held relative to the stance foot is lowered after the last row
     lowering_cycles: int
 
 

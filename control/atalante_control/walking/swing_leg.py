@@ -1,9 +1,9 @@
 """Swing leg of a step on the ground, with the leg of the patient: `gait, kinematics -> Leg of the guides, unmodelled torque`.
 
 The guide filter computes the torques of sagittal hip and knee (SH, SK) with the mass matrix of the leg of robot and patient, for
-a fixed pelvis. On the ground, the pelvis moves with the stance leg. The torque u_g + u_f of the gait includes the effect of this
-motion, but a torque that is computed with this mass matrix does not. The filter therefore adds the missing torque w to the
-gravity torque. w depends on the time t in the step:
+a fixed pelvis. On the ground, the pelvis moves with the stance leg. The torque u_g + u_f of the gait includes the effect of the
+pelvis motion. A torque computed with the mass matrix for a fixed pelvis does not include this effect. The filter therefore adds
+the missing torque w to the gravity torque. w depends on the time t in the step:
 
     w(t) = u_f - M(q_nom) q_nom'' - c(q_nom, q_nom')
 
