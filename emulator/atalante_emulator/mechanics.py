@@ -6,7 +6,7 @@ A description can be pickled, so it can be sent to another process.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Final
 
 from atalante_emulator.bodies import ENGINES, FRICTION, Body, hang, make_body
@@ -20,6 +20,8 @@ from atalante_hal.robot import JOINTS
 
 #: Parameters of the nodes of a robot on the ground. The IMUs have attitude errors, because these errors affect a walk.
 GROUND_PARAMETERS: Final = EmulatorParameters(imu=ImuParameters(attitude_error=0.004, heading_drift=5.2e-5))
+#: The same, but the IMUs have a heading reference, such as a magnetometer, so their headings do not drift.
+HEADING_REFERENCE_PARAMETERS: Final = replace(GROUND_PARAMETERS, imu=replace(GROUND_PARAMETERS.imu, heading_drift=0.0))
 
 
 @dataclass(frozen=True)

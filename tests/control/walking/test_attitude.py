@@ -67,6 +67,34 @@ def test_reset_removes_the_heading_only() -> None:
     np.testing.assert_allclose(observer.rotation, rotation_of(tilt), atol=1e-12)
 
 
+@pytest.mark.parametrize("start", [0.0, 3.0])
+@pytest.mark.parametrize("drift", [-0.002, 0.002])
+def test_heading_follows_a_measured_heading_although_the_gyro_drifts(start: float, drift: float) -> None:
+    observer, gain = AttitudeObserver(), 0.5
+    measured = (math.cos(0.5 * start), 0.0, 0.0, math.sin(0.5 * start))
+    observer.reset(measured)
+    for gained, lasting in ((0.0, drift * 30.0), (gain, drift / gain)):
+        for _ in range(30_000):
+            observer.update(np.array([0.0, 0.0, drift]), -GRAVITY, (0.0, 0.0, 0.0))
+            if gained:
+                observer.follow_heading(np.array(measured), gained)
+        assert math.atan2(observer.rotation[1, 0], observer.rotation[0, 0]) == pytest.approx(lasting, rel=1e-3)
+    np.testing.assert_allclose(observer.rotation @ observer.rotation.T, np.eye(3), atol=1e-5)
+
+
+def test_heading_error_decays_on_the_short_way_round_and_the_tilt_stays() -> None:
+    observer = AttitudeObserver()
+    tilt = (math.cos(0.1), 0.0, math.sin(0.1), 0.0)
+    observer.reset(tilt)
+    turned = pinocchio.Quaternion(rotation_of((math.cos(1.6), 0.0, 0.0, math.sin(1.6))) @ rotation_of(tilt)).coeffs()
+    x, y, z, w = turned.tolist()
+    vertical = observer.rotation[2].copy()
+    observer.follow_heading(np.array([w, x, y, z]), 1.0)
+    heading = math.atan2(observer.rotation[1, 0], observer.rotation[0, 0])
+    assert heading == pytest.approx((3.2 - 2.0 * math.pi) * 1e-3, rel=1e-3)
+    np.testing.assert_array_equal(observer.rotation[2], vertical)
+
+
 def test_rotation_stays_orthogonal_for_minutes() -> None:
     observer, generator = AttitudeObserver(), np.random.default_rng(0)
     for _ in range(20_000):

@@ -29,6 +29,13 @@ def test_patient_walks_three_steps_and_stands(engine: str) -> None:
     assert abs(result["yaw_deg"]) < 5.0
 
 
+def test_walk_with_a_heading_reference_stands() -> None:
+    code, out, errors = run("--steps", "2", "--engine", "mujoco", "--json", "--heading-reference")
+    result = json.loads(out)
+    assert (code, result["outcome"]) == (0, "stood"), errors
+    assert result["yaw_deg"] == pytest.approx(result["true_yaw_deg"], abs=1.0)
+
+
 def test_passive_wearer_walks_inside_the_certified_guide(tmp_path: Path) -> None:
     arguments = (
         "--steps",

@@ -40,7 +40,8 @@ def walk_result(
     histogram = [10] * (len(EDGES) - 1)
     guide = {"outer": outer, "spread": spread, "histogram": [histogram, histogram]} if xi < 1.0 else None
     return {
-        "trial": fields(trial), "versions": VERSIONS, "outcome": "stood", "steps": 3, "certified": True,
+        "trial": fields(trial), "versions": VERSIONS, "outcome": "stood", "steps": 3, "certified": True if xi < 1.0 else None,
+        "true_lateral_m": -0.4, "true_yaw_deg": 0.5, "attitude_rms_deg": 0.07,
         "max_ratio": 0.6 if xi < 1.0 else None, "error_deg": {"full": 0.5, "transition": 0.7, "target": error},
         "metabolic_w_kg": {"full": 1.44, "transition": 1.44, "target": 1.44 + net}, "muscle_w_kg": net, "guide": guide,
         "respirometer": {"segment": [0, 1, 2], "rate_w_kg": [1.44, 1.44, 1.44 + net]},
@@ -243,6 +244,8 @@ def test_protocol_needs_certified_guides_and_no_alarm() -> None:
         "protocol-contained": True,
         "protocol-certified": True,
         "protocol-diagnostics": True,
+        "protocol-line": True,
+        "protocol-attitude": True,
     }
     walks[0]["certified"] = False
     assert verdicts(protocol_findings(walks))["protocol-certified"] is True
@@ -252,6 +255,32 @@ def test_protocol_needs_certified_guides_and_no_alarm() -> None:
     assert verdicts(protocol_findings(alarmed))["protocol-certified"] is True
     assert verdicts(protocol_findings(alarmed))["protocol-diagnostics"] is False
     assert verdicts(protocol_findings([{**walks[2], "outcome": "fell"}]))["protocol-contained"] is False
+
+
+def test_full_assistance_has_no_guide_to_certify() -> None:
+    walks = [walk_result(75.0, False, 1.0, net=0.0, error=0.5)]
+    walks[0]["diagnostics"] = {}
+    assert verdicts(protocol_findings(walks))["protocol-certified"] is None
+    guided = {**walk_result(75.0, False, 0.5, net=0.0, error=0.5), "diagnostics": {}}
+    assert verdicts(protocol_findings([*walks, guided]))["protocol-certified"] is True
+
+
+@pytest.mark.parametrize(("reference", "limit"), [(False, 1.5), (True, 0.5)])
+@pytest.mark.parametrize("side", [-1.0, 1.0])
+def test_walks_end_near_their_line(reference: bool, limit: float, side: float) -> None:
+    walk = {**walk_result(75.0, False, 0.5, net=0.0, error=1.0), "diagnostics": {}}
+    walk["trial"]["heading_reference"] = reference
+    for deviation, near in ((limit, True), (limit + 0.001, False)):
+        other = {**walk, "true_lateral_m": side * deviation}
+        assert verdicts(protocol_findings([walk, other]))["protocol-line"] is near
+    fallen = {**walk, "true_lateral_m": None}
+    assert verdicts(protocol_findings([fallen]))["protocol-line"] is None
+
+
+@pytest.mark.parametrize(("error", "passed"), [(0.499, True), (0.5, False), (None, None)])
+def test_attitude_error_has_a_limit(error: float | None, passed: bool | None) -> None:
+    walk = {**walk_result(75.0, False, 0.5, net=0.0, error=1.0), "diagnostics": {}, "attitude_rms_deg": error}
+    assert verdicts(protocol_findings([walk]))["protocol-attitude"] is passed
 
 
 @pytest.mark.parametrize("experiment", ["protocol", "robustness", "pushes"])

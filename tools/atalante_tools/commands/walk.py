@@ -117,6 +117,12 @@ def _protocol(_ctx: click.Context, _param: click.Parameter, text: str | None) ->
     metavar="MU",
     help="Coefficient of friction between soles and floor of the emulated robot.",
 )
+@click.option(
+    "--heading-reference",
+    is_flag=True,
+    help="Follow the heading of the pelvis IMU, which must have a reference, such as a magnetometer. The headings of the "
+    "emulated IMUs then do not drift.  [default: integral of the gyro]",
+)
 @click.option("--seed", type=SEED, default=0, show_default=True, metavar="N", help="Seed of the emulated sensor noise.")
 @click.option(
     "--out",
@@ -148,6 +154,7 @@ def command(
     push: float | None,
     push_direction: float,
     friction: float,
+    heading_reference: bool,
     seed: int,
     out: Path | None,
     robot_process: bool | None,
@@ -186,6 +193,7 @@ def command(
         protocol=protocol,
         recording=recording,
         robot_process=robot_process,
+        heading_reference=heading_reference,
         out=out,
     )
     walk(target, options, as_json=as_json)

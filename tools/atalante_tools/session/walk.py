@@ -95,7 +95,7 @@ def _walk(
         child: Subprocess that writes the outputs.
         as_json: Whether to print a JSON object instead of text.
     """
-    from atalante_control.walking.config import WALK_GUIDE, WalkConfig
+    from atalante_control.walking.config import HEADING_GAIN, WALK_GUIDE, WalkConfig
     from atalante_control.walking.controller import WalkController
     from atalante_hal.robot import load_robot
     from atalante_hal.types import PERIOD
@@ -110,6 +110,7 @@ def _walk(
     config = replace(
         WalkConfig.literal() if law.literal else WalkConfig(),
         guide=replace(WALK_GUIDE, idealization=law.idealization, feedforward=law.feedforward),
+        heading_gain=HEADING_GAIN if options.heading_reference else 0.0,
     )
     controller = WalkController(robot, patient, gaits, options.steps, config, shape=guide_shape(options.shape))
     if options.xi < 1.0:  # at Xi = 1 there is no guide
@@ -118,11 +119,12 @@ def _walk(
         controller.prepare()
     mechanics = None
     if target.embedded:
-        from atalante_emulator.mechanics import Ground, Mechanics
+        from atalante_emulator.mechanics import HEADING_REFERENCE_PARAMETERS, Ground, Mechanics
         from atalante_emulator.wearer import LimbParameters
 
         ground, limbs = Ground(friction=options.friction), LimbParameters() if options.passive else None
-        mechanics = Mechanics(describe(robot, None, patient), target.engine, ground, limbs)
+        parameters = HEADING_REFERENCE_PARAMETERS if options.heading_reference else None
+        mechanics = Mechanics(describe(robot, None, patient), target.engine, ground, limbs, parameters=parameters)
     with ExitStack() as stack:
         rig = stack.enter_context(
             open_hal(

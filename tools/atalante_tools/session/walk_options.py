@@ -56,6 +56,9 @@ class WalkOptions:
     recording: RecordingOptions = field(default_factory=RecordingOptions)
     #: Whether the emulated robot runs in a process of its own; None: only if enough processor cores are idle.
     robot_process: bool | None = None
+    heading_reference: bool = (
+        False  # whether the heading follows that of the pelvis IMU, whose heading then does not drift
+    )
     out: Path | None = None  # folder for summary.json, trace.npz and walk.png; None means no files
 
 

@@ -193,12 +193,34 @@ def faults(ids: tuple[str, ...], running: Running, as_json: bool) -> None:
     is_flag=True,
     help="Use the control law as the paper prints it. The guides are then not certified.",
 )
+@click.option(
+    "--xi",
+    "factors",
+    type=Between(0.0, 1.0),
+    multiple=True,
+    metavar="X",
+    help="Assistance factor after the transition. Repeat the option for several factors. With 1, all steps have full "
+    "assistance.  [default: 0.5 and 0]",
+)
+@click.option(
+    "--heading-reference",
+    is_flag=True,
+    help="The IMUs have a heading reference, such as a magnetometer, and the controller follows the heading of the pelvis IMU.",
+)
 @_walking()
 @_running("protocol")
-def protocol(masses: tuple[float, ...], literal: bool, walking: Walking, running: Running, as_json: bool) -> None:
-    """Walk 112 steps with full assistance, 38 steps of transition and 225 steps with Xi = 0.5 or Xi = 0.
+def protocol(
+    masses: tuple[float, ...],
+    literal: bool,
+    factors: tuple[float, ...],
+    heading_reference: bool,
+    walking: Walking,
+    running: Running,
+    as_json: bool,
+) -> None:
+    """Walk 112 steps with full assistance, 38 steps of transition and 225 steps with another assistance factor.
 
-    Eight subjects walk, each passive and active.
+    Eight subjects walk, each passive and active, and with each assistance factor.
     """
     from atalante_tools.trial.findings import protocol_findings
     from atalante_tools.trial.plan import PROTOCOL, PROTOCOL_FACTORS, QUICK_MASSES, QUICK_PROTOCOL, protocol_trials
@@ -206,8 +228,13 @@ def protocol(masses: tuple[float, ...], literal: bool, walking: Walking, running
     masses = _known(masses)
     if running.quick:
         masses = masses or QUICK_MASSES
-    setting = replace(_setting(walking, running, QUICK_PROTOCOL if running.quick else PROTOCOL), literal=literal)
-    _conduct("protocol", protocol_trials(setting, PROTOCOL_FACTORS, masses), protocol_findings, running, as_json)
+    setting = replace(
+        _setting(walking, running, QUICK_PROTOCOL if running.quick else PROTOCOL),
+        literal=literal,
+        heading_reference=heading_reference,
+    )
+    trials = protocol_trials(setting, tuple(dict.fromkeys(factors)) or PROTOCOL_FACTORS, masses)
+    _conduct("protocol", trials, protocol_findings, running, as_json)
 
 
 @command.command(short_help="Walk with random errors of model, floor and bus, and with pushes.")

@@ -36,6 +36,10 @@ VARIATION: Final = 0.05
 #: `CERTIFIED` is the smallest accepted share of certified guides.
 #: `ROBUST` is the smallest accepted share of walks that end standing in the experiment `robustness`.
 CERTIFIED, ROBUST = 0.95, 0.98
+#: Largest deviation from the line after the walks of `protocol` [m]: with the gyro alone, and with a heading reference.
+SIDEWAYS, SIDEWAYS_WITH_REFERENCE = 1.5, 0.5
+#: Largest root mean square error of the estimated vertical [deg].
+ATTITUDE: Final = 0.5
 #: Pushes of 0.2 s that the robot must withstand [N]: in the worst direction and phase, and forwards in the worst phase.
 PUSH_WORST, PUSH_FORWARD = 200.0, 300.0
 
@@ -134,24 +138,53 @@ def sweep_findings(results: Sequence[Result]) -> list[Finding]:
 
 
 def protocol_findings(results: Sequence[Result]) -> list[Finding]:
-    """Return the findings of `protocol`: walks end standing and inside the guide, guides are certified, no fault is reported.
+    """Return the findings of `protocol`.
+
+    Walks end standing, inside the guide and near the line. The guides are certified, and no fault is reported.
 
     Args:
         results: results of `walk` trials.
     """
-    certified, alarms = sum(bool(r["certified"]) for r in results), _alarms(results)
-    share = f"{certified} of {len(results)} guides with a promise, at least {CERTIFIED:.0%} wanted"
+    guided = [r for r in results if r["certified"] is not None]  # with full assistance, there is no guide
+    certified, alarms = sum(r["certified"] for r in guided), _alarms(results)
+    share = f"{certified} of {len(guided)} guides with a promise, at least {CERTIFIED:.0%} wanted"
     return [
         _contained("protocol-contained", results),
         Finding(
             "protocol-certified", "the guides have a promise", share,
-            certified >= CERTIFIED * len(results) if results else None,
+            certified >= CERTIFIED * len(guided) if guided else None,
         ),
         Finding(
             "protocol-diagnostics", "no fault is reported", alarms or "no diagnostic",
             not alarms if results else None,
         ),
+        _line(results),
+        _attitude(results),
     ]  # fmt: skip
+
+
+def _line(results: Sequence[Result]) -> Finding:
+    """Return the finding that the robot walks along a line. A robot that fell has no deviation."""
+    reference = any(r["trial"]["heading_reference"] for r in results)
+    limit = SIDEWAYS_WITH_REFERENCE if reference else SIDEWAYS
+    deviations = [abs(r["true_lateral_m"]) for r in results if r["true_lateral_m"] is not None]
+    largest = max(deviations, default=math.nan)
+    text = f"largest true deviation {largest:.2f} m in {len(deviations)} walks, limit {limit:g} m"
+    source = "a heading reference" if reference else "the gyro alone"
+    return Finding(
+        "protocol-line", f"with {source}, the robot stays near its line", text,
+        largest <= limit if deviations else None,
+    )  # fmt: skip
+
+
+def _attitude(results: Sequence[Result]) -> Finding:
+    """Return the finding that the estimated vertical is right."""
+    errors = [r["attitude_rms_deg"] for r in results if r["attitude_rms_deg"] is not None]
+    largest = max(errors, default=math.nan)
+    text = f"largest RMS error of a walk {largest:.2f} deg, limit {ATTITUDE:g} deg"
+    return Finding(
+        "protocol-attitude", "the attitude of the pelvis is known", text, largest < ATTITUDE if errors else None
+    )
 
 
 def robust_findings(results: Sequence[Result]) -> list[Finding]:

@@ -99,6 +99,7 @@ class WalkTrial:
     engine: str
     order: str = ""  # day and position of a trial of the sweep
     literal: bool = False  # whether the control law follows the paper literally
+    heading_reference: bool = False  # whether the IMUs have a heading reference, which the controller follows
 
     @property
     def name(self) -> str:
@@ -184,6 +185,7 @@ class WalkSetting:
     seed: int  # seed of the experiment, from which the seed of each trial is computed
     engine: str
     literal: bool = False
+    heading_reference: bool = False
 
     def walk(self, patient: Patient, active: bool, xi: float, index: int, order: str = "") -> WalkTrial:
         """Return the trial of a subject.
@@ -197,7 +199,7 @@ class WalkSetting:
         """
         return WalkTrial(
             patient.mass, patient.height, active, xi, self.protocol, self.shape, self.idealization, self.feedforward,
-            1000 * self.seed + index, self.engine, order, self.literal,
+            1000 * self.seed + index, self.engine, order, self.literal, self.heading_reference,
         )  # fmt: skip
 
 

@@ -170,6 +170,8 @@ def _trials(results: Sequence[Result]) -> tuple[list[str], list[list[str]]]:
         ("exercise [W/kg]", lambda r: _number(r.get("metabolic_w_kg", {}).get("target"), 4)),
         ("true exercise above standing [W/kg]", lambda r: _number(r.get("muscle_w_kg"), 4)),
         ("true sideways [m]", lambda r: _number(r.get("true_lateral_m"), 2)),
+        ("true heading [deg]", lambda r: _number(r.get("true_yaw_deg"), 1)),
+        ("RMS attitude error [deg]", lambda r: _number(r.get("attitude_rms_deg"), 2)),
         ("patient [kg]", lambda r: _number(r["trial"]["mass"], 0) if "mass_share" in r["trial"] else "-"),
         ("true mass / known mass", lambda r: _number(r["trial"].get("mass_share"), 2)),
         ("friction", lambda r: _number(r["trial"].get("friction"), 2)),
@@ -198,6 +200,7 @@ def _provenance(results: Sequence[Result]) -> list[tuple[str, str]]:
     for name, meaning in (
         ("seed", "seeds"), ("engine", "engine"), ("protocol", "steps: full assistance, transition, target"),
         ("shape", "guide shape"), ("idealization", "idealization"), ("feedforward", "feedforward"),
+        ("literal", "law of the paper"), ("heading_reference", "heading reference"),
     ):  # fmt: skip
         values = dict.fromkeys(str(r["trial"][name]) for r in results if name in r["trial"])
         if values:

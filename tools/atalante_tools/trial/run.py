@@ -20,10 +20,10 @@ from atalante_control.gait.subject import Subject
 from atalante_control.gait.walk import WalkGaits
 from atalante_control.guide.shapes import SHAPES
 from atalante_control.model import Patient
-from atalante_control.walking.config import WALK_GUIDE, WalkConfig
+from atalante_control.walking.config import HEADING_GAIN, WALK_GUIDE, WalkConfig
 from atalante_control.walking.controller import WalkController
 from atalante_control.walking.phases import Phase
-from atalante_emulator.mechanics import Ground, Mechanics
+from atalante_emulator.mechanics import HEADING_REFERENCE_PARAMETERS, Ground, Mechanics
 from atalante_emulator.metabolism import (
     SAMPLE,
     MetabolismParameters,
@@ -134,7 +134,11 @@ def _walk(trial: WalkTrial) -> dict[str, Any]:
     gaits = solved_gaits(Subject(patient, *STEP))
     guide = replace(WALK_GUIDE, idealization=trial.idealization, feedforward=trial.feedforward)
     steps = sum(trial.protocol)
-    config = replace(WalkConfig.literal() if trial.literal else WalkConfig(), guide=guide)
+    config = replace(
+        WalkConfig.literal() if trial.literal else WalkConfig(),
+        guide=guide,
+        heading_gain=HEADING_GAIN if trial.heading_reference else 0.0,
+    )
     controller = WalkController(robot, patient, gaits, steps, config, shape=SHAPES[trial.shape])
     operator = Operator()
     with open_hal(
@@ -147,7 +151,12 @@ def _walk(trial: WalkTrial) -> dict[str, Any]:
         controller_fields=controller.telemetry_fields,
         gait_hash=gaits.step.hash32,
         mechanics=Mechanics(
-            describe(robot, None, patient), trial.engine, Ground(), LimbParameters(), active=_task(trial, gaits)
+            describe(robot, None, patient),
+            trial.engine,
+            Ground(),
+            LimbParameters(),
+            active=_task(trial, gaits),
+            parameters=HEADING_REFERENCE_PARAMETERS if trial.heading_reference else None,
         ),
     ) as rig:
         observation, dial = Observation(rig, controller, None), Dial(operator, trial.protocol, trial.xi)
@@ -162,7 +171,8 @@ def _walk(trial: WalkTrial) -> dict[str, Any]:
         with deferred():
             run(rig.hal, controller, LockStep(), until=ending, record=record)
         certified = controller.certificate(trial.xi).certified if trial.xi < 1.0 else None
-        deviation, found = observation.true_deviation(), diagnostics(rig.hal)
+        deviation = {**observation.true_deviation(), "attitude_rms_deg": observation.attitude_rms_deg}
+        found = diagnostics(rig.hal)
     statistics = controller.statistics
     counted = statistics.guide.cycles > 0
     return {
