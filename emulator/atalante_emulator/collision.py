@@ -1,6 +1,6 @@
 """Detection of two senders of the same message, by the alive counters of the received frames.
 
-A sender increments its counter by one with each frame. CAN may lose or repeat a frame, but it keeps the order of the frames. So
+A sender increments its counter by one with each frame. CAN may lose or repeat a frame, but CAN keeps the order of the frames. So
 two different frames with the same counter, one directly after the other, come from two senders. Two successive frames of one
 cycle also come from two senders if their counters are not consecutive.
 """

@@ -1,7 +1,7 @@
 """Crane of an emulated robot: suspends the robot above the floor until the drives are enabled, then lowers it onto its feet.
 
-The sling is a spring between the hook and the pelvis. It pulls upwards only. While the sling is under tension, the crane also
-keeps the pelvis upright and holds its horizontal position and heading constant. These forces and moments grow in
+The sling is a spring between the hook and the pelvis. The sling pulls upwards only. While the sling is under tension, the crane
+also keeps the pelvis upright and holds its horizontal position and heading constant. These forces and moments grow in
 proportion to the tension, until the tension equals the weight of the robot. A slack sling exerts no force.
 """
 

@@ -68,7 +68,7 @@ def treadmill_rate(speed: float, mass: float) -> float:
     """Return the metabolic rate [W] of a person who walks on a level treadmill without an exoskeleton.
 
     This is the equation 1.44 + 1.94 v^0.43 + 0.24 v^4 [W/kg] of Looney et al. (Med. Sci. Sports Exerc. 51, 2019), fitted to
-    measurements of healthy adults. It is not a simulation of the legs.
+    measurements of healthy adults. The motion of the legs is not simulated.
 
     Args:
         speed: walking speed [m/s].

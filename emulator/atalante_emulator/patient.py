@@ -2,8 +2,8 @@
 
     joint angles, landings -> perceived error -> feedback with a delay + learned torque -> muscles -> torque, work
 
-The patient lives in the emulator. The HAL and the controller neither read nor command anything in this module. A passive patient
-is `wearer.PassiveWearer` alone: limbs without muscle torque.
+The patient is part of the emulator. The HAL and the controller have no access to this module. A passive patient is
+`wearer.PassiveWearer` alone: limbs without muscle torque.
 
 After each step, the learned torque u is updated with the perceived error e: `u <- f u + g e`. This model describes motor
 adaptation as a greedy minimisation of error and effort: without error, the effort decays (Emken, Benitez, Sideris, Bobrow,
@@ -89,7 +89,7 @@ class ActiveTask:
 class ActivePatient:
     """Legs of an active patient: the limbs of a passive wearer, and muscles at sagittal hip and knee of the swing leg.
 
-    The patient feels the joint angles and the load on the feet. A landing starts the next step of the other leg.
+    The patient feels the joint angles and the load on the feet. When a foot lands, the step of the other leg begins.
 
     Attributes:
         muscle: Torques of the muscles in the last cycle, shape (12,) [Nm].

@@ -11,7 +11,7 @@ from atalante_hal.robot import CELLS, FEET, IMUS
 IMU_LINKS: Final = tuple(f"imu_{imu}" for imu in IMUS)
 #: Links of the feet, in the order of FEET.
 FOOT_LINKS: Final = tuple(f"{foot}_foot" for foot in FEET)
-#: Contact pads at the force cells: the cells of the first foot, then those of the second foot.
+#: Contact pads at the force cells: the pads of the first foot, then the pads of the second foot.
 PAD_LINKS: Final = tuple(f"{foot}_foot_{cell}" for foot in FEET for cell in CELLS)
 
 

@@ -100,7 +100,7 @@ class PyBulletBody:
         pybullet.setJointMotorControlArray(
             self._body, self._joints, pybullet.VELOCITY_CONTROL, forces=[0.0] * len(JOINTS), **client
         )
-        self._touches = ground is not None  # the only possible contacts are those with the floor
+        self._touches = ground is not None  # only the soles and the floor can be in contact
         if ground is not None:
             self._add_floor(ground, friction)
         self._force, self._moment = [0.0] * 3, [0.0] * 3  # external force [N] and moment [Nm] on the pelvis
@@ -250,7 +250,7 @@ class PyBulletBody:
         position = a[0], b[0], c[0], d[0], e[0], f[0], g[0], h[0], i[0], j[0], k[0], m[0]
         velocity = a[1], b[1], c[1], d[1], e[1], f[1], g[1], h[1], i[1], j[1], k[1], m[1]
         _PACK_JOINTS(self._joint_memory, 0, *position, *velocity)
-        # `links` contains the states of the IMU links, then those of the feet if the sole forces are needed.
+        # `links` contains the states of the IMU links, then the states of the feet if the sole forces are needed.
         for memory, state in zip(self._imu_memory, links, strict=False):
             _PACK_LINK(memory, 0, *state[_ATTITUDE], *state[_LINEAR], *state[_ANGULAR])
         if contacts:

@@ -150,7 +150,7 @@ def test_reversed_motor_fails_although_its_torque_acts_late(joints: Joints, join
 
 @pytest.mark.parametrize("joint", range(6), ids=JOINTS[:6])
 def test_reversed_motor_fails_again_in_a_second_start(joints: Joints, joint: int):
-    """In a second start, only this joint is tested."""
+    """In the second start, only the joint that failed is tested."""
     joints.strength[joint] = -1.0
     assert joints.run()[0]
     joints.position, joints.velocity = MIDDLE.copy(), np.zeros(12)

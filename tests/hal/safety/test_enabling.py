@@ -184,7 +184,7 @@ def test_start_with_a_drive_that_never_enables_fails_without_sag(place, holds: b
 
 
 def test_feet_that_touch_the_floor_lightly_do_not_prevent_the_start():
-    """The straight legs sink with their drives off until the feet touch the floor, so the pulses press the soles onto it."""
+    """With the drives off, the straight legs sink until the feet touch the floor. The pulses press the soles onto the floor."""
     with robot(crane(50.0), pose=[0.0] * len(JOINTS)) as started:
         started.until(S.READY)
         for _ in range(3000):

@@ -174,7 +174,7 @@ def test_command_within_the_limits_is_unchanged_for_1000_cycles():
 @joints
 @pytest.mark.parametrize("sign", [1.0, -1.0])
 class TestTightThresholds:
-    """A torque just inside its limit is unchanged. If it is just outside, only the torque of this joint is reduced."""
+    """A torque just below its limit is unchanged. If one torque is just above its limit, only this torque is reduced."""
 
     def expect(self, limiter: Limiter, torque: np.ndarray, motion: np.ndarray, cut: int | None) -> None:
         assert limiter.apply(torque, motion) == (FREE if cut is None else CUT)
@@ -305,7 +305,7 @@ class TestTightThresholds:
         (1.0, 0.0, 50.0, 60.9902),
         (0.0, 0.0, 50.0, 50.0),
         (-1.0, 0.0, 50.0, 50.0),
-        (-1.0, -10.0, 50.0, 51.0),  # a deceleration permits a growth that cancels it
+        (-1.0, -10.0, 50.0, 51.0),  # a deceleration permits a torque that cancels the deceleration
         (-1.0, 1.0, 50.0, 0.0),
         (1.0, 100.0, 90.0, 70.0),  # 100 * (0.003 + 70 / 1e4) = 1
         (1.0, 100.0, 70.0, 70.0),

@@ -341,7 +341,7 @@ def test_late_frame_after_a_loss_is_reported_with_its_age(bench: MonitorBench) -
 
 def out_of_range(frames: Frames) -> Frames:
     drive_state, data = MESSAGES[KNEE].signal("DriveState"), frames[KNEE]["data"]
-    data[drive_state.start // 8] = 65  # one more than the largest
+    data[drive_state.start // 8] = 65  # raw code that is one above the largest valid code
     protected = data[2 : MESSAGES[KNEE].length].tobytes()
     data[:2] = list(crc(protected, data_id_bytes(MESSAGES[KNEE].data_id)).to_bytes(2, "little"))
     return frames

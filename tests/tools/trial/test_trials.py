@@ -230,7 +230,7 @@ def test_command_uses_stored_results_and_writes_the_report(
     os.remove(next((tmp_path / "trials").glob("*active-xi0.5*.json")))
     again = CliRunner().invoke(cli, [word for word in arguments if word != "--json"])
     assert again.exit_code == 0, again.output
-    assert len(ran) == 5  # only the removed one
+    assert len(ran) == 5  # only the trial whose result was removed was run again
     assert "passive-flat" in again.stdout
     assert (tmp_path / "report.html").exists()
 

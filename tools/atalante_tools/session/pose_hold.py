@@ -44,8 +44,8 @@ def minimum_jerk(phase: float) -> tuple[float, float]:
 class PoseHold:
     """PD controller with gravity compensation, which holds a pose with the stiffness of the drives.
 
-    The damping is that of `pose_gains`. With the damping of the drives, the delay of the HAL would make light joints
-    unstable.
+    The damping gains are the gains of `pose_gains`. With the damping gains of the drives, the delay of the HAL would make light
+    joints unstable.
 
     Attributes:
         telemetry: Reference angles, shape (12,) [rad].

@@ -137,7 +137,7 @@ def _dcm_on_ground(columns: Mapping[str, Vector]) -> Vector:
     c, s = np.cos(columns["yaw"][:, 0]), np.sin(columns["yaw"][:, 0])
     x, y = columns["dcm"].T
     dcm = feet + np.column_stack([c * x - s * y, s * x + c * y])
-    # In the first cycle of a step, the DCM is still relative to the last stance foot.
+    # In the first cycle of a step, the DCM is still relative to the stance foot of the step before.
     valid = np.isin(columns["phase"][:, 0], list(STEPPING)) & (columns["elapsed"][:, 0] > 0.0)
     dcm[~valid] = math.nan
     return np.asarray(dcm)

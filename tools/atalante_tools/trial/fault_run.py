@@ -143,7 +143,7 @@ def _longest(trial: FaultTrial, case: Case, permanent: FaultRun) -> int:
 def longest_without(falls: Callable[[int], bool], horizon: int, resolution: int) -> int:
     """Return the longest duration without a fall, by bisection from 0 to `horizon`.
 
-    The robot must not fall without a fault. A longer fault must not be easier to survive than a shorter one.
+    The robot must walk to the end without a fault. If the robot falls with a fault, it must also fall with each longer fault.
 
     Args:
         falls: function that returns whether the robot falls with a fault of the given duration [cycles].

@@ -27,7 +27,7 @@ SAME: Final = 0.02
 STANDING: Final = 1.44  # metabolic rate of quiet standing [W/kg]
 #: A quantity has a falling trend if its rank correlation with the assistance factor is between -1 and -`TREND`.
 #: `ASYMMETRY` is the largest mean difference between the k-th trial and the k-th last trial of a day, relative to the
-#: range.
+#: range of the values.
 TREND, ASYMMETRY = 0.8, 0.25
 #: Largest coefficient of variation of the baseline metabolic rates of a sweep.
 VARIATION: Final = 0.05
@@ -246,7 +246,7 @@ def condition(result: Result) -> str:
 
 
 def normalised(result: Result) -> float:
-    """Return the metabolic rate of the exercise part, divided by that of the baseline part (full assistance) of the same trial.
+    """Return the metabolic rate of exercise divided by the metabolic rate of the baseline (full assistance) of the same trial.
 
     Args:
         result: result of a walk.
@@ -280,7 +280,7 @@ def _alarms(results: Sequence[Result]) -> str:
 
 
 def _net(result: Result) -> float:
-    """Return the metabolic rate of the exercise part minus that of the baseline part of the same trial [W/kg]."""
+    """Return the metabolic rate of the exercise part minus the rate of the baseline part of the same trial [W/kg]."""
     return float(result["metabolic_w_kg"]["target"] - result["metabolic_w_kg"]["full"])
 
 

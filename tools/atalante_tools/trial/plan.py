@@ -45,8 +45,8 @@ QUICK_MASSES: Final = (58.0, 75.0)
 MASS_SHARE: Final = (0.9, 1.1)
 FRICTION: Final = (0.25, 0.8)
 #: Parts of the control loop of `robustness` that can be a cycle late: state messages, command messages, motors.
-#: If messages are one cycle late, they time out after four lost frames in a row. Messages that are later would time out
-#: after fewer lost frames than the fault matrix intends.
+#: If messages are one cycle late, they time out after four lost frames in a row. If messages were later than one cycle,
+#: they would time out after fewer lost frames than the fault matrix intends.
 LATE_PARTS: Final = 3
 #: Probability of a lost frame, force of a push [N], and number of steps per push. The time of a push within
 #: these steps is random.
@@ -155,7 +155,7 @@ class PushTrial:
 class TreadmillTrial:
     """Baseline of the sweep: level walking without exoskeleton. No body is simulated.
 
-    An equation gives the metabolic rate. The emulated respirometer measures it.
+    An equation gives the metabolic rate. The emulated respirometer measures this rate.
     """
 
     kind: ClassVar[str] = "treadmill"
@@ -220,7 +220,7 @@ def assist_trials(setting: WalkSetting, masses: Sequence[float] = ()) -> list[Tr
     """Return four trials for each subject: passive and active, with full and with partial assistance.
 
     Args:
-        setting: what all walks share.
+        setting: settings that all walks share.
         masses: masses of the subjects [kg]; empty means all eight subjects.
     """
     return protocol_trials(setting, (1.0, PARTIAL), masses)
@@ -230,7 +230,7 @@ def sweep_trials(setting: WalkSetting, factors: Sequence[float], days: int) -> l
     """Return the trials of the sweep. Each day has a treadmill trial, then one walk of an active subject for each factor.
 
     Args:
-        setting: what all walks share.
+        setting: settings that all walks share.
         factors: assistance factors in their order.
         days: number of days. Only the seeds differ between the days.
     """
@@ -250,7 +250,7 @@ def protocol_trials(setting: WalkSetting, factors: Sequence[float], masses: Sequ
     """Return a trial for each subject, passive and active, and each assistance factor.
 
     Args:
-        setting: what all walks share.
+        setting: settings that all walks share.
         factors: assistance factors after the transition.
         masses: masses of the subjects [kg]; empty means all eight subjects.
     """

@@ -22,17 +22,18 @@ EXPERIMENTS: Final = {
     "assist": (
         "Full and partial assistance",
         "Virtual subjects walk on the ground, passive and active, with full and with partial assistance (second experiment of "
-        "the paper). A passive subject has no muscle torque, so the metabolic rate is that of standing, and it is flat by "
-        "construction. An active subject tracks the gait at hip and knee of the swing leg. Metabolic rates pass through oxygen, "
-        "carbon dioxide and the equation of Brockway.",
+        "the paper). A passive subject has no muscle torque, so its metabolic rate is always the rate of quiet standing. An "
+        "active subject tracks the gait at hip and knee of the swing leg. The measured metabolic rate is computed from oxygen "
+        "uptake and carbon dioxide output with the equation of Brockway.",
     ),
     "sweep": (
         "Assistance factors",
         "One active virtual subject walks with a falling and then rising assistance factor (third experiment of the paper). Each "
         "trial starts with a subject who has learned nothing and is not tired, so the symmetry in time tests noise, not "
-        "exhaustion. The treadmill is an equation for level walking at the same speed (Looney et al. 2019). No body is simulated "
-        "for it. The normalised metabolic rate is exercise divided by baseline, without subtraction of the resting rate: with "
-        "full assistance the virtual subject rests, so the difference would be close to zero.",
+        "exhaustion. The metabolic rate on the treadmill comes from an equation for level walking at the same speed (Looney et "
+        "al. 2019), without a simulated body. The normalised metabolic rate is the rate during exercise divided by the rate "
+        "during the baseline. The resting rate is not subtracted: with full assistance the virtual subject rests, so the "
+        "difference would be close to zero.",
     ),
     "faults": (
         "Faults during walks on the ground",
@@ -48,13 +49,14 @@ EXPERIMENTS: Final = {
     "robustness": (
         "Robustness",
         "The emulated robot differs at random from the model of the controller: mass of the patient, friction of the floor, late "
-        "messages and motors. Its buses lose frames, and it is pushed at the pelvis. Each result contains all parameters.",
+        "messages and motors. The buses lose frames, and the robot is pushed at the pelvis. Each result contains all parameters.",
     ),
     "pushes": (
         "Pushes",
         "The robot walks with full assistance and a passive wearer, and is pushed at the pelvis for 0.2 s in a right-stance "
-        "step. It has withstood the push if it walks four more steps, makes the stop step and stands. The force rises until "
-        "the robot falls or stops; the table contains the largest force that it has withstood, and how the next walk ended.",
+        "step. The robot has withstood the push if it walks four more steps, makes the stop step and stands. The force rises "
+        "from walk to walk until the robot falls or stops. The table contains the largest force that the robot has withstood, "
+        "and how the next walk ended.",
     ),
 }  # fmt: skip
 _CERTIFIED: Final = {True: "yes", False: "no", None: "-"}

@@ -1,7 +1,7 @@
 """Run one trial on the emulated robot: `trial -> rig in lock-step -> result as a JSON object`.
 
-HAL, bus, controller and emulator are those of `atalante airwalk` and `atalante walk`. Equal trials give equal results: time is
-virtual, and all random numbers come from the seed of the trial.
+HAL, bus, controller and emulator are the same as in `atalante airwalk` and `atalante walk`. Equal trials give equal results: time
+is virtual, and all random numbers come from the seed of the trial.
 """
 
 from __future__ import annotations
