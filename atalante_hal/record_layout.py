@@ -25,7 +25,7 @@ class Layout:
         offset = 0
         for name, length in self.fields:
             if name in self._slices:
-                raise ValueError(f"field {name!r} is defined twice: give each field a unique name")
+                raise ValueError(f"field {name!r} must be defined once, got it twice: give each field a unique name")
             if length <= 0:
                 raise ValueError(f"field {name!r} must have a length of at least 1, got {length}")
             self._slices[name] = slice(offset, offset + length)

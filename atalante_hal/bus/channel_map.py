@@ -43,7 +43,9 @@ def parse_channel_map(text: str, buses: Sequence[str]) -> dict[str, str]:
         if bus not in buses:
             raise ChannelMapError(f"a bus of the channel map must be one of {', '.join(buses)}, got {bus!r}")
         if bus in channels:
-            raise ChannelMapError(f"the channel map assigns {bus} twice: to {channels[bus]} and to {channel}")
+            raise ChannelMapError(
+                f"the channel map must assign {bus} once, got it twice: {channels[bus]} and {channel}"
+            )
         channels[bus] = channel
     missing = [bus for bus in buses if bus not in channels]
     if missing:

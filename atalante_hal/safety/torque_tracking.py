@@ -101,8 +101,8 @@ class TorqueTracking:
         return tuple(
             Finding(
                 Dtc.TORQUE_TRACKING, JOINTS[joint].upper(), float(reported[joint]), True,
-                f"{JOINTS[joint]} reports a torque of {reported[joint]:.1f} Nm, which must follow the command of "
-                f"{sent[joint]:.1f} Nm",
+                f"the drive of {JOINTS[joint]} must follow the torque command of {sent[joint]:.1f} Nm, "
+                f"got a reported torque of {reported[joint]:.1f} Nm",
             )
             for joint, cycles in enumerate(self._tracking.wrong.tolist())
             if cycles >= CONFIRM

@@ -92,7 +92,7 @@ def test_invalid_matrix_is_rejected_with_line_and_value(tmp_path) -> None:
     assert row.tests == ("test_x.py::test_y",)
     for text, message in (
         ("", "must have a table"),
-        (head + good + "\n" + good, "line 4: fault ID F01 occurs twice, but must be unique"),
+        (head + good + "\n" + good, "line 4: fault ID F01 must occur once, got it twice"),
         (head + good.replace("F01", "X1"), "got 'X1'"),
         (head + good.replace("HOLD", "STOP"), "state must be one of .*, got 'STOP'"),
         (head + good.replace("| - ", ""), "got 7 columns"),

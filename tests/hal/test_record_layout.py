@@ -34,7 +34,7 @@ def test_layout_is_unchanged_by_json(fields: list[tuple[str, int]]) -> None:
 @pytest.mark.parametrize(
     ("fields", "sentence"),
     [
-        ([("q", 1), ("q", 1)], "field 'q' is defined twice"),
+        ([("q", 1), ("q", 1)], "field 'q' must be defined once, got it twice"),
         ([("q", 0)], "field 'q' must have a length of at least 1, got 0"),
         ([("q", -1)], "field 'q' must have a length of at least 1, got -1"),
     ],

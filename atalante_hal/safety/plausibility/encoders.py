@@ -283,7 +283,7 @@ class EncoderChecks:
 
     def _overspeed(self, joint: int, speed: float, values: int) -> Finding:
         limit = np.degrees(self._top_speed[joint])
-        text = f"{JOINTS[joint]} moves at {np.degrees(speed):+.0f} deg/s, which must be within {limit:.0f} deg/s"
+        text = f"the speed of {JOINTS[joint]} must be at most {limit:.0f} deg/s, got {np.degrees(speed):+.0f} deg/s"
         return Finding(Dtc.OVERSPEED, JOINT_NODES[joint], speed, values >= OVERSPEED_TO_CONFIRM, text)
 
     def _outside(self, joint: int) -> Finding:

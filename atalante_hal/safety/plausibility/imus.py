@@ -136,5 +136,5 @@ def _no_attitude(imu: int, norm: float, confirmed: bool) -> Finding:
 
 
 def _saturated(imu: int, value: float, confirmed: bool) -> Finding:
-    text = f"the {IMUS[imu]} IMU is at the end of its range, {value:.0f}"
+    text = f"the {IMUS[imu]} IMU is saturated: its reading of {value:.0f} is at the end of the measuring range"
     return Finding(Dtc.IMU_SATURATED, IMU_NODES[imu], value, confirmed, text)

@@ -239,7 +239,7 @@ def _follow_imu_drift(moved: _Comparison, axis: int, change: float) -> _Comparis
 
 def _drift(side: str, joints: tuple[str, ...], error: float) -> Finding:
     named = " and ".join(f"{side}_{joint}" for joint in joints)
-    text = f"encoder of {named}: {math.degrees(error):+.1f} degrees away from the angle of the pelvis and tibia IMUs"
+    text = f"encoder of {named}: its angle differs by {math.degrees(error):+.1f} degrees from pelvis and tibia IMU"
     node = JOINT_NODES[JOINTS.index(f"{side}_{joints[0]}")]
     return Finding(Dtc.ENC_DRIFT, node, error, True, text)
 

@@ -132,6 +132,6 @@ def sole_tilt(tibia: Sequence[float], sa: float, ha: float, toe_out: float) -> t
 def _tilted(foot: int, along: float, across: float) -> Finding:
     joint = _ANKLES[foot][abs(across) > abs(along)]
     tilt = math.hypot(along, across)
-    found = f"seems to be tilted by {math.degrees(tilt):.1f} degrees"
-    text = f"encoder of {JOINTS[joint]}: the {SIDES[foot]} sole lies flat on the floor, but {found}"
+    got = f"got a tilt of {math.degrees(tilt):.1f} degrees"
+    text = f"encoder of {JOINTS[joint]}: the {SIDES[foot]} sole must be level, because it is flat on the floor, {got}"
     return Finding(Dtc.ENC_DRIFT, JOINT_NODES[joint], tilt, True, text)

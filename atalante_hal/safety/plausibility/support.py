@@ -146,7 +146,7 @@ def on_wrong_leg(lean: float, left: float, right: float) -> bool:
 
 
 def _high(foot: int, height: float) -> Finding:
-    text = f"the {FEET[foot]} foot reports load although it is {abs(height):.2f} m above the other foot, which reports none"
+    text = f"the {FEET[foot]} foot reports load although it is {abs(height):.2f} m above the other foot, which reports no load"
     return Finding(Dtc.FOOT_CELL, FOOT_NODES[foot], abs(height), True, text)
 
 

@@ -5,7 +5,7 @@ at most `knee` Nm on the sagittal knee (SK), at the same time and in any directi
 model by 20 %, and the mass and inertia of the leg by 10 %. The loop may have one more cycle of delay than the model. The step may
 start with any deviation inside the hand-over box (`HandOver`). The running filter is built for exactly this promise.
 
-**Why it holds.** A prediction starts at the true state of the leg, under the backup policy and the worst of these
+**Why the promise holds.** A prediction starts at the true state of the leg, under the backup policy and the worst of these
 disturbances. Let r be the largest ratio of error to width in this prediction, and h = 1 - r^2. Three conditions are
 sufficient.
 
@@ -16,15 +16,15 @@ sufficient.
 2. *Backup.* If the gate is 1, the leg follows the backup policy. Then h does not fall, because all disturbances in the
    prediction of the next cycle are already in the current prediction. Each new prediction adds one cycle at the end of
    the horizon. This cycle must not be the worst cycle. At the end of the horizon the free motion has decayed. The error
-   in the added cycle therefore follows from the errors in earlier cycles of the prediction. It must be smaller than the
-   width minus the effect of the disturbances.
+   in the added cycle therefore follows from the errors in earlier cycles of the prediction. This error must be smaller than
+   the width minus the effect of the disturbances.
 3. *Gate.* Let g be the effect on r of one cycle without backup torque. Near h = 0 the gate is at least 1 - 3 h. A cycle with this
    gate lowers 1 - r by at most 6 g (1 - r). So r stays below 1 if 6 g is at most 1. If the intensity of u_i or u_f is below 1,
    the torque that is not compensated in this cycle is part of g. The tests check that 6 g is at most 1 for the shape
    `constant`, at zero intensities. In the other shapes of the package 6 g reaches 1.4 if the smallest width of a step
    is taken as the width. This estimate is too large by an unknown factor, because these guides are wider in most
-   cycles. For these shapes condition 3 is not proved. It is supported only by `atalante guide check`, which searches
-   for pushes that break a promise.
+   cycles. For these shapes condition 3 is not proved. Condition 3 is supported only by `atalante guide check`, which
+   searches for pushes that break a promise.
 
 The filter does not know the true state, so it uses bounds. Errors of inertia and delay change the rows of the prediction
 (`Prediction.slack`), and the measured velocity lags behind the true velocity (part of `Prediction.reach`). So the h of the

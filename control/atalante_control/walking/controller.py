@@ -143,7 +143,7 @@ class WalkController:
         )
         force = np.zeros((len(FEET), len(CELLS), 3))
         self._forces = force.copy()  # forces with an estimate for a lost foot
-        #: Copy of the requested torque, used if the `State` does not contain the sent torque.
+        #: Copy of the torque that the controller requested last, used if the `State` does not contain the sent torque.
         self._sent = np.zeros(_N)
         self._state: State | None = None  # `State` object whose arrays are in `_measured_by`
         self._measured = Measured(np.zeros(_N), np.zeros(_N), np.zeros(3), np.zeros(3), np.zeros(3), force, self._sent)

@@ -566,7 +566,7 @@ def test_channel_map_accepts_the_buses_in_any_order() -> None:
         ("left_leg=can0,can1", "must be BUS=CHANNEL, got 'can1'"),
         ("left_leg=", "must be BUS=CHANNEL"),
         ("left_arm=can0", "must be one of left_leg, right_leg, left_sense, right_sense, got 'left_arm'"),
-        ("left_leg=can0,left_leg=can1", "assigns left_leg twice: to can0 and to can1"),
+        ("left_leg=can0,left_leg=can1", "must assign left_leg once, got it twice: can0 and can1"),
         ("left_leg=can0,right_sense=can1", "no channel for right_leg, left_sense; write left_leg=can0,right_leg=can1"),
     ],
 )

@@ -99,7 +99,7 @@ def test_finding_names_joint_and_torques() -> None:
     sent[KNEE], reported[KNEE] = 30.0, -30.0
     for _ in range(SPAN + CONFIRM - 1):
         found = check.check(sent, limit, reported)
-    text = "left_SK reports a torque of -30.0 Nm, which must follow the command of 30.0 Nm"
+    text = "the drive of left_SK must follow the torque command of 30.0 Nm, got a reported torque of -30.0 Nm"
     assert found == (Finding(Dtc.TORQUE_TRACKING, "LEFT_SK", -30.0, True, text),)
 
 

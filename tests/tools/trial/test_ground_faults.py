@@ -104,7 +104,7 @@ def test_faults_without_fall_are_in_the_matrix() -> None:
 def test_fault_at_power_on_is_refused(tmp_path: Path) -> None:
     outcome = CliRunner().invoke(cli, ["trial", "faults", POWER_ON, "--out", str(tmp_path)])
     assert outcome.exit_code == 2
-    assert "F53 begins at power-on, not during a walk" in outcome.output
+    assert "a fault must have a case during a walk, got F53, whose cases begin at power-on" in outcome.output
 
 
 def test_f41_robot_with_both_feet_on_the_ground_stands_when_the_hal_is_killed() -> None:

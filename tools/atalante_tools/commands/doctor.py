@@ -340,7 +340,7 @@ def _show_facts(interface: str, as_json: bool) -> None:
     elif adapter:
         click.echo(facts(adapter))
     else:
-        click.echo(f"\ninterface {interface}: nothing is known of it")
+        click.echo(f"\ninterface {interface}: no facts about this interface are stored")
 
 
 def _realtime(machine: Machine) -> Iterator[CheckResult]:

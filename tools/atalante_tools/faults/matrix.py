@@ -86,7 +86,7 @@ def load_matrix(path: Path = MATRIX_FILE) -> Mapping[str, Row]:
         elif inside and not set(line) <= set("|- "):
             row = _row(f"{path.name} line {number}", cells)
             if row.id in rows:
-                raise MatrixError(f"{path.name} line {number}: fault ID {row.id} occurs twice, but must be unique")
+                raise MatrixError(f"{path.name} line {number}: fault ID {row.id} must occur once, got it twice")
             rows[row.id] = row
     if not rows:
         raise MatrixError(f"{path.name} must have a table with the columns {', '.join(COLUMNS)}, got none")

@@ -38,7 +38,7 @@ class TestImuRange:
         finding = only(robot.cycle(show(signal.maximum)))
         assert (finding.dtc, finding.node) == (Dtc.IMU_SATURATED, f"IMU_{IMUS[imu].upper()}")
         assert finding.value == pytest.approx(signal.maximum)
-        assert f"the {IMUS[imu]} IMU is at the end of its range, {signal.maximum:.0f}" in finding.text
+        assert f"the {IMUS[imu]} IMU is saturated: its reading of {signal.maximum:.0f} is at the end" in finding.text
         assert robot.rejected == {row(f"IMU_{IMUS[imu]}"): 1}
         for name, value in before.items():
             assert np.array_equal(getattr(robot.now, name)[imu], value)

@@ -146,7 +146,7 @@ class TestDrift:
         side, axis = JOINTS[joint].split("_")
         named_joints = f"{side}_SH and {side}_SK" if axis in ("SH", "SK") else JOINTS[joint]
         degrees = f"{math.degrees(finding.value):+.1f} degrees"
-        assert finding.text == f"encoder of {named_joints}: {degrees} away from the angle of the pelvis and tibia IMUs"
+        assert finding.text == f"encoder of {named_joints}: its angle differs by {degrees} from pelvis and tibia IMU"
         robot.missing = {row("pendant")}
         assert only(robot.run(40, off)) is finding
         robot.missing = set()

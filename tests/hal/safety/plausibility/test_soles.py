@@ -74,8 +74,8 @@ def test_error_of_an_ankle_encoder_is_reported_with_its_joint(foot: int, joint: 
         finding = only(robot.checks.findings())
         assert (finding.dtc, finding.node, finding.confirmed) == (Dtc.ENC_DRIFT, JOINTS[joint].upper(), True)
         assert finding.value == pytest.approx(1.01 * LIMIT, rel=0.01)
-        text = f"encoder of {JOINTS[joint]}: the {FEET[foot]} sole lies flat on the floor, but seems to be tilted by 2.0 degrees"
-        assert finding.text == text
+        level = f"the {FEET[foot]} sole must be level, because it is flat on the floor"
+        assert finding.text == f"encoder of {JOINTS[joint]}: {level}, got a tilt of 2.0 degrees"
         robot.now.force[foot, :2, 2] = 0.0
         robot.run(1)
         assert robot.checks.findings() == ()

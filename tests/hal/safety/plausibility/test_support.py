@@ -73,7 +73,9 @@ class TestHeight:
         loads = (800.0, 0.0) if foot == 0 else (0.0, 800.0)
         for _ in range(2):
             assert legs.run(HEIGHT_CYCLES + 1, *loads) == [False] * (HEIGHT_CYCLES - 1) + [True] * 2
-            text = f"the {FEET[foot]} foot reports load although it is 0.06 m above the other foot, which reports none"
+            text = (
+                f"the {FEET[foot]} foot reports load although it is 0.06 m above the other foot, which reports no load"
+            )
             assert legs.checks.findings() == (
                 Finding(Dtc.FOOT_CELL, f"FOOT_{FEET[foot].upper()}", pytest.approx(0.063, abs=0.001), True, text),
             )
