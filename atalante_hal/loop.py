@@ -161,7 +161,7 @@ def run(
         Timing of the run.
 
     Raises:
-        ValueError: If the HAL was constructed with other `controller_fields` than those of the controller.
+        ValueError: If the HAL was constructed with `controller_fields` that differ from the fields of the controller.
     """
     statistics = Statistics()
     costs, header = statistics.costs, hal.record

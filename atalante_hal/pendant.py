@@ -2,7 +2,7 @@
 
 `process image -> pendant -> state machine` is the only path for the operator's commands.
 
-START is edge-triggered: a press is a frame with the request START whose `RequestCounter` differs from that of the previous cycle.
+START is edge-triggered: a press is a frame with the request START whose `RequestCounter` differs from the previous cycle.
 The first frame is never a press. If START is pressed while the pendant is not qualified yet, the press is stored until the
 pendant is qualified. A stored press is dropped if the dead-man switch or START is released, or if the supervisor state changes.
 """

@@ -120,7 +120,10 @@ class Transceiver:
         """
         for header in as_words(frames)[:, 0].tolist():
             if header not in self._table:
-                raise TransmitDenied(f"{self._node} may not send id 0x{header & 0xFFFFFFFF:X} in this format")
+                raise TransmitDenied(
+                    f"{self._node} may send only its own messages, with the length and format of the DBC, "
+                    f"got id 0x{header & 0xFFFFFFFF:X}"
+                )
         return Outgoing(frames)
 
     def send(self, batch: Outgoing) -> None:

@@ -93,7 +93,7 @@ class Batches:
                 "frames must be a one-dimensional array of frame.FRAME records: create it with frame.new_frames(n)"
             )
         if not frames.flags.c_contiguous:
-            raise TypeError("frames must be contiguous, got a strided slice: pass its copy()")
+            raise TypeError("frames must be a contiguous array, got a strided slice: pass a copy of the slice")
         batch = Batch(frames, frames.view(np.uint8).data, as_words(frames)[:, 0])
         if len(self._batches) >= REMEMBERED:
             self._batches.clear()

@@ -106,7 +106,7 @@ class Dtc(StrEnum):
         "the load on the feet contradicts ground and posture",
     )
     TORQUE_DIRECTION = "TORQUE_DIRECTION", _R.LOWER, _S.ERROR, "a joint moves against its torque, or does not follow it"
-    TORQUE_TRACKING = "TORQUE_TRACKING", _R.LOWER, _S.ERROR, "a drive reports another torque than that of its command"
+    TORQUE_TRACKING = "TORQUE_TRACKING", _R.LOWER, _S.ERROR, "a drive reports a torque that differs from its command"
     HOLD_UNSTABLE = "HOLD_UNSTABLE", _R.LOWER, _S.ERROR, "a joint oscillates although its drive holds its position"
     # Bus.
     BUS_FLOOD = "BUS_FLOOD", _R.HOLD, _S.ERROR, "more frames arrived than the HAL reads in a cycle"

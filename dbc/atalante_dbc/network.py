@@ -133,7 +133,7 @@ _T = TypeVar("_T", Signal, Node)
 def wire_time(length: int, nominal_bitrate: float = 1e6, data_bitrate: float = 5e6) -> float:
     """Return the longest time [s] for which a CAN FD frame with an 11-bit identifier occupies the bus, including stuff bits.
 
-    The bit counts are those of ISO 11898-1. The nominal phase with the interframe space has 33 bits. The data phase has 5 + 8 n
+    The bit counts come from ISO 11898-1. The nominal phase with the interframe space has 33 bits. The data phase has 5 + 8 n
     bits for n payload bytes, and one stuff bit per four of these bits. The CRC with its fixed stuff bits and the delimiters adds
     28 bits, or 33 bits if n is above 16.
 

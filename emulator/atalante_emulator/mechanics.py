@@ -20,7 +20,7 @@ from atalante_hal.robot import JOINTS
 
 #: Parameters of the nodes of a robot on the ground. The IMUs have attitude errors, because these errors affect a walk.
 GROUND_PARAMETERS: Final = EmulatorParameters(imu=ImuParameters(attitude_error=0.004, heading_drift=5.2e-5))
-#: The same, but the IMUs have a heading reference, such as a magnetometer, so their headings do not drift.
+#: `GROUND_PARAMETERS` for IMUs with a heading reference, such as a magnetometer. The headings of these IMUs do not drift.
 HEADING_REFERENCE_PARAMETERS: Final = replace(GROUND_PARAMETERS, imu=replace(GROUND_PARAMETERS.imu, heading_drift=0.0))
 
 

@@ -19,7 +19,7 @@ def main() -> NoReturn:
     """Run the command line and end the process with its exit code.
 
     Raises:
-        SystemExit: Always. The exit code is that of the stop signal if one arrived, otherwise that of the command.
+        SystemExit: Always. If a stop signal arrived, its exit code is used, otherwise the exit code of the command.
     """
     code: object = 0
     with interruptible() as stop:

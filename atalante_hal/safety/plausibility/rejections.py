@@ -1,4 +1,4 @@
-"""Leaky buckets of rejected values, which detect a sensor whose values are implausible again and again.
+"""Leaky buckets of rejected values, which detect a sensor with frequent implausible values.
 
 Single implausible values of a joint or an IMU are tolerated: the robot uses the previous values. If every new value is
 implausible, the check that rejects the values confirms its diagnostic. If good values arrive in between, this check confirms

@@ -62,7 +62,9 @@ class ExoskeletonParameters:
             if not 0.2 < getattr(self, name) < 0.7:
                 raise ValueError(f"{name} must be between 0.2 and 0.7 m, got {getattr(self, name)!r}")
         if not 0.0 < 4 * self.pad_mass < 0.1 * self.foot_mass:
-            raise ValueError(f"pad_mass must be positive and below 1/40 of foot_mass, got {self.pad_mass!r}")
+            raise ValueError(
+                f"pad_mass must be above 0 and below {self.foot_mass / 40.0:g} kg (1/40 of foot_mass), got {self.pad_mass!r}"
+            )
 
     def fitted(self, patient: Patient) -> ExoskeletonParameters:
         """Return the parameters with thigh and shank adjusted to a patient.

@@ -13,7 +13,7 @@ from atalante_hal.robot import JOINTS, Robot
 def urdf(parameters: ExoskeletonParameters, robot: Robot, patient: Patient | None = None) -> str:
     """Return the URDF of the exoskeleton, empty or with a patient.
 
-    The joints are those of `JOINTS`, in the same order. Only the eight contact pads have collision shapes. The links of the IMUs
+    The URDF has the joints in `JOINTS`, in this order. Only the eight contact pads have collision shapes. The links of the IMUs
     have no mass. The same parameters give the same text, with all digits of every number.
 
     Args:

@@ -68,8 +68,8 @@ class WalkConfig:
     landing_timeout: float = 0.4
     load_bandwidth: float = 35.0  # Hz, cut-off frequency of the low-pass of the vertical foot forces
     observer_bandwidth: float = 2.0  # rad/s, natural frequency of the attitude observer
-    #: 1/s, rate with which the heading follows that of the pelvis IMU; 0: integral of the gyro alone. A positive value requires
-    #: an IMU with a heading reference, because the heading of other IMUs drifts.
+    #: 1/s, rate with which the estimated heading follows the heading of the pelvis IMU. With 0, the estimated heading is the
+    #: integral of the gyro. A value above 0 requires an IMU with a heading reference, because the heading of other IMUs drifts.
     heading_gain: float = 0.0
     loaded: float = 0.3  # smallest load with which a standing foot counts as loaded, as a fraction of the weight
     #: loads at which the stance gains are fully applied (standing, walking), as fractions of the weight
@@ -106,7 +106,7 @@ class WalkConfig:
         if not 0.0 <= self.stabiliser <= 10.0:
             raise ValueError(f"stabiliser must be from 0 to 10 m/m, got {self.stabiliser!r}")
         if not 0.0 <= self.heading_gain <= 10.0:
-            raise ValueError(f"heading_gain must be from 0 to 10 per second, got {self.heading_gain!r}")
+            raise ValueError(f"heading_gain must be from 0 to 10 [1/s], got {self.heading_gain!r}")
         placement = self.placement
         if not 0.0 < placement.slowest <= 1.0:
             raise ValueError(f"placement.slowest must be above 0 and at most 1, got {placement.slowest!r}")

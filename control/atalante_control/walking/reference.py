@@ -2,7 +2,7 @@
 
 The divergent component of motion (DCM) is c + c' / w, with the horizontal position c of the centre of mass and
 w = sqrt(g / height). In a step the DCM is relative to the centre of the stance sole. While standing the DCM is relative to the
-middle between both soles. The axes are those of the walking frame: x forward, y left, without the toe-out of the feet.
+middle between both soles. The axes are the axes of the walking frame: x forward, y left, without the toe-out of the feet.
 """
 
 from __future__ import annotations

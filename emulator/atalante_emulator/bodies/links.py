@@ -20,7 +20,7 @@ def find(names: Sequence[str], available: dict[str, int], noun: str) -> list[int
 
     Args:
         names: required names.
-        available: index of each name that the engine knows.
+        available: index of each name in the engine.
         noun: `joint` or `link`, for the error message.
 
     Raises:

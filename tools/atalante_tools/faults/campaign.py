@@ -29,4 +29,4 @@ def results(tasks: Sequence[Task], *, jobs: int = 1, dask: str = "") -> Iterator
     except FanOutError as error:
         raise Failed(str(error)) from error
     except TimeoutError as error:
-        raise Failed(f"no task ended within {RESULT_TIMEOUT:.0f} s: each task must end within this time") from error
+        raise Failed(f"a task must end within {RESULT_TIMEOUT:.0f} s, got no result in this time") from error

@@ -1,7 +1,7 @@
 """Simulation of walking steps on the ideal plant with the controller of the robot: `start, push -> |e| / q_bound over the step`.
 
 Each step calls the compiled cycle of the real controller, so the check covers the control law that runs on the robot. At the
-start of a step, the torques from before the stance change still act. The plant, the limiter and the drives are those of the
+start of a step, the torques from before the stance change still act. The plant, the limiter and the drives are the same as in the
 module `plant`.
 """
 
@@ -176,7 +176,7 @@ class IdealLeg:
         """Return the largest and the smallest error e of each joint in the safe backward image.
 
         The safe backward image is the set of states with h >= 0, from which the backup policy can keep both joints inside the
-        guide. The angle of the other joint and the speeds of both joints are those of the desired motion.
+        guide. The angle of the other joint and the speeds of both joints are equal to the desired motion.
 
         Args:
             start: state at the stance change.

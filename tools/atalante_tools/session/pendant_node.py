@@ -28,7 +28,7 @@ FIRMWARE_VERSION: Final = 0x0100
 
 
 class Request(IntEnum):
-    """Button that the operator pressed last. The values are those of the signal `PENDANT_STATE.Request`."""
+    """Button that the operator pressed last. The values are the values of the signal `PENDANT_STATE.Request`."""
 
     NONE = 0
     START = 1

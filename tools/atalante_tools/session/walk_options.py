@@ -56,9 +56,8 @@ class WalkOptions:
     recording: RecordingOptions = field(default_factory=RecordingOptions)
     #: Whether the emulated robot runs in a process of its own; None: only if enough processor cores are idle.
     robot_process: bool | None = None
-    heading_reference: bool = (
-        False  # whether the heading follows that of the pelvis IMU, whose heading then does not drift
-    )
+    #: whether the pelvis IMU has a heading reference, so that its heading does not drift and the controller follows its heading
+    heading_reference: bool = False
     out: Path | None = None  # folder for summary.json, trace.npz and walk.png; None means no files
 
 

@@ -296,7 +296,7 @@ def _known(masses: tuple[float, ...]) -> tuple[float, ...]:
     """Return the masses if each of them is the mass of a virtual subject.
 
     Raises:
-        UsageError: If a mass is not that of a subject.
+        UsageError: If no subject has one of the masses.
     """
     from atalante_control.gait.subject import STUDY_PATIENTS
 

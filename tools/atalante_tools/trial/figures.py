@@ -1,4 +1,4 @@
-"""Figures of the trials, like those of the paper: `results -> PNG images as bytes`."""
+"""Figures of the trials, similar to the figures of the paper: `results -> PNG images as bytes`."""
 
 from __future__ import annotations
 

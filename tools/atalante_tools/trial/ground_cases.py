@@ -1,4 +1,4 @@
-"""Cases of the experiment `faults`: those of the fault matrix, and cases that need a robot on the ground."""
+"""Cases of the experiment `faults`: the cases of the fault matrix, and cases that need a robot on the ground."""
 
 from __future__ import annotations
 

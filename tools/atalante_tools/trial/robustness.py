@@ -1,7 +1,7 @@
 """Walk of a robot that differs from its model, with lost frames and pushes: `trial -> rig in lock-step -> result`.
 
-The controller knows the nominal patient. The emulated robot carries a patient with another mass and stands on a floor with random
-friction. The messages and motors of this robot are late, its buses lose frames, and the robot is pushed at the pelvis.
+The controller uses a model with the nominal patient. The emulated robot carries a patient with another mass and stands on a floor
+with random friction. Messages and motors of this robot are late, its buses lose frames, and the robot is pushed at the pelvis.
 """
 
 from __future__ import annotations

@@ -88,7 +88,7 @@ class LocalAccess:
 
     def attitude(self) -> tuple[float, float, float, float]:
         """Return the true attitude of the pelvis, see `Access.attitude`."""
-        # The axes of the pelvis IMU are parallel to those of the pelvis.
+        # The axes of the pelvis IMU are parallel to the axes of the pelvis.
         x, y, z, w = self._emulator.body.imu[_PELVIS, :4].tolist()
         return x, y, z, w
 
