@@ -17,8 +17,8 @@ alive counter of the accepted frame but other bytes, or an alive counter out of 
 confirm the diagnostic. Then the message is no longer trusted.
 
 In single support it is safer to finish the walking step than to stop. So if a joint of the swing leg times out, the robot first
-finishes the step. It goes to HOLD if no message has arrived after twice the timeout (10 cycles). If any other joint times out,
-the robot goes to HOLD without a delay.
+finishes the step. If the joint has sent no message for twice the timeout (10 cycles), the robot goes to HOLD. If any other joint
+times out, the robot goes to HOLD without a delay.
 """
 
 from __future__ import annotations

@@ -69,7 +69,7 @@ def next_state(state: SupervisorState, conditions: Conditions) -> tuple[Supervis
 
     Returns:
         The next state, and the diagnostics with the most severe reaction. The set of diagnostics is empty if this reaction is
-        INFO. It is also empty if the operator requested the end of the walk and this reaction is milder than FINISH_STEP.
+        INFO. The set is also empty if the operator requested the end of the walk and this reaction is milder than FINISH_STEP.
     """
     diagnostics = conditions.diagnostics
     dead_man = conditions.dead_man or conditions.walk_end_requested

@@ -9,9 +9,9 @@ The drives are the last safety layer. They react to errors without the HAL, in o
   command, low supply voltage. The drive stays in QUICK STOP ACTIVE until the HAL acknowledges the hold, and the motor
   holds the present position of the drive's own encoder. If the encoder jumps during the hold, the setpoint jumps by the
   same angle, so the joint does not move.
-- Lowering. Causes: over-temperature, over-current, encoder error. The drive cannot hold the joint. It enters FAULT REACTION
-  ACTIVE and then FAULT. The power stage is off, and the brake lets the joint sink slowly. The same brake acts in every drive
-  whose power stage is off, so the HAL can lower a joint with DISABLE_VOLTAGE.
+- Lowering. Causes: over-temperature, over-current, encoder error. The drive cannot hold the joint. The drive enters FAULT
+  REACTION ACTIVE and then FAULT. The power stage is off, and the brake lets the joint sink slowly. The same brake acts in every
+  drive whose power stage is off, so the HAL can lower a joint with DISABLE_VOLTAGE.
 """
 
 from __future__ import annotations

@@ -69,12 +69,12 @@ class EmulatorParameters:
 class Emulator:
     """All nodes of the network except the HAL, connected to one body.
 
-    `before_send` is a list of callables `(cycle, values)`. They are called after the SYNC of a cycle and may change `values`, the
-    signal values that the nodes then send. The values are in the order of `signals`.
+    `before_send` is a list of callables `(cycle, values)`. Each callable is called after the SYNC of a cycle and may change
+    `values`, the signal values that the nodes then send. The values are in the order of `signals`.
 
-    `pelvis_forces` is a list of callables `(hal_state) -> wrench`. They are called once per time step, also without SYNC. The sum
-    of the returned wrenches acts on the pelvis: force [N] and moment [Nm] in world axes, shape (6,). For example, a `Crane` is
-    such a callable.
+    `pelvis_forces` is a list of callables `(hal_state) -> wrench`. Each callable is called once per time step, also without SYNC.
+    The sum of the returned wrenches acts on the pelvis: force [N] and moment [Nm] in world axes, shape (6,). For example, a
+    `Crane` is such a callable.
     """
 
     def __init__(
@@ -129,7 +129,7 @@ class Emulator:
         """Add faults to an emulator that has no faults yet.
 
         Args:
-            faults: faults to inject. They must begin at least two cycles later, because the next frames are already computed.
+            faults: faults to inject; each must begin at least two cycles later, because the next frames are already computed.
 
         Raises:
             FaultError: If the target or a signal of a fault is not in the network.

@@ -1,10 +1,10 @@
 """Leaky buckets of rejected values, which detect a sensor with frequent implausible values.
 
 Single implausible values of a joint or an IMU are tolerated: the robot uses the previous values. If every new value is
-implausible, the check that rejects the values confirms its diagnostic. If good values arrive in between, this check confirms
-nothing, because each good value ends the fault. So each sensor has a leaky bucket that counts its tolerated values. The bucket
-has the same size as the buckets in `message_monitor`. It is full if more than a fifth of the values are rejected. Then the
-diagnostic is confirmed, until 16 values in a row are good.
+implausible, the check that rejects the values confirms its diagnostic. If good values arrive in between, this check does not
+confirm its diagnostic, because each good value ends the fault. So each sensor has a leaky bucket that counts its rejected values.
+The bucket has the same size as the buckets in `message_monitor`. The bucket is full if more than a fifth of the values are
+rejected. Then the diagnostic is confirmed, until 16 values in a row are good.
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
 """Gaits of a walk from standing to standing: start step, periodic step and stop step, in one object and in one file.
 
 `walk file -> WalkGaits`. The walking controller follows these gaits. The start step begins at rest, with the weight on the
-right foot. It ends with the angles and speeds at the end of the periodic step. The stop step begins with the angles and
-speeds at the start of the periodic step. It ends at rest, with the weight on the stance foot.
+right foot, and ends with the angles and speeds at the end of the periodic step. The stop step begins with the angles and
+speeds at the start of the periodic step, and ends at rest, with the weight on the stance foot.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """Initial guess of the optimiser: a simple step with bent knees, computed by inverse kinematics.
 
-All gaits of the library start from this guess. They therefore converge to similar local minima.
+The optimisation of each gait of the library starts from this guess. All gaits therefore converge to similar local minima.
 """
 
 from __future__ import annotations

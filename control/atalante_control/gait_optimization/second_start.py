@@ -41,7 +41,7 @@ def solve_with_second_start(subject: Subject, attempt: Attempt) -> SolvedGait:
 
     Returns:
         The gait. After two failures, the gait is the last iterate of the first attempt. The status then states the
-        reasons of both failures. It also names the joints that are at a limit in this iterate.
+        reasons of both failures, and names the joints that are at a limit in this iterate.
     """
     first = attempt(subject, None)
     if first.solved or first.iterations == 0:

@@ -4,7 +4,7 @@ The attitude comes from the tibia IMU. If this IMU is lost, the attitude is comp
 targets replace the nominal angles in the reference of the PID. The attitude of the foot in the world is
 :math:`R_{tibia} R_z(\text{toe}) R_y(q_{SA}) R_a(q_{HA})`. The sole is level when this rotation maps the normal of the sole to the
 vertical. Let :math:`g` be the vertical in the ankle frame and :math:`a = (a_x, 0, a_z)` the henke axis. The y component of
-:math:`R_a e_z` is :math:`-a_x \sin q_{HA}` and does not depend on SA. This gives HA. Then SA follows in the x-z plane.
+:math:`R_a e_z` is :math:`-a_x \sin q_{HA}` and does not depend on SA, so it gives HA. Then SA follows in the x-z plane.
 """
 
 from __future__ import annotations

@@ -12,8 +12,8 @@ The predicted error beyond a dead zone is removed in two ways, see `landing`:
 - Step timing. The error depends on the time of the landing, because the DCM moves outwards during a step. The phase
   rate with the lowest cost is used. The cost consists of the shift of the landing, the shift that the limits do not
   permit, and the change of the step duration. (After M. Khadiv et al., Walking control based on step timing adaptation,
-  IEEE Transactions on Robotics 36, 2020. They solve a quadratic program. Here the phase rate is the only unknown, so no
-  solver is needed.)
+  IEEE Transactions on Robotics 36, 2020. The authors solve a quadratic program. Here the phase rate is the only unknown,
+  so no solver is needed.)
 
 A push also moves and tilts the pelvis. With the joint angles of the gait, the swing foot would move with the pelvis:
 sideways, forwards and away from the floor. From the first reaction until the landing, the ankle of the swing leg is

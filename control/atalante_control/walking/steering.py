@@ -1,8 +1,9 @@
 """Steering along a line: `positions and headings of the soles -> deviation from the line -> hip rotation in the next step`.
 
-The line is the straight path that the robot must follow. It starts in the middle between the feet when the walk begins, in the
-direction of the mean heading of the soles. The position on the ground is the sum of the relative sole positions at each landing.
-The heading of the pelvis is not used, because the pelvis turns by several degrees during a step. TH is the transverse hip.
+The line is the straight path that the robot must follow. The line starts in the middle between the feet when the walk begins,
+in the direction of the mean heading of the soles. The position on the ground is the sum of the relative sole positions at each
+landing. The heading of the pelvis is not used, because the pelvis turns by several degrees during a step. TH is the transverse
+hip.
 """
 
 from __future__ import annotations

@@ -36,7 +36,7 @@ def command() -> None:
     """Act as the operator's pendant on a bus.
 
     Only one pendant sends at a time: a new pendant takes over from the previous pendant. The commands `start` and `xi` keep
-    the dead-man switch pressed while they run. They read further commands from the keyboard: start, stop, hold, xi 0.3.
+    the dead-man switch pressed while they run. Both commands read further commands from the keyboard: start, stop, hold, xi 0.3.
 
     \b
     Example: atalante pendant start -i socketcan -c vcan0

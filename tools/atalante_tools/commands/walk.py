@@ -134,8 +134,8 @@ def _protocol(_ctx: click.Context, _param: click.Parameter, text: str | None) ->
 @click.option(
     "--robot-process/--no-robot-process",
     default=None,
-    help="Run the emulated robot in a process of its own, in parallel with the HAL. This is faster on idle processor cores. The "
-    "result is the same.  [default: on if one core is idle, or two cores with a CAN log or a rate above 100 Hz]",
+    help="Run the emulated robot in a process of its own, in parallel with the HAL. With idle processor cores, the walk is then "
+    "faster. The result is the same.  [default: on if one core is idle, or two cores with a CAN log or a rate above 100 Hz]",
 )
 @options_as("recording", RecordingOptions, RECORDING_OPTIONS)
 @target_options(embedded=True)

@@ -87,7 +87,7 @@ command.add_command(solve)
     "--mass",
     type=levels_of,
     metavar="KG,...",
-    help="Patient masses of the grid, in kg.  [default: four levels that cover the subjects of the paper]",
+    help="Patient masses of the grid, in kg.  [default: levels that cover the subjects of the paper]",
 )
 @click.option("--height", type=levels_of, metavar="M,...", help="Patient heights of the grid, in m.")
 @click.option("--step-length", type=levels_of, metavar="M,...", help="Step lengths of the grid, in m.")
@@ -115,7 +115,7 @@ command.add_command(solve)
 def library(out: Path, jobs: int, machine_code: bool, cluster: str | None, as_json: bool, **grid_options: Any) -> None:
     """Solve gaits of a grid of patients, step lengths and step durations, and write a file per gait to DIR/gaits.
 
-    After an interruption, the same command solves the missing gaits. It also solves a gait again if its file is damaged, was
+    After an interruption, the same command solves the missing gaits. A gait is also solved again if its file is damaged, was
     made by another version of the code, or belongs to another subject. Failed gaits are listed on stderr and in DIR/failed, and
     the next call retries them. The exit code is 1 if a gait failed.
 

@@ -5,7 +5,7 @@ r"""Ideal plant for the search for the worst push: hip and knee of one swing leg
 .. math:: m\,[M(q) \ddot q + c(q, \dot q) + g(q)] + f\,r(\dot q) = u + d
 
 with the sagittal hip and knee (SH, SK) as coordinates q, the real joint torques u of the drives, the push d, the friction torque
-r of the model, the mass factor m and the friction factor f. The mass matrix M depends only on the knee angle. It is
+r of the model, the mass factor m and the friction factor f. The mass matrix M depends only on the knee angle. M is
 :math:`A + B \cos q_{SK} + C \sin q_{SK}`, because both axes are parallel. The velocity-dependent torque c follows from the
 derivatives of M. The gravity torque g is linear in the sine and cosine of the hip angle and of the sum of both angles. All
 coefficients are fitted to Pinocchio's rigid-body dynamics of the whole exoskeleton. The other ten joints rest at their mean

@@ -1,6 +1,6 @@
 """Search for the worst push on the ideal plant: `guide, limits of the push -> push with the largest |e| / q_bound`.
 
-The search knows the equation of motion but not the control law. It has three stages:
+The search uses the equation of motion, but not the control law. The search has three stages:
 
 1. *Guesses.* Constant pushes. Pushes that follow the sign of the error, or of the rate of the error (pumping). Pushes
    that switch at random. Bang-bang pushes. A bang-bang push makes the error of one joint at a chosen time as large as

@@ -32,7 +32,7 @@ def minimum_jerk(phase: float) -> tuple[float, float]:
     """Return the minimum-jerk profile s = 10 x^3 - 15 x^4 + 6 x^5 and its derivative (Flash and Hogan, 1985).
 
     Args:
-        phase: Time divided by the duration of the move, x. It is clipped to 0 to 1.
+        phase: Time divided by the duration of the move, x; clipped to the range from 0 to 1.
 
     Returns:
         Ratio s of covered distance to whole distance, 0 to 1, and its derivative ds/dx.

@@ -83,7 +83,7 @@ class Rig:
             controller: Controller that computes the command of every cycle.
             until: End condition, called with the state after every cycle.
             record: Function called after every cycle to record it.
-            on_stop: Function called at the first stop signal. It must only set a flag. If None, the first signal ends the run.
+            on_stop: Function called at the first stop signal; must only set a flag. If None, the first signal ends the run.
 
         Returns:
             Statistics of the loop.
@@ -252,7 +252,7 @@ class Watch:
         Args:
             rig: Rig of the run.
             stop: Stop request of the process.
-            done: Function that returns whether the run is complete. It is called in each cycle in ACTIVE.
+            done: Function that returns whether the run is complete; called in each cycle in ACTIVE.
             describe: Function that returns the progress line in ACTIVE.
             resumes: Whether the run continues when the operator presses START in HOLD. If False, HOLD ends the run.
         """

@@ -1,8 +1,8 @@
 """Findings of the paper, tested on the results of the trials: `results -> one line per finding, with statistic and verdict`.
 
 The limits in this file were chosen before the trials of the documentation ran. The finding `active-vary` was added after these
-trials. It compares steps at equal phase, because the standard deviation over whole steps (`active-spread`) mostly measures the
-shape of the mean trajectory. A finding without results has no verdict.
+trials. `active-vary` compares steps at equal phase, because the standard deviation over whole steps (`active-spread`) mostly
+measures the shape of the mean trajectory. A finding without results has no verdict.
 """
 
 from __future__ import annotations

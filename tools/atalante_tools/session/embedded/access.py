@@ -3,7 +3,7 @@
     push, dial -> emulated robot -> true attitude of the pelvis, true position of the feet
 
 `LocalAccess` accesses an emulator in this process. `RemoteAccess` accesses an emulator in a subprocess through shared memory,
-whose other end is a `ServedAccess`. Both act in the same cycles, so the bytes on the bus are the same.
+whose other end is a `ServedAccess`. Both kinds of access act in the same cycles, so the bytes on the bus are the same.
 """
 
 from __future__ import annotations
