@@ -56,7 +56,7 @@ def test_lost_frames_cause_no_findings():
 
 
 def test_rejected_jumps_keep_the_last_good_position():
-    """The history is a jump, a lost frame and another jump."""
+    """The position jumps, then a frame is lost, then the position jumps again."""
     robot = SimulatedRobot()
     good = float(robot.now.position[4])
     for change, missing in ((1.0, set()), (0.0, {row("left_SA")}), (1.0, set())):

@@ -1,4 +1,4 @@
-"""Leaky buckets of implausible values: single ones are tolerated, more than a fifth are not."""
+"""Leaky buckets of implausible values: single values are tolerated, more than a fifth of the values are a fault."""
 
 from __future__ import annotations
 

@@ -154,8 +154,8 @@ class Line:
 class Fault:
     """Fault, with the largest number of cycles until it is found.
 
-    This number is that of FAULTS.md. For CONTACT_IMPLAUSIBLE it is one period of the foot checks longer, because late values of
-    a foot delay the finding by a cycle.
+    This number comes from FAULTS.md. For CONTACT_IMPLAUSIBLE, one period of the foot checks is added, because late values
+    of a foot delay the finding by a cycle.
     """
 
     dtc: Dtc

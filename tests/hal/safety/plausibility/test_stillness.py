@@ -222,7 +222,7 @@ class TestStuckEncoder:
 
     @pytest.mark.parametrize("joint", ANKLES, ids=lambda joint: JOINTS[joint])
     def test_still_ankle_of_a_loaded_foot_is_not_stuck(self, joint: int):
-        """The torque varies by 40 Nm, but it would have to move the whole robot."""
+        """The torque varies by 40 Nm, but the ankle would have to move the whole robot."""
         robot = SimulatedRobot(standing=True)
         at = float(robot.now.position[joint])
         assert robot.run(400, lambda now: now.position.__setitem__(joint, at)) == ()
@@ -394,7 +394,7 @@ class TestStillnessAlone:
 
         assert not sample(1.0, new=True)
         assert not sample(2.0, new=False)
-        assert not sample(2.0, new=True)  # not the value of the last sample
+        assert not sample(2.0, new=True)  # the new value differs from the last sample
         for _ in range(4):
             assert not sample(2.0, new=True)
             assert not sample(2.0, new=False)

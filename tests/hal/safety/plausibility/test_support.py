@@ -84,7 +84,7 @@ class TestHeight:
 
     @pytest.mark.parametrize("foot", [0, 1])
     def test_raised_foot_may_carry_load_together_with_the_lower_foot(self, foot: int):
-        """It stands on a step."""
+        """The raised foot stands on a step, so both feet carry load."""
         legs = Legs()
         legs.pose(lifted(foot, 0.8))
         assert not any(legs.run(300, 800.0, 800.0))
