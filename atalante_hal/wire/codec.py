@@ -140,7 +140,7 @@ class Codec:
             raise KeyError(f"the quantity must be one of {', '.join(dict.fromkeys(self._groups))}, got {group!r}")
         if found[-1] - found[0] + 1 != len(found):
             raise KeyError(
-                f"the values of the quantity {group!r} are not contiguous: some of its signals are signed and others are not"
+                f"the signals of the quantity {group!r} must be all signed or all unsigned, got both"
             )
         return slice(found[0], found[-1] + 1)
 

@@ -10,7 +10,7 @@ coordinates to the control points.
 2. *Weighted errors.* The distance between two gaits is the deviation of their angles and accelerations along the step. The
    accelerations determine the feedforward. The ends of the step have a larger weight, because the foot lands there. The
    perceptron learns the principal directions of the library in this metric. The least important directions are omitted.
-   Together they cause an rms error of at most `RESOLUTION`.
+   Together, the omitted directions cause an rms error of at most `RESOLUTION`.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ JUMP_KEPT = 0.4  # the fit keeps this fraction of the speed jump that each gait 
 END_WEIGHT = 40.0  # weight of the samples at start and end of a step; the other samples have weight 1
 ACCELERATION_WEIGHT = 5e-2  # s2, weight of an acceleration error [rad/s2] relative to an angle error [rad]
 #: Root mean square of the learnt coordinates after scaling. L-BFGS stops if an iteration reduces the squared error by less than
-#: 2e-9. For coordinates of size 1 this is too early.
+#: 2e-9. With coordinates of size 1, L-BFGS would stop too early.
 TARGET_SIZE = 10.0
 ALPHA = 1e-5  # penalty on the squared weights of the network; the penalty smooths the gaits between the grid points
 SEED = 1  # seed of the initial weights

@@ -58,7 +58,7 @@ class StepProblem:
     """
 
     def __init__(self, kind: Kind, robot: Robot, requirements: Requirements) -> None:
-        """Build the nonlinear program. This takes some seconds.
+        """Build the nonlinear program. The construction takes some seconds.
 
         Args:
             kind: kind of step, `periodic`, `start` or `stop`.

@@ -128,7 +128,7 @@ def follow_heading(attitudes: Records[Attitude], quaternion: Vector, origin: flo
     Args:
         attitudes: state of the observer, shape (1,), updated.
         quaternion: measured attitude, unit quaternion wxyz, pelvis to world, shape (4,).
-        origin: heading of the measured attitude that counts as zero [rad].
+        origin: measured heading at which the heading of the observer is zero [rad].
         gain: rate with which a heading error decays [1/s].
     """
     w, x, y, z = quaternion[0], quaternion[1], quaternion[2], quaternion[3]

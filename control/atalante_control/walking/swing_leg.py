@@ -7,7 +7,8 @@ the missing torque w to the gravity torque. w depends on the time t in the step:
 
     w(t) = u_f - M(q_nom) q_nom'' - c(q_nom, q_nom')
 
-Here c are the velocity torques. A motion of the pelvis that differs from the motion in the gait acts as a disturbance.
+Here M is the mass matrix and c are the velocity torques. A motion of the pelvis that differs from the motion in the gait acts as
+a disturbance.
 """
 
 from __future__ import annotations

@@ -180,7 +180,7 @@ def test_quantity_with_and_without_sign_is_rejected_if_it_is_not_contiguous():
     signals = tuple(replace(s, signed=s.name != "Position") for s in message.signals)
     codec = Codec([message, replace(message, signals=signals)])
     assert codec.slice("Velocity").stop - codec.slice("Velocity").start == 2
-    with pytest.raises(KeyError, match="the values of the quantity 'Position' are not contiguous"):
+    with pytest.raises(KeyError, match="the signals of the quantity 'Position' must be all signed or all unsigned"):
         codec.slice("Position")
 
 

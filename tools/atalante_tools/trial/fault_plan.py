@@ -2,7 +2,7 @@
 
     cases of the fault matrix -> trials
 
-A trial is one case at all its moments.
+A trial is one case of a fault, with one walk for each moment at which the fault begins.
 """
 
 from __future__ import annotations

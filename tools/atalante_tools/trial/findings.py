@@ -178,7 +178,7 @@ def _line(results: Sequence[Result]) -> Finding:
 
 
 def _attitude(results: Sequence[Result]) -> Finding:
-    """Return the finding that the estimated vertical is right."""
+    """Return the finding that the error of the estimated vertical is below `ATTITUDE` in every walk."""
     errors = [r["attitude_rms_deg"] for r in results if r["attitude_rms_deg"] is not None]
     largest = max(errors, default=math.nan)
     text = f"largest RMS error of a walk {largest:.2f} deg, limit {ATTITUDE:g} deg"
