@@ -139,9 +139,7 @@ class Codec:
         if not found:
             raise KeyError(f"the quantity must be one of {', '.join(dict.fromkeys(self._groups))}, got {group!r}")
         if found[-1] - found[0] + 1 != len(found):
-            raise KeyError(
-                f"the signals of the quantity {group!r} must be all signed or all unsigned, got both"
-            )
+            raise KeyError(f"the signals of the quantity {group!r} must be all signed or all unsigned, got both")
         return slice(found[0], found[-1] + 1)
 
     def template(self) -> Frames:
