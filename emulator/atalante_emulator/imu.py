@@ -27,7 +27,7 @@ class ImuParameters:
     accel_bias: float = 0.02  # standard deviation of the bias over all devices [m/s2]
     attitude_error: float = 0.0  # slowly changing attitude error about each world axis [rad rms]
     attitude_time: float = 10.0  # time constant of the attitude error [s]
-    heading_drift: float = 0.0  # constant drift of the heading, standard deviation over all devices [rad/s]
+    heading_drift: float = 0.0  # standard deviation, over all devices, of the constant heading drift [rad/s]
     temperature: float = 32.0  # constant temperature of all IMUs [degC]
 
 

@@ -18,8 +18,8 @@ _Task = TypeVar("_Task")
 _Result = TypeVar("_Result")
 #: Timeout of the connection to a dask scheduler.
 _CONNECT_TIMEOUT: Final = "10s"
-#: If processes have ended unexpectedly this many times, each further call gets processes of its own. Then only a call
-#: that ends its own process has no result.
+#: After this many unexpected ends of a process, each further call gets processes of its own. A call that crashes its
+#: process then loses only its own result.
 _SHARED_LOSSES: Final = 3
 _REMEDY: Final = "repeat the command, if necessary with fewer --jobs"
 _LOKY_THREAD: Final = "ExecutorManagerThread"

@@ -19,9 +19,9 @@ class Requirements:
     speed_share: float = 0.9  # usable fraction of the speed limits of the joints
     friction: float = 0.5  # largest ratio of horizontal to vertical ground force
     force_min: float = 300.0  # N, smallest vertical ground force
-    sole_share: float = 0.6  # fraction of the sole in which the centre of pressure must be
-    #: Fraction of the rectangle between the force cells in which the centre of pressure must be at the nodes. The
-    #: centre of pressure can be up to 3.2 mm outside this area between two nodes, and in gaits of the network.
+    sole_share: float = 0.6  # the centre of pressure must be inside this fraction of the sole
+    #: At each node, the centre of pressure must be inside this fraction of the rectangle between the force cells.
+    #: Between two nodes, and in gaits of the network, it can be up to 3.2 mm outside this area.
     cell_share: float = 0.7
     yaw_lever: float = 0.03  # m, largest ratio of yaw moment about the sole centre to vertical ground force
     #: Required height of the swing sole at mid-swing [m]. At other times this height is multiplied by sin(pi t / T)^2.

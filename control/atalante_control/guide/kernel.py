@@ -242,9 +242,10 @@ def _acceleration(hip: float, knee: float, m: tuple[float, float, float], row: V
 
 
 def largest_ratio(guide: GuideTables, cycle: int) -> float:
-    """Return the largest of the predicted error / width, torque / limit and speed / limit under the backup policy.
+    """Return the largest predicted ratio under the backup policy.
 
-    The effect of the disturbances is included. The ratios of torque and speed are converted with the slope `STEEPNESS`.
+    The ratios are tracking error to width of the guide, torque to torque limit, and speed to speed limit. The effect of the
+    disturbances is included. The ratios of torque and speed are converted with the slope `STEEPNESS`.
 
     Args:
         guide: tables of the guide filter; `Guard.state` must contain the state of the current cycle.

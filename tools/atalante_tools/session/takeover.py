@@ -32,7 +32,7 @@ DRAW_CYCLES: Final = 50
 PRESENT_FRAMES: Final = 2
 #: A pendant that has stopped sending gives up after this number of consecutive frames of another pendant.
 LOST_FRAMES: Final = 3
-#: A pendant that has stopped sending resumes if no frame of another pendant arrives for this time [cycles].
+#: A silent pendant starts to send again if no frame of another pendant arrives for this time [cycles].
 #: The HAL reports a timeout after 5 cycles without a frame.
 QUIET_CYCLES: Final = 3
 #: E2E check results of a frame with a valid CRC, whether or not its counter is as expected.

@@ -30,7 +30,7 @@ MOMENTS: Final = {
     "shift back": Moment("BACK", STEPS, 0.25),
 }
 QUICK_MOMENTS: Final = ("weight shift", "phase 0.375")
-#: Further moments with both feet on the ground, for the faults that end the frames of the HAL.
+#: Further moments with both feet on the ground, for the faults after which the HAL sends no more frames.
 FURTHER_MOMENTS: Final = {
     "standing": Moment("SHIFT", 0, 0.0),
     "start of the first step": Moment("START", 0, 0.0),
@@ -38,7 +38,7 @@ FURTHER_MOMENTS: Final = {
 }
 #: Names of the moments with both feet on the ground.
 DOUBLE_SUPPORT: Final = frozenset({"weight shift", "shift back", *FURTHER_MOMENTS})
-#: Faults that end the frames of the HAL on a bus or on all buses.
+#: Faults after which the HAL sends no more frames, on a bus or on all buses.
 NO_FRAMES: Final = frozenset({"F15", "F16", "F41"})
 #: Faults of `--quick`.
 QUICK_IDS: Final = ("F05", "F56")

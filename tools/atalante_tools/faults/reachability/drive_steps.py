@@ -43,7 +43,7 @@ class Drive(NamedTuple):
 
     state: DriveState
     latched: bool
-    missed: int  # age of the last valid command [cycles]; higher ages are stored as `WATCHDOG`
+    missed: int  # age of the last valid command [cycles]; ages above `WATCHDOG` are stored as `WATCHDOG`
     unsynced: int  # number of consecutive cycles without SYNC; higher numbers are stored as `WATCHDOG`
     errors: tuple[int, ...]  # codes of the errors whose cause persists
 

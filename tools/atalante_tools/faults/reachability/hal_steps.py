@@ -169,7 +169,7 @@ class HalSteps:
         )
 
     def _process(self, before: Reception, frames: tuple[PendantFrame, ...]) -> tuple[tuple[Reception, Inputs], ...]:
-        """Return the possible results of the HAL, with `own_request` 0.
+        """Return the possible results of the HAL. The field `own_request` of each result is 0.
 
         A state does not contain all counters of the HAL. The other counters are set to each value that gives another
         result, see the tests.
