@@ -135,8 +135,8 @@ def _protocol(_ctx: click.Context, _param: click.Parameter, text: str | None) ->
     "--robot-process/--no-robot-process",
     default=None,
     help="Run the emulated robot in a process of its own, in parallel with the HAL. With idle processor cores, the walk is then "
-    "faster. The result is the same.  [default: on if enough cores are idle: one core, or two cores if a CAN log is written or the rate is above "
-    "100 Hz]",
+    "faster. The result is the same.  [default: on if enough cores are idle: one core, or two cores if a CAN log is written "
+    "or the rate is above 100 Hz]",
 )
 @options_as("recording", RecordingOptions, RECORDING_OPTIONS)
 @target_options(embedded=True)
