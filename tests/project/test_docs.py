@@ -32,6 +32,7 @@ NOT_RUN = {
     r"^atalante airwalk --steps 100": "runs until it is stopped; tests/project/test_examples.py runs it with the subscriber",
     r"faults\.reachability\.report$": "tests/faults/test_reachability.py runs the same searches and the report",
     r"^atalante gait (library|fit|check|verify)": "takes minutes, or needs the result of such a command",
+    r"--network control/": "tests/control/gait_optimization/test_walk_verification.py solves it",
     r"^atalante faults campaign": "takes an hour",
     r"^atalante guide check --patients": "takes hours",
 }

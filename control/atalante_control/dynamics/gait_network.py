@@ -103,6 +103,18 @@ class GaitNetwork:
         made = {"method": "gait network", "version": self.version}
         return Gait(str(subject), subject.step_duration, coefficients, feedforward, subject.parameters(), made)
 
+    def check_patient(self, patient: Patient) -> None:
+        """Raise `NetworkError` if a patient is outside the range for which the network was fitted.
+
+        Args:
+            patient: patient of any step.
+
+        Raises:
+            NetworkError: If a parameter is out of range, as in `check`.
+        """
+        _, _, length, duration, *_ = (self.low + self.high) / 2.0
+        self.check(Subject(patient, float(length), round(float(duration), 3)))
+
     def check(self, subject: Subject) -> None:
         """Raise `NetworkError` if a subject is outside the range for which the network was fitted.
 

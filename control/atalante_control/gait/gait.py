@@ -12,10 +12,10 @@ import math
 import sys
 import zlib
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from math import comb
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal, get_args
 
 import numpy as np
 
@@ -37,7 +37,11 @@ DURATION_RANGE = (0.3, 3.0)  # s, shortest and longest step
 ROUNDING = 1e-9  # rad, rad/s or Nm, tolerance for rounding errors in the limit checks
 
 _REQUIRED = ("format", "name", "duration", "joints")
-_OPTIONAL = ("feedforward", "parameters", "solver")
+_OPTIONAL = ("kind", "feedforward", "parameters", "solver")
+#: Kinds of steps: a periodic step, the start step from rest to walking, and the stop step from walking to rest.
+Kind = Literal["periodic", "start", "stop"]
+KINDS: tuple[Kind, ...] = get_args(Kind)
+_SIZE_MAX = 1_000_000  # byte, largest accepted size of a JSON file; a walk file has about 20,000 bytes
 
 
 class GaitError(ValueError):
@@ -58,7 +62,7 @@ class StepTables:
 
 @dataclass(frozen=True)
 class Gait:
-    """Periodic gait, described by its right-stance step. `mirrored()` returns the left-stance step."""
+    """Gait, described by its right-stance step. `mirrored()` returns the left-stance step."""
 
     name: str
     duration: float  # s, T
@@ -66,6 +70,7 @@ class Gait:
     feedforward: Vector | None = None  # (12, 8) Nm, Bezier control points of the feedforward u_f, without gravity
     parameters: Mapping[str, float] = field(default_factory=dict)  # name -> parameter of patient or step
     solver: Mapping[str, Any] = field(default_factory=dict)  # report of the solver, for information only
+    kind: Kind = "periodic"
 
     @property
     def cycles(self) -> int:
@@ -83,7 +88,7 @@ class Gait:
     def mirrored(self) -> Gait:
         """Return the step of the mirrored robot. Stance leg and swing leg are exchanged."""
         feedforward = None if self.feedforward is None else _mirror(self.feedforward)
-        return Gait(self.name, self.duration, _mirror(self.coefficients), feedforward, self.parameters, self.solver)
+        return replace(self, coefficients=_mirror(self.coefficients), feedforward=feedforward)
 
     def tables(self) -> StepTables:
         """Return the trajectory of the step, with one row for each control cycle."""
@@ -174,11 +179,12 @@ def power_basis(coefficients: Vector) -> Vector:
 
 
 def load_gait(path: Path, robot: Robot) -> Gait:
-    """Read a gait file (JSON) and check it against the limits of the robot.
+    """Read a gait file (JSON) with a periodic step, and check it against the limits of the robot.
 
     Required keys: `format` ("atalante-gait/1"), `name`, `duration` [s], and `joints` with 8 Bezier control points [rad] of the
     right-stance step for each of JOINTS. Optional keys: `feedforward` (torque without gravity) with 8 control points
-    [Nm] for each of JOINTS; `parameters`, an object of numbers; `solver`, any object.
+    [Nm] for each of JOINTS; `kind` ("periodic", "start" or "stop"; without this key the step is periodic); `parameters`, an
+    object of numbers; `solver`, any object.
 
     Args:
         path: path of the gait file.
@@ -186,10 +192,11 @@ def load_gait(path: Path, robot: Robot) -> Gait:
 
     Raises:
         GaitError: If a key is unknown, missing or malformed, if a value is not finite, if an angle jumps by more than
-            0.1 degrees or a speed by more than 0.05 rad/s at the stance change, or if a position, speed or feedforward
-            exceeds a limit of the robot.
+            0.1 degrees or a speed by more than 0.05 rad/s at the stance change, if a position, speed or feedforward
+            exceeds a limit of the robot, or if the step is not periodic.
     """
     gait = gait_from(read_object(path), str(path))
+    check_kind(gait, "periodic", str(path))
     check_gait(gait, robot, str(path))
     return gait
 
@@ -204,11 +211,18 @@ def read_object(path: Path) -> dict[str, Any]:
         GaitError: If the file cannot be read, or if it is not a JSON object with unique keys and finite numbers.
     """
     try:
-        document = json.loads(
-            path.read_text(encoding="utf-8"), parse_constant=_reject_constant, object_pairs_hook=_unique_keys
-        )
+        with path.open("rb") as file:
+            content = file.read(_SIZE_MAX + 1)
     except OSError as error:
         raise GaitError(f"{path} cannot be read: {error.strerror}") from error
+    if len(content) > _SIZE_MAX:
+        raise GaitError(f"{path} is not a gait file: a gait file has at most {_SIZE_MAX} bytes")
+    try:
+        document = json.loads(content.decode("utf-8"), parse_constant=_reject_constant, object_pairs_hook=_unique_keys)
+    except UnicodeDecodeError as error:
+        raise GaitError(f"{path} is not a gait file: a gait file is text in JSON") from error
+    except json.JSONDecodeError as error:
+        raise GaitError(f"{path} is damaged or not a gait file: {error}") from error
     except (ValueError, RecursionError) as error:
         raise GaitError(f"{path}: {error}") from error
     if not isinstance(document, dict):
@@ -235,9 +249,12 @@ def gait_from(document: Mapping[str, Any], where: str) -> Gait:
         raise GaitError(f"{where}: {missing[0]} is missing; required keys are {', '.join(_REQUIRED)}")
     if document["format"] != FORMAT:
         raise GaitError(f"{where}: format must be {FORMAT!r}, got {document['format']!r}")
-    name, parameters, solver = document["name"], document.get("parameters", {}), document.get("solver", {})
+    name, kind = document["name"], document.get("kind", "periodic")
+    parameters, solver = document.get("parameters", {}), document.get("solver", {})
     if not (isinstance(name, str) and name):
         raise GaitError(f"{where}: name must be a non-empty text, got {name!r}")
+    if kind not in KINDS:
+        raise GaitError(f"{where}: kind must be {', '.join(KINDS[:-1])} or {KINDS[-1]}, got {kind!r:.80}")
     if not isinstance(parameters, dict) or not all(_is_number(value) for value in parameters.values()):
         raise GaitError(f"{where}: parameters must be an object of finite numbers, got {parameters!r}")
     if not isinstance(solver, dict):
@@ -249,7 +266,23 @@ def gait_from(document: Mapping[str, Any], where: str) -> Gait:
         _control_points(where, "feedforward", document["feedforward"]) if "feedforward" in document else None,
         {key: float(value) for key, value in parameters.items()},
         solver,
+        kind,
     )
+
+
+def check_kind(gait: Gait, kind: Kind, where: str) -> None:
+    """Raise `GaitError` if a gait is of another kind.
+
+    Args:
+        gait: gait to check.
+        kind: required kind.
+        where: start of the error message, for example the name of the file.
+
+    Raises:
+        GaitError: If the gait is of another kind.
+    """
+    if gait.kind != kind:
+        raise GaitError(f"{where}: kind must be {kind}, got {gait.kind}")
 
 
 def write_gait(gait: Gait, path: Path) -> None:
@@ -268,7 +301,12 @@ def gait_object(gait: Gait) -> dict[str, Any]:
     Args:
         gait: gait to convert.
     """
-    document: dict[str, Any] = {"format": FORMAT, "name": gait.name, "duration": gait.duration}
+    document: dict[str, Any] = {
+        "format": FORMAT,
+        "name": gait.name,
+        "kind": gait.kind,
+        "duration": gait.duration,
+    }
     document["joints"] = dict(zip(JOINTS, gait.coefficients.tolist(), strict=True))
     if gait.feedforward is not None:
         document["feedforward"] = dict(zip(JOINTS, gait.feedforward.tolist(), strict=True))

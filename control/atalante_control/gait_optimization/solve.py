@@ -18,7 +18,7 @@ import casadi
 import numpy as np
 
 from atalante_control.dynamics.stance import stance_dynamics
-from atalante_control.gait.gait import Gait
+from atalante_control.gait.gait import Gait, Kind
 from atalante_control.gait.subject import Subject
 from atalante_control.gait_optimization.compiled import compiled
 from atalante_control.gait_optimization.guess import guess
@@ -27,7 +27,7 @@ from atalante_control.gait_optimization.progress import Progress, Watch
 from atalante_control.gait_optimization.reach import Reach
 from atalante_control.gait_optimization.requirements import Requirements
 from atalante_control.gait_optimization.result import SOLVED, Residual, SolvedGait
-from atalante_control.gait_optimization.step_problem import TRANSITION, Kind, StepProblem
+from atalante_control.gait_optimization.step_problem import TRANSITION, StepProblem
 from atalante_hal.robot import ROBOT_FILE, load_robot
 
 RESIDUAL = 1e-6  # largest accepted violation of each constraint in a solved gait, in the SI unit of this constraint
@@ -125,7 +125,7 @@ def solve(
         "version": code_version(),
     }
     feedforward = stance_dynamics(load_robot(), subject.patient).feedforward(coefficients, duration)
-    gait = Gait(f"{kind}, {subject}", duration, coefficients, feedforward, subject.parameters(), record)
+    gait = Gait(f"{kind}, {subject}", duration, coefficients, feedforward, subject.parameters(), record, kind)
     peak = np.abs(problem.torques(x)).max(axis=0)
     return SolvedGait(gait, status, worst, seconds, iterations, residuals, peak)
 

@@ -14,12 +14,12 @@ the start of the next step.
 from __future__ import annotations
 
 import math
-from typing import Any, Literal
+from typing import Any
 
 import casadi
 import numpy as np
 
-from atalante_control.gait.gait import DEGREE, SIGN, SWAP, Gait, bezier, derivative
+from atalante_control.gait.gait import DEGREE, SIGN, SWAP, Gait, Kind, bezier, derivative
 from atalante_control.gait_optimization.nlp import Indices, NonlinearProgram, Rows
 from atalante_control.gait_optimization.requirements import Requirements
 from atalante_control.gait_optimization.result import Residual
@@ -29,8 +29,6 @@ from atalante_hal.robot import JOINTS, Robot
 from atalante_hal.types import Vector
 
 Symbol = Any  # casadi.SX
-Kind = Literal["periodic", "start", "stop"]
-KINDS: tuple[Kind, ...] = ("periodic", "start", "stop")
 TRANSITION = 1.2  # s, duration of start and stop steps
 
 _N = len(JOINTS)

@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from atalante_control.gait.gait import GaitError
-from atalante_control.gait.walk import DEFAULT_WALK, WalkGaits, check_walk, load_walk, write_walk
+from atalante_control.dynamics.gait_network import DEFAULT_NETWORK
+from atalante_control.gait.gait import Gait, GaitError, gait_object, write_gait
+from atalante_control.gait.walk import DEFAULT_WALK, WalkGaits, check_walk, load_gaits, load_walk, write_walk
 from atalante_hal.robot import load_robot
 
 ROBOT = load_robot()
@@ -53,3 +55,53 @@ def test_step_beyond_a_limit_is_refused() -> None:
     coefficients[3, 3] = 9.0
     with pytest.raises(GaitError, match=r"start: angle of joints\.left_SK must be"):
         check_walk(WALK._replace(start=replace(WALK.start, coefficients=coefficients)), ROBOT)
+
+
+@pytest.mark.parametrize("key", WalkGaits._fields)
+def test_step_of_another_kind_is_refused(key: str) -> None:
+    other = "stop" if key == "start" else "start"
+    moved = replace(getattr(WALK, key), kind=other)
+    with pytest.raises(GaitError, match=rf"walk: {key}: kind must be (start|periodic|stop), got {other}"):
+        check_walk(WALK._replace(**{key: moved}), ROBOT)
+
+
+def test_one_reader_for_gait_files_and_walk_files(tmp_path: Path) -> None:
+    file = tmp_path / "gait.json"
+    write_gait(WALK.step, file)
+    read = load_gaits(file, ROBOT)
+    assert isinstance(read, Gait)
+    assert read.hash32 == WALK.hash32
+    walk = load_gaits(DEFAULT_WALK, ROBOT)
+    assert isinstance(walk, WalkGaits)
+    assert [gait.kind for gait in walk] == ["start", "periodic", "stop"]
+
+
+def _truncated(content: bytes) -> bytes:
+    return content[:1000]
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (_truncated, "is damaged or not a gait file: "),
+        (lambda _: b"", "is damaged or not a gait file: "),
+        (lambda _: DEFAULT_NETWORK.read_bytes(), "is not a gait file: a gait file is text in JSON"),
+        (lambda content: content + b" " * 1_000_000, "is not a gait file: a gait file has at most 1000000 bytes"),
+        (lambda _: b'{"format": "other/1"}', "format must be 'atalante-gait/1' or 'atalante-walk/1', got 'other/1'"),
+        (lambda _: b'{"name": "other"}', "format must be 'atalante-gait/1' or 'atalante-walk/1', got None"),
+        (
+            lambda content: content.replace(b'"periodic"', b'"hop"'),
+            "step: kind must be periodic, start or stop, got 'hop'",
+        ),
+        (lambda _: json.dumps(gait_object(WALK.stop)).encode(), "kind must be periodic, got stop"),
+    ],
+)
+def test_file_that_is_not_a_gait_gives_one_sentence(
+    tmp_path: Path, change: Callable[[bytes], bytes], message: str
+) -> None:
+    file = tmp_path / "walk.json"
+    file.write_bytes(change(DEFAULT_WALK.read_bytes()))
+    with pytest.raises(GaitError) as error:
+        load_gaits(file, ROBOT)
+    assert message in str(error.value)
+    assert "\n" not in str(error.value)

@@ -227,7 +227,7 @@ def change_one_number(path: Path) -> None:
 DAMAGES: dict[str, tuple[Callable[[Path], Any], str]] = {
     "truncated": (truncate, "Expecting|Unterminated"),
     "empty": (lambda path: path.write_bytes(b""), "Expecting value"),
-    "binary": (lambda path: path.write_bytes(b"\xff\xfe\x00"), "decode"),
+    "binary": (lambda path: path.write_bytes(b"\xff\xfe\x00"), "is not a gait file: a gait file is text"),
     "list": (lambda path: path.write_text("[]"), "must be a JSON object"),
     "key missing": (lambda path: change(path, lambda d: d.pop("joints")), "joints is missing"),
     "number changed": (change_one_number, "solver.checksum must be"),

@@ -8,12 +8,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from atalante_control.gait.gait import SIGN, SWAP, Gait, check_gait, load_gait, motion, write_gait
+from atalante_control.gait.gait import SIGN, SWAP, Gait, Kind, check_gait, load_gait, motion, write_gait
 from atalante_control.gait.subject import Subject
 from atalante_control.gait_optimization.requirements import Requirements
 from atalante_control.gait_optimization.result import SOLVED, SolvedGait
 from atalante_control.gait_optimization.solve import RESIDUAL, code_version, solve
-from atalante_control.gait_optimization.step_problem import TRANSITION, Kind
+from atalante_control.gait_optimization.step_problem import TRANSITION
 from atalante_control.model import Patient
 from atalante_hal.robot import JOINTS, load_robot
 

@@ -7,11 +7,12 @@ import math
 import numpy as np
 import pytest
 
+from atalante_control.gait.gait import KINDS
 from atalante_control.gait.subject import Subject
 from atalante_control.gait_optimization.guess import guess
 from atalante_control.gait_optimization.nlp import Functions
 from atalante_control.gait_optimization.requirements import Requirements
-from atalante_control.gait_optimization.step_problem import KINDS, StepProblem
+from atalante_control.gait_optimization.step_problem import StepProblem
 from atalante_control.model import GRAVITY, Patient
 from atalante_hal.robot import JOINTS, load_robot
 

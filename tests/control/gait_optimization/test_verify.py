@@ -9,11 +9,11 @@ import pinocchio
 import pytest
 
 from atalante_control.dynamics.stance import STANCE_FOOT, SWING_FOOT, stance_dynamics
-from atalante_control.gait.gait import Gait, motion
+from atalante_control.gait.gait import KINDS, Gait, Kind, motion
 from atalante_control.gait.subject import Subject
 from atalante_control.gait_optimization.requirements import Requirements
 from atalante_control.gait_optimization.solve import solve
-from atalante_control.gait_optimization.step_problem import KINDS, Kind, StepProblem
+from atalante_control.gait_optimization.step_problem import StepProblem
 from atalante_control.gait_optimization.verify import Verifier
 from atalante_control.model import ExoskeletonParameters, Patient, pinocchio_model, urdf
 from atalante_hal.robot import load_robot

@@ -14,7 +14,9 @@ import pytest
 from click.testing import CliRunner, Result
 from PIL import Image
 
+from atalante_control.dynamics.gait_network import DEFAULT_NETWORK
 from atalante_control.gait.gait import load_gait
+from atalante_control.gait.walk import load_walk
 from atalante_control.gait_optimization import solve
 from atalante_hal.robot import JOINTS, load_robot
 from atalante_tools.cli import cli
@@ -92,6 +94,17 @@ def test_text_output_has_torques_residuals_and_verification() -> None:
     assert "FAIL" not in outcome.stdout
 
 
+@pytest.mark.parametrize("network", [[], ["--network", str(DEFAULT_NETWORK)]], ids=["solver", "network"])
+def test_walk_is_one_file_with_three_verified_steps(tmp_path: Path, network: list[str]) -> None:
+    outcome = run(*PATIENT, "--kind", "walk", *network, "--out", str(tmp_path / "walk.json"), "--json")
+    assert outcome.exit_code == 0, outcome.output
+    kinds = [json.loads(line)["kind"] for line in outcome.stdout.splitlines()]
+    assert kinds == (["start", "stop"] if network else ["periodic", "start", "stop"])
+    walk = load_walk(tmp_path / "walk.json", load_robot())
+    assert [gait.kind for gait in walk] == ["start", "periodic", "stop"]
+    assert walk.step.solver["method"] == ("gait network" if network else "periodic step, IPOPT: Solve_Succeeded")
+
+
 def test_infeasible_gait_gives_one_sentence(monkeypatch: pytest.MonkeyPatch) -> None:
     # Fewer iterations than the default of 150 end the infeasible problem sooner.
     monkeypatch.setitem(solve._OPTIONS, "ipopt.max_iter", 15)
@@ -109,6 +122,8 @@ def test_infeasible_gait_gives_one_sentence(monkeypatch: pytest.MonkeyPatch) -> 
         ([*PATIENT, "--step-length", "3"], "step length must be 0.05 to 0.4 m, got 3 m"),
         ([*PATIENT, "--step-duration", "0.8005"], "whole number of milliseconds"),
         ([*PATIENT, "--kind", "hop"], "periodic"),
+        ([*PATIENT, "--network", str(DEFAULT_NETWORK)], "--network requires --kind walk"),
+        ([*PATIENT, "--kind", "walk", "--plot", "walk.png"], "--plot and --animate show a single step"),
     ],
 )
 def test_invalid_options_are_usage_errors(arguments: list[str], sentence: str) -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 import click
 
@@ -16,9 +16,10 @@ from atalante_tools.console.terminal import Progress, print_message, show_json, 
 from atalante_tools.session.extra import extra
 
 if TYPE_CHECKING:
+    from atalante_control.gait.gait import Gait, Kind
     from atalante_control.gait.subject import Subject
+    from atalante_control.gait.walk import WalkGaits
     from atalante_control.gait_optimization.result import SolvedGait
-    from atalante_control.gait_optimization.step_problem import Kind
     from atalante_control.gait_optimization.verify import GaitCheck
 
 
@@ -26,12 +27,21 @@ if TYPE_CHECKING:
 @subject_options
 @click.option(
     "--kind",
-    type=click.Choice(["periodic", "start", "stop"]),
+    type=click.Choice(["periodic", "start", "stop", "walk"]),
     default="periodic",
     show_default=True,
-    help="Step to solve: a periodic step, the start step from rest to walking, or the stop step from walking to rest.",
+    help="Step to solve: a periodic step, the start step from rest to walking, the stop step from walking to rest, or a "
+    "walk with all three steps.",
 )
-@click.option("--out", type=OutputFile(".json"), metavar="FILE", help="Write the gait to this .json file.")
+@click.option(
+    "--network",
+    type=click.Path(path_type=Path, dir_okay=False),
+    metavar="FILE",
+    help="With --kind walk, take the periodic step from this gait network.  [default: the periodic step is solved]",
+)
+@click.option(
+    "--out", type=OutputFile(".json"), metavar="FILE", help="Write the gait, or the walk, to this .json file."
+)
 @click.option(
     "--plot",
     type=OutputFile(".png", ".svg", ".pdf"),
@@ -43,7 +53,13 @@ if TYPE_CHECKING:
 )
 @json_option
 def solve(
-    subject: Subject | None, kind: Kind, out: Path | None, plot: Path | None, animate: Path | None, as_json: bool
+    subject: Subject | None,
+    kind: Kind | Literal["walk"],
+    network: Path | None,
+    out: Path | None,
+    plot: Path | None,
+    animate: Path | None,
+    as_json: bool,
 ) -> None:
     """Optimise the gait of a patient. If there is no gait, the exit code is 1 and stderr names the violated constraint.
 
@@ -56,13 +72,69 @@ def solve(
     Example: atalante gait solve --mass 75 --height 175
              atalante gait solve --mass 58 --height 1.62 --step-length 0.12 --step-duration 0.9 --out gait.json --plot gait.png
              atalante gait solve --mass 75 --height 175 --kind start --animate start.gif
+             atalante gait solve --mass 75 --height 175 --kind walk --out walk.json
     """
     if subject is None:
         raise click.UsageError("mass and height of the patient must be given: add --mass and --height")
+    if network is not None and kind != "walk":
+        raise click.UsageError("--network requires --kind walk")
+    if kind == "walk" and (plot is not None or animate is not None):
+        raise click.UsageError("--plot and --animate show a single step: use --kind periodic, start or stop")
+    from atalante_control.gait.gait import write_gait
+
+    if kind == "walk":
+        walk = _walk(subject, network, as_json)
+        if out is not None:
+            from atalante_control.gait.walk import write_walk
+
+            write_walk(walk, out)
+            print_message(f"walk in {out}")
+        return
+    solved = _solved(subject, kind, None, as_json)
+    if out is not None:
+        write_gait(solved.gait, out)
+        print_message(f"gait in {out}")
+    if plot is not None or animate is not None:
+        _draw(solved, subject, plot, animate)
+
+
+def _walk(subject: Subject, network: Path | None, as_json: bool) -> WalkGaits:
+    """Return a verified walk: periodic step from the solver or from a network, and start step and stop step from the solver.
+
+    Raises:
+        Failed: If a step has no solution or fails the verification.
+        GaitError: If the steps do not fit together.
+        NetworkError: If the network file is invalid, or if the subject is outside the range of the network.
+    """
+    from atalante_control.dynamics.gait_network import load_network
+    from atalante_control.gait.gait import check_gait
+    from atalante_control.gait.walk import WalkGaits, check_walk
+    from atalante_control.gait_optimization.walk_verification import check_on_ground
+    from atalante_hal.robot import load_robot
+
+    robot = load_robot()
+    if network is None:
+        periodic = _solved(subject, "periodic", None, as_json).gait
+    else:
+        periodic = load_network(network).gait(subject, robot)
+        check_gait(periodic, robot, str(network))
+    start = _solved(subject, "start", periodic, as_json).gait
+    stop = _solved(subject, "stop", periodic, as_json).gait
+    walk = WalkGaits(start, periodic, stop)
+    check_walk(walk, robot)
+    check_on_ground(walk, subject.patient, robot, "walk")
+    return walk
+
+
+def _solved(subject: Subject, kind: Kind, around: Gait | None, as_json: bool) -> SolvedGait:
+    """Return a solved and verified step, and print its tables or its JSON object.
+
+    Raises:
+        Failed: If the step has no solution or fails the verification.
+    """
     with extra():
         from atalante_control.gait_optimization.second_start import solve_with_second_start
         from atalante_control.gait_optimization.solve import solve as optimise
-    from atalante_control.gait.gait import write_gait
     from atalante_control.gait_optimization.verify import Verifier
     from atalante_hal.robot import load_robot
 
@@ -78,29 +150,21 @@ def solve(
         if kind == "periodic":
             solved = solve_with_second_start(subject, partial(optimise, progress=show))
         else:
-            solved = optimise(subject, kind=kind, progress=show)
+            solved = optimise(subject, kind=kind, progress=show, around=around)
     progress.clear()
     if stop.wanted:
         raise SystemExit(stop.exit_code)
     if as_json:
-        show_json(_summary(subject, solved))
+        show_json({**_summary(subject, solved), "kind": kind})
     if not solved.solved:
         raise Failed(solved.status)
     checks = Verifier(load_robot(), subject.patient).verify(solved.gait, kind)
     if not as_json:
-        click.echo(_torques(solved))
-        click.echo()
-        click.echo(_residuals(solved))
-        click.echo()
-        click.echo(_verification(checks))
+        click.echo("\n\n".join([_torques(solved), _residuals(solved), _verification(checks)]))
     print_message(f"{kind} step of {subject}: {solved.iterations} iterations, {solved.solve_s:.2f} s")
     if failed := [check.name for check in checks if not check.holds]:
         raise Failed(f"the gait fails the verification with Pinocchio: {', '.join(failed)}")
-    if out is not None:
-        write_gait(solved.gait, out)
-        print_message(f"gait in {out}")
-    if plot is not None or animate is not None:
-        _draw(solved, subject, plot, animate)
+    return solved
 
 
 def _summary(subject: Subject, solved: SolvedGait) -> dict[str, Any]:
