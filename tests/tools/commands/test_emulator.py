@@ -8,6 +8,9 @@ from contextlib import contextmanager
 import pytest
 from click.testing import CliRunner, Result
 
+from atalante_control.dynamics.gait_network import DEFAULT_NETWORK
+from atalante_control.gait.subject import patient_of
+from atalante_control.gait.walk import DEFAULT_WALK, load_walk
 from atalante_control.model import ExoskeletonParameters, Patient, urdf
 from atalante_dbc import Network
 from atalante_hal.bus import BusDown
@@ -100,6 +103,37 @@ def test_the_legs_are_adjusted_to_the_given_patient(
     exoskeleton = ExoskeletonParameters()
     assert bodies == [urdf(exoskeleton, robot), urdf(exoskeleton.fitted(Patient(75.0, 1.75, None, 0.42)), robot)]
     assert "atalante airwalk -i pcan -c test --mass 75 --height 1.75 --shank 0.42\n" in result.stderr
+
+
+@pytest.mark.parametrize(
+    ("arguments", "other_side"),
+    [
+        (("--gait", str(DEFAULT_WALK)), f"airwalk -i pcan -c test --gait {DEFAULT_WALK}"),
+        (
+            ("--network", str(DEFAULT_NETWORK), "--mass", "75", "--height", "175"),
+            f"airwalk -i pcan -c test --mass 75 --height 1.75 --network {DEFAULT_NETWORK}",
+        ),
+        (
+            ("--ground", "--engine", "mujoco", "--gait", str(DEFAULT_WALK)),
+            f"walk -i pcan -c test --gait {DEFAULT_WALK}",
+        ),
+    ],
+    ids=["gait", "network", "ground"],
+)
+def test_the_legs_are_adjusted_to_the_patient_of_the_gait(
+    arguments: tuple[str, ...], other_side: str, network: Network, robot: Robot, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    bodies: list[str] = []
+    opened = body_module.open_mechanics
+    monkeypatch.setattr(
+        body_module, "open_mechanics", lambda mechanics: (bodies.append(mechanics.urdf), opened(mechanics))[1]
+    )
+    result = OtherProcess(network, robot, 5, monkeypatch).run(*arguments)
+    assert result.exit_code == 130, result.stderr
+    patient = patient_of(load_walk(DEFAULT_WALK, robot).step.parameters)
+    worn = patient if "--ground" in arguments else None
+    assert bodies == [urdf(ExoskeletonParameters().fitted(patient), robot, worn)]
+    assert f"now type in another terminal: atalante {other_side}\n" in result.stderr
 
 
 def test_equal_seeds_give_equal_sensor_noise(network: Network, robot: Robot, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -18,7 +18,7 @@ from atalante_emulator.mechanics import Ground, Mechanics
 from atalante_emulator.pendant import Operator
 from atalante_hal.robot import load_robot
 from atalante_hal.types import PERIOD, State, SupervisorState, Vector
-from atalante_tools.console.options import MUJOCO, Target
+from atalante_tools.console.options import MUJOCO, GaitFiles, Target
 from atalante_tools.session.body import describe
 from atalante_tools.session.law import Law
 from atalante_tools.session.rig import open_hal
@@ -123,8 +123,8 @@ def test_gaits_fit_the_leg_lengths_of_the_patient(tmp_path: Path) -> None:
     assert gaits.hash32 != load_walk(DEFAULT_WALK, ROBOT).hash32
     write_walk(gaits, tmp_path / "walk.json")
     options = WalkOptions(
-        steps=1, xi=1.0, shape="pinched", passive=False, subject=None, gait=tmp_path / "walk.json", seed=0, friction=0.6,
-        push=None, law=Law(),
+        steps=1, xi=1.0, shape="pinched", passive=False, subject=None, files=GaitFiles(tmp_path / "walk.json"), seed=0,
+        friction=0.6, push=None, law=Law(),
     )  # fmt: skip
     patient, read = gaits_of(options, ROBOT)
     assert patient.length("thigh") == 0.44

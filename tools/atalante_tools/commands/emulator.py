@@ -14,8 +14,10 @@ import click
 from atalante_tools.console.options import (
     SEED,
     Between,
+    GaitFiles,
     Target,
     engine_option,
+    gait_options,
     patient_arguments,
     patient_options,
     target_options,
@@ -82,6 +84,7 @@ LISTEN: Final = 0.25
     "With 0, there is no operator.",
 )
 @patient_options
+@gait_options
 def command(
     target: Target,
     seed: int,
@@ -91,6 +94,7 @@ def command(
     wearer: str,
     operator_force: float,
     patient: Patient | None,
+    files: GaitFiles,
 ) -> None:
     """Emulate the robot on a bus: drives, IMUs, feet, vibration motors and the operator's pendant.
 
@@ -98,8 +102,9 @@ def command(
     interface goes down, the emulator waits until the interface is up again. The emulator does not start if another robot
     answers on the bus.
 
-    --mass, --height, --thigh and --shank adjust the leg lengths to a patient. Give the same values to `atalante airwalk`. In
-    the air, the exoskeleton is empty. On the ground, the patient wears the exoskeleton.
+    --mass, --height, --thigh and --shank adjust the leg lengths to a patient. Without them, --gait adjusts them to the patient in
+    the file. --network checks that the network covers the patient. Give the same values and files to `atalante airwalk` or
+    `atalante walk`. In the air, the exoskeleton is empty. On the ground, the patient wears the exoskeleton.
 
     \b
     Example: atalante emulator -i socketcan -c vcan0
@@ -112,19 +117,24 @@ def command(
         raise click.UsageError(
             "--xi requires the emulated operator: remove --no-operator, or use `atalante pendant xi`"
         )
+    files.require_patient(patient)
     import atalante_dbc
     from atalante_control.model import ExoskeletonParameters
     from atalante_emulator.mechanics import Ground, Mechanics
     from atalante_emulator.wearer import LimbParameters
     from atalante_hal.robot import load_robot
     from atalante_tools.session.body import describe, open_mechanics
+    from atalante_tools.session.gait_source import patient_of_files
     from atalante_tools.session.rig import join, open_buses
 
     network, robot, exoskeleton = atalante_dbc.load(), load_robot(), ExoskeletonParameters()
-    other_side = f"atalante airwalk {target.arguments}"
+    other_side = f"atalante {'airwalk' if friction is None else 'walk'} {target.arguments}"
+    if patient is not None:
+        other_side += f" {patient_arguments(patient)}"
+    other_side += files.arguments
+    patient = patient_of_files(files, patient, robot)
     if patient is not None:
         exoskeleton = exoskeleton.fitted(patient)
-        other_side += f" {patient_arguments(patient)}"
     ground = None if friction is None else Ground(friction, operator_force=operator_force)
     mechanics = Mechanics(
         describe(robot, exoskeleton, patient if ground else None),

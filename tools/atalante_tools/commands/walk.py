@@ -10,7 +10,9 @@ import click
 from atalante_tools.console.options import (
     SEED,
     Between,
+    GaitFiles,
     Target,
+    gait_options,
     json_option,
     length,
     options_as,
@@ -89,12 +91,7 @@ def _protocol(_ctx: click.Context, _param: click.Parameter, text: str | None) ->
 @click.option(
     "--step-duration", type=float, default=DEFAULT_STEP[1], show_default=True, metavar="S", help="Step duration [s]."
 )
-@click.option(
-    "--gait",
-    type=click.Path(path_type=Path, dir_okay=False, exists=True),
-    metavar="FILE",
-    help="File with the start step, the periodic step and the stop step of a walk.  [default: steps computed for the patient]",
-)
+@gait_options
 @click.option(
     "--push",
     type=Between(0.0, 1000.0),
@@ -151,7 +148,7 @@ def command(
     patient: Patient | None,
     step_length: float,
     step_duration: float,
-    gait: Path | None,
+    files: GaitFiles,
     push: float | None,
     push_direction: float,
     friction: float,
@@ -169,8 +166,12 @@ def command(
     robot onto its feet. The robot shifts its weight, walks, and stops on both feet. Ctrl-C ends the walk with a stop step. A
     second Ctrl-C ends the command at once. The exit code is 1 if the robot falls.
 
+    Before the walk, Pinocchio verifies the gait: joint limits, torques, ground forces, centre of pressure, friction, clearance of
+    the swing foot, and the landing.
+
     \b
     Example: atalante walk --steps 40 --mass 75 --height 1.75
+             atalante walk --gait walk.json
     """
     emulated = {"--push": push is not None, "--wearer passive": wearer == "passive", "--protocol": protocol is not None}
     emulated["--robot-process"] = bool(robot_process)
@@ -179,14 +180,14 @@ def command(
             raise click.UsageError(f"{option} requires the emulated robot of -i embedded")
     if protocol is not None:
         steps = sum(protocol)
-    subject = _subject(patient, step_length, step_duration, gait)
+    subject = _subject(patient, step_length, step_duration)
     options = WalkOptions(
         steps=steps,
         xi=xi,
         shape=shape,
         passive=wearer == "passive",
         subject=subject,
-        gait=gait,
+        files=files,
         seed=seed,
         friction=friction,
         push=None if push is None else Push(push, push_direction),
@@ -200,9 +201,9 @@ def command(
     walk(target, options, as_json=as_json)
 
 
-def _subject(patient: Patient | None, step_length: float, step_duration: float, gait: Path | None) -> Subject | None:
-    """Return the patient and the step that the user gave. Return None if the walk file determines both."""
-    if patient is None and (gait is not None or (step_length, step_duration) == DEFAULT_STEP):
+def _subject(patient: Patient | None, step_length: float, step_duration: float) -> Subject | None:
+    """Return the patient and the step that the user gave, or None if all of them have their defaults."""
+    if patient is None and (step_length, step_duration) == DEFAULT_STEP:
         return None
     from atalante_control.gait.subject import Subject
     from atalante_control.model import Patient

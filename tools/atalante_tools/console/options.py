@@ -153,6 +153,67 @@ def _segment_option(name: str, ends: str) -> Callable[[Any], Any]:
     )
 
 
+@dataclass(frozen=True)
+class GaitFiles:
+    """Files from which a command takes its gait. At most one of them is given."""
+
+    gait: Path | None = None  # gait file or walk file
+    network: Path | None = None  # file of a gait network; None means the network of the package
+
+    @property
+    def arguments(self) -> str:
+        """Return the options `--gait` and `--network` as text for the command line of another `atalante` command."""
+        return "".join(f" --{name} {path}" for name, path in (("gait", self.gait), ("network", self.network)) if path)
+
+    def require_patient(self, patient: object) -> None:
+        """Raise an error if a network is given without a patient.
+
+        Args:
+            patient: Patient or subject that the user gave, or None.
+
+        Raises:
+            click.UsageError: If the patient is missing.
+        """
+        if self.network is not None and patient is None:
+            raise click.UsageError("--network requires a patient: add --mass and --height")
+
+
+def _gait_files(gait: Path | None, network: Path | None) -> GaitFiles:
+    if gait is not None and network is not None:
+        raise click.UsageError("--gait and --network exclude each other: use only one of them")
+    context = click.get_current_context()
+    for name in ("step_length", "step_duration"):
+        if gait is not None and context.get_parameter_source(name) is click.core.ParameterSource.COMMANDLINE:
+            raise click.UsageError(
+                f"--{name.replace('_', '-')} has no effect with --gait, because the file contains the step: remove it"
+            )
+    return GaitFiles(gait, network)
+
+
+def gait_options(command: _Command) -> _Command:
+    """Add `--gait` and `--network` to a command, which then gets the argument `files`.
+
+    Args:
+        command: Command to decorate.
+    """
+    file = click.Path(path_type=Path, dir_okay=False)
+    options = [
+        click.option(
+            "--gait",
+            type=file,
+            metavar="FILE",
+            help="Gait file or walk file of `atalante gait solve`. Without --mass and --height, it states the patient, too.",
+        ),
+        click.option(
+            "--network",
+            type=file,
+            metavar="FILE",
+            help="Network file of `atalante gait fit`.  [default: the network of the package]",
+        ),
+    ]
+    return options_as("files", _gait_files, options)(command)
+
+
 def patient_options(command: _Command) -> _Command:
     """Add `--mass`, `--height`, `--thigh` and `--shank` to a command, which then gets the argument `patient`.
 

@@ -15,7 +15,16 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 import click
 
-from atalante_tools.console.options import SEED, Between, Target, json_option, options_as, subject_options
+from atalante_tools.console.options import (
+    SEED,
+    Between,
+    GaitFiles,
+    Target,
+    gait_options,
+    json_option,
+    options_as,
+    subject_options,
+)
 from atalante_tools.console.stop_request import stop_requested
 from atalante_tools.console.terminal import print_message, show_json
 from atalante_tools.session.certificates import announce, promise_fields, weakest
@@ -37,7 +46,6 @@ from atalante_tools.session.run_folder import Result, results_table, run_folder,
 from atalante_tools.session.shapes import guide_shapes
 
 if TYPE_CHECKING:
-    from atalante_control.airwalk.config import AirwalkConfig
     from atalante_control.airwalk.controller import AirwalkController
     from atalante_control.gait.gait import Gait
     from atalante_control.gait.subject import Subject
@@ -71,6 +79,7 @@ class Options:
     law: Law  # control law of the assisted joints
     #: patient and step parameters: inputs of the gait network. None means the default gait.
     subject: Subject | None = None
+    files: GaitFiles = field(default_factory=GaitFiles)  # files of the gait
 
 
 @dataclass
@@ -103,7 +112,7 @@ def trial_options(steps: int, out: str) -> Callable[[_Command], _Command]:
         *RECORDING_OPTIONS,
     ]  # fmt: skip
 
-    return options_as("options", Options, [*options, law_options(), json_option, subject_options])
+    return options_as("options", Options, [*options, law_options(), json_option, subject_options, gait_options])
 
 
 def run_trial(target: Target, shapes: Sequence[str], options: Options, *, as_json: bool) -> None:
@@ -123,6 +132,7 @@ def run_trial(target: Target, shapes: Sequence[str], options: Options, *, as_jso
         FaultLatched: If the robot is in FAULT.
         SystemExit: If a signal ended the run.
     """
+    options.files.require_patient(options.subject)
     wanted = guide_shapes(shapes)
     if options.can_log is not None:
         require_format(options.can_log)
@@ -148,7 +158,8 @@ def _summary_options(options: Options) -> dict[str, Any]:
     """Return the options for summary.json, as JSON types and without the output paths."""
     given = {key: value for key, value in asdict(options).items() if key not in ("out", "can_log")}
     telemetry, law = None if options.telemetry is None else str(options.telemetry), given.pop("law")
-    return {**given, **law, "telemetry": telemetry, "version": version("atalante-hal")}
+    files = {name: None if path is None else str(path) for name, path in given.pop("files").items()}
+    return {**given, **law, **files, "telemetry": telemetry, "version": version("atalante-hal")}
 
 
 def _walk_all(
@@ -172,7 +183,7 @@ def _walk_all(
         telemetry_child = stack.enter_context(TelemetryChild())
         robot_process = stack.enter_context(EmbeddedRobot(target.engine)) if parallel else None
         network, robot = atalante_dbc.load(), load_robot()
-        exoskeleton, gait, controllers = _controllers(options.law.config(), options.subject, robot, shapes)
+        exoskeleton, gait, controllers = _controllers(options, robot, shapes)
         if not target.lockstep:
             for controller in controllers.values():
                 controller.prepare()
@@ -251,24 +262,17 @@ class _Walk:
 
 
 def _controllers(
-    config: AirwalkConfig, subject: Subject | None, robot: Robot, shapes: Mapping[str, GuideShape]
+    options: Options, robot: Robot, shapes: Mapping[str, GuideShape]
 ) -> tuple[ExoskeletonParameters, Gait, dict[str, AirwalkController]]:
-    """Return the exoskeleton, the gait, and one controller per guide shape. Leg lengths and gait fit the subject."""
+    """Return the exoskeleton, the gait, and one controller per guide shape. Leg lengths and gait fit the patient."""
     from atalante_control.airwalk.controller import AirwalkController
-    from atalante_control.dynamics.gait_network import load_network
-    from atalante_control.dynamics.suspended import suspended_gait
-    from atalante_control.gait.gait import AIRWALK_GAIT, load_gait
-    from atalante_control.model import ExoskeletonParameters
+    from atalante_tools.session.gait_source import gait_in_the_air
 
-    exoskeleton = ExoskeletonParameters()
-    if subject is None:
-        gait = load_gait(AIRWALK_GAIT, robot)
-    else:
-        exoskeleton = exoskeleton.fitted(subject.patient)
-        gait = suspended_gait(load_network().gait(subject, robot), exoskeleton, robot)
+    config = options.law.config()
+    exoskeleton, gait, source = gait_in_the_air(options.files, options.subject, robot)
     controllers = {name: AirwalkController(robot, gait, shape, config, exoskeleton) for name, shape in shapes.items()}
-    if subject is not None:  # the gait is valid, because the controllers accepted it
-        print_message(f"gait of the network: {subject}; the exoskeleton is empty")
+    if source:  # the gait is valid, because the controllers accepted it
+        print_message(f"{source}; the exoskeleton is empty")
     return exoskeleton, gait, controllers
 
 

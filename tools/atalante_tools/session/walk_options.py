@@ -7,8 +7,8 @@ from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
-from atalante_tools.console.outcome import Failed
-from atalante_tools.console.terminal import print_message
+from atalante_tools.console.options import GaitFiles
+from atalante_tools.session.gait_source import gaits_of_file, with_start_and_stop
 from atalante_tools.session.law import Law
 from atalante_tools.session.recording import RecordingOptions
 
@@ -44,8 +44,8 @@ class WalkOptions:
     shape: str  # name or file of the guide shape
     passive: bool  # whether the limbs of the emulated patient have the impedance of a passive wearer
     subject: Subject | None  # patient and step parameters; None means the values in the walk file
-    #: walk file; None means the gait of the network, or the walk file of the project for the default subject
-    gait: Path | None
+    #: files of the gait; without a file, the gait of the network, or the walk file of the project for the default subject
+    files: GaitFiles
     seed: int  # seed of the sensor noise
     friction: float  # coefficient of friction between soles and floor
     push: Push | None  # push in the middle of the walk; None means no push
@@ -69,25 +69,23 @@ def gaits_of(options: WalkOptions, robot: Robot) -> tuple[Patient, WalkGaits]:
         robot: Limits of the joints.
 
     Raises:
-        GaitError: If the walk file is invalid, or if there is no start step or no stop step for the gait.
-        NetworkError: If the subject is outside the range of the network.
+        GaitError: If the file of the gait is invalid, if a step fails a check on the ground, or if there is no start step or
+            no stop step for the gait.
+        NetworkError: If the network file is invalid, or if the subject is outside the range of the network.
         Failed: If the gait optimisation is needed, but not installed.
     """
-    from atalante_control.gait.subject import patient_of
-    from atalante_control.gait.walk import DEFAULT_WALK, load_walk
+    from atalante_control.gait.subject import Subject
+    from atalante_control.gait_optimization.walk_verification import check_on_ground
+    from atalante_control.model import Patient
 
-    if options.gait is not None or options.subject is None or _is_default(options.subject):
-        gaits = load_walk(options.gait or DEFAULT_WALK, robot)
-        parameters = gaits.step.parameters
-        if options.subject is not None:
-            return options.subject.patient, gaits
-        try:
-            return patient_of(parameters), gaits
-        except KeyError as error:
-            raise Failed(
-                f"the parameters of the step in {options.gait} must contain {error.args[0]}: add --mass and --height"
-            ) from error
-    return options.subject.patient, gaits_of_subject(options.subject, robot)
+    subject, file = options.subject, options.files.gait
+    if file is not None:
+        patient, gaits = gaits_of_file(file, None if subject is None else subject.patient, robot)
+        check_on_ground(gaits, patient, robot, str(file))
+        return patient, gaits
+    if subject is None:
+        subject = Subject(Patient(*DEFAULT_PATIENT), *DEFAULT_STEP)
+    return subject.patient, gaits_of_subject(subject, robot, options.files.network)
 
 
 @cache
@@ -108,31 +106,33 @@ def solved_gaits(subject: Subject) -> WalkGaits:
     return gaits
 
 
-def gaits_of_subject(subject: Subject, robot: Robot) -> WalkGaits:
+def gaits_of_subject(subject: Subject, robot: Robot, network: Path | None = None) -> WalkGaits:
     """Return the gaits of a subject: from the default walk file, or from the network and the gait solver.
 
     Args:
         subject: Patient and step.
         robot: Limits of the joints.
+        network: Network file; None means the network of the package, or the default walk file for the default subject.
 
     Raises:
-        GaitError: If there is no start step or no stop step for the gait.
-        NetworkError: If the subject is outside the range of the network.
+        GaitError: If there is no start step or no stop step for the gait, or if a step fails a check on the ground.
+        NetworkError: If the network file is invalid, or if the subject is outside the range of the network.
         Failed: If the gait optimisation is needed, but not installed.
     """
     from atalante_control.dynamics.gait_network import load_network
+    from atalante_control.gait.gait import check_gait
     from atalante_control.gait.walk import DEFAULT_WALK, check_walk, load_walk
-    from atalante_tools.session.extra import extra
+    from atalante_control.gait_optimization.walk_verification import check_on_ground
 
-    if _is_default(subject):
-        return load_walk(DEFAULT_WALK, robot)
-    step = load_network().gait(subject, robot)
-    print_message(f"solving start step and stop step for {subject}")
-    with extra():
-        from atalante_control.gait_optimization.walk import solve_walk
-
-        gaits = solve_walk(subject, step)
-    check_walk(gaits, robot)
+    if network is None and _is_default(subject):
+        gaits, where = load_walk(DEFAULT_WALK, robot), str(DEFAULT_WALK)
+    else:
+        where = "gait of the network" if network is None else f"gait of the network {network}"
+        step = load_network(network).gait(subject, robot)
+        check_gait(step, robot, where)  # before the solver gets it
+        gaits = with_start_and_stop(subject, step)
+        check_walk(gaits, robot, where)
+    check_on_ground(gaits, subject.patient, robot, where)
     return gaits
 
 

@@ -108,12 +108,13 @@ def write_result(
 ) -> None:
     """Write summary.json, the trace and the figure of a walk, and print the names of the files."""
     subject, law = None if options.subject is None else str(options.subject), asdict(options.law)
-    given = {key: value for key, value in asdict(options).items() if key not in ("out", "recording", "law")}
+    given = {key: value for key, value in asdict(options).items() if key not in ("out", "recording", "law", "files")}
     given = {**given, **law, "subject": subject, "record_rate": options.recording.record_rate}
-    for name, path in (("gait", options.gait), ("telemetry", options.recording.telemetry)):
+    files = {"gait": options.files.gait, "network": options.files.network, "telemetry": options.recording.telemetry}
+    for name, path in files.items():
         given[name] = None if path is None else str(path)
     recorded = None if recording is None else asdict(recording)
     content = {"options": given, "result": asdict(result), "recording": recorded, "version": version("atalante-hal")}
     (out / "summary.json").write_text(json.dumps(content, indent=2) + "\n")
-    files = [] if recording is None else recording.files
-    print_message(f"in {out}: {', '.join([*files, 'summary.json', *trace.write(out)])}")
+    written = [] if recording is None else recording.files
+    print_message(f"in {out}: {', '.join([*written, 'summary.json', *trace.write(out)])}")
