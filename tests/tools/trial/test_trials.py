@@ -13,12 +13,15 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 from click.testing import CliRunner
 
+from atalante_control.dynamics.gait_network import DEFAULT_NETWORK, load_network, save_network
 from atalante_control.model import Patient
 from atalante_emulator.metabolism import MetabolismParameters
 from atalante_tools.cli import cli
+from atalante_tools.console.outcome import Failed
 from atalante_tools.session.walk_options import Push
 from atalante_tools.trial import lockstep, plan, store
 from atalante_tools.trial.plan import (
@@ -34,6 +37,7 @@ from atalante_tools.trial.plan import (
     WalkTrial,
     assist_trials,
     key,
+    network_of,
     protocol_trials,
     push_trials,
     robust_trials,
@@ -106,7 +110,7 @@ def test_key_depends_on_every_parameter_and_on_the_versions(monkeypatch: pytest.
     changes: list[dict[str, Any]] = [
         {"mass": 76.0}, {"height": 1.76}, {"active": False}, {"xi": 0.4}, {"protocol": (1, 1, 3)}, {"shape": "pinched"},
         {"idealization": 0.9}, {"feedforward": 0.9}, {"seed": 1}, {"engine": "pybullet"}, {"order": "day1-01"},
-        {"literal": True}, {"heading_reference": True},
+        {"literal": True}, {"heading_reference": True}, {"network": ("network.npz", "1a")},
     ]  # fmt: skip
     keys = {key(trial), *(key(replace(trial, **change)) for change in changes)}
     assert len(keys) == 1 + len(changes)
@@ -254,6 +258,36 @@ def test_unknown_subject_is_a_usage_error(tmp_path: Path) -> None:
     assert done.exit_code == 2
     assert "58, 62" in done.stderr
     assert not (tmp_path / "x").exists()
+
+
+def test_trial_walks_with_the_gaits_of_the_given_network(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    file = tmp_path / "network.npz"
+    file.write_bytes(DEFAULT_NETWORK.read_bytes())
+    monkeypatch.setattr(plan, "QUICK_PROTOCOL", (1, 1, 1))
+    arguments = ["trial", "protocol", "--quick", "--mass", "75", "--xi", "1", "--jobs", "1", "--network", str(file)]
+    done = CliRunner().invoke(cli, [*arguments, "--out", str(tmp_path / "out"), "--json"])
+    assert done.exit_code == 0, done.output
+    walks = [json.loads(path.read_text()) for path in (tmp_path / "out" / "trials").glob("*.json")]
+    assert [walk["outcome"] for walk in walks] == ["stood"] * 2
+    assert {walk["trial"]["network"][0] for walk in walks} == {str(file)}
+    setting = replace(SETTING, network=network_of(file))
+    file.write_bytes(b"another network")
+    with pytest.raises(Failed, match=r"network\.npz must be unchanged until the end of the trials"):
+        run_trial(setting.walk(SUBJECT, False, 1.0, 0))
+
+
+def test_network_that_does_not_cover_a_subject_starts_no_trial(tmp_path: Path) -> None:
+    network, file = load_network(), tmp_path / "network.npz"
+    save_network(replace(network, low=np.maximum(network.low, [61.0, 0.0, 0.0, 0.0, 0.0, 0.0])), file)
+    for arguments, message in (
+        ([str(file)], "mass for the gait network must be 61 to 91 kg, got 58 kg"),
+        ([str(tmp_path / "none.npz")], "none.npz cannot be read: No such file or directory"),
+        ([__file__], "is not a valid gait network"),
+    ):
+        done = CliRunner().invoke(cli, ["trial", "protocol", "--out", str(tmp_path / "x"), "--network", *arguments])
+        assert done.exit_code == 1, done.output
+        assert message in done.stderr
+        assert not (tmp_path / "x").exists()
 
 
 def test_protocol_has_a_trial_per_subject_condition_and_factor() -> None:

@@ -50,6 +50,14 @@ dask_option = click.option(
     help="Run on the workers of this dask scheduler, such as tcp://127.0.0.1:8786.",
 )
 
+#: Option `--network`: file of the gait network that computes the gaits.
+network_option = click.option(
+    "--network",
+    type=click.Path(path_type=Path, dir_okay=False),
+    metavar="FILE",
+    help="Network file of `atalante gait fit`.  [default: the network of the package]",
+)
+
 #: Option type for a seed of random numbers.
 SEED: Final = click.IntRange(min=0)
 
@@ -204,12 +212,7 @@ def gait_options(command: _Command) -> _Command:
             metavar="FILE",
             help="Gait file or walk file of `atalante gait solve`. Without --mass and --height, it states the patient, too.",
         ),
-        click.option(
-            "--network",
-            type=file,
-            metavar="FILE",
-            help="Network file of `atalante gait fit`.  [default: the network of the package]",
-        ),
+        network_option,
     ]
     return options_as("files", _gait_files, options)(command)
 

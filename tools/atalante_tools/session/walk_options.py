@@ -89,11 +89,12 @@ def gaits_of(options: WalkOptions, robot: Robot) -> tuple[Patient, WalkGaits]:
 
 
 @cache
-def solved_gaits(subject: Subject) -> WalkGaits:
+def solved_gaits(subject: Subject, network: Path | None = None) -> WalkGaits:
     """Return the gaits of a subject with the default limits of the joints. The gaits are solved once per process.
 
     Args:
         subject: Patient and step.
+        network: Network file; None means the network of the package.
 
     Raises:
         Stopped: If a signal arrived during the optimisation.
@@ -101,7 +102,7 @@ def solved_gaits(subject: Subject) -> WalkGaits:
     from atalante_hal.robot import load_robot
     from atalante_tools.console.stop_request import check_stop
 
-    gaits = gaits_of_subject(subject, load_robot())
+    gaits = gaits_of_subject(subject, load_robot(), network)
     check_stop()  # the optimiser discards the exception of a stop signal
     return gaits
 

@@ -20,6 +20,7 @@ from atalante_tools.console.options import (
     dask_option,
     jobs_option,
     json_option,
+    network_option,
     options_as,
 )
 from atalante_tools.console.outcome import Failed
@@ -52,6 +53,7 @@ class Walking:
     shape: str  # guide shape
     idealization: float
     feedforward: float
+    network: Path | None  # network file of the gaits; None means the network of the package
 
 
 def _running(experiment: str) -> Callable[[_Command], _Command]:
@@ -82,6 +84,7 @@ def _walking() -> Callable[[_Command], _Command]:
         click.option("--feedforward", type=Between(0.0, 1.0), default=1.0, show_default=True, metavar="X",
                      help="Intensity of the feedforward. At a lower intensity, the subject must produce more of the torque that "
                           "accelerates the leg."),
+        network_option,
     ]  # fmt: skip
     return options_as("walking", Walking, options)
 
@@ -309,7 +312,30 @@ def _known(masses: tuple[float, ...]) -> tuple[float, ...]:
 def _setting(walking: Walking, running: Running, protocol: tuple[int, int, int]) -> WalkSetting:
     from atalante_tools.trial.plan import WalkSetting
 
-    return WalkSetting(protocol, walking.shape, walking.idealization, walking.feedforward, running.seed, running.engine)
+    setting = WalkSetting(
+        protocol, walking.shape, walking.idealization, walking.feedforward, running.seed, running.engine
+    )
+    if walking.network is None:
+        return setting
+    from atalante_tools.trial.plan import network_of
+
+    return replace(setting, network=network_of(walking.network))
+
+
+def _require_network(trials: Sequence[Trial]) -> None:
+    """Check that the network file of the trials covers every subject.
+
+    Raises:
+        NetworkError: If the file is invalid, or if a subject is outside the range of the network.
+    """
+    from atalante_control.dynamics.gait_network import load_network
+    from atalante_control.gait.subject import Subject
+    from atalante_control.model import Patient
+    from atalante_tools.trial.plan import STEP, WalkTrial
+
+    for trial in trials:
+        if isinstance(trial, WalkTrial) and trial.network:
+            load_network(Path(trial.network[0])).check(Subject(Patient(trial.mass, trial.height), *STEP))
 
 
 def _conduct(
@@ -324,6 +350,7 @@ def _conduct(
     Raises:
         Failed: If the robot fell or stopped in a trial.
     """
+    _require_network(trials)
     from atalante_tools.session.run_folder import run_folder
     from atalante_tools.trial.report import summary, verdict, write_report
     from atalante_tools.trial.store import stored

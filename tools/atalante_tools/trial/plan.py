@@ -19,6 +19,7 @@ from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, Final
 
+from atalante_tools.console.outcome import Failed
 from atalante_tools.trial.fault_plan import FaultTrial
 
 if TYPE_CHECKING:
@@ -100,6 +101,8 @@ class WalkTrial:
     order: str = ""  # day and position of a trial of the sweep
     literal: bool = False  # whether the control law follows the paper literally
     heading_reference: bool = False  # whether the IMUs have a heading reference, which the controller follows
+    #: path and SHA-256 of the network file of the gaits; empty for the network of the package
+    network: tuple[str, ...] = ()
 
     @property
     def name(self) -> str:
@@ -186,6 +189,7 @@ class WalkSetting:
     engine: str
     literal: bool = False
     heading_reference: bool = False
+    network: tuple[str, ...] = ()
 
     def walk(self, patient: Patient, active: bool, xi: float, index: int, order: str = "") -> WalkTrial:
         """Return the trial of a subject.
@@ -199,8 +203,24 @@ class WalkSetting:
         """
         return WalkTrial(
             patient.mass, patient.height, active, xi, self.protocol, self.shape, self.idealization, self.feedforward,
-            1000 * self.seed + index, self.engine, order, self.literal, self.heading_reference,
+            1000 * self.seed + index, self.engine, order, self.literal, self.heading_reference, self.network,
         )  # fmt: skip
+
+
+def network_of(path: Path) -> tuple[str, str]:
+    """Return path and SHA-256 of a network file, so that another content is another trial.
+
+    Args:
+        path: path of the file.
+
+    Raises:
+        Failed: If the file cannot be read.
+    """
+    try:
+        content = path.read_bytes()
+    except OSError as error:
+        raise Failed(f"{path} cannot be read: {error.strerror}") from error
+    return str(path.resolve()), hashlib.sha256(content).hexdigest()
 
 
 def shape_trials(names: Sequence[str], steps: int, xi: float, seed: int, engine: str) -> list[Trial]:
