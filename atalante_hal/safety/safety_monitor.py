@@ -489,8 +489,8 @@ class SafetyMonitor:
     def _update_lowered(self) -> None:
         """Update the set `lowered`: in LOWER and FAULT, add each drive with a confirmed diagnostic whose reaction is LOWER.
 
-        In all other states, `lowered` contains the drives of the joints that failed in the last test of the directions, and of
-        those that oscillated since the last START.
+        In all other states, `lowered` contains the drives of two kinds of joints: joints that failed in the last test of the
+        directions, and joints that oscillated since the last START.
         """
         if self._state.supervisor in (_S.LOWER, _S.FAULT):
             lower = frozenset(dtc for dtc in self.memory.confirmed if dtc.reaction is Reaction.LOWER)

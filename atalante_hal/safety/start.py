@@ -26,8 +26,7 @@ ENABLE_CYCLES = 200
 STALLED_CYCLES = 10
 #: Prefix of the event text for a refused START.
 REFUSED = "START refused: "
-#: Last words of the reason for FINISH_STEP and of the reason for the next HOLD if the operator ends a walk on the
-#: ground.
+#: If the operator ends a walk on the ground, the reason for FINISH_STEP and the reason for the next HOLD end with this text.
 WALK_ENDS = ", so the walk ends on both feet"
 _S = SupervisorState
 #: States in which START only acknowledges faults. An acknowledged fault may stay active for some cycles.

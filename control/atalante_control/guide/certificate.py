@@ -209,7 +209,8 @@ class _Horizon:
         beyond = prediction.beyond * SIZES
         self._factor = (beyond * rows[-1]).sum(axis=1) / (rows[-1] ** 2).sum(axis=1)
         remainder = beyond - self._factor[:, None] * rows[-1]
-        #: two predicted cycles (counted from the start), and the weights of the two errors in the remainder
+        #: two predicted cycles, counted from the start of the prediction, and the weights of the errors of these cycles in
+        #: the remainder
         self._pairs: list[tuple[tuple[int, int], Vector]] = []
         for near, far in ((0.1, 0.3), (0.25, 0.5), (0.4, 0.7)):
             lags = round(near * self.cycles), round(far * self.cycles)

@@ -17,7 +17,7 @@ from atalante_hal.types import Vector
 
 Pair = tuple[float, float]
 
-#: The kernel converts a ratio x = torque / limit or x = speed / limit to 1 - STEEPNESS * (1 - x), which is 1 at x = 1.
+#: The kernel converts the ratio x of a torque or speed to its limit into 1 - STEEPNESS * (1 - x), which is 1 at x = 1.
 #: The gait alone needs most of the allowed torque and speed, so the gate must rise only close to the limits of torque and speed.
 STEEPNESS = 4.0
 #: Number of elements of the compressed state, from which the predicted errors are computed.
@@ -77,15 +77,14 @@ class Block:
     middle: Annotated[Vector, (COMPRESSED, 2)]  # mean of the largest and the smallest `Lag.ahead` in the block
     #: half the difference of the largest and the smallest `Lag.ahead` in the block
     spread: Annotated[Vector, (COMPRESSED, 2)]
-    ratio: float  # upper bound of predicted error / guide width in the block, computed in the last control cycle
+    ratio: float  # upper bound of the ratio of predicted error to guide width in the block, for the last control cycle
 
 
 class Few:
     """Prediction of torque and speed a fixed number of cycles ahead, see `prediction.FEW`."""
 
     lag: int  # number of cycles ahead
-    #: matrix from the state to four predictions: backup acceleration [rad/s2] of hip and knee, e' [rad/s] of hip and
-    #: knee
+    #: matrix from the state to four predictions: backup acceleration [rad/s2] of hip and knee, then e' [rad/s] of hip and knee
     ahead: Annotated[Vector, (STATES, 4)]
     #: matrix from `Guard.magnitude` to the largest change of the predicted e' of hip and knee that model errors can cause [rad/s]
     slack: Annotated[Vector, (STATES, 2)]
@@ -265,7 +264,7 @@ def largest_ratio(guide: GuideTables, cycle: int) -> float:
 
 
 def _error_ratio(guide: GuideTables, cycle: int) -> float:
-    """Return the largest predicted error / width.
+    """Return the largest ratio of predicted error to guide width.
 
     Most cycles ahead need not be predicted. `bound_blocks` computes an upper bound of the ratio for each block. The
     block with the largest bound is predicted first. A block whose bound is at most the largest ratio found so far
@@ -307,7 +306,7 @@ def _compressed(guard: Guard) -> tuple[float, float, float, float, float]:
 
 
 def bound_blocks(guide: GuideTables, cycle: int, blocks: int) -> int:
-    """Compute `Block.ratio`, the bound of error / width, for each block. Return the index of the largest ratio.
+    """Compute `Block.ratio`, the bound of the ratio of error to width, for each block. Return the index of the largest ratio.
 
     In a block, a predicted error differs from `Block.middle` times the compressed state y by at most `Block.spread` times abs(y).
     The disturbances add at most `GuideTables.highest`, and no width is below the width in the columns `NEAR`.
@@ -341,7 +340,7 @@ def bound_blocks(guide: GuideTables, cycle: int, blocks: int) -> int:
 
 
 def _few_ratio(guide: GuideTables, cycle: int, least: float) -> float:
-    """Return the largest predicted torque / limit or speed / limit x, converted to 1 - STEEPNESS * (1 - x).
+    """Return the largest ratio x of predicted torque or speed to its limit, converted to 1 - STEEPNESS * (1 - x).
 
     Args:
         guide: tables of the guide filter.

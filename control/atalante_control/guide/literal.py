@@ -38,11 +38,11 @@ _ASSISTED = [LEG_JOINTS.index("SH"), LEG_JOINTS.index("SK")]
 class Letter:
     """Constants and state of the control law that follows the paper literally. Each array has values for hip and knee."""
 
-    kp: Annotated[Vector, 2]  # Nm/rad
-    kd: Annotated[Vector, 2]  # Nm s/rad
-    inertia: Annotated[Vector, 2]  # kg m2, J
-    coulomb: Annotated[Vector, 2]  # Nm, k_d
-    viscous: Annotated[Vector, 2]  # Nm s/rad, k_v
+    kp: Annotated[Vector, 2]  # Nm/rad, proportional gain of the backup torque u_b
+    kd: Annotated[Vector, 2]  # Nm s/rad, derivative gain of the backup torque u_b
+    inertia: Annotated[Vector, 2]  # kg m2, inertia J of the joint
+    coulomb: Annotated[Vector, 2]  # Nm, Coulomb friction k_d
+    viscous: Annotated[Vector, 2]  # Nm s/rad, viscous friction k_v
     push: Annotated[Vector, 2]  # Nm, largest absolute value of the external torque u_ext
     zeta: float  # s, gain of lambda_d; lambda_d increases the gate (factor of u_b) while h decreases
     idealization: float  # intensity of the joint idealization u_i

@@ -59,8 +59,8 @@ class StartReach(NamedTuple):
     certified torques on SH and SK.
     """
 
-    error: Vector  # (n, 4) rad
-    torque: Vector  # (n, 4) Nm
+    error: Vector  # (n, 4) rad, tracking error
+    torque: Vector  # (n, 4) Nm, backup torque
     speed: Vector  # (n, 4) rad/s
     worst_speed: Vector  # (n, 4) rad/s, speed with the worst errors of inertia and delay
     change: Vector  # (n, 4) Nm, change of the backup torque within one cycle

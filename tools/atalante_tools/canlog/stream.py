@@ -24,7 +24,7 @@ class Stream:
     """Frames of a chunk: n frames of m messages, sorted by message. Frames of the same message keep the order of the log."""
 
     rows: Rows  # for each frame, the index of its message in the plan, shape (n,)
-    stamps: npt.NDArray[np.int64]  # ns
+    stamps: npt.NDArray[np.int64]  # time stamp of each frame [ns], shape (n,)
     indices: npt.NDArray[np.intp]  # index of each frame in the chunk, shape (n,)
     frames: Frames
     present: npt.NDArray[np.intp]  # indices of the messages that have frames, ascending, shape (m,)

@@ -17,7 +17,7 @@ GRAVITY: Final = 9.81  # m/s2
 _MEASURED: Final = 100
 NORM: Final = 1e-3  # largest deviation of a quaternion from unit length
 SPECIFIC_FORCE: Final = 0.3  # largest deviation of the mean acceleration from gravity [m/s2]
-TILT: Final = math.radians(3.0)  # largest angle between mean acceleration and the vertical by the quaternion [rad]
+TILT: Final = math.radians(3.0)  # largest angle between the mean acceleration and the vertical of the quaternion [rad]
 RATE: Final = 0.05  # largest deviation of the mean gyro rate from the rate of change of the attitude [rad/s]
 UNLOADED: Final = 10.0  # largest mean force on an axis of an unloaded force cell [N]
 

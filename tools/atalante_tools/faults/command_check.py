@@ -52,12 +52,12 @@ class SentFrames:
         """
 
     def frames(self) -> tuple[npt.NDArray[np.int64], Frames]:
-        """Return the HAL cycles of the sent frames, shape (n,), and the sent frames, shape (n,)."""
+        """Return the HAL cycle of each sent frame, and the sent frames. Both arrays have the shape (n,)."""
         return np.repeat(self._cycles, self._sizes).astype(np.int64), np.frombuffer(bytes(self._memory), FRAME)
 
 
 class _Leg:
-    """Command frames of one leg: HAL cycles, shape (n,), and one array of shape (n, 6) per signal of the six joints."""
+    """Decoded command frames of one leg: HAL cycle of each frame (shape (n,)), and values of each signal (shape (n, 6))."""
 
     def __init__(self, message: Message, cycles: npt.NDArray[np.int64], frames: Frames) -> None:
         selected = (frames["can_id"] == message.frame_id) & (frames["len"] == message.length)
@@ -113,7 +113,7 @@ class Commands:
             joint: index into JOINTS.
 
         Returns:
-            Cycles, shape (n,), and torques, shape (n,) [Nm].
+            Cycles and torques [Nm], each of shape (n,).
         """
         leg = self._legs[joint // len(LEG_JOINTS)]
         return leg.cycle, leg.torque[:, joint % len(LEG_JOINTS)]
@@ -125,13 +125,13 @@ class Commands:
             joint: index into JOINTS.
 
         Returns:
-            Cycles, shape (n,), and torque limits, shape (n,) [Nm].
+            Cycles and torque limits [Nm], each of shape (n,).
         """
         leg = self._legs[joint // len(LEG_JOINTS)]
         return leg.cycle, leg.limit[:, joint % len(LEG_JOINTS)]
 
     def largest_step(self, joint: int) -> float:
-        """Return the largest change of the target torque of a joint between two consecutive cycles that enable its drive [Nm].
+        """Return the largest change [Nm] of a joint's target torque between two consecutive cycles that both enable its drive.
 
         Args:
             joint: index into JOINTS.

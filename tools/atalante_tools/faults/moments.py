@@ -65,7 +65,7 @@ class Schedule:
     """Times of a run, in HAL cycles."""
 
     begins: int  # first faulty cycle
-    starts: tuple[int, ...]  # cycles before the end of the fault in which the operator presses START
+    starts: tuple[int, ...]  # cycles in which the operator presses START, all before the end of the fault
     stop: int | None = None  # cycle in which the operator presses STOP
 
 
@@ -209,7 +209,7 @@ def _extremes(run: Observation, starts: Sequence[int]) -> Extremes:
 
     Args:
         run: observation of the run.
-        starts: cycles before the end of the fault in which the operator pressed START.
+        starts: cycles in which the operator pressed START, all before the end of the fault.
     """
     count = len(JOINTS)
     sag, lost, held = np.zeros(count), np.zeros(count), None

@@ -25,7 +25,8 @@ class Line:
     id: str
     passed: bool
     state: str
-    cycles: int | None  # reaction time of the worst case: a failed case, otherwise the case closest to its time limit
+    #: reaction time of the worst case [cycles]: of a failed case; if no case failed, of the case closest to its time limit
+    cycles: int | None
     bound: int
     dtc: str
     cases: int

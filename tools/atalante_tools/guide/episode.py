@@ -52,8 +52,8 @@ RATE = 0.5
 class Push(NamedTuple):
     """Push during one step. Each joint always gets its largest push, with the sign of `signs + feedback @ features`."""
 
-    signs: Vector  # (cycles + 1, 2)
-    feedback: Vector  # (2, FEATURES)
+    signs: Vector  # constant part of the sum for hip and knee in each cycle, shape (cycles + 1, 2)
+    feedback: Vector  # weights of the features for hip and knee, shape (2, FEATURES)
 
 
 class Start(NamedTuple):

@@ -13,7 +13,7 @@ if TYPE_CHECKING:
 
 
 def weakest(certificates: Iterable[Certificate]) -> Certificate:
-    """Return a certificate without certified torques. If all have certified torques, return the one with the smallest hip torque.
+    """Return a certificate without certified torques; if there is none, return the certificate with the smallest hip torque.
 
     Args:
         certificates: Certificates of one guide shape, one for each assistance factor. At least one is needed.

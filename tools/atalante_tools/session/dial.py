@@ -17,7 +17,7 @@ class Dial:
 
         Args:
             operator: Operator of the emulated pendant, or access to the robot of this operator.
-            protocol: Numbers of steps with full assistance, in the transition, and with `xi`.
+            protocol: Numbers of steps: with full assistance, in the transition, with `xi`.
             xi: Assistance factor at the end.
         """
         self._operator, self._set = operator, 1.0

@@ -25,7 +25,7 @@ NO_FALL: Final = {
     "F56": "STOP|dead-man|pendant",
     **dict.fromkeys(("F63", "F64", "F65"), ""),
 }
-#: IDs of the faults that end the frames of the HAL. The robot must not fall if such a fault begins in double support.
+#: IDs of the faults after which the HAL sends no more frames. The robot must not fall if such a fault begins in double support.
 NO_FALL_IN_DOUBLE_SUPPORT: Final = NO_FRAMES
 
 
@@ -59,9 +59,9 @@ def _finding(id_: str, fault: str, results: Sequence[Result]) -> Finding:
 def _claim(id_: str) -> str:
     if id_ in NO_FALL:
         cases = NO_FALL[id_].replace("|", ", ")
-        return f"no fall (cases {cases}), and a diagnostic with each other fall" if cases else "no fall"
+        return f"no fall (cases {cases}), and a diagnostic with every other fall" if cases else "no fall"
     if id_ in NO_FALL_IN_DOUBLE_SUPPORT:
-        return "no fall in double support, and a diagnostic before each other fall"
+        return "no fall in double support, and a diagnostic before every other fall"
     return "a diagnostic with each fall"
 
 
@@ -88,7 +88,7 @@ def _moments(falls: Sequence[dict[str, Any]]) -> str:
 
 
 def _longest(result: Result) -> str:
-    """Return as text the longest duration of the fault that makes the robot fall at no moment, and the worst moment."""
+    """Return as text the longest fault duration without a fall at any moment, and the worst moment."""
     limited = [
         (cycles, run["moment"])
         for cycles, run in zip(result["longest"], result["runs"], strict=True)

@@ -52,8 +52,8 @@ _LEAD: Final = 5
 _FALLEN: Final = 300
 #: Cycles after which a walk ends at the latest. A walk without a fault lasts about 10000 cycles.
 _LONGEST: Final = 20_000
-#: The robot is at rest if its pelvis and its joints have been slower than these speeds [m/s, rad/s] for this time [cycles], and
-#: each foot carries a load of at least this force [N].
+#: The robot is at rest if its pelvis and its joints have been slower than `_STILL` [m/s, rad/s] for `_RESTED` cycles, and
+#: each foot carries a load of at least `_LOADED` [N].
 _STILL, _RESTED, _LOADED = 0.01, 500, 50.0
 #: The robot is considered to walk on if it still walks this time [cycles] after the second landing (`_LANDINGS`) that
 #: follows the fault.
@@ -62,7 +62,7 @@ _LANDINGS: Final = 2
 #: Phases of the walk that begin with the landing of a foot.
 _LANDED: Final = frozenset({Phase.STEP, Phase.STOP, Phase.BACK})
 _PELVIS: Final = IMUS.index("pelvis")
-#: Largest accepted error [cycles] of the measured fault duration that the robot survives without a fall.
+#: Largest accepted error of the measured longest fault duration without a fall [cycles].
 RESOLUTION: Final = 10
 
 
@@ -86,7 +86,7 @@ class _Request(NamedTuple):
 
     stimuli: tuple[Stimulus, ...]  # faults and actions of the operator
     begins: int  # HAL cycle in which the case begins
-    ends: int | None  # first cycle after all faults and actions, counted from `begins`; None if one is permanent
+    ends: int | None  # first cycle after all faults and actions, counted from `begins`; None if a fault is permanent
 
 
 class _Answer(NamedTuple):

@@ -26,8 +26,8 @@ _PHASES: Final = np.linspace(0.1, 0.8, 29)
 SAME: Final = 0.02
 STANDING: Final = 1.44  # metabolic rate of quiet standing [W/kg]
 #: A quantity has a falling trend if its rank correlation with the assistance factor is between -1 and -`TREND`.
-#: `ASYMMETRY` is the largest mean difference between the k-th trial and the k-th last trial of a day, relative to the
-#: range of the values.
+#: `ASYMMETRY` is the largest mean difference between the k-th trial of a day and the k-th trial counted from the end of the
+#: day, relative to the range of the values.
 TREND, ASYMMETRY = 0.8, 0.25
 #: Largest coefficient of variation of the baseline metabolic rates of a sweep.
 VARIATION: Final = 0.05
@@ -359,7 +359,7 @@ def _trend(id_: str, claim: str, walks: Sequence[Result], value: Callable[[Resul
 
 
 def _symmetry(id_: str, claim: str, walks: Sequence[Result], value: Callable[[Result], float]) -> Finding:
-    """Return the finding that the k-th trial and the k-th last trial of a day have nearly the same value."""
+    """Return the finding that the values of a day are nearly the same in the reverse order of the trials."""
     days: dict[str, list[Result]] = {}
     for walk in walks:
         days.setdefault(walk["trial"]["order"].split("-")[0], []).append(walk)

@@ -42,7 +42,7 @@ TREADMILL_TIME: Final = 300
 SWEEP_SUBJECT: Final = (75.0, 1.75)
 #: Masses of the subjects of `assist --quick` [kg].
 QUICK_MASSES: Final = (58.0, 75.0)
-#: Ranges of the random parameters of `robustness`: true mass / known mass, friction.
+#: Ranges of the random parameters of `robustness`: true mass divided by known mass, and coefficient of friction.
 MASS_SHARE: Final = (0.9, 1.1)
 FRICTION: Final = (0.25, 0.8)
 #: Parts of the control loop of `robustness` that can be a cycle late: state messages, command messages, motors.
@@ -92,13 +92,13 @@ class WalkTrial:
     height: float  # height of the subject [m]
     active: bool  # whether the muscles of the subject track the gait
     xi: float  # assistance factor after the transition
-    protocol: tuple[int, int, int]  # steps with full assistance, in the transition, and with `xi`
+    protocol: tuple[int, int, int]  # numbers of steps: with full assistance, in the transition, with `xi`
     shape: str  # guide shape
     idealization: float
     feedforward: float
     seed: int
     engine: str
-    order: str = ""  # day and position of a trial of the sweep
+    order: str = ""  # day of the sweep, and position of the trial in this day; empty outside the sweep
     literal: bool = False  # whether the control law follows the paper literally
     heading_reference: bool = False  # whether the IMUs have a heading reference, which the controller follows
     #: path and SHA-256 of the network file of the gaits; empty for the network of the package
@@ -119,7 +119,7 @@ class RobustTrial:
     number: int
     mass: float  # mass of the patient in the model of the controller [kg]
     height: float  # height of the patient [m]
-    mass_share: float  # true mass of the patient / known mass
+    mass_share: float  # true mass of the patient divided by `mass`
     friction: float  # coefficient of friction between soles and floor
     delay: tuple[int, int, int]  # cycles by which state messages, command messages and motor torques are late
     loss: float  # probability that a frame is lost, on all buses

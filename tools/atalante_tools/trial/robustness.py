@@ -160,7 +160,8 @@ class SafeEnding:
         outcome: "stood", "fell", "hold" or "fault".
         observation: attitude of the robot.
         state: state of the HAL in the last cycle.
-        safe: whether the robot stood at the end, or the HAL stopped the controller and no drive follows a command.
+        safe: whether the walk ended safely. Either the robot stood at the end, or the HAL stopped the controller and no drive
+            follows a command.
     """
 
     def __init__(self, rig: Rig, controller: WalkController) -> None:

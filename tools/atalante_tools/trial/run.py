@@ -319,11 +319,11 @@ class Effort:
 
 
 def _respiration(rate: Vector, segments: Sequence[int], mass: float, seed: int) -> dict[str, Any]:
-    """Return the measurements of the respirometer, for a subject who stood before the first sample.
+    """Return the measurements of the respirometer. The subject stood still before the first sample.
 
     Args:
         rate: metabolic rate in each second, shape (n,) [W].
-        segments: number of the segment of each second, shape (n,).
+        segments: index of the segment to which each second belongs, shape (n,).
         mass: mass of the subject [kg].
         seed: seed of the trial.
     """

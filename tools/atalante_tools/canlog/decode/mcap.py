@@ -21,7 +21,7 @@ from atalante_tools.canlog.decode.signals import DecodedFrames
 from atalante_tools.canlog.plan import Plan
 
 _PACKAGE = "atalante.can"
-_FIXED64 = 1  # wire type
+_FIXED64 = 1  # protobuf wire type of a value of eight bytes
 _TYPES: dict[str, tuple[Any, str]] = {
     "f": (FieldDescriptorProto.TYPE_DOUBLE, "<f8"),
     "i": (FieldDescriptorProto.TYPE_SFIXED64, "<i8"),

@@ -23,8 +23,8 @@ class DecodedFrames:
 
     row: int  # index of the message in the plan
     codec: ColumnCodec
-    raw: Words  # shape (fields, n)
-    stamps: npt.NDArray[np.int64]  # ns
+    raw: Words  # raw code of each field in each frame, shape (fields, n)
+    stamps: npt.NDArray[np.int64]  # time stamp of each frame [ns], shape (n,)
     channels: npt.NDArray[np.uint8]  # for each frame: index of its channel in the channel list of the log
     indices: npt.NDArray[np.intp]  # for each frame: index in the chunk
 

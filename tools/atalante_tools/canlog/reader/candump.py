@@ -36,7 +36,7 @@ Positions = npt.NDArray[np.intp]
 MARGIN = 160
 _NEWLINE, _RETURN, _SPACE, _OPEN, _CLOSE, _HASH, _DOT = b"\n\r ()#."
 _NAME_BYTES = 16  # longest channel name that the array operations parse; Linux allows 15
-_MAX_DIGITS = 2 * 64  # hexadecimal digits
+_MAX_DIGITS = 2 * 64  # largest number of hexadecimal digits in a payload
 _STANDARD, _ALL_BITS = 0x7FF, 0x1FFF_FFFF
 _NOT_HEX = 255
 _HEX = np.full(256, _NOT_HEX, np.uint8)
@@ -62,7 +62,7 @@ class Parsed:
     """Frames parsed from a text, and the number of lines that contain no frame."""
 
     chunk: Chunk
-    unreadable: int  # lines
+    unreadable: int  # number of lines that contain no frame
     first_unreadable: bytes
 
 

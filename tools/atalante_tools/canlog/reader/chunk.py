@@ -21,7 +21,7 @@ class Chunk:
     """Consecutive frames of a log. Each array has shape (n,)."""
 
     frames: Frames  # `FRAME` records
-    stamps: npt.NDArray[np.int64]  # ns
+    stamps: npt.NDArray[np.int64]  # time stamp of each frame [ns]
     channels: npt.NDArray[np.uint8]  # for each frame: index of its channel in the channel list of the log
     sent: npt.NDArray[np.int8]  # direction of each frame: SENT, RECEIVED or NO_DIRECTION
 

@@ -38,10 +38,10 @@ class LogFile:
 
     path: Path
     suffix: str  # file suffix of the format, in lower case, without .gz
-    size: int  # bytes
+    size: int  # size of the file [byte]
     channels: Channels = field(default_factory=Channels)
     remarks: list[Remark] = field(default_factory=list)
-    position: int = 0  # bytes read so far
+    position: int = 0  # number of bytes read so far
 
     @property
     def keeps_direction(self) -> bool:

@@ -22,7 +22,7 @@ _E2E = ("Crc", "Counter")
 class Unchecked:
     """Messages, signals or channels that some rules did not check, and the reason."""
 
-    rules: tuple[str, ...]  # empty means all rules
+    rules: tuple[str, ...]  # identifiers of the rules that did not check the items; empty means all rules
     items: tuple[str, ...]  # messages, signals or channels; empty means the whole log
     reason: str
 

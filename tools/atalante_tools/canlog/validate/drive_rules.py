@@ -30,8 +30,8 @@ _SPONTANEOUS = {(s, f) for s in DriveState for f in (_S.FAULT_REACTION_ACTIVE, _
 LEGAL = {(int(state), int(after)) for (state, _), after in TRANSITIONS.items()} | {
     (int(a), int(b)) for a, b in _SPONTANEOUS
 }
-#: Pairs (state, controlword) to which a drive need not respond: command to enable operation after a quick stop that was
-#: not acknowledged, and command to reset a fault whose cause persists.
+#: Pairs (state, controlword) to which a drive need not respond. A drive may ignore ENABLE_OPERATION until the quick stop is
+#: acknowledged, and FAULT_RESET while the cause of the fault persists.
 EXEMPT = {(int(_S.QUICK_STOP_ACTIVE), int(_C.ENABLE_OPERATION)), (int(_S.FAULT), int(_C.FAULT_RESET))}
 _NOTHING = -1
 

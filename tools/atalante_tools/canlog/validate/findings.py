@@ -29,8 +29,8 @@ class Finding:
     node: str
     signal: str
     count: int
-    first: int  # ns
-    last: int  # ns
+    first: int  # time stamp of the first violation [ns]
+    last: int  # time stamp of the last violation [ns]
     worst: str  # value at the worst violation, with unit
     badness: float  # severity of the worst violation; larger is worse
 

@@ -26,7 +26,7 @@ class _Bus:
     sync: int  # index of the SYNC message in the plan
     states: list[int]  # indices of the state messages in the plan
     cycle_ns: float
-    count: int = 0  # SYNC frames so far
+    count: int = 0  # number of SYNC frames so far
     stamp: int = 0  # time stamp of the last SYNC frame [ns]
     cycle_of: dict[int, int] = field(default_factory=dict)  # cycle number of the last state frame, by message index
     #: number of cycles between the last two state frames, by message index

@@ -38,7 +38,7 @@ class Silence:
     """Table [[silence]] of a rules file, which silences a rule for some messages."""
 
     rule: str
-    message: str  # name or pattern
+    message: str  # name of the message, or pattern for the names of several messages
     reason: str
 
     def covers(self, rule: str, message: str) -> bool:

@@ -50,7 +50,7 @@ class TimingRules:
         self.histogram = np.zeros((count, BINS), np.int64)
         #: Number of intervals in the histogram of each message.
         self.intervals = np.zeros(count, np.int64)
-        self._sum = np.zeros(count)  # sum of these intervals [ns]
+        self._sum = np.zeros(count)  # sum of the intervals in the histogram of each message [ns]
         #: Counter gaps for the plot: (time stamp of the frame after the gap [ns], message index, lost frames).
         self.gaps: list[tuple[int, int, int]] = []
 

@@ -33,7 +33,7 @@ class Decoded:
 
     family: Family
     span: slice  # slice of the stream that contains the frames
-    raw: Words  # shape (fields, n)
+    raw: Words  # raw code of each field in each frame, shape (fields, n)
     bad: dict[int, Mask] = field(default_factory=dict)  # for each field index: mask of the frames with an invalid value
 
     @property

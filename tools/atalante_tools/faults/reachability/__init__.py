@@ -1,4 +1,4 @@
-"""Exhaustive searches that prove safety properties in all states which any sequence of inputs can reach.
+"""Exhaustive searches that prove safety properties in every reachable state, for all sequences of inputs.
 
     functions of HAL and drive -> steps (hal_steps, drive_steps) -> breadth-first search (search) -> properties (explorations)
                                                                        counterexample -> scenario (replay)

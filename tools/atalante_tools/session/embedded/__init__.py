@@ -183,7 +183,7 @@ def cores_are_idle(others: int, load: Path = _LOAD) -> bool:
         except (OSError, IndexError, ValueError):
             return True  # the load is not known
         time.sleep(_LOAD_INTERVAL)
-    busy = max(1, min(samples))  # number of threads that ran in every sample, including this one
+    busy = max(1, min(samples))  # smallest number of running threads in a sample; this thread is one of them
     return (os.cpu_count() or 1) - busy >= 1 + others
 
 
