@@ -50,8 +50,8 @@ class Adapter:
             process (software).
         reports_can_fd: Whether the backend reports CAN FD in `can.BusABC.protocol` after a bus was opened for CAN FD.
             If False, `PythonCanBus` does not check `protocol`, and relies on `can_fd`.
-        unusable: Reason why the interface cannot connect a HAL and a robot in two processes. Empty if the interface
-            can.
+        unusable: Reason why the interface cannot connect a HAL and a robot in two processes. Empty if the interface can
+            connect them.
         note: Further information for the operator.
         tried: Test that was run on this interface with this project.
         source: Where the facts come from.

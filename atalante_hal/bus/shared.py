@@ -32,8 +32,8 @@ from atalante_hal.wire.frame import FRAME_BYTES, Frames
 
 #: Indices of the counters of each bus end: frames sent, frames received, calls of `step` requested, calls of `step` completed.
 _SENT, _RECEIVED, _REQUESTED, _COMPLETED = range(4)
-#: Indices of the flags of each bus end. The first flag is 1 while the end serves, the second while it sleeps, and the third
-#: after it is closed.
+#: Indices of the flags of each bus end. `_SERVING` is 1 while the end serves, `_SLEEPING` is 1 while the end sleeps, and
+#: `_CLOSED` is 1 after the end is closed.
 _SERVING, _SLEEPING, _CLOSED = range(4, 7)
 #: Number of 64-bit header words of each bus end: one cache line.
 _END_WORDS = 8

@@ -23,7 +23,7 @@ from atalante_hal.bus import BusAbsent, BusDown, BusError, BusFull, Stamps
 from atalante_hal.bus.batch import Batches
 from atalante_hal.wire.frame import FLAG_FDF, FRAME_BYTES, Frames, as_words, new_frames
 
-CLASSIC_BYTES = 16  # struct can_frame
+CLASSIC_BYTES = 16  # size of a `struct can_frame` [bytes]
 CAN_RAW_ERR_FILTER: Final = 2
 SO_RCVBUFFORCE: Final = 33
 SO_TIMESTAMPNS: Final = 35  # number of the socket option; its control message has the same number

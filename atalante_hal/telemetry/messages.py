@@ -30,7 +30,7 @@ class Sample:
 
     values: list[float]  # values of the record, in the order of its layout
     cycle: int
-    timestamp: int  # ns
+    timestamp: int  # log time of the cycle [ns]
     run: int = 0  # number of the run in the session
     run_name: str = ""
 

@@ -65,7 +65,7 @@ class TelemetryConfig:
 
     robot: str = "exo"  # name of the robot in the Zenoh keys atalante/<robot>/...
     publish: bool = True  # publish on Zenoh
-    listen: str | None = None  # Zenoh endpoint; None for the first free port, starting at tcp/127.0.0.1:7447
+    listen: str | None = None  # Zenoh endpoint; None means the first free port from tcp/127.0.0.1:7447 on
     stream_rate: int = 100  # Hz in robot time, publishing rate of each stream
     loop_rate: int = 10  # Hz in robot time, rate of the messages with loop statistics
     recording: Path | None = None  # MCAP file; None if nothing is recorded
@@ -139,11 +139,11 @@ class TelemetrySummary:
     """Result of a telemetry session."""
 
     complete: bool = False  # False if a subprocess ended without a summary; the numbers are then incomplete
-    published: int = 0  # messages
-    recorded: int = 0  # messages
+    published: int = 0  # number of published messages
+    recorded: int = 0  # number of recorded messages
     frames_logged: int = 0
     can_log_complete: bool = True  # False if a requested CAN log lacks frames, has several files or was not closed
-    lost: int = 0  # cycles that telemetry lost, because it read more slowly than the loop wrote
+    lost: int = 0  # number of cycles that telemetry lost, because it read more slowly than the loop wrote
     frames_lost: int = 0  # number of lost records with CAN frames; a record contains up to 64 frames
     restarts: int = 0  # number of restarts of the subprocess after it ended or hung
     notices: tuple[str, ...] = field(default=())  # one sentence for each fault of the session

@@ -85,7 +85,7 @@ class Service:
         At the end the remaining contents of the rings are handled.
 
         Args:
-            stop: Sequence that becomes non-empty to request the stop.
+            stop: Sequence. The loop stops as soon as it is not empty.
         """
         checked = time.monotonic()
         while not (stop or self._records.closed):

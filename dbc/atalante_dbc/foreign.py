@@ -46,7 +46,7 @@ class Field:
 
     name: str
     start: int  # start bit in DBC numbering: least significant bit for Intel, most significant bit for Motorola
-    length: int  # bits
+    length: int  # length of the signal [bit]
     big_endian: bool  # True for Motorola byte order, False for Intel byte order
     kind: str  # "unsigned", "signed" or "float" (IEEE 754)
     factor: int | float
@@ -81,10 +81,10 @@ class Layout:
 
     name: str
     frame_id: int
-    extended: bool  # 29-bit identifier
+    extended: bool  # True for a 29-bit identifier, False for an 11-bit identifier
     fd: bool | None  # True for a CAN FD frame; None if unknown
     bit_rate_switch: bool | None  # True if the payload is sent at the data bit rate; None if unknown
-    length: int  # bytes
+    length: int  # length of the payload [byte]
     sender: str | None
     fields: tuple[Field, ...]
     bus: str | None
@@ -130,8 +130,8 @@ class Catalogue:
     refused: tuple[Refused, ...]
     nodes: Mapping[str, str]  # kind of each node, by the name of the node; "" if the DBC has no NodeKind
     buses: tuple[str, ...]
-    nominal_bitrate: float | None  # bit/s, arbitration phase
-    data_bitrate: float | None  # bit/s, data phase
+    nominal_bitrate: float | None  # bit rate of the arbitration phase [bit/s]
+    data_bitrate: float | None  # bit rate of the data phase [bit/s]
     hash32: int  # CRC-32 of the file
 
     @cached_property

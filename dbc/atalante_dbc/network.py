@@ -20,7 +20,7 @@ class Signal:
 
     name: str
     start: int  # index of the least significant bit in the payload
-    length: int  # bits
+    length: int  # length of the signal [bit]
     signed: bool
     factor: float
     offset: float
@@ -38,7 +38,7 @@ class Message:
 
     name: str
     frame_id: int  # 11-bit CAN identifier
-    length: int  # bytes
+    length: int  # length of the payload [byte]
     sender: str
     signals: tuple[Signal, ...]
     bus: str
@@ -79,8 +79,8 @@ class Network:
     nodes: tuple[Node, ...]
     messages: tuple[Message, ...]
     buses: tuple[str, ...]
-    nominal_bitrate: int  # bit/s, arbitration phase
-    data_bitrate: int  # bit/s, data phase
+    nominal_bitrate: int  # bit rate of the arbitration phase [bit/s]
+    data_bitrate: int  # bit rate of the data phase [bit/s]
     hash32: int  # CRC-32 of the DBC file, which each node sends in its heartbeat (DbcHash)
 
     @cached_property

@@ -62,10 +62,10 @@ class DriveParameters:
 class DriveSignals(NamedTuple):
     """Signals in the state frames of the twelve drives, shape (12,) each. `Drives` updates the signals."""
 
-    position: Vector  # at the motor [rad]
-    velocity: Vector  # at the motor [rad/s]
-    torque: Vector  # at the joint [Nm]
-    temperature: Vector  # of the winding [degC]
+    position: Vector  # position of the motor [rad]
+    velocity: Vector  # velocity of the motor [rad/s]
+    torque: Vector  # measured torque at the joint [Nm]
+    temperature: Vector  # temperature of the winding [degC]
     state: Vector  # value of `DriveState`
 
 

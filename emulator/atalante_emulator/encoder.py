@@ -11,7 +11,7 @@ from atalante_hal.robot import JOINTS, Robot
 from atalante_hal.types import PERIOD, Vector
 
 COUNTS = 131072  # encoder counts per motor turn, 17 bits
-LSB = 2.0 * math.pi / COUNTS  # rad at the motor
+LSB = 2.0 * math.pi / COUNTS  # angle of the motor for one count [rad]
 
 
 def _sample(

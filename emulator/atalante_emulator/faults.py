@@ -86,7 +86,9 @@ LINK_KINDS: Final[Mapping[str, Kind]] = {
     "drop": Kind("frames are lost", _ANY_TARGET, {"p": _P}),
     "duplicate": Kind("frames are repeated", _ANY_TARGET, {"p": _P, "copies": _whole(1, 16, default=1)}),
     "delay": Kind("frames arrive `by` cycles late", _ANY_TARGET, {"p": _P, "by": _whole(1, 1000, default=1)}),
-    "reorder": Kind("pairs of frames of a message arrive in reverse order, in the cycle of the second", _ANY_TARGET),
+    "reorder": Kind(
+        "frames of a message arrive in pairs, in reverse order, in the cycle of the later frame", _ANY_TARGET
+    ),
     "flip": Kind("random bits of the payload are inverted", _ANY_TARGET, {"p": _P, "bits": _whole(1, 512, default=1)}),
     "freeze_counter": Kind("the alive counter does not change, the CRC is correct", _ANY_TARGET),
     "masquerade": Kind(
@@ -159,7 +161,7 @@ NODE_KINDS: Final[Mapping[str, Kind]] = {
     ),
     "push": Kind("an external torque acts on a joint", "drive", {"torque": _number(-500.0, 500.0, "Nm")}),
     "torque_weak": Kind(
-        "a motor produces a multiple of the torque it measures; a negative one reverses it",
+        "a motor produces a multiple of the torque it measures; a negative multiple reverses it",
         "drive",
         {"share": _number(-2.0, 2.0)},
     ),

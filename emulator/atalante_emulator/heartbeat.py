@@ -15,7 +15,7 @@ from atalante_hal.wire.process_image import TransmitImage
 BOOTUP: Final = 0
 OPERATIONAL: Final = 5
 _FIRMWARE_VERSION: Final = 0x0100
-_SUPPLY_VOLTAGE: Final = 48.0  # V
+_SUPPLY_VOLTAGE: Final = 48.0  # supply voltage in the status messages [V]
 
 
 @dataclass

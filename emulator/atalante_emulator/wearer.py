@@ -18,8 +18,8 @@ from atalante_hal.types import Vector
 class LimbParameters:
     """Impedance of relaxed legs. A tuple has one value per leg joint: FH, TH, SH, SK, SA, HA. The values are assumptions."""
 
-    stiffness: tuple[float, ...] = (20.0, 10.0, 20.0, 15.0, 15.0, 5.0)  # Nm/rad
-    damping: tuple[float, ...] = (2.0, 1.0, 2.0, 1.5, 1.0, 0.5)  # Nm s/rad
+    stiffness: tuple[float, ...] = (20.0, 10.0, 20.0, 15.0, 15.0, 5.0)  # stiffness of each joint [Nm/rad]
+    damping: tuple[float, ...] = (2.0, 1.0, 2.0, 1.5, 1.0, 0.5)  # damping of each joint [Nm s/rad]
     rest: tuple[float, ...] = (0.0, 0.0, -0.2, 0.4, -0.1, 0.0)  # joint angles with no stiffness torque [rad]
 
 

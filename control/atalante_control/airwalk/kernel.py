@@ -29,8 +29,8 @@ _TIBIAE = tuple(IMUS.index(f"{side}_tibia") for side in SIDES)
 class Measured(NamedTuple):
     """Measurements of this cycle, and torque command of the previous cycle."""
 
-    q: Vector  # (12,) rad
-    qd: Vector  # (12,) rad/s
+    q: Vector  # (12,) rad, joint angles
+    qd: Vector  # (12,) rad/s, joint speeds
     attitudes: Vector  # (4, 4) attitude of each IMU, unit quaternion wxyz, sensor frame to world
     gyros: Vector  # (4, 3) rad/s, angular velocity of each IMU in the frame of the same IMU
     sent: Vector  # (12,) Nm, torque command of the previous cycle after the limiter
@@ -55,7 +55,7 @@ class Outputs:
     """Results of one control cycle."""
 
     desired: Annotated[Vector, 2 * len(JOINTS)]  # q_des [rad], then q_des' [rad/s]
-    gravity: Annotated[Vector, len(JOINTS)]  # Nm, u_g
+    gravity: Annotated[Vector, len(JOINTS)]  # Nm, gravity torques u_g
     torque: Annotated[Vector, len(JOINTS)]  # Nm, torque command u
     vibration: Annotated[Vector, len(MOTORS)]  # levels of the vibration motors, 0 to 1
 

@@ -17,7 +17,7 @@ Pair = tuple[float, float]
 class Telemetry:
     """Telemetry of one cycle. Each pair except `guide` has values for sagittal hip and knee of the swing leg."""
 
-    q_des: Annotated[Vector, len(JOINTS)]  # rad
+    q_des: Annotated[Vector, len(JOINTS)]  # rad, desired joint angles
     error: Annotated[Vector, 2]  # rad, q - q_des
     q_bound: Annotated[Vector, 2]  # rad, distance from q_des to the guide bound on the side of the error
     guide: Annotated[Vector, 2]  # rad, distances from q_des to upper and lower guide bound of the hip
@@ -27,7 +27,7 @@ class Telemetry:
     filter_active: Annotated[Vector, 2]  # 1 while the guide filter is active, else 0; the same for both joints
     step: float  # number of completed right-stance steps
     phase: float  # t / T, time since the start of the step divided by the step duration
-    stance: float  # 0 left, 1 right
+    stance: float  # stance leg: 0 left, 1 right
     assistance_factor: float  # Xi of this step
 
 
@@ -41,9 +41,9 @@ TELEMETRY_FIELDS = tuple(
 class Step:
     """Values that are constant during one step."""
 
-    stance: int  # 0 left, 1 right
+    stance: int  # stance leg: 0 left, 1 right
     completed: int  # number of right-stance steps completed before this step
-    cycles: int  # cycles of a step
+    cycles: int  # number of cycles in a step
     xi: float  # assistance factor
     assisted: bool  # True if hip and knee of the swing leg get the assistive torque; False at assistance factor 1
     intensity: float  # factor of the haptic levels
@@ -55,7 +55,7 @@ class Step:
 class AirwalkStatistics(GuideStatistics):
     """Statistics of the guide. Counting starts after the first completed right-stance step."""
 
-    steps: int = 0  # completed right-stance steps
+    steps: int = 0  # number of completed right-stance steps
 
     def count(self, cycle: int, ratio: float, h: float, acting: bool) -> None:
         """Add one cycle to the statistics if a right-stance step has been completed, see `GuideStatistics.count`."""

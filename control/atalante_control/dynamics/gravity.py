@@ -34,8 +34,8 @@ class LinkRecord:
     # The rotation matrix from link to parent is turn[0] + sin(q) turn[1] + (1 - cos(q)) turn[2].
     turn: Annotated[Vector, (3, 3, 3)]
     axis: Annotated[Vector, 3]  # unit vector of the joint axis
-    mass: float  # kg
-    lever: Annotated[Vector, 3]  # m, centre of mass
+    mass: float  # kg, mass of the link
+    lever: Annotated[Vector, 3]  # m, position of the centre of mass
     rotation: Annotated[Vector, (3, 3)]  # rotation matrix from link to parent
     down: Annotated[Vector, 3]  # m/s2, gravitational acceleration
     force: Annotated[Vector, 3]  # N, force that holds the link and its descendants

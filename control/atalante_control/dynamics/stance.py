@@ -36,7 +36,7 @@ _SAMPLES = 33
 class GroundForces(NamedTuple):
     """Joint torques and ground wrench of one state, with the attitude of the pelvis."""
 
-    torque: Vector  # (12,) Nm, order of JOINTS
+    torque: Vector  # (12,) Nm, joint torques in the order of JOINTS
     force: Vector  # (3,) N, ground force on the stance foot, in the axes of the foot
     moment: Vector  # (3,) Nm, ground moment about the ankle of the stance foot, in the axes of the foot
     pelvis: tuple[float, float, float, float]  # attitude of the pelvis, unit quaternion wxyz, pelvis to world

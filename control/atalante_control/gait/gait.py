@@ -54,9 +54,9 @@ class GaitError(ValueError):
 class StepTables:
     """Samples of a step, one per control cycle from 0 to T. The arrays have shape (N + 1, 12) and are read-only."""
 
-    q: Vector  # rad
-    qd: Vector  # rad/s
-    qdd: Vector  # rad/s2
+    q: Vector  # rad, joint angles
+    qd: Vector  # rad/s, joint speeds
+    qdd: Vector  # rad/s2, joint accelerations
     uf: Vector  # Nm, feedforward torque without gravity; zero for a gait without feedforward
 
 
@@ -65,7 +65,7 @@ class Gait:
     """Gait, described by its right-stance step. `mirrored()` returns the left-stance step."""
 
     name: str
-    duration: float  # s, T
+    duration: float  # s, duration T of the step
     coefficients: Vector  # (12, 8) rad, Bezier control points in the order of JOINTS
     feedforward: Vector | None = None  # (12, 8) Nm, Bezier control points of the feedforward u_f, without gravity
     parameters: Mapping[str, float] = field(default_factory=dict)  # name -> parameter of patient or step

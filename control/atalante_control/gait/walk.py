@@ -78,7 +78,7 @@ def load_gaits(path: Path, robot: Robot) -> Gait | WalkGaits:
         robot: limits of the joints.
 
     Raises:
-        GaitError: If the file is neither of them, or if it is rejected as in `load_gait` or `load_walk`.
+        GaitError: If the file is neither a gait file nor a walk file, or if it is rejected as in `load_gait` or `load_walk`.
     """
     document = read_object(path)
     found = document.get("format")

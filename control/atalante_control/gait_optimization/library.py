@@ -59,10 +59,10 @@ class Grid:
             range.
     """
 
-    mass: tuple[float, ...] = (58.0, 65.0, 74.0, 84.0, 91.0)  # kg
-    height: tuple[float, ...] = (1.62, 1.69, 1.775, 1.86, 1.93)  # m
-    step_length: tuple[float, ...] = (0.10, 0.12, 0.15, 0.18, 0.20)  # m
-    step_duration: tuple[float, ...] = (0.7, 0.74, 0.8, 0.88, 0.97, 1.05, 1.1)  # s
+    mass: tuple[float, ...] = (58.0, 65.0, 74.0, 84.0, 91.0)  # kg, mass of the patient
+    height: tuple[float, ...] = (1.62, 1.69, 1.775, 1.86, 1.93)  # m, height of the patient
+    step_length: tuple[float, ...] = (0.10, 0.12, 0.15, 0.18, 0.20)  # m, step length
+    step_duration: tuple[float, ...] = (0.7, 0.74, 0.8, 0.88, 0.97, 1.05, 1.1)  # s, step duration
     thigh: tuple[float, ...] = (0.94, 0.965, 1.0, 1.035, 1.06)  # length of the thigh relative to Winter's table
     shank: tuple[float, ...] = (0.94, 0.965, 1.0, 1.035, 1.06)  # length of the shank relative to Winter's table
     size: int = 1000  # number of selected points; if the grid has fewer points, all points are selected

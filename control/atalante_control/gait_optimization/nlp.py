@@ -26,7 +26,7 @@ class Rows(NamedTuple):
     name: str  # readable name of the group, for example "swing clearance"
     unit: str  # SI unit
     size: float  # [unit] scale; the program divides values and bounds by this scale
-    values: Symbol  # SX, shape (m,) [unit]
+    values: Symbol  # SX, constrained expressions, shape (m,) [unit]
     lower: Vector  # [unit] lower bounds, shape (m,), or (repetitions, m) if they differ between repetitions
     upper: Vector  # [unit] upper bounds, same shapes as `lower`
 
@@ -56,7 +56,7 @@ NAMES = ("nlp_f", "nlp_g", "nlp_grad_f", "nlp_jac_g", "nlp_hess_l")
 class _Block(NamedTuple):
     """Expression that is repeated for several groups of unknowns: a cost if it has weights, else a constraint."""
 
-    expression: Symbol  # SX
+    expression: Symbol  # SX, cost or constraints of one repetition
     x: Symbol  # SX symbols of the unknowns of one repetition, shape (n,)
     at: Indices  # indices of the unknowns of each repetition, shape (repetitions, n)
     weights: Vector | None  # weight of each repetition in the objective, or None if the expression is a constraint

@@ -1,6 +1,6 @@
 """Second start of the optimiser after a failure: `subject, attempt -> gait`.
 
-If the second start fails, too, the result is the reasons of the two failures.
+If the second start fails, too, the result states the reasons of both failures.
 
 The second initial guess is the solved gait of the same patient with a moderate step. The result therefore depends only
 on the parameters of the subject, as it does without a second start.

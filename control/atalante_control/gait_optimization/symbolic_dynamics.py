@@ -38,7 +38,7 @@ class Body:
     origin: Vector3  # m, position of the joint in the frame of the parent link
     yaw: float  # rad, rotation from parent frame to link frame about the z axis, at joint angle 0
     axis: Vector3  # joint axis in the frame of the link
-    mass: float  # kg
+    mass: float  # kg, mass of the body
     moment: Vector3  # kg m, mass times position of the centre of mass
     inertia: Vector  # (6,) kg m2, inertia about the origin of the link: xx, xy, xz, yy, yz, zz
 
@@ -47,16 +47,16 @@ class Body:
 class Wrench:
     """Wrench of the ground on the stance foot, at the origin and in the axes of the foot link."""
 
-    force: Symbol  # (3,) N
-    moment: Symbol  # (3,) Nm
+    force: Symbol  # (3,) N, ground force
+    moment: Symbol  # (3,) Nm, ground moment about the origin of the foot link
 
 
 @dataclass(frozen=True)
 class Frame:
     """Pose and velocity of a link in the frame of the stance foot."""
 
-    rotation: Symbol  # (3, 3), link to stance foot
-    position: Symbol  # (3,) m
+    rotation: Symbol  # (3, 3), rotation matrix from the axes of the link to the axes of the stance foot
+    position: Symbol  # (3,) m, position of the origin of the link
     angular: Symbol  # (3,) rad/s, angular velocity in the axes of the link
     linear: Symbol  # (3,) m/s, velocity of the origin of the link, in the axes of the link
 

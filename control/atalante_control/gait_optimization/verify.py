@@ -64,9 +64,9 @@ class GaitCheck(NamedTuple):
 class _Motion(NamedTuple):
     """Joint angles, speeds and accelerations at the samples of a step."""
 
-    q: Vector  # (n, 12) rad
-    qd: Vector  # (n, 12) rad/s
-    qdd: Vector  # (n, 12) rad/s2
+    q: Vector  # (n, 12) rad, joint angles
+    qd: Vector  # (n, 12) rad/s, joint speeds
+    qdd: Vector  # (n, 12) rad/s2, joint accelerations
 
 
 class Verifier:
@@ -84,7 +84,7 @@ class Verifier:
         model = self._articulated.model
         self._data: Any = model.createData()
         self._left, self._right, self._pelvis = (model.getFrameId(name) for name in (_LEFT, _RIGHT, BASE_LINK))
-        self.weight = pinocchio.computeTotalMass(model) * GRAVITY  # N
+        self.weight = pinocchio.computeTotalMass(model) * GRAVITY  # N, weight of exoskeleton and patient
 
     def verify(self, gait: Gait, kind: str = "periodic", tolerances: Tolerances = EXACT) -> tuple[GaitCheck, ...]:
         """Run all checks of a right-stance step.

@@ -1,6 +1,6 @@
 """Verification of a walk before it is walked: `start step, periodic step, stop step, patient -> error or nothing`.
 
-The checks and their limits are those of the gaits of the gait network. They need no optimiser.
+The checks and their limits are the same as for the gaits of the network. The checks need no optimiser.
 """
 
 from __future__ import annotations

@@ -31,7 +31,7 @@ Vector3 = tuple[float, float, float]
 
 _SA, _HA = LEG_JOINTS.index("SA"), LEG_JOINTS.index("HA")
 _STOP_MARGIN = math.radians(1.0)  # rad, smallest distance between a target and the joint limit
-_STOP_FADE = math.radians(3.0)  # rad, closer than this to the joint limit, the target rate is reduced
+_STOP_FADE = math.radians(3.0)  # rad, distance to the joint limit below which the target rate is reduced
 _PELVIS = IMUS.index("pelvis")
 _TIBIAE = tuple(IMUS.index(f"{side}_tibia") for side in SIDES)
 _IMU_AGE = 10  # cycles, largest valid age of an IMU message, equal to the timeout of the message in the DBC
@@ -41,7 +41,7 @@ class Ankle:
     """Constants of one ankle, and its deviation from the targets at the stance change. The re-centring removes the deviation."""
 
     geometry: Annotated[Vector, 4]  # `FlatFoot.geometry`
-    offset: float  # rad, added to SA
+    offset: float  # rad, angle added to the target of the sagittal ankle (SA)
     joints: Annotated[npt.NDArray[np.int64], 2]  # indices of sagittal and henke ankle (SA, HA) of this leg in JOINTS
     low: Annotated[Vector, 2]  # rad, smallest targets of sagittal and henke ankle
     high: Annotated[Vector, 2]  # rad, largest targets of sagittal and henke ankle

@@ -34,9 +34,9 @@ class Law:
     """Parameters of `idealization` for the assisted joints, sagittal hip and knee."""
 
     fit: Annotated[Vector, (3, 3)]  # kg m2, `AssistedInertia.fit`
-    coulomb: Annotated[Vector, 2]  # Nm
-    viscous: Annotated[Vector, 2]  # Nm s/rad
-    smoothing: float  # rad/s
+    coulomb: Annotated[Vector, 2]  # Nm, Coulomb friction k_d
+    viscous: Annotated[Vector, 2]  # Nm s/rad, viscous friction k_v
+    smoothing: float  # rad/s, smoothing speed v_s
 
 
 @dataclass(frozen=True)
@@ -47,9 +47,9 @@ class Friction:
         ValueError: If a list does not have six values, a value is negative, or the smoothing speed is not positive.
     """
 
-    coulomb: tuple[float, ...] = (4.0, 3.0, 5.0, 5.0, 2.0, 1.0)  # Nm, k_d
-    viscous: tuple[float, ...] = (6.0, 4.0, 6.0, 4.0, 1.0, 0.5)  # Nm s/rad, k_v
-    smoothing: float = 0.05  # rad/s, v_s
+    coulomb: tuple[float, ...] = (4.0, 3.0, 5.0, 5.0, 2.0, 1.0)  # Nm, Coulomb friction k_d of each joint
+    viscous: tuple[float, ...] = (6.0, 4.0, 6.0, 4.0, 1.0, 0.5)  # Nm s/rad, viscous friction k_v of each joint
+    smoothing: float = 0.05  # rad/s, smoothing speed v_s
 
     def __post_init__(self) -> None:
         for name in ("coulomb", "viscous"):

@@ -32,9 +32,9 @@ class LegGains:
         ValueError: If a list does not have six values, or if a value is negative or not finite.
     """
 
-    kp: PerJoint  # Nm/rad
-    ki: PerJoint  # Nm/(rad s)
-    kd: PerJoint  # Nm s/rad
+    kp: PerJoint  # Nm/rad, proportional gains
+    ki: PerJoint  # Nm/(rad s), integral gains
+    kd: PerJoint  # Nm s/rad, derivative gains
 
     def __post_init__(self) -> None:
         for name in ("kp", "ki", "kd"):
@@ -60,7 +60,7 @@ class PidGains:
         ki=(180.0, 72.0, 180.0, 90.0, 30.0, 18.0),
         kd=(40.0, 12.0, 40.0, 15.0, 3.0, 2.0),
     )
-    integral_limit: float = 10.0  # Nm
+    integral_limit: float = 10.0  # Nm, largest absolute value of the integral torque
 
 
 #: Gains for the suspended robot. The stance leg carries no load, so TH, SK, SA and HA of this leg have the swing leg

@@ -46,7 +46,7 @@ class ExoskeletonParameters:
     toe_out: float = math.radians(8.0)  # rad, outward rotation of the foot about the vertical
     ha_axis: Vector3 = (0.788, 0.0, 0.616)  # axis of joint HA in the foot frame; the URDF contains the unit vector
 
-    sole_size: tuple[float, float] = (0.275, 0.119)  # m, length and width
+    sole_size: tuple[float, float] = (0.275, 0.119)  # m, length and width of the sole
     sole_centre: tuple[float, float] = (0.06, -0.165)  # m, x and z of the sole centre relative to the ankle
     cell_x: tuple[float, float] = (0.178, -0.064)  # m, x of front and rear force cells relative to the ankle
     cell_y: float = 0.027  # m, lateral distance of the force cells from the middle of the foot

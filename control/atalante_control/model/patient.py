@@ -10,8 +10,8 @@ from dataclasses import dataclass
 
 from atalante_control.model.rigid_body import Box, Inertia, Vector3
 
-MASS_RANGE = (45.0, 110.0)  # kg
-HEIGHT_RANGE = (1.50, 2.00)  # m
+MASS_RANGE = (45.0, 110.0)  # kg, smallest and largest mass of a patient
+HEIGHT_RANGE = (1.50, 2.00)  # m, smallest and largest height of a patient
 #: Adjustment range of thigh and shank [m]. It contains Winter's lengths for every height in `HEIGHT_RANGE`.
 LEG_RANGE = (0.30, 0.55)
 #: Height of the ankle above the sole, as a fraction of the height of the patient.
@@ -22,11 +22,11 @@ ANKLE_HEIGHT = 0.039
 class Segment:
     """Segment of the human body, a row of Winter's table."""
 
-    mass: float  # fraction of the body mass
-    centre: float  # distance of the centre of mass from the proximal end, fraction of the segment length
-    gyration: float  # transverse radius of gyration about the centre of mass, fraction of the segment length
-    length: float  # fraction of the body height
-    density: float  # kg/m3
+    mass: float  # mass of the segment, as a fraction of the body mass
+    centre: float  # distance of the centre of mass from the proximal end, as a fraction of the segment length
+    gyration: float  # transverse radius of gyration about the centre of mass, as a fraction of the segment length
+    length: float  # length of the segment, as a fraction of the body height
+    density: float  # kg/m3, density of the segment
 
 
 #: Body segments from D. A. Winter, Biomechanics and Motor Control of Human Movement, 4th ed. 2009.
@@ -49,10 +49,10 @@ class Patient:
         ValueError: If a number is outside its range; the message states the range.
     """
 
-    mass: float  # kg
-    height: float  # m
-    thigh_length: float | None = None  # m, hip to knee
-    shank_length: float | None = None  # m, knee to ankle
+    mass: float  # kg, body mass
+    height: float  # m, body height
+    thigh_length: float | None = None  # m, distance from hip to knee
+    shank_length: float | None = None  # m, distance from knee to ankle
 
     def __post_init__(self) -> None:
         for name, value, (low, high), unit in (

@@ -34,7 +34,7 @@ class Box:
 class Sphere:
     """Sphere that touches the floor."""
 
-    radius: float  # m
+    radius: float  # m, radius of the sphere
     centre: Vector3  # m, in the link frame
 
 
@@ -43,7 +43,7 @@ class Inertia:
     """Mass properties of a rigid body in a link frame."""
 
     mass: float  # kg
-    centre: Vector3  # m, centre of mass
+    centre: Vector3  # m, position of the centre of mass in the link frame
     #: Inertia about the centre of mass: xx, xy, xz, yy, yz, zz [kg m2].
     tensor: tuple[float, float, float, float, float, float]
 

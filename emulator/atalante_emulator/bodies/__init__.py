@@ -30,16 +30,16 @@ ENGINES: Final = ("pybullet", "mujoco")
 class Pose(NamedTuple):
     """Position and attitude of a link in the world."""
 
-    position: Sequence[float]  # m, shape (3,)
+    position: Sequence[float]  # position of the link in the world [m], shape (3,)
     attitude: Sequence[float] = (0.0, 0.0, 0.0, 1.0)  # quaternion xyzw from the link frame to the world
 
 
 class Motion(NamedTuple):
     """Pose and velocity of a link frame in the world, in world axes."""
 
-    position: Vector  # m, shape (3,)
+    position: Vector  # position of the origin of the link frame [m], shape (3,)
     attitude: Vector  # quaternion xyzw from the link frame to the world, shape (4,)
-    velocity: Vector  # m/s, shape (3,)
+    velocity: Vector  # velocity of the origin of the link frame [m/s], shape (3,)
     rate: Vector  # angular velocity [rad/s], shape (3,)
 
 

@@ -50,8 +50,8 @@ class _Sensed(NamedTuple):
 class _Read(NamedTuple):
     """Results of a time step, as the properties of `Body` return them. The body owns the arrays."""
 
-    position: Vector  # shape (12,) [rad]
-    velocity: Vector  # shape (12,) [rad/s]
+    position: Vector  # joint positions, shape (12,) [rad]
+    velocity: Vector  # joint velocities, shape (12,) [rad/s]
     imu: Vector  # link states of the IMUs, shape (4, LINK_STATE)
     force: Vector  # forces on the corners in the axes of the feet, shape (2, 4, 3) [N]
 

@@ -31,7 +31,7 @@ _REPEATED, _QUICK_REPEATED = 25, 2
 #: Number of frames that the baseline of python-can and cantools decodes per block. This baseline is slow, so the number
 #: is small.
 _SLICE = 30_000
-_MS = 1_000_000  # ns
+_MS = 1_000_000  # one millisecond [ns]
 _BEGIN = 1_700_000_000 * 1000 * _MS
 _LENGTHS = np.array([0, 1, 2, 3, 4, 5, 6, 7, 8, 12, 16, 20, 24, 32, 48, 64])
 

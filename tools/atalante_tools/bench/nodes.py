@@ -270,7 +270,7 @@ def active_hal() -> RecordedHal:
     bus = RecordedBus(recording)
     hal = Hal(walk().network, walk().robot, bus)
     hal._safety_monitor.proof.proven.fill(True)  # recorded nodes do not react to test pulses
-    hal._safety_monitor.torque_tracking.tolerance.fill(np.inf)  # nor to commands
+    hal._safety_monitor.torque_tracking.tolerance.fill(np.inf)  # recorded nodes do not follow torque commands
     for _ in range(2 * TURN):
         hal.read()
         hal.hold()

@@ -87,7 +87,7 @@ class Vectors:
         return HEADER.pack(MAGIC, self._build.network.hash32, images)
 
     def images(self, count: int) -> Iterator[bytes]:
-        """Yield images. The first three contain minimum, maximum and invalid signal values; all others random values.
+        """Yield images. The first three contain minimum, maximum and invalid signal values. All others contain random values.
 
         Call this only once per instance, because a second call would continue the counters and the random numbers.
         """
