@@ -49,6 +49,9 @@ class WalkConfig:
     #: m/m, gain of the ankle stabiliser: shift of the centre of pressure / error of the divergent component of motion
     stabiliser: float = 2.5
     shift_limit: Pair = (0.12, 0.05)  # m, largest shifts of the centre of pressure: along the walk, sideways
+    edge: float = (
+        0.005  # m, smallest distance of the centre of pressure from heel and toes that the stance ankle requests
+    )
     placement: PlacementConfig = field(default_factory=PlacementConfig)  # parameters of foot placement and step timing
     lean: LeanConfig = field(default_factory=LeanConfig)  # parameters of the lean of the trunk
     flat_foot: bool = True  # whether the ankle of the swing leg holds the sole level
@@ -107,6 +110,8 @@ class WalkConfig:
             raise ValueError(f"stabiliser must be from 0 to 10 m/m, got {self.stabiliser!r}")
         if not 0.0 <= self.heading_gain <= 10.0:
             raise ValueError(f"heading_gain must be from 0 to 10 [1/s], got {self.heading_gain!r}")
+        if not 0.0 <= self.edge <= 0.1:
+            raise ValueError(f"edge must be from 0 to 0.1 m, got {self.edge!r}")
         placement = self.placement
         if not 0.0 < placement.slowest <= 1.0:
             raise ValueError(f"placement.slowest must be above 0 and at most 1, got {placement.slowest!r}")

@@ -138,8 +138,14 @@ class WalkController:
             placement=config.placement,
             lean=config.lean,
         )
+        middle, half = exoskeleton.sole_centre[0], 0.5 * exoskeleton.sole_size[0] - exoskeleton.pad_radius
         self._stabiliser = Stabiliser(
-            config.stabiliser, *config.shift_limit, flat_feet(exoskeleton)[LEFT].geometry[2], exoskeleton.toe_out
+            config.stabiliser,
+            *config.shift_limit,
+            flat_feet(exoskeleton)[LEFT].geometry[2],
+            exoskeleton.toe_out,
+            heel=middle - half + config.edge,
+            toe=middle + half - config.edge,
         )
         force = np.zeros((len(FEET), len(CELLS), 3))
         self._forces = force.copy()  # forces with an estimate for a lost foot

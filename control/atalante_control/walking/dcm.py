@@ -15,6 +15,9 @@ from atalante_hal.types import Vector
 
 Pair = tuple[float, float]
 
+#: Nm, permitted torque of the sagittal ankle of a stance foot without load, for example a foot that bounces at its landing
+_UNLOADED = 10.0
+
 
 class Stabiliser(NamedTuple):
     """Parameters of the ankle stabiliser."""
@@ -24,6 +27,8 @@ class Stabiliser(NamedTuple):
     sideways: float  # m, largest shift to each side
     henke: float  # forward component of the unit Henke axis in the foot frame
     toe_out: float  # rad, toe-out of the left foot, positive to the left
+    heel: float  # m, rearmost permitted centre of pressure relative to the ankle, negative
+    toe: float  # m, foremost permitted centre of pressure relative to the ankle, positive
 
 
 class Balance:
@@ -61,6 +66,21 @@ def pressure_shift(parameters: Stabiliser, error: Vector) -> Pair:
         min(max(x, -parameters.forward), parameters.forward),
         min(max(y, -parameters.sideways), parameters.sideways),
     )
+
+
+def within_sole(parameters: Stabiliser, torque: float, load: float) -> float:
+    """Return the torque of the sagittal ankle with which the centre of pressure stays within the sole [Nm].
+
+    With a larger torque, the foot would turn about its heel or its toes. The ankle of a foot that stands on an edge moves only
+    the small inertia of the foot, so that the stiff stance gains would make the foot oscillate.
+
+    Args:
+        parameters: geometry of the foot.
+        torque: requested torque of the sagittal ankle, all parts [Nm].
+        load: measured vertical force on the foot [N]; a negative force counts as zero.
+    """
+    force = max(load, 0.0)
+    return min(max(torque, force * parameters.heel - _UNLOADED), force * parameters.toe + _UNLOADED)
 
 
 def ankle_torques(parameters: Stabiliser, shift: Vector, load: float, side: int) -> Pair:

@@ -20,7 +20,7 @@ from atalante_control.joint.flat_foot import Ankle, start_level_ankle, write_lev
 from atalante_control.joint.pid import PidRecord, control
 from atalante_control.structured import Records
 from atalante_control.walking.attitude import Attitude, observe
-from atalante_control.walking.dcm import Balance, Stabiliser, ankle_torques, dcm, pressure_shift
+from atalante_control.walking.dcm import Balance, Stabiliser, ankle_torques, dcm, pressure_shift, within_sole
 from atalante_control.walking.kinematics import Chain, move
 from atalante_control.walking.lean import Lean, LeanConfig, follow_lean, lean_target
 from atalante_control.walking.placement import (
@@ -293,6 +293,9 @@ def act(
             sagittal, henke = ankle_torques(stabiliser, balance.shift, sensed.bearing[side], side)
             torque[side * _LEG + _SA] += sagittal
             torque[side * _LEG + _HA] += henke
+    if not stage.double and not stage.literal:
+        ankle = stage.stance * _LEG + _SA
+        torque[ankle] = within_sole(stabiliser, torque[ankle], sensed.bearing[stage.stance])
     if stage.assisted:
         _assist(cycle, measured, assistance, parts)
     requested = parts.pids[0].requested

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 
 import numpy as np
 import pytest
@@ -142,10 +143,16 @@ def elapsed_of(controller: WalkController) -> float:
     return float(controller.telemetry[sum(widths[name] for name in names[: names.index("elapsed")])])
 
 
-def pushed(dead_zone: float, direction: float, force: float) -> bool:
+def pushed(
+    dead_zone: float,
+    direction: float,
+    force: float,
+    edge: float = WalkConfig().edge,
+    check: Callable[[WalkController, State], None] | None = None,
+) -> bool:
     """Push the pelvis for 0.2 s from phase 0.2 of the second step; return whether the robot walks three more steps."""
     lean = LeanConfig() if math.isfinite(dead_zone) else LeanConfig(gain=0.0)
-    config = WalkConfig(placement=PlacementConfig(dead_zone=dead_zone), lean=lean)
+    config = WalkConfig(placement=PlacementConfig(dead_zone=dead_zone), lean=lean, edge=edge)
     controller = WalkController(ROBOT, PATIENT, WALK, 100, config)
     body = make_body("mujoco", urdf(ExoskeletonParameters(), ROBOT, PATIENT), free=True, ground=0.0)
     angle, cycles = math.radians(direction), 0
@@ -154,6 +161,8 @@ def pushed(dead_zone: float, direction: float, force: float) -> bool:
         robot = Ideal(body)
         while controller.statistics.steps < 4 and robot.upright():
             robot.cycle(controller)
+            if check is not None:
+                check(controller, robot.state)
             steps, elapsed = controller.statistics.steps, elapsed_of(controller)
             if steps == 1 and controller.phase is Phase.STEP and elapsed >= 0.16 and cycles < 200:
                 body.push((force * math.cos(angle), force * math.sin(angle), 0.0))
@@ -170,6 +179,22 @@ def pushed(dead_zone: float, direction: float, force: float) -> bool:
 def test_robot_withstands_a_push_only_with_foot_placement_step_timing_and_lean(direction: float, force: float) -> None:
     assert pushed(PlacementConfig().dead_zone, direction, force)
     assert not pushed(math.inf, direction, force)
+
+
+def test_ankle_of_a_pushed_robot_keeps_the_centre_of_pressure_within_the_sole() -> None:
+    foot, arms = ExoskeletonParameters(), list[float]()
+
+    def store_arm(controller: WalkController, state: State) -> None:
+        if controller.phase is Phase.STEP and elapsed_of(controller) > 0.1:
+            stance = controller._stance
+            force = float(state.foot_force[stance, :, 2].sum())
+            if force > 1000.0:
+                arms.append(float(controller._command.torque[6 * stance + 4]) / force)
+
+    edge = 0.06  # so large that the push moves the centre of pressure to the limit
+    pushed(PlacementConfig().dead_zone, 180.0, 200.0, edge, store_arm)
+    heel = foot.sole_centre[0] - 0.5 * foot.sole_size[0] + foot.pad_radius
+    assert heel + edge - 0.01 <= min(arms) < heel + edge
 
 
 @pytest.mark.parametrize("foot", [0, 1])

@@ -8,11 +8,12 @@ import numpy as np
 import pytest
 
 from atalante_control.model import ExoskeletonParameters
-from atalante_control.walking.dcm import Stabiliser, ankle_torques, dcm, pressure_shift
+from atalante_control.walking.config import WalkConfig
+from atalante_control.walking.dcm import Stabiliser, ankle_torques, dcm, pressure_shift, within_sole
 
 EXOSKELETON = ExoskeletonParameters()
 HENKE = np.array(EXOSKELETON.ha_axis) / np.linalg.norm(EXOSKELETON.ha_axis)
-STABILISER = Stabiliser(2.5, 0.12, 0.05, float(HENKE[0]), EXOSKELETON.toe_out)
+STABILISER = Stabiliser(2.5, 0.12, 0.05, float(HENKE[0]), EXOSKELETON.toe_out, -0.07, 0.19)
 
 
 def test_dcm_is_position_plus_speed_over_frequency_in_walking_axes() -> None:
@@ -46,3 +47,17 @@ def test_ankle_torques_balance_the_shifted_ground_force(side: int) -> None:
 
 def test_foot_without_load_gets_no_torque() -> None:
     assert ankle_torques(STABILISER, np.array([0.1, 0.05]), -20.0, 0) == (0.0, 0.0)
+
+
+@pytest.mark.parametrize(("torque", "edge"), [(-300.0, STABILISER.heel), (600.0, STABILISER.toe)])
+def test_ankle_torque_keeps_the_centre_of_pressure_within_the_sole(torque: float, edge: float) -> None:
+    limits = [within_sole(STABILISER, torque, load) for load in (0.0, 1500.0)]
+    assert limits[1] - limits[0] == pytest.approx(1500.0 * edge)
+    assert within_sole(STABILISER, torque, -20.0) == limits[0]
+    assert within_sole(STABILISER, 0.5 * limits[1], 1500.0) == 0.5 * limits[1]
+
+
+@pytest.mark.parametrize("edge", [-0.001, 0.11, math.nan])
+def test_invalid_distance_from_the_edge_is_rejected(edge: float) -> None:
+    with pytest.raises(ValueError, match=r"edge must be from 0 to 0\.1 m, got"):
+        WalkConfig(edge=edge)
