@@ -56,7 +56,7 @@ class PlacementConfig(NamedTuple):
     forward: float = 0.15  # m, largest offset of a landing forwards and backwards
     outward: float = 0.22  # m, largest offset of a landing away from the stance foot
     inward: float = 0.02  # m, largest offset of a landing towards the stance foot
-    slowest: float = 0.5  # smallest phase rate
+    slowest: float = 0.1  # smallest phase rate
     fastest: float = 1.6  # largest phase rate
     #: s, time after the start of a step in which the DCM error is ignored, because the new stance foot is not yet at rest
     settled: float = 0.08
