@@ -23,7 +23,7 @@ from atalante_hal.wire.frame import (
     as_words,
 )
 
-#: Largest number of cached arrays. At most the same number of batches have cached header words.
+#: Largest number of cached arrays, and largest number of batches with cached header words.
 #: A HAL or an emulator uses about five arrays and five batches.
 REMEMBERED = 64
 CLASSIC_LENGTHS = tuple(range(9))

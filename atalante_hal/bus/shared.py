@@ -8,7 +8,7 @@ end raises `BusDown`. Polling saves time only if the two processes run on differ
 
 In lock-step one end is the client and the other end is the server. `receive()` of the client publishes the frames that the
 client sent, and requests one step of the server. Then `receive()` returns the frames that the server sends in this step, if any.
-So the sequence of calls and the bytes on the bus are identical to those of a `PairBus`. Only the work that the server does
+So the sequence of calls and the bytes on the bus are the same as on a `PairBus`. Only the work that the server does
 after its answer runs in parallel with the client.
 """
 
@@ -40,7 +40,7 @@ _END_WORDS = 8
 _HEADER_BYTES = mmap.PAGESIZE
 #: A waiting bus end polls for this time [s] before it sleeps. The time is longer than the computing time of a cycle.
 _POLL_TIME = 500e-6
-#: After a wait in which polling found no frame, the bus end sleeps without polling in this number of waits.
+#: If polling finds no frame during a wait, the bus end sleeps without polling in this number of following waits.
 _WAITS_WITHOUT_POLLING = 32
 #: Longest sleep of a waiting bus end before it reads the shared memory again [ms].
 #: A sleep must be limited, because a wake-up byte may arrive before the new value in the shared memory is visible.

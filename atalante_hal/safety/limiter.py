@@ -243,7 +243,7 @@ def limit(
 
 
 def highest_torque(room: float, acceleration: float, oldest: float, inertia: float, delay: float, fall: float) -> float:
-    """Return U [Nm], the largest torque in one direction with which the predicted velocity stays within its limit.
+    """Return U [Nm], the largest torque in one direction that keeps the predicted velocity within its limit.
 
     Args:
         room: difference between the velocity limit and the velocity [rad/s].

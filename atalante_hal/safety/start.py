@@ -22,7 +22,7 @@ from atalante_hal.wire.cia402 import Controlword, DriveState, controlword_toward
 
 #: Longest time after START until all drives must be in OPERATION ENABLED [cycles].
 ENABLE_CYCLES = 200
-#: Longest time of a start in which no drive changes its state [cycles]. A command and its answer may each be lost four times.
+#: A start ends if no drive changes its state for this time [cycles]. A command and its answer may each be lost four times.
 STALLED_CYCLES = 10
 #: Prefix of the event text for a refused START.
 REFUSED = "START refused: "

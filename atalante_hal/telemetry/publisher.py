@@ -211,6 +211,6 @@ def _parsed(robot: str, listen: str, access: Access) -> zenoh.Config:
 
 
 def _reason(error: zenoh.ZError) -> str:
-    """Return the text of a Zenoh error without the source file and line of Zenoh in which it was raised."""
+    """Return the text of a Zenoh error, without the file name and the line number of Zenoh's source code."""
     text = str(error)
     return "the port is taken" if "os error 98" in text else text.split(" at /")[0]

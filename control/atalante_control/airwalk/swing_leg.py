@@ -20,7 +20,7 @@ OVERLAP = 100
 def swing_leg(
     config: AirwalkConfig, gait: Gait, inertia: AssistedInertia, gravity: Gravity, overlap: int = OVERLAP
 ) -> Leg:
-    """Return the swing leg along the nominal trajectory of a step and of the first cycles of the next step.
+    """Return the swing leg along its nominal trajectory, during a step and during the first cycles of the next step.
 
     Args:
         config: parameters of the controller; only `alpha` and `friction` are used.

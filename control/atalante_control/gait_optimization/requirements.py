@@ -31,7 +31,7 @@ class Requirements:
     roll: float = math.radians(5.0)  # rad, largest roll of the pelvis
     pitch: float = math.radians(6.0)  # rad, largest pitch of the pelvis
     yaw: float = math.radians(6.0)  # rad, largest yaw of the pelvis
-    #: m/s, range of the vertical speed of the ankle of the landing foot, upwards positive
+    #: m/s, range of the vertical ankle speed of the landing foot, upwards positive
     landing_speed: tuple[float, float] = -0.03, -0.003
     #: m/s, range of the vertical speed of each corner of the landing sole, upwards positive
     corner_speed: tuple[float, float] = -0.03, 0.0

@@ -371,7 +371,7 @@ class StepProblem:
         ]
 
     def _touchdown(self, q: Symbol, rate: Symbol) -> list[Rows]:
-        """Return the constraints of a soft landing: limits of the speeds of the ankle and of the corners of the sole."""
+        """Return the constraints of a soft landing: speed limits of the ankle and of the corners of the sole."""
         requirements = self.requirements
         foot = self.chain.frames(q, rate)[self.chain.swing_foot]
         ankle = self._yaw @ foot.rotation @ foot.linear

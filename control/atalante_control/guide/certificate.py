@@ -18,7 +18,8 @@ sufficient.
    the horizon. This cycle must not be the worst cycle. At the end of the horizon the free motion has decayed. The error
    in the added cycle therefore follows from the errors in earlier cycles of the prediction. This error must be smaller than
    the width minus the effect of the disturbances.
-3. *Gate.* Let g be the effect on r of one cycle without backup torque. Near h = 0 the gate is at least 1 - 3 h. A cycle with this
+3. *Gate.* Let g be the effect that one cycle without backup torque has on r. Near h = 0 the gate is at least 1 - 3 h. A cycle
+with this
    gate lowers 1 - r by at most 6 g (1 - r). So r stays below 1 if 6 g is at most 1. If the intensity of u_i or u_f is below 1,
    the torque that is not compensated in this cycle is part of g. The tests check that 6 g is at most 1 for the shape
    `constant`, at zero intensities. In the other shapes of the package 6 g reaches 1.4 if the smallest width of a step
@@ -176,7 +177,7 @@ def _pair(torque: Vector) -> JointTorque | None:
 
 
 def _limit(room: Vector, reach: Vector, steps: int, what: str) -> Limit:
-    """Return the largest multiple of the requested torques for which the whole effect is at most `room`.
+    """Return the largest multiple of the requested torques whose whole effect is at most `room`.
 
     Args:
         room: largest permitted effect on SH and SK in each cycle, shape (n, 2).

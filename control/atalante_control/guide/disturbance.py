@@ -57,7 +57,7 @@ class Mismatch:
 
 @dataclass(frozen=True)
 class HandOver:
-    """Hand-over box: range of deviations at the start of a step for which the guide certificate holds.
+    """Hand-over box: the guide certificate holds if the deviations at the start of a step are in this range.
 
     Raises:
         ValueError: If a value is negative or not finite.
@@ -92,7 +92,7 @@ class HandOver:
 
 
 class Leg(NamedTuple):
-    """Swing leg along the nominal trajectory of a step and of the first cycles of the next step (overlap).
+    """Swing leg along its nominal trajectory, during a step and during the first cycles of the next step (overlap).
 
     The rows are cycles; the columns are SH and SK.
     """

@@ -44,7 +44,7 @@ class WalkTrace:
             self._rows.append(self._controller.telemetry.copy())
 
     def columns(self) -> dict[str, Vector]:
-        """Return the samples of each telemetry field by its name, shape (n, width), and `time` [s], shape (n,)."""
+        """Return the samples of each telemetry field (shape (n, width)) by its name, and the array `time` [s] (shape (n,))."""
         from atalante_hal.types import PERIOD
 
         fields = self._controller.telemetry_fields
@@ -86,7 +86,7 @@ def foot_prints(columns: Mapping[str, Vector]) -> list[tuple[int, float, float, 
 
 
 def draw(columns: Mapping[str, Vector], picture: Path) -> None:
-    """Draw foot prints with the divergent component of motion (DCM), and error / guide width of SH and SK.
+    """Draw foot prints with the divergent component of motion (DCM), and the ratio of error to guide width of SH and SK.
 
     Args:
         columns: Samples of `WalkTrace.columns`.

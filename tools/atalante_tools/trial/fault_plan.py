@@ -18,7 +18,7 @@ class Moment(NamedTuple):
 
     phase: str  # name of a member of `atalante_control.walking.phases.Phase`
     step: int  # number of steps before the phase
-    share: float  # time since the first cycle of the phase / nominal duration of a step
+    share: float  # time since the first cycle of the phase, divided by the nominal duration of a step
 
 
 #: Steps of a walk before its stop step.

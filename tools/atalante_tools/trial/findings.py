@@ -270,7 +270,7 @@ def step_variation(result: Result) -> float:
 
 
 def _alarms(results: Sequence[Result]) -> str:
-    """Return the diagnostics that a walk without a fault must not report, with their numbers."""
+    """Return as text the number of each diagnostic that must not be reported in a walk without a fault."""
     counts: dict[str, int] = {}
     for result in results:
         for code, count in result["diagnostics"].items():

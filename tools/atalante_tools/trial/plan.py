@@ -1,6 +1,6 @@
 """Trials of the experiments: `experiment, options -> list of trials`. Each trial has a key.
 
-The key is a hash of the parameters of the trial and of the versions of all software that computes the trial. A stored
+The key is a hash of two things: the parameters of the trial, and the versions of all software that computes the trial. A stored
 result is therefore used again only if a new run would give the same result.
 """
 

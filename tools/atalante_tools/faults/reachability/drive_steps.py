@@ -33,7 +33,7 @@ _CYCLE: Final = 1000
 _POWERED: Final = (DriveState.OPERATION_ENABLED, DriveState.QUICK_STOP_ACTIVE)
 _OFF_WORDS: Final = (Controlword.DISABLE_VOLTAGE, Controlword.SHUTDOWN, Controlword.SWITCH_ON)
 
-WATCHDOG_PROPERTY: Final = "a drive is not enabled without a valid command and a SYNC of the last 5 cycles"
+WATCHDOG_PROPERTY: Final = "a drive is enabled only with a valid command and a SYNC of the last 5 cycles"
 HOLD_PROPERTY: Final = "a drive with power keeps power until a valid command or an error switches it off"
 LATCH_PROPERTY: Final = "a local hold ends only on QUICK STOP and then ENABLE OPERATION"
 
