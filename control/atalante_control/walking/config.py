@@ -20,6 +20,8 @@ Pair = tuple[float, float]
 STEERING = 0.5, 0.15, math.radians(3.0)
 
 _NO_INTEGRAL = (0.0,) * 6
+#: Largest turn before a periodic step [rad]. Larger turns were not tried.
+TURN_MAX = math.radians(5.0)
 #: Heading gain of an IMU with a heading reference [1/s].
 HEADING_GAIN = 0.5
 #: Gains without integral terms. With integral terms, the robot began to limp after about 120 steps in MuJoCo.
@@ -67,6 +69,7 @@ class WalkConfig:
     #: Steering by an offset of the transverse hip: gain on the heading error [rad/rad], gain on the sideways deviation
     #: [rad/m], limit [rad].
     steering: tuple[float, float, float] = STEERING
+    turn: float = 0.0  # rad, angle by which the desired line turns before each periodic step, positive to the left
     #: s, time after the nominal end of a step at which the step ends if no landing is detected
     landing_timeout: float = 0.4
     load_bandwidth: float = 35.0  # Hz, cut-off frequency of the low-pass of the vertical foot forces
@@ -112,6 +115,8 @@ class WalkConfig:
             raise ValueError(f"heading_gain must be from 0 to 10 [1/s], got {self.heading_gain!r}")
         if not 0.0 <= self.edge <= 0.1:
             raise ValueError(f"edge must be from 0 to 0.1 m, got {self.edge!r}")
+        if not abs(self.turn) <= TURN_MAX:
+            raise ValueError(f"turn must be from {-TURN_MAX:.4f} to {TURN_MAX:.4f} rad, got {self.turn!r}")
         placement = self.placement
         if not 0.0 < placement.slowest <= 1.0:
             raise ValueError(f"placement.slowest must be above 0 and at most 1, got {placement.slowest!r}")

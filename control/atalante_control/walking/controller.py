@@ -177,7 +177,11 @@ class WalkController:
             sensed[0].heading,
         )
         self._stage.flat = config.flat_foot
-        self._pid, self._impact, self.steering = pid, ImpactDetector(config.impact), Steering(config.steering)
+        self._pid, self._impact, self.steering = (
+            pid,
+            ImpactDetector(config.impact),
+            Steering(config.steering, config.turn),
+        )
         ankles = ankle_records(robot, exoskeleton, 0.0)
         self._parts = Parts(
             chain=kinematics.chain,
@@ -414,6 +418,8 @@ class WalkController:
             self._command.step = (self._command.step or 0) + 1
         self._command.walking = phase in WALKING
         stage.stance, stage.double = self._stance, phase not in STEPPING
+        if phase is Phase.STEP and self.config.turn:
+            self.steering.turn()
         stage.steering = self.steering.offset() if phase is Phase.STEP else 0.0
         self.phase, self._since, self._table = phase, cycle, self._tables[phase, self._stance]
         stage.literal = self.config.literal_law and phase is Phase.STEP

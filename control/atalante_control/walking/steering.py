@@ -23,14 +23,15 @@ class Steering:
         yaw: mean heading of both soles relative to the line [rad].
     """
 
-    def __init__(self, gains: tuple[float, float, float]) -> None:
+    def __init__(self, gains: tuple[float, float, float], turn: float = 0.0) -> None:
         """Set the gains of the steering.
 
         Args:
             gains: TH offset per heading error [rad/rad], TH offset per sideways deviation [rad/m], and largest TH
-                offset [rad].
+                offset without a turn [rad].
+            turn: angle by which the line turns before each periodic step, positive to the left [rad].
         """
-        self._gains = gains
+        self._gains, self._turn = gains, turn
         self.feet: Vector = np.zeros((2, 2))
         self.yaw = self._origin = 0.0
 
@@ -67,10 +68,23 @@ class Steering:
         self.feet[side] = self.feet[1 - side] + (right if side else -right)
         self.yaw = float(headings.mean()) - self._origin
 
+    def turn(self) -> None:
+        """Turn the line about the middle between the feet. The deviation from the line stays the same."""
+        self._origin += self._turn
+        self.yaw -= self._turn
+        c, s = math.cos(self._turn), math.sin(self._turn)
+        middle = self.feet.mean(axis=0)
+        x, y = (self.feet - middle).T
+        self.feet[:] = middle + np.column_stack([c * x + s * y, c * y - s * x])
+
     def offset(self) -> float:
         """Return the offset of the transverse hip (TH) of the swing leg for the next step, positive to the left [rad]."""
         per_yaw, per_metre, largest = self._gains
-        return -min(max(per_yaw * self.yaw + per_metre * self.lateral, -largest), largest)
+        limit = largest + abs(self._turn)
+        # In a steady turn, the stance sole has the heading of the line before this turn, and the other sole is one turn behind.
+        # The mean heading is therefore 1.5 turns behind the line.
+        error = self.yaw + 1.5 * self._turn
+        return -min(max(per_yaw * error + per_metre * self.lateral - self._turn, -limit), limit)
 
     def _on_line(self, step: Vector) -> Vector:
         c, s = math.cos(self._origin), math.sin(self._origin)

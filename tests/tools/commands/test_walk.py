@@ -36,6 +36,23 @@ def test_walk_with_a_heading_reference_stands() -> None:
     assert result["yaw_deg"] == pytest.approx(result["true_yaw_deg"], abs=1.0)
 
 
+@pytest.mark.parametrize(("turn", "xi"), [(3.0, 1.0), (-3.0, 0.5)])
+def test_line_turns_before_each_step(turn: float, xi: float) -> None:
+    code, out, errors = run("--steps", "8", "--turn", str(turn), "--xi", str(xi), "--engine", "mujoco", "--json")
+    result = json.loads(out)
+    assert (code, result["outcome"], result["steps"]) == (0, "stood", 8), errors
+    assert result["true_yaw_deg"] == pytest.approx(8 * turn, abs=3.0)
+    assert abs(result["yaw_deg"]) < 4.0
+    assert abs(result["lateral_m"]) < 0.1
+    assert result["xi"] == 1.0 or result["inside"] == 1.0
+
+
+def test_turn_is_refused_without_steering() -> None:
+    code, _, errors = run("--turn", "2", "--literal")
+    assert code == 2
+    assert "--turn requires steering, which --literal does not have" in errors
+
+
 def test_passive_wearer_walks_inside_the_certified_guide(tmp_path: Path) -> None:
     arguments = (
         "--steps",

@@ -93,6 +93,14 @@ def _protocol(_ctx: click.Context, _param: click.Parameter, text: str | None) ->
 )
 @gait_options
 @click.option(
+    "--turn",
+    type=Between(-5.0, 5.0),
+    default=0.0,
+    show_default=True,
+    metavar="DEG",
+    help="Angle by which the desired line turns before each periodic step, positive to the left [deg].",
+)
+@click.option(
     "--push",
     type=Between(0.0, 1000.0),
     metavar="N",
@@ -153,6 +161,7 @@ def command(
     push_direction: float,
     friction: float,
     heading_reference: bool,
+    turn: float,
     seed: int,
     out: Path | None,
     robot_process: bool | None,
@@ -178,6 +187,8 @@ def command(
     for option, given in emulated.items():
         if given and not target.embedded:
             raise click.UsageError(f"{option} requires the emulated robot of -i embedded")
+    if turn and law.literal:
+        raise click.UsageError("--turn requires steering, which --literal does not have: remove one of them")
     if protocol is not None:
         steps = sum(protocol)
     subject = _subject(patient, step_length, step_duration)
@@ -196,6 +207,7 @@ def command(
         recording=recording,
         robot_process=robot_process,
         heading_reference=heading_reference,
+        turn=turn,
         out=out,
     )
     walk(target, options, as_json=as_json)

@@ -111,6 +111,7 @@ def _walk(
         WalkConfig.literal() if law.literal else WalkConfig(),
         guide=replace(WALK_GUIDE, idealization=law.idealization, feedforward=law.feedforward),
         heading_gain=HEADING_GAIN if options.heading_reference else 0.0,
+        turn=math.radians(options.turn),
     )
     controller = WalkController(robot, patient, gaits, options.steps, config, shape=guide_shape(options.shape))
     if options.xi < 1.0:  # at Xi = 1 there is no guide

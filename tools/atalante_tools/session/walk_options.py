@@ -58,6 +58,7 @@ class WalkOptions:
     robot_process: bool | None = None
     #: whether the pelvis IMU has a heading reference, so that its heading does not drift and the controller follows its heading
     heading_reference: bool = False
+    turn: float = 0.0  # angle by which the line turns before each periodic step, positive to the left [deg]
     out: Path | None = None  # folder for summary.json, trace.npz and walk.png; None means no files
 
 
