@@ -101,7 +101,7 @@ def pose_gains(robot: Robot) -> tuple[Vector, Vector]:
 
 
 def mobilities_of(torque: Vector, position: Vector) -> tuple[Vector, Vector]:
-    """Return the mobility of each joint, which is the inverse of its effective inertia, for each delay in `LATENCIES`.
+    """Return the mobility (inverse of the effective inertia) of each joint, for each delay in `LATENCIES`.
 
     A wrong delay makes the mobility of a light joint several times too small.
 

@@ -23,7 +23,7 @@ class Event:
     cycle: int
     code: str  # code of the event, e.g. NODE_TIMEOUT; cut to 39 bytes when packed
     text: str  # one sentence for the operator; cut to 220 bytes when packed
-    severity: str = "info"  # one of `SEVERITIES`
+    severity: str = "info"  # severity of the event, one of `SEVERITIES`
     node: str = "HAL"  # DBC name of the node; cut to 32 bytes when packed
     value: float = 0.0  # measured value, whose quantity and unit depend on the code
     count: int = 1  # number of occurrences that this event reports

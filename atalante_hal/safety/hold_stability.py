@@ -31,7 +31,7 @@ class Swings(NamedTuple):
     """Record of the reversals of all joints, shape (12,) each."""
 
     direction: npt.NDArray[np.int64]  # sign of the last velocity above `SPEED`; 0 if there is none
-    age: npt.NDArray[np.int64]  # cycles since the joint first exceeded `SPEED` in this direction
+    age: npt.NDArray[np.int64]  # number of cycles since the joint first exceeded `SPEED` in its current direction
     reversals: npt.NDArray[np.int64]  # number of consecutive reversals
 
 

@@ -60,7 +60,7 @@ _RIVAL = (Check.CONFLICT, Check.WRONG_SEQUENCE)
 #: Results of the E2E check of a rejected frame whose format and CRC are correct.
 _INTACT = (*_RIVAL, Check.RANGE, Check.INVALID)
 _FRESH = int(Check.SOME_LOST)
-#: Result of the E2E check of a rejected frame -> diagnostic that is raised when its leaky bucket is full.
+#: E2E check result of a rejected frame -> diagnostic. The diagnostic is raised when its leaky bucket is full.
 #: An INVALID frame of an IMU raises another diagnostic, see `MessageMonitor`.
 _DISTURBANCES = {
     Check.REPEATED: Dtc.E2E_REPEAT_RATE,

@@ -71,7 +71,7 @@ class Refusal(NamedTuple):
     """Event that ends a START."""
 
     code: str  # START_REFUSED, or START_FAILED if the drives were not enabled in time
-    severity: str  # one of `events.SEVERITIES`
+    severity: str  # severity of the event, one of `events.SEVERITIES`
     text: str  # one sentence for the operator
 
 

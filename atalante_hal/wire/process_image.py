@@ -483,8 +483,8 @@ def classify_frame(words: Words, row: int, offset: int, e2e: E2EState, tag: int,
             return _CONFLICT
         result = _CONFLICT
     elif tag != _NO_TAG and not back:
-        # Reject a frame that answers no recent SYNC, and a frame that answers a SYNC before that of the last accepted
-        # frame. A rejected frame does not change the expected counter.
+        # Reject a frame that answers no recent SYNC, and a frame that answers an earlier SYNC than the last accepted frame. A
+        # rejected frame does not change the expected counter.
         backwards = expected[row] != NOTHING and counter - expected[row] + 1 & 0xFF >= _HALF_TURN
         if not in_time or backwards:
             return _WRONG_SEQUENCE

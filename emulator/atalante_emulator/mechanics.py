@@ -38,7 +38,7 @@ class Mechanics:
     """Mechanics of an emulated robot."""
 
     urdf: str  # text of the URDF, with the wearer's segments if the robot is worn
-    engine: str = ENGINES[0]  # one of `ENGINES`
+    engine: str = ENGINES[0]  # physics engine, one of `ENGINES`
     ground: Ground | None = None  # with None, the pelvis is fixed, and there is no floor
     #: Impedance of a passive wearer. With None, a wearer in the URDF affects the joints only by the masses of the limbs.
     limbs: LimbParameters | None = None

@@ -59,7 +59,7 @@ def _advance(
 
 
 class Motors:
-    """Motors of all joints, which update the arrays of measured torque [Nm at the joint] and winding temperature [degC]."""
+    """Motors of all joints. They update two arrays: measured torque [Nm at the joint] and winding temperature [degC]."""
 
     def __init__(self, robot: Robot, parameters: MotorParameters, torque: Vector, temperature: Vector) -> None:
         both = len(SIDES)

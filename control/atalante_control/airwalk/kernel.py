@@ -40,14 +40,14 @@ class Parts(NamedTuple):
     """Arrays of the controller parts. `run` reads and updates them. Each part allocates the arrays that it owns."""
 
     steps: Records[Step]  # (1,) values of the step
-    links: Records[LinkRecord]  # (n,) `Gravity.links`
-    pids: Records[PidRecord]  # (1,) `Pid.records`
-    ankles: Records[Ankle]  # (2,) `LevelFeet.ankles`
-    cubics: Vector  # (n, 4) `LevelFeet.cubics`
-    literal: LiteralTables  # `LiteralGuide.tables`
-    carries: Records[Carry]  # (1,) `CarryOver.records`
-    blend: Vector  # (n,) `CarryOver.blend`
-    outputs: Records[Outputs]  # (1,) results
+    links: Records[LinkRecord]  # (n,) links of the exoskeleton, see `Gravity.links`
+    pids: Records[PidRecord]  # (1,) gains and integral torques of the PIDs, see `Pid.records`
+    ankles: Records[Ankle]  # (2,) left and right ankle, see `LevelFeet.ankles`
+    cubics: Vector  # (n, 4) basis cubics of the re-centring, see `LevelFeet.cubics`
+    literal: LiteralTables  # tables of the literal control law, see `LiteralGuide.tables`
+    carries: Records[Carry]  # (1,) state of the carry-over, see `CarryOver.records`
+    blend: Vector  # (n,) fraction of the torque jump that is still compensated, see `CarryOver.blend`
+    outputs: Records[Outputs]  # (1,) results of the cycle
     telemetry: Records[Telemetry]  # (1,) telemetry of the cycle
 
 

@@ -44,7 +44,7 @@ class Step:
     stance: int  # stance leg: 0 left, 1 right
     completed: int  # number of right-stance steps completed before this step
     cycles: int  # number of cycles in a step
-    xi: float  # assistance factor
+    xi: float  # assistance factor Xi of the step
     assisted: bool  # True if hip and knee of the swing leg get the assistive torque; False at assistance factor 1
     intensity: float  # factor of the haptic levels
     literal: bool  # whether the control law follows the paper literally, see `guide.literal`

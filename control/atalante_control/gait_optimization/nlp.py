@@ -24,7 +24,7 @@ class Rows(NamedTuple):
     """Named group of constraints: lower <= values <= upper."""
 
     name: str  # readable name of the group, for example "swing clearance"
-    unit: str  # SI unit
+    unit: str  # SI unit of `values`
     size: float  # [unit] scale; the program divides values and bounds by this scale
     values: Symbol  # SX, constrained expressions, shape (m,) [unit]
     lower: Vector  # [unit] lower bounds, shape (m,), or (repetitions, m) if they differ between repetitions
@@ -34,9 +34,9 @@ class Rows(NamedTuple):
 class Group(NamedTuple):
     """Indices of the rows of g that belong to one named group of constraints."""
 
-    name: str  # as in `Rows`
-    unit: str  # as in `Rows`
-    size: float  # as in `Rows`
+    name: str  # name of the group, as in `Rows`
+    unit: str  # SI unit of the constraints, as in `Rows`
+    size: float  # scale of the constraints, as in `Rows`
     rows: Indices  # row indices in g
 
 

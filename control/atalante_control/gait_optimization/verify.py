@@ -28,7 +28,7 @@ _SLIDING = 1.0  # Ns, accepted impact impulse above the friction limit; 1 Ns cha
 _SLIDE = 0.04  # m/s, accepted horizontal speed of a corner of the sole at the landing
 _DROP = 0.035  # m/s, accepted downward speed of a corner of the sole at the landing
 _LIFT = 0.005  # m/s, accepted upward speed of a corner of the sole at the landing
-_SHORTFALL = 2e-3  # m, the swing sole may be this much lower than the intended height
+_SHORTFALL = 2e-3  # m, accepted distance of the swing sole below its intended height
 _SINKING = 1e-3  # m, accepted depth of the swing sole below the ground at the start of the swing
 
 

@@ -72,7 +72,7 @@ class Lag:
 class Block:
     """Bounds of the predicted tracking errors over `SLACK_CYCLES` consecutive cycles ahead."""
 
-    #: matrix from `Guard.magnitude` to the largest change of the predicted errors that model errors can cause [rad]
+    #: matrix from `Guard.magnitude` to the largest change [rad] that model errors can cause in the predicted tracking errors
     slack: Annotated[Vector, (STATES, 2)]
     middle: Annotated[Vector, (COMPRESSED, 2)]  # mean of the largest and the smallest `Lag.ahead` in the block
     #: half the difference of the largest and the smallest `Lag.ahead` in the block
@@ -86,17 +86,18 @@ class Few:
     lag: int  # number of cycles ahead
     #: matrix from the state to four predictions: backup acceleration [rad/s2] of hip and knee, then e' [rad/s] of hip and knee
     ahead: Annotated[Vector, (STATES, 4)]
-    #: matrix from `Guard.magnitude` to the largest change of the predicted e' of hip and knee that model errors can cause [rad/s]
+    #: matrix from `Guard.magnitude` to the largest change [rad/s] that model errors can cause in the predicted e' of hip and
+    #: knee
     slack: Annotated[Vector, (STATES, 2)]
 
 
 class GuideTables(NamedTuple):
     """Tables of the guide filter. `GuideFilter` owns the tables; `tick` writes to `guards` and to `Block.ratio` only."""
 
-    guards: Records[Guard]  # (1,)
+    guards: Records[Guard]  # (1,) constants, state and results of the filter
     laws: Records[Law]  # (1,) mass matrix and friction
-    lags: Records[Lag]  # (lags,)
-    blocks: Records[Block]  # (blocks,)
+    lags: Records[Lag]  # (lags,) predictions of the tracking errors, one for each number of cycles ahead
+    blocks: Records[Block]  # (blocks,) bounds of the predicted tracking errors
     few: Records[Few]  # (rows,) predictions of torque and speed, in ascending order of `Few.lag`
     #: (starts, lags, 4) rad, largest errors of sagittal hip and knee.
     #: Columns 0 and 1: due to model errors. Columns 2 and 3: due to the requested disturbances.

@@ -55,7 +55,7 @@ class Letter:
 class LiteralTables(NamedTuple):
     """Tables of the control law that follows the paper literally. `assistive_torque` changes only `letters`."""
 
-    letters: Records[Letter]  # (1,)
+    letters: Records[Letter]  # (1,) constants and state of the control law
     step: Vector  # (cycles + 1, 8) values of each cycle of the step; the columns are defined below
 
 

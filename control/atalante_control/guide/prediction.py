@@ -78,13 +78,13 @@ class Prediction:
         compress: matrix from the state to the compressed state, shape (COMPRESSED, STATES).
         ahead: matrices from the compressed state to the predicted errors e of SH and SK, shape (lags, 2, COMPRESSED).
         beyond: matrix from the state to the errors one cycle beyond the horizon, shape (2, STATES).
-        slack: largest change of the predicted errors that model errors can cause, per unit of each element of
+        slack: largest change that model errors can cause in the predicted errors, per unit of each element of
             `Guard.magnitude`, for each block of `SLACK_CYCLES` cycles ahead, shape (blocks, 2, STATES).
-        reach: `GuideTables.reach`.
+        reach: largest errors due to model errors and requested disturbances, see `GuideTables.reach`.
         few_ahead: matrices from the state to the predicted feedback [rad/s2] of SH and SK and the predicted e' [rad/s] of SH and
             SK, `FEW` cycles ahead, shape (rows, 4, STATES).
-        few_reach: `GuideTables.few_reach`.
-        few_slack: largest change of the predicted e' that model errors can cause, per unit of each element of
+        few_reach: largest effects of disturbances on torques and speeds, see `GuideTables.few_reach`.
+        few_slack: largest change that model errors can cause in the predicted e', per unit of each element of
             `Guard.magnitude`, shape (rows, 2, STATES).
         start: largest effect of the disturbances since the start of a step.
         torque: torque that the leg needs along the nominal trajectory, shape (n, 2) [Nm].

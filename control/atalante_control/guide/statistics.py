@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 class GuideStatistics:
     """Statistics of the guide over the cycles that were added with `count`."""
 
-    cycles: int = 0  # counted cycles
+    cycles: int = 0  # number of counted cycles
     inside: int = 0  # number of counted cycles with both assisted joints inside the guide
     active: int = 0  # number of counted cycles with the filter active
     max_ratio: float = 0.0  # largest |e| / q_bound

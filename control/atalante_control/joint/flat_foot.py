@@ -40,7 +40,7 @@ _IMU_AGE = 10  # cycles, largest valid age of an IMU message, equal to the timeo
 class Ankle:
     """Constants of one ankle, and its deviation from the targets at the stance change. The re-centring removes the deviation."""
 
-    geometry: Annotated[Vector, 4]  # `FlatFoot.geometry`
+    geometry: Annotated[Vector, 4]  # geometry of the ankle, see `FlatFoot.geometry`
     offset: float  # rad, angle added to the target of the sagittal ankle (SA)
     joints: Annotated[npt.NDArray[np.int64], 2]  # indices of sagittal and henke ankle (SA, HA) of this leg in JOINTS
     low: Annotated[Vector, 2]  # rad, smallest targets of sagittal and henke ankle

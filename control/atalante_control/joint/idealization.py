@@ -33,7 +33,7 @@ _ASSISTED = (LEG_JOINTS.index("SH"), LEG_JOINTS.index("SK"))
 class Law:
     """Parameters of `idealization` for the assisted joints, sagittal hip and knee."""
 
-    fit: Annotated[Vector, (3, 3)]  # kg m2, `AssistedInertia.fit`
+    fit: Annotated[Vector, (3, 3)]  # kg m2, coefficients of the mass matrix, see `AssistedInertia.fit`
     coulomb: Annotated[Vector, 2]  # Nm, Coulomb friction k_d
     viscous: Annotated[Vector, 2]  # Nm s/rad, viscous friction k_v
     smoothing: float  # rad/s, smoothing speed v_s

@@ -19,7 +19,7 @@ from atalante_hal.compiled import compiled
 from atalante_hal.robot import JOINTS, LEG_JOINTS
 from atalante_hal.types import Vector
 
-PerJoint = tuple[float, float, float, float, float, float]  # FH, TH, SH, SK, SA, HA
+PerJoint = tuple[float, float, float, float, float, float]  # one value for each joint of a leg: FH, TH, SH, SK, SA, HA
 
 LEFT, RIGHT = 0, 1
 

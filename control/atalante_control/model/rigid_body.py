@@ -86,7 +86,7 @@ class Link:
     axis: Vector3  # joint axis in the frame of the link; unused for a fixed link
     inertia: Inertia
     boxes: tuple[Box, ...] = ()  # shapes for viewers
-    pad: Sphere | None = None  # contact sphere
+    pad: Sphere | None = None  # sphere that touches the floor; None if the link has no contact
 
     def fused(self, box: Box, inertia: Inertia) -> Link:
         """Return a copy of the link that is fused with a second body.

@@ -160,7 +160,7 @@ def no_joint_is_too_fast(run: Observation) -> str | None:
 
 
 def start_fails_and_names_the_hip(run: Observation) -> str | None:
-    """Check that START soon fails with an event that names the left sagittal hip, and that all other drives hold then.
+    """Check that START soon fails with an event that names the left sagittal hip, and that all other drives then hold.
 
     Args:
         run: observation of the run.

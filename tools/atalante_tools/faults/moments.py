@@ -115,7 +115,7 @@ class MomentVerdict:
     state: str  # state of the HAL just before the operator presses START after the faults
     restarted: bool  # whether the operator's START after the faults led to ACTIVE
     extremes: Extremes | None  # None if the run raised an exception
-    failures: tuple[str, ...]  # one sentence each
+    failures: tuple[str, ...]  # failed checks, one sentence each
 
 
 @dataclass(frozen=True)

@@ -70,7 +70,7 @@ class PairVerdict:
     first: str
     second: str
     state: str  # final state of the HAL
-    failures: tuple[str, ...]  # one sentence each
+    failures: tuple[str, ...]  # failed checks, one sentence each
 
 
 @dataclass(frozen=True)
@@ -163,9 +163,9 @@ def run_case(id_: str, case: Case) -> Verdict:
 class Scope:
     """Additional runs of a campaign, besides the cases of the fault matrix."""
 
-    endurance: bool  # endurance runs
-    pairs: bool  # the pairs of `REPRESENTATIVES` during a walk
-    moments: bool  # one run for each combination of a case and a `Moment` at which the case begins
+    endurance: bool  # whether to run the endurance runs
+    pairs: bool  # whether to run the pairs of `REPRESENTATIVES` during a walk
+    moments: bool  # whether to run each case at each `Moment`
     random_pairs: int  # number of random pairs of cases that begin at random times
     seed: int  # seed of the random pairs
 

@@ -80,7 +80,7 @@ class Verdict:
     cycles: int | None
     bound: int  # time limit for `cycles`
     dtc: str  # first reported diagnostic code that matches the expected code
-    failures: tuple[str, ...]  # one sentence each
+    failures: tuple[str, ...]  # failed checks, one sentence each
 
     @property
     def passed(self) -> bool:

@@ -170,7 +170,7 @@ class Adversary:
             yield "constant", Push(np.tile(direction, (cycles, 1)), _no_feedback())
 
     def _following(self, cycles: int) -> Iterator[tuple[str, Push]]:
-        """Yield pushes with the sign of the error, of the rate of the error, or of random mixtures of all features."""
+        """Yield pushes whose sign follows the error, the rate of the error, or a random mixture of all features."""
         for joint, (error, rate) in itertools.product((0, 1), ((0.0, 1.0), (1.0, 0.0), (1.0, 1.0))):
             # The mass matrix couples the joints, so the worst push at the other joint may have either direction.
             for other in (-1.0, 1.0):

@@ -348,7 +348,7 @@ def push_trials(
 
 @cache
 def versions() -> dict[str, str]:
-    """Return the version of Python, of this project, of its source text, and of the packages that compute a trial."""
+    """Return the versions of Python, this project, its source text, and the packages that compute a trial."""
     folder = Path(__file__).parent
     source = source_hash([*_roots(), folder], [folder / name for name in _REPORTING])
     found = {"python": platform.python_version(), "atalante-hal": version("atalante-hal"), "source": source}

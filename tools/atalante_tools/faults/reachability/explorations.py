@@ -61,7 +61,7 @@ class Operator(NamedTuple):
 class Presses(NamedTuple):
     """Memory of the search `moves`: number of START presses that changed no state yet, and whether a START is in progress."""
 
-    received: int = 0  # number of presses; two stands for two or more
+    received: int = 0  # number of presses of START; 2 means two or more
     started: bool = False
 
 

@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from atalante_emulator.emulator import Emulator
     from atalante_emulator.pendant import Operator
 
-#: Row of the pelvis IMU.
+#: Index of the pelvis IMU in `IMUS`.
 _PELVIS: Final = IMUS.index("pelvis")
 #: Values of `_Shared.question`: run a cycle, or answer with the true attitude or the true stance.
 _CYCLE, _ATTITUDE, _STANCE = 0.0, 1.0, 2.0
