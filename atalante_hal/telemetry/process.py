@@ -64,7 +64,7 @@ class TelemetryConfig:
     """Configuration of the telemetry: what is published, recorded and logged, and where."""
 
     robot: str = "exo"  # name of the robot in the Zenoh keys atalante/<robot>/...
-    publish: bool = True  # publish on Zenoh
+    publish: bool = True  # whether messages are published on Zenoh
     listen: str | None = None  # Zenoh endpoint; None means the first free port from tcp/127.0.0.1:7447 on
     stream_rate: int = 100  # Hz in robot time, publishing rate of each stream
     loop_rate: int = 10  # Hz in robot time, rate of the messages with loop statistics

@@ -189,7 +189,7 @@ class Qualification(NamedTuple):
     """Trust in the sender of one message, and the error counter on which the trust depends."""
 
     bucket: int = 0  # error counter (leaky bucket), 0 to `FULL`
-    good: int = 0  # good cycles in a row, counted up to `REQUALIFY`
+    good: int = 0  # number of good cycles in a row, counted up to `REQUALIFY`
     trusted: bool = False  # True if the values of the message may be used
 
 

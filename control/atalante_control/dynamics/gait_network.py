@@ -47,8 +47,8 @@ class NetworkError(ValueError):
 class Layer(NamedTuple):
     """Linear layer of the network, y = x W + b."""
 
-    weights: Vector  # W, (inputs, outputs)
-    bias: Vector  # b, (outputs,)
+    weights: Vector  # weight matrix W, shape (inputs, outputs)
+    bias: Vector  # bias vector b, shape (outputs,)
 
 
 @dataclass(frozen=True)

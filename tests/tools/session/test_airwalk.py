@@ -126,7 +126,8 @@ def test_certificates_are_printed_before_the_run(demo):
     pinched = json.loads(demo[0].stdout.splitlines()[0])
     hip, knee = pinched["promise_hip_nm"], pinched["promise_knee_nm"]
     assert promise.startswith(
-        f"pinched: promise at Xi 0.5: disturbances up to {hip:.2f} Nm at the hip and {knee:.2f} Nm at the knee together"
+        f"pinched: promise at Xi 0.5: both joints stay in the guide while disturbances of up to {hip:.2f} Nm at the hip and "
+        f"{knee:.2f} Nm at the knee act at the same time; "
     )
     assert "the promise includes joint torque and rate limits, delay" in stderr
 

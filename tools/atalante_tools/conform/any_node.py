@@ -124,7 +124,7 @@ def requirements(tester: NodeTester) -> tuple[list[Requirement], list[Requiremen
     after = [
         Requirement(
             "NODE-11",
-            "Increments the counter of each message by 1 per frame; for an answer to SYNC it is the low byte of Cycle.",
+            "Increments each counter by 1 per frame; the counter of an answer to SYNC is the low byte of Cycle.",
             all_frames,
             e2e,
             _all(_counter_defects),

@@ -27,10 +27,10 @@ class Absence:
             emulator: emulated robot.
         """
         self._clock, self._emulator = clock, emulator
-        self._begun = 0  # HAL cycles that have begun
+        self._begun = 0  # number of HAL cycles that have begun
         self._skipped = 0.0  # time lost by the loop in cycles that began more than a period late [s]
         self._seen = 0  # cycle number of the robot at the end of the last call of `wait`
-        self._alone = 0  # cycles of the robot since the last SYNC
+        self._alone = 0  # number of robot cycles since the last SYNC
 
     def wait(self) -> float:
         """Advance the robot to the start of the current HAL cycle. Return the delay [s] of this HAL cycle."""

@@ -49,8 +49,8 @@ def announce(certificates: Collection[Certificate], mismatch: Mismatch, leg: str
             print_message(f"{name}: NOT CERTIFIED at Xi {xi:g}: {certificate.reason}")
             continue
         print_message(
-            f"{name}: promise at Xi {xi:g}: disturbances up to {promise.hip:.2f} Nm at the hip and {promise.knee:.2f} Nm at the "
-            f"knee together leave both joints in the guide; {certificate.reason}"
+            f"{name}: promise at Xi {xi:g}: both joints stay in the guide while disturbances of up to {promise.hip:.2f} Nm "
+            f"at the hip and {promise.knee:.2f} Nm at the knee act at the same time; {certificate.reason}"
         )
     if any(certificate.certified for certificate in certificates):
         print_message(

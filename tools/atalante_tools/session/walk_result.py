@@ -27,10 +27,10 @@ if TYPE_CHECKING:
 class WalkResult:
     """Result of a walk. The JSON object has the same fields."""
 
-    steps: int  # completed steps of the periodic gait
+    steps: int  # number of completed steps of the periodic gait
     fell: bool
-    outcome: str  # stood, fell, stopped, hold or fault
-    engine: str | None  # None means the real robot
+    outcome: str  # how the walk ended: stood, fell, stopped, hold or fault
+    engine: str | None  # physics engine of the emulated robot; None means the real robot
     xi: float
     shape: str | None  # guide shape; None at Xi = 1, where there is no guide
     certified: bool | None  # whether the guide is certified; None at Xi = 1, where there is no guide
@@ -40,9 +40,9 @@ class WalkResult:
     promise_knee_nm: float | None
     max_ratio: float | None  # largest tracking error as a fraction of the guide width; None if no step was guided
     inside: float | None  # fraction of the guided time with both joints inside the guide; None if no step was guided
-    outside_cycles: int  # guided cycles with a joint outside the guide
+    outside_cycles: int  # number of guided cycles with a joint outside the guide
     filter_active: float | None  # fraction of the guided time with the guide filter active; None if no step was guided
-    hand_overs_exceeded: int  # guided steps that started with a larger deviation than the certificate assumes
+    hand_overs_exceeded: int  # number of guided steps that started with a larger deviation than the certificate assumes
     full_assist: bool  # whether the HAL changed to full assistance
     lateral_m: float  # sideways deviation from the walking line at the last landing, positive to the left
     yaw_deg: float  # heading of the soles relative to the walking line at the last landing, positive to the left

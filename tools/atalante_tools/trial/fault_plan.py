@@ -21,7 +21,7 @@ class Moment(NamedTuple):
     share: float  # time since the first cycle of the phase, divided by the nominal duration of a step
 
 
-#: Steps of a walk before its stop step.
+#: Number of steps of a walk before its stop step.
 STEPS: Final = 2
 #: Moments at which each fault begins, by name. Both feet carry load in the weight shifts before and after the steps.
 MOMENTS: Final = {

@@ -23,7 +23,7 @@ from atalante_tools.trial.plan import STEP, PushTrial
 
 #: Index of the pushed step. In a step with an odd index, the right leg is the stance leg.
 _PUSHED: Final = 3
-#: Periodic steps after the pushed step.
+#: Number of periodic steps after the pushed step.
 _AFTER: Final = 4
 
 

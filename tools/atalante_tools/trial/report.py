@@ -38,7 +38,7 @@ EXPERIMENTS: Final = {
     "faults": (
         "Faults during walks on the ground",
         "Each case of the fault matrix begins at ten moments of a walk with a passive wearer: at eight phases of the second "
-        "step, and in the weight shifts before and after the steps, in which both feet carry load. A robot has fallen if its "
+        "step, and in the weight shifts (both feet carry load) before and after the steps. A robot has fallen if its "
         "pelvis leans by more than 35 degrees. The longest duration of a permanent fault without a fall is found by bisection.",
     ),
     "protocol": (

@@ -403,7 +403,7 @@ def test_foreign_network_is_checked_within_its_dbc(tmp_path: Path) -> None:
         "no cyclic message SYNC",
         "no message has a signal DriveState",
         "no rule checked the values of these signals (1): Speed.Raw",
-        "not in the log and not required (1): Event",
+        "neither in the log nor required (1): Event",
     ):
         assert sentence in result.stderr
 

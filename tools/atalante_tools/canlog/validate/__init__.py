@@ -35,7 +35,7 @@ class Options:
     lockstep: bool  # whether the time stamps of the live bus are computed from the cycle number in SYNC
     seconds: float | None  # listening time on the live bus [s]; None means until Ctrl-C
     dbc: Path | None  # DBC to check against; None means the DBC of the robot
-    node: str | None  # report missing messages of this node only; None means all nodes
+    node: str | None  # node whose missing messages are reported; None means all nodes
     rules_file: Path | None
     list_rules: bool
     junit: Path | None

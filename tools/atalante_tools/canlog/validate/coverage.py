@@ -73,9 +73,7 @@ def _of_the_network(validator: Validator) -> Iterator[Unchecked]:
             "the DBC has no attribute Bus; the channel of the first frame is taken as the bus of a message",
         )
     elif mixed:
-        reason = (
-            "these channels carry messages of several buses; assign them in [channels] of a rules file if that is wrong"
-        )
+        reason = "these channels carry messages of several buses; if that is wrong, assign them in [channels] of a rules file"
         yield Unchecked(("wrong-bus",), mixed, reason)
     if not validator.load.checked:
         yield Unchecked(("bus-load",), (), "the DBC has neither NominalBitrate nor Baudrate")
@@ -137,7 +135,7 @@ def _of_messages(validator: Validator) -> Iterator[Unchecked]:
     absent_rows = [row for row in range(len(plan.layouts)) if not counts[row]]
     reported = {f.message for f in validator.findings.all() if f.rule == "never-seen"}
     if unseen := [row for row in absent_rows if plan.name(row) not in reported]:
-        yield Unchecked((), _names(validator, unseen), "messages of the DBC that are not in the log and not required")
+        yield Unchecked((), _names(validator, unseen), "messages of the DBC that are neither in the log nor required")
 
 
 def unseen_signals(validator: Validator) -> list[tuple[Layout, str]]:

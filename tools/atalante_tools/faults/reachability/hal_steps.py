@@ -81,7 +81,7 @@ class Inputs(NamedTuple):
     """Inputs of the operator, as computed by `Pendant.evaluate`."""
 
     dead_man: bool
-    stop: int  # 0 none, 1 STOP, 2 HOLD
+    stop: int  # stop request: 0 none, 1 STOP, 2 HOLD
     started: bool
 
 
