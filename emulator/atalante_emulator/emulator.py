@@ -276,7 +276,7 @@ class Emulator:
         """Receive frames until all SYNCs of the cycle have arrived, or until `_SYNC_SKEW` after the first SYNC.
 
         Args:
-            count: frames already in the scratch buffer.
+            count: number of frames already in the scratch buffer.
 
         Returns:
             Number of frames in the scratch buffer; 0 if there is no SYNC yet. Then the frames are kept for the next call.
@@ -302,7 +302,7 @@ class Emulator:
         """Process the frames of a cycle in which a frame is missing, rejected or late. Return whether a cycle was run.
 
         Args:
-            count: frames in the scratch buffer.
+            count: number of frames in the scratch buffer.
         """
         self._check_delays()
         checks = self._rx.check.tolist()
@@ -356,7 +356,7 @@ class Emulator:
 
         Args:
             checks: value of `Check` of each row of the process image.
-            count: frames in the scratch buffer.
+            count: number of frames in the scratch buffer.
         """
         for leg, row in enumerate(self._command_rows):
             check = checks[row]

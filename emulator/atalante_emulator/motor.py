@@ -23,7 +23,7 @@ class MotorParameters:
     # While the power stage is off, a relay shorts the windings. The motor then brakes the joint with this additional damping.
     brake: tuple[float, ...] = (150.0, 40.0, 125.0, 80.0, 20.0, 8.0)  # Nm s/rad
     current_loop: float = 0.5e-3  # time constant of the torque [s]
-    dead_time: int = 0  # cycles until a new setpoint reaches the current loop
+    dead_time: int = 0  # number of cycles until a new setpoint reaches the current loop
     ambient: float = 25.0  # ambient temperature [degC]
     heating: float = 70.0  # temperature rise after a long time at half the torque limit [K]
     thermal_time: float = 300.0  # time constant of the winding temperature [s]

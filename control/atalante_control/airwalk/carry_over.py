@@ -69,7 +69,7 @@ def add_carried(carries: Records[Carry], blend: Vector, cycle: int, torque: Vect
     Args:
         carries: `CarryOver.records`; `pending` is set to False.
         blend: `CarryOver.blend`.
-        cycle: cycles since the stance change.
+        cycle: number of cycles since the stance change.
         torque: torque command, shape (12,) [Nm], updated.
     """
     carry = carries[0]

@@ -66,7 +66,7 @@ def run(
     """Compute torque, vibration and telemetry of one cycle.
 
     Args:
-        cycle: cycles since the stance change.
+        cycle: number of cycles since the stance change.
         level: whether the targets of the swing ankle come from the tibia IMU. If not, the targets come from `row`.
         row: q_des [rad], then q_des' [rad/s], shape (24,).
         measured: measurements of the cycle.

@@ -85,7 +85,7 @@ class GaitReference:
 
         Args:
             stance: stance leg, LEFT or RIGHT.
-            cycle: cycles since the stance change.
+            cycle: number of cycles since the stance change.
         """
         row: Vector = self._rows[stance][cycle]
         return row

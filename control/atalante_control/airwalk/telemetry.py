@@ -72,7 +72,7 @@ def write_telemetry(
         telemetry: record to write, shape (1,).
         step: values of the step.
         guard: record of the guide filter after the tick of the cycle.
-        cycle: cycles since the stance change.
+        cycle: number of cycles since the stance change.
         desired: q_des [rad], then q_des' [rad/s], shape (24,).
         errors: q - q_des of SH and SK of the swing leg [rad].
 

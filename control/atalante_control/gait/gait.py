@@ -514,7 +514,7 @@ def step_over(cycle: int, cycles: int) -> bool:
     """Return whether the nominal duration of a step has passed.
 
     Args:
-        cycle: cycles since the stance change.
+        cycle: number of cycles since the stance change.
         cycles: nominal duration of the step in cycles.
     """
     return cycle >= cycles

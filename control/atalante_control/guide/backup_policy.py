@@ -141,8 +141,8 @@ def responses(policy: BackupPolicy, loop: SampledLoop, mobility: float, cycles: 
         loop: time behaviour of the drives and of the bus.
         mobility: inertia of the model divided by the true inertia of the leg; 1 if the model is exact.
         cycles: number of cycles ahead.
-        delay: cycles between a measurement and the torque that is computed from it, at least 1. All commands that are still
-            pending are assumed to be equal to the last command.
+        delay: number of cycles between a measurement and the torque that is computed from it, at least 1. All commands that
+            are still pending are assumed to be equal to the last command.
     """
     kappa, delta, shapes = policy.modes()
     inverse = np.linalg.inv(shapes)

@@ -164,7 +164,7 @@ class GuideFilter:
         """Return the torques of sagittal hip and knee [Nm].
 
         Args:
-            cycle: cycles since the stance change. A number above the length of the step is replaced by this length.
+            cycle: number of cycles since the stance change. A number above the length of the step is replaced by this length.
             leg: measurements of the swing leg.
         """
         return self._tick(self.tables, min(cycle, self.cycles), leg)

@@ -176,7 +176,7 @@ def tick(guide: GuideTables, cycle: int, leg: LegState) -> Pair:
 
     Args:
         guide: tables of the guide filter; the results of the tick are written to `GuideTables.guards`.
-        cycle: cycles since the stance change, at most the length of the step.
+        cycle: number of cycles since the stance change, at most the length of the step.
         leg: measurements of the swing leg.
 
     Returns:
@@ -249,7 +249,7 @@ def largest_ratio(guide: GuideTables, cycle: int) -> float:
 
     Args:
         guide: tables of the guide filter; `Guard.state` must contain the state of the current cycle.
-        cycle: cycles since the stance change.
+        cycle: number of cycles since the stance change.
     """
     guard = guide.guards[0]
     x, y, size = guard.state, guard.compressed, guard.magnitude
@@ -314,7 +314,7 @@ def bound_blocks(guide: GuideTables, cycle: int, blocks: int) -> int:
 
     Args:
         guide: tables of the guide filter; `Guard.magnitude` and `Guard.compressed` must belong to the current cycle.
-        cycle: cycles since the stance change.
+        cycle: number of cycles since the stance change.
         blocks: number of blocks.
     """
     guard, highest, promise = guide.guards[0], guide.highest[cycle // START_CYCLES], guide.guards[0].promise
@@ -345,7 +345,7 @@ def _few_ratio(guide: GuideTables, cycle: int, least: float) -> float:
 
     Args:
         guide: tables of the guide filter.
-        cycle: cycles since the stance change.
+        cycle: number of cycles since the stance change.
         least: ratio below which the exact result is not needed. If the exact result is below `least`, the returned
             result may be smaller than the exact result.
     """

@@ -139,7 +139,7 @@ def assistive_torque(tables: LiteralTables, guard: Guard, cycle: int, leg: LegSt
         tables: tables of the literal law.
         guard: record of the guide filter. For the telemetry, this record receives the minimum of h and the maximum of
             the gate over both joints, and the guide.
-        cycle: cycles since the stance change. A number above the length of the step is replaced by this length.
+        cycle: number of cycles since the stance change. A number above the length of the step is replaced by this length.
         leg: measurements of the swing leg.
         rates: q_des' of SH and SK [rad/s].
     """

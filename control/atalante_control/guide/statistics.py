@@ -32,7 +32,7 @@ class GuideStatistics:
         """Add one cycle of a step to the statistics.
 
         Args:
-            cycle: cycles since the stance change.
+            cycle: number of cycles since the stance change.
             ratio: the larger |e| / q_bound of the two joints.
             h: safe backward image function.
             acting: whether the filter is active.

@@ -60,7 +60,7 @@ class StepGuides:
             shape: shape of the guide.
             leg: swing leg along the nominal trajectory, to the end of the overlap.
             blend: smallest allowed weight of the backup torque in each cycle since the stance change, shape (m,).
-            overlap: cycles of the leg after the end of the step.
+            overlap: number of cycles of the leg after the end of the step.
         """
         assumptions = Assumptions(
             promise=config.promise, mismatch=config.mismatch, hand_over=config.hand_over, overlap=overlap

@@ -211,7 +211,7 @@ class LevelFeet:
         Args:
             state: measured state of the robot.
             side: swing leg, 0 left, 1 right.
-            cycle: cycles since the stance change.
+            cycle: number of cycles since the stance change.
             row: q_des [rad], then q_des' [rad/s], shape (24,); not changed.
         """
         desired = row.copy()
@@ -262,7 +262,7 @@ def write_level_ankle(
     Args:
         ankle: record of the swing ankle.
         cubics: `LevelFeet.cubics`.
-        cycle: cycles since the stance change.
+        cycle: number of cycles since the stance change.
         tibia: attitude of the tibia IMU, unit quaternion wxyz as in `level`.
         gyro: angular velocity of the tibia in the frame of the tibia [rad/s].
         desired: q_des [rad], then q_des' [rad/s], shape (24,); the elements of the swing ankle are overwritten.

@@ -32,7 +32,7 @@ class Quiet:
     """Result of a walk without a fault."""
 
     name: str
-    cycles: int  # cycles from power-on to the end of the walk
+    cycles: int  # number of cycles from power-on to the end of the walk
     state: str  # state of the HAL at the end of the walk
     counts: dict[str, int]  # number of each reported diagnostic
 

@@ -35,17 +35,17 @@ _S = SupervisorState
 #: Largest accepted motion of a joint between START and ACTIVE, or in the first `_SETTLED` cycles after START [deg].
 SAG_MAX: Final = 1.0
 _SETTLED: Final = 40
-#: Cycles from READY to the operator's START.
+#: Number of cycles from READY to the operator's START.
 _PAUSE: Final = 50
-#: Cycles from the operator's STOP to a fault that begins in HOLD.
+#: Number of cycles from the operator's STOP to a fault that begins in HOLD.
 _STOPPED: Final = 60
-#: Cycles from the operator's STOP to the START that restarts the walk.
+#: Number of cycles from the operator's STOP to the START that restarts the walk.
 _RESTART: Final = 200
 #: Longest observation of a fault [cycles]. A permanent fault is observed for this time.
 _LONGEST: Final = 400
-#: Cycles from the end of the observation to the operator's START.
+#: Number of cycles from the end of the observation to the operator's START.
 _REST: Final = 60
-#: Cycles from the second press of START to the end of the run.
+#: Number of cycles from the second press of START to the end of the run.
 _END: Final = 300
 
 

@@ -40,9 +40,9 @@ CONFIG: Final = AirwalkConfig(startup=0.1)
 ASSISTANCE: Final = 0.5
 #: Number of cycles within which a robot without fault must reach ACTIVE after power-on.
 _START: Final = 600
-#: Cycles between two presses of START after the fault. The first press ends the state FAULT, the second press ends HOLD.
+#: Number of cycles between two presses of START after the fault. The first press ends FAULT, the second press ends HOLD.
 RECOVERY: Final = 100
-#: Cycles after the second press within which the robot must be ACTIVE.
+#: Number of cycles after the second press within which the robot must be ACTIVE.
 _RESTART: Final = 300
 
 
@@ -111,7 +111,7 @@ def observe(case: Case, bound: int, *, recovery: bool = True) -> Observation:
 
     Args:
         case: faults to inject and actions of the operator.
-        bound: cycles within which the reaction must occur. A permanent fault lasts `bound + case.observed` cycles.
+        bound: number of cycles within which the reaction must occur. A permanent fault lasts `bound + case.observed` cycles.
         recovery: whether the operator presses START twice after the fault, to restart the walk.
     """
     begins = 1 if case.phase is None else walk_cycle(case.phase, case.engine)

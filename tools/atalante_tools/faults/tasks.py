@@ -33,7 +33,7 @@ from atalante_tools.faults.verdict import (
 
 #: Longest duration of a fault in an endurance run [cycles]. This duration is longer than a walking step.
 HORIZON: Final = 1000
-#: Cycles between the first and the second fault of a pair.
+#: Number of cycles between the first and the second fault of a pair.
 PAIR_DELAY: Final = 3
 #: Test cases that a campaign also runs in pairs: (fault ID, name of a case of this fault).
 REPRESENTATIVES: Final = (

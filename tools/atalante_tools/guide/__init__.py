@@ -52,8 +52,8 @@ class CheckOptions:
     patients: bool  # whether to check the network gaits of several patients, too
     conditions: tuple[str, ...]  # names of conditions; empty means all
     push: tuple[float, float] | None  # largest push at hip and knee [Nm]; None means the certified torques
-    steps: int | None  # steps on the plant per guide; None means the number in `effort`
-    robot_steps: int | None  # steps on the emulated robot per guide; None means the number in `effort`
+    steps: int | None  # number of steps on the plant per guide; None means the number in `effort`
+    robot_steps: int | None  # number of steps on the emulated robot per guide; None means the number in `effort`
     seed: int  # seed of the search and of the noise
     quick: bool  # whether to use the small number of steps `QUICK`
     plot: Path | None  # picture file; None means no picture

@@ -217,7 +217,7 @@ def noise_of(cycles: int, condition: Condition, generator: np.random.Generator) 
     """Draw encoder noise [rad] (columns 0 and 1) and numbers in [0, 1] that decide about lost frames (columns 2 and 3).
 
     Args:
-        cycles: cycles of a step.
+        cycles: number of cycles in a step.
         condition: size of the noise.
         generator: source of the random numbers.
 

@@ -64,8 +64,8 @@ _SHARE: Final = 0.1
 class Effort:
     """Number of steps and extent of the search for the check of one guide."""
 
-    steps: int  # steps on the ideal plant with pushes up to the certified torques
-    robot_steps: int  # steps on the emulated robot; 0: the robot is not used
+    steps: int  # number of steps on the ideal plant with pushes up to the certified torques
+    robot_steps: int  # number of steps on the emulated robot; 0: the robot is not used
     tightness: bool  # whether to search for the smallest push that moves a joint out of the guide
 
 

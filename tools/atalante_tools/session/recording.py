@@ -92,7 +92,7 @@ def telemetry_cores(outputs: Outputs | None) -> int:
 
 
 def outlet_of(telemetry: Path | None) -> Mapping[str, Any]:
-    """Read the telemetry file. Return no fields if there is none.
+    """Read the telemetry file. Return no fields if no file is given.
 
     Args:
         telemetry: TOML file with endpoint, TLS certificate and users.

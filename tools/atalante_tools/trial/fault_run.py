@@ -45,12 +45,12 @@ from atalante_tools.trial.plan import STEP
 if TYPE_CHECKING:
     from atalante_hal.safety.events import Event
 
-#: Cycles from a branch of the walk to the moment of the fault. The first faulty frames are computed one cycle
+#: Number of cycles from a branch of the walk to the moment of the fault. The first faulty frames are computed one cycle
 #: before this moment.
 _LEAD: Final = 5
-#: Cycles for which the HAL is observed after a fall.
+#: Number of cycles for which the HAL is observed after a fall.
 _FALLEN: Final = 300
-#: Cycles after which a walk ends at the latest. A walk without a fault lasts about 10000 cycles.
+#: Number of cycles after which a walk ends at the latest. A walk without a fault lasts about 10000 cycles.
 _LONGEST: Final = 20_000
 #: The robot is at rest if its pelvis and its joints have been slower than `_STILL` [m/s, rad/s] for `_RESTED` cycles, and
 #: each foot carries a load of at least `_LOADED` [N].
@@ -76,9 +76,11 @@ class FaultRun:
     state: str  # state of the HAL at the end
     #: diagnostics since the first faulty cycle, except information, in the order of their first report
     codes: tuple[str, ...]
-    detected: int | None  # cycles from the first faulty cycle to the diagnostic of the fault matrix, both included
+    detected: (
+        int | None
+    )  # number of cycles from the first faulty cycle to the diagnostic of the fault matrix, both included
     reason: str  # reason that the HAL states for its last state, or the exception
-    fallen: int | None = None  # cycles from the start of the case to the fall
+    fallen: int | None = None  # number of cycles from the start of the case to the fall
 
 
 class _Request(NamedTuple):

@@ -72,7 +72,7 @@ class ShapeTrial:
 
     kind: ClassVar[str] = "shape"
     shape: str
-    steps: int  # right-stance steps
+    steps: int  # number of right-stance steps
     xi: float
     seed: int
     engine: str
@@ -228,7 +228,7 @@ def shape_trials(names: Sequence[str], steps: int, xi: float, seed: int, engine:
 
     Args:
         names: names of the shapes.
-        steps: right-stance steps of each trial.
+        steps: number of right-stance steps in each trial.
         xi: assistance factor.
         seed: seed of the sensor noise.
         engine: name of the physics engine.
@@ -290,7 +290,7 @@ def robust_trials(count: int, steps: int, seed: int, engine: str) -> list[Trial]
 
     Args:
         count: number of trials.
-        steps: periodic steps of each trial.
+        steps: number of periodic steps in each trial.
         seed: seed of the experiment.
         engine: name of the physics engine.
     """

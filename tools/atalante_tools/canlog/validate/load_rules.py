@@ -29,7 +29,7 @@ def wire_time(extended: bool, fd: bool, switch: bool, length: int, nominal: floa
         extended: whether the identifier has 29 bits.
         fd: whether the frame is CAN FD.
         switch: whether the data phase uses the data bit rate.
-        length: payload, bytes.
+        length: payload length [bytes].
         nominal: nominal bit rate, bit/s.
         data: bit rate of the data phase, bit/s.
     """

@@ -184,8 +184,8 @@ class _Columns:
         """Return the raw codes of each frame and of the previous frame, which may be in an earlier chunk.
 
         Returns:
-            The codes of each frame, the codes of the previous frame (shape (fields, n) each), and the indices of the
-            frames without a previous frame.
+            Three arrays: the codes of each frame and the codes of its previous frame, both of shape (fields, n), and the
+            indices of the frames without a previous frame.
         """
         codes = decoded.codes[self._indices]
         before = np.empty_like(codes)

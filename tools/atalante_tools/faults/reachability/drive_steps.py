@@ -51,8 +51,8 @@ class Drive(NamedTuple):
 class DriveObserver(NamedTuple):
     """Values with which the search checks the properties. The search computes these values independently of the drive."""
 
-    command_age: int = WATCHDOG  # cycles since the last valid command was sent
-    sync_age: int = 0  # cycles since the last SYNC
+    command_age: int = WATCHDOG  # number of cycles since the last valid command was sent
+    sync_age: int = 0  # number of cycles since the last SYNC
     unacknowledged: bool = False  # the drive started a local hold, and the HAL has not sent QUICK STOP since then
 
 

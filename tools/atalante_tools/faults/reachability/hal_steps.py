@@ -70,7 +70,7 @@ SILENT: Final = Reception(LOST, False, 0, _NONE, trusted=False, own_request=0)
 class PendantFrame(NamedTuple):
     """Pendant frame that arrives in a cycle."""
 
-    age: int  # cycles since the pendant sampled the content of the frame
+    age: int  # number of cycles since the pendant sampled the content of the frame
     dead_man: bool
     request: int
     pressed: bool  # whether a button was pressed since the last accepted frame
