@@ -98,6 +98,12 @@ class Dtc(StrEnum):
     IMU_INVALID = "IMU_INVALID", _R.FULL_ASSIST, _S.WARNING, "an IMU reports that it has no valid value"
     IMU_SATURATED = "IMU_SATURATED", _R.FULL_ASSIST, _S.WARNING, "an IMU reading is at the end of its measuring range"
     IMU_STUCK = "IMU_STUCK", _R.FULL_ASSIST, _S.WARNING, "the gyro reading of an IMU does not change"
+    IMU_IMPLAUSIBLE = (
+        "IMU_IMPLAUSIBLE",
+        _R.FULL_ASSIST,
+        _S.WARNING,
+        "the readings of an IMU contradict gravity, each other or another IMU",
+    )
     FOOT_CELL = "FOOT_CELL", _R.FULL_ASSIST, _S.WARNING, "a force cell contradicts the other cells or the posture"
     CONTACT_IMPLAUSIBLE = (
         "CONTACT_IMPLAUSIBLE",

@@ -1,4 +1,4 @@
-"""Robot on the ground: faults of feet and ankle encoders are found, and a healthy robot stands and starts again."""
+"""Robot on crane and ground: faults of feet, ankle encoders and trunk IMUs are found; a healthy robot stands and starts again."""
 
 from __future__ import annotations
 
@@ -43,6 +43,7 @@ class Run:
         engine: str = "mujoco",
         cycles: int = 4000,
         presses: dict[int, str] | None = None,
+        patient: Patient | None = PATIENT,
     ) -> None:
         self.states: list[SupervisorState] = []
         #: Vertical force on each foot, and difference of the diagonals of its cells, in each cycle [N].
@@ -52,7 +53,7 @@ class Run:
         with open_hal(
             Target("embedded", "", lockstep=True, engine=engine), robot=robot, seed=3, pose=pose, operator=operator,
             controller_fields=controller.telemetry_fields, faults=faults,
-            mechanics=Mechanics(describe(robot, None, PATIENT), engine, Ground()),
+            mechanics=Mechanics(describe(robot, None, patient), engine, Ground()),
         ) as rig:  # fmt: skip
             seen = 0
 
@@ -109,6 +110,23 @@ def test_f79_drift_of_an_ankle_encoder_is_found_while_the_robot_stands(robot, jo
     )
     assert run.found.cycle - 3500 < 1400
     assert S.FULL_ASSIST in run.states
+
+
+@pytest.mark.parametrize("engine", ENGINES)
+@pytest.mark.parametrize("patient", [PATIENT, None], ids=["patient", "empty"])
+def test_f81_exchanged_imus_of_the_trunk_are_found(robot, engine: str, patient: Patient | None) -> None:
+    fault = Fault("sensor_swapped", "IMU_TORSO", other="IMU_PELVIS")
+    run = Run(
+        robot, PoseHold(robot), STANDING, (fault,), "IMU_IMPLAUSIBLE", engine=engine, cycles=3500, patient=patient
+    )
+    assert run.found is not None
+    assert run.found.text.startswith("the IMUs of torso and pelvis are exchanged")
+    if patient is None:  # the empty robot swings on the crane from the start
+        assert run.found.cycle <= 330
+        assert S.ACTIVE not in run.states
+    else:
+        assert run.found.cycle <= 2800
+        assert run.states[-1] is S.FULL_ASSIST
 
 
 @pytest.mark.parametrize("engine", ENGINES)

@@ -6,6 +6,8 @@ _PLAUSIBILITY = (
     "finding",
     "encoders",
     "imus",
+    "inertial",
+    "trunk",
     "legs",
     "feet",
     "support",
@@ -18,6 +20,8 @@ _PLAUSIBILITY = (
 _PLAUSIBILITY_TESTS = (
     "encoders",
     "imus",
+    "inertial",
+    "trunk",
     "legs",
     "feet",
     "support",

@@ -6,6 +6,7 @@ The module `legs` compares the IMUs with the encoders.
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 from atalante_hal.compiled import specialised
 from atalante_hal.robot import IMUS, Robot
@@ -16,6 +17,14 @@ from atalante_hal.wire.codec import Codec
 
 #: Time [cycles] without good values after which the diagnostic of the IMU is confirmed.
 IMU_CYCLES = 10
+
+
+class ImuLimits(NamedTuple):
+    """Values from which the readings of an IMU must not be used."""
+
+    norm_error: float  # largest deviation of the squared norm of a quaternion from 1
+    gyro_end: float  # smallest angular velocity at which a gyroscope is saturated [rad/s]
+    accel_end: float  # smallest specific force at which an accelerometer is saturated [m/s2]
 
 
 class Imus:
@@ -29,15 +38,15 @@ class Imus:
 
     def __init__(self, robot: Robot, codec: Codec, now: Signals) -> None:
         self._now = now
-        self._gyro_end, self._accel_end = (_end_of_range(codec, signal) for signal in ("GyroX", "AccelX"))
-        self._norm_error = robot.sensors.quaternion_error
+        gyro_end, accel_end = (_end_of_range(codec, signal) for signal in ("GyroX", "AccelX"))
+        self.limits = ImuLimits(robot.sensors.quaternion_error, gyro_end, accel_end)
         #: Norm of each quaternion that does not have unit norm, by IMU index.
         self.no_attitude: dict[int, float] = {}
         #: Largest reading of each saturated IMU, by IMU index [rad/s or m/s2].
         self.saturated: dict[int, float] = {}
         self._confirmed: dict[int, bool] = {}
         #: Arguments of the function `usable`. The array objects are the same in every call.
-        self._readings = now.quaternion, now.gyro, now.accel, self._norm_error, self._gyro_end, self._accel_end
+        self._readings = now.quaternion, now.gyro, now.accel, self.limits
         self._usable = specialised(usable, *self._readings)
 
     def usable(self) -> bool:
@@ -74,7 +83,7 @@ class Imus:
 
     def _saturation(self, imu: int) -> float | None:
         """Return the largest reading of a saturated IMU [rad/s or m/s2]; None if no axis is saturated."""
-        for readings, end in ((self._now.gyro, self._gyro_end), (self._now.accel, self._accel_end)):
+        for readings, end in ((self._now.gyro, self.limits.gyro_end), (self._now.accel, self.limits.accel_end)):
             if (most := largest(readings[imu])) >= end:
                 return most
         return None
@@ -82,7 +91,7 @@ class Imus:
     def _wrong_norm(self, imu: int) -> float | None:
         """Return the norm of the quaternion of an IMU; None if the norm is 1 within the tolerance."""
         squared = squared_norm(self._now.quaternion[imu])
-        return None if abs(squared - 1.0) <= self._norm_error else math.sqrt(squared)
+        return None if abs(squared - 1.0) <= self.limits.norm_error else math.sqrt(squared)
 
     def findings(self) -> tuple[Finding, ...]:
         """Return the current findings of the IMU checks."""
@@ -92,25 +101,33 @@ class Imus:
         )
 
 
-def usable(
-    quaternion: Vector, gyro: Vector, accel: Vector, norm_error: float, gyro_end: float, accel_end: float
-) -> bool:
+def usable(quaternion: Vector, gyro: Vector, accel: Vector, limits: ImuLimits) -> bool:
     """Return whether the values of every IMU may be used.
 
     Args:
         quaternion: attitude of each IMU, shape (4, 4), wxyz.
         gyro: angular velocity of each IMU, shape (4, 3) [rad/s].
         accel: specific force at each IMU, shape (4, 3) [m/s2].
-        norm_error: largest deviation of the squared norm of a quaternion from 1.
-        gyro_end: smallest angular velocity at which a gyro is saturated [rad/s].
-        accel_end: smallest specific force at which an accelerometer is saturated [m/s2].
+        limits: values from which the readings must not be used.
     """
+    every = True
     for imu in range(len(quaternion)):
-        if not abs(squared_norm(quaternion[imu]) - 1.0) <= norm_error:
-            return False
-        if largest(gyro[imu]) >= gyro_end or largest(accel[imu]) >= accel_end:
-            return False
-    return True
+        every = every and usable_one(quaternion[imu], gyro[imu], accel[imu], limits)
+    return every
+
+
+def usable_one(quaternion: Vector, gyro: Vector, accel: Vector, limits: ImuLimits) -> bool:
+    """Return whether the values of one IMU may be used.
+
+    Args:
+        quaternion: attitude, shape (4,), wxyz.
+        gyro: angular velocity, shape (3,) [rad/s].
+        accel: specific force, shape (3,) [m/s2].
+        limits: values from which the readings must not be used.
+    """
+    if not abs(squared_norm(quaternion) - 1.0) <= limits.norm_error:
+        return False
+    return largest(gyro) < limits.gyro_end and largest(accel) < limits.accel_end
 
 
 def squared_norm(quaternion: Vector) -> float:

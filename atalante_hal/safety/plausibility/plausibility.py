@@ -1,7 +1,7 @@
 """Schedule of the plausibility checks in each cycle.
 
-    process image -> one slow check in turn (standstill, velocity, feet, legs, support, soles, monitor of checks that lack data)
-    -> jump, range, IMUs -> state
+    process image -> one slow check in turn (standstill, velocity, feet, legs, support, soles, inertial, checks that lack data)
+    -> jump, range, IMUs, trunk -> state
 
 Each cycle checks the encoders and the IMUs, and runs at most one slow check. If the new values of a joint or an IMU
 fail a check, they are rejected: the process image keeps the previous values, and the age of these values grows. The
@@ -14,17 +14,19 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from atalante_hal.robot import Robot
+from atalante_hal.robot import IMUS, Robot
 from atalante_hal.safety.diagnostics import Dtc, Finding
 from atalante_hal.safety.plausibility.encoders import EncoderChecks
 from atalante_hal.safety.plausibility.feet import FootChecks
 from atalante_hal.safety.plausibility.finding import JOINT_NODES, Ages, Rows, signals_of
 from atalante_hal.safety.plausibility.imus import Imus
+from atalante_hal.safety.plausibility.inertial import Inertial
 from atalante_hal.safety.plausibility.legs import Legs
 from atalante_hal.safety.plausibility.rejections import Rejections
 from atalante_hal.safety.plausibility.soles import Soles
 from atalante_hal.safety.plausibility.stillness import Stillness
 from atalante_hal.safety.plausibility.support import Support
+from atalante_hal.safety.plausibility.trunk import Trunk
 from atalante_hal.safety.plausibility.unchecked import Unchecked
 from atalante_hal.types import Vector
 from atalante_hal.wire.e2e import Check
@@ -36,6 +38,10 @@ FEET = 4
 SLOW = 16
 #: Period of the schedule of all slow checks [cycles]. Each leg, each sole and the support are checked once per period.
 _PERIOD = 32
+#: Intervals of the inertial checks, alternately [cycles].
+_INERTIAL_INTERVALS = (15, 17)
+#: Largest age of values that the trunk check uses [cycles]. A message may be late by one cycle in every cycle.
+_LATE = 1
 _FRESH = int(Check.SOME_LOST)
 
 
@@ -63,7 +69,10 @@ class Plausibility:
         self._feet = FootChecks(robot, now, FEET)
         self._support = Support(robot, now, _PERIOD)
         self._soles = Soles(robot, now)
+        self._inertial = Inertial(robot, now, self._imus.limits, _INERTIAL_INTERVALS, period)
+        self._trunk = Trunk(now, period)
         self._rows = Rows(codec)
+        self._trunk_rows = self._rows.imu[[IMUS.index("torso"), IMUS.index("pelvis")]]
         self._rejections = Rejections()
         self._unchecked = Unchecked(self._rows, image.check, SLOW)
         self._joint_rows, self._imu_rows = self._rows.joint.tolist(), self._rows.imu.tolist()
@@ -91,6 +100,7 @@ class Plausibility:
         turns[2::SLOW] = [self._check_velocity] * (_PERIOD // SLOW)
         turns[4::SLOW] = [self._check_unchecked] * (_PERIOD // SLOW)
         turns[6] = self._support.evaluate
+        turns[12] = turns[12 + _INERTIAL_INTERVALS[0]] = self._check_inertial
         turns[1::FEET] = [self._check_feet] * (_PERIOD // FEET)
         turns[8], turns[24] = self._legs.check_left, self._legs.check_right
         turns[10], turns[26] = self._soles.check_left, self._soles.check_right
@@ -111,11 +121,14 @@ class Plausibility:
         settled = fresh and self._settled and self.findings is self._evaluated and not self._rejections.pending
         if settled and self._encoders.within_reach() and self._imus.usable():
             self._encoders.follow()
-            if self._stillness.follow():
+            changed = self._stillness.follow()
+            if self._trunk.follow() or changed:
                 self._collect()
         else:
             self._evaluated = self.findings
             self._check_rows()
+            if (self._image.age[self._trunk_rows] <= _LATE).all():
+                self._trunk.follow()
             self._collect()
         if self.findings:
             self._set_faulty_cells_to_zero()
@@ -151,6 +164,12 @@ class Plausibility:
 
     def _check_unchecked(self, ages: Ages | None) -> bool:
         return self._unchecked.evaluate(None if ages is None else self._image.age)
+
+    def _check_inertial(self, ages: Ages | None) -> bool:
+        if frozen := self._stillness.imus:  # the frozen values are rejected later in the cycle
+            ages = ages or self._rows.ages(self._image.age)
+            ages.imu[frozen] = NEVER
+        return self._inertial.evaluate(ages)
 
     def _check_feet(self, ages: Ages | None) -> bool:
         now = [0] * len(self._foot_ages) if ages is None else ages.foot.tolist()
@@ -206,6 +225,8 @@ class Plausibility:
             *self._feet.findings(),
             *self._support.findings(),
             *self._soles.findings(),
+            *self._inertial.findings(),
+            *self._trunk.findings(),
             *self._unchecked.findings(),
         )
         if often := self._rejections.findings():

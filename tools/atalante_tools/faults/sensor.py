@@ -375,6 +375,56 @@ SCENARIOS: Final = (
         ),
     ),
     Scenario(
+        "F80",
+        (
+            *(
+                Case(
+                    f"{imu}, wrong sign along Z, from power-on",
+                    (Fault("imu_inverted", imu, axis="Z"),),
+                    phase=None,
+                    state=SupervisorState.OFF,
+                    node=imu,
+                    detected=80,
+                    reacted=80,
+                    recovers=False,
+                    checks=(start_is_rejected,),
+                )
+                for imu in _IMUS[:2]
+            ),
+            *(
+                Case(
+                    f"{imu}, wrong sign along Z, from power-on",
+                    (Fault("imu_inverted", imu, axis="Z"),),
+                    phase=None,
+                    node=imu,
+                    recovers=False,
+                )
+                for imu in _IMUS[2:]
+            ),
+            *(
+                Case(
+                    f"{imu}, turned in its mount, from power-on",
+                    (Fault("imu_turned", imu, axis="X", degrees=5.0),),
+                    phase=None,
+                    state=SupervisorState.OFF,
+                    node="IMU_TORSO",
+                    detected=80,
+                    reacted=80,
+                    recovers=False,
+                    checks=(start_is_rejected,),
+                )
+                for imu in _IMUS[:2]
+            ),
+            Case(
+                "IMU_TORSO, wrong sign while walking",
+                (Fault("imu_inverted", "IMU_TORSO", axis="Z"),),
+                detected=1100,
+                reacted=1100,
+                recovers=False,
+            ),
+        ),
+    ),
+    Scenario(
         "F61",
         (
             Case(

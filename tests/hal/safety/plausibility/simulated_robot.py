@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 
@@ -16,6 +17,7 @@ from atalante_hal.robot import CELLS, FEET, IMUS, JOINTS, load_robot
 from atalante_hal.safety.diagnostics import Dtc
 from atalante_hal.safety.plausibility import Finding, Plausibility
 from atalante_hal.safety.plausibility.finding import Signals, signals_of
+from atalante_hal.safety.plausibility.inertial import GRAVITY, turn_rate, upward
 from atalante_hal.wire.codec import Codec
 from atalante_hal.wire.e2e import Check
 from atalante_hal.wire.frame import new_frames
@@ -63,6 +65,11 @@ def attitudes(position: np.ndarray) -> np.ndarray:
     return np.array([[w, x, y, z] for x, y, z, w in quaternions])
 
 
+def specific_force(quaternion: np.ndarray) -> np.ndarray:
+    """Return the specific force at rest in the frame of an IMU with this attitude wxyz, shape (3,) [m/s2]."""
+    return GRAVITY * np.array(upward(quaternion))
+
+
 def signals() -> Signals:
     """Return new signals, all of them zero."""
     return signals_of(CODEC, np.zeros(CODEC.size))
@@ -98,6 +105,9 @@ class SimulatedRobot:
         self.now = signals_of(CODEC, self.image.values)
         self.checks = Plausibility(UNEVEN, self.image, PERIOD)
         self.attitudes = attitudes(MIDDLE)
+        self.rates = np.zeros((len(IMUS), 3))  # angular velocity of each IMU [rad/s]
+        #: Attitudes in the last eight cycles, with the changes that the test made.
+        self.reported = deque([self.attitudes] * 8, maxlen=8)
         self.run(1)
 
     @property
@@ -127,16 +137,25 @@ class SimulatedRobot:
         # Without motion the torque is constant, because a varying torque would show that the encoders are stuck.
         swing = 20.0 * math.sin(50.0 * self.time) if self.amplitude else 0.0
         now.torque[:] = swing + 0.05 * noise.torque
-        if self.cycles % 16 in (0, 8):  # the cycles in which the attitudes may be checked
-            self.attitudes = attitudes(position)
+        if self.cycles % 8 == 0:  # the cycles in which the attitudes may be checked
+            before, self.attitudes = self.attitudes, attitudes(position)
+            self.rates = np.array([turn_rate(*pair, 8.0 * PERIOD) for pair in zip(before, self.attitudes, strict=True)])
         now.quaternion[:] = self.attitudes
-        now.gyro[:] = 4e-3 * noise.gyro
-        now.accel[:] = [0.0, 0.0, 9.81]
-        now.accel[:] += 0.05 * noise.accel
+        now.gyro[:] = self.rates + 4e-3 * noise.gyro
+        now.accel[:] = [specific_force(quaternion) for quaternion in self.attitudes] + 0.05 * noise.accel
         now.force[:] = 3.0 * noise.force
         if self.standing:
             now.force[:, :, 2] += 100.0
+        gyro, accel = now.gyro.copy(), now.accel.copy()
         change(now)
+        for imu in np.flatnonzero((now.quaternion != self.attitudes).any(axis=1)).tolist():
+            # The test turns this IMU, so gyroscope and accelerometer measure the turn, unless the test changes them, too.
+            if (now.gyro[imu] == gyro[imu]).all():
+                turn = turn_rate(self.reported[0][imu], now.quaternion[imu], 8.0 * PERIOD)
+                now.gyro[imu] = turn + 4e-3 * noise.gyro[imu]
+            if (now.accel[imu] == accel[imu]).all():
+                now.accel[imu] = 0.05 * noise.accel[imu] + specific_force(now.quaternion[imu])
+        self.reported.append(now.quaternion.copy())
         missing = list(self.missing)
         lost = np.isin(CODEC.row_of, missing)
         values[lost] = image.values_before[lost]

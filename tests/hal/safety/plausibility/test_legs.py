@@ -451,7 +451,8 @@ class TestStandingEncoder:
             x, y, z, w = (pinocchio.Quaternion(np.array([x, y, z, w])) * askew).coeffs()
             now.quaternion[tibia] = w, x, y, z
 
-        assert robot.run(400, mounted) == ()
+        found = robot.run(400, mounted)
+        assert {finding.dtc for finding in found} <= {Dtc.IMU_IMPLAUSIBLE}  # the attitude jumps when the mount changes
 
     @pytest.mark.exhaustive
     def test_heading_drift_of_imu_at_standstill_reports_nothing(self):

@@ -16,7 +16,7 @@ from dataclasses import dataclass
 import numpy as np
 import pinocchio
 import pytest
-from simulated_robot import UNEVEN
+from simulated_robot import UNEVEN, specific_force
 
 import atalante_dbc
 from atalante_control.model import ExoskeletonParameters, pinocchio_model, urdf
@@ -132,7 +132,7 @@ class Line:
         sent.position[:], sent.velocity[:] = position * GEAR, velocity * GEAR
         sent.torque[:] = 20.0 * math.sin(0.05 * self.cycles) + 0.05 * noisy[:12]
         sent.gyro[:] = gyro + 4e-3 * noisy[12:24].reshape(4, 3)
-        sent.accel[:] = [0.0, 0.0, 9.81] + 0.05 * noisy[24:36].reshape(4, 3)
+        sent.accel[:] = [specific_force(q) for q in sent.quaternion] + 0.05 * noisy[24:36].reshape(4, 3)
         sent.force[:] = 3.0 * noisy[36:60].reshape(2, 4, 3) + [0.0, 0.0, 150.0 * self.standing]
         change(sent, self.cycles)
         self.transmit.seal(self.cycles & 0xFF)

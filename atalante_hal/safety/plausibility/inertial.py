@@ -1,0 +1,343 @@
+"""Inertial checks, which compare the readings of each IMU with each other and with gravity, and torso IMU with pelvis IMU.
+
+All IMUs are sampled about every 16 cycles, alternately in an even and an odd cycle, so a vibration of half the sampling rate of
+the IMUs has no effect. Each check compares a mean over about `SAMPLES` samples with a limit, so a single impact or a short fall
+has no effect. The checks run in every state of the robot, and need no standstill.
+
+*Accelerometer.* The mean acceleration of a body over a second is small, because its speed is limited. So the mean specific force
+in world axes is gravity, upwards. The difference of each sample is limited to `_FORCE_CLIP`, because impacts are short and large.
+Samples of an IMU that turns fast are omitted, because a leg without torque falls. The check detects a wrong sign, exchanged axes,
+a gain that is wrong by a third, and an attitude that is tilted by more than 18 degrees.
+
+*Gyroscope.* The change of the attitude between two samples is an angular velocity, about each axis of the sensor. The gyroscope
+must report the same. The mean square of the difference may be at most `_RATE_ERROR` squared plus a share of the mean square of
+the angular velocity. The check detects a wrong sign and exchanged axes as soon as the IMU turns by more than 0.06 rad/s rms.
+
+*Torso and pelvis.* Both IMUs are on one rigid body with equal axes. So their angular velocities and their vertical directions are
+equal. Their headings are not compared, because they drift. If one of the two IMUs fails a check of its own, the comparison is
+omitted.
+
+A sample is skipped if its values are too old, if it is saturated, or if its quaternion has a wrong norm. If the values of an IMU
+are too old, its means are set to 0, because another check reports this fault.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from atalante_hal.compiled import specialised
+from atalante_hal.robot import IMUS, Robot
+from atalante_hal.safety.diagnostics import Dtc, Finding
+from atalante_hal.safety.plausibility.finding import IMU_NODES, Ages, Cycles, Signals
+from atalante_hal.safety.plausibility.imus import ImuLimits, usable_one
+from atalante_hal.types import Vector
+from atalante_hal.wire.process_image import NEVER
+
+#: Number of samples in each mean. Until then, a mean is over all samples since the start.
+SAMPLES = 64
+#: Smallest number of samples after which the means of each IMU are compared with their limits. A faulty IMU of the trunk is found
+#: before READY. Bent legs sink before READY, because the drives are off, so the tibiae need more samples.
+FIRST_SAMPLES = (4, 4, 16, 16)
+GRAVITY = 9.81  # m/s2
+#: Largest mean difference between specific force and gravity [m/s2]. In walks and falls of a healthy robot it is up to 2.2 m/s2.
+_FORCE_ERROR = 3.0
+#: Difference between specific force and gravity to which each sample is limited [m/s2].
+_FORCE_CLIP = 5.0
+#: Angular velocity of the attitude above which the specific force is not compared with gravity [rad/s]. When the drives are off,
+#: bent legs fall until their joints are at their end stops.
+_MOVING_RATE = 0.5
+#: Largest root mean square of the difference of two angular velocities of an IMU that hardly turns [rad/s].
+_RATE_ERROR = 0.1
+#: Largest mean square of the difference of two angular velocities, as a share of the mean square of the angular velocity.
+_RATE_SHARE = 0.25
+_TORSO, _PELVIS = IMUS.index("torso"), IMUS.index("pelvis")
+
+
+class Readings(NamedTuple):
+    """Readings of all IMUs in one sample."""
+
+    quaternion: Vector  # (4, 4) wxyz, sensor to world
+    gyro: Vector  # (4, 3) rad/s
+    accel: Vector  # (4, 3) m/s2
+
+
+class Record(NamedTuple):
+    """Last sample and mean values of each IMU, and mean values of the comparison of torso and pelvis."""
+
+    quaternion: Vector  # (4, 4) attitude in the last sample
+    gyro: Vector  # (4, 3) angular velocity in the last sample [rad/s]
+    age: Cycles  # (4,) age of the last sample [cycles]; `NEVER` if it must not be used
+    #: Number of samples in each mean, at most `SAMPLES`, shape (9,): rates of each IMU, comparison, forces of each IMU.
+    samples: Vector
+    force: Vector  # (4, 3) mean difference between specific force and gravity, in world axes [m/s2]
+    rate_error: (
+        Vector  # (5, 3) mean square of the difference of angular velocities [rad2/s2]: each IMU, torso to pelvis
+    )
+    rate: Vector  # (5, 3) mean square of the angular velocity [rad2/s2]: each IMU, torso and pelvis
+    tilt: Vector  # (3,) mean difference of the upward directions of torso and pelvis
+
+
+class Excess(NamedTuple):
+    """Values that exceed their limits, otherwise 0."""
+
+    force: Vector  # (4,) mean difference between specific force and gravity [m/s2]
+    rate: Vector  # (5,) root mean square of the difference of angular velocities [rad/s]
+    tilt: Vector  # (1,) angle between the upward directions of torso and pelvis [rad]
+
+
+class Inertial:
+    """Checks of the IMUs against gravity, against their own attitude, and of torso against pelvis.
+
+    Args:
+        robot: sensor thresholds of the robot.
+        now: signals decoded in this cycle.
+        limits: values from which the readings of an IMU must not be used.
+        intervals: times from each call of `evaluate` to the next one [cycles]; they repeat.
+        period: cycle time [s].
+    """
+
+    def __init__(
+        self, robot: Robot, now: Signals, limits: ImuLimits, intervals: tuple[int, ...], period: float
+    ) -> None:
+        imus = len(IMUS)
+        self._new = np.zeros(imus, np.int64)
+        self._excess = Excess(np.zeros(imus), np.zeros(imus + 1), np.zeros(1))
+        record = Record(
+            np.zeros((imus, 4)), np.zeros((imus, 3)), np.full(imus, NEVER), np.zeros(2 * imus + 1), np.zeros((imus, 3)),
+            np.zeros((imus + 1, 3)), np.zeros((imus + 1, 3)), np.zeros(3),
+        )  # fmt: skip
+        self._intervals = itertools.cycle(intervals)
+        self._interval = 0  # time since the last call of `evaluate` [cycles]
+        #: Arguments of the function `follow` besides the ages and the interval. The array objects are the same in every call.
+        self._readings = (
+            Readings(now.quaternion, now.gyro, now.accel), record, self._excess, limits,
+            period, 2.0 * robot.sensors.attitude_error,
+        )  # fmt: skip
+        never = np.full(imus, NEVER)
+        self._follow = specialised(follow, never, self._interval, *self._readings)
+        self._found: tuple[Finding, ...] = ()
+
+    def evaluate(self, ages: Ages | None) -> bool:
+        """Sample the IMUs and check them.
+
+        Args:
+            ages: ages of the sensor values; an IMU with values that are too old is not sampled. None if all values are of this
+                cycle.
+
+        Returns:
+            Whether an IMU is implausible.
+        """
+        implausible = self._follow(self._new if ages is None else ages.imu, self._interval, *self._readings)
+        self._interval = next(self._intervals)
+        self._found = _findings(self._excess) if implausible else ()
+        return bool(self._found)
+
+    def findings(self) -> tuple[Finding, ...]:
+        """Return the current findings of the inertial checks."""
+        return self._found
+
+
+def follow(
+    age: Cycles,
+    interval: int,
+    now: Readings,
+    record: Record,
+    excess: Excess,
+    limits: ImuLimits,
+    period: float,
+    tilt_error: float,
+) -> bool:
+    """Add a sample of each IMU to the means, and compare the means with their limits.
+
+    Args:
+        age: age of the values of each IMU, shape (4,) [cycles]. An IMU with an age of at least `NEVER` is skipped.
+        interval: time since the last call [cycles].
+        now: readings of the sample.
+        record: last sample and means. Updated here.
+        excess: output for the values that exceed their limits.
+        limits: values from which the readings of an IMU must not be used.
+        period: cycle time [s].
+        tilt_error: largest angle between the upward directions of torso and pelvis [rad].
+
+    Returns:
+        Whether a value exceeds its limit.
+    """
+    comparable = True
+    for imu in range(len(age)):
+        used = age[imu] < NEVER and usable_one(now.quaternion[imu], now.gyro[imu], now.accel[imu], limits)
+        if used and record.age[imu] < NEVER:
+            add(imu, now, record, period * (interval + record.age[imu] - age[imu]))
+        elif imu in (_TORSO, _PELVIS):
+            comparable = False
+        if age[imu] >= NEVER:  # another check has found a fault of this IMU
+            record.force[imu] = 0.0
+            record.rate_error[imu] = 0.0
+            if imu in (_TORSO, _PELVIS):
+                record.tilt[:] = 0.0
+                record.rate_error[len(age)] = 0.0
+        record.age[imu] = age[imu] if used else NEVER
+        record.quaternion[imu] = now.quaternion[imu]
+        record.gyro[imu] = now.gyro[imu]
+    if comparable:
+        compare(now, record)
+    return exceeds(record, excess, tilt_error)
+
+
+def add(imu: int, now: Readings, record: Record, time: float) -> None:
+    """Add a sample of one IMU to its means.
+
+    Args:
+        imu: index of the IMU in IMUS.
+        now: readings of the sample.
+        record: last sample and means. Updated here.
+        time: time since the last sample [s].
+    """
+    share = count(record, imu)
+    turn = turn_rate(record.quaternion[imu], now.quaternion[imu], time)
+    for axis in range(3):
+        mean = 0.5 * (record.gyro[imu, axis] + now.gyro[imu, axis])
+        add_rates(record, imu, axis, share, (turn[axis], mean))
+    if turn[0] ** 2 + turn[1] ** 2 + turn[2] ** 2 > _MOVING_RATE**2:
+        return
+    share = count(record, len(record.rate) + imu)
+    x, y, z = to_world(now.quaternion[imu], now.accel[imu])
+    z -= GRAVITY
+    scale = share * _FORCE_CLIP / max(_FORCE_CLIP, math.sqrt(x * x + y * y + z * z))
+    record.force[imu, 0] += scale * x - share * record.force[imu, 0]
+    record.force[imu, 1] += scale * y - share * record.force[imu, 1]
+    record.force[imu, 2] += scale * z - share * record.force[imu, 2]
+
+
+def compare(now: Readings, record: Record) -> None:
+    """Add a sample to the means of the comparison of torso and pelvis.
+
+    Args:
+        now: readings of the sample.
+        record: means. Updated here.
+    """
+    pair = len(IMUS)
+    share = count(record, pair)
+    torso, pelvis = upward(now.quaternion[_TORSO]), upward(now.quaternion[_PELVIS])
+    for axis in range(3):
+        record.tilt[axis] += share * (torso[axis] - pelvis[axis] - record.tilt[axis])
+        add_rates(record, pair, axis, share, (now.gyro[_PELVIS, axis], now.gyro[_TORSO, axis]))
+
+
+def count(record: Record, row: int) -> float:
+    """Count a sample of a row of `Record.samples`, and return its share in the means."""
+    record.samples[row] = min(record.samples[row] + 1.0, SAMPLES)
+    return float(1.0 / record.samples[row])
+
+
+def add_rates(record: Record, row: int, axis: int, share: float, rates: tuple[float, float]) -> None:
+    """Add two angular velocities about one axis, which should be equal, to the means of a row [rad/s]."""
+    first, second = rates
+    record.rate_error[row, axis] += share * ((first - second) ** 2 - record.rate_error[row, axis])
+    record.rate[row, axis] += share * (first**2 - record.rate[row, axis])
+
+
+def exceeds(record: Record, excess: Excess, tilt_error: float) -> bool:
+    """Write the values that exceed their limits to `excess`, and return whether there is one.
+
+    Args:
+        record: means.
+        excess: output for the values that exceed their limits.
+        tilt_error: largest angle between the upward directions of torso and pelvis [rad].
+    """
+    pair = len(record.force)
+    for imu in range(pair):
+        x, y, z = record.force[imu, 0], record.force[imu, 1], record.force[imu, 2]
+        excess.force[imu] = 0.0
+        if record.samples[pair + 1 + imu] >= FIRST_SAMPLES[imu]:
+            excess.force[imu] = beyond(math.sqrt(x * x + y * y + z * z), _FORCE_ERROR)
+        excess.rate[imu] = wrong_rate(record, imu) if record.samples[imu] >= FIRST_SAMPLES[imu] else 0.0
+    x, y, z = record.tilt[0], record.tilt[1], record.tilt[2]
+    enough = record.samples[pair] >= FIRST_SAMPLES[_TORSO]
+    excess.tilt[0] = beyond(math.sqrt(x * x + y * y + z * z), tilt_error) if enough else 0.0
+    excess.rate[pair] = wrong_rate(record, pair) if enough else 0.0
+    return bool(excess.force.max() > 0.0 or excess.rate.max() > 0.0 or excess.tilt[0] > 0.0)
+
+
+def beyond(value: float, limit: float) -> float:
+    """Return a value if it is above its limit, otherwise 0."""
+    return value if value > limit else 0.0
+
+
+def wrong_rate(record: Record, row: int) -> float:
+    """Return the largest root mean square of a difference of angular velocities that exceeds its limit [rad/s], otherwise 0."""
+    largest = 0.0
+    for axis in range(3):
+        error = record.rate_error[row, axis]
+        limit = _RATE_ERROR**2 + _RATE_SHARE * record.rate[row, axis]
+        largest = max(largest, beyond(error, limit))
+    return math.sqrt(largest)
+
+
+def upward(quaternion: Vector) -> tuple[float, float, float]:
+    """Return the upward direction of the world in the sensor frame, as a unit vector.
+
+    Args:
+        quaternion: attitude wxyz of unit norm, sensor to world, shape (4,).
+    """
+    w, x, y, z = quaternion[0], quaternion[1], quaternion[2], quaternion[3]
+    return 2.0 * (x * z - w * y), 2.0 * (y * z + w * x), 1.0 - 2.0 * (x * x + y * y)
+
+
+def to_world(quaternion: Vector, vector: Vector) -> tuple[float, float, float]:
+    """Return a vector of the sensor frame in world axes.
+
+    Args:
+        quaternion: attitude wxyz of unit norm, sensor to world, shape (4,).
+        vector: vector in the sensor frame, shape (3,).
+    """
+    w, i, j, k = quaternion[0], quaternion[1], quaternion[2], quaternion[3]
+    x, y, z = vector[0], vector[1], vector[2]
+    p, q, r = 2.0 * (j * z - k * y), 2.0 * (k * x - i * z), 2.0 * (i * y - j * x)
+    return x + w * p + j * r - k * q, y + w * q + k * p - i * r, z + w * r + i * q - j * p
+
+
+def turn_rate(first: Vector, last: Vector, time: float) -> tuple[float, float, float]:
+    """Return the mean angular velocity between two attitudes, in the sensor frame, to first order [rad/s].
+
+    Args:
+        first: first attitude, quaternion wxyz, sensor to world, shape (4,).
+        last: last attitude, in the same form.
+        time: time between the attitudes [s].
+    """
+    a, b, c, d = first[0], first[1], first[2], first[3]
+    e, f, g, h = last[0], last[1], last[2], last[3]
+    # Attitude of the last sample relative to the first one: conj(first) * last. Both signs of a quaternion are the same attitude.
+    factor = math.copysign(2.0 / time, a * e + b * f + c * g + d * h)
+    x = a * f - b * e - c * h + d * g
+    y = a * g + b * h - c * e - d * f
+    z = a * h - b * g + c * f - d * e
+    return factor * x, factor * y, factor * z
+
+
+def _findings(excess: Excess) -> tuple[Finding, ...]:
+    """Return the findings about the values that exceed their limits."""
+    found = []
+    for imu, (force, rate) in enumerate(zip(excess.force.tolist(), excess.rate.tolist(), strict=False)):
+        if force:
+            text = f"the accelerometer of the {IMUS[imu]} IMU contradicts gravity in the reported attitude by {force:.1f} m/s2"
+            found.append(_finding(imu, force, text))
+        elif rate:
+            text = f"the gyroscope of the {IMUS[imu]} IMU contradicts the change of its attitude by {rate:.2f} rad/s"
+            found.append(_finding(imu, rate, text))
+    if any(excess.force[imu] or excess.rate[imu] for imu in (_TORSO, _PELVIS)):
+        return tuple(found)
+    tilt, rate = float(excess.tilt[0]), float(excess.rate[-1])
+    contradict = "torso IMU and pelvis IMU contradict each other"
+    if tilt:
+        found.append(_finding(_TORSO, tilt, f"{contradict} by {math.degrees(tilt):.1f} degrees of tilt"))
+    elif rate:
+        found.append(_finding(_TORSO, rate, f"{contradict} by {rate:.2f} rad/s"))
+    return tuple(found)
+
+
+def _finding(imu: int, value: float, text: str) -> Finding:
+    return Finding(Dtc.IMU_IMPLAUSIBLE, IMU_NODES[imu], value, True, text)

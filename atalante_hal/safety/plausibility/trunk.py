@@ -1,0 +1,128 @@
+"""Trunk check, which detects exchanged IMUs of torso and pelvis.
+
+Both IMUs are on one rigid body with equal axes, so their attitudes and angular velocities are equal. Only the vertical distance
+`TORSO_HEIGHT` distinguishes them: an angular acceleration of the body accelerates the torso IMU more than the pelvis IMU. So the
+integral of the difference of their accelerometers is the angular velocity times this distance:
+
+    integral of a_torso - a_pelvis, along x = height * angular velocity about y
+    integral of a_torso - a_pelvis, along y = - height * angular velocity about x
+
+Both sides pass the same high-pass of second order, with the time constant `_FILTER_TIME`, because the integral of a constant
+error of an accelerometer has no limit. Centrifugal accelerations are neglected; they are small and of twice the frequency. The
+height is the mean product of both sides, divided by the mean square of the filtered angular velocity. If the IMUs are exchanged,
+the height is negative. The check needs an angular velocity above `_LEAST_RATE`, so it cannot decide while the pelvis is at rest.
+The angular velocity is the mean of both gyroscopes, so a gyroscope with a wrong sign does not lead to a wrong decision.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from atalante_hal.compiled import specialised
+from atalante_hal.robot import IMUS
+from atalante_hal.safety.diagnostics import Dtc, Finding
+from atalante_hal.safety.plausibility.finding import IMU_NODES, Signals
+from atalante_hal.types import Vector
+
+#: Height of the torso IMU above the pelvis IMU [m].
+TORSO_HEIGHT = 0.309
+#: Time constant of both high-pass filters [s].
+_FILTER_TIME = 0.1
+#: Time constant of the mean values [s].
+_MEAN_TIME = 0.25
+#: Time after the start in which the filters settle, before the mean values begin [s].
+_SETTLING_TIME = 0.3
+#: Least root mean square of the filtered angular velocity [rad/s]. The noise of the gyroscopes at rest is up to 0.004 rad/s rms.
+_LEAST_RATE = 0.008
+#: Computed height, as a share of `TORSO_HEIGHT`, below whose negative value the IMUs are exchanged. In walks, pushes and falls
+#: of a healthy robot, the computed height is at least 0.6 times `TORSO_HEIGHT`.
+_SHARE = 0.5
+_TORSO, _PELVIS = IMUS.index("torso"), IMUS.index("pelvis")
+
+
+class Filters(NamedTuple):
+    """Values of the filters along the axes x and y of the IMUs."""
+
+    speed: Vector  # (2,) leaky integral of the difference of the accelerometers [m/s]
+    slow_speed: Vector  # (2,) low-pass of `speed` [m/s]
+    slow_rate: Vector  # (2,) low-pass of the angular velocity about the other axis [rad/s]
+    slower_rate: Vector  # (2,) low-pass of the difference between angular velocity and `slow_rate` [rad/s]
+    time: Vector  # (1,) time since the start, up to `_SETTLING_TIME` [s]
+    moments: Vector  # (2,) mean product of speed and rate [m/s2], and mean square of the rate [rad2/s2]
+
+
+class Trunk:
+    """Check whether the IMUs of torso and pelvis are exchanged.
+
+    Args:
+        now: signals decoded in this cycle.
+        period: cycle time [s].
+    """
+
+    def __init__(self, now: Signals, period: float) -> None:
+        #: Arguments of the function `follow`. The array objects are the same in every call.
+        speed, slow_speed, slow_rate, slower_rate, moments = np.zeros((5, 2))
+        filters = Filters(speed, slow_speed, slow_rate, slower_rate, np.zeros(1), moments)
+        self._arguments = now.gyro, now.accel, filters, period
+        self._follow = specialised(follow, *self._arguments)
+        for values in filters:
+            values.fill(0.0)
+        self._found: tuple[Finding, ...] = ()
+
+    def follow(self) -> bool:
+        """Follow the motion of the trunk by one cycle. Both IMUs must have new values.
+
+        Returns:
+            Whether the finding has changed.
+        """
+        height = self._follow(*self._arguments)
+        if (height > 0.0) if self._found else (height < 0.0):
+            self._found = () if self._found else (_exchanged(height),)
+            return True
+        return False
+
+    def findings(self) -> tuple[Finding, ...]:
+        """Return the finding about exchanged IMUs, if there is one."""
+        return self._found
+
+
+def follow(gyro: Vector, accel: Vector, filters: Filters, period: float) -> float:
+    """Update the filters by one cycle, and return the height of the torso IMU above the pelvis IMU.
+
+    Args:
+        gyro: angular velocity of each IMU, shape (4, 3) [rad/s].
+        accel: specific force at each IMU, shape (4, 3) [m/s2].
+        filters: values of the filters. Updated here.
+        period: cycle time [s].
+
+    Returns:
+        The height [m]. It is 0 if the trunk hardly turns, or if the magnitude of the height is too small.
+    """
+    share, product, square = period / _FILTER_TIME, 0.0, 0.0
+    for axis in range(2):
+        sign, other = 0.5 - axis, 1 - axis
+        rate = sign * (gyro[_TORSO, other] + gyro[_PELVIS, other])
+        filters.speed[axis] += (accel[_TORSO, axis] - accel[_PELVIS, axis]) * period - share * filters.speed[axis]
+        filters.slow_speed[axis] += share * (filters.speed[axis] - filters.slow_speed[axis])
+        filters.slow_rate[axis] += share * (rate - filters.slow_rate[axis])
+        rate -= filters.slow_rate[axis]
+        filters.slower_rate[axis] += share * (rate - filters.slower_rate[axis])
+        rate -= filters.slower_rate[axis]
+        product += (filters.speed[axis] - filters.slow_speed[axis]) * rate
+        square += rate * rate
+    if filters.time[0] < _SETTLING_TIME:
+        filters.time[0] += period
+        return 0.0
+    share = period / _MEAN_TIME
+    filters.moments[0] += share * (product - filters.moments[0])
+    filters.moments[1] += share * (square - filters.moments[1])
+    if filters.moments[1] <= _LEAST_RATE**2 or abs(filters.moments[0]) <= _SHARE * TORSO_HEIGHT * filters.moments[1]:
+        return 0.0
+    return float(filters.moments[0] / filters.moments[1])
+
+
+def _exchanged(height: float) -> Finding:
+    text = "the IMUs of torso and pelvis are exchanged: when the robot turns, the torso IMU measures the smaller acceleration"
+    return Finding(Dtc.IMU_IMPLAUSIBLE, IMU_NODES[_TORSO], height, True, text)
