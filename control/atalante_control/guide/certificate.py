@@ -18,12 +18,11 @@ sufficient.
    the horizon. This cycle must not be the worst cycle. At the end of the horizon the free motion has decayed. The error
    in the added cycle therefore follows from the errors in earlier cycles of the prediction. This error must be smaller than
    the width minus the effect of the disturbances.
-3. *Gate.* Let g be the effect that one cycle without backup torque has on r. Near h = 0 the gate is at least 1 - 3 h. A cycle
-with this
-   gate lowers 1 - r by at most 6 g (1 - r). So r stays below 1 if 6 g is at most 1. If the intensity of u_i or u_f is below 1,
-   the torque that is not compensated in this cycle is part of g. The tests check that 6 g is at most 1 for the shape
-   `constant`, at zero intensities. In the other shapes of the package 6 g reaches 1.4 if the smallest width of a step
-   is taken as the width. This estimate is too large by an unknown factor, because these guides are wider in most
+3. *Gate.* Let g be the effect that one cycle without backup torque has on r. Near h = 0 the gate is at least 1 - 3 h. A
+   cycle with this gate lowers 1 - r by at most 6 g (1 - r). So r stays below 1 if 6 g is at most 1. If the intensity of u_i
+   or u_f is below 1, the torque that is not compensated in this cycle is part of g. The tests check that 6 g is at most 1
+   for the shape `constant`, at zero intensities. In the other shapes of the package 6 g reaches 1.4 if the smallest width of
+   a step is taken as the width. This estimate is too large by an unknown factor, because these guides are wider in most
    cycles. For these shapes condition 3 is not proved. Condition 3 is supported only by `atalante guide check`, which
    searches for pushes that break a promise.
 
