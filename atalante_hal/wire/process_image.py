@@ -202,7 +202,7 @@ class ReceiveImage:
         return self.accept_each(frames, count, tag)
 
     def refuse(self, row: int) -> None:
-        """Reject a row whose values are implausible after `accept` committed them: restore the previous values and age.
+        """Reject the implausible values of a row that `accept` has committed: restore the previous values and age.
 
         Args:
             row: row of the message; its age becomes one cycle more than before `accept`.

@@ -43,7 +43,7 @@ def missing(text: str) -> Iterator[tuple[int, str]]:
 
 
 def _valid_values(name: str, kind: str, domain: str, value: str, *, by_name: bool) -> str:
-    """Return the valid values as text if `value` is invalid, else an empty text.
+    """If `value` is invalid, return the valid values as text; otherwise return an empty text.
 
     Args:
         name: name of the attribute.

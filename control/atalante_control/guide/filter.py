@@ -175,7 +175,7 @@ class GuideFilter:
         return self.tables.guards[0].state.copy()
 
     def errors_ahead(self) -> Vector:
-        """Return the last prediction: tracking errors of hip and knee if no disturbance acts, shape (n, 2) [rad]."""
+        """Return the last prediction: tracking errors of hip and knee without disturbances, shape (n, 2) [rad]."""
         return np.asarray(self.prediction.ahead @ (self.prediction.compress @ self.state))
 
     def uncertainty(self) -> Vector:

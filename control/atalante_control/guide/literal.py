@@ -122,7 +122,7 @@ class LiteralGuide:
 
 
 def no_promise(shape: str, xi: float) -> Certificate:
-    """Return a certificate without certified torques, as the control law follows the paper literally.
+    """Return a certificate without certified torques, because the control law follows the paper literally.
 
     Args:
         shape: name of the shape.

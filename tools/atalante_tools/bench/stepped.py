@@ -31,7 +31,7 @@ class SteppedRollout:
         self._cycles = len(guide.prediction.ahead)
 
     def errors(self, state: Vector) -> Vector:
-        """Return the tracking errors of hip and knee in the next n cycles if no disturbance acts. Shape (n, 2) [rad].
+        """Return the tracking errors of hip and knee in the next n cycles, without disturbances. Shape (n, 2) [rad].
 
         Args:
             state: state of the sampled loop, see `backup_policy`, shape (10,).

@@ -88,7 +88,7 @@ class CaseTask:
 
 @dataclass(frozen=True)
 class EnduranceTask:
-    """Task to measure the longest duration for which the fault of `Scenario.permanent` does not stop the walk."""
+    """Task to measure how long the fault of `Scenario.permanent` can last until it stops the walk."""
 
     id: str
     engine: str = PYBULLET

@@ -121,7 +121,7 @@ class ParquetSink:
         self._integers.clear()
 
     def _texts_of(self, field: Field, codes: npt.NDArray[np.int64]) -> npt.NDArray[np.int32] | None:
-        """Return the index in `_texts` of the value name of each raw code, or -1 for a raw code without a name.
+        """Return for each raw code the index of its name in `_texts`; -1 for a raw code without a name.
 
         Returns:
             The indices, shape (n,); None if the field has no value table.
