@@ -97,7 +97,7 @@ class Motors:
 
         Args:
             motor: index of the motor.
-            strength: ratio. A motor without fault has 1, a reversed motor -1.
+            strength: ratio; 1 for a motor without fault, -1 for a reversed motor.
         """
         self._motors[_STRENGTH, motor] = strength
 
@@ -106,7 +106,7 @@ class Motors:
 
         Args:
             motor: index of the motor.
-            gain: ratio. A motor without fault has 1, a motor whose power stage is off 0.
+            gain: ratio; 1 for a motor without fault, 0 for a motor whose power stage is off.
         """
         self._motors[_GAIN, motor] = gain
 

@@ -147,8 +147,8 @@ class Chain:
             links: links of the robot.
 
         Raises:
-            ValueError: If name, parent, joint, yaw or axis of a body differs from the reference robot, or if a number is not zero
-                that is zero in the reference robot.
+            ValueError: If name, parent, joint, yaw or axis of a body differs from the reference robot, or if a number that is
+                zero in the reference robot is not zero.
         """
         robot = bodies(links)
         for body, reference in zip(robot, self.bodies, strict=True):

@@ -221,7 +221,7 @@ class _Walk:
     """Walk on the ground.
 
     Attributes:
-        begins: first cycle of each phase, by the phase and the number of steps before it.
+        begins: first cycle of each phase, by the phase and the number of steps before the phase.
         branches: branches of the walk, by their cycles.
         outcome: how the walk ended, as in `FaultRun`.
         reason: reason of the last state.

@@ -192,8 +192,8 @@ class OperatorPath:
         Args:
             before: state of the safety monitor.
             inputs: inputs of the operator.
-            suspended: True if the robot does not walk on the ground. A walk on the ground is finished before STOP, a
-                released dead-man switch or a lost pendant leads to HOLD.
+            suspended: True if the robot does not walk on the ground. During a walk on the ground, STOP, a released dead-man
+                switch or a lost pendant leads to HOLD only after the walk is finished.
         """
         results: dict[_Decided, Environment] = {}
         for environment in environments(before, suspended):
