@@ -25,6 +25,7 @@ from atalante_dbc import Message, Network
 from atalante_hal.bus import Stamps
 from atalante_hal.hal import Hal
 from atalante_hal.robot import JOINTS, Robot, load_robot
+from atalante_hal.safety.plausibility.inertial import GRAVITY
 from atalante_hal.types import PERIOD, Command, State, SupervisorState, Vector
 from atalante_hal.wire.cia402 import DriveState
 from atalante_hal.wire.e2e import COUNTER_BYTE
@@ -111,6 +112,8 @@ class Recording:
             half_pitch = 0.5 * (walk.tables.q[0] + error)[leg + 2 : leg + 4].sum()
             for axis, value in (("W", np.cos(half_pitch)), ("Y", np.sin(half_pitch))):
                 self.values[:, codec.index(f"IMU_{side}_TIBIA_STATE", f"Quaternion{axis}")] = value
+            for axis, change in (("X", -np.sin(2.0 * half_pitch)), ("Z", np.cos(2.0 * half_pitch) - 1.0)):
+                self.values[:, codec.index(f"IMU_{side}_TIBIA_STATE", f"Accel{axis}")] += GRAVITY * change
         request = [codec.index("PENDANT_STATE", name) for name in ("Request", "RequestCounter")]
         self._before = _seal(image, self.values)
         self.values[:, request] = 1.0  # START pressed once
