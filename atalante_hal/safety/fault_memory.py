@@ -25,7 +25,7 @@ from atalante_hal.safety.diagnostics import (
 )
 from atalante_hal.safety.events import Event
 
-#: After a logged event, equal events are counted instead of logged for this time [cycles].
+#: Time after a logged event in which equal events are only counted, not logged [cycles].
 FOLD_CYCLES = 1000
 #: Number of events that the log keeps. These events need about 2 MB of memory.
 EVENTS_KEPT = 4096

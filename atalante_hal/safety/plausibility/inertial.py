@@ -234,7 +234,7 @@ def count(record: Record, row: int) -> float:
 
 
 def add_rates(record: Record, row: int, axis: int, share: float, rates: tuple[float, float]) -> None:
-    """Add two angular velocities about one axis, which should be equal, to the means of a row [rad/s]."""
+    """Update the means of a row with two measurements of the same angular velocity about one axis [rad/s]."""
     first, second = rates
     record.rate_error[row, axis] += share * ((first - second) ** 2 - record.rate_error[row, axis])
     record.rate[row, axis] += share * (first**2 - record.rate[row, axis])

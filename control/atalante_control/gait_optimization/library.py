@@ -201,7 +201,7 @@ class Library:
         return gaits
 
     def rejected(self) -> dict[Index, str]:
-        """Return the reason for each gait file that does not count as solved. `generate` solves these gaits again."""
+        """Return why gait files do not count as solved, by grid point. `generate` solves these gaits again."""
         return self._read()[1]
 
     def failures(self) -> dict[Index, str]:

@@ -17,7 +17,8 @@ from atalante_control.gait_optimization.step_problem import StepProblem
 from atalante_hal.robot import JOINTS
 from atalante_hal.types import Vector
 
-#: Accepted violation of a joint range [rad]. The optimiser can find a valid pose near a pose with a smaller violation.
+#: Accepted violation of a joint range [rad]. The optimiser can find a valid pose near a pose that
+#: violates the range by less.
 _TOLERANCE = math.radians(0.5)
 _CENTRE_WEIGHT = 1e-6  # weight of the distance from the middle of a joint range; violations of the range have weight 1
 _OPTIONS: dict[str, Any] = {"ipopt.print_level": 0, "ipopt.sb": "yes", "print_time": False, "error_on_fail": False}

@@ -25,7 +25,7 @@ from atalante_hal.robot import JOINTS, load_robot
 from atalante_hal.types import Vector
 
 MODERATE: Final = (0.15, 0.9)  # m and s, step length and step duration of the gait for the second start
-#: a joint is at a limit if less than this fraction of its limit or of its range remains
+#: A joint is at a limit if its margin is less than this fraction of the limit, or of the range of a position.
 _AT_LIMIT: Final = 1e-3
 
 #: Function that solves a gait. Its second argument is the gait for a warm start, or None for the usual initial guess.

@@ -207,7 +207,7 @@ def tail(inverse: Vector) -> Vector:
 
 
 def narrowest(inverse: Vector, cycles: int) -> Vector:
-    """Return for each cycle 1 / width at the narrowest point of the guide within the next `cycles` cycles [1/rad].
+    """Return the largest value of 1 / width of the guide within the next `cycles` cycles, for each cycle [1/rad].
 
     Args:
         inverse: 1 / distance to the guide for each cycle, shape (n, m) [1/rad]; the last row applies to all later cycles.

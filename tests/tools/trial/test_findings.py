@@ -204,11 +204,13 @@ def robust_result(number: int, outcome: str = "stood", *, safe: bool = True) -> 
     }  # fmt: skip
 
 
-def test_robustness_needs_98_percent_standing_and_a_safe_end_of_the_others() -> None:
+def test_robustness_needs_98_percent_with_all_steps_and_a_safe_end_of_the_others() -> None:
     stood = [robust_result(k) for k in range(98)]
     held = [robust_result(98 + k, "hold") for k in range(2)]
     assert verdicts(robust_findings([*stood, *held])) == {"robust-walk": True, "robust-safe": True}
     assert verdicts(robust_findings([*stood[1:], *held, robust_result(0, "fell")]))["robust-walk"] is False
+    early = {**robust_result(0), "steps": 59}
+    assert verdicts(robust_findings([*stood[1:], *held, early])) == {"robust-walk": False, "robust-safe": True}
     unsafe = robust_findings([*stood, robust_result(99, "fell", safe=False)])
     assert verdicts(unsafe)["robust-safe"] is False
     assert "robust-099" in unsafe[1].statistic

@@ -1,4 +1,4 @@
-"""Requirements for the pendant: requests on button presses, dead-man switch and assistance dial."""
+"""Requirements for the pendant: its dead-man switch, its assistance dial, and its requests after a button press."""
 
 from __future__ import annotations
 

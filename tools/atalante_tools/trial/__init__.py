@@ -251,7 +251,7 @@ def protocol(
 def robustness(seeds: int | None, steps: int | None, running: Running, as_json: bool) -> None:
     """Walk with full assistance, random patients, errors of the model, friction, late motors, lost frames and pushes.
 
-    Each trial that does not end standing is repeated with a recording, which is in the folder `recordings`.
+    Each trial in which the robot does not walk all steps and stand is repeated with a recording, in the folder `recordings`.
     """
     from atalante_tools.trial.findings import robust_findings
     from atalante_tools.trial.plan import QUICK_ROBUST, ROBUST, robust_trials
@@ -279,14 +279,15 @@ def pushes(running: Running, as_json: bool) -> None:
 
 
 def _record_failures(trials: Sequence[Trial], running: Running) -> None:
-    """Repeat each trial in which the robot did not end standing, and record the repetition."""
+    """Repeat each trial in which the robot did not walk all steps and stand, and record the repetition."""
+    from atalante_tools.trial.findings import walked_all_steps
     from atalante_tools.trial.plan import RobustTrial
     from atalante_tools.trial.store import stored
 
     folder = running.out / "recordings"
     for trial in trials:
         result, file = stored(trial, running.out / "trials"), folder / f"{trial.name}.mcap"
-        if isinstance(trial, RobustTrial) and result and result["outcome"] != "stood" and not file.exists():
+        if isinstance(trial, RobustTrial) and result and not walked_all_steps(result) and not file.exists():
             from atalante_tools.trial.robustness import robust_walk
 
             check_stop()

@@ -79,7 +79,7 @@ def pushes(results: Sequence[Result]) -> bytes:
     ]
     axis.plot(angles, worst, linewidth=2.5, color="black", label="worst phase")
     axis.set(
-        theta_zero_location="N",  # a push forwards is drawn upwards, a push to the left (90 degrees) to the left
+        theta_zero_location="N",  # forwards (0 degrees) points up in the plot, left (90 degrees) points left
         ylim=(0.0, None),
         title="largest push withstood [N]\n0 deg forwards, 90 deg to the left, right leg is stance leg",
     )

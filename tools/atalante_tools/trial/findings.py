@@ -26,15 +26,15 @@ _PHASES: Final = np.linspace(0.1, 0.8, 29)
 SAME: Final = 0.02
 STANDING: Final = 1.44  # metabolic rate of quiet standing [W/kg]
 #: A quantity has a falling trend if its rank correlation with the assistance factor is between -1 and -`TREND`.
-#: `ASYMMETRY` is the largest mean difference between the k-th trial of a day and the k-th trial counted from the end of the
-#: day, relative to the range of the values.
+#: `ASYMMETRY` limits the difference between the k-th trial of a day and the k-th trial from its end. The difference is averaged
+#: over k and divided by the range of the values.
 TREND, ASYMMETRY = 0.8, 0.25
 #: Largest coefficient of variation of the baseline metabolic rates of a sweep.
 VARIATION: Final = 0.05
 
 
 #: `CERTIFIED` is the smallest accepted share of certified guides.
-#: `ROBUST` is the smallest accepted share of walks that end standing in the experiment `robustness`.
+#: `ROBUST` is the smallest accepted share of robots that walk all steps and stand in the experiment `robustness`.
 CERTIFIED, ROBUST = 0.95, 0.98
 #: Largest deviation from the line after the walks of `protocol` [m]: with the gyro alone, and with a heading reference.
 SIDEWAYS, SIDEWAYS_WITH_REFERENCE = 1.5, 0.5
@@ -193,21 +193,31 @@ def robust_findings(results: Sequence[Result]) -> list[Finding]:
     Args:
         results: results of `robust` trials.
     """
-    count, stood = len(results), sum(r["outcome"] == "stood" for r in results)
+    count = len(results)
+    walked = sum(map(walked_all_steps, results))
     unsafe = [r["trial"]["name"] for r in results if not r["safe"]]
-    walks = f"{stood} of {count} walks ended standing, at least {ROBUST:.0%} wanted"
+    walks = f"{walked} of {count} robots walked all steps and stood, at least {ROBUST:.0%} wanted"
     ends = f"{count - len(unsafe)} of {count} robots stood or were stopped, all wanted" + (": not " if unsafe else "")
     tested = bool(results)
     return [
         Finding(
             "robust-walk", "the robot walks in spite of errors of model, floor and bus, and of pushes", walks,
-            stood >= ROBUST * count if tested else None,
+            walked >= ROBUST * count if tested else None,
         ),
         Finding(
             "robust-safe", "a walk that does not end standing ends with the controller stopped and all drives holding or off",
             ends + ", ".join(unsafe), not unsafe if tested else None,
         ),
     ]  # fmt: skip
+
+
+def walked_all_steps(result: Result) -> bool:
+    """Return whether the robot walked all steps of a trial of `robustness`, and stood at the end.
+
+    Args:
+        result: result of a `robust` trial.
+    """
+    return bool(result["outcome"] == "stood" and result["steps"] == result["trial"]["steps"])
 
 
 def push_findings(results: Sequence[Result]) -> list[Finding]:
