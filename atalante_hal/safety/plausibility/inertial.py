@@ -180,8 +180,11 @@ def follow(
                 record.tilt[:] = 0.0
                 record.rate_error[len(age)] = 0.0
         record.age[imu] = age[imu] if used else NEVER
-        record.quaternion[imu] = now.quaternion[imu]
-        record.gyro[imu] = now.gyro[imu]
+        # numba would create an array to copy a row, because source and target could overlap.
+        for axis in range(4):
+            record.quaternion[imu, axis] = now.quaternion[imu, axis]
+        for axis in range(3):
+            record.gyro[imu, axis] = now.gyro[imu, axis]
     if comparable:
         compare(now, record)
     return exceeds(record, excess, tilt_error)
@@ -248,18 +251,19 @@ def exceeds(record: Record, excess: Excess, tilt_error: float) -> bool:
         excess: output for the values that exceed their limits.
         tilt_error: largest angle between the upward directions of torso and pelvis [rad].
     """
-    pair = len(record.force)
+    pair, found = len(record.force), False
     for imu in range(pair):
         x, y, z = record.force[imu, 0], record.force[imu, 1], record.force[imu, 2]
         excess.force[imu] = 0.0
         if record.samples[pair + 1 + imu] >= FIRST_SAMPLES[imu]:
             excess.force[imu] = beyond(math.sqrt(x * x + y * y + z * z), _FORCE_ERROR)
         excess.rate[imu] = wrong_rate(record, imu) if record.samples[imu] >= FIRST_SAMPLES[imu] else 0.0
+        found = found or excess.force[imu] > 0.0 or excess.rate[imu] > 0.0
     x, y, z = record.tilt[0], record.tilt[1], record.tilt[2]
     enough = record.samples[pair] >= FIRST_SAMPLES[_TORSO]
     excess.tilt[0] = beyond(math.sqrt(x * x + y * y + z * z), tilt_error) if enough else 0.0
     excess.rate[pair] = wrong_rate(record, pair) if enough else 0.0
-    return bool(excess.force.max() > 0.0 or excess.rate.max() > 0.0 or excess.tilt[0] > 0.0)
+    return bool(found or excess.tilt[0] > 0.0 or excess.rate[pair] > 0.0)
 
 
 def beyond(value: float, limit: float) -> float:
