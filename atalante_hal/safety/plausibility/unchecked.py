@@ -3,7 +3,8 @@
 A check uses values that are younger than the timeout of their message, see `finding.Rows`. If a node sends no message,
 the message monitor brings the robot to HOLD within 10 cycles. If a node sends messages without usable values, the robot
 may keep moving. For example, the robot stays in FULL_ASSIST if an IMU permanently sends the code for invalid values.
-Then the encoders of the leg are not checked against the IMUs, and this module reports the missing check.
+Then the encoders of the leg are not checked against the IMUs, and this module reports the missing check. The checks that need
+only one IMU are not reported here, because an IMU without usable values is itself reported with the same reaction.
 """
 
 from __future__ import annotations
@@ -16,7 +17,7 @@ import numpy.typing as npt
 
 from atalante_hal.robot import FEET, IMUS, JOINTS, LEG_JOINTS, SIDES
 from atalante_hal.safety.diagnostics import Dtc, Finding
-from atalante_hal.safety.plausibility.finding import FOOT_NODES, JOINT_NODES, Cycles, Rows
+from atalante_hal.safety.plausibility.finding import FOOT_NODES, IMU_NODES, JOINT_NODES, Cycles, Rows
 from atalante_hal.wire.e2e import Check
 from atalante_hal.wire.process_image import NEVER
 
@@ -88,7 +89,7 @@ class Unchecked:
 
 
 def _checks(rows: Rows) -> Iterator[_SensorCheck]:
-    """Yield the checks: velocity of each joint, encoders against IMUs of each leg, force cells of each foot."""
+    """Yield the checks: velocity of each joint, encoders against IMUs of each leg, torso against pelvis, cells of each foot."""
     joints, imus, feet = rows.joint.tolist(), rows.imu.tolist(), rows.foot.tolist()
     for joint, row in enumerate(joints):
         yield _SensorCheck(Dtc.ENC_VELOCITY, JOINT_NODES[joint], [row], f"the velocity of {JOINTS[joint]}")
@@ -96,6 +97,10 @@ def _checks(rows: Rows) -> Iterator[_SensorCheck]:
         hip = leg * len(LEG_JOINTS)
         needed = [*joints[hip : hip + _COMPARED], imus[IMUS.index("pelvis")], imus[IMUS.index(f"{side}_tibia")]]
         yield _SensorCheck(Dtc.ENC_DRIFT, JOINT_NODES[hip], needed, f"the encoders against the IMUs of the {side} leg")
+    torso, pelvis = IMUS.index("torso"), IMUS.index("pelvis")
+    yield _SensorCheck(
+        Dtc.IMU_IMPLAUSIBLE, IMU_NODES[torso], [imus[torso], imus[pelvis]], "the torso IMU against the pelvis IMU"
+    )
     for foot, row in enumerate(feet):
         yield _SensorCheck(Dtc.FOOT_CELL, FOOT_NODES[foot], [row], f"the force cells of the {FEET[foot]} foot")
 

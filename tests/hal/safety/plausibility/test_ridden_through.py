@@ -24,6 +24,7 @@ from atalante_hal.robot import IMUS, JOINTS, load_robot
 from atalante_hal.safety.diagnostics import Dtc
 from atalante_hal.safety.plausibility import Finding, Plausibility
 from atalante_hal.safety.plausibility.finding import Signals, signals_of
+from atalante_hal.safety.plausibility.trunk import TORSO_HEIGHT
 from atalante_hal.safety.plausibility.unchecked import UNCHECKED_CYCLES
 from atalante_hal.wire.e2e import COUNTER_BYTE
 from atalante_hal.wire.frame import Frames, new_frames
@@ -40,6 +41,9 @@ MIDDLE = (ROBOT.position_min + ROBOT.position_max) / 2.0
 AMPLITUDE, RATE = 0.15, 6.0
 SWING_PERIOD = round(2.0 * math.pi / RATE / PERIOD)
 JOINT, LEG_IMU = JOINTS.index("right_FH"), IMUS.index("right_tibia")
+TORSO, PELVIS = IMUS.index("torso"), IMUS.index("pelvis")
+#: Angular velocity [rad/s] and angular frequency [rad/s] of a trunk that swings.
+TRUNK_RATE, TRUNK_FREQUENCY = 0.05, 12.0
 
 Change = Callable[[Signals, int], object]
 #: Function that returns the received frames for the frames sent in this cycle and in the last cycle.
@@ -58,11 +62,11 @@ def late(row: int) -> Disturbance:
     return lambda frames, before: np.concatenate([before[row : row + 1], np.delete(frames, row)])
 
 
-def lost_when_sampled(row: int) -> Disturbance:
-    """Lose three of 16 frames, in the cycles of the slow checks. This is less than the 20 % that the leaky bucket tolerates."""
+def lost_when_sampled(row: int, cycles: tuple[int, ...] = (0, 2, 8)) -> Disturbance:
+    """Lose at most three of 16 frames, in the cycles of slow checks. This is less than the 20 % that is tolerated."""
 
     def disturb(frames: Frames, before: Frames) -> Frames:
-        lost = int(frames["data"][0, COUNTER_BYTE]) % 16 in (0, 2, 8)
+        lost = int(frames["data"][0, COUNTER_BYTE]) % 16 in cycles
         return np.delete(frames, row) if lost else frames
 
     return disturb
@@ -80,6 +84,11 @@ DISTURBANCES: dict[str, Disturbance] = {
     **{f"{name} doubled": doubled(row) for row, name in enumerate(NAMES)},
     **{f"{name} one cycle late": late(row) for row, name in enumerate(NAMES)},
     **{f"{name} lost when sampled": lost_when_sampled(row) for row, name in enumerate(NAMES)},
+    **{
+        f"{name} lost in the inertial checks": lost_when_sampled(row, (11, 12))
+        for row, name in enumerate(NAMES)
+        if name.startswith("IMU_")
+    },
 }
 
 
@@ -206,6 +215,34 @@ def _lone_cell(first: int) -> Change:
     return lambda sent, cycle: sent.force.__setitem__((1, 2, 2), 200.0 + sent.force[1, 2, 0])
 
 
+def _wrong_sign(first: int) -> Change:
+    return lambda sent, cycle: sent.accel.__setitem__(TORSO, -sent.accel[TORSO])
+
+
+def _wrong_gyroscope(first: int) -> Change:
+    return lambda sent, cycle: sent.gyro.__setitem__(LEG_IMU, -sent.gyro[LEG_IMU])
+
+
+def _tilted_torso(first: int) -> Change:
+    def change(sent: Signals, cycle: int) -> None:
+        sent.quaternion[TORSO] = math.cos(0.05), math.sin(0.05), 0.0, 0.0
+        sent.accel[TORSO] = specific_force(sent.quaternion[TORSO])
+
+    return change
+
+
+def _exchanged_trunk(first: int) -> Change:
+    # The trunk must turn, because attitudes and angular velocities of the exchanged IMUs are equal.
+    def change(sent: Signals, cycle: int) -> None:
+        phase = TRUNK_FREQUENCY * PERIOD * (cycle - first)
+        half = -0.5 * TRUNK_RATE / TRUNK_FREQUENCY * math.cos(phase)
+        sent.quaternion[[TORSO, PELVIS]] = math.cos(half), 0.0, math.sin(half), 0.0
+        sent.gyro[[TORSO, PELVIS], 1] += TRUNK_RATE * math.sin(phase)
+        sent.accel[PELVIS, 0] += TORSO_HEIGHT * TRUNK_RATE * TRUNK_FREQUENCY * math.cos(phase)
+
+    return change
+
+
 FAULTS = {
     "velocity 1 rad/s off": Fault(Dtc.ENC_VELOCITY, "RIGHT_FH", 64, _velocity_off),
     "velocity stays at 0": Fault(Dtc.ENC_VELOCITY, "LEFT_HA", 64, _velocity_zero),
@@ -214,6 +251,10 @@ FAULTS = {
     "gyro repeats itself": Fault(Dtc.IMU_STUCK, "IMU_RIGHT_TIBIA", 100, _frozen),
     "cell repeats itself": Fault(Dtc.FOOT_CELL, "FOOT_RIGHT", 260, _dead_cell),
     "cell contradicts the others": Fault(Dtc.FOOT_CELL, "FOOT_RIGHT", 260, _lone_cell),
+    "accelerometer has the wrong sign": Fault(Dtc.IMU_IMPLAUSIBLE, "IMU_TORSO", 300, _wrong_sign),
+    "gyroscope has the wrong sign": Fault(Dtc.IMU_IMPLAUSIBLE, "IMU_RIGHT_TIBIA", 300, _wrong_gyroscope),
+    "torso IMU is tilted": Fault(Dtc.IMU_IMPLAUSIBLE, "IMU_TORSO", 300, _tilted_torso),
+    "IMUs of the trunk are exchanged": Fault(Dtc.IMU_IMPLAUSIBLE, "IMU_TORSO", 627, _exchanged_trunk),
     "both feet swing": Fault(Dtc.CONTACT_IMPLAUSIBLE, "FOOT_LEFT", 64, lambda first: lambda sent, cycle: None, True),
 }
 
@@ -255,9 +296,13 @@ class TestUnchecked:
             ("position", JOINTS.index("left_SA"), {(Dtc.ENC_VELOCITY, "LEFT_SA")}),
             ("position", JOINTS.index("left_SK"), {(Dtc.ENC_VELOCITY, "LEFT_SK"), (Dtc.ENC_DRIFT, "LEFT_FH")}),
             ("position", JOINTS.index("right_FH"), {(Dtc.ENC_VELOCITY, "RIGHT_FH"), (Dtc.ENC_DRIFT, "RIGHT_FH")}),
-            ("quaternion", IMUS.index("pelvis"), {(Dtc.ENC_DRIFT, "LEFT_FH"), (Dtc.ENC_DRIFT, "RIGHT_FH")}),
+            (
+                "quaternion",
+                IMUS.index("pelvis"),
+                {(Dtc.ENC_DRIFT, "LEFT_FH"), (Dtc.ENC_DRIFT, "RIGHT_FH"), (Dtc.IMU_IMPLAUSIBLE, "IMU_TORSO")},
+            ),
             ("quaternion", IMUS.index("left_tibia"), {(Dtc.ENC_DRIFT, "LEFT_FH")}),
-            ("quaternion", IMUS.index("torso"), set()),
+            ("quaternion", IMUS.index("torso"), {(Dtc.IMU_IMPLAUSIBLE, "IMU_TORSO")}),
             ("force", 1, {(Dtc.FOOT_CELL, "FOOT_RIGHT")}),
         ],
     )
