@@ -397,3 +397,17 @@ class TestSchedule:
     def test_wrong_gyroscope_is_found_although_a_message_is_late(self, imu: int):
         robot = SimulatedRobot(amplitude=0.0, late=dict.fromkeys(range(19), 1))
         robot.until_found(Dtc.IMU_IMPLAUSIBLE, 300, lambda now: now.gyro[imu].__iadd__(0.2))
+
+    @imus
+    def test_imu_that_repeats_the_values_of_a_fast_turn_is_found_before_it_is_stuck(self, imu: int):
+        robot = SimulatedRobot(amplitude=0.0)
+        assert robot.run(1100) == ()
+
+        def freeze(now: Signals) -> None:
+            now.gyro[imu] = [0.0, 2.0, 0.0]
+
+        cycles = robot.until_found(Dtc.IMU_IMPLAUSIBLE, 32, freeze)
+        cycles += robot.until_found(Dtc.IMU_STUCK, 100 - cycles, freeze)
+        robot.run(16, freeze)
+        finding = only(robot.checks.findings)  # the values are not used any more
+        assert (finding.dtc, finding.node) == (Dtc.IMU_STUCK, IMU_NODES[imu])
