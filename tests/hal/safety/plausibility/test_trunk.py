@@ -86,6 +86,13 @@ def test_height_is_the_vertical_distance(axis: int, height: float, amplitude: fl
     assert robot.checks._follow(*robot.checks._arguments) == pytest.approx(height * TORSO_HEIGHT, rel=0.03)
 
 
+def test_height_is_zero_while_the_filters_settle():
+    robot = Swinging()
+    for cycle in range(299):
+        swing(robot.now, cycle, 1, TORSO_HEIGHT, AMPLITUDE)
+        assert robot.checks._follow(*robot.checks._arguments) == 0.0
+
+
 @pytest.mark.parametrize(("amplitude", "found"), [(0.0205, True), (0.017, False)])
 def test_slow_motion_is_not_evaluated(amplitude: float, found: bool):
     # The filters reduce the amplitude to 0.59 times its value, so a limit of 0.008 rad/s rms is an amplitude of 0.0192 rad/s.
