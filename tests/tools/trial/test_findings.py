@@ -277,6 +277,7 @@ def test_walks_end_near_their_line(reference: bool, limit: float, side: float) -
         assert verdicts(protocol_findings([walk, other]))["protocol-line"] is near
     fallen = {**walk, "true_lateral_m": None}
     assert verdicts(protocol_findings([fallen]))["protocol-line"] is None
+    assert "no walk ended standing" in {finding.statistic for finding in protocol_findings([fallen])}
 
 
 @pytest.mark.parametrize(("error", "passed"), [(0.499, True), (0.5, False), (None, None)])

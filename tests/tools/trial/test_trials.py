@@ -158,6 +158,17 @@ def test_two_processes_give_the_same_files_as_one(reference: Path, tmp_path: Pat
     assert content(tmp_path) == content(reference)
 
 
+@pytest.mark.filterwarnings("ignore")  # dask's own
+def test_a_dask_cluster_on_loopback_gives_the_same_files(reference: Path, tmp_path: Path) -> None:
+    from distributed import LocalCluster
+
+    with LocalCluster(
+        n_workers=1, threads_per_worker=1, host="127.0.0.1", dashboard_address=None, silence_logs=50
+    ) as cluster:
+        assert len(list(compute(TINY, tmp_path, cluster=cluster.scheduler_address))) == len(TINY)
+    assert content(tmp_path) == content(reference)
+
+
 def test_a_killed_run_is_resumed_with_the_same_files(reference: Path, tmp_path: Path) -> None:
     with subprocess.Popen([sys.executable, "-c", PROGRAM, str(tmp_path)], stderr=subprocess.PIPE, text=True) as process:
         await_result(tmp_path, process)

@@ -168,23 +168,21 @@ def _line(results: Sequence[Result]) -> Finding:
     reference = any(r["trial"]["heading_reference"] for r in results)
     limit = SIDEWAYS_WITH_REFERENCE if reference else SIDEWAYS
     deviations = [abs(r["true_lateral_m"]) for r in results if r["true_lateral_m"] is not None]
-    largest = max(deviations, default=math.nan)
-    text = f"largest true deviation {largest:.2f} m in {len(deviations)} walks, limit {limit:g} m"
-    source = "a heading reference" if reference else "the gyro alone"
-    return Finding(
-        "protocol-line", f"with {source}, the robot stays near its line", text,
-        largest <= limit if deviations else None,
-    )  # fmt: skip
+    claim = f"with {'a heading reference' if reference else 'the gyro alone'}, the robot stays near its line"
+    if not deviations:
+        return Finding("protocol-line", claim, "no walk ended standing", None)
+    text = f"largest true deviation {max(deviations):.2f} m in {len(deviations)} walks, limit {limit:g} m"
+    return Finding("protocol-line", claim, text, max(deviations) <= limit)
 
 
 def _attitude(results: Sequence[Result]) -> Finding:
     """Return the finding that the error of the estimated vertical is below `ATTITUDE` in every walk."""
     errors = [r["attitude_rms_deg"] for r in results if r["attitude_rms_deg"] is not None]
-    largest = max(errors, default=math.nan)
-    text = f"largest RMS error of a walk {largest:.2f} deg, limit {ATTITUDE:g} deg"
-    return Finding(
-        "protocol-attitude", "the attitude of the pelvis is known", text, largest < ATTITUDE if errors else None
-    )
+    claim = "the attitude of the pelvis is known"
+    if not errors:
+        return Finding("protocol-attitude", claim, "no robot walked", None)
+    text = f"largest RMS error of a walk {max(errors):.2f} deg, limit {ATTITUDE:g} deg"
+    return Finding("protocol-attitude", claim, text, max(errors) < ATTITUDE)
 
 
 def robust_findings(results: Sequence[Result]) -> list[Finding]:
