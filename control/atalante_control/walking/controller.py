@@ -3,27 +3,27 @@
     state -> loads, attitude, divergent component of motion (DCM) -> phase (re-centring, steering) -> torque command u
 
 A walk begins and ends with standing: weight shift, start step, periodic steps, stop step, weight shift back (`walking.phases`).
+The periodic steps can have several gaits, one after another (`walking.section`).
 The controller uses only measurements from the bus. The torque is the sum of the PID torque, the gravity torque u_g, the
 feedforward u_f and the torque of the ankle stabiliser. In a periodic step with Xi < 1, the sagittal hip and knee (SH, SK) of the
 swing leg get only the torque of the guide filter until the nominal end of the step. The start step and the stop step
-are always fully assisted. As in the air, Xi changes only at a stance change.
+are always fully assisted, and so are the first two steps with a new gait.
+As in the air, Xi changes only at a stance change.
 """
 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
 import numpy as np
 
 from atalante_control.dynamics.gravity import Gravity
 from atalante_control.gait.gait import PERIOD
-from atalante_control.gait.recentering import Deadbeat
 from atalante_control.gait.walk import WalkGaits
 from atalante_control.guide.certificate import Certificate
-from atalante_control.guide.literal import LiteralConfig, LiteralGuide, no_promise
 from atalante_control.guide.shapes import PINCHED, GuideShape
-from atalante_control.guide.step_guides import Choice, StepGuides
-from atalante_control.joint.flat_foot import ankle_records, flat_feet, recentring_rows
+from atalante_control.joint.flat_foot import ankle_records, flat_feet
 from atalante_control.joint.pid import LEFT, RIGHT, Pid
 from atalante_control.model import GRAVITY, ExoskeletonParameters, Patient, pinocchio_model, urdf
 from atalante_control.structured import Records, zeros
@@ -32,7 +32,6 @@ from atalante_control.walking.config import WalkConfig
 from atalante_control.walking.contact import ImpactDetector
 from atalante_control.walking.dcm import Balance, Stabiliser
 from atalante_control.walking.kernel import (
-    Assistance,
     Constants,
     Measured,
     Outputs,
@@ -47,10 +46,8 @@ from atalante_control.walking.kinematics import Kinematics
 from atalante_control.walking.lean import Lean
 from atalante_control.walking.phases import STEPPING, WALKING, Facts, Phase, next_phase
 from atalante_control.walking.placement import Placement
-from atalante_control.walking.reference import PhaseTable, Reach, shift_tables, step_table
-from atalante_control.walking.standing import Standing
+from atalante_control.walking.section import Models, Section, SectionMotion
 from atalante_control.walking.steering import Steering
-from atalante_control.walking.swing_leg import swing_leg
 from atalante_control.walking.telemetry import TELEMETRY_FIELDS, Telemetry, WalkStatistics
 from atalante_hal.compiled import specialised
 from atalante_hal.robot import CELLS, FEET, IMUS, JOINTS, LEG_JOINTS, MOTORS, Robot
@@ -89,6 +86,7 @@ class WalkController:
         steps: int,
         config: WalkConfig | None = None,
         shape: GuideShape = PINCHED,
+        then: Sequence[Section] = (),
     ) -> None:
         """Build the parts and allocate all arrays, because the control loop must not allocate memory.
 
@@ -96,34 +94,25 @@ class WalkController:
             robot: limits of the joints.
             patient: patient in the exoskeleton, or None for an empty exoskeleton.
             gaits: start step, periodic step and stop step.
-            steps: number of periodic steps until the stop step.
+            steps: number of periodic steps with these gaits.
             config: parameters of the controller. If None, the defaults are used.
             shape: shape of the virtual guide of the periodic steps.
+            then: further sections of the walk with other gaits, in walking order. The stop step is that of the last section.
 
         Raises:
             GaitError: If a pose of the weight shift cannot be reached.
+            ValueError: If a section has no step.
         """
         self.config = config = config or WalkConfig()
-        self._steps_wanted, self._step_duration = steps, gaits.step.duration
         exoskeleton = ExoskeletonParameters() if patient is None else ExoskeletonParameters().fitted(patient)
         worn, empty = pinocchio_model(urdf(exoskeleton, robot, patient)), pinocchio_model(urdf(exoskeleton, robot))
         gravity, kinematics = Gravity(empty), Kinematics(worn, exoskeleton)
-        standing = Standing(worn, gravity, exoskeleton, robot)
-        self._tables = _tables(gaits, standing, kinematics, config, exoskeleton.toe_out)
-
-        swinging = swing_leg(gaits.step, config.guided_alpha, worn, kinematics, gravity, config.guide.friction)
-        # On the ground the guide ends with the step, because the foot lands. So the prediction covers no cycles of the next step.
-        self._guides = StepGuides(config.guide, robot, shape, swinging.leg, _fading(config.engage), 0)
-        guide = config.guide
-        self._literal = LiteralGuide(
-            LiteralConfig(config.gains.swing, guide.promise, guide.zeta, guide.idealization, guide.feedforward),
-            shape,
-            swinging.leg,
-            gaits.step.tables().uf[:, [_SH, _SK]],
-        )
-        self._assistance = Assistance(
-            self._guides.filters[-1].tables, self._literal.tables, swinging.unmodelled.copy(), _fading(config.release)
-        )
+        models = Models(robot, worn, gravity, kinematics, exoskeleton)
+        self._sections: list[SectionMotion] = []
+        for section in (Section(gaits, steps), *then):
+            before = self._sections[-1].end if self._sections else 0
+            self._sections.append(SectionMotion(section, before, models, config, shape))
+        self._section = self._sections[0]
 
         pid, self._observer = Pid(config.gains), AttitudeObserver(config.observer_bandwidth)
         self._imus = {_PELVIS: np.array(exoskeleton.pelvis_imu), _TORSO: np.array(exoskeleton.torso_imu)}
@@ -203,7 +192,7 @@ class WalkController:
             round(seconds / PERIOD) for seconds in (config.settle, config.rest, config.landing_timeout)
         )
         self._command = Command(outputs[0].torque, np.zeros(len(MOTORS)))
-        self._table = self._tables[Phase.POSTURE, RIGHT]
+        self._table = self._section.tables[Phase.POSTURE, RIGHT]
         self._compile()
         self._forget(0)
 
@@ -212,7 +201,7 @@ class WalkController:
         measured, table, constants, stabiliser = self._measured, self._table, self._constants, self._stabiliser
         self._sense = specialised(sense, measured, table, constants, stabiliser, self._parts)
         self._start = specialised(start, measured, table, self._parts)
-        self._act = specialised(act, 0, measured, table, constants, stabiliser, self._assistance, self._parts)
+        self._act = specialised(act, 0, measured, table, constants, stabiliser, self._section.assistance, self._parts)
 
     def _forget(self, cycle: int) -> None:
         """Reset all values of the last walk."""
@@ -225,7 +214,8 @@ class WalkController:
         self._command.outside = self._command.guide_left = self._command.hand_over_exceeded = False
         self._load[:] = 0.0
         self._pid.reset()
-        self._table = self._tables[Phase.POSTURE, RIGHT]
+        self._section = self._sections[0]
+        self._table = self._section.tables[Phase.POSTURE, RIGHT]
         self.telemetry.fill(0.0)
         self.statistics = WalkStatistics()
 
@@ -242,13 +232,13 @@ class WalkController:
     @property
     def standing_pose(self) -> Vector:
         """Return the joint angles of the standing pose, shape (12,) [rad]."""
-        pose: Vector = self._tables[Phase.STAND, RIGHT].rows[0, :_N]
+        pose: Vector = self._sections[0].tables[Phase.STAND, RIGHT].rows[0, :_N]
         return pose
 
     @property
     def steps_wanted(self) -> int:
         """Return the number of periodic steps until the stop step."""
-        return self._steps_wanted
+        return self._sections[-1].end
 
     def reached(self, step: int, phase: float) -> bool:
         """Return whether the walk has reached a phase of a periodic step. The result remains True after this phase.
@@ -259,7 +249,7 @@ class WalkController:
         """
         steps = self.statistics.steps
         return steps > step or (
-            steps == step and self.phase is Phase.STEP and self._record.elapsed >= phase * self._step_duration
+            steps == step and self.phase is Phase.STEP and self._record.elapsed >= phase * self._section.duration
         )
 
     @property
@@ -275,18 +265,16 @@ class WalkController:
 
     def prepare(self) -> None:
         """Compute the guides of all assistance factors before a walk in real time, see `StepGuides.prepare`."""
-        if not self.config.literal_law:
-            self._guides.prepare()
+        for section in self._sections:
+            section.prepare()
 
-    def certificate(self, xi: float) -> Certificate:
-        """Return the certificate of the guide used at an assistance factor, see `StepGuides.certificate`.
+    def certificates(self, xi: float) -> list[Certificate]:
+        """Return the certificate of the guide of each section at an assistance factor, in walking order.
 
         Args:
             xi: assistance factor in [0, 1].
         """
-        if self.config.literal_law and xi < 1.0:
-            return no_promise(self._guides.filters[0].shape.name, xi)
-        return self._guides.certificate(xi)
+        return [section.certificate(xi) for section in self._sections]
 
     def stop(self) -> None:
         """End the walk with a stop step after the current step."""
@@ -327,7 +315,9 @@ class WalkController:
         if following is not None:
             self._begin(following, state.cycle, state.assistance_factor)
             cycle = 0
-        self._act(cycle, self._measured, self._table, self._constants, self._stabiliser, self._assistance, self._parts)
+        self._act(
+            cycle, self._measured, self._table, self._constants, self._stabiliser, self._section.assistance, self._parts
+        )
         self._watch_guide(cycle)
         return self._command
 
@@ -395,7 +385,7 @@ class WalkController:
             cycle = int(self._clock[0] + self._pace[0])
             landed = self._landed = self._impact.update(load[1 - self._stance], cycle / nominal)
         steps = self.statistics.steps + (phase is Phase.STEP)
-        loaded, stopping = self._loaded >= self._settled, self._stopping or steps >= self._steps_wanted
+        loaded, stopping = self._loaded >= self._settled, self._stopping or steps >= self.steps_wanted
         return Facts(cycle, nominal, self._rest, self._timeout, landed, loaded, stopping)
 
     def _begin(self, phase: Phase, cycle: int, xi: float) -> None:
@@ -421,9 +411,12 @@ class WalkController:
         if phase is Phase.STEP and self.config.turn:
             self.steering.turn()
         stage.steering = self.steering.offset() if phase is Phase.STEP else 0.0
-        self.phase, self._since, self._table = phase, cycle, self._tables[phase, self._stance]
+        steps = self.statistics.steps
+        if phase is Phase.STEP and steps == self._section.end:
+            self._section = self._sections[self._sections.index(self._section) + 1]
+        self.phase, self._since, self._table = phase, cycle, self._section.tables[phase, self._stance]
         stage.literal = self.config.literal_law and phase is Phase.STEP
-        self._assisted = stage.assisted = phase is Phase.STEP and xi < 1.0
+        self._assisted = stage.assisted = phase is Phase.STEP and xi < 1.0 and steps >= self._section.guided
         stage.placed = phase in (Phase.START, Phase.STEP) and not self._assisted and not stage.literal
         self._start(self._measured, self._table, self._parts)
         self._start_guide(min(1.0, max(0.0, xi)))
@@ -444,12 +437,7 @@ class WalkController:
         leg = _LEG * (1 - self._stance)
         angles = float(stage.deviation[leg + _SH]), float(stage.deviation[leg + _SK])
         rates = float(stage.rate[leg + _SH]), float(stage.rate[leg + _SK])
-        literal = self.config.literal_law
-        guide, promise = Choice(self._guides.filters[0], 0.0) if literal else self._guides.at(xi)
-        if literal:
-            self._literal.start_step(xi, angles, rates)
-        guide.start_step(xi, angles, rates, promise)
-        self._assistance = self._assistance._replace(guide=guide.tables)
+        promise = self._section.start_guide(xi, angles, rates)
         largest = self.config.guide.hand_over
         self._promised = promise > 0.0
         self._exceeded = max(map(abs, angles)) > largest.deviation or max(map(abs, rates)) > largest.rate
@@ -460,7 +448,7 @@ class WalkController:
     def _watch_guide(self, cycle: int) -> None:
         """Add a guided cycle to the statistics, and report to the HAL if the leg is outside the guide."""
         command, guide = self._command, self.config.guide
-        guided = self._assisted and cycle < len(self._assistance.unmodelled)
+        guided = self._assisted and cycle < len(self._section.assistance.unmodelled)
         command.hand_over_exceeded = guided and cycle == 0 and self._exceeded
         if not guided:
             command.outside = False
@@ -483,48 +471,3 @@ def _range(robot: Robot, config: WalkConfig) -> tuple[Vector, Vector]:
     low, high = robot.position_min + _MARGIN, robot.position_max - _MARGIN
     low[[_SK, _LEG + _SK]] = config.reach_knee
     return low, high
-
-
-def _fading(duration: float) -> Vector:
-    """Return a factor for each cycle. The factors fall from 1 to 0 along a half cosine within a duration [s]."""
-    factors: Vector = 0.5 + 0.5 * np.cos(math.pi * np.arange(round(duration / PERIOD)) * (PERIOD / duration))
-    return factors
-
-
-def _tables(
-    gaits: WalkGaits, standing: Standing, kinematics: Kinematics, config: WalkConfig, toe_out: float
-) -> dict[tuple[Phase, int], PhaseTable]:
-    """Return the table of each phase for each stance leg. A walk starts on the right foot and can stop on either foot."""
-    tables: dict[tuple[Phase, int], PhaseTable] = {}
-    steps = {Phase.START: gaits.start, Phase.STEP: gaits.step, Phase.STOP: gaits.stop}
-    for phase, gait in steps.items():
-        for stance in (LEFT, RIGHT):
-            speed, alphas = config.reach_speed[phase is Phase.STOP], (config.alpha, config.guided_alpha)
-            reach = Reach(speed, config.reach_rate, config.reach_time, config.reach_knee)
-            tables[phase, stance] = step_table(gait, stance, alphas, reach, kinematics, toe_out)
-    ahead, _ = shift_tables(standing.shift(gaits.start.coefficients[:, 0], RIGHT), config.shift, config.alpha)
-    tables[Phase.SHIFT, RIGHT] = ahead
-    tables[Phase.POSTURE, RIGHT] = _held(ahead, 0, config.posture)
-    tables[Phase.STAND, RIGHT] = _held(ahead, 0, config.settle)
-    for stance in (LEFT, RIGHT):
-        last = tables[Phase.STOP, stance].rows[-1, :_N]
-        _, back = shift_tables(standing.shift(last, stance), config.shift, config.alpha)
-        tables[Phase.BACK, stance] = back
-        tables[Phase.REST, stance] = _held(back, -1, config.settle)
-    return tables
-
-
-def _held(table: PhaseTable, row: int, duration: float) -> PhaseTable:
-    """Return the table of a phase that moves the joints from the measured pose to the pose in a row of `table`.
-
-    Args:
-        table: table that contains the row.
-        row: index of the row.
-        duration: duration of the motion [s].
-    """
-    count = round(duration / PERIOD) + 1
-    rows, feedforward, dcm = (
-        np.repeat(array[[row]], count, axis=0) for array in (table.rows, table.feedforward, table.dcm)
-    )
-    recentring = recentring_rows(Deadbeat(duration, 1.0), count)
-    return table._replace(rows=rows, feedforward=feedforward, dcm=dcm, recentring=recentring, guided=recentring)

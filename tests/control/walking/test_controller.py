@@ -5,101 +5,26 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 
-import numpy as np
 import pytest
 
-from atalante_control.gait.walk import DEFAULT_WALK, load_walk
-from atalante_control.model import ExoskeletonParameters, Patient, urdf
+from atalante_control.model import ExoskeletonParameters, urdf
 from atalante_control.walking.config import WalkConfig
 from atalante_control.walking.controller import WalkController
 from atalante_control.walking.lean import LeanConfig
 from atalante_control.walking.phases import Phase
 from atalante_control.walking.placement import PlacementConfig
 from atalante_control.walking.telemetry import TELEMETRY_FIELDS
-from atalante_emulator.bodies import Body, hang, make_body
-from atalante_emulator.imu import ImuParameters, Imus, ImuSignals
-from atalante_hal.robot import load_robot
-from atalante_hal.types import State, SupervisorState
-
-ROBOT = load_robot()
-PATIENT = Patient(75.0, 1.75)
-WALK = load_walk(DEFAULT_WALK, ROBOT)
-
-
-class Ideal:
-    """Robot without noise and bus. The torques act in the next cycle."""
-
-    def __init__(self, body: Body) -> None:
-        self.body = body
-        self.signals = ImuSignals(np.zeros((4, 4)), np.zeros((4, 3)), np.zeros((4, 3)))
-        self._imus = Imus(ImuParameters(), self.signals)
-        zero, valid = np.zeros(12), np.ones(22, bool)
-        self.state = State(
-            cycle=0,
-            time=0.0,
-            supervisor=SupervisorState.ACTIVE,
-            assistance_factor=1.0,
-            position=zero.copy(),
-            velocity=zero.copy(),
-            torque=zero.copy(),
-            temperature=zero.copy(),
-            drive_state=zero.copy(),
-            imu_quaternion=self.signals.quaternion,
-            imu_gyro=self.signals.gyro,
-            imu_accel=self.signals.accel,
-            foot_force=np.zeros((2, 4, 3)),
-            vibration=np.zeros(8),
-            valid=valid,
-            age=np.zeros(22, np.int64),
-            joints_valid=True,
-            foot_rows=(0, 1),
-        )
-        self._torque = zero.copy()
-
-    def cycle(self, controller: WalkController) -> None:
-        body, state = self.body, self.state
-        self._imus.sample(body.imu)
-        state.position[:], state.velocity[:] = body.position, body.velocity
-        received = state.age[list(state.foot_rows)] == 0
-        state.foot_force[received] = body.sole_force[received]
-        if state.cycle == 0:
-            controller.reset(state)
-        torque = controller.update(state).torque.copy()
-        body.step(self._torque.tolist())
-        self._torque = np.clip(torque, -ROBOT.torque_max, ROBOT.torque_max)
-        state.cycle += 1
-
-    def upright(self) -> bool:
-        x, y, _, _ = self.body.motion("pelvis").attitude
-        return bool(1.0 - 2.0 * (x * x + y * y) > 0.9)
+from atalante_emulator.bodies import hang, make_body
+from atalante_hal.types import State
+from tests.control.walking.ideal_robot import PATIENT, ROBOT, WALK, Ideal, walk_with
 
 
 def walked(
     engine: str, steps: int, *, finish_after: int | None = None, xi: float = 1.0, lost_foot: int | None = None
 ) -> tuple[WalkController, list[Phase]]:
-    """Walk until the robot stands again; return the controller and its phases.
-
-    After `finish_after` steps, FINISH_STEP begins and the data of the foot `lost_foot` is no longer received.
-    """
+    """Walk as in `walk_with`; return the controller and its phases."""
     controller = WalkController(ROBOT, PATIENT, WALK, steps)
-    body = make_body(engine, urdf(ExoskeletonParameters(), ROBOT, PATIENT), free=True, ground=0.0)
-    try:
-        hang(body, controller.standing_pose.tolist(), 0.0005)
-        robot, phases = Ideal(body), [controller.phase]
-        robot.state.assistance_factor = xi
-        while not controller.done:
-            robot.cycle(controller)
-            if controller.phase is not phases[-1]:
-                phases.append(controller.phase)
-            if finish_after is not None and controller.statistics.steps == finish_after:
-                robot.state.supervisor = SupervisorState.FINISH_STEP
-                if lost_foot is not None:
-                    robot.state.age[robot.state.foot_rows[lost_foot]] = 100
-            assert robot.upright(), f"fell in {controller.phase.name} after {controller.statistics.steps} steps"
-            assert robot.state.cycle < 30_000
-    finally:
-        body.close()
-    return controller, phases
+    return controller, walk_with(controller, engine, finish_after=finish_after, xi=xi, lost_foot=lost_foot)
 
 
 @pytest.mark.parametrize("engine", ["pybullet", "mujoco"])
@@ -215,7 +140,7 @@ def test_swing_leg_stays_inside_the_certified_guide(xi: float) -> None:
     controller, phases = walked("mujoco", 3, xi=xi)
     guide = controller.statistics.guide
     assert phases == list(Phase)
-    assert controller.certificate(xi).certified
+    assert [certificate.certified for certificate in controller.certificates(xi)] == [True]
     assert guide.factors == {xi}
     assert 3 * 600 < guide.cycles < 3 * 850
     # The joints stay inside although this robot has no friction and the controller compensates friction.
@@ -226,4 +151,4 @@ def test_swing_leg_stays_inside_the_certified_guide(xi: float) -> None:
 def test_guide_does_not_act_at_full_assistance() -> None:
     controller, _ = walked("mujoco", 1)
     assert controller.statistics.guide.cycles == 0
-    assert not controller.certificate(1.0).certified
+    assert not controller.certificates(1.0)[0].certified

@@ -16,7 +16,7 @@ def weakest(certificates: Iterable[Certificate]) -> Certificate:
     """Return a certificate without certified torques; if there is none, return the certificate with the smallest hip torque.
 
     Args:
-        certificates: Certificates of one guide shape, one for each assistance factor. At least one is needed.
+        certificates: Certificates of one guide shape, for each assistance factor and each gait. At least one is needed.
     """
     return min(certificates, key=lambda c: -1.0 if c.promise is None else c.promise.hip)
 

@@ -167,8 +167,10 @@ def _walk(
         if recorder is not None and telemetry is not None:
             recorder.report_events()
             summary = close_telemetry(telemetry)
-        factors = sorted(controller.statistics.guide.factors) or [options.xi]
-        weakest_guide = None if options.xi >= 1.0 else weakest(controller.certificate(xi) for xi in factors)
+        weakest_guide = None
+        if options.xi < 1.0:
+            factors = sorted(controller.statistics.guide.factors) or [options.xi]
+            weakest_guide = weakest(certificate for xi in factors for certificate in controller.certificates(xi))
         result = WalkResult(
             steps=controller.statistics.steps,
             fell=observation.fell,
@@ -204,4 +206,4 @@ def _walk(
 def _announce(controller: WalkController, xi: float) -> None:
     """Print the certificate of the guide at the assistance factor `xi`."""
     leg = "leg of exoskeleton and patient, while the pelvis moves as in the gait, until the foot touches the ground"
-    announce([controller.certificate(xi)], controller.config.guide.mismatch, leg)
+    announce(controller.certificates(xi), controller.config.guide.mismatch, leg)

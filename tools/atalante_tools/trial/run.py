@@ -175,7 +175,8 @@ def _walk(trial: WalkTrial) -> dict[str, Any]:
         ending = Ending(rig, lambda: controller.done, observation)
         with deferred():
             run(rig.hal, controller, LockStep(), until=ending, record=record)
-        certified = controller.certificate(trial.xi).certified if trial.xi < 1.0 else None
+        (certificate,) = controller.certificates(trial.xi)
+        certified = certificate.certified if trial.xi < 1.0 else None
         deviation = {**observation.true_deviation(), "attitude_rms_deg": observation.attitude_rms_deg}
         found = diagnostics(rig.hal)
     statistics = controller.statistics
