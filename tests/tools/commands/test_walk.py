@@ -53,6 +53,25 @@ def test_turn_is_refused_without_steering() -> None:
     assert "--turn requires steering, which --literal does not have" in errors
 
 
+def test_step_length_and_duration_change_during_a_walk(tmp_path: Path) -> None:
+    arguments = ("--steps", "3", "--step-length", "0.12", "--step-duration", "0.9", "--then", "3", "0.18", "0.8")
+    options = ("--xi", "0.5", "--wearer", "passive", "--engine", "mujoco", "--json", "--out", str(tmp_path / "walk"))
+    code, out, errors = run(*arguments, *options)
+    result = json.loads(out)
+    assert (code, result["outcome"], result["steps"]) == (0, "stood", 6), errors
+    assert (result["step_lengths_m"], result["step_durations_s"]) == ([0.12, 0.18], [0.9, 0.8])
+    assert result["distance_m"] == pytest.approx(3.5 * (0.12 + 0.18), abs=0.12)
+    assert result["inside"] == 1.0
+    assert result["hand_overs_exceeded"] == 0
+    # The certificates of both gaits are printed. The weaker certificate of the second gait is the result.
+    assert "step 0.12 m in 0.9 s, then 75 kg, 1.75 m, step 0.18 m in 0.8 s" in errors
+    assert errors.count("pinched: promise at Xi 0.5") == 2
+    assert f"{result['promise_hip_nm']:.2f} Nm at the hip" in errors
+    assert result["promise_hip_nm"] < 30.0
+    given = json.loads((tmp_path / "walk" / "summary.json").read_text())["options"]
+    assert given["then"] == [{"steps": 3, "subject": "75 kg, 1.75 m, step 0.18 m in 0.8 s"}]
+
+
 def test_passive_wearer_walks_inside_the_certified_guide(tmp_path: Path) -> None:
     arguments = (
         "--steps",
@@ -179,6 +198,10 @@ def test_robot_that_is_pushed_over_ends_with_code_1() -> None:
         (("--protocol", "1,2,3", "-i", "socketcan", "-c", "vcan0"), "--protocol requires the emulated robot"),
         (("--push", "50", "-i", "socketcan", "-c", "vcan0"), "--push requires the emulated robot"),
         (("--robot-process", "-i", "socketcan", "-c", "vcan0"), "--robot-process requires the emulated robot"),
+        (("--then", "0", "0.18", "0.8"), "0 is not in the range x>=1"),
+        (("--then", "3", "0.9", "0.8"), "step length must be 0.05 to 0.4 m, got 0.9 m"),
+        (("--then", "3", "0.18", "0.8", "--literal"), "--then requires the ankle stabiliser, which --literal does not"),
+        (("--then", "3", "0.18", "0.8", "--gait", "walk.json"), "--gait gives one gait: remove one of them"),
         (("--step-length", "0.9"), "step length must be 0.05 to 0.4 m, got 0.9 m"),
     ],
 )

@@ -11,13 +11,16 @@ from pathlib import Path
 
 import pytest
 
-from atalante_control.dynamics.gait_network import DEFAULT_NETWORK, load_network, save_network
+from atalante_control.dynamics.gait_network import DEFAULT_NETWORK, NetworkError, load_network, save_network
 from atalante_control.gait.gait import gait_object, load_gait, write_gait
+from atalante_control.gait.subject import Subject
 from atalante_control.gait.walk import DEFAULT_WALK, load_walk, write_walk
 from atalante_control.model import Patient
 from atalante_hal.robot import JOINTS, load_robot
 from atalante_tools.console.options import GaitFiles
 from atalante_tools.session.gait_source import gait_in_the_air, patient_of_files
+from atalante_tools.session.law import Law
+from atalante_tools.session.walk_options import SpeedChange, WalkOptions, sections_of
 
 ATALANTE = str(Path(sys.executable).with_name("atalante"))
 ROBOT = load_robot()
@@ -176,6 +179,16 @@ def test_wrong_network_is_rejected_before_the_robot_moves(
     assert done.returncode == 1, done.stderr
     assert message in done.stderr
     assert done.stderr.count("\n") == 1
+
+
+def test_speed_change_takes_its_gait_from_the_given_network(folder: Path) -> None:
+    change = SpeedChange(2, Subject(Patient(75.0, 1.75), 0.16, 0.8))
+    options = WalkOptions(
+        steps=2, xi=1.0, shape="pinched", passive=False, subject=None, files=GaitFiles(network=folder / "network.npz"),
+        seed=0, friction=0.6, push=None, law=Law(), then=(change,),
+    )  # fmt: skip
+    with pytest.raises(NetworkError, match="mass for the gait network must be 60 to 70 kg"):
+        sections_of(options, ROBOT)
 
 
 @pytest.mark.parametrize("command", COMMANDS)

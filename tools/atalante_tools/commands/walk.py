@@ -23,7 +23,7 @@ from atalante_tools.session.law import Law, law_options
 from atalante_tools.session.recording import RECORDING_OPTIONS, RecordingOptions
 from atalante_tools.session.shapes import SHAPE_HELP
 from atalante_tools.session.walk import walk
-from atalante_tools.session.walk_options import DEFAULT_PATIENT, DEFAULT_STEP, Push, WalkOptions
+from atalante_tools.session.walk_options import DEFAULT_PATIENT, DEFAULT_STEP, Push, SpeedChange, WalkOptions
 
 if TYPE_CHECKING:
     from atalante_control.gait.subject import Subject
@@ -52,7 +52,7 @@ def _protocol(_ctx: click.Context, _param: click.Parameter, text: str | None) ->
     default=20,
     show_default=True,
     metavar="N",
-    help="Number of steps between start step and stop step.",
+    help="Number of steps between start step and stop step, or until the change of --then.",
 )
 @click.option(
     "--xi",
@@ -90,6 +90,14 @@ def _protocol(_ctx: click.Context, _param: click.Parameter, text: str | None) ->
 )
 @click.option(
     "--step-duration", type=float, default=DEFAULT_STEP[1], show_default=True, metavar="S", help="Step duration [s]."
+)
+@click.option(
+    "--then",
+    type=(click.IntRange(1), length, float),
+    multiple=True,
+    metavar="STEPS LENGTH DURATION",
+    help="After the steps before, change to this step length [m] and step duration [s] for this number of steps. Can be "
+    "repeated.  [default: no change]",
 )
 @gait_options
 @click.option(
@@ -156,6 +164,7 @@ def command(
     patient: Patient | None,
     step_length: float,
     step_duration: float,
+    then: tuple[tuple[int, float, float], ...],
     files: GaitFiles,
     push: float | None,
     push_direction: float,
@@ -181,6 +190,7 @@ def command(
     \b
     Example: atalante walk --steps 40 --mass 75 --height 1.75
              atalante walk --gait walk.json
+             atalante walk --steps 10 --then 10 0.18 0.8
     """
     emulated = {"--push": push is not None, "--wearer passive": wearer == "passive", "--protocol": protocol is not None}
     emulated["--robot-process"] = bool(robot_process)
@@ -189,6 +199,8 @@ def command(
             raise click.UsageError(f"{option} requires the emulated robot of -i embedded")
     if turn and law.literal:
         raise click.UsageError("--turn requires steering, which --literal does not have: remove one of them")
+    if then:
+        _require_speed_changes(law, files)
     if protocol is not None:
         steps = sum(protocol)
     subject = _subject(patient, step_length, step_duration)
@@ -207,16 +219,36 @@ def command(
         recording=recording,
         robot_process=robot_process,
         heading_reference=heading_reference,
+        then=tuple(SpeedChange(count, _walking_with(patient, *step)) for count, *step in then),
         turn=turn,
         out=out,
     )
     walk(target, options, as_json=as_json)
 
 
+def _require_speed_changes(law: Law, files: GaitFiles) -> None:
+    """Raise an error if the options exclude speed changes.
+
+    Raises:
+        click.UsageError: If the control law or the gait file excludes speed changes.
+    """
+    if law.literal:
+        raise click.UsageError(
+            "--then requires the ankle stabiliser, which --literal does not have: remove one of them"
+        )
+    if files.gait is not None:
+        raise click.UsageError("--then requires the gaits of a network, and --gait gives one gait: remove one of them")
+
+
 def _subject(patient: Patient | None, step_length: float, step_duration: float) -> Subject | None:
     """Return the patient and the step that the user gave, or None if all of them have their defaults."""
     if patient is None and (step_length, step_duration) == DEFAULT_STEP:
         return None
+    return _walking_with(patient, step_length, step_duration)
+
+
+def _walking_with(patient: Patient | None, step_length: float, step_duration: float) -> Subject:
+    """Return a patient with a step. The default patient is that of the package."""
     from atalante_control.gait.subject import Subject
     from atalante_control.model import Patient
 

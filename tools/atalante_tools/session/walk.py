@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 
 from atalante_tools.console.options import Target
 from atalante_tools.console.stop_request import stop_requested
-from atalante_tools.console.terminal import show_json
+from atalante_tools.console.terminal import print_message, show_json
 from atalante_tools.session.certificates import announce, weakest
 from atalante_tools.session.dial import Dial
 from atalante_tools.session.recording import (
@@ -30,7 +30,7 @@ from atalante_tools.session.recording import (
 )
 from atalante_tools.session.run_folder import run_folder
 from atalante_tools.session.walk_observation import Observation
-from atalante_tools.session.walk_options import WalkOptions, gaits_of
+from atalante_tools.session.walk_options import WalkOptions, gaits_of, sections_of
 from atalante_tools.session.walk_result import WalkResult, diagnostics, guide_fields, show_result, write_result
 from atalante_tools.session.walk_watch import WalkWatch
 
@@ -106,6 +106,7 @@ def _walk(
 
     robot = load_robot()
     patient, gaits = gaits_of(options, robot)
+    then = sections_of(options, robot)
     law = options.law
     config = replace(
         WalkConfig.literal() if law.literal else WalkConfig(),
@@ -113,9 +114,11 @@ def _walk(
         heading_gain=HEADING_GAIN if options.heading_reference else 0.0,
         turn=math.radians(options.turn),
     )
-    controller = WalkController(robot, patient, gaits, options.steps, config, shape=guide_shape(options.shape))
+    controller = WalkController(robot, patient, gaits, options.steps, config, guide_shape(options.shape), then)
+    walked = [gaits.step, *(section.gaits.step for section in then)]
+    names = ", then ".join(gait.name for gait in walked)
     if options.xi < 1.0:  # at Xi = 1 there is no guide
-        _announce(controller, options.xi)
+        _announce(controller, options.xi, names if then else None)
     if not target.lockstep:
         controller.prepare()
     mechanics = None
@@ -142,7 +145,8 @@ def _walk(
         )
         telemetry = recorder = summary = None
         if outputs is not None:
-            about = {"seed": options.seed, "steps": options.steps, "xi": options.xi, **asdict(law)}
+            about = {"seed": options.seed, "steps": controller.steps_wanted, "xi": options.xi, "gaits": names}
+            about.update(asdict(law))
             telemetry = start_telemetry(target, outputs, rig.hal, rig.hal.network, gaits.step.hash32, about, child)
             stack.callback(telemetry.close)
             telemetry.begin_run("walk", {"shape": options.shape, "xi": options.xi})
@@ -160,7 +164,7 @@ def _walk(
                 dial.turn(controller.statistics.steps)
 
         with stop_requested() as stop:
-            watch = WalkWatch(rig, controller, observation, stop, options.steps)
+            watch = WalkWatch(rig, controller, observation, stop, controller.steps_wanted)
             processor = time.process_time()
             statistics = rig.run(controller, until=watch, record=record, on_stop=controller.stop)
             processor = time.process_time() - processor
@@ -173,6 +177,8 @@ def _walk(
             weakest_guide = weakest(certificate for xi in factors for certificate in controller.certificates(xi))
         result = WalkResult(
             steps=controller.statistics.steps,
+            step_lengths_m=[gait.parameters.get("step_length") for gait in walked],
+            step_durations_s=[gait.duration for gait in walked],
             fell=observation.fell,
             outcome=watch.outcome,
             engine=target.engine if target.embedded else None,
@@ -203,7 +209,15 @@ def _walk(
             require_complete_log(options.recording.can_log, summary.can_log_complete)
 
 
-def _announce(controller: WalkController, xi: float) -> None:
-    """Print the certificate of the guide at the assistance factor `xi`."""
+def _announce(controller: WalkController, xi: float, gaits: str | None) -> None:
+    """Print the certificate of the guide of each gait at the assistance factor `xi`.
+
+    Args:
+        controller: Controller of the walk.
+        xi: Assistance factor.
+        gaits: Names of the gaits. None for a walk with one gait, whose name is not printed.
+    """
+    if gaits is not None:
+        print_message(f"one certificate for each gait: {gaits}")
     leg = "leg of exoskeleton and patient, while the pelvis moves as in the gait, until the foot touches the ground"
     announce(controller.certificates(xi), controller.config.guide.mismatch, leg)

@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from atalante_control.gait.subject import Subject
     from atalante_control.gait.walk import WalkGaits
     from atalante_control.model import Patient
+    from atalante_control.walking.section import Section
     from atalante_hal.robot import Robot
 
 #: Patient of the walk file of this project: mass [kg] and height [m].
@@ -36,10 +37,18 @@ class Push:
 
 
 @dataclass(frozen=True)
+class SpeedChange:
+    """Change of step length and step duration during a walk."""
+
+    steps: int  # number of steps after the change
+    subject: Subject  # patient of the walk, and the step parameters after the change
+
+
+@dataclass(frozen=True)
 class WalkOptions:
     """Options of a walk."""
 
-    steps: int  # number of steps between start step and stop step
+    steps: int  # number of steps between the start step and the first speed change or the stop step
     xi: float  # assistance factor, 0 to 1
     shape: str  # name or file of the guide shape
     passive: bool  # whether the limbs of the emulated patient have the impedance of a passive wearer
@@ -58,6 +67,7 @@ class WalkOptions:
     robot_process: bool | None = None
     #: whether the pelvis IMU has a heading reference, so that its heading does not drift and the controller follows its heading
     heading_reference: bool = False
+    then: tuple[SpeedChange, ...] = ()  # speed changes, in walking order
     turn: float = 0.0  # angle by which the line turns before each periodic step, positive to the left [deg]
     out: Path | None = None  # folder for summary.json, trace.npz and walk.png; None means no files
 
@@ -87,6 +97,24 @@ def gaits_of(options: WalkOptions, robot: Robot) -> tuple[Patient, WalkGaits]:
     if subject is None:
         subject = Subject(Patient(*DEFAULT_PATIENT), *DEFAULT_STEP)
     return subject.patient, gaits_of_subject(subject, robot, options.files.network)
+
+
+def sections_of(options: WalkOptions, robot: Robot) -> list[Section]:
+    """Return the sections of a walk after each speed change, in walking order.
+
+    Args:
+        options: Options of the user.
+        robot: Limits of the joints.
+
+    Raises:
+        GaitError: If there is no start step or no stop step for a gait, or if a step fails a check on the ground.
+        NetworkError: If a step is outside the range of the network.
+        Failed: If the gait optimisation is needed, but not installed.
+    """
+    from atalante_control.walking.section import Section
+
+    network = options.files.network
+    return [Section(gaits_of_subject(change.subject, robot, network), change.steps) for change in options.then]
 
 
 @cache

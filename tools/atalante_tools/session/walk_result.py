@@ -27,7 +27,10 @@ if TYPE_CHECKING:
 class WalkResult:
     """Result of a walk. The JSON object has the same fields."""
 
-    steps: int  # number of completed steps of the periodic gait
+    steps: int  # number of completed periodic steps
+    #: step length of each gait, in walking order [m]; None if the gait file does not state it
+    step_lengths_m: list[float | None]
+    step_durations_s: list[float]  # step duration of each gait, in walking order [s]
     fell: bool
     outcome: str  # how the walk ended: stood, fell, stopped, hold or fault
     engine: str | None  # physics engine of the emulated robot; None means the real robot
@@ -108,8 +111,9 @@ def write_result(
 ) -> None:
     """Write summary.json, the trace and the figure of a walk, and print the names of the files."""
     subject, law = None if options.subject is None else str(options.subject), asdict(options.law)
+    then = [{"steps": change.steps, "subject": str(change.subject)} for change in options.then]
     given = {key: value for key, value in asdict(options).items() if key not in ("out", "recording", "law", "files")}
-    given = {**given, **law, "subject": subject, "record_rate": options.recording.record_rate}
+    given = {**given, **law, "subject": subject, "then": then, "record_rate": options.recording.record_rate}
     files = {"gait": options.files.gait, "network": options.files.network, "telemetry": options.recording.telemetry}
     for name, path in files.items():
         given[name] = None if path is None else str(path)
