@@ -106,7 +106,7 @@ def test_f79_drift_of_an_ankle_encoder_is_found_while_the_robot_stands(robot, jo
     assert run.found is not None
     side, name = joint.split("_")
     assert run.found.text.startswith(
-        f"encoder of {side.lower()}_{name}: the {side.lower()} sole lies flat on the floor"
+        f"encoder of {side.lower()}_{name}: the {side.lower()} sole must be level, because it is flat on the floor, got a tilt of"
     )
     assert run.found.cycle - 3500 < 1400
     assert S.FULL_ASSIST in run.states

@@ -109,7 +109,7 @@ def with_nan(gait: Gait) -> Gait:
             replace(AIRWALK, coefficients=AIRWALK.coefficients[:11]),
             r"gait 'airwalk': joints must be 64-bit floats of shape \(12, 8\)",
         ),
-        (with_nan(AIRWALK), r"joints\.left_SK must be finite, got nan"),
+        (with_nan(AIRWALK), r"joints\.left_SK\[4\] must be a finite number, got nan"),
         (with_ankle_torque(81.9), r"feedforward and gravity of joints\.\w+_HA must be -82 to 82 Nm"),
         (with_ankle_torque(-81.9), r"feedforward and gravity of joints\.\w+_HA must be -82 to 82 Nm"),
         (replace(AIRWALK, duration=0.3), r"speed of joints\.left_SK must be -4 to 4 rad/s"),
