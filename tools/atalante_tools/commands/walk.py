@@ -96,7 +96,7 @@ def _protocol(_ctx: click.Context, _param: click.Parameter, text: str | None) ->
     type=(click.IntRange(1), length, float),
     multiple=True,
     metavar="STEPS LENGTH DURATION",
-    help="After the steps before, change to this step length [m] and step duration [s] for this number of steps. Can be "
+    help="After the previous steps, walk this number of steps with another step length [m] and step duration [s]. Can be "
     "repeated.  [default: no change]",
 )
 @gait_options
