@@ -74,9 +74,8 @@ class Record(NamedTuple):
     #: Number of samples in each mean, at most `SAMPLES`, shape (9,): rates of each IMU, comparison, forces of each IMU.
     samples: Vector
     force: Vector  # (4, 3) mean difference between specific force and gravity, in world axes [m/s2]
-    rate_error: (
-        Vector  # (5, 3) mean square of the difference of angular velocities [rad2/s2]: each IMU, torso to pelvis
-    )
+    #: Mean square of the difference of angular velocities, shape (5, 3) [rad2/s2]: each IMU, torso to pelvis.
+    rate_error: Vector
     rate: Vector  # (5, 3) mean square of the angular velocity [rad2/s2]: each IMU, torso and pelvis
     tilt: Vector  # (3,) mean difference of the upward directions of torso and pelvis
 

@@ -86,6 +86,21 @@ def _every(cycles: int, kind: str, target: str, count: int, **parameters: float)
     return tuple(Fault(kind, target, cycles * number, 1, **parameters) for number in range(count))
 
 
+def _never_ready(name: str, fault: Fault, *, node: str) -> Case:
+    """Return a case of an IMU that is faulty from power-on: the HAL stays in OFF, and START is refused."""
+    return Case(
+        f"{name}, from power-on",
+        (fault,),
+        phase=None,
+        state=SupervisorState.OFF,
+        node=node,
+        detected=80,
+        reacted=80,
+        recovers=False,
+        checks=(start_is_rejected,),
+    )
+
+
 #: Raw code of the signal Position that marks an invalid value.
 _INVALID_CODE: Final = 1 << 23
 
@@ -378,17 +393,7 @@ SCENARIOS: Final = (
         "F80",
         (
             *(
-                Case(
-                    f"{imu}, wrong sign along Z, from power-on",
-                    (Fault("imu_inverted", imu, axis="Z"),),
-                    phase=None,
-                    state=SupervisorState.OFF,
-                    node=imu,
-                    detected=80,
-                    reacted=80,
-                    recovers=False,
-                    checks=(start_is_rejected,),
-                )
+                _never_ready(f"{imu}, wrong sign along Z", Fault("imu_inverted", imu, axis="Z"), node=imu)
                 for imu in _IMUS[:2]
             ),
             *(
@@ -402,16 +407,8 @@ SCENARIOS: Final = (
                 for imu in _IMUS[2:]
             ),
             *(
-                Case(
-                    f"{imu}, turned in its mount, from power-on",
-                    (Fault("imu_turned", imu, axis="X", degrees=5.0),),
-                    phase=None,
-                    state=SupervisorState.OFF,
-                    node="IMU_TORSO",
-                    detected=80,
-                    reacted=80,
-                    recovers=False,
-                    checks=(start_is_rejected,),
+                _never_ready(
+                    f"{imu}, turned in its mount", Fault("imu_turned", imu, axis="X", degrees=5.0), node="IMU_TORSO"
                 )
                 for imu in _IMUS[:2]
             ),
