@@ -31,14 +31,14 @@ def gait_in_the_air(files: GaitFiles, subject: Subject | None, robot: Robot) -> 
     """
     from atalante_control.dynamics.gait_network import load_network
     from atalante_control.dynamics.suspended import suspended_gait
-    from atalante_control.gait.gait import AIRWALK_GAIT, Gait, load_gait
+    from atalante_control.gait.gait import AIRWALK_GAIT, load_gait
     from atalante_control.gait.walk import load_gaits
     from atalante_control.model import ExoskeletonParameters
 
     exoskeleton = ExoskeletonParameters()
     if files.gait is not None:
         loaded = load_gaits(files.gait, robot)
-        gait = loaded if isinstance(loaded, Gait) else loaded.step
+        gait = _periodic_step(loaded)
         patient = patient_in(gait, files.gait) if subject is None else subject.patient
         if patient is not None:
             exoskeleton = exoskeleton.fitted(patient)
@@ -66,7 +66,6 @@ def patient_of_files(files: GaitFiles, patient: Patient | None, robot: Robot) ->
         NetworkError: If the network file is invalid, or the patient is outside the range of the network.
     """
     from atalante_control.dynamics.gait_network import load_network
-    from atalante_control.gait.gait import Gait
     from atalante_control.gait.walk import load_gaits
 
     if files.network is not None and patient is not None:
@@ -74,7 +73,7 @@ def patient_of_files(files: GaitFiles, patient: Patient | None, robot: Robot) ->
     if files.gait is None:
         return patient
     loaded = load_gaits(files.gait, robot)
-    stated = patient_in(loaded if isinstance(loaded, Gait) else loaded.step, files.gait)
+    stated = patient_in(_periodic_step(loaded), files.gait)
     return stated if patient is None else patient
 
 
@@ -95,7 +94,7 @@ def gaits_of_file(path: Path, patient: Patient | None, robot: Robot) -> tuple[Pa
     from atalante_control.gait.walk import load_gaits
 
     loaded = load_gaits(path, robot)
-    gait = loaded if isinstance(loaded, Gait) else loaded.step
+    gait = _periodic_step(loaded)
     patient = patient_in(gait, path) if patient is None else patient
     if patient is None:
         raise GaitError(
@@ -149,3 +148,10 @@ def patient_in(gait: Gait, path: Path) -> Patient | None:
         return None
     except ValueError as error:
         raise GaitError(f"{path}: {error}") from error
+
+
+def _periodic_step(loaded: Gait | WalkGaits) -> Gait:
+    """Return the periodic step of a loaded gait file or walk file."""
+    from atalante_control.gait.gait import Gait
+
+    return loaded if isinstance(loaded, Gait) else loaded.step
