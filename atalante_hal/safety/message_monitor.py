@@ -19,12 +19,17 @@ confirm the diagnostic. Then the message is no longer trusted.
 In single support it is safer to finish the walking step than to stop. So if a joint of the swing leg times out, the robot first
 finishes the step. If the joint has sent no message for twice the timeout (10 cycles), the robot goes to HOLD. If any other joint
 times out, the robot goes to HOLD without a delay.
+
+In a walk on the ground, both legs are treated like a swing leg, and the timeouts of the joints are three cycles longer. A walk
+then continues after five lost frames in a row even if the messages are one cycle late: the first frame after five lost frames is
+rejected (E2E_SEQUENCE), so the data is up to seven cycles old.
 """
 
 from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Collection, Sequence
+from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -67,8 +72,21 @@ _DISTURBANCES = {
     Check.RANGE: Dtc.SIGNAL_RANGE,
     Check.INVALID: Dtc.SIGNAL_RANGE,
 }
-#: In a walk on the ground, HOLD follows when the data age of a joint reaches this multiple of the message timeout.
+#: HOLD follows when the data age of a joint in a tolerant leg reaches this multiple of the message timeout.
 BRIEF_TIMEOUTS = 2
+
+
+class Tolerance(NamedTuple):
+    """Tolerance of timeouts of the joints. It depends on the motion of the robot."""
+
+    legs: Collection[
+        int
+    ] = ()  # indices in SIDES of the legs in which a brief timeout leads to FINISH_STEP instead of HOLD
+    longer: int = 0  # cycles by which the timeouts of the joints of these legs are longer than in the DBC
+
+
+NO_TOLERANCE = Tolerance()
+GROUND_TOLERANCE = Tolerance(range(len(SIDES)), longer=3)
 
 
 class MessageMonitor:
@@ -116,14 +134,13 @@ class MessageMonitor:
         """Return whether the data of a row is younger than the timeout of its message."""
         return bool(self._image.age[row] < self._timeouts[row])
 
-    def evaluate(self, cycle: int, memory: FaultMemory, tolerant: Collection[int] = ()) -> None:
+    def evaluate(self, cycle: int, memory: FaultMemory, tolerance: Tolerance = NO_TOLERANCE) -> None:
         """Check all rows in one cycle. If `settled` is True and all rows have new data, this call may be omitted.
 
         Args:
             cycle: number of the current cycle.
             memory: fault memory in which diagnostics are raised.
-            tolerant: indices in SIDES of the legs in which a brief timeout of a joint leads to FINISH_STEP instead of
-                HOLD.
+            tolerance: tolerance of timeouts in this cycle.
         """
         image = self._image
         checks, ages = image.check.tolist(), image.age.tolist()
@@ -138,7 +155,7 @@ class MessageMonitor:
         for row, check in enumerate(checks):
             rival = row in rivals
             if check or ages[row] or rival or self._evidence[row] or self.qualification[row] is not SETTLED:
-                self._check_row(cycle, memory, row, Check(check), ages[row], tolerant, rival)
+                self._check_row(cycle, memory, row, Check(check), ages[row], tolerance, rival)
         self.valid[:] = [check <= _FRESH and self.is_trusted(row) for row, check in enumerate(checks)]
         self.joints_valid = bool(self.valid[self._joint_rows].all())
         undisturbed = not (self._disturbed or any(self._evidence))
@@ -197,11 +214,12 @@ class MessageMonitor:
         row: int,
         check: Check,
         age: int,
-        tolerant: Collection[int],
+        tolerance: Tolerance,
         rival: bool,
     ) -> None:
         sender, two_senders = self._senders[row], self._check_senders(cycle, memory, row, rival)
-        fresh, late = check <= Check.SOME_LOST, age >= self._timeouts[row]
+        tolerated, timeout = self._legs[row] in tolerance.legs, self._timeouts[row]
+        fresh, late = check <= Check.SOME_LOST, age >= timeout + tolerance.longer * tolerated
         # Impossible signal values do not reduce the trust, because the frame was transmitted correctly.
         good = (fresh or check >= Check.RANGE) and not rival
         now = self.qualification[row] = qualify(self.qualification[row], good=good, timed_out=late or two_senders)
@@ -211,7 +229,7 @@ class MessageMonitor:
         if confirmed and check is not Check.IMPLAUSIBLE:
             dtc = self._invalid[row] if check is Check.INVALID else CONFIRMED[check]
             text = f"{sender}: {dtc.meaning}; its data is {age} cycles old"
-            if brief := self._legs[row] in tolerant and age < BRIEF_TIMEOUTS * self._timeouts[row]:
+            if brief := tolerated and age < BRIEF_TIMEOUTS * timeout:
                 memory.raise_dtc(cycle, Dtc.JOINT_TIMEOUT, sender, value=age)
             memory.raise_dtc(cycle, dtc, sender, value=age, confirmed=not brief, text=text)
         elif fresh and age and not late:

@@ -16,7 +16,7 @@ import numpy as np
 
 from atalante_dbc import Network
 from atalante_hal.pendant import Pendant
-from atalante_hal.robot import JOINTS, SIDES, Robot
+from atalante_hal.robot import JOINTS, Robot
 from atalante_hal.safety.diagnostics import Dtc, Finding, Reaction
 from atalante_hal.safety.direction import DirectionProof
 from atalante_hal.safety.events import Event
@@ -24,7 +24,7 @@ from atalante_hal.safety.fault_memory import FaultMemory
 from atalante_hal.safety.heartbeats import Heartbeats
 from atalante_hal.safety.hold_stability import HoldStability
 from atalante_hal.safety.limiter import Limiter
-from atalante_hal.safety.message_monitor import MessageMonitor
+from atalante_hal.safety.message_monitor import GROUND_TOLERANCE, NO_TOLERANCE, MessageMonitor, Tolerance
 from atalante_hal.safety.plausibility import Plausibility
 from atalante_hal.safety.start import ENABLE_CYCLES, Refusal, StartRequest, entry_text, refusal, stop_text
 from atalante_hal.safety.state_machine import MOVING, Conditions, next_state
@@ -233,7 +233,7 @@ class SafetyMonitor:
         """Raise all diagnostics of this cycle, run the state machine, and apply the reactions."""
         state, memory, cycle = self._state, self.memory, self._state.cycle
         message_monitor, pendant = self._message_monitor, self._pendant
-        message_monitor.evaluate(cycle, memory, self._tolerant_legs())
+        message_monitor.evaluate(cycle, memory, self._tolerance())
         state.joints_valid = message_monitor.joints_valid
         self._heartbeats.evaluate(cycle, memory)
         for node in self._heartbeats.booted:
@@ -297,13 +297,15 @@ class SafetyMonitor:
             )
         )
 
-    def _tolerant_legs(self) -> Sequence[int]:
-        """Return the legs in which a brief timeout of a joint leads to FINISH_STEP: both legs in a walk on the ground.
+    def _tolerance(self) -> Tolerance:
+        """Return the tolerance of timeouts in this cycle.
 
-        Otherwise the only such leg is the swing leg while the other foot is on the ground.
+        In a walk on the ground, both legs are tolerant. Otherwise only a swing leg is, while the other foot is on the ground.
         """
+        if self.walking:
+            return GROUND_TOLERANCE
         swing = self._plausibility.swing
-        return range(len(SIDES)) if self.walking else () if swing is None else (swing,)
+        return NO_TOLERANCE if swing is None else Tolerance((swing,))
 
     def _check_drives(self, nodes_ready: bool) -> None:
         state, memory = self._state, self.memory

@@ -10,7 +10,7 @@ import pytest
 from atalante_dbc import load
 from atalante_hal.safety.diagnostics import Dtc
 from atalante_hal.safety.fault_memory import FaultMemory
-from atalante_hal.safety.message_monitor import MessageMonitor, rivals_of
+from atalante_hal.safety.message_monitor import GROUND_TOLERANCE, NO_TOLERANCE, MessageMonitor, Tolerance, rivals_of
 from atalante_hal.wire.e2e import COUNTER_BYTE, SETTLED, Check, crc, data_id_bytes
 from atalante_hal.wire.frame import FLAG_ESI, Frames, new_frames
 from atalante_hal.wire.process_image import ReceiveImage, TransmitImage
@@ -31,7 +31,7 @@ class MonitorBench:
         self.tx, self.image = TransmitImage(MESSAGES), ReceiveImage(MESSAGES)
         self.message_monitor, self.memory = MessageMonitor(NETWORK, self.image), FaultMemory()
         self.buffer, self.number = new_frames(64), 0
-        self.tolerant: tuple[int, ...] = ()
+        self.tolerance = NO_TOLERANCE
 
     def cycle(self, change: Change = lambda frames: frames, times: int = 1) -> MonitorBench:
         for _ in range(times):
@@ -39,7 +39,7 @@ class MonitorBench:
             frames = change(self.tx.seal(self.number & 0xFF).copy())
             self.buffer[: len(frames)] = frames
             self.image.accept(self.buffer, len(frames), self.number & 0xFF)
-            self.message_monitor.evaluate(self.number, self.memory, self.tolerant)
+            self.message_monitor.evaluate(self.number, self.memory, self.tolerance)
             self.memory.close_cycle(self.number)
         return self
 
@@ -421,7 +421,7 @@ class TestTolerantLeg:
     @pytest.fixture
     def bench(self) -> MonitorBench:
         bench = MonitorBench().trust_all()
-        bench.tolerant = (0,)
+        bench.tolerance = Tolerance((0,))
         return bench
 
     def test_timeout_of_a_swing_joint_lets_the_step_finish(self, bench: MonitorBench):
@@ -433,18 +433,35 @@ class TestTolerantLeg:
             assert {entry.value for entry in bench.memory.active.values()} == {bench.image.age[KNEE]}
         assert bench.cycle(lose(KNEE)).active == {("NODE_TIMEOUT", "LEFT_SK"): True}
 
-    def test_timeout_in_a_walk_on_the_ground_is_tolerated_in_both_legs(self, bench: MonitorBench):
-        bench.tolerant = (0, 1)
-        assert bench.cycle(lose(OTHER_KNEE), times=5).active == {
-            ("JOINT_TIMEOUT", "RIGHT_SK"): True,
-            ("NODE_TIMEOUT", "RIGHT_SK"): False,
+    def test_timeouts_of_both_legs_are_three_cycles_longer_in_a_walk_on_the_ground(self, bench: MonitorBench):
+        bench.tolerance = GROUND_TOLERANCE
+        assert bench.cycle(lose(OTHER_KNEE), times=7).active == {}
+        assert bench.message_monitor.is_trusted(OTHER_KNEE)
+        for _ in range(2):
+            assert bench.cycle(lose(OTHER_KNEE)).active == {
+                ("JOINT_TIMEOUT", "RIGHT_SK"): True,
+                ("NODE_TIMEOUT", "RIGHT_SK"): False,
+            }
+        assert bench.cycle(lose(OTHER_KNEE)).active == {("NODE_TIMEOUT", "RIGHT_SK"): True}
+
+    def test_five_lost_frames_in_a_walk_on_the_ground_raise_no_timeout(self, bench: MonitorBench):
+        bench.tolerance = GROUND_TOLERANCE
+        bench.cycle(lose(KNEE), times=5)
+        assert bench.cycle().active == {("E2E_SEQUENCE", "LEFT_SK"): False}
+        assert bench.cycle().active == {}
+
+    def test_timeout_of_imu_and_foot_is_not_longer_in_a_walk_on_the_ground(self, bench: MonitorBench):
+        bench.tolerance = GROUND_TOLERANCE
+        assert bench.cycle(lose(IMU, FOOT), times=10).active == {
+            ("NODE_TIMEOUT", "IMU_PELVIS"): True,
+            ("NODE_TIMEOUT", "FOOT_LEFT"): True,
         }
 
     def test_timeout_of_a_stance_joint_is_confirmed_immediately(self, bench: MonitorBench):
         assert bench.cycle(lose(OTHER_KNEE), times=5).active == {("NODE_TIMEOUT", "RIGHT_SK"): True}
 
     def test_timeout_in_double_stance_is_confirmed_immediately(self, bench: MonitorBench):
-        bench.tolerant = ()
+        bench.tolerance = NO_TOLERANCE
         assert bench.cycle(lose(KNEE), times=5).active == {("NODE_TIMEOUT", "LEFT_SK"): True}
 
     def test_timeout_of_imu_and_foot_is_confirmed_immediately(self, bench: MonitorBench):

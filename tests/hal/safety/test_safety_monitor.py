@@ -316,7 +316,7 @@ def test_silent_drive_ends_a_walk_and_after_ten_cycles_the_motion(rig, drive: st
     walking_on_the_ground(rig)
     rig.bus.to_hal = rig.drop(load().message(f"{drive}_STATE").frame_id)
     states = [rig.walk(1, step=7, walking=True).supervisor for _ in range(10)]
-    assert states == [S.ACTIVE] * 4 + [S.FINISH_STEP] * 5 + [S.HOLD]
+    assert states == [S.ACTIVE] * 7 + [S.FINISH_STEP] * 2 + [S.HOLD]
 
 
 def test_exception_of_the_controller_in_a_walk_is_bridged_with_the_last_torques(rig):
