@@ -305,6 +305,9 @@ def test_protocol_has_a_trial_per_subject_condition_and_factor() -> None:
     trials = protocol_trials(replace(SETTING, literal=True), (0.5, 0.0))
     assert len({trial.name for trial in trials}) == len({trial.seed for trial in trials}) == len(trials) == 32
     assert all(isinstance(trial, WalkTrial) and trial.literal for trial in trials)
+    passive = protocol_trials(replace(SETTING, literal=True), (0.5, 0.0), kinds=("passive",))
+    assert passive == [trial for trial in trials if isinstance(trial, WalkTrial) and not trial.active]
+    assert len(passive) == 16
 
 
 def test_robust_trials_are_drawn_from_the_seed_within_their_ranges() -> None:

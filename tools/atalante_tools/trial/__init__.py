@@ -194,6 +194,13 @@ def faults(ids: tuple[str, ...], running: Running, as_json: bool) -> None:
 @command.command(short_help="Walk with full and then partial assistance, with every subject.")
 @_mass_option
 @click.option(
+    "--subject",
+    "kinds",
+    type=click.Choice(["passive", "active"]),
+    multiple=True,
+    help="Kind of the subjects.  [default: both]",
+)
+@click.option(
     "--literal",
     is_flag=True,
     help="Use the control law as the paper prints it. The guides are then not certified.",
@@ -216,6 +223,7 @@ def faults(ids: tuple[str, ...], running: Running, as_json: bool) -> None:
 @_running("protocol")
 def protocol(
     masses: tuple[float, ...],
+    kinds: tuple[str, ...],
     literal: bool,
     factors: tuple[float, ...],
     heading_reference: bool,
@@ -228,7 +236,14 @@ def protocol(
     Eight subjects walk, each passive and active, and with each assistance factor.
     """
     from atalante_tools.trial.findings import protocol_findings
-    from atalante_tools.trial.plan import PROTOCOL, PROTOCOL_FACTORS, QUICK_MASSES, QUICK_PROTOCOL, protocol_trials
+    from atalante_tools.trial.plan import (
+        KINDS,
+        PROTOCOL,
+        PROTOCOL_FACTORS,
+        QUICK_MASSES,
+        QUICK_PROTOCOL,
+        protocol_trials,
+    )
 
     masses = _known(masses)
     if running.quick:
@@ -238,7 +253,7 @@ def protocol(
         literal=literal,
         heading_reference=heading_reference,
     )
-    trials = protocol_trials(setting, tuple(dict.fromkeys(factors)) or PROTOCOL_FACTORS, masses)
+    trials = protocol_trials(setting, tuple(dict.fromkeys(factors)) or PROTOCOL_FACTORS, masses, kinds or KINDS)
     _conduct("protocol", trials, protocol_findings, running, as_json)
 
 

@@ -177,6 +177,10 @@ class TreadmillTrial:
 Trial = ShapeTrial | WalkTrial | TreadmillTrial | RobustTrial | PushTrial | FaultTrial
 
 
+#: Kinds of subjects, by the field `active` of a trial.
+KINDS: Final = "passive", "active"
+
+
 @dataclass(frozen=True)
 class WalkSetting:
     """Settings that all walks of an experiment share."""
@@ -266,13 +270,16 @@ def sweep_trials(setting: WalkSetting, factors: Sequence[float], days: int) -> l
     return trials
 
 
-def protocol_trials(setting: WalkSetting, factors: Sequence[float], masses: Sequence[float] = ()) -> list[Trial]:
+def protocol_trials(
+    setting: WalkSetting, factors: Sequence[float], masses: Sequence[float] = (), kinds: Sequence[str] = KINDS
+) -> list[Trial]:
     """Return a trial for each subject, passive and active, and each assistance factor.
 
     Args:
         setting: settings that all walks share.
         factors: assistance factors after the transition.
         masses: masses of the subjects [kg]; empty means all eight subjects.
+        kinds: one or both of `KINDS`. The seed of a trial does not depend on this choice.
     """
     from atalante_control.gait.subject import STUDY_PATIENTS
 
@@ -281,7 +288,7 @@ def protocol_trials(setting: WalkSetting, factors: Sequence[float], masses: Sequ
         setting.walk(patient, active, xi, len(conditions) * number + index)
         for number, patient in enumerate(STUDY_PATIENTS)
         for index, (active, xi) in enumerate(conditions)
-        if not masses or patient.mass in masses
+        if (not masses or patient.mass in masses) and KINDS[active] in kinds
     ]
 
 
