@@ -85,11 +85,14 @@ class ColumnCodec:
             ) from None
 
     def _plan(self) -> None:
-        """Assign a 64-bit word to each field: an Intel word, a byte-swapped Motorola word, or one joined from two words."""
+        """Choose for each field the 64-bit word from which the field is extracted.
+
+        This is a word of the payload (Intel), a byte-swapped word of the payload (Motorola), or a word joined from two.
+        """
         rows: dict[tuple[str, int], int] = {}
         self._little: list[int] = []  # Intel words
         self._big: list[int] = []  # Motorola words, byte-swapped
-        self._joined: list[tuple[bool, int, int]] = []  # fields that lie in two words: (is Motorola, first word, shift)
+        self._joined: list[tuple[bool, int, int]] = []  # fields that span two words: (big endian, word, first bit)
         sources: list[tuple[str, int]] = []
         left: list[int] = []
         for number, field in enumerate(self.fields):
@@ -217,9 +220,9 @@ def raw_range(field: Field) -> range:
 
 
 def _integer_type(field: Field) -> Any:
-    """Return an integer type for all raw and physical values of a field whose factor and offset are integers.
+    """Return an integer type that can represent all raw and physical values of a field.
 
-    The type is int64, uint64, or `object` for Python integers.
+    Factor and offset of the field must be integers. The type is int64, uint64, or `object` for Python integers.
     """
     factor, offset = int(field.factor), int(field.offset)
     codes = raw_range(field)
@@ -271,7 +274,7 @@ def crc_of_zeros(length: int, data_id: int) -> int:
 
 
 def crc_differences(frames: Frames, length: int) -> npt.NDArray[np.uint16]:
-    """Return the received CRC XORed with the CRC contributions of all payload bytes. Shape (n,).
+    """Return for each frame its received CRC, XORed with the CRC contributions of all its payload bytes. Shape (n,).
 
     The CRC is affine over GF(2), so a frame is intact if and only if the result is `crc_of_zeros(length, data_id)`. A lookup
     table of 65536 entries gives the contribution of each pair of bytes.

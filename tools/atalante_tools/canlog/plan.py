@@ -1,4 +1,4 @@
-"""Plan: the DBC compiled to arrays with one element per message, and the message index of each CAN identifier."""
+"""Plan: properties of the DBC messages as arrays, and a lookup table from CAN identifiers to message indices."""
 
 from __future__ import annotations
 
@@ -74,7 +74,7 @@ class Plan:
 
     @property
     def has_buses(self) -> bool:
-        """Return whether the DBC assigns each message to a bus."""
+        """Return whether the DBC assigns messages to buses."""
         return bool(self.catalogue.buses)
 
     def name(self, row: int) -> str:
@@ -135,10 +135,10 @@ class Plan:
         return rows
 
     def rows_in_other_format(self, can_ids: npt.NDArray[np.uint32]) -> Rows:
-        """Return the index of the message with the same number in the other identifier format. Shape (n,).
+        """Return for each identifier the message that has the same number in the other identifier format. Shape (n,).
 
         The number of an 11-bit identifier is searched among the 29-bit identifiers of the DBC, and vice versa.
-        The index is `UNKNOWN` if the DBC has no such message.
+        The result is the message index, or `UNKNOWN` if the DBC has no such message.
         """
         numbers = can_ids & np.uint32(_ALL_BITS)
         short = self._standard[np.where(numbers < _STANDARD, numbers, 0)]

@@ -35,7 +35,7 @@ class Stream:
         return len(self.rows)
 
     def before(self, column: _Column, carried: npt.NDArray[Any]) -> _Column:
-        """Return the value of the previous frame of the same message, for each frame. Shape (n,).
+        """Return for each frame the value of the previous frame of the same message. Shape (n,).
 
         Args:
             column: value of each frame, shape (n,).
@@ -48,7 +48,7 @@ class Stream:
         return found
 
     def last(self, column: npt.NDArray[Any], carried: npt.NDArray[Any]) -> None:
-        """Copy the last value of each message in the chunk to `carried`.
+        """For each message in the chunk, copy the value of its last frame to `carried`.
 
         Args:
             column: value of each frame, shape (n,).

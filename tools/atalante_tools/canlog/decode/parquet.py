@@ -121,7 +121,7 @@ class ParquetSink:
         self._integers.clear()
 
     def _texts_of(self, field: Field, codes: npt.NDArray[np.int64]) -> npt.NDArray[np.int32] | None:
-        """Return for each raw code the index of its name in `_texts`; -1 for a raw code without a name.
+        """Return for each raw code the index of its name in `_texts`; -1 if the raw code has no name.
 
         Returns:
             The indices, shape (n,); None if the field has no value table.
@@ -139,7 +139,7 @@ class ParquetSink:
 
 
 def _exact(field: Field, values: npt.NDArray[Any]) -> Any:
-    """Return the exact values as decimals for the column `integer`, or nulls if float64 represents all values exactly."""
+    """Return the column `integer`: exact values as decimals, or only nulls if float64 represents all values exactly."""
     codes = raw_range(field) if field.kind != "float" else range(0)
     if values.dtype.kind == "f" or not codes or max(-codes[0], codes[-1]) * abs(field.factor) <= _EXACT:
         return pa.nulls(len(values), _DECIMAL)

@@ -57,7 +57,7 @@ class Sink(Protocol):
 
 
 class Decoder:
-    """Decoder for the chunks of a log, which counts the skipped frames for each reason."""
+    """Decoder of a log. It decodes one chunk at a time, and counts the skipped frames for each reason."""
 
     def __init__(self, plan: Plan) -> None:
         self._plan = plan

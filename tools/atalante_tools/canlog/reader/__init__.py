@@ -1,1 +1,1 @@
-"""Readers of CAN logs, which return consecutive frames in chunks."""
+"""Readers of CAN logs. They return consecutive frames in chunks."""

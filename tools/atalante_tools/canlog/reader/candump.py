@@ -1,4 +1,4 @@
-"""Parser for candump logs (`candump -l`, .log of python-can), which parses many lines at a time with array operations.
+"""Parser for candump logs (`candump -l`, .log of python-can). It parses many lines at a time with array operations.
 
     (1700000000.123456) left_leg 181##15A0F004000000041 R
      time                channel id fd flags, payload   direction (may be missing)
@@ -35,15 +35,15 @@ Positions = npt.NDArray[np.intp]
 #: Padding before and after the text [byte]. The parser may read up to this number of bytes outside a line.
 MARGIN = 160
 _NEWLINE, _RETURN, _SPACE, _OPEN, _CLOSE, _HASH, _DOT = b"\n\r ()#."
-_NAME_BYTES = 16  # longest channel name that the array operations parse; Linux allows 15
-_MAX_DIGITS = 2 * 64  # largest number of hexadecimal digits in a payload
+_NAME_BYTES = 16  # maximum length of a channel name in a regular line; Linux allows 15
+_MAX_DIGITS = 2 * 64  # maximum number of hexadecimal digits in a payload
 _STANDARD, _ALL_BITS = 0x7FF, 0x1FFF_FFFF
 _NOT_HEX = 255
 _HEX = np.full(256, _NOT_HEX, np.uint8)
 _HEX[np.frombuffer(b"0123456789", np.uint8)] = np.arange(10)
 _HEX[np.frombuffer(b"ABCDEF", np.uint8)] = _HEX[np.frombuffer(b"abcdef", np.uint8)] = np.arange(10, 16)
-#: Lookup table for two characters: value of two hexadecimal digits; 0xFFFF if one of the characters is not a hexadecimal digit.
-#: The index into the lookup table is the pair of characters as a little-endian 16-bit number.
+#: Value of each pair of hexadecimal digits; 0xFFFF for a pair with another character.
+#: The index is the pair of characters as a little-endian 16-bit number.
 _HEX_PAIR = np.full(1 << 16, 0xFFFF, np.uint16)
 _HEX_PAIR.reshape(256, 256)[:] = np.where(
     (_HEX < 16) & (_HEX < 16)[:, None], _HEX.astype(np.uint16) << 4 | _HEX[:, None], 0xFFFF
@@ -165,7 +165,7 @@ class _Lines:
         return closes
 
     def _one_per_line(self, found: Positions, regular: npt.NDArray[np.bool_], *, alone: bool = True) -> Positions:
-        """Return the first of the found positions in each line. Shape (lines,).
+        """Return for each line the first of the `found` positions that is in this line. Shape (lines,).
 
         Args:
             found: positions in the text, ascending.

@@ -128,7 +128,7 @@ def _remark(log: LogFile, count: int, broken: str, ends_within: bool, warnings: 
 
 
 class _Batch:
-    """Buffer of frames, which were converted from python-can messages."""
+    """Buffer of frames that were converted from python-can messages."""
 
     def __init__(self, capacity: int) -> None:
         self._frames = new_frames(capacity)

@@ -80,7 +80,7 @@ _options = options_as(
             "--node",
             default=None,
             metavar="NODE",
-            help="Report missing messages of this node only, for a test bench with one node.  [default: all nodes]",
+            help="Report missing messages of this node only, for example on a test bench with one node.  [default: all nodes]",
         ),
         click.option(
             "--rules",

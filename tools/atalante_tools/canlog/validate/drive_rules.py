@@ -30,8 +30,9 @@ _SPONTANEOUS = {(s, f) for s in DriveState for f in (_S.FAULT_REACTION_ACTIVE, _
 LEGAL = {(int(state), int(after)) for (state, _), after in TRANSITIONS.items()} | {
     (int(a), int(b)) for a, b in _SPONTANEOUS
 }
-#: Pairs (state, controlword) to which a drive need not respond. A drive may ignore ENABLE_OPERATION until the quick stop is
-#: acknowledged, and FAULT_RESET while the cause of the fault persists.
+#: Pairs (state, controlword) to which a drive need not respond.
+#: A drive may ignore ENABLE_OPERATION until the quick stop is acknowledged.
+#: A drive may ignore FAULT_RESET while the cause of the fault persists.
 EXEMPT = {(int(_S.QUICK_STOP_ACTIVE), int(_C.ENABLE_OPERATION)), (int(_S.FAULT), int(_C.FAULT_RESET))}
 _NOTHING = -1
 

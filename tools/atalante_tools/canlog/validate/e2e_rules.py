@@ -99,7 +99,7 @@ def _at(plan: Plan, length: int) -> npt.NDArray[np.intp]:
 
 
 class Counters:
-    """Calculator of alive counter increments, which stores the last counter of each message."""
+    """Calculator of alive counter increments. It stores the last counter of each message."""
 
     def __init__(self, plan: Plan) -> None:
         self._protected = plan.protected

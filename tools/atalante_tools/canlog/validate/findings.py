@@ -16,7 +16,7 @@ Stamps = npt.NDArray[np.int64]
 #: Maximum number of unknown identifiers that get a finding of their own. All others share the finding `OTHERS`.
 MAX_UNKNOWN_IDS = 100
 OTHERS = "(others)"
-#: Rules that can have more findings than the DBC has messages, because they concern unknown identifiers.
+#: Rules about unknown identifiers. The number of messages in the DBC does not limit the number of their findings.
 _UNBOUNDED = ("unknown-id",)
 
 

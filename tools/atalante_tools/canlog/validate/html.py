@@ -74,7 +74,7 @@ def _rules() -> str:
 
 
 class _Axes:
-    """Plot area, which converts data coordinates to pixels and draws axes, labels and curves."""
+    """Plot area. It converts data coordinates to pixels, and draws axes, labels and curves."""
 
     def __init__(self, x: tuple[float, float], y: tuple[float, float], x_label: str, y_label: str) -> None:
         self._x, self._y = x, (y[0], y[1] if y[1] > y[0] else y[0] + 1.0)

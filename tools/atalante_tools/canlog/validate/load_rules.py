@@ -43,7 +43,7 @@ def wire_time(extended: bool, fd: bool, switch: bool, length: int, nominal: floa
 
 
 class LoadRules:
-    """Rule for the bus load, computed as the sum of the wire times of all frames per bus and time window."""
+    """Rule for the bus load. The bus load is the fraction of a time window in which a frame is on the bus."""
 
     def __init__(self, plan: Plan, findings: Findings, project: Project, channel_map: ChannelMap) -> None:
         self._plan, self._findings, self._channel_map = plan, findings, channel_map
@@ -59,7 +59,7 @@ class LoadRules:
         #: Start time of each time window with at least one frame [s], set by `finish`. Shape (windows,).
         self.begins: npt.NDArray[np.float64] = np.zeros(0)
         #: Bus load in each time window as a fraction of full load, set by `finish`. Shape (windows, buses).
-        #: The first columns of the bus load are the buses of the DBC; the other columns are the log channels without a bus.
+        #: The first columns are the buses of the DBC. The other columns are the log channels without a bus.
         self.load: npt.NDArray[np.float64] = np.zeros((0, len(plan.buses)))
 
     @property

@@ -35,7 +35,7 @@ _SPACING_NS, _LAST = 1000, 0.7
 
 @dataclass
 class _Channel:
-    """State of the clock for one channel after the last frame on this channel."""
+    """State of the clock for one channel."""
 
     #: Plan index of the first SYNC message that was received on this channel; -1 before the first SYNC.
     #: The clock reads the cycle number from this message.

@@ -181,7 +181,9 @@ class _Columns:
     def with_before(
         self, decoded: Decoded, stream: Stream
     ) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64], list[int]]:
-        """Return the raw codes of each frame and of the previous frame, which may be in an earlier chunk.
+        """Return the raw codes of each frame, and of the previous frame of the same message.
+
+        The previous frame may be in an earlier chunk.
 
         Returns:
             Three arrays: the codes of each frame and the codes of its previous frame, both of shape (fields, n), and the

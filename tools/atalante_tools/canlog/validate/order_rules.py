@@ -21,7 +21,7 @@ SYNC = "SYNC"
 
 @dataclass
 class _Bus:
-    """Bus with a SYNC message, and intermediate results of the order check after the last chunk."""
+    """Bus with a SYNC message: its messages, and the results of earlier chunks that the next check needs."""
 
     sync: int  # index of the SYNC message in the plan
     states: list[int]  # indices of the state messages in the plan
@@ -31,8 +31,9 @@ class _Bus:
     cycle_of: dict[int, int] = field(default_factory=dict)  # cycle number of the last state frame, by message index
     #: number of cycles between the last two state frames, by message index
     jump_of: dict[int, int] = field(default_factory=dict)
-    #: Message index -> time stamp of the last state frame [ns], if the cycle of this frame has two state frames.
-    #: The second state frame arrived before its SYNC if the next cycle has no state frame.
+    #: State frames to be checked with the next chunk: message index -> time stamp [ns].
+    #: Such a state frame is the second frame of its message in one cycle.
+    #: The state frame arrived before its SYNC if the next cycle has no frame of the same message.
     doubtful: dict[int, int] = field(default_factory=dict)
 
 

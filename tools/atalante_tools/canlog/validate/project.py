@@ -42,7 +42,7 @@ class Silence:
     reason: str
 
     def covers(self, rule: str, message: str) -> bool:
-        """Return whether this table silences the findings of a rule about a message."""
+        """Return whether this table silences a rule for a message."""
         return rule == self.rule and fnmatch.fnmatchcase(message, self.message)
 
 
@@ -84,7 +84,7 @@ class Project:
         return next((s for s in self.silences if s.covers(rule, message)), None)
 
 
-#: Rules with one threshold per signal name, such as Position. A rules file may add signal names to these rules.
+#: Rules with one threshold for each signal name, for example for `Position`. A rules file may add signal names.
 _OPEN = ("step",)
 
 

@@ -280,13 +280,13 @@ class TimingRules:
 
 
 def median(histogram: npt.NDArray[np.int64]) -> float:
-    """Return the median interval of a histogram, in cycle times. The histogram has the shape (BINS,)."""
+    """Return the median interval of a histogram, divided by the cycle time. The histogram has the shape (BINS,)."""
     half = (int(histogram.sum()) + 1) // 2
     return (int(np.searchsorted(np.cumsum(histogram), half)) + 0.5) / BINS_A_CYCLE
 
 
 def jitter_p99(histogram: npt.NDArray[np.int64]) -> float:
-    """Return the 99 % quantile of the deviation from the median interval, in cycle times."""
+    """Return the 99 % quantile of the deviation from the median interval, divided by the cycle time."""
     total = int(histogram.sum())
     distance, order = _by_distance(len(histogram), int(median(histogram) * BINS_A_CYCLE))
     reached = np.cumsum(histogram[order])
@@ -295,6 +295,6 @@ def jitter_p99(histogram: npt.NDArray[np.int64]) -> float:
 
 @lru_cache(maxsize=64)  # cached, because most messages have the same median interval
 def _by_distance(bins: int, middle: int) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.intp]]:
-    """Return the distance of each bin to the middle bin, and the bins in the order of this distance. Shape (bins,) each."""
+    """Return the distance of each bin to the bin `middle`, and the bin indices sorted by this distance. Shape (bins,)."""
     distance = np.abs(np.arange(bins) - middle)
     return distance, np.argsort(distance, kind="stable")

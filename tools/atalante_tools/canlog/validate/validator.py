@@ -1,4 +1,4 @@
-"""Validator of one log, which checks each chunk of frames and finally applies the rules about the whole log.
+"""Validator of one log. It checks each chunk of frames, and at the end applies the rules about the whole log.
 
 chunk -> headers (frame_rules) -> sort by message (stream) -> CRC, counters, time -> payloads by family -> values, motion, drives
 """

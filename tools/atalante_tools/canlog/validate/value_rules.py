@@ -21,7 +21,7 @@ from atalante_tools.canlog.stream import Stream
 from atalante_tools.canlog.validate.findings import Findings
 from atalante_tools.canlog.validate.project import Project
 
-#: Length of the longest field whose value table is stored as a lookup array [bit].
+#: Maximum length of a field [bit] whose value table is stored as a lookup array.
 _TABLE_BITS = 16
 _WORD = 64
 _HASH_BITS = 32
@@ -217,7 +217,7 @@ class _FamilyChecks:
         self.limited = np.array(list(self.bounds), np.intp)
         self.low = np.array([low for low, _ in self.bounds.values()], np.int64)
         self.high = np.array([high for _, high in self.bounds.values()], np.int64)
-        #: Field index -> raw code for "no value", for each field without a range.
+        #: Field index -> raw code that means "no value". Only for fields that have such a code, and have no range.
         self.coded = {
             p: _as_signed(f, f.invalid_raw) for p, f in fields if f.invalid_raw is not None and (p, f) not in ranged
         }
@@ -250,7 +250,10 @@ def is_limited(limits: Field) -> bool:
 
 
 def raw_bounds(limits: Field) -> tuple[int, int]:
-    """Return the smallest and the largest raw code inside the DBC range, with a tolerance for rounded decimals."""
+    """Return the smallest and the largest raw code inside the DBC range.
+
+    A tolerance of 1e-6 of a raw code is added, because the DBC limits are rounded decimals.
+    """
     assert limits.minimum is not None
     assert limits.maximum is not None
     return _codes_within(limits.minimum, limits.maximum, limits.factor, limits.offset, raw_range(limits))
