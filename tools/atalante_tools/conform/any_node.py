@@ -27,8 +27,8 @@ _HEARTBEAT_CYCLES, _ANSWER_CYCLES = 520, 200
 _MEAN, _SINGLE = 0.1, 0.5
 #: The flood test sends `_FLOOD` random frames in each of `_FLOOD_CYCLES` cycles. The bus load stays below 100 %.
 _FLOOD, _FLOOD_CYCLES = 6, 100
-#: Bits of the SYNC payload that belong to CRC, HAL state or cycle number. In each damaged SYNC, one of these bits is
-#: flipped.
+#: Bits of the SYNC payload that a test flips, one bit in each damaged SYNC.
+#: These bits belong to the CRC, the HAL state or the cycle number.
 _DAMAGED: Final = (0, 5, 10, 15, *range(24, 32), *range(48, 56))
 #: Number of wrong SYNCs sent for each kind of defect.
 _WRONG: Final = len(_DAMAGED)
@@ -342,7 +342,13 @@ def _statuses(tester: NodeTester, received: list[ReceivedFrame] | None = None) -
 
 
 def _answered(tester: NodeTester, received: list[ReceivedFrame], cycles: int) -> Outcome:
-    """Return whether the number and the spacing of the state frames in `cycles` cycles are as expected."""
+    """Check the number of state frames, and the number of cycles between them.
+
+    Args:
+        tester: tester of the node.
+        received: frames received in the test.
+        cycles: duration of the test [cycles].
+    """
     period = tester.state_message.cycle_ms
     at = [frame.cycle for frame in received if frame.message is tester.state_message]
     if period == 1:

@@ -68,7 +68,7 @@ class Axis:
         )
 
     def signal(self, name: str) -> str:
-        """Return the name of a signal of this joint in the command message, with the prefix of the joint."""
+        """Return the full name of a signal in the command message: prefix of this joint, then `name`."""
         return f"{self._prefix}_{name}"
 
     def command(

@@ -137,8 +137,8 @@ def latches(tester: NodeTester) -> Outcome:
     axis.enable()
     last = tester.command.counter
     received = tester.states([frame for _ in range(LATCHED) for frame in tester.cycle()])
-    # The counter of the next command increases by the largest valid step.
-    # A drive whose watchdog is too slow accepts this command.
+    # The alive counter of the next command is valid, because it increases by the largest valid step.
+    # A drive accepts this command, unless its watchdog has already latched the position hold.
     received += axis.send(axis.command(_C.ENABLE_OPERATION, counter=last + MAX_DELTA & 0xFF))
     received += axis.run(2 * SHOWN, _C.ENABLE_OPERATION)
     stopped = any(state_of(frame) == _S.QUICK_STOP_ACTIVE for frame in received)

@@ -1,4 +1,4 @@
-"""Requirements for the haptics node: eight motors follow commanded levels as first-order lags and stop on timeout."""
+"""Requirements for the haptics node: its eight motors follow the commanded levels with a lag, and stop without commands."""
 
 from __future__ import annotations
 

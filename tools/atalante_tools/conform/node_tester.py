@@ -1,4 +1,4 @@
-"""Node tester, which replaces the HAL for one node. Each cycle is `SYNC -> state message of the node -> command`.
+"""Node tester: replaces the HAL for one node. Each cycle is `SYNC -> state message of the node -> command`.
 
 The tester records every frame of the node. The same examination tests a real node on a bus in real time, or an emulated
 node in this process in lock-step.
@@ -58,7 +58,7 @@ class Clock(Protocol):
 
 
 class LockStep:
-    """Lock-step clock for an emulated node, which answers without delay.
+    """Lock-step clock for an emulated node. The emulated node answers without delay.
 
     An emulated node normally runs one cycle per SYNC. After several cycles without SYNC, this clock advances the node.
     """
@@ -116,7 +116,7 @@ class Limits:
 
 
 class NodeTester:
-    """Tester of one node, which sends SYNC and commands, and records every frame of the node.
+    """Tester of one node: sends SYNC and commands, and records every frame of the node.
 
     Attributes:
         received: frames of the node since the start of the examination.
@@ -228,7 +228,8 @@ class NodeTester:
         return self.sync.frame(cycle, counter=counter, length=length, classic=classic, flip=flip)
 
     def _send(self, frames: Frames) -> None:
-        # A bus caches the memory address of each array that it sends, so the tester reuses one array for each number of frames.
+        # A bus caches the memory address of each array that it sends, so the tester reuses its arrays.
+        # The key of `_outboxes` is the number of frames in the array.
         outbox = self._outboxes.setdefault(len(frames), new_frames(len(frames)))
         as_words(outbox)[:] = as_words(frames)
         try:
@@ -278,7 +279,7 @@ class NodeTester:
     def run_until(
         self, shows: Callable[[list[ReceivedFrame]], bool], cycle: Callable[[], list[ReceivedFrame]] | None = None
     ) -> bool:
-        """Run cycles until a condition holds, for at most `technician.patience`; return whether the condition holds.
+        """Run cycles until a condition holds, for at most `technician.patience` [s]; return whether the condition holds.
 
         Args:
             shows: condition on the frames received in a cycle.

@@ -134,7 +134,7 @@ def agrees_with_attitude(tester: NodeTester) -> Outcome:
 
 
 def _changes(*vectors: str) -> Callable[[NodeTester], Outcome]:
-    """Return a test which requires that no axis of the named vectors is constant."""
+    """Return a test which requires that every axis of the named vectors changes."""
     names = [f"{vector}{axis}" for vector in vectors for axis in _VECTOR]
 
     def test(tester: NodeTester) -> Outcome:
