@@ -84,7 +84,7 @@ class Options:
 
 @dataclass
 class Walked:
-    """Results and recording of a trial. The recording and the state of the CAN log are set when the telemetry is closed."""
+    """Results and recording of a trial. `recording` and `can_log_complete` are set when the telemetry is closed."""
 
     results: list[Result] = field(default_factory=list)  # one result per finished guide shape
     recording: Recording | None = None  # recording of the trial; None until the telemetry is closed
@@ -171,7 +171,10 @@ def _walk_all(
     *,
     as_json: bool,
 ) -> None:
-    """Walk inside one guide shape after another, and add results and recording to `walked`. Raise the errors of `run_trial`."""
+    """Walk inside one guide shape after another, and add results and recording to `walked`.
+
+    The raised exceptions are listed in `run_trial`.
+    """
     import atalante_dbc
     from atalante_hal.robot import load_robot
     from atalante_hal.telemetry.child import TelemetryChild
@@ -311,7 +314,8 @@ def _close(telemetry: TelemetryProcess, walked: Walked) -> None:
 
 def _result(certificate: Certificate, controller: AirwalkController, hal: Hal, statistics: Statistics) -> Result:
     walking = controller.statistics
-    # The statistics start after the first step. After a run of one step they contain a single cycle and are not reported.
+    # The statistics start after the first step.
+    # After a run of only one step, the statistics contain a single cycle, so they are not reported.
     counted = walking.steps >= 2
     return Result(
         shape=certificate.shape,

@@ -52,7 +52,7 @@ def require_engine(engine: str = PYBULLET) -> None:
 
 
 def describe(robot: Robot, exoskeleton: ExoskeletonParameters | None = None, wearer: Patient | None = None) -> str:
-    """Return the URDF text of the exoskeleton, empty or with a patient.
+    """Return the URDF text of the exoskeleton, without or with a patient.
 
     Args:
         robot: Joint limits of the robot.

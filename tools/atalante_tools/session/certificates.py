@@ -13,7 +13,7 @@ if TYPE_CHECKING:
 
 
 def weakest(certificates: Iterable[Certificate]) -> Certificate:
-    """Return a certificate without certified torques; if there is none, return the certificate with the smallest hip torque.
+    """Return the weakest certificate: one without certified torques, or else the one with the smallest certified hip torque.
 
     Args:
         certificates: Certificates of one guide shape, for each assistance factor and each gait. At least one is needed.

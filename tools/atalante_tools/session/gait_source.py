@@ -42,7 +42,7 @@ def gait_in_the_air(files: GaitFiles, subject: Subject | None, robot: Robot) -> 
         patient = patient_in(gait, files.gait) if subject is None else subject.patient
         if patient is not None:
             exoskeleton = exoskeleton.fitted(patient)
-        # The feedforward of a gait on the ground contains the load of the patient, so it is computed again for the air.
+        # A gait on the ground has a feedforward that carries the patient. For a walk in the air, compute the feedforward again.
         if gait.feedforward is not None:
             gait = suspended_gait(gait, exoskeleton, robot)
         return exoskeleton, gait, f"gait of {files.gait}: {gait.name}"
@@ -78,7 +78,9 @@ def patient_of_files(files: GaitFiles, patient: Patient | None, robot: Robot) ->
 
 
 def gaits_of_file(path: Path, patient: Patient | None, robot: Robot) -> tuple[Patient, WalkGaits]:
-    """Return the patient and the gaits of a walk from a file. Start step and stop step of a gait file are solved.
+    """Return the patient and the gaits of a walk from a file.
+
+    A gait file contains only the periodic step. Its start step and stop step are computed by the gait optimisation.
 
     Args:
         path: Path of a gait file or walk file.
@@ -112,7 +114,7 @@ def gaits_of_file(path: Path, patient: Patient | None, robot: Robot) -> tuple[Pa
 
 
 def with_start_and_stop(subject: Subject, step: Gait) -> WalkGaits:
-    """Solve start step and stop step for a periodic gait.
+    """Return a periodic gait together with a start step and a stop step, which the gait optimisation computes.
 
     Args:
         subject: Patient and step.

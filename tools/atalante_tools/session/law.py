@@ -33,7 +33,7 @@ class Law:
 
 
 def law_options() -> Callable[[_Command], _Command]:
-    """Return a decorator that adds the options of the control law to a command, which then gets the argument `law`."""
+    """Return a decorator that adds the options of the control law to a command. The command gets the argument `law`."""
     options = [
         click.option(
             "--idealization",

@@ -15,7 +15,9 @@ POLL_TIMEOUT: Final = 0.02
 
 
 def received(bus: Bus, seconds: float, stop: StopRequest) -> Iterator[tuple[Frames, int]]:
-    """Yield the receive buffer and its number of new frames after each receive call, at least every `POLL_TIMEOUT`.
+    """Call `receive` repeatedly, and yield after each call: the receive buffer, and the number of new frames in the buffer.
+
+    A call ends after `POLL_TIMEOUT`, even if no frame was received.
 
     Args:
         bus: Bus to listen to.

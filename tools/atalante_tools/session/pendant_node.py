@@ -37,7 +37,7 @@ class Request(IntEnum):
 
 
 class PendantNode:
-    """Pendant node, which listens until `start_sending()`, and then answers every SYNC until another pendant takes over.
+    """Pendant node. It listens until `start_sending()`, and then answers every SYNC until another pendant takes over.
 
     Attributes:
         hal: State of the HAL in the last SYNC. None if no SYNC was received.

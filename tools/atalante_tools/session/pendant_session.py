@@ -19,7 +19,7 @@ from atalante_tools.console.stop_request import StopRequest
 from atalante_tools.console.terminal import print_message
 from atalante_tools.session.pendant_node import PendantNode, Request
 
-#: Shortest time in which a new pendant listens for another pendant before it sends [s].
+#: Shortest time for which a new pendant listens for another pendant before it sends [s].
 LISTEN: Final = 0.05
 #: Smallest number of SYNCs that a new pendant must receive before it sends.
 LISTEN_CYCLES: Final = 3
@@ -83,7 +83,10 @@ class Session:
                 return
 
     def take_over(self) -> None:
-        """Listen, and copy the signals of another pendant that sends. Then press the dead-man switch and answer each SYNC."""
+        """Listen first, then press the dead-man switch and start to answer each SYNC.
+
+        If another pendant is sending, the first answers are copies of its signals.
+        """
         self.listen()
         print_message(
             f"taking over from another pendant on {self._target}"

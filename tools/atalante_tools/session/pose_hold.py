@@ -42,7 +42,7 @@ def minimum_jerk(phase: float) -> tuple[float, float]:
 
 
 class PoseHold:
-    """PD controller with gravity compensation, which holds a pose with the stiffness of the drives.
+    """PD controller with gravity compensation. It holds a pose with the stiffness that the drives have in HOLD.
 
     The damping gains are the gains of `pose_gains`. With the damping gains of the drives, the delay of the HAL would make light
     joints unstable.

@@ -21,10 +21,10 @@ if TYPE_CHECKING:
     from atalante_hal.telemetry.process import Recording, TelemetryProcess, TelemetrySummary
     from atalante_tools.session.rig import Rig
 
-#: Longest wait for the telemetry process before a run on the wall clock [s]. A process that is ready
-#: later joins the run at that time.
+#: Longest wait for the telemetry process before a run on the wall clock [s].
+#: A process that is not ready in time begins to record during the run, as soon as it is ready.
 _TELEMETRY_WAIT: Final = 5.0
-#: Period of the check of the telemetry process [cycles].
+#: Time between two checks of the telemetry process [cycles].
 _TEND_CYCLES: Final = 250
 
 

@@ -1,4 +1,4 @@
-"""Attitude and path of the robot during a walk on the ground: `emulated body or controller -> has fallen, deviation`."""
+"""Observer of a walk on the ground: `true or estimated motion of the robot -> has fallen, deviation from the start line`."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ AFTERMATH: Final = 5000
 
 
 class Observation:
-    """Attitude and path of the robot during the walk, and the push. The true values of an emulated robot are read from its body.
+    """Observer of a walk: detects a fall, and measures the true path of an emulated robot. It also applies the push.
 
     Attributes:
         fell: Whether the pelvis has leaned by more than `FALLEN`.
@@ -53,13 +53,16 @@ class Observation:
         access = self._rig.access
         try:
             upright = float(self._controller.vertical[2]) if access is None else self._compare(access)
-        except BusDown:  # the process of the robot has ended, which the HAL reports
+        except BusDown:  # the process of the robot has ended; the HAL reports this
             return self.fell
         self.fell = self.fell or upright < math.cos(FALLEN)
         return self.fell
 
     def _compare(self, access: Access) -> float:
-        """Return the vertical component of the true pelvis axis. In the walk, sum the error of the estimated vertical."""
+        """Return the cosine of the true angle between the pelvis axis and the vertical.
+
+        While the controller walks, also add up the squared error of the vertical that the controller estimates.
+        """
         x, y, z, w = access.attitude()
         upright = 1.0 - 2.0 * (x * x + y * y)
         if self._controller.walking:

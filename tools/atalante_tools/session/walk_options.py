@@ -48,24 +48,26 @@ class SpeedChange:
 class WalkOptions:
     """Options of a walk."""
 
-    steps: int  # number of steps between the start step and the first speed change or the stop step
+    steps: int  # number of periodic steps before the first speed change; if there is none, before the stop step
     xi: float  # assistance factor, 0 to 1
     shape: str  # name or file of the guide shape
     passive: bool  # whether the limbs of the emulated patient have the impedance of a passive wearer
     subject: Subject | None  # patient and step parameters; None means the values in the walk file
-    #: files of the gait; without a file, the gait of the network, or the walk file of the project for the default subject
+    #: Files of the gait. Without a file, the default subject walks with the walk file of the package.
+    #: Without a file, the gaits of any other subject are computed with the gait network of the package.
     files: GaitFiles
     seed: int  # seed of the sensor noise
     friction: float  # coefficient of friction between soles and floor
     push: Push | None  # push in the middle of the walk; None means no push
     law: Law  # control law of the periodic steps
-    #: numbers of steps with full assistance, in the transition to `xi`, and with `xi`; None means that all steps have `xi`
+    #: Three numbers of steps: with full assistance, then in the transition to `xi`, then with `xi`. None: `xi` in all steps.
     protocol: tuple[int, int, int] | None = None
     #: Options of recording, CAN log and telemetry. If none of these outputs is requested, no telemetry process is started.
     recording: RecordingOptions = field(default_factory=RecordingOptions)
     #: Whether the emulated robot runs in a process of its own; None: only if enough processor cores are idle.
     robot_process: bool | None = None
-    #: whether the pelvis IMU has a heading reference, so that its heading does not drift and the controller follows its heading
+    #: Whether the pelvis IMU has a heading reference, so that the measured heading does not drift.
+    #: The controller then corrects its estimated heading with the measured heading.
     heading_reference: bool = False
     then: tuple[SpeedChange, ...] = ()  # speed changes, in walking order
     turn: float = 0.0  # angle by which the line turns before each periodic step, positive to the left [deg]

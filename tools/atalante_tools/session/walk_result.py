@@ -60,9 +60,8 @@ class WalkResult:
     diagnostics: dict[str, int]  # number of occurrences of each diagnostic of the HAL
     real_time_factor: float
     robot_process: bool  # whether the emulated robot ran in a process of its own, in parallel with the HAL
-    cpu_per_second: (
-        float  # processor time of this process per second of the run, including waits for a robot in another process
-    )
+    #: Processor time of this process per second of the run. Waiting for a robot in another process uses processor time, too.
+    cpu_per_second: float
 
 
 def guide_fields(certificate: Certificate | None, statistics: GuideStatistics) -> dict[str, Any]:

@@ -37,10 +37,11 @@ if TYPE_CHECKING:
     from atalante_emulator.faults import Fault
     from atalante_emulator.mechanics import Mechanics
 
-#: `_PATIENCE` is the timeout of the answer to a SYNC [s]. `_START` is the timeout of the creation of the robot [s].
+#: `_PATIENCE` is the longest wait for the answer to a SYNC [s].
+#: `_START` is the longest wait for the creation of the robot [s].
 #: `_END` is the longest wait for the end of the child after the bus is closed [s].
 _PATIENCE, _START, _END = 2.0, 60.0, 5.0
-#: File with the load of the computer, number of samples of the load, and time between two samples [s].
+#: `_LOAD` is the file with the load of the computer. The load is read `_LOAD_SAMPLES` times, every `_LOAD_INTERVAL` [s].
 _LOAD, _LOAD_SAMPLES, _LOAD_INTERVAL = Path("/proc/loadavg"), 5, 2e-3
 
 

@@ -1,4 +1,4 @@
-"""Access to an emulated robot in addition to the bus: pushes, assistance dial and true motion, in this process or a subprocess.
+"""Access to an emulated robot without the bus: push its pelvis, turn the assistance dial, and read its true motion.
 
     push, dial -> emulated robot -> true attitude of the pelvis, true position of the feet
 
@@ -27,9 +27,9 @@ if TYPE_CHECKING:
 
 #: Index of the pelvis IMU in `IMUS`.
 _PELVIS: Final = IMUS.index("pelvis")
-#: Values of `_Shared.question`: run a cycle, or answer with the true attitude or the true stance.
+#: Values of `_Shared.question`: run a cycle, return the true attitude, or return the true stance.
 _CYCLE, _ATTITUDE, _STANCE = 0.0, 1.0, 2.0
-#: Number of values in the memory of both processes.
+#: Number of values in the memory that both processes share.
 _SIZE: Final = 14
 
 
@@ -42,10 +42,10 @@ class Stance(NamedTuple):
 
 
 class Access(Protocol):
-    """Access to an emulated robot in addition to the bus: pushes, assistance dial and true motion."""
+    """Access to an emulated robot without the bus: push its pelvis, turn the assistance dial, read its true motion."""
 
     def push(self, wrench: Callable[[], Vector]) -> None:
-        """Push the pelvis with the wrench that a function returns.
+        """Push the pelvis in every cycle from now on, with the wrench that the function `wrench` returns.
 
         Args:
             wrench: Function that returns force [N] and moment [Nm] on the pelvis, in world axes, shape (6,). The
@@ -74,7 +74,7 @@ class LocalAccess:
 
         Args:
             emulator: Emulator of the robot.
-            operator: Operator of its pendant.
+            operator: Operator who turns the assistance dial.
         """
         self._emulator, self._operator = emulator, operator
 
@@ -106,14 +106,15 @@ class LocalAccess:
 
 
 class _Shared(NamedTuple):
-    """Views of the memory of both processes. The HAL writes all fields except `answer` before it requests a step of the bus.
+    """Fields of the memory that both processes share. Each field is a view of this memory.
 
-    The emulator reads these fields at the start of the step, and writes `answer` before the end of the step. As on a `SharedBus`,
-    stores must become visible in program order.
+    Before the HAL requests a step (`SharedBus.run_step`), it writes all fields except `answer`. The emulator reads these fields
+    at the start of the step, and writes `answer` before the end of the step. As on a `SharedBus`, stores must become visible in
+    program order.
     """
 
     question: Vector  # `_CYCLE`, `_ATTITUDE` or `_STANCE`, shape (1,)
-    dial: Vector  # number of changes of the dial so far, and assistance factor (NaN: None), shape (2,)
+    dial: Vector  # [number of calls of `assist` so far, last assistance factor (NaN means None)], shape (2,)
     pushes: Vector  # whether the pelvis is pushed, shape (1,)
     wrench: Vector  # force [N] and moment [Nm] on the pelvis, shape (6,)
     answer: Vector  # attitude or stance, shape (4,)
@@ -159,12 +160,12 @@ class RemoteAccess:
         dial[0], dial[1] = dial[0] + 1.0, math.nan if factor is None else factor
 
     def attitude(self) -> tuple[float, float, float, float]:
-        """Return the true attitude of the pelvis, see `Access.attitude`. Wait until the body has moved."""
+        """Return the true attitude of the pelvis, see `Access.attitude`. Block until the emulator has answered."""
         x, y, z, w = self._ask(_ATTITUDE)
         return x, y, z, w
 
     def stance(self) -> Stance:
-        """Return the true position of the feet, see `Access.stance`. Wait until the body has moved."""
+        """Return the true position of the feet, see `Access.stance`. Block until the emulator has answered."""
         return Stance(*self._ask(_STANCE)[:3])
 
     def _ask(self, question: float) -> list[float]:
@@ -187,7 +188,7 @@ class ServedAccess:
         Args:
             memory: File descriptor of `access_memory`. This object closes it.
             emulator: Emulator of the robot.
-            operator: Operator of its pendant.
+            operator: Operator who turns the assistance dial.
         """
         self._shared, self._emulator = _attach(memory), emulator
         self._local = LocalAccess(emulator, operator)
@@ -206,7 +207,10 @@ class ServedAccess:
             self._emulator.poll()
 
     def _apply(self) -> None:
-        """Apply the inputs. The HAL may write new inputs while the emulator still runs the cycle, so the wrench is copied."""
+        """Apply the dial and the wrench that the HAL wrote to the shared memory.
+
+        The wrench is copied, because the HAL may write a new wrench while the emulator still runs the cycle.
+        """
         shared = self._shared
         turns, factor = shared.dial.tolist()
         if turns != self._turns:
