@@ -201,7 +201,10 @@ class FrameFilter(WrappedBus):
         return count
 
     def _apply_faults(self, frames: Frames, delayed: list[tuple[int, Frames]]) -> Frames:
-        """Apply the faults to new frames. Return the delayed frames that are due, then the new frames that remain."""
+        """Apply the faults to new frames. Return one array: first the delayed frames that are due, then the new frames.
+
+        The new frames that are dropped or delayed are not in this array.
+        """
         due = [frame for cycle, frame in delayed if cycle <= self._cycle][:_BATCH]
         delayed[:] = [(cycle, frame) for cycle, frame in delayed if cycle > self._cycle]
         arriving = due

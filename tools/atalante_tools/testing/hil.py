@@ -1,4 +1,4 @@
-"""Parts of the pytest fixtures: the bus with a robot, the HAL loop in steps, and a recording of all frames.
+"""Parts of the pytest fixtures: the bus with a robot, a HAL loop that runs cycle by cycle, and a recording of all frames.
 
 An emulated robot runs in lock-step with the HAL. On a CAN interface, the emulated robot is polled before every
 `receive` of the HAL.
@@ -85,9 +85,8 @@ def emulated_robot(network: Network, robot: Robot, robot_bus: Bus, engine: str) 
         robot_bus: bus of the robot.
         engine: name of the physics engine.
     """
-    with open_body(
-        robot, engine=engine
-    ) as body:  # before the imports: if the engine is missing, the error of `open_body` names the package
+    # Open the body before the imports. If the engine is not installed, `open_body` raises an error that names the package.
+    with open_body(robot, engine=engine) as body:
         from atalante_emulator.emulator import Emulator
         from atalante_emulator.pendant import Operator
 
@@ -111,7 +110,7 @@ def connect(hal_bus: Bus, emulator: Emulator) -> Callable[[], object] | None:
 
 
 class Stepper:
-    """HAL loop that a test advances cycle by cycle. The default `controller` holds the first pose of ACTIVE."""
+    """HAL loop that a test advances cycle by cycle. The default `controller` holds the pose at the change to ACTIVE."""
 
     def __init__(self, hal: Hal, clock: Clock) -> None:
         self.hal = hal
