@@ -138,7 +138,7 @@ def diff(old: Path, new: Path, as_json: bool) -> None:
 def c_code(
     file: Path | None, output: Path, node: str | None, check: bool, images: int, seed: int, as_json: bool
 ) -> None:
-    """Generate C code for FILE: pack, unpack, E2E protect and check, with test vectors and a host test.
+    """Generate C code for the messages of FILE: pack, unpack, E2E protection, test vectors and a host test.
 
     The host test is a C program that compares the C code with the Python codec.
     """

@@ -92,8 +92,7 @@ def _timing(old: Message, new: Message) -> Iterator[Change]:
     elif old.cycle_ms != new.cycle_ms:
         yield Change(True, "timing", new.name, f"cycle {old.cycle_ms} -> {new.cycle_ms} ms")
     if old.timeout_ms != new.timeout_ms:
-        # A changed timeout breaks communication only if the timeout in one version is at most the cycle time in the
-        # other version.
+        # Communication breaks only if the timeout in one version is not longer than the cycle time in the other version.
         late = 0 < old.timeout_ms <= new.cycle_ms or 0 < new.timeout_ms <= old.cycle_ms
         yield Change(late, "timing", new.name, f"timeout {old.timeout_ms} -> {new.timeout_ms} ms")
     if old.inhibit_ms != new.inhibit_ms:

@@ -78,7 +78,7 @@ def run_host_test(build: Build, program: Path, images: int, seed: int) -> int:
                 process.stdin.write(image)
             process.stdin.close()
         except BrokenPipeError:
-            pass  # after the first difference, the host test prints it and exits, which breaks the pipe
+            pass  # the host test exits at the first difference, so the pipe to it breaks
         output = process.stdout.read().decode(errors="replace").strip()
     if process.returncode:
         raise Failed(f"the generated C code differs from the Python codec: {output}")
@@ -263,7 +263,7 @@ def _receive(build: Build, message: Message, received: tuple[Signal, ...], other
     names = [camel_to_snake_case(s.name) for s in received]
     values = "\n".join(f"        EXPECT({prefix}_{name}_decode(message.{name}) == next(&in_p));" for name in names)
     wrong_id = f"{build.name}_e2e_check(&copy, payload, sizeof(payload), sizeof(payload), {other.data_id:#06x}u)"
-    # A network with a single message has no other Data ID, so the check cannot be called with one.
+    # A network with a single message has no other Data ID.
     other_id = f"            EXPECT({wrong_id} == {upper}_E2E_CRC);\n" if other is not message else ""
     return f"""
     {{

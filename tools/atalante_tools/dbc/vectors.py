@@ -1,4 +1,4 @@
-"""Test vectors of a network: payloads and the signal values that the Python codec decodes, as binary stream or JSON.
+"""Test vectors of a network, as binary stream or JSON: payloads, and the values that the Python codec decodes from them.
 
 An image is a set of payloads, one per message. The generated host test reads the binary stream, which is little endian.
 The stream begins with 8 bytes magic, u32 network hash and u32 number of images; then the images follow. Each image
@@ -60,7 +60,7 @@ class Vectors:
         self._order = self._stream_order()
 
     def _stream_order(self) -> npt.NDArray[np.intp]:
-        """Return, for each byte of an image, the index of this byte in the concatenated arrays of `images`."""
+        """Return for each byte of an image its index in the arrays that `images` concatenates."""
         build, codec = self._build, self._codec
         rows = len(build.messages)
         parts = (FRAME_BYTES * rows, FRAME_BYTES * rows, 8 * codec.size, 8 * codec.size, rows)
@@ -87,7 +87,9 @@ class Vectors:
         return HEADER.pack(MAGIC, self._build.network.hash32, images)
 
     def images(self, count: int) -> Iterator[bytes]:
-        """Yield images. The first three contain minimum, maximum and invalid signal values. All others contain random values.
+        """Yield images. Image 0 contains the minimum of each signal, image 1 the maximum, and image 2 the invalid code.
+
+        All further images contain random values.
 
         Call this only once per instance, because a second call would continue the counters and the random numbers.
         """
@@ -97,7 +99,9 @@ class Vectors:
             yield np.concatenate([part.view(np.uint8) for part in parts])[self._order].tobytes()
 
     def examples(self) -> Iterator[dict[str, Any]]:
-        """Yield JSON objects of four images, which contain minimum, maximum, invalid and random signal values.
+        """Yield one JSON object for each message in each of four images.
+
+        The images contain minimum values, maximum values, invalid codes, and random values.
 
         Call this only once per instance, because a second call would continue the counters and the random numbers.
         """
@@ -118,7 +122,7 @@ class Vectors:
                 }
 
     def _next(self, image: int) -> Vector:
-        """Encode the test vectors of image number `image`, and return the signal values before encoding, shape (signals,)."""
+        """Encode the image with the number `image`, and return its signal values before encoding, shape (signals,)."""
         limits = (self._minimum, self._maximum, self._invalid)
         encoded = limits[image] if image < len(limits) else self._random.uniform(self._minimum, self._maximum)
         self._sender.values[:] = encoded
