@@ -20,7 +20,7 @@ XI = 0.5  # assistance factor
 
 
 def waist(phase, half_width):
-    """Return the upper and the lower bound of the guide as fractions of the half-width, two arrays of shape (n,).
+    """Return two arrays of shape (n,): the upper and the lower bound of the guide, as fractions of the half-width.
 
     Args:
         phase: time since the start of the step divided by the step duration, 0 to 1, shape (n,).

@@ -1,4 +1,4 @@
-"""Check of the attribute values in a DBC text before cantools parses it: `text -> attributes -> parser`.
+"""Check of the attribute values in a DBC text. It runs before cantools parses the text: `text -> attributes -> parser`.
 
 cantools does not check whether a value has the type that its attribute requires. Without this check, an invalid value causes
 an error later or remains undetected.
@@ -35,7 +35,7 @@ def wrong_values(text: str) -> Iterator[tuple[int, str]]:
 
 
 def missing(text: str) -> Iterator[tuple[int, str]]:
-    """Yield (1, problem) for each required attribute that has no definition or no default."""
+    """Yield (1, problem) for each required attribute without a definition or a default. The 1 stands for line 1."""
     for name in _REQUIRED:
         for keyword, part in (("BA_DEF_", "definition"), ("BA_DEF_DEF_", "default")):
             if not re.search(rf'^{keyword}\s+[^"]*"{name}"', text, re.MULTILINE):

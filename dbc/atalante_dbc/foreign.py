@@ -32,9 +32,9 @@ _FLOAT_BITS = (16, 32, 64)
 _E2E_HEADER = {"Crc": (0, 16), "Counter": (16, 8)}
 #: Values of GenMsgSendType for cyclic messages, in lower case. The empty text stands for a missing GenMsgSendType.
 _CYCLIC = ("", "cyclic", "cyclicx", "periodic", "fixedperiodic", "fixed_periodic")
-# J1939: an identifier with a PDU format below `_PDU2` contains a destination address, which is not part of the
-# parameter group. `_PGN_PEER` is the mask of the parameter group in these identifiers. `_PGN_BROADCAST` is the mask in
-# all other identifiers.
+# Masks of the parameter group in a J1939 identifier.
+# `_PGN_PEER` applies if the PDU format is below `_PDU2`. Such an identifier also contains a destination address.
+# `_PGN_BROADCAST` applies to all other identifiers.
 _PGN_PEER, _PGN_BROADCAST, _PDU2 = 0x03FF0000, 0x03FFFF00, 240
 _QUOTED = re.compile(r'"[^"]*"')
 _WRITTEN = re.compile(r"\bBO_\s+(\d+)\s+(\w+)\s*:|\bSG_\s+(\w+)\s+(M|m\d+M?)?\s*:")
@@ -91,11 +91,11 @@ class Layout:
     cyclic: bool  # True if the message is sent every `cycle_ms`, False for an event message
     cycle_ms: float | None
     timeout_ms: float | None
-    inhibit_ms: float | None  # ms, minimum time between two frames of an event message
+    inhibit_ms: float | None  # minimum time between two frames of an event message [ms]
     data_id: int | None  # Data ID of AUTOSAR E2E Profile 5; None if the message is not protected
-    pgn_mask: (
-        int  # mask of the identifier bits that identify the message: all bits, or the bits of a J1939 parameter group
-    )
+    #: Mask of the identifier bits that identify the message. For J1939 these are the bits of the parameter group.
+    #: For all other messages these are all bits.
+    pgn_mask: int
     #: Name of each multiplexer -> raw values for which the DBC defines a layout.
     multiplexers: Mapping[str, frozenset[int]]
 
@@ -113,7 +113,7 @@ class Layout:
 
 @dataclass(frozen=True)
 class Refused:
-    """Message of the DBC that cannot be decoded, with the reason."""
+    """Rejected message of a DBC, and the reason why the message cannot be decoded."""
 
     name: str
     frame_id: int
@@ -188,7 +188,7 @@ class _DbcText:
         self.ids: Counter[int] = Counter()
         self.names: Counter[str] = Counter()
         self.signals: dict[int, Counter[str]] = {}
-        self.multiplexed: Counter[int] = Counter()  # number of signals marked m0, m1, ..., by frame id
+        self.multiplexed: Counter[int] = Counter()  # frame id -> number of signals with a mark m0, m1, ...
         current = -1
         for match in _WRITTEN.finditer(_QUOTED.sub('""', text)):
             if match[1]:
@@ -268,7 +268,7 @@ def _selectors(message: RawMessage) -> dict[str, tuple[tuple[str, frozenset[int]
 
 
 def _multiplexers(message: RawMessage) -> dict[str, frozenset[int]]:
-    """Return for each multiplexer the raw values that select a signal or have a name in its value table."""
+    """Return the known raw values of each multiplexer: values that select a signal, and values with a name."""
     known: dict[str, frozenset[int]] = {}
     for multiplexer in (s for s in message.signals if s.is_multiplexer):
         values = {int(value) for value in multiplexer.choices or {}}

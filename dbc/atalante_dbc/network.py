@@ -81,7 +81,7 @@ class Network:
     buses: tuple[str, ...]
     nominal_bitrate: int  # bit rate of the arbitration phase [bit/s]
     data_bitrate: int  # bit rate of the data phase [bit/s]
-    hash32: int  # CRC-32 of the DBC file, which each node sends in its heartbeat (DbcHash)
+    hash32: int  # CRC-32 of the DBC file. Each node sends this CRC in its heartbeat (DbcHash).
 
     @cached_property
     def _by_name(self) -> dict[str, Message]:
@@ -119,7 +119,7 @@ class Network:
         return tuple(m for m in self.messages if node in m.receivers)
 
     def bus_load(self) -> dict[str, float]:
-        """Return the worst-case load of each bus, 0 to 1. An event message counts as sent once per inhibit time."""
+        """Return the worst-case load of each bus, 0 to 1. An event message is assumed to be sent once per inhibit time."""
         load = dict.fromkeys(self.buses, 0.0)
         for message in self.messages:
             period = (message.cycle_ms or message.inhibit_ms) * 1e-3

@@ -19,11 +19,11 @@ SPEED: Final = 0.1
 #: Time in ACTIVE after which the crane lowers the robot [s]. The walking controller first moves the legs to the standing pose.
 #: A walk should begin with the right stance width, but on the floor friction would keep the feet where they are.
 DELAY: Final = 2.0
-#: Stiffness and damping of the sling per kg of the robot. The weight of the robot stretches the sling by 25 mm.
+#: Stiffness and damping of the sling, both per kg of the robot. The weight of the robot stretches the sling by 25 mm.
 STIFFNESS: Final = 400.0  # N/m per kg
 DAMPING: Final = 28.0  # N s/m per kg
-#: Rotational stiffness and damping of the sling, which turns the pelvis upright, per kg of the robot. The values apply while
-#: the sling carries the full weight.
+#: Rotational stiffness and damping per kg of the robot, with which the sling turns the pelvis upright.
+#: Both values apply while the sling carries the full weight.
 RIGHTING: Final = 100.0  # Nm/rad per kg
 ATTITUDE_DAMPING: Final = 1.5  # Nm s/rad per kg
 #: Slack of the sling at which lowering ends [m]. The pelvis of a walking robot rises by less, so the sling stays slack.

@@ -32,7 +32,7 @@ from atalante_hal.wire.cia402 import AUTOMATIC, Controlword, DriveState, next_st
 
 #: Timeout of the commands and of SYNC [cycles]. At a timeout, an enabled drive starts its local hold.
 WATCHDOG: Final = 5
-#: Period of two tasks [cycles]: update of the temperatures, and check whether lowered joints are at rest.
+#: Period [cycles] with which the drives update their temperatures and check whether lowered joints are at rest.
 SLOW_CYCLES: Final = 100
 #: Names of the drive nodes, in the order of JOINTS.
 NODES: Final = tuple(joint.upper() for joint in JOINTS)
@@ -52,9 +52,8 @@ class DriveParameters:
     cool_enough: float = 100.0  # highest winding temperature at which an over-temperature error can end [degC]
     supply: float = 48.0  # nominal supply voltage [V]
     hold_below: float = 40.0  # supply voltage below which a drive starts its local hold [V]
-    jump_speed: float = (
-        20.0  # highest plausible joint speed from two samples [rad/s]; a faster change is an encoder error
-    )
+    #: Highest plausible joint speed, computed from two encoder samples [rad/s]. A higher speed is an encoder error.
+    jump_speed: float = 20.0
     off_below: float = 20.0  # lowest supply voltage at which the power stage works [V]
     rest_speed: float = 0.05  # joint speed below which the controlled lowering of a leg ends [rad/s]
 
@@ -70,7 +69,7 @@ class DriveSignals(NamedTuple):
 
 
 def _within(target: Vector, limit: Vector, own_limit: Vector, wanted: Vector) -> None:
-    """Clip the target torque to the limits of HAL and drive, and write the result to `wanted`. Shape (12,) each [Nm]."""
+    """Clip the target torque to the limits of HAL and drive, and write it to `wanted`. All arrays have shape (12,) [Nm]."""
     for i in range(len(wanted)):
         most = min(limit[i], own_limit[i])
         wanted[i] = max(-most, min(target[i], most))
@@ -97,8 +96,8 @@ class Drives:
         self.parameters = parameters
         self.signals = signals
         self.state = [DriveState.SWITCH_ON_DISABLED] * len(JOINTS)
-        #: For each drive: True since the drive left OPERATION ENABLED without a command, for example for a local hold.
-        #: A latched drive ignores ENABLE_OPERATION, until the HAL sends QUICK_STOP or a controlword that changes the state.
+        #: For each drive: True after the drive has left OPERATION ENABLED without a command, for example for a local hold.
+        #: A latched drive ignores ENABLE_OPERATION until the HAL sends QUICK_STOP or a controlword that changes the state.
         self.latched = [False] * len(JOINTS)
         #: Delay of each drive from the command ENABLE_OPERATION to the state OPERATION ENABLED [cycles].
         self.enable_delay = [0] * len(JOINTS)
@@ -115,8 +114,8 @@ class Drives:
         self.encoders = Encoders(robot, parameters.velocity_bandwidth, signals.position, signals.velocity)
         self.motors = Motors(robot, parameters.motor, signals.torque, signals.temperature)
         self._slow_phase = 0
-        #: Last evaluated controlwords if this evaluation changed nothing, else empty. Equal controlwords are not
-        #: evaluated again.
+        #: Last evaluated controlwords if they changed nothing; empty otherwise.
+        #: The drives evaluate new controlwords only if they differ from `_steady`.
         self._steady = b""
         self._hold_at = np.zeros(len(JOINTS))  # setpoint of the local hold of each drive [rad]
         self._target, self._limit = np.zeros((2, len(JOINTS)))
@@ -244,7 +243,9 @@ class Drives:
         self._unsynced[leg] = 0
 
     def warn(self, leg: int, code: int) -> None:
-        """Report an error in the command of a leg as a warning of its drives. The drives do not react to a warning.
+        """Report a warning from each drive of a leg, because the command of the leg has an error.
+
+        The drives do not react to a warning.
 
         Args:
             leg: index of the leg, 0 is left.
@@ -287,7 +288,7 @@ class Drives:
         self._steady = b""
 
     def leave(self, drive: int, state: DriveState) -> None:
-        """Leave the present state without a command, for example because the power stage is locked for a moment.
+        """Change the state of a drive without a command, for example because its power stage is locked for a moment.
 
         Args:
             drive: index of the drive.
@@ -299,7 +300,7 @@ class Drives:
         self._states_changed()
 
     def reset(self, drive: int) -> None:
-        """Restart a drive in SWITCH_ON_DISABLED without errors, as after a loss of power.
+        """Restart a drive, as after a loss of power. The drive is then in SWITCH_ON_DISABLED and has no errors.
 
         Args:
             drive: index of the drive.

@@ -26,8 +26,8 @@ COMMAND_TIMEOUT: Final = 0x8250  # command timed out
 _REGISTER: Final = {0x2: 0x03, 0x3: 0x05, 0x4: 0x09, 0x7: 0x21, 0x8: 0x11}
 _GENERIC: Final = 0x01
 
-# Ages of a warning [calls of `Errors.advance`]: at the age `_ENDED` the warning ends, and at the age `_REPEATABLE` the same
-# warning may be reported again.
+# Ages of a warning [calls of `Errors.advance`]. A warning ends at the age `_ENDED`.
+# The same warning may be reported again from the age `_REPEATABLE` on.
 _ENDED, _REPEATABLE = 2, 3
 
 

@@ -183,8 +183,8 @@ class Emulator:
         self._whole = [self._tx.frames]
         #: For each leg: index of its SYNC message in the list of SYNC messages.
         self._leg_syncs = [[m.name for m in syncs].index(f"SYNC_{side.upper()}_LEG") for side in SIDES]
-        #: One answer per SYNC message. If a SYNC arrives late, the nodes send this answer. In a cycle with missing or
-        #: late frames, all answers are copied.
+        #: For each SYNC: answer that the nodes send if this SYNC arrives late.
+        #: The answers are copies from the last cycle with a missing or late frame.
         self._answered = self._shares
         batch = new_frames(_BATCH)
         self._batch = batch.view(np.uint8).data
@@ -394,7 +394,7 @@ class Emulator:
     # -- steps of one cycle ------------------------------------------------------------------------------------------
 
     def _sample_next(self) -> None:
-        """Sample the sensors for the next cycle. If `before_send` contains no function, also encode the next frames."""
+        """Sample the sensors for the next cycle. If `before_send` is empty, also encode the frames of the next cycle."""
         body = self.body
         position = body.position
         if self._node_faults is not None:

@@ -26,7 +26,9 @@ class Haptics:
         self._parameters = parameters
 
     def advance(self, level: Vector, silence: int, cycles: int) -> None:
-        """Advance the amplitudes a by a number of cycles, with the exact solution of da/dt = (level - a) / rise_time.
+        """Advance the amplitudes by a number of cycles.
+
+        An amplitude a follows the exact solution of da/dt = (level - a) / rise_time.
 
         Args:
             level: last valid command, shape (8,), 0 to 1.

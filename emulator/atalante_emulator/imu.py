@@ -22,12 +22,12 @@ class ImuParameters:
     """Noise, bias and temperature of the emulated IMUs. Noise and bias are given per axis. The sample rate is 1 kHz."""
 
     gyro_noise: float = 3.9e-3  # noise [rad/s rms]: density 0.01 deg/s/sqrt(Hz) times the square root of 500 Hz
-    gyro_bias: float = 5.2e-5  # standard deviation of the bias over all devices [rad/s], equal to 0.003 deg/s
+    gyro_bias: float = 5.2e-5  # standard deviation of the constant bias of a device [rad/s] (0.003 deg/s)
     accel_noise: float = 0.05  # noise [m/s2 rms]
-    accel_bias: float = 0.02  # standard deviation of the bias over all devices [m/s2]
+    accel_bias: float = 0.02  # standard deviation of the constant bias of a device [m/s2]
     attitude_error: float = 0.0  # slowly changing attitude error about each world axis [rad rms]
     attitude_time: float = 10.0  # time constant of the attitude error [s]
-    heading_drift: float = 0.0  # standard deviation, over all devices, of the constant heading drift [rad/s]
+    heading_drift: float = 0.0  # standard deviation of the constant heading drift of a device [rad/s]
     temperature: float = 32.0  # constant temperature of all IMUs [degC]
 
 
@@ -98,7 +98,7 @@ class AttitudeError:
             self.apply(0.0, np.tile([1.0, 0.0, 0.0, 0.0], (count, 1)))
 
     def draw(self) -> None:
-        """Draw the attitude errors at the end of the next interval."""
+        """Draw new attitude errors. They apply at the end of the interval that begins now."""
         self._slow = self._keep * self._slow + self._new * self._generator.standard_normal(self._slow.shape)
         self._heading += self._rate * self._interval
         self._last, self._next = self._next, self._slow.copy()
@@ -115,7 +115,7 @@ class AttitudeError:
 
 
 def _turn(share: float, last: Vector, following: Vector, quaternion: Vector) -> None:
-    """Turn attitudes by small rotations. The rotation vectors are interpolated linearly over an interval.
+    """Turn each attitude by a small rotation. The rotation is interpolated linearly between two rotation vectors.
 
     Args:
         share: elapsed share of the interval, 0 to 1.

@@ -40,7 +40,7 @@ class _Disturbance:
 
     def __init__(self, fault: Fault, network: Network, seed: str) -> None:
         self.fault = fault
-        # The fault `inject` becomes active one cycle before it sends its first copy, because it must first receive a frame.
+        # The fault `inject` begins one cycle early, because it needs a received frame to copy.
         self.from_cycle = fault.start - (fault.kind == "inject")
         self.messages = {message.frame_id: message for message in messages_of(fault, network)}
         self.random = random.Random(seed)
@@ -78,7 +78,7 @@ class _Disturbance:
         return self._effect(self, frame, self.messages[_id(frame)], cycle)
 
     def due(self, cycle: int) -> list[Frames]:
-        """Remove the delayed frames that are due from `late`, and return these frames, each of shape (1,).
+        """Return the delayed frames that are due, each of shape (1,), and remove them from `late`.
 
         Args:
             cycle: number of the cycle.
@@ -126,7 +126,7 @@ class _Disturbance:
         earlier = self._held.pop(message.frame_id, None)
         if earlier is not None:
             return frame, earlier
-        # Keep this frame back until the next frame was sent, but only if the fault is still active in the next cycle.
+        # Send this frame after the next frame, but only if the fault is still active in the next cycle.
         if cycle + 1 < self.fault.end:
             self._held[message.frame_id] = frame
             return ()
@@ -354,7 +354,7 @@ def _cut(frame: Frames, length: int) -> None:
 
 
 def _sealed(frame: Frames, message: Message, *, counter: int | None = None) -> Frames:
-    """Write the CRC into a frame, computed with the Data ID of the message, and return the frame.
+    """Compute the CRC of a frame with the Data ID of its message, write the CRC into the frame, and return the frame.
 
     If `counter` is given, the function also writes this alive counter. A frame that is too short for an alive counter stays
     unchanged.

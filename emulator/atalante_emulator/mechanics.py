@@ -1,4 +1,4 @@
-"""Description of the mechanics of an emulated robot, from which body, crane, wearer and virtual operator are created.
+"""Description of the mechanics of an emulated robot. It creates the body, the crane, the wearer and the virtual operator.
 
 A description can be pickled, so it can be sent to another process.
 """

@@ -1,4 +1,4 @@
-"""Twelve emulated motors, which compute the torques on the joints: current loop, friction, brake and winding temperature."""
+"""Twelve emulated motors with current loop, friction, brake and winding temperature. They compute the joint torques."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ class MotorParameters:
     current_loop: float = 0.5e-3  # time constant of the torque [s]
     dead_time: int = 0  # number of cycles until a new setpoint reaches the current loop
     ambient: float = 25.0  # ambient temperature [degC]
-    heating: float = 70.0  # temperature rise after a long time at half the torque limit [K]
+    heating: float = 70.0  # steady temperature rise at half the torque limit [K]
     thermal_time: float = 300.0  # time constant of the winding temperature [s]
 
 
@@ -33,9 +33,9 @@ _MOTORS = np.arange(len(JOINTS))
 #: Largest delay of a motor torque that the emulator supports [cycles].
 MOST_LATE = 20
 
-# Rows of the motor array, first to fourth: torque setpoint, ratio of true to measured torque, dry friction, damping.
-# Rows of the motor array, fifth to seventh: external torque, resulting joint torque, torque of the wearer's limb.
-# Eighth row of the motor array: ratio of measured torque to setpoint.
+# Rows 0 to 3 of the motor array: torque setpoint, true torque / measured torque, dry friction, damping.
+# Rows 4 to 6 of the motor array: external torque, resulting joint torque, torque of the wearer's limb.
+# Row 7 of the motor array: measured torque / setpoint.
 _WANTED, _STRENGTH, _DRY, _DAMPING, _PUSH, _JOINT, _LIMB, _GAIN = range(8)
 
 

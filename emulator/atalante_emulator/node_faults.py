@@ -199,7 +199,7 @@ class NodeFaults:
     # -- sensors -----------------------------------------------------------------------------------------------------
 
     def _measured(self, node: str) -> list[int]:
-        """Return the indices of the measured values of an IMU or a foot."""
+        """Return the signal indices of the values that an IMU or a foot measures."""
         return [
             index
             for index, (message, signal) in enumerate(self._codec.signals)
@@ -223,7 +223,7 @@ class NodeFaults:
         values[self._codec.index(f"{node}_STATE", f"{fault['cell']}_ForceZ")] = fault["force"]
 
     def _cells(self, fault: Fault, node: str) -> list[int]:
-        """Return the indices of the vertical forces that a fault affects."""
+        """Return the signal indices of the vertical forces that a fault affects."""
         cells = CELLS if fault["cell"] == ALL_CELLS else (fault["cell"],)
         return [self._codec.index(f"{node}_STATE", f"{cell}_ForceZ") for cell in cells]
 
@@ -238,7 +238,7 @@ class NodeFaults:
             values[self._codec.index(f"{node}_STATE", quantity + fault["axis"])] *= -1.0
 
     def _imu_turned(self, fault: Fault, node: str, values: Vector) -> None:
-        """Express the readings in the axes of a sensor that is turned in its mount."""
+        """Change the readings to those of a sensor that is turned in its mount."""
         indices = self._measured(node)
         quaternion, gyro, accel = np.split(values[indices], [4, 7])
         angle, axis = math.radians(fault["degrees"]), np.eye(3)["XYZ".index(fault["axis"])]

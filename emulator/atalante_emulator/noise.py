@@ -12,7 +12,7 @@ from atalante_emulator.imu import Imus
 from atalante_hal.types import PERIOD, Vector
 from atalante_hal.wire.codec import Codec
 
-#: Number of cycles for which one call of `draw` draws the noise.
+#: Number of cycles covered by one call of `draw`.
 NOISE_CYCLES: Final = 128
 
 

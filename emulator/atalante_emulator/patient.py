@@ -28,8 +28,8 @@ from atalante_hal.types import PERIOD, Vector
 Pair = tuple[float, float]
 
 _SH, _SK, _LEG = LEG_JOINTS.index("SH"), LEG_JOINTS.index("SK"), len(LEG_JOINTS)
-#: Thresholds of the load of a foot, as fractions of the weight. Before the walk, a foot with more than `_STANDING` stands.
-#: During the walk, a foot with less than `_AIR` is in the air. A foot in the air lands when its load exceeds `_LANDED`.
+#: Thresholds of the foot load, as fractions of the weight. Before the walk, a foot stands if its load exceeds `_STANDING`.
+#: During the walk, a foot is in the air when its load is below `_AIR`. It lands when its load exceeds `_LANDED`.
 _STANDING, _AIR, _LANDED = 0.25, 0.02, 0.1
 #: Time for which both feet must stand before the patient expects steps [cycles].
 _READY: Final = 500
@@ -53,11 +53,11 @@ class ActiveParameters:
     threshold: float = math.radians(1.0)
     #: Learning rate. Each step adds `learning` times `gain` times the perceived error to the learned torque of the leg.
     learning: float = 0.1
-    forgetting: float = 0.95  # f: fraction of the learned torque that remains in the next step of the same leg
-    noise: float = 0.1  # standard deviation of the torque as a fraction of the torque (signal-dependent noise)
+    forgetting: float = 0.95  # fraction of the learned torque that remains in the next step of the same leg
+    noise: float = 0.1  # standard deviation of the noise torque, as a fraction of the torque (signal-dependent noise)
     noise_time: float = 0.1  # correlation time of the noise [s]
     activation: float = 0.05  # time constant from excitation to torque [s] (Zajac, Crit. Rev. Biomed. Eng. 17, 1989)
-    #: Largest voluntary torque in the weaker direction of each joint (flexion), as a fraction of mass times gravity times height.
+    #: Largest voluntary flexion torque of each joint, divided by mass * gravity * height. Flexion is the weaker direction.
     #: Source: Anderson, Madigan, Nussbaum, J. Biomech. 40, 2007.
     strength: Pair = (0.113, 0.087)
     fraction: float = 1.0  # strength of this patient as a fraction of the strength of an able-bodied person
@@ -80,7 +80,7 @@ class ActiveTask:
 
     mass: float  # mass of the patient [kg]
     height: float  # height of the patient [m]
-    #: nominal angles of hip and knee of the swing leg in each cycle of a step, from landing to landing, shape (n + 1, 2) [rad]
+    #: nominal hip and knee angles of the swing leg in each cycle from landing to landing, shape (n + 1, 2) [rad]
     swing: Sequence[Pair]
     seed: int = 0
     parameters: ActiveParameters = ActiveParameters()

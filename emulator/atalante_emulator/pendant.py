@@ -1,4 +1,4 @@
-"""Emulated pendant node, and the emulated operator of its dead-man switch, buttons and assistance dial.
+"""Emulated pendant node, and an emulated operator who uses its dead-man switch, buttons and assistance dial.
 
 Like a real pendant, the node sends `PENDANT_STATE` and reads the HAL state from SYNC.
 """
@@ -39,7 +39,7 @@ class Operator:
     In HOLD the emulated operator does not press START. Call `start()` to end HOLD.
     """
 
-    #: Time in READY after which the operator presses START, and then presses START again [cycles].
+    #: While the HAL is in READY, the operator presses START each time this number of cycles has passed.
     REACTION = 200
 
     def __init__(self, assistance_factor: float | None = None, *, starts: bool = True) -> None:

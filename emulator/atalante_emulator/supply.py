@@ -31,7 +31,7 @@ class HoldUp:
         self._energy = 0.5 * capacity * voltage**2
 
     def draw(self, torque: Vector, speed: Vector) -> float:
-        """Draw the energy of one `PERIOD` and return the remaining voltage [V]. Braking motors return no energy.
+        """Take the energy of one `PERIOD` out of the DC link, and return its voltage [V]. Braking motors return no energy.
 
         Args:
             torque: motor torques, shape (12,) [Nm at the joint].

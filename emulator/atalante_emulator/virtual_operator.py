@@ -19,15 +19,15 @@ _log = logging.getLogger(__name__)
 
 #: Largest lean of the pelvis at which the operator exerts no force [rad]. The pelvis of a walking robot leans by less.
 DEADBAND: Final = 0.1
-STIFFNESS: Final = 2000.0  # force for each rad of lean beyond `DEADBAND` [N/rad]
-DAMPING: Final = 300.0  # force for each rad/s of the lean rate [N s/rad]
+STIFFNESS: Final = 2000.0  # force per angle by which the lean exceeds `DEADBAND` [N/rad]
+DAMPING: Final = 300.0  # force per lean rate [N s/rad]
 #: An intervention of the operator ends after this time without a force [cycles].
 _PAUSE: Final = 200
 
 
 @dataclass
 class Intervention:
-    """Interval in which the virtual operator held the robot."""
+    """Interval in which the virtual operator exerted a force."""
 
     start: int  # first cycle with a force; the first call of the operator is cycle 0
     end: int  # last cycle with a force

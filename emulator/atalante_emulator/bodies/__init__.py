@@ -101,7 +101,9 @@ class Body(Protocol):
         """
 
     def motion(self, link: str) -> Motion:
-        """Return the true pose and velocity of a link, for crane, virtual operator and tests, not for emulated nodes.
+        """Return the true pose and velocity of a link. Emulated nodes must not use these values.
+
+        The callers are the crane, the virtual operator and tests.
 
         Args:
             link: name of the link in the URDF.
@@ -150,7 +152,7 @@ def make_body(
 
 
 def hang(body: Body, position: Sequence[float], clearance: float, floor: float = 0.0) -> Pose:
-    """Place a robot with a free pelvis at rest above the floor, upright above the origin. Return the pose of the pelvis.
+    """Place the robot upright and at rest, with the pelvis above the origin. Return the pose of the pelvis.
 
     Args:
         body: robot with a free pelvis.

@@ -32,8 +32,8 @@ class Contact(NamedTuple):
     """
 
     solref: tuple[float, float] = (0.02, 1.0)  # time constant [s] and damping ratio
-    solimp: tuple[float, float] = (0.99, 0.99)  # impedance without penetration, impedance at full penetration
-    impratio: float = 1.0  # ratio of friction to normal impedance
+    solimp: tuple[float, float] = (0.99, 0.99)  # two impedances: without penetration and at full penetration
+    impratio: float = 1.0  # friction impedance divided by normal impedance
 
 
 class _Sensed(NamedTuple):
@@ -242,7 +242,7 @@ def _prepare(spec: Any, free: bool, ground: float | None, friction: float, conta
         floor.contype, floor.conaffinity = 0, 1
         shapes.append(("floor", floor))
     for _, shape in shapes:
-        shape.friction[0], shape.condim = friction, 3  # in a contact, MuJoCo uses the larger coefficient of the shapes
+        shape.friction[0], shape.condim = friction, 3  # a contact has the larger friction of its two shapes
         shape.solref, shape.solimp[:2] = contact.solref, contact.solimp
     _add_sensors(spec, ground is not None)
 

@@ -75,7 +75,7 @@ class PyBulletBody:
         Raises:
             ValueError: If the text is not a URDF, or a required joint or link is missing.
         """
-        # Each body has a new physics client, because a restored PyBullet state does not repeat a simulation exactly.
+        # Each body has a new physics client. A simulation from a restored PyBullet state would not repeat exactly.
         self._client = pybullet.connect(pybullet.DIRECT)
         client = {"physicsClientId": self._client}
         pybullet.setPhysicsEngineParameter(
@@ -152,8 +152,8 @@ class PyBulletBody:
             pybullet.changeDynamics(self._body, pad, lateralFriction=friction, **client)
 
     def _link_states(self, links: Sequence[int]) -> Any:
-        # The argument after `links` requests velocities. The next argument requests the forward kinematics. Without
-        # forward kinematics, PyBullet returns the poses of the previous time step.
+        # The first 1 requests velocities, the second 1 requests the forward kinematics.
+        # Without forward kinematics, PyBullet returns the poses of the previous time step.
         return pybullet.getLinkStates(self._body, links, 1, 1, physicsClientId=self._client)
 
     def reset(self, position: Sequence[float], base: Pose | None = None) -> None:
