@@ -132,7 +132,9 @@ class Commands:
 
 
 class StatusReport:
-    """Sender of HAL_STATUS, the heartbeat of the HAL: supervisor state, hashes of DBC, robot file and gait, worst diagnostic.
+    """Sender of HAL_STATUS, the heartbeat of the HAL.
+
+    The message contains the supervisor state, the worst diagnostic, and the hashes of the DBC, the robot file and the gait.
 
     Args:
         network: CAN network; its hash is sent as DbcHash.

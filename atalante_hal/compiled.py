@@ -35,10 +35,10 @@ Function = TypeVar("Function", bound=Callable[..., Any])
 P = ParamSpec("P")
 R = TypeVar("R")
 
-#: Name of a file that marks the cache folder of a function that creates arrays.
-#: Such a function cannot be compiled without reference counts.
+#: Name of a marker file. It is in the cache folder of each function that creates arrays.
+#: A function that creates arrays cannot be compiled without reference counts.
 _MARK = "creates-arrays"
-#: Whether each function that was given to `specialised` creates arrays.
+#: Function given to `specialised` -> whether this function creates arrays.
 _CREATES_ARRAYS: dict[Callable[..., Any], bool] = {}
 
 
@@ -93,7 +93,7 @@ def _machine_code(function: Callable[..., Any], args: tuple[Any, ...], counted: 
     """Compile a function, call it once, and return its machine code for the types of the arguments."""
     dispatcher = _compiled(function, counted)
     dispatcher(*args)
-    if len(dispatcher.overloads) == 1:  # a search by the types of the arguments takes longer
+    if len(dispatcher.overloads) == 1:  # the search by argument types below is slower
         (only,) = dispatcher.overloads.values()
         return only.entry_point
     return dispatcher.get_overload(tuple(dispatcher.typeof_pyval(arg) for arg in args))

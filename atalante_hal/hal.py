@@ -207,7 +207,7 @@ class Hal:
         return self._send_command()
 
     def hold(self) -> Vector:
-        """Send HOLD or, during a start, the next CiA 402 controlword on the path to OPERATION ENABLED.
+        """Send HOLD. During a start, send the next CiA 402 controlword on the path to OPERATION ENABLED instead.
 
         Returns:
             Torques that were sent, shape (12,) [Nm], valid until the next call.
@@ -262,7 +262,7 @@ class Hal:
         self._commands.torque[:] = self._limiter.last
 
     def fail(self, error: Exception) -> Vector:
-        """Report an exception of the controller or of its command, and send HOLD in the same cycle.
+        """Report an exception of the controller or of `write`, and send HOLD in the same cycle.
 
         While the robot walks on the ground, up to `BRIDGED_ERRORS` consecutive exceptions are bridged with the last torques, as a
         drive bridges lost commands. The safety monitor then ends the walk, because HOLD within a step would make the robot fall.
@@ -362,7 +362,7 @@ class Hal:
 
     @property
     def silent(self) -> bool:
-        """Return True as long as no node has answered a SYNC."""
+        """Return whether no node has answered a SYNC so far."""
         return bool((self._image.age >= NEVER).all())
 
     def missing(self) -> list[str]:

@@ -67,9 +67,10 @@ class Sensors:
     #: Largest mean difference [rad/s at the joint] between the reported velocity and the filtered encoder velocity.
     velocity_error: float
     velocity_bandwidth: float  # Hz, cut-off frequency of the low-pass of the reported velocity
-    #: Largest difference [rad] about each axis between the tibia attitude from the encoders and that from the IMUs.
+    #: Largest difference [rad] about each axis between two tibia attitudes: from the encoders and from the IMUs.
     attitude_error: float
-    attitude_change: float  # rad, largest change of the attitude difference while an encoder reading is constant
+    #: Largest change [rad] of the difference between encoders and IMUs while an encoder reading is constant.
+    attitude_change: float
     misalignment: float  # rad, allowance added to `attitude_change` for each rad by which the leg turns
     quaternion_error: float  # largest difference between the squared norm of a quaternion and 1
     cell_free: float  # N, largest vertical force at which a cell is regarded as unloaded
@@ -90,7 +91,7 @@ class Thresholds:
     position_tolerance: float
     #: Largest torque that a drive may report while it is off [Nm]. A drive that is on may exceed its limit by this torque.
     idle_torque: float
-    surplus_frames: float  # largest number of frames in a cycle that are not cyclic, such as status messages
+    surplus_frames: float  # largest number of frames in a cycle besides one frame of each cyclic message
 
 
 @dataclass(frozen=True)
@@ -119,7 +120,7 @@ class Robot:
 
     @property
     def top_speed(self) -> Vector:
-        """Return the speed from which the limiter permits no accelerating torque, shape (12,) [rad/s]."""
+        """Return the lowest speed at which the limiter permits no accelerating torque, shape (12,) [rad/s]."""
         return self.velocity_max + self.envelope.velocity_margin
 
     def torque_limit(self, temperature: Vector) -> Vector:

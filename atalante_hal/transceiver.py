@@ -153,7 +153,7 @@ class Transceiver:
                 self.tap.sent(batch.frames)
 
     def receive(self, count: int = 0, cycle: ReceiveImage | None = None, patience: float = 0.0) -> int:
-        """Receive frames into `scratch`, after the frames already in it, up to `RECEIVE_BUDGET` frames.
+        """Append received frames to the frames already in `scratch`, up to `RECEIVE_BUDGET` frames in total.
 
         Args:
             count: Number of frames already in `scratch`.

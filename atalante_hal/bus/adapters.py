@@ -255,7 +255,7 @@ def refusal(interface: str, *, one_process: bool = False) -> str:
     if adapter is None:
         import can
 
-        # a plug-in of python-can, about which this table has no facts; `PythonCanBus` checks its CAN FD support
+        # a python-can plug-in that is not in the table; `PythonCanBus` checks its CAN FD support
         if interface in can.VALID_INTERFACES:
             return ""
         known = ", ".join(sorted(can.VALID_INTERFACES))
@@ -271,7 +271,7 @@ def refusal(interface: str, *, one_process: bool = False) -> str:
 
 
 def reports_can_fd(interface: str) -> bool:
-    """Return whether python-can reports the protocol CAN FD for a bus that was opened for CAN FD.
+    """Return whether a CAN FD bus on this interface reports CAN FD in its attribute `protocol`.
 
     Args:
         interface: Name of the interface in python-can.

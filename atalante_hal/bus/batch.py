@@ -23,7 +23,7 @@ from atalante_hal.wire.frame import (
     as_words,
 )
 
-#: Largest number of cached arrays, and largest number of batches with cached header words.
+#: Largest number of cached arrays. Also the largest number of batches whose header words are cached.
 #: A HAL or an emulator uses about five arrays and five batches.
 REMEMBERED = 64
 CLASSIC_LENGTHS = tuple(range(9))

@@ -63,7 +63,7 @@ class JoinedBus:
         self._shares: dict[bytes, list[Share]] = {}
         #: lists of the slices `frames[i:]`, one list for each receive buffer that was used so far
         self._tails: list[list[Frames]] = []
-        #: index of the channel that is read first; changes in each call, so that no busy channel blocks the others
+        #: index of the channel that is read first; it changes in each call, so a busy channel cannot block the others
         self._turn = 0
         self._closed = False
         self._failure: BusError | None = None  # error that a channel raised in the current call of `receive`

@@ -16,8 +16,7 @@ from atalante_hal.wire.frame import Frames
 #: Longest time for which `receive` waits after an error of a lost link [s]. The next call tries the link again.
 RETRY_PERIOD = 0.1
 #: An error message is reported when it has not changed for this time [s].
-#: When an interface is removed, the first error message says that the interface is down. The next error message names
-#: the removal.
+#: A removed interface causes two messages. The first one reports that the interface is down, the second one its removal.
 SETTLE_TIME = 0.1
 
 

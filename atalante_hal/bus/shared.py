@@ -32,7 +32,7 @@ from atalante_hal.wire.frame import FRAME_BYTES, Frames
 
 #: Indices of the counters of each bus end: frames sent, frames received, calls of `step` requested, calls of `step` completed.
 _SENT, _RECEIVED, _REQUESTED, _COMPLETED = range(4)
-#: Indices of the flags of each bus end. `_SERVING` is 1 while the end serves, `_SLEEPING` is 1 while the end sleeps, and
+#: Indices of the flags of each bus end. `_SERVING` is 1 while the end serves. `_SLEEPING` is 1 while the end sleeps.
 #: `_CLOSED` is 1 after the end is closed.
 _SERVING, _SLEEPING, _CLOSED = range(4, 7)
 #: Number of 64-bit header words of each bus end: one cache line.
@@ -40,7 +40,7 @@ _END_WORDS = 8
 _HEADER_BYTES = mmap.PAGESIZE
 #: A waiting bus end polls for this time [s] before it sleeps. The time is longer than the computing time of a cycle.
 _POLL_TIME = 500e-6
-#: If polling finds no frame during a wait, the bus end sleeps without polling in this number of following waits.
+#: If a bus end finds no frame by polling, it does not poll in the next waits. This is the number of these waits.
 _WAITS_WITHOUT_POLLING = 32
 #: Longest sleep of a waiting bus end before it reads the shared memory again [ms].
 #: A sleep must be limited, because a wake-up byte may arrive before the new value in the shared memory is visible.
@@ -90,7 +90,7 @@ class SharedBus:
         self._sent = self._received = 0
         self._waits_without_polling = 0  # number of further waits in which this end does not poll
         self._closed = False
-        self._close_reason = ""  # why the other end was closed, as that end has reported
+        self._close_reason = ""  # reason for closing that the other end has sent
         self._stamps: Stamps = np.zeros(size // FRAME_BYTES, np.int64)
         self._received_at = 0
         self._batches = Batches()

@@ -193,7 +193,7 @@ class Finding:
 
     dtc: Dtc
     node: str  # DBC name of the affected node
-    value: float  # measured value, whose quantity and unit depend on the code
+    value: float  # measured value; quantity and unit depend on the code
     confirmed: bool  # whether the diagnostic is confirmed (its reaction follows) or pending (no reaction)
     text: str  # one sentence for the operator; if empty, the event shows the node name and the code's meaning
 

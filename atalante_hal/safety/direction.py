@@ -46,23 +46,23 @@ from atalante_hal.types import PERIOD, Vector
 
 #: Joints of a leg that are tested at the same time, and duration of their pulse [cycles].
 GROUPS = ((("FH", "SH"), 32), (("TH", "SA"), 16), (("SK", "HA"), 16))
-#: Delay from the command of a torque to the first position that shows its effect, if bus and motors are not late [cycles].
+#: Delay [cycles] from a torque command to the first position that shows its effect, without late frames or motors.
 LATENCY = 2
-#: Delays that are tried [cycles]: states, commands and motors may be late by three cycles in total. If they were late by
-#: four cycles, this would look like a wrong sign, because the pulse of 16 cycles changes its sign every four cycles.
+#: Delays that the test tries [cycles]. States, commands and motors may be late by three cycles in total.
+#: Four cycles would look like a wrong sign, because the pulse of 16 cycles changes its sign every four cycles.
 LATENCIES = tuple(range(LATENCY, LATENCY + 4))
 #: Peak of the pulse as a multiple of `Robot.breakaway`, in the order of LEG_JOINTS. FH and SH move a whole leg.
 PEAK = (6.0, 3.0, 6.0, 3.0, 3.0, 3.0)
-#: Stiffness and damping of the HAL's position control in the test, relative to the drive's gains, in the order of
-#: LEG_JOINTS. The HAL's position control has more delay than the position control of a drive. So the HAL's gains for
-#: light joints must be lower.
+#: Gains of the HAL's position control in the test, divided by the gains of the drive. The order is LEG_JOINTS.
+#: The position control of the HAL has more delay than that of a drive, so its gains for light joints must be lower.
 STIFFNESS = (1.0, 1.0, 1.25, 0.5, 0.25, 0.25)
 DAMPING = (0.5, 0.5, 0.6, 0.25, 0.25, 0.25)
 #: Integral time of the HAL's position control, which holds the legs during the test [s].
 INTEGRAL = 0.03
 #: Largest motion of a joint during the test [rad].
 TRAVEL = math.radians(1.5)
-#: A foot is loaded if its mean force during a test exceeds `LOAD * cell_free`, which is four times the noise of the mean.
+#: A foot is loaded if its mean force during a test exceeds `LOAD * cell_free`.
+#: `LOAD * cell_free` is four times the noise of the mean force.
 LOAD = 1.0 / 3.0
 #: A foot hit the floor if the sum of its forces in two consecutive cycles exceeds `HIT * cell_free`.
 #: `HIT * cell_free` is four times the noise of the sum. An impact that stops an ankle is at least 1.5 times as large.
@@ -72,8 +72,8 @@ BOOST = 6.0
 #: Number of unsuccessful tests of a joint after which the joint has failed.
 TRIALS = 2
 #: Smallest mobility [1/(kg m2)] that proves that a joint follows its torque, in the order of LEG_JOINTS.
-#: `MOBILITY` is about half of the smallest mobility of the suspended robot in four cases: straight or bent legs, each
-#: without a patient and with a patient of 110 kg.
+#: `MOBILITY` is about half of the smallest mobility that the joint of a suspended robot had in four cases.
+#: The cases are straight legs and bent legs, each without a patient and with a patient of 110 kg.
 MOBILITY = (0.045, 0.23, 0.075, 0.56, 4.6, 6.8)
 
 
@@ -118,7 +118,7 @@ def mobilities_of(torque: Vector, position: Vector) -> tuple[Vector, Vector]:
     for row, latency in enumerate(LATENCIES):
         response[row, latency:] = torque[:-latency] - torque[0]
     response = response.cumsum(axis=1).cumsum(axis=1) * PERIOD**2
-    # Remove the cubic polynomials of time from response and motion, because a joint may also move without a pulse.
+    # Remove the cubic trends over time from response and motion, because a joint may also move without a pulse.
     free = np.linalg.qr(np.vander(np.linspace(-1.0, 1.0, count), 4))[0]
     response -= free @ (free.T @ response)
     motion = position - position[0]
@@ -157,11 +157,11 @@ class DirectionProof:
         self.failed: list[int] = []
         self.running = False
         self._anchor, self._base, self._sign = np.zeros((3, len(JOINTS)))
-        #: Joints of each test that is still to be done, and duration of its pulse [cycles].
+        #: Tests still to be done: joints of the test, and duration of its pulse [cycles].
         self._tests: list[tuple[list[int], int]] = []
         self._trials = [0] * len(JOINTS)
-        #: Index in `LATENCIES` of the delay that the last test of more than two joints found. A test of one or two joints uses
-        #: this delay, because these joints may be faulty, and a reversed motor may look like a late motor.
+        #: Index in `LATENCIES` of the delay that the last test of more than two joints found.
+        #: A test of one or two joints does not search the delay, because a reversed motor may look like a late motor.
         self._delay = 0
         self._position: list[Vector] = []  # joint positions in each cycle of the current test
         self._force: list[Vector] = []  # vertical force of each foot in each cycle of the current test

@@ -25,7 +25,7 @@ class Event:
     text: str  # one sentence for the operator; cut to 220 bytes when packed
     severity: str = "info"  # severity of the event, one of `SEVERITIES`
     node: str = "HAL"  # DBC name of the node; cut to 32 bytes when packed
-    value: float = 0.0  # measured value, whose quantity and unit depend on the code
+    value: float = 0.0  # measured value; quantity and unit depend on the code
     count: int = 1  # number of occurrences that this event reports
 
     def __post_init__(self) -> None:

@@ -24,8 +24,8 @@ from atalante_hal.wire.process_image import NEVER, ReceiveImage
 
 #: Values of the signal NodeState (CiA 301): 0 after the node has started, 5 in normal operation.
 BOOT_UP, OPERATIONAL = 0, 5
-#: Highest `Check` result of a frame with new data. The constant is an integer, because numpy compares enum members ten
-#: times slower.
+#: Highest `Check` result of a frame with new data.
+#: The constant is an integer, because numpy compares enum members ten times slower.
 _FRESH = int(Check.SOME_LOST)
 
 
@@ -81,8 +81,7 @@ class Heartbeats:
         #: `_notices` also contains an entry with error code 0 for each frame of an error passive node.
         self._notices: list[tuple[str, Dtc, int]] = []
         self._reset: set[str] = set()  # nodes that restarted since the last `evaluate`
-        #: Counters that detect two senders of a message, by row of the process image. Each counter is between 0 and
-        #: `FULL`.
+        #: Row of the process image -> counter that detects two senders of this message, from 0 to `FULL`.
         self._evidence: defaultdict[int, int] = defaultdict(int)
         #: Nodes that sent a boot-up message. The safety monitor empties this set after each use.
         self.booted: set[str] = set()
@@ -129,7 +128,7 @@ class Heartbeats:
         return unknown
 
     def evaluate(self, cycle: int, memory: FaultMemory) -> None:
-        """Raise the diagnostics of all nodes in the fault memory."""
+        """Report the diagnostics of all nodes to the fault memory."""
         self._age(cycle)
         messages = self.image.codec.messages
         for row, why in self.image.refused:

@@ -19,7 +19,7 @@ from atalante_hal.safety.diagnostics import Dtc, Finding
 from atalante_hal.types import Vector
 from atalante_hal.wire.cia402 import DriveState
 
-#: Speed that a joint must exceed in both directions, so that a change of direction counts [rad/s].
+#: A reversal counts only if the joint exceeds this speed before and after it [rad/s].
 SPEED: Final = 0.5
 #: Longest time between two reversals of an oscillation [cycles].
 INTERVAL: Final = 100

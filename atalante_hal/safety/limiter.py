@@ -63,12 +63,11 @@ from atalante_hal.types import Vector
 _COUNT = len(JOINTS)
 #: Number of cycles after which a change of the commanded torque is visible in the measured acceleration.
 DELAY: Final = 3
-#: Smallest inertia [kg m2] that the torque of a joint accelerates while all other joints are free, in leg joint order.
+#: Smallest effective inertia [kg m2] of each joint in LEG_JOINTS while all other joints are free to move.
 #: `SMALLEST_INERTIA` is a lower bound over all poses of the empty exoskeleton, suspended or floating.
 #: The bound does not depend on the gait.
 SMALLEST_INERTIA: Final = (0.12, 0.14, 0.17, 0.11, 0.038, 0.038)
-#: Results of `limit`: 0 if all torques are unchanged, 1 if at least one torque was reduced, 2 if an input is not
-#: finite.
+#: Results of `limit`: all torques are unchanged, at least one torque was reduced, an input is not finite.
 _UNCHANGED, _CUT, _NOT_FINITE = range(3)
 
 

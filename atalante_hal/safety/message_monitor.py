@@ -44,7 +44,7 @@ from atalante_hal.wire.process_image import NEVER, ReceiveImage
 #: Result of the E2E check of a rejected message -> diagnostic that becomes pending.
 PENDING = {
     Check.REPEATED: Dtc.E2E_REPEATED,
-    Check.CONFLICT: Dtc.E2E_REPEATED,  # if the message has no second frame in the cycle; otherwise see `rivals_of`
+    Check.CONFLICT: Dtc.E2E_REPEATED,  # if the cycle has no second frame of the message, see `rivals_of`
     Check.WRONG_SEQUENCE: Dtc.E2E_SEQUENCE,
     Check.CRC: Dtc.E2E_CRC,
     Check.LENGTH: Dtc.FRAME_LENGTH,
@@ -72,17 +72,16 @@ _DISTURBANCES = {
     Check.RANGE: Dtc.SIGNAL_RANGE,
     Check.INVALID: Dtc.SIGNAL_RANGE,
 }
-#: HOLD follows when the data age of a joint in a tolerant leg reaches this multiple of the message timeout.
+#: A joint in one of `Tolerance.legs` leads to HOLD when the age of its data reaches this multiple of its timeout.
 BRIEF_TIMEOUTS = 2
 
 
 class Tolerance(NamedTuple):
-    """Tolerance of timeouts of the joints. It depends on the motion of the robot."""
+    """Legs whose joint messages may time out briefly, depending on the motion of the robot."""
 
-    legs: Collection[
-        int
-    ] = ()  # indices in SIDES of the legs in which a brief timeout leads to FINISH_STEP instead of HOLD
-    longer: int = 0  # cycles by which the timeouts of the joints of these legs are longer than in the DBC
+    #: Indices of the legs in SIDES. A brief timeout in these legs leads to FINISH_STEP instead of HOLD.
+    legs: Collection[int] = ()
+    longer: int = 0  # cycles that are added to the DBC timeouts of the joints in these legs
 
 
 NO_TOLERANCE = Tolerance()

@@ -35,8 +35,8 @@ from atalante_hal.wire.e2e import SETTLED, Check, Qualification, qualify
 from atalante_hal.wire.frame import Frames
 from atalante_hal.wire.process_image import ReceiveImage
 
-#: Maximum duration of FINISH_STEP [cycles]. The rest of a step, a stop step and the weight shift back take less time in
-#: total.
+#: Maximum duration of FINISH_STEP [cycles].
+#: It is longer than the rest of a step, a stop step and the weight shift back take together.
 FINISH_STEP_CYCLES = 6000
 
 #: If a drive does not report QUICK STOP within this time [cycles] after the command QUICK_STOP, the command was lost.
@@ -53,13 +53,13 @@ _STARTABLE = (_S.READY, _S.FULL_ASSIST, _S.HOLD, _S.LOWER, _S.FAULT)
 
 
 class Verdict(NamedTuple):
-    """Result of the evaluation of one cycle, on which the HAL acts."""
+    """Result of evaluating one cycle. The HAL sets the drive commands and the record from it."""
 
     supervisor: SupervisorState  # state of the state machine
     assistance_factor: float  # Xi in [0, 1]
     torque_limit: Vector  # (12,) Nm, torque limit of the drives in this cycle; the limiter owns the array
     diagnostics: int  # bit set of the active diagnostics, see `diagnostics.dtcs_of`
-    acknowledged: bool  # True if the operator pressed START, which acknowledges a bus-off
+    acknowledged: bool  # True if the operator pressed START and thereby acknowledged a bus-off
 
 
 class SafetyMonitor:
@@ -117,13 +117,13 @@ class SafetyMonitor:
         self.recalled = -RECALL_CYCLES
         self.proof = DirectionProof(robot)
         self._proof_begun = False  # True if the test of the joint directions has begun in the current start
-        self._stalled = 0  # number of cycles since a drive last changed its state, during a start
-        self._states_at_start = b""  # drive states in the previous cycle, during a start
+        self._stalled = 0  # number of cycles of the current start since any drive changed its state
+        self._states_at_start = b""  # drive states in the previous cycle of the current start
         self.lowered: set[str] = set()
         self._hold_stability = HoldStability()
         self.torque_tracking = TorqueTracking(robot.breakaway)
         self._oscillating: set[str] = set()  # DBC names of the drives whose joints oscillated since the last START
-        #: True if `evaluate` may skip a cycle that has new data, no fault and the same pendant and drive values as before.
+        #: True if `evaluate` may skip a cycle with new data, without a fault, and with unchanged pendant and drive values.
         self._steady = False
         self._reports: list[Finding] = []  # faults that loop and controller reported since the last `evaluate`
         self._acknowledged = False  # True if START was pressed in this cycle
@@ -163,9 +163,9 @@ class SafetyMonitor:
         return Verdict(state.supervisor, state.assistance_factor, limit, diagnostics, self._acknowledged)
 
     def _check_joints(self) -> tuple[Finding, ...]:
-        """Check the torques of the drives while the robot moves, otherwise check the joints for oscillations. Return the faults.
+        """Check the drive torques if the robot moves. Check the joints for oscillations if it does not. Return the faults.
 
-        A drive with a wrong torque loses its proof of direction. The drive of an oscillating joint is stored.
+        The next START repeats the direction test of a drive with a wrong torque. The drive of an oscillating joint is stored.
         """
         state = self._state
         if self.moving:
@@ -351,7 +351,7 @@ class SafetyMonitor:
                 )
 
     def _process_start(self, nodes_ready: bool) -> None:
-        """Process a START until the state changes, `ENABLE_CYCLES` are over, or the start is refused.
+        """Process a START until the state changes, the start is refused, or `ENABLE_CYCLES` cycles have passed.
 
         Args:
             nodes_ready: True if every required node is trusted and has sent a status message.

@@ -20,13 +20,13 @@ from atalante_hal.robot import JOINTS, Robot
 from atalante_hal.types import SupervisorState, Vector
 from atalante_hal.wire.cia402 import Controlword, DriveState, controlword_towards_operation
 
-#: Longest time after START until all drives must be in OPERATION ENABLED [cycles].
+#: All drives must be in OPERATION ENABLED within this time after START [cycles].
 ENABLE_CYCLES = 200
 #: A start ends if no drive changes its state for this time [cycles]. A command and its answer may each be lost four times.
 STALLED_CYCLES = 10
 #: Prefix of the event text for a refused START.
 REFUSED = "START refused: "
-#: If the operator ends a walk on the ground, the reason for FINISH_STEP and the reason for the next HOLD end with this text.
+#: Last words of the reason for FINISH_STEP and for the HOLD after it, if the operator ends a walk on the ground.
 WALK_ENDS = ", so the walk ends on both feet"
 _S = SupervisorState
 #: States in which START only acknowledges faults. An acknowledged fault may stay active for some cycles.
@@ -56,7 +56,7 @@ class StartRequest(NamedTuple):
     supervisor: SupervisorState  # state of the state machine
     pressed: bool  # True in the cycle in which START is pressed, False in the later cycles of this start
     cycles_left: int  # number of cycles left until all drives must be enabled
-    stalled: int  # number of cycles since a drive last changed its state
+    stalled: int  # number of cycles since any drive last changed its state
     ending: bool  # True if the program is ending
     stop_requested: bool  # True if the operator requests STOP or HOLD
     dead_man: bool  # True if the dead-man switch is pressed and the pendant has not timed out
@@ -108,7 +108,7 @@ def _reason(request: StartRequest) -> str:
 
 
 def _failure(request: StartRequest) -> str:
-    """Return why the start failed, with the drives that are not enabled. Return an empty text if the start may continue."""
+    """Return why the start failed, and name the drives that caused it. Return an empty text if the start may continue."""
     if not request.cycles_left:
         within = f"within {ENABLE_CYCLES} cycles"
     elif request.supervisor in _ENABLING and request.stalled >= STALLED_CYCLES:
@@ -119,7 +119,7 @@ def _failure(request: StartRequest) -> str:
 
 
 def _not_enabled(drive_state: Vector) -> str:
-    """Return a text that names the drives that are not enabled and hold up the start, see `words_towards_operation`.
+    """Return a text with the names and states of the drives that delay the start, see `words_towards_operation`.
 
     Args:
         drive_state: values of `DriveState`, shape (12,).
@@ -135,7 +135,7 @@ def _name(drive_state: float) -> str:
 
 
 def words_towards_operation(drive_state: Vector) -> list[Controlword]:
-    """Return the next controlword of each drive on its path to OPERATION ENABLED, so that no joint sags.
+    """Return the next controlword of each drive on the path to OPERATION ENABLED. Drives wait for others, so no joint sags.
 
     If all drives produce torque, all get ENABLE OPERATION. Until then, a drive that produces torque gets QUICK STOP and holds
     its position. A drive in SWITCHED ON waits until every other drive is in SWITCHED ON or produces torque.
@@ -176,7 +176,7 @@ def missing_text(missing: Collection[str]) -> str:
 
 
 def entry_text(state: SupervisorState, missing: Collection[str], stop_requested: bool) -> str:
-    """Return one sentence that explains why the HAL entered a state without a diagnostic.
+    """Return the reason for a change of the state that no diagnostic caused, as one sentence.
 
     Args:
         state: state that was entered.

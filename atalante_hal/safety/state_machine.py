@@ -21,11 +21,11 @@ class Conditions:
     nodes_ready: bool = False  # every required node is trusted and has sent its status
     drives_enabled: bool = False  # all twelve drives are in OPERATION ENABLED
     dead_man: bool = False  # the pendant has not timed out and its dead-man switch is pressed
-    #: the operator requested HOLD, or STOP outside a walk on the ground, or the program is ending
+    #: One of three is true: HOLD requested, STOP requested outside a walk on the ground, program ending.
     stop_requested: bool = False
     start_wanted: bool = False  # START was pressed, and this start has not ended yet
     step_finished: bool = False  # the walking step has ended, the robot does not walk, or FINISH_STEP took too long
-    #: the robot walks on the ground, and the operator requested STOP or released the dead-man, or the pendant timed out
+    #: During a walk on the ground, one of three is true: STOP requested, dead-man released, pendant timed out.
     walk_end_requested: bool = False
     #: confirmed diagnostics that lead to FINISH_STEP instead of HOLD, because the robot walks on the ground
     walk_ends: frozenset[Dtc] = frozenset()

@@ -25,7 +25,7 @@ from atalante_hal.robot import JOINTS
 from atalante_hal.safety.diagnostics import Dtc, Finding
 from atalante_hal.types import Vector
 
-#: A drive may report a sent torque up to this number of cycles later: 4 lost commands, 4 late cycles, 4 cycles for its answer.
+#: Largest time from sending a torque to its report by the drive [cycles]: 4 lost commands, 4 late cycles, 4 for the answer.
 SPAN: Final = 12
 #: Largest distance of a reported torque from the range of the sent torques, relative to the breakaway torque of the joint.
 TOLERANCE: Final = 0.2

@@ -38,7 +38,7 @@ _SESSION_END = 1.0
 
 
 class Outlets:
-    """Open sinks of the telemetry process: CAN log, recorder and publisher.
+    """Sinks of the telemetry process that are open: CAN log, recorder and publisher.
 
     The files are opened first, so that no socket is open if a file fails.
 

@@ -42,7 +42,7 @@ _READ, _LOST, _READER_PID, _KEPT = range(16, 20)
 _HEADER_BYTES = 256
 
 _WRITER_BYTE, _READER_BYTE = 0, 1  # offsets of the bytes that writer and reader lock
-#: number of attempts to lock a byte, because `_held` of the other end also locks the byte for some microseconds
+#: number of attempts to lock a byte; several are needed, because `_held` of the other end locks the byte for microseconds
 _LOCK_TRIES = 50
 
 _WAIT = 0.0002  # s, polling period
@@ -320,7 +320,7 @@ class RingReader(_Ring, Closing):
         return self._batch[intact - first : count, : self.record_size]
 
     def keep(self, records: int) -> None:
-        """Increase the number of saved records that `kept` returns.
+        """Report that more records were saved. `kept` returns the total number of saved records.
 
         Args:
             records: Number of records whose content was saved to disk since the last call.

@@ -217,7 +217,7 @@ def qualify(before: Qualification, *, good: bool, timed_out: bool = False) -> Qu
 
 
 def suspect(evidence: int, *, rival: bool) -> int:
-    """Return the counter that detects two senders of one message, as updated at the end of a cycle.
+    """Return the updated counter that detects two senders of one message.
 
     Args:
         evidence: counter after the previous cycle, 0 to `FULL`.

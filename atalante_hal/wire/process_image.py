@@ -67,8 +67,7 @@ _FOREIGN = -1
 NEVER = 1 << 30
 #: Lowest age at which an answer to a SYNC is rejected as replayed [cycles].
 LATEST = 16
-#: Half a counter period. The counter wraps around, so a frame whose counter is at least this far ahead of the expected
-#: counter is regarded as old.
+#: Half a counter period. A counter at least this far ahead of the expected counter marks an old frame.
 #: After a gap of this number of cycles, a counter does not show whether a frame is old.
 _HALF_TURN = 128
 
@@ -223,7 +222,7 @@ class ReceiveImage:
         return count >= len(self.check) and self._received_in(frames).headers.tobytes() == self._expected_headers
 
     def expected_ages(self) -> dict[int, int]:
-        """Return the age [cycles] of each message whose age is at most its DBC timeout. The keys are frame identifiers."""
+        """Return frame identifier -> age [cycles] of each message that is not older than its DBC timeout."""
         ages = zip(self.codec.messages, self.age.tolist(), strict=True)
         return {m.frame_id: age for m, age in ages if age <= m.timeout_ms}
 
@@ -483,8 +482,8 @@ def classify_frame(words: Words, row: int, offset: int, e2e: E2EState, tag: int,
             return _CONFLICT
         result = _CONFLICT
     elif tag != _NO_TAG and not back:
-        # Reject a frame that answers no recent SYNC, and a frame that answers an earlier SYNC than the last accepted frame. A
-        # rejected frame does not change the expected counter.
+        # Reject a frame that answers no recent SYNC, or that answers an earlier SYNC than the last accepted frame.
+        # A rejected frame does not change the expected counter.
         backwards = expected[row] != NOTHING and counter - expected[row] + 1 & 0xFF >= _HALF_TURN
         if not in_time or backwards:
             return _WRONG_SEQUENCE
