@@ -1,8 +1,8 @@
-"""Encoder checks, which compare each position with the previous position, its limits and the reported velocity.
+"""Encoder checks, which compare each position with its limits, with the previous position and with the reported velocity.
 
 *Jump.* Between two good values that are n cycles apart, a position changes by at most n * top_speed * period plus 3
-sigma of the encoder noise. `Robot.top_speed` is the speed from which the limiter permits no accelerating torque, so
-every motion that the limiter permits is accepted. A value with a larger change is rejected. After `JUMPS_TO_CONFIRM`
+sigma of the encoder noise. At `Robot.top_speed` and above, the limiter permits no accelerating torque, so every motion
+that the limiter permits is accepted. A value with a larger change is rejected. After `JUMPS_TO_CONFIRM`
 rejected values in a row, the loss of the encoder's reference is confirmed. The encoder is used again when its value jumps
 back to the expected position, or when its drive has restarted (see `reference`). The expected position includes the
 motion since the jump.
@@ -302,7 +302,7 @@ class EncoderChecks:
 
 
 def continues(mean: float, speed: float, top_speed: float) -> bool:
-    """Return whether a motion above the top speed is real, because it continues a fast motion.
+    """Return whether a motion above the top speed is real: the joint must already have moved fast in this direction.
 
     Args:
         mean: mean velocity since the last good position [rad/s].

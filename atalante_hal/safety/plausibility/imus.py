@@ -20,7 +20,7 @@ IMU_CYCLES = 10
 
 
 class ImuLimits(NamedTuple):
-    """Values from which the readings of an IMU must not be used."""
+    """Limits of the readings of an IMU. Readings outside these limits must not be used."""
 
     norm_error: float  # largest deviation of the squared norm of a quaternion from 1
     gyro_end: float  # smallest angular velocity at which a gyroscope is saturated [rad/s]
@@ -108,7 +108,7 @@ def usable(quaternion: Vector, gyro: Vector, accel: Vector, limits: ImuLimits) -
         quaternion: attitude of each IMU, shape (4, 4), wxyz.
         gyro: angular velocity of each IMU, shape (4, 3) [rad/s].
         accel: specific force at each IMU, shape (4, 3) [m/s2].
-        limits: values from which the readings must not be used.
+        limits: limits of the readings of an IMU.
     """
     every = True
     for imu in range(len(quaternion)):
@@ -123,7 +123,7 @@ def usable_one(quaternion: Vector, gyro: Vector, accel: Vector, limits: ImuLimit
         quaternion: attitude, shape (4,), wxyz.
         gyro: angular velocity, shape (3,) [rad/s].
         accel: specific force, shape (3,) [m/s2].
-        limits: values from which the readings must not be used.
+        limits: limits of the readings of an IMU.
     """
     if not abs(squared_norm(quaternion) - 1.0) <= limits.norm_error:
         return False

@@ -1,4 +1,4 @@
-"""Inertial checks, which compare the readings of each IMU with each other and with gravity, and torso IMU with pelvis IMU.
+"""Inertial checks of the IMUs: accelerometers against gravity, gyroscopes against attitudes, torso IMU against pelvis IMU.
 
 All IMUs are sampled about every 16 cycles, alternately in an even and an odd cycle, so a vibration of half the sampling rate of
 the IMUs has no effect. Each check compares a mean over about `SAMPLES` samples with a limit, so a single impact or a short fall
@@ -37,22 +37,23 @@ from atalante_hal.safety.plausibility.imus import ImuLimits, usable_one
 from atalante_hal.types import Vector
 from atalante_hal.wire.process_image import NEVER
 
-#: Number of samples in each mean. Until then, a mean is over all samples since the start.
+#: Number of samples in each mean. Before this number is reached, a mean is over all samples since the start.
 SAMPLES = 64
-#: Smallest number of samples after which the means of each IMU are compared with their limits. A faulty IMU of the trunk is found
-#: before READY. Bent legs sink before READY, because the drives are off, so the tibiae need more samples.
+#: For each IMU: number of samples after which its means are first compared with their limits.
+#: A few samples are enough for the trunk, so a faulty IMU of the trunk is found before READY.
+#: The tibiae need more samples, because the drives are off before READY, and bent legs sink.
 FIRST_SAMPLES = (4, 4, 16, 16)
 GRAVITY = 9.81  # m/s2
 #: Largest mean difference between specific force and gravity [m/s2]. In walks and falls of a healthy robot it is up to 2.2 m/s2.
 _FORCE_ERROR = 3.0
-#: Difference between specific force and gravity to which each sample is limited [m/s2].
+#: Each sample of the difference between specific force and gravity is clipped to this magnitude [m/s2].
 _FORCE_CLIP = 5.0
-#: Angular velocity of the attitude above which the specific force is not compared with gravity [rad/s]. When the drives are off,
-#: bent legs fall until their joints are at their end stops.
+#: If the attitude turns faster than this [rad/s], the specific force is not compared with gravity.
+#: For example, bent legs fall to their end stops when the drives are switched off.
 _MOVING_RATE = 0.5
-#: Largest root mean square of the difference of two angular velocities of an IMU that hardly turns [rad/s].
+#: Two measurements of one angular velocity may differ by this root mean square while the IMU hardly turns [rad/s].
 _RATE_ERROR = 0.1
-#: Largest mean square of the difference of two angular velocities, as a share of the mean square of the angular velocity.
+#: While the IMU turns, the mean square of the difference may be larger by this share of the mean square angular velocity.
 _RATE_SHARE = 0.25
 _TORSO, _PELVIS = IMUS.index("torso"), IMUS.index("pelvis")
 
@@ -66,36 +67,38 @@ class Readings(NamedTuple):
 
 
 class Record(NamedTuple):
-    """Last sample and mean values of each IMU, and mean values of the comparison of torso and pelvis."""
+    """Last sample of each IMU, means of each IMU, and means of the comparison of torso and pelvis."""
 
     quaternion: Vector  # (4, 4) attitude in the last sample
     gyro: Vector  # (4, 3) angular velocity in the last sample [rad/s]
     age: Cycles  # (4,) age of the last sample [cycles]; `NEVER` if it must not be used
-    #: Number of samples in each mean, at most `SAMPLES`, shape (9,): rates of each IMU, comparison, forces of each IMU.
+    #: Number of samples in each mean, at most `SAMPLES`, shape (9,).
+    #: Elements: angular velocity of each IMU (4), comparison of torso and pelvis (1), specific force of each IMU (4).
     samples: Vector
     force: Vector  # (4, 3) mean difference between specific force and gravity, in world axes [m/s2]
-    #: Mean square of the difference of angular velocities, shape (5, 3) [rad2/s2]: each IMU, torso to pelvis.
+    #: Mean square of the difference of two measurements of one angular velocity, shape (5, 3) [rad2/s2].
+    #: Rows: gyroscope and attitude of each IMU (4), torso and pelvis (1).
     rate_error: Vector
-    rate: Vector  # (5, 3) mean square of the angular velocity [rad2/s2]: each IMU, torso and pelvis
+    rate: Vector  # (5, 3) mean square of the angular velocity [rad2/s2], with the rows of `rate_error`
     tilt: Vector  # (3,) mean difference of the upward directions of torso and pelvis
 
 
 class Excess(NamedTuple):
-    """Values that exceed their limits, otherwise 0."""
+    """Values that exceed their limits. A value within its limit is replaced by 0."""
 
     force: Vector  # (4,) mean difference between specific force and gravity [m/s2]
-    rate: Vector  # (5,) root mean square of the difference of angular velocities [rad/s]
+    rate: Vector  # (5,) largest root mean square of each row of `Record.rate_error` [rad/s]
     tilt: Vector  # (1,) angle between the upward directions of torso and pelvis [rad]
 
 
 class Inertial:
-    """Checks of the IMUs against gravity, against their own attitude, and of torso against pelvis.
+    """Inertial checks of all IMUs, see the module docstring.
 
     Args:
         robot: sensor thresholds of the robot.
         now: signals decoded in this cycle.
-        limits: values from which the readings of an IMU must not be used.
-        intervals: times from each call of `evaluate` to the next one [cycles]; they repeat.
+        limits: limits of the readings of an IMU.
+        intervals: times between successive calls of `evaluate` [cycles]. The sequence of times repeats.
         period: cycle time [s].
     """
 
@@ -158,7 +161,7 @@ def follow(
         now: readings of the sample.
         record: last sample and means. Updated here.
         excess: output for the values that exceed their limits.
-        limits: values from which the readings of an IMU must not be used.
+        limits: limits of the readings of an IMU.
         period: cycle time [s].
         tilt_error: largest angle between the upward directions of torso and pelvis [rad].
 
@@ -230,7 +233,12 @@ def compare(now: Readings, record: Record) -> None:
 
 
 def count(record: Record, row: int) -> float:
-    """Count a sample of a row of `Record.samples`, and return its share in the means."""
+    """Count one sample in an element of `Record.samples`, and return the share of this sample in the means.
+
+    Args:
+        record: means. Updated here.
+        row: index of the element.
+    """
     record.samples[row] = min(record.samples[row] + 1.0, SAMPLES)
     return float(1.0 / record.samples[row])
 
@@ -271,7 +279,7 @@ def beyond(value: float, limit: float) -> float:
 
 
 def wrong_rate(record: Record, row: int) -> float:
-    """Return the largest root mean square of a difference of angular velocities that exceeds its limit [rad/s], otherwise 0."""
+    """Return the largest root mean square in a row of `Record.rate_error` [rad/s]; 0 if no axis exceeds its limit."""
     largest = 0.0
     for axis in range(3):
         error = record.rate_error[row, axis]

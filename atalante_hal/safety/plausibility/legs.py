@@ -81,11 +81,11 @@ class Legs:
         self._to_joint: Vector = robot.polarity / robot.gear
         self._attitude_error = robot.sensors.attitude_error
         self._attitude_change, self._misalignment = robot.sensors.attitude_change, robot.sensors.misalignment
-        #: Estimated heading drift between the IMUs of each leg [rad], which is subtracted from the error of the transverse hip.
+        #: Estimated heading drift between the IMUs of each leg [rad]. It is subtracted from the error of TH.
         self._heading = [0.0 for _ in SIDES]
         self._contradicts = [[0] * len(_AXES) for _ in SIDES]
         self._constant_samples = [constant_samples[hip : hip + len(_AXIS_OF)] for hip in _HIPS]
-        #: For each joint: comparison of encoders and IMUs in the last sample in which the encoder reading of this joint changed.
+        #: For each joint: comparison of encoders and IMUs when the encoder reading of this joint last changed.
         self._moved: list[_Comparison | None] = [None] * len(JOINTS)
         #: Number of consecutive samples in which the leg turned but the encoder reading was constant, by joint index.
         self._turned: dict[int, int] = {}

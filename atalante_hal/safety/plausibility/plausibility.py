@@ -34,11 +34,11 @@ from atalante_hal.wire.process_image import NEVER, ReceiveImage
 
 #: Interval of the foot checks [cycles].
 FEET = 4
-#: Interval of the standstill check, of the velocity check, and of the monitor of checks that lack data [cycles].
+#: Interval of three checks [cycles]: standstill check, velocity check, monitor `Unchecked`.
 SLOW = 16
 #: Period of the schedule of all slow checks [cycles]. Each leg, each sole and the support are checked once per period.
 _PERIOD = 32
-#: Intervals of the inertial checks, alternately [cycles].
+#: Alternating intervals of the inertial checks [cycles].
 _INERTIAL_INTERVALS = (15, 17)
 #: Largest age of values that the trunk check uses [cycles]. A message may be late by one cycle in every cycle.
 _LATE = 1

@@ -24,13 +24,12 @@ from atalante_hal.wire.process_image import NEVER
 SOLE_SAMPLES = 4
 #: Load above which a foot may be flat, as a multiple of `cell_free`.
 _LOAD = 4.0
-#: Largest offset of the centre of pressure from the middle of the cells if a foot is flat: along the foot, across the
-#: foot. The unit is the distance of a cell from the middle. In this unit, the edges of the sole are at 1.1 along the
-#: foot and at 2.0 across the foot.
+#: Largest offset of the centre of pressure of a flat foot from the middle of the cells: along the foot, across the foot.
+#: Each offset is divided by the offset of a cell from the middle. At the edges of the sole, the values are 1.1 and 2.0.
 _CENTRE = (0.8, 1.4)
 #: Outward rotation of the foot about the vertical axis of the tibia [rad].
 TOE_OUT = math.radians(8.0)
-#: Direction of the henke axis in the axes of the sole: x and z. Its length is not 1.
+#: Components x and z of a vector along the henke axis, in the axes of the sole. The length of the vector is not 1.
 HENKE_AXIS = (0.788, 0.616)
 _TIBIAE = [IMUS.index(f"{side}_tibia") for side in SIDES]
 _ANKLES = [[JOINTS.index(f"{side}_{name}") for name in ("SA", "HA")] for side in SIDES]
@@ -102,7 +101,7 @@ def stands_flat(cells: Sequence[float], loaded: float) -> bool:
 
 
 def sole_tilt(tibia: Sequence[float], sa: float, ha: float, toe_out: float) -> tuple[float, float]:
-    """Return the components of the upward direction along the axes of a sole that lie in its plane; 0 if the sole is level.
+    """Return the components of the upward direction along and across a sole. Both are 0 if the sole is level.
 
     Args:
         tibia: attitude of the tibia, quaternion wxyz, sensor to world.

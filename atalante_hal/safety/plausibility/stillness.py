@@ -51,18 +51,20 @@ FROZEN_CYCLES = 100
 _TURN = 0.01
 #: Upper bound of the inertia about any joint [kg m2], including the knee of a leg that carries robot and patient.
 _INERTIA = 100.0
-#: Number of cycles with a constant reading after which a joint is at rest, because an unbalanced torque would have moved it.
+#: A joint is at rest after this number of cycles with a constant reading. An unbalanced torque would have moved it.
 _AT_REST = 3
-#: Angle after which the encoder reading of a turning joint must have changed [rad]: 20 counts of a motor encoder.
+#: When a joint has turned by this angle [rad], its encoder reading must have changed. The angle is 20 encoder counts.
 _DRIVEN = 1e-5
 #: A joint whose distance to a position limit is below this angle [rad] is regarded as being at its end stop.
 _AT_STOP = 0.005
 _NEVER = 1 << 30
-#: Indices of the ankles in JOINTS, and for each ankle the index of its foot in FEET and of its shank IMU in IMUS.
+#: Index of each ankle joint in JOINTS.
 _ANKLES = [JOINTS.index(f"{side}_{joint}") for side in SIDES for joint in ("SA", "HA")]
+#: For each ankle joint: index of its foot in FEET.
 _FOOT_OF = [0, 0, 1, 1]
-#: For each ankle joint: index in FEET of the foot that stops the joint when the foot is on the ground; -1 for other joints.
+#: For each joint: index of its foot in FEET if the joint is an ankle, otherwise -1. A foot on the ground holds its ankles.
 _HELD_BY = tuple(_FOOT_OF[_ANKLES.index(joint)] if joint in _ANKLES else -1 for joint in range(len(JOINTS)))
+#: For each ankle joint: index in IMUS of the IMU at its shank.
 _SHANK_OF = [IMUS.index(f"{side}_tibia") for side in SIDES for _ in ("SA", "HA")]
 
 

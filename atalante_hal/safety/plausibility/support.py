@@ -27,12 +27,12 @@ from atalante_hal.safety.plausibility.finding import FOOT_NODES, Ages, Signals
 HEIGHT_CYCLES = 64
 #: The load is reported after it has been on the wrong leg for this time [cycles].
 WEIGHT_CYCLES = 128
-#: Mean length of thigh and shank [m]; both are adjusted to the patient.
+#: Mean length of a thigh or a shank [m]. The real lengths are adjusted to the patient.
 _SEGMENT = 0.4
 #: Lateral distance of the ankles while both legs are parallel [m].
 ANKLE_DISTANCE = 0.188
-#: Height above the other foot at which a foot cannot carry load [m]. In walks of eight patients, a loaded foot is at most
-#: 0.01 m above the other foot, and a swinging foot is up to 0.09 m above the other foot.
+#: A foot cannot carry load if it is above the other foot by more than this height [m].
+#: In walks of eight patients, a loaded foot is at most 0.01 m above the other foot, a swinging foot up to 0.09 m.
 _HEIGHT = 0.04
 #: If the robot leans to one side by more than this angle [rad], the load must be on the leg of this side.
 _LEAN = 0.05
@@ -123,9 +123,9 @@ def posture_of(pelvis: Sequence[float], tibiae: Sequence[Sequence[float]], knees
     length = math.hypot(left_x, left_y)
     drops, lean = [], 0.0
     for (w, x, y, z), knee in zip(tibiae, knees, strict=True):
-        # Axis z of the shank in the world, then world component z of axis z of the thigh. The thigh is the shank turned
-        # by minus the knee angle.
+        # Axis z of the shank in world axes.
         shank_x, shank_y, shank_z = 2.0 * (x * z + w * y), 2.0 * (y * z - w * x), 1.0 - 2.0 * (x * x + y * y)
+        # World component z of axis z of the thigh. The thigh is the shank turned by minus the knee angle.
         thigh_z = math.cos(knee) * shank_z - math.sin(knee) * 2.0 * (x * z - w * y)
         drops.append(_SEGMENT * (thigh_z + shank_z))
         lean += (shank_x * left_x + shank_y * left_y) / (length * len(SIDES))

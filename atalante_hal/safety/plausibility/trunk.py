@@ -32,12 +32,13 @@ TORSO_HEIGHT = 0.309
 _FILTER_TIME = 0.1
 #: Time constant of the mean values [s].
 _MEAN_TIME = 0.25
-#: Time after the start in which the filters settle, before the mean values begin [s].
+#: Time that the filters need to settle after the start [s]. The mean values begin after this time.
 _SETTLING_TIME = 0.3
-#: Least root mean square of the filtered angular velocity [rad/s]. The noise of the gyroscopes at rest is up to 0.004 rad/s rms.
+#: The check decides only above this root mean square of the filtered angular velocity [rad/s].
+#: At rest, the noise of the gyroscopes is up to 0.004 rad/s rms.
 _LEAST_RATE = 0.008
-#: Computed height, as a share of `TORSO_HEIGHT`, below whose negative value the IMUs are exchanged. In walks, pushes and falls
-#: of a healthy robot, the computed height is at least 0.6 times `TORSO_HEIGHT`.
+#: The IMUs are exchanged if the computed height is below minus this share of `TORSO_HEIGHT`.
+#: In walks, pushes and falls of a healthy robot, the computed height is at least 0.6 times `TORSO_HEIGHT`.
 _SHARE = 0.5
 _TORSO, _PELVIS = IMUS.index("torso"), IMUS.index("pelvis")
 

@@ -89,7 +89,7 @@ class Unchecked:
 
 
 def _checks(rows: Rows) -> Iterator[_SensorCheck]:
-    """Yield the checks: velocity of each joint, encoders against IMUs of each leg, torso against pelvis, cells of each foot."""
+    """Yield one check of each velocity, of each leg, of torso IMU against pelvis IMU, and of the cells of each foot."""
     joints, imus, feet = rows.joint.tolist(), rows.imu.tolist(), rows.foot.tolist()
     for joint, row in enumerate(joints):
         yield _SensorCheck(Dtc.ENC_VELOCITY, JOINT_NODES[joint], [row], f"the velocity of {JOINTS[joint]}")
