@@ -242,8 +242,9 @@ class Emulator:
             for message in codec.messages:
                 if message.name.startswith(f"{kind}_"):
                     truth[codec.index(message.name, "Temperature")] = temperature
-        amplitude = self._haptics_tx.values[self._haptics_tx.codec.slice("Amplitude")]
-        self._haptics = Haptics(parameters.haptics, amplitude)
+        #: amplitudes of the vibration motors in the order of MOTORS, shape (8,), 0 to 1
+        self.vibration: Vector = self._haptics_tx.values[self._haptics_tx.codec.slice("Amplitude")]
+        self._haptics = Haptics(parameters.haptics, self.vibration)
         self._haptics_cycles = self._haptics_tx.codec.messages[0].cycle_ms
         self._pendant = None if self.operator is None else PendantNode(self.operator, codec, truth)
 

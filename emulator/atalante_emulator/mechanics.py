@@ -84,7 +84,7 @@ class Mechanics:
             emulator: emulator with the body of `make_body`.
         """
         if self.active is not None:
-            emulator.wearer = ActivePatient(emulator.body, self.active, self.limbs)
+            emulator.wearer = ActivePatient(emulator.body, self.active, self.limbs, emulator.vibration)
         elif self.limbs is not None:
             emulator.wearer = PassiveWearer(self.limbs)
         if self.ground is not None:

@@ -22,7 +22,7 @@ import numpy as np
 
 from atalante_emulator.bodies import GRAVITY, Body
 from atalante_emulator.wearer import LimbParameters, PassiveWearer
-from atalante_hal.robot import LEG_JOINTS, SIDES
+from atalante_hal.robot import LEG_JOINTS, MOTORS, SIDES
 from atalante_hal.types import PERIOD, Vector
 
 Pair = tuple[float, float]
@@ -31,6 +31,14 @@ _SH, _SK, _LEG = LEG_JOINTS.index("SH"), LEG_JOINTS.index("SK"), len(LEG_JOINTS)
 #: Thresholds of the foot load, as fractions of the weight. Before the walk, a foot stands if its load exceeds `_STANDING`.
 #: During the walk, a foot is in the air when its load is below `_AIR`. It lands when its load exceeds `_LANDED`.
 _STANDING, _AIR, _LANDED = 0.25, 0.02, 0.1
+#: Indices in MOTORS of the motors on the front and the back of thigh and shank, per leg.
+_MOTORS = [
+    [
+        [MOTORS.index(f"{side.lower()}_{segment}_{where}") for where in ("front", "back")]
+        for segment in ("thigh", "shank")
+    ]
+    for side in SIDES
+]
 #: Time for which both feet must stand before the patient expects steps [cycles].
 _READY: Final = 500
 
@@ -61,6 +69,10 @@ class ActiveParameters:
     #: Source: Anderson, Madigan, Nussbaum, J. Biomech. 40, 2007.
     strength: Pair = (0.113, 0.087)
     fraction: float = 1.0  # strength of this patient as a fraction of the strength of an able-bodied person
+    #: Amplitude from which the patient feels a vibration motor, 0 to 1. The motors of the thigh belong to the hip, those of the
+    #: shank to the knee. While the patient feels a motor, the threshold of its joint is 0. With infinity, the patient ignores the
+    #: motors.
+    vibration: float = math.inf
 
     def __post_init__(self) -> None:
         for name in ("delay", "noise_time", "activation"):
@@ -69,6 +81,8 @@ class ActiveParameters:
         for name in ("learning", "forgetting", "noise", "fraction"):
             if not 0.0 <= getattr(self, name) <= 1.0:
                 raise ValueError(f"{name} must be from 0 to 1, got {getattr(self, name)!r}")
+        if not self.vibration > 0.0:
+            raise ValueError(f"vibration must be positive, got {self.vibration!r}")
         for name in ("gain", "damping", "strength"):
             if not all(math.isfinite(value) and value >= 0.0 for value in getattr(self, name)):
                 raise ValueError(f"{name} must be two numbers of at least 0, got {getattr(self, name)!r}")
@@ -89,7 +103,8 @@ class ActiveTask:
 class ActivePatient:
     """Legs of an active patient: the limbs of a passive wearer, and muscles at sagittal hip and knee of the swing leg.
 
-    The patient feels the joint angles and the load on the feet. When a foot lands, the step of the other leg begins.
+    The patient feels the joint angles, the load on the feet and, with `ActiveParameters.vibration`, the vibration motors.
+    When a foot lands, the step of the other leg begins.
 
     Attributes:
         muscle: Torques of the muscles in the last cycle, shape (12,) [Nm].
@@ -99,13 +114,17 @@ class ActivePatient:
         impulse: Integral of the magnitudes of the muscle torques since the start [Nm s].
     """
 
-    def __init__(self, body: Body, task: ActiveTask, limbs: LimbParameters | None = None) -> None:
+    def __init__(
+        self, body: Body, task: ActiveTask, limbs: LimbParameters | None = None, amplitude: Vector | None = None
+    ) -> None:
         """Create the patient at rest. The patient has learned nothing.
 
         Args:
             body: robot with a free pelvis on a floor.
             task: person and motion.
             limbs: impedance of the relaxed limbs. With None, the default impedance is used.
+            amplitude: amplitudes of the vibration motors in the order of MOTORS, shape (8,), 0 to 1. The array is read in each
+                cycle. With None, no motor vibrates.
         """
         parameters = task.parameters
         self._body, self._limbs, self._p = body, PassiveWearer(limbs), parameters
@@ -121,6 +140,10 @@ class ActivePatient:
         self._plan = np.zeros((cycles, 2))  # learned torque of the current step, without noise
         self._wobble = np.ones((cycles, 2))  # noise factor of the torque in the current step
         self._error, self._slope = np.zeros((cycles, 2)), np.zeros((cycles, 2))
+        self._threshold = np.full(
+            (cycles, 2), parameters.threshold
+        )  # threshold of perception in each cycle of the step
+        self._amplitude = np.zeros(len(MOTORS)) if amplitude is None else amplitude
         self._swing, self._cycle, self._ready = -1, 0, 0  # no step before the first landing
         self._air = [False] * len(SIDES)
         self._weight = body.mass * GRAVITY
@@ -178,7 +201,7 @@ class ActivePatient:
     def _learn(self, cycles: int) -> None:
         """Update the learned torque of the last swing leg from the errors in the first `cycles` cycles of its step."""
         felt = np.zeros_like(self._error)
-        felt[:cycles] = _perceived(self._error[:cycles], self._p.threshold)
+        felt[:cycles] = _perceived(self._error[:cycles], self._threshold[:cycles])
         self._learned[self._swing] *= self._p.forgetting
         self._learned[self._swing] += self._p.learning * np.array(self._p.gain) * _smooth(felt)
 
@@ -200,6 +223,8 @@ class ActivePatient:
         for k, joint in enumerate((first + _SH, first + _SK)):
             self._error[cycle, k] = self._nominal[cycle, k] - position[joint]
             self._slope[cycle, k] = self._rate[cycle, k] - velocity[joint]
+            felt_motor = self._amplitude[_MOTORS[self._swing][k]].max() >= self._p.vibration
+            self._threshold[cycle, k] = 0.0 if felt_motor else self._p.threshold
         self._cycle += 1
         past = cycle - self._delay
         wanted = []
@@ -207,15 +232,15 @@ class ActivePatient:
             goal = float(self._plan[cycle, k])
             if past >= 0:
                 error = float(self._error[past, k])
-                felt = math.copysign(max(abs(error) - self._p.threshold, 0.0), error)
+                felt = math.copysign(max(abs(error) - float(self._threshold[past, k]), 0.0), error)
                 if felt:
                     goal += self._p.gain[k] * felt + self._p.damping[k] * float(self._slope[past, k])
             wanted.append(goal * float(self._wobble[cycle, k]))
         return wanted[0], wanted[1]
 
 
-def _perceived(error: Vector, threshold: float) -> Vector:
-    """Return the part of each error that exceeds the threshold of perception, with the sign of the error."""
+def _perceived(error: Vector, threshold: Vector) -> Vector:
+    """Return the part of each error that exceeds its threshold of perception, with the sign of the error."""
     felt: Vector = np.sign(error) * np.maximum(np.abs(error) - threshold, 0.0)
     return felt
 

@@ -15,6 +15,7 @@ from atalante_emulator.mechanics import Mechanics
 from atalante_emulator.patient import ActiveParameters, ActivePatient, ActiveTask
 from atalante_emulator.wearer import LimbParameters
 from atalante_hal.bus.pair import lockstep_pair
+from atalante_hal.robot import MOTORS
 
 CYCLES = 400  # of a step
 LIMP = LimbParameters((0.0,) * 6, (0.0,) * 6, (0.0,) * 6)
@@ -42,7 +43,8 @@ class Walk:
     def __init__(self, parameters: ActiveParameters = QUIET, seed: int = 0, error: float = 0.0) -> None:
         self.floor, self.nominal = Floor(), 0.3
         task = ActiveTask(75.0, 1.75, [(self.nominal, self.nominal)] * CYCLES, seed, parameters)
-        self.patient = ActivePatient(self.floor, task, LIMP)  # type: ignore[arg-type]
+        self.amplitude = np.zeros(len(MOTORS))
+        self.patient = ActivePatient(self.floor, task, LIMP, self.amplitude)  # type: ignore[arg-type]
         self.position = np.full(12, self.nominal - error)
         self.velocity, self.torque = np.zeros(12), np.zeros(12)
         self.stand()
@@ -142,6 +144,38 @@ def test_work_is_split_by_its_sign() -> None:
     assert walk.patient.impulse == pytest.approx(1e-3 * np.abs(torque[:, [LEFT_SH, LEFT_SK]]).sum(), rel=1e-6)
 
 
+@pytest.mark.parametrize(
+    ("motor", "amplitude", "joint"),
+    [
+        ("left_thigh_front", 0.2, LEFT_SH),
+        ("left_thigh_back", 0.2, LEFT_SH),
+        ("left_shank_front", 1.0, LEFT_SK),
+        ("left_shank_back", 0.2, LEFT_SK),
+        ("left_thigh_front", 0.19, None),
+        ("right_thigh_front", 1.0, None),
+    ],
+)
+def test_vibration_shows_an_error_below_the_threshold_of_perception(
+    motor: str, amplitude: float, joint: int | None
+) -> None:
+    parameters = replace(QUIET, vibration=0.2)
+    walk = Walk(parameters, error=0.5 * QUIET.threshold)
+    assert not walk.step().any()
+    walk.step(RIGHT_IN_AIR)
+    walk.amplitude[MOTORS.index(motor)] = amplitude
+    torque = walk.step()
+    moved = [] if joint is None else [joint]
+    assert np.flatnonzero(torque.any(axis=0)).tolist() == moved
+    if joint is not None:
+        assert torque[-1, joint] > 0.0
+
+
+def test_patient_ignores_the_vibration_motors_by_default() -> None:
+    walk = Walk(error=0.5 * QUIET.threshold)
+    walk.amplitude[:] = 1.0
+    assert not walk.step().any()
+
+
 def test_equal_seeds_give_equal_torques() -> None:
     one, same, other = (Walk(ActiveParameters(), seed, error=0.2).step() for seed in (1, 1, 2))
     np.testing.assert_array_equal(one, same)
@@ -157,7 +191,15 @@ def test_noise_is_proportional_to_the_torque() -> None:
 
 @pytest.mark.parametrize(
     "change",
-    [{"delay": 0.0}, {"activation": float("nan")}, {"forgetting": 1.1}, {"fraction": -0.1}, {"gain": (1.0, -1.0)}],
+    [
+        {"delay": 0.0},
+        {"activation": float("nan")},
+        {"forgetting": 1.1},
+        {"fraction": -0.1},
+        {"gain": (1.0, -1.0)},
+        {"vibration": 0.0},
+        {"vibration": float("nan")},
+    ],
 )
 def test_parameters_out_of_range_are_rejected(change: dict[str, object]) -> None:
     with pytest.raises(ValueError, match=next(iter(change))):

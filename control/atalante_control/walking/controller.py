@@ -24,6 +24,7 @@ from atalante_control.gait.walk import WalkGaits
 from atalante_control.guide.certificate import Certificate
 from atalante_control.guide.shapes import PINCHED, GuideShape
 from atalante_control.joint.flat_foot import ankle_records, flat_feet
+from atalante_control.joint.haptics import intensity
 from atalante_control.joint.pid import LEFT, RIGHT, Pid
 from atalante_control.model import GRAVITY, ExoskeletonParameters, Patient, pinocchio_model, urdf
 from atalante_control.structured import Records, zeros
@@ -50,7 +51,7 @@ from atalante_control.walking.section import Models, Section, SectionMotion
 from atalante_control.walking.steering import Steering
 from atalante_control.walking.telemetry import TELEMETRY_FIELDS, Telemetry, WalkStatistics
 from atalante_hal.compiled import specialised
-from atalante_hal.robot import CELLS, FEET, IMUS, JOINTS, LEG_JOINTS, MOTORS, Robot
+from atalante_hal.robot import CELLS, FEET, IMUS, JOINTS, LEG_JOINTS, Robot
 from atalante_hal.types import Command, State, SupervisorState, Vector
 
 _N, _LEG = len(JOINTS), len(LEG_JOINTS)
@@ -191,7 +192,7 @@ class WalkController:
         self._settled, self._rest, self._timeout = (
             round(seconds / PERIOD) for seconds in (config.settle, config.rest, config.landing_timeout)
         )
-        self._command = Command(outputs[0].torque, np.zeros(len(MOTORS)))
+        self._command = Command(outputs[0].torque, outputs[0].vibration)
         self._table = self._section.tables[Phase.POSTURE, RIGHT]
         self._compile()
         self._forget(0)
@@ -211,6 +212,7 @@ class WalkController:
         self._assisted, self._outside, self._promised, self._exceeded = False, 0, False, False
         self._stage.assisted = self._stage.literal = self._stage.placed = False
         self._command.walking = False
+        self._command.vibration.fill(0.0)
         self._command.outside = self._command.guide_left = self._command.hand_over_exceeded = False
         self._load[:] = 0.0
         self._pid.reset()
@@ -431,6 +433,7 @@ class WalkController:
         stage, record, statistics = self._stage, self._record, self.statistics.guide
         record.assistance_factor, record.gate, record.h = 1.0, 0.0, 1.0
         record.error[:], record.q_bound[:] = 0.0, 0.0
+        self._command.vibration.fill(0.0)
         self._promised = self._exceeded = False
         if not self._assisted:
             return
@@ -443,7 +446,7 @@ class WalkController:
         self._exceeded = max(map(abs, angles)) > largest.deviation or max(map(abs, rates)) > largest.rate
         statistics.hand_overs_exceeded += self._exceeded
         statistics.factors.add(xi)
-        record.assistance_factor = xi
+        record.assistance_factor, stage.intensity = xi, intensity(xi)
 
     def _watch_guide(self, cycle: int) -> None:
         """Add a guided cycle to the statistics, and report to the HAL if the leg is outside the guide."""

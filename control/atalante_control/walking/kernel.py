@@ -17,6 +17,7 @@ from atalante_control.gait.gait import PERIOD
 from atalante_control.guide.kernel import GuideTables, leg_state, tick
 from atalante_control.guide.literal import LiteralTables, assistive_torque
 from atalante_control.joint.flat_foot import Ankle, start_level_ankle, write_level_ankle
+from atalante_control.joint.haptics import levels
 from atalante_control.joint.pid import PidRecord, control
 from atalante_control.structured import Records
 from atalante_control.walking.attitude import Attitude, observe
@@ -36,7 +37,7 @@ from atalante_control.walking.placement import (
 from atalante_control.walking.reference import PhaseTable
 from atalante_control.walking.rotation import cross, rotated, tilt_quaternion
 from atalante_control.walking.telemetry import Telemetry, write_guide, write_telemetry
-from atalante_hal.robot import JOINTS, LEG_JOINTS, SIDES
+from atalante_hal.robot import JOINTS, LEG_JOINTS, MOTORS, SIDES
 from atalante_hal.types import Vector
 
 _LEG = len(LEG_JOINTS)
@@ -76,6 +77,7 @@ class Stage:
     flat: bool  # True: the sole of the swing foot is held level
     #: True: the guide filter drives hip and knee of the swing leg. False at assistance factor 1 and outside the periodic step.
     assisted: bool
+    intensity: float  # factor of the vibration levels, see `haptics.intensity`
     #: Nm, torque of the guide filter minus torque of the baseline controller at sagittal hip and knee, in the last guided cycle
     excess: Annotated[Vector, 2]
 
@@ -130,11 +132,12 @@ class Parts(NamedTuple):
 
 
 class Outputs:
-    """Results of the second half of a cycle, `act`: desired motion and torque command."""
+    """Results of the second half of a cycle, `act`: desired motion, torque command and vibration levels."""
 
     desired: Annotated[Vector, 2 * len(JOINTS)]  # q_des [rad], then q_des' [rad/s]
     gravity: Annotated[Vector, len(JOINTS)]  # Nm, u_g
     torque: Annotated[Vector, len(JOINTS)]  # Nm, torque command u
+    vibration: Annotated[Vector, len(MOTORS)]  # levels of the vibration motors, 0 to 1
 
 
 def sense(measured: Measured, table: PhaseTable, constants: Constants, stabiliser: Stabiliser, parts: Parts) -> None:
@@ -252,7 +255,7 @@ def act(
     assistance: Assistance,
     parts: Parts,
 ) -> None:
-    """Compute the torque command of one cycle.
+    """Compute torque command and vibration levels of one cycle.
 
     Args:
         cycle: cycles since the start of the phase.
@@ -305,7 +308,7 @@ def act(
 
 
 def _assist(cycle: int, measured: Measured, assistance: Assistance, parts: Parts) -> None:
-    """Replace the torques of sagittal hip and knee of the swing leg by the torques of the guide filter.
+    """Replace the torques of SH and SK of the swing leg by the torques of the guide filter, and set the vibration levels.
 
     After the nominal end of the step, the baseline controller lowers the foot. `Stage.excess` is the difference of both
     torques in the last guided cycle. This difference is added to the torque of the baseline controller and fades out
@@ -333,8 +336,12 @@ def _assist(cycle: int, measured: Measured, assistance: Assistance, parts: Parts
             u_hip, u_knee = tick(guide, cycle, leg)
         stage.excess[0], stage.excess[1] = u_hip - torque[hip], u_knee - torque[knee]
         torque[hip], torque[knee] = u_hip, u_knee
-        write_guide(parts.telemetry, guide.guards[0], (q[hip] - desired[hip], q[knee] - desired[knee]))
-    elif cycle - last < len(assistance.fade):
+        errors = q[hip] - desired[hip], q[knee] - desired[knee]
+        bounds = write_guide(parts.telemetry, guide.guards[0], errors)
+        levels(1 - stage.stance, errors, bounds, stage.intensity, output.vibration)
+        return
+    output.vibration[:] = 0.0
+    if cycle - last < len(assistance.fade):
         torque[hip] += assistance.fade[cycle - last] * stage.excess[0]
         torque[knee] += assistance.fade[cycle - last] * stage.excess[1]
 

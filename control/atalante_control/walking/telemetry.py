@@ -92,8 +92,8 @@ def write_telemetry(
         record.max_dcm_error = max(record.max_dcm_error, math.hypot(balance.error[0], balance.error[1]))
 
 
-def write_guide(telemetry: Records[Telemetry], guard: Guard, errors: tuple[float, float]) -> None:
-    """Write the telemetry of a guided cycle.
+def write_guide(telemetry: Records[Telemetry], guard: Guard, errors: tuple[float, float]) -> tuple[float, float]:
+    """Write the telemetry of a guided cycle, and return q_bound of SH and SK [rad].
 
     Args:
         telemetry: record to write, shape (1,).
@@ -105,3 +105,4 @@ def write_guide(telemetry: Records[Telemetry], guard: Guard, errors: tuple[float
         record.error[i] = errors[i]
         record.q_bound[i] = guard.bounds[2 * i if errors[i] > 0.0 else 2 * i + 1]
     record.h, record.gate = guard.h, guard.gate
+    return record.q_bound[0], record.q_bound[1]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from dataclasses import dataclass
 
 import pytest
 
@@ -15,7 +16,8 @@ from atalante_control.walking.phases import Phase
 from atalante_control.walking.placement import PlacementConfig
 from atalante_control.walking.telemetry import TELEMETRY_FIELDS
 from atalante_emulator.bodies import hang, make_body
-from atalante_hal.types import State
+from atalante_hal.robot import MOTORS
+from atalante_hal.types import Command, State
 from tests.control.walking.ideal_robot import PATIENT, ROBOT, WALK, Ideal, walk_with
 
 
@@ -148,7 +150,53 @@ def test_swing_leg_stays_inside_the_certified_guide(xi: float) -> None:
     assert 0.02 < guide.active_fraction < 1.0
 
 
-def test_guide_does_not_act_at_full_assistance() -> None:
-    controller, _ = walked("mujoco", 1)
+@dataclass
+class Felt:
+    """Vibration of one cycle, with the values from which the controller computes it."""
+
+    guided: bool
+    swing: int
+    shares: list[float]  # e / q_bound of SH and SK
+    levels: list[float]
+
+
+class RecordingController(WalkController):
+    """Controller that records the vibration of each cycle in `felt`."""
+
+    felt: list[Felt]
+
+    def update(self, state: State) -> Command:
+        command, fields = super().update(state), {}
+        first = 0
+        for name, width in TELEMETRY_FIELDS:
+            fields[name] = self.telemetry[first : first + width].copy()
+            first += width
+        guided = self.phase is Phase.STEP and fields["elapsed"][0] <= 0.8 and state.assistance_factor < 1.0
+        shares = (fields["error"] / fields["q_bound"]).tolist() if guided else []
+        self.felt.append(Felt(guided, 1 - int(fields["stance"][0]), shares, command.vibration.tolist()))
+        return command
+
+
+def test_vibration_shows_the_tracking_errors_of_the_guided_leg() -> None:
+    controller = RecordingController(ROBOT, PATIENT, WALK, 2)
+    controller.felt = []
+    walk_with(controller, "mujoco", xi=0.5)
+    guided = [felt for felt in controller.felt if felt.guided]
+    assert {felt.swing for felt in guided} == {0, 1}
+    assert max(max(felt.levels) for felt in guided) > 0.1
+    for felt in guided:
+        expected = [0.0] * len(MOTORS)
+        for segment, share in zip(("thigh", "shank"), felt.shares, strict=True):
+            motor = f"{('left', 'right')[felt.swing]}_{segment}_{'front' if share > 0.0 else 'back'}"
+            expected[MOTORS.index(motor)] = min(1.0, abs(share) * (1.0 - math.exp(30.0 * (0.5 - 1.0))))
+        assert felt.levels == pytest.approx(expected)
+    assert not any(any(felt.levels) for felt in controller.felt if not felt.guided)
+
+
+def test_guide_and_vibration_are_off_at_full_assistance() -> None:
+    controller = RecordingController(ROBOT, PATIENT, WALK, 1)
+    controller.felt = []
+    walk_with(controller, "mujoco")
+    assert not any(any(felt.levels) for felt in controller.felt)
     assert controller.statistics.guide.cycles == 0
     assert not controller.certificates(1.0)[0].certified

@@ -54,6 +54,7 @@ class Walking:
     idealization: float
     feedforward: float
     network: Path | None  # network file of the gaits; None means the network of the package
+    haptics: bool  # whether active subjects respond to the vibration motors
 
 
 def _running(experiment: str) -> Callable[[_Command], _Command]:
@@ -85,6 +86,9 @@ def _walking() -> Callable[[_Command], _Command]:
                      help="Intensity of the feedforward. At a lower intensity, the subject must produce more of the torque that "
                           "accelerates the leg."),
         network_option,
+        click.option("--haptics", is_flag=True,
+                     help="Active subjects respond to the vibration motors: while a motor of a joint vibrates, they perceive an "
+                          "angle error of any size. Without this option, they perceive no error below one degree."),
     ]  # fmt: skip
     return options_as("walking", Walking, options)
 
@@ -329,7 +333,13 @@ def _setting(walking: Walking, running: Running, protocol: tuple[int, int, int])
     from atalante_tools.trial.plan import WalkSetting
 
     setting = WalkSetting(
-        protocol, walking.shape, walking.idealization, walking.feedforward, running.seed, running.engine
+        protocol,
+        walking.shape,
+        walking.idealization,
+        walking.feedforward,
+        running.seed,
+        running.engine,
+        haptics=walking.haptics,
     )
     if walking.network is None:
         return setting

@@ -103,6 +103,7 @@ class WalkTrial:
     heading_reference: bool = False  # whether the IMUs have a heading reference, which the controller follows
     #: path and SHA-256 of the network file of the gaits; empty for the network of the package
     network: tuple[str, ...] = ()
+    haptics: bool = False  # whether an active subject responds to the vibration motors
 
     @property
     def name(self) -> str:
@@ -194,6 +195,7 @@ class WalkSetting:
     literal: bool = False
     heading_reference: bool = False
     network: tuple[str, ...] = ()
+    haptics: bool = False
 
     def walk(self, patient: Patient, active: bool, xi: float, index: int, order: str = "") -> WalkTrial:
         """Return the trial of a subject.
@@ -208,6 +210,7 @@ class WalkSetting:
         return WalkTrial(
             patient.mass, patient.height, active, xi, self.protocol, self.shape, self.idealization, self.feedforward,
             1000 * self.seed + index, self.engine, order, self.literal, self.heading_reference, self.network,
+            self.haptics and active,
         )  # fmt: skip
 
 

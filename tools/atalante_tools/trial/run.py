@@ -33,7 +33,7 @@ from atalante_emulator.metabolism import (
     metabolic_rate,
     treadmill_rate,
 )
-from atalante_emulator.patient import ActivePatient, ActiveTask
+from atalante_emulator.patient import ActiveParameters, ActivePatient, ActiveTask
 from atalante_emulator.pendant import Operator
 from atalante_emulator.wearer import LimbParameters
 from atalante_hal.loop import LockStep, run
@@ -54,6 +54,8 @@ from atalante_tools.trial.robustness import robust_walk
 
 _SH, _LEG = LEG_JOINTS.index("SH"), len(LEG_JOINTS)
 _RIGHT: Final = 1
+#: Amplitude from which a subject who responds to the vibration motors feels a motor, 0 to 1; an assumption.
+_FELT_VIBRATION: Final = 0.1
 _SAMPLING = 20  # cycles between two samples of the motion
 #: Number of swings of the left leg that a result contains as curves.
 _CURVES: Final = 15
@@ -202,7 +204,8 @@ def _task(trial: WalkTrial, gaits: WalkGaits) -> ActiveTask | None:
     if not trial.active:
         return None
     swing = gaits.step.tables().q[:, _SH : _SH + 2].tolist()
-    return ActiveTask(trial.mass, trial.height, [(hip, knee) for hip, knee in swing], trial.seed)
+    parameters = ActiveParameters(vibration=_FELT_VIBRATION) if trial.haptics else ActiveParameters()
+    return ActiveTask(trial.mass, trial.height, [(hip, knee) for hip, knee in swing], trial.seed, parameters)
 
 
 class Motion:
