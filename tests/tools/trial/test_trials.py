@@ -110,7 +110,7 @@ def test_key_depends_on_every_parameter_and_on_the_versions(monkeypatch: pytest.
     changes: list[dict[str, Any]] = [
         {"mass": 76.0}, {"height": 1.76}, {"active": False}, {"xi": 0.4}, {"protocol": (1, 1, 3)}, {"shape": "pinched"},
         {"idealization": 0.9}, {"feedforward": 0.9}, {"seed": 1}, {"engine": "pybullet"}, {"order": "day1-01"},
-        {"literal": True}, {"heading_reference": True}, {"network": ("network.npz", "1a")},
+        {"literal": True}, {"heading_reference": True}, {"network": ("network.npz", "1a")}, {"haptics": True},
     ]  # fmt: skip
     keys = {key(trial), *(key(replace(trial, **change)) for change in changes)}
     assert len(keys) == 1 + len(changes)

@@ -202,7 +202,7 @@ def _provenance(results: Sequence[Result]) -> list[tuple[str, str]]:
     for name, meaning in (
         ("seed", "seeds"), ("engine", "engine"), ("protocol", "steps: full assistance, transition, target"),
         ("shape", "guide shape"), ("idealization", "idealization"), ("feedforward", "feedforward"),
-        ("literal", "law of the paper"), ("heading_reference", "heading reference"),
+        ("literal", "law of the paper"), ("heading_reference", "heading reference"), ("haptics", "response to vibration"),
     ):  # fmt: skip
         values = dict.fromkeys(str(r["trial"][name]) for r in results if name in r["trial"])
         if values:
