@@ -1,1 +1,1 @@
-"""Airwalk: walking while suspended in the air. Controller, its parts, compiled kernel and telemetry."""
+"""Airwalk (walking while suspended in the air): controller, its compiled kernel, and telemetry."""

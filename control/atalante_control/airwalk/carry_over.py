@@ -30,12 +30,12 @@ class CarryOver:
 
     Attributes:
         records: record that `add_carried` reads and updates, shape (1,).
-        blend: fraction of the torque jump that is still compensated in each cycle since the stance change. It falls from 1
-            towards 0, shape (n,).
+        blend: fraction of the torque jump that is still compensated, one value per cycle since the stance change, shape (n,).
+            The fraction falls from 1 towards 0.
     """
 
     def __init__(self, duration: float) -> None:
-        """Compute the factors with which the compensation of the torque jump fades out.
+        """Compute `blend`, the fading of the compensation, and create the record of the state.
 
         Args:
             duration: time in which the compensation of the torque jump fades out [s]. With 0, the jump is not compensated.

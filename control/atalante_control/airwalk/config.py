@@ -18,8 +18,8 @@ class AirwalkConfig(StepGuideConfig):
         ValueError: If a parameter is out of range.
     """
 
-    #: True: the torques of the assisted joints and of the baseline controller follow the paper literally, see `guide.literal`.
-    #: With `literal_law`, no guide is certified for a disturbance torque.
+    #: Whether the assisted joints and the baseline controller follow the paper literally, see `guide.literal`.
+    #: If true, no guide is certified for a disturbance torque.
     literal_law: bool = False
     gains: PidGains = AIR_GAINS
     alpha: float = 0.4  # end of the re-centring, as a fraction of the step duration

@@ -64,7 +64,7 @@ class AirwalkController:
     """Airwalk controller, which implements `atalante_hal.types.Controller`.
 
     Attributes:
-        reference: desired trajectories of both steps.
+        reference: desired trajectories of the left-stance and the right-stance step.
         pid: PIDs of the baseline controller.
         guide: virtual guide filter of the current step, one of `guides`.
         statistics: statistics of the guide since `reset`.
@@ -173,7 +173,7 @@ class AirwalkController:
         return self.choice(xi).guide
 
     def prepare(self) -> None:
-        """Compute the guides of all assistance factors, see `StepGuides.prepare`. Call this before a walk on the wall clock."""
+        """Compute the guides for all assistance factors, see `StepGuides.prepare`. Call this before a walk on the wall clock."""
         if not self.config.literal_law:
             self._guides.prepare()
 
@@ -189,7 +189,7 @@ class AirwalkController:
 
     @property
     def blend(self) -> Vector:
-        """Return the fraction of the torque jump that is still compensated in each cycle since the stance change, shape (n,)."""
+        """Return the compensated fraction of the torque jump for each cycle since the stance change, shape (n,)."""
         return self._carry.blend
 
     def certificate(self, xi: float) -> Certificate:
@@ -216,7 +216,7 @@ class AirwalkController:
             self.pid.store_request(state.torque_sent)
 
     def _forget(self) -> None:
-        """Reset all values of the last motion."""
+        """Clear all data of the last motion."""
         self._walking, self._assisting, self._stance, self._changed_at = False, False, RIGHT, 0
         self._carry.cancel()
         self.pid.reset()

@@ -74,7 +74,7 @@ def run(
         parts: arrays of the other parts; updated, and the results are written to `outputs` and `telemetry`.
 
     Returns:
-        The larger |e| / q_bound of SH and SK, h, and whether the filter is active.
+        Three values: the larger of the ratios |e| / q_bound of SH and SK, then h, then whether the guide filter is active.
     """
     step, outputs = parts.steps[0], parts.outputs[0]
     q, qd, attitudes, gyros, sent = measured

@@ -20,7 +20,7 @@ _N, _LEG, _SA = len(JOINTS), len(LEG_JOINTS), LEG_JOINTS.index("SA")
 
 
 class Deviation(NamedTuple):
-    """Deviation of the measured angles and speeds from the nominal values at the start of a step."""
+    """Deviation at the start of a step: measured angles and speeds minus nominal angles and speeds."""
 
     angle: Vector  # (12,) rad, s(0) = q - q_nom
     rate: Vector  # (12,) rad/s, s'(0) = q' - q_nom'
@@ -30,7 +30,7 @@ class GaitReference:
     """Desired trajectory of right-stance and left-stance steps, sampled at every cycle.
 
     Attributes:
-        nominal: rows (q_nom, q_nom') of the step with stance leg LEFT (0) and RIGHT (1), each of shape (n + 1, 24).
+        nominal: stance leg (LEFT or RIGHT) -> rows (q_nom, q_nom') of the step, shape (n + 1, 24).
     """
 
     def __init__(self, gait: Gait, deadbeat: Deadbeat, ankle_offset: float) -> None:
@@ -51,12 +51,13 @@ class GaitReference:
         time: Vector = np.arange(gait.cycles + 1, dtype=np.float64) * PERIOD
         (c0, c1), (c0d, c1d), _ = deadbeat.basis(time)
         end = self._end = int(np.searchsorted(time, deadbeat.end))
-        #: Re-centring (s, s') of each cycle: element 0 for s(0) = 1 rad, element 1 for s'(0) = 1 rad/s.
+        #: Unit responses of the re-centring, rows (s, s') of each cycle. Element 0 is for s(0) = 1 rad and s'(0) = 0.
+        #: Element 1 is for s(0) = 0 and s'(0) = 1 rad/s.
         self._basis = np.zeros((2, end, 2 * _N))
         self._basis[0, :, :_N], self._basis[0, :, _N:] = c0[:end, None], c0d[:end, None]
         self._basis[1, :, :_N], self._basis[1, :, _N:] = c1[:end, None], c1d[:end, None]
         self._added = np.zeros_like(self._basis)
-        # `_angles` contains s(0) twice, for the added angles s and the added speeds s'. `_rates` contains s'(0) twice.
+        # A row has 12 angles s, then 12 speeds s'. `_angles` therefore contains s(0) twice, and `_rates` contains s'(0) twice.
         self._angles, self._rates = np.zeros(2 * _N), np.zeros(2 * _N)
 
     def start_step(self, stance: int, position: Vector, velocity: Vector) -> Deviation:

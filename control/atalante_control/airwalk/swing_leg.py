@@ -13,21 +13,23 @@ from atalante_control.joint.idealization import AssistedInertia
 from atalante_hal.robot import LEG_JOINTS
 
 _SH, _SK = LEG_JOINTS.index("SH"), LEG_JOINTS.index("SK")
-#: The predictions of the guides cover this number of cycles of the next step.
+#: Number of cycles of the next step in the predictions of the guides.
 OVERLAP = 100
 
 
 def swing_leg(
     config: AirwalkConfig, gait: Gait, inertia: AssistedInertia, gravity: Gravity, overlap: int = OVERLAP
 ) -> Leg:
-    """Return the swing leg along its nominal trajectory, during a step and during the first cycles of the next step.
+    """Return the data of the swing leg for the guides, along its nominal trajectory.
+
+    The data cover one step and the first cycles of the next step, in which the same leg is the stance leg.
 
     Args:
         config: parameters of the controller; only `alpha` and `friction` are used.
         gait: right-stance step that repeats.
         inertia: mass matrix of SH and SK.
         gravity: gravity of the exoskeleton.
-        overlap: number of cycles of the next step.
+        overlap: number of cycles of the next step to include.
     """
     cycles = gait.cycles
     this = motion(gait.coefficients, gait.duration, np.arange(cycles + 1) / cycles)

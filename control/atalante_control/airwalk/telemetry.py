@@ -58,7 +58,7 @@ class AirwalkStatistics(GuideStatistics):
     steps: int = 0  # number of completed right-stance steps
 
     def count(self, cycle: int, ratio: float, h: float, acting: bool) -> None:
-        """Add one cycle to the statistics if a right-stance step has been completed, see `GuideStatistics.count`."""
+        """Add one cycle to the statistics if at least one right-stance step is completed, see `GuideStatistics.count`."""
         if self.steps:
             super().count(cycle, ratio, h, acting)
 
@@ -77,8 +77,8 @@ def write_telemetry(
         errors: q - q_des of SH and SK of the swing leg [rad].
 
     Returns:
-        Distances of SH and SK to the bound on the side of the error [rad], the larger |e| / q_bound, and whether the filter is
-        active.
+        Three values: the q_bound [rad] of SH and SK, then the larger of their ratios |e| / q_bound, then whether the guide filter
+        is active.
     """
     record, active = telemetry[0], guard.gate > step.active
     for i in range(len(record.q_des)):

@@ -1,1 +1,1 @@
-"""Dynamics of the exoskeleton on the ground and suspended in the air, its gravity torques, and the gait network."""
+"""Inverse dynamics on the ground and in the air, gravity torques of the suspended exoskeleton, and gait network."""

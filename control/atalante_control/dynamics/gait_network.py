@@ -28,7 +28,7 @@ from atalante_hal.types import Vector
 
 FORMAT = "atalante-gait-network/3"
 DEFAULT_NETWORK = Path(__file__).parents[1] / "gaits" / "network.npz"
-#: Inputs of the network in their order: name -> unit. The lengths of thigh and shank are relative to Winter's table.
+#: Inputs of the network in their order: name -> unit. `thigh` and `shank` are lengths divided by the lengths in Winter's table.
 INPUTS = {"mass": "kg", "height": "m", "step_length": "m", "step_duration": "s", "thigh": "", "shank": ""}
 LEG_SEGMENTS = ("thigh", "shank")  # body segments whose length is an input
 OUTPUTS = len(JOINTS) * (DEGREE + 1)
@@ -107,7 +107,7 @@ class GaitNetwork:
         """Raise `NetworkError` if a patient is outside the range for which the network was fitted.
 
         Args:
-            patient: patient of any step.
+            patient: patient to check, with any step.
 
         Raises:
             NetworkError: If a parameter is out of range, as in `check`.

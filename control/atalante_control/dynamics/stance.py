@@ -43,7 +43,7 @@ class GroundForces(NamedTuple):
 
 
 class StanceDynamics:
-    """Inverse dynamics of the exoskeleton, empty or with a patient, standing on its right foot."""
+    """Inverse dynamics of an exoskeleton (empty or with a patient) that stands on its right foot."""
 
     def __init__(self, urdf_text: str, empty: str) -> None:
         """Build the Pinocchio models with floating and with fixed pelvis, and the gravity model of the empty exoskeleton.
@@ -61,7 +61,8 @@ class StanceDynamics:
         self._foot, self._swing_foot = (self._fixed.model.getFrameId(name) for name in (STANCE_FOOT, SWING_FOOT))
         pinocchio.forwardKinematics(self._fixed.model, self._data[1], pinocchio.neutral(self._fixed.model))
         pinocchio.updateFramePlacement(self._fixed.model, self._data[1], self._foot)
-        #: Rotation from stance foot to pelvis with all joints at zero; the pelvis then faces the walking direction.
+        #: Toe-out: rotation from stance foot to pelvis at the zero pose. The stance foot has this rotation in the world, so the
+        #: pelvis faces the walking direction at the zero pose.
         self._toe_out = self._data[1].oMf[self._foot].rotation.copy()
 
     def forces(self, position: Vector, velocity: Vector, acceleration: Vector) -> GroundForces:
@@ -144,7 +145,7 @@ class StanceDynamics:
 
 
 def stance_dynamics(robot: Robot, patient: Patient | None = None) -> StanceDynamics:
-    """Build the inverse dynamics for a robot and its patient.
+    """Build the inverse dynamics of an exoskeleton that stands on its right foot, empty or with a patient.
 
     Args:
         robot: limits of the joints.

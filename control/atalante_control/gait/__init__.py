@@ -1,1 +1,1 @@
-"""Gaits, the subjects of the gaits, and the re-centring of the joint trajectories at a stance change."""
+"""Gaits, subjects (patient and step parameters), and re-centring of the joint trajectories at a stance change."""

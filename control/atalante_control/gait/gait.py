@@ -33,7 +33,7 @@ SIGN = np.array(MIRROR_SIGN * len(SIDES), dtype=np.float64)
 
 POSITION_JUMP = math.radians(0.1)  # rad, largest accepted jump of a joint angle between two motions
 VELOCITY_JUMP = 0.05  # rad/s, largest accepted jump of a joint speed between two motions
-DURATION_RANGE = (0.3, 3.0)  # s, shortest and longest step
+DURATION_RANGE = (0.3, 3.0)  # s, shortest and longest duration of a step
 ROUNDING = 1e-9  # rad, rad/s or Nm, tolerance for rounding errors in the limit checks
 
 _REQUIRED = ("format", "name", "duration", "joints")
@@ -459,7 +459,7 @@ def _turning_points(gait: Gait) -> Vector:
 
 
 def _check_duration(value: Any, where: str) -> float:
-    """Check that a duration [s] is a whole number of cycles within `DURATION_RANGE`, and return it."""
+    """Check that a duration [s] is in `DURATION_RANGE` and is a whole number of cycles, and return the duration."""
     low, high = DURATION_RANGE
     if not (_is_number(value) and low <= value <= high):
         raise GaitError(f"{where}: duration must be a number from {low} to {high} [s], got {value!r}")
@@ -484,7 +484,7 @@ def _control_points(where: str, key: str, table: Any) -> Vector:
 
 
 def _is_number(value: Any) -> bool:
-    # math.isfinite raises an exception for a very large integer. The comparison with the largest float does not.
+    # For a very large integer, math.isfinite raises an exception, but a comparison with the largest float is possible.
     return type(value) in (int, float) and abs(value) <= sys.float_info.max
 
 

@@ -39,7 +39,7 @@ class Deadbeat:
 
     @property
     def end(self) -> float:
-        """Return the time alpha T after the stance change at which the re-centring ends [s]."""
+        """Return alpha T [s], the time from the stance change to the end of the re-centring."""
         return self.alpha * self.duration
 
     def polynomials(self) -> Vector:

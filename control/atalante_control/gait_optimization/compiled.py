@@ -21,13 +21,13 @@ from atalante_control.gait_optimization.nlp import Functions
 COMPILER = "gcc"
 #: Compiler options. With -O0, 60,000 C statements compile in 13 s and run 4 times as fast as in CasADi's interpreter.
 #: With -O1, the same statements compile in 95 s and run twice as fast as with -O0, but the time of the solver is only
-#: 10 % shorter. Fused multiply-adds are disabled, because their rounding differs from the interpreter.
+#: 10 % shorter. Fused multiply-adds are disabled, because their rounding differs from the rounding in the interpreter.
 OPTIONS = ("-O0", "-fPIC", "-shared", "-ffp-contract=off")
 CACHE_VARIABLE = "ATALANTE_CACHE"
 
 
 def cache_directory() -> Path:
-    """Return the directory of the compiled functions: $ATALANTE_CACHE if set, else a folder in the cache of the user."""
+    """Return the directory of the compiled functions: $ATALANTE_CACHE if set, else a folder in the user's cache."""
     if given := os.environ.get(CACHE_VARIABLE):
         return Path(given)
     return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "atalante"

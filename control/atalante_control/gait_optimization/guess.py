@@ -16,7 +16,7 @@ from atalante_hal.robot import JOINTS
 from atalante_hal.types import Vector
 
 _BEND = 0.96  # height of the pelvis above the ankle, as a fraction of the length of the straight leg
-_WIDTH = 0.20  # m, lateral distance of the ankles
+_WIDTH = 0.20  # m, lateral distance between the ankles
 _SWAY = 0.03  # m, largest lateral displacement of the pelvis towards the stance foot
 _LIFT = 0.06  # m, largest height of the swing foot
 _CROUCH = {"SH": -0.25, "SK": 0.5, "SA": -0.2}  # rad, start pose of the inverse kinematics; all other joints are at 0

@@ -1,4 +1,4 @@
-"""Library of gaits, solved in parallel, one per subject on a grid. An interrupted computation can be resumed.
+"""Library of gaits, one gait for each subject of a grid. The gaits are solved in parallel, and the computation can be resumed.
 
 `Grid, solve -> one file for each gait`. `atalante_control.gait_optimization.fit` reads the files. The gait of another
 patient is never the initial guess. A gait therefore depends only on the parameters of its own subject. Other gaits, the
@@ -34,7 +34,7 @@ from atalante_control.gait_optimization.verify import Verifier
 from atalante_hal.robot import Robot, load_robot
 
 FORMAT = "atalante-library/2"
-_ROOT_ITERATIONS = 60  # number of fixed-point iterations; the root of the sequence is then exact except for rounding
+_ROOT_ITERATIONS = 60  # number of iterations in the computation of the root g, see `Grid.points`
 LEVELS_MIN = 3  # smallest number of grid levels of a parameter; a network fitted to 2 levels has an error of 10 degrees
 
 Index = tuple[int, ...]
@@ -110,8 +110,8 @@ class Grid:
         shape = np.array(self.shape)
         if math.prod(self.shape) <= self.size:
             return list(product(*map(range, self.shape)))
-        # Additive recurrence: its constants are powers of the root g of g^(d + 1) = g + 1. For d = 1, g is the golden
-        # ratio.
+        # The points are an additive recurrence sequence with the increments g^-1, g^-2, ..., g^-d. Here d is the number of
+        # parameters, and g is the root of g^(d + 1) = g + 1. For d = 1, g is the golden ratio.
         root = 2.0
         for _ in range(_ROOT_ITERATIONS):
             root = (1.0 + root) ** (1.0 / (len(shape) + 1))
@@ -201,7 +201,7 @@ class Library:
         return gaits
 
     def rejected(self) -> dict[Index, str]:
-        """Return why gait files do not count as solved, by grid point. `generate` solves these gaits again."""
+        """Return grid point -> reason for each file that does not count as a solved gait. `generate` solves these gaits again."""
         return self._read()[1]
 
     def failures(self) -> dict[Index, str]:

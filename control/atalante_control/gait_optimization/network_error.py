@@ -34,7 +34,7 @@ class Deviation(NamedTuple):
 
 
 class Finding(NamedTuple):
-    """One error with its limit, a line of the report."""
+    """Line of the report: one error with its limit."""
 
     name: str
     value: float

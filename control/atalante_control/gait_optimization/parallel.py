@@ -18,8 +18,8 @@ _Task = TypeVar("_Task")
 _Result = TypeVar("_Result")
 #: Timeout of the connection to a dask scheduler.
 _CONNECT_TIMEOUT: Final = "10s"
-#: After this many unexpected ends of a process, each further call gets processes of its own. A call that crashes its
-#: process then loses only its own result.
+#: Number of unexpected ends of a process after which the calls run one at a time. A call that crashes its process then
+#: loses only its own result.
 _SHARED_LOSSES: Final = 3
 _REMEDY: Final = "repeat the command, if necessary with fewer --jobs"
 _LOKY_THREAD: Final = "ExecutorManagerThread"
@@ -119,7 +119,7 @@ def _numbered(call: Callable[[_Task], _Result], number: int, task: _Task) -> tup
 
 @contextmanager
 def _without_ctrl_c() -> Iterator[None]:
-    """Ignore Ctrl-C inside the `with` block. Child processes started inside the block ignore it too.
+    """Ignore Ctrl-C inside the `with` block. Child processes that start inside the block ignore Ctrl-C too.
 
     The parent process ends the child processes. The signal is ignored and not blocked, because the resource tracker of
     joblib unblocks the signal for later processes.

@@ -1,4 +1,4 @@
-"""Check before the optimisation that a landing pose exists: `problem, subject -> None, or reason why no pose exists`.
+"""Check that a landing pose exists, before the optimisation starts: `problem, subject -> None, or reason why no pose exists`.
 
 The search finds a pose with both feet flat on the ground, one step length apart. In the search the joint limits are
 soft. If a joint must leave its range, the joint with the largest violation is reported as the reason why there is no
@@ -17,8 +17,8 @@ from atalante_control.gait_optimization.step_problem import StepProblem
 from atalante_hal.robot import JOINTS
 from atalante_hal.types import Vector
 
-#: Accepted violation of a joint range [rad]. The optimiser can find a valid pose near a pose that
-#: violates the range by less.
+#: Accepted violation of a joint range [rad]. If a pose violates the range by less, the optimiser can find a valid pose
+#: close to this pose.
 _TOLERANCE = math.radians(0.5)
 _CENTRE_WEIGHT = 1e-6  # weight of the distance from the middle of a joint range; violations of the range have weight 1
 _OPTIONS: dict[str, Any] = {"ipopt.print_level": 0, "ipopt.sb": "yes", "print_time": False, "error_on_fail": False}

@@ -42,8 +42,8 @@ class Requirements:
     #: The fit error of the gait network adds to this jump. The sum must stay below VELOCITY_JUMP.
     impact_jump: float = 0.6 * VELOCITY_JUMP
     sinking: float = 0.01  # m/s, largest downward speed of the rear foot after the impact
-    # The cost is the sum of squared torques [(100 Nm)^2] plus three sums of squares with the weights below. Without the
-    # weights of tilt and pressure, similar subjects get very different swing motions.
-    acceleration_weight: float = 3e-3  # weight of the squared joint accelerations [(rad/s2)^2]
-    tilt_weight: float = 5.0  # weight of the squared tilt of the swing sole [rad^2]
-    pressure_weight: float = 20.0  # weight of the squared ground moment about the sole centre [(1500 Nm)^2]
+    # The cost is the sum of (joint torque / 100 Nm)^2 plus three weighted sums of squares. Without the sums for tilt and
+    # pressure, similar subjects get very different swing motions.
+    acceleration_weight: float = 3e-3  # weight of the squared joint accelerations in rad/s2
+    tilt_weight: float = 5.0  # weight of the squared tilt of the swing sole in rad
+    pressure_weight: float = 20.0  # weight of (horizontal ground moment about the sole centre / 1500 Nm)^2

@@ -25,7 +25,8 @@ from atalante_hal.robot import JOINTS, load_robot
 from atalante_hal.types import Vector
 
 MODERATE: Final = (0.15, 0.9)  # m and s, step length and step duration of the gait for the second start
-#: A joint is at a limit if its margin is less than this fraction of the limit, or of the range of a position.
+#: A joint is at a limit if the distance to the limit is below this fraction of a reference value. For angles the reference
+#: value is the joint range. For speeds and torques it is the limit.
 _AT_LIMIT: Final = 1e-3
 
 #: Function that solves a gait. Its second argument is the gait for a warm start, or None for the usual initial guess.
@@ -33,7 +34,7 @@ Attempt = Callable[[Subject, Gait | None], SolvedGait]
 
 
 def solve_with_second_start(subject: Subject, attempt: Attempt) -> SolvedGait:
-    """Solve a gait. If the optimiser fails, solve it again from the gait of the same patient with a moderate step.
+    """Solve a gait. If the optimiser fails, start it again from the gait of the same patient with a moderate step.
 
     If the patient has no landing pose for the step length, the optimiser does not start, and there is no second start.
 

@@ -32,7 +32,7 @@ Symbol = Any  # casadi.SX
 TRANSITION = 1.2  # s, duration of start and stop steps
 
 _N = len(JOINTS)
-_POINTS = _N * (DEGREE + 1)  # number of control points; they are the first unknowns, sorted by joint
+_POINTS = _N * (DEGREE + 1)  # number of control points; the control points are the first unknowns, sorted by joint
 _NODE = 4 * _N + 6  # number of unknowns of a node: q, dq/ds, d2q/ds2, torque, ground force, ground moment
 _TORQUE, _FORCE, _MOMENT = 100.0, 1500.0, 1500.0  # scales of joint torque [Nm], ground force [N], ground moment [Nm]
 _BOUND_UNITS = {
@@ -437,7 +437,7 @@ def _outside(values: Vector, bounds: tuple[Vector, Vector]) -> Vector:
 
 
 def _stacked(vectors: list[Symbol], components: slice) -> Symbol:
-    """Return some components of several vectors, one vector after the other."""
+    """Return the same components of several vectors in one column, one vector after the other."""
     return casadi.vertcat(*(vector[components] for vector in vectors))
 
 

@@ -1,4 +1,4 @@
-"""Symbolic kinematics and inverse dynamics of the robot standing on its right foot, in CasADi.
+"""Kinematics and inverse dynamics of the robot standing on its right foot, as CasADi expressions.
 
 `links of the model -> bodies -> Chain (topology, masses and lengths as parameters) -> expressions for the program`. The
 root of the model is the pelvis, but the right foot is at rest. The recursion therefore starts at the right foot. It
@@ -25,7 +25,7 @@ Symbol = Any  # casadi.SX
 
 _LEFT, _RIGHT = SIDES
 STANCE_FOOT, SWING_FOOT = f"{_RIGHT}_{LEG_LINKS['HA']}", f"{_LEFT}_{LEG_LINKS['HA']}"
-_NUMBERS = 13  # parameters per body: mass, first moment (3), inertia about the origin (6), joint origin (3)
+_NUMBERS = 13  # number of parameters per body: mass, first moment (3), inertia about the origin (6), joint origin (3)
 
 
 @dataclass(frozen=True)

@@ -298,7 +298,7 @@ class Verifier:
         return np.asarray(configuration)
 
     def _standing(self, q: Vector, qd: Vector) -> tuple[Vector, Vector, Vector]:
-        """Return configuration and speed of the floating robot with its right foot at rest, and the foot's Jacobian."""
+        """Return configuration, speed, and Jacobian of the right foot, for the floating robot with its right foot at rest."""
         model, joints = self._articulated.model, self._articulated.v
         configuration, speed = self._on_right_foot(q), np.zeros(model.nv)
         speed[joints] = qd

@@ -1,4 +1,4 @@
-"""Start and stop step around a periodic gait: `subject, periodic gait -> WalkGaits`."""
+"""Start step and stop step for a periodic gait: `subject, periodic gait -> WalkGaits`."""
 
 from __future__ import annotations
 

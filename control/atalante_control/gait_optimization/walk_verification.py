@@ -1,4 +1,4 @@
-"""Verification of a walk before it is walked: `start step, periodic step, stop step, patient -> error or nothing`.
+"""Verification of a walk before the robot executes it: `start step, periodic step, stop step, patient -> error or nothing`.
 
 The checks and their limits are the same as for the gaits of the network. The checks need no optimiser.
 """

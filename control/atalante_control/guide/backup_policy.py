@@ -88,7 +88,7 @@ class BackupPolicy:
 
     stiffness: Pair  # Nm/rad, k of SH and SK
     damping: Pair  # damping ratios of the two coupled modes of motion, the slower mode first
-    #: kg m2, mass matrix elements M11, M12 and M22 at the reference knee angle. There the joint stiffness equals `stiffness`.
+    #: kg m2, mass matrix elements M11, M12 and M22 at the reference knee angle. At this angle the joint stiffness is `stiffness`.
     #: At other angles the joint stiffness differs from `stiffness`, because the mass matrix changes and the gains do not.
     mass: tuple[float, float, float]
 
@@ -102,7 +102,7 @@ class BackupPolicy:
             raise ValueError(f"mass of the backup policy must be positive definite, got {self.mass!r}")
 
     def modes(self) -> tuple[Vector, Vector, Vector]:
-        """Return stiffness [1/s2] and damping [1/s] of the two modes, each of shape (2,), and a (2, 2) matrix of mode vectors."""
+        """Return stiffness [1/s2], damping [1/s] and mode vectors (columns) of the two modes, of shapes (2,), (2,) and (2, 2)."""
         m11, m12, m22 = self.mass
         values, shapes = np.linalg.eig(np.linalg.solve([[m11, m12], [m12, m22]], np.diag(self.stiffness)))
         order = np.argsort(values)
@@ -127,14 +127,14 @@ class Responses(NamedTuple):
     error: Vector  # (n + 1, 2, 10) matrix from the state to the predicted error e [rad]
     rate: Vector  # (n + 1, 2, 10) matrix from the state to the predicted rate e' [rad/s]
     feedback: Vector  # (n + 1, 2, 10) matrix from the state to the predicted -Kv e - Dv e' [rad/s2]
-    pushed_error: Vector  # (n + 1, 2, 2) error e [rad] after a unit acceleration of hip and knee in the first cycle
-    pushed_rate: Vector  # (n + 1, 2, 2) rate e' [rad/s] after a unit acceleration of hip and knee in the first cycle
-    #: (n + 1, 2, 2) backup acceleration [rad/s2] after a unit acceleration of hip and knee in the first cycle
+    pushed_error: Vector  # (n + 1, 2, 2) matrix from the acceleration in the first cycle to the error e [rad]
+    pushed_rate: Vector  # (n + 1, 2, 2) matrix from the acceleration in the first cycle to the rate e' [rad/s]
+    #: (n + 1, 2, 2) matrix from the acceleration in the first cycle to the feedback -Kv e - Dv e' [rad/s2]
     pushed_feedback: Vector
 
 
 def responses(policy: BackupPolicy, loop: SampledLoop, mobility: float, cycles: int, delay: int = 1) -> Responses:
-    """Compute the responses of the sampled loop in each cycle: to the initial state, and to a unit acceleration.
+    """Compute the responses of the sampled loop to the initial state and to a unit acceleration in the first cycle.
 
     Args:
         policy: gains of the backup policy.
@@ -178,7 +178,7 @@ def _powers(a: Vector, b: Vector, outputs: Vector, cycles: int) -> tuple[Vector,
 
 
 def _mode(kappa: float, delta: float, loop: SampledLoop, mobility: float, delay: int) -> tuple[Vector, Vector]:
-    """Return the matrices A and b of one mode: x(k + 1) = A x(k) + b w(k), with the disturbance acceleration w(k) in cycle k.
+    """Return A and b of one mode: x(k + 1) = A x(k) + b w(k), where w(k) is the disturbance acceleration in cycle k.
 
     The state x is (z, z', v, m, p), followed by older commands that are still pending if the delay is longer than one cycle.
     """

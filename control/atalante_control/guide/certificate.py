@@ -79,21 +79,24 @@ class Certificate:
 
     shape: str
     xi: float
-    certified: bool  # whether the guide is certified for any disturbance torques
+    certified: bool  # False if no disturbance torques are certified
     reason: str  # sentence that states what limits the certified torques, or why there are none
-    #: certified disturbance torques, for which the running filter is built; None without certified torques
+    #: certified disturbance torques, which the running filter assumes; None if no torques are certified
     promise: JointTorque | None
-    #: largest disturbance torques for which a filter with these gains could be certified; None without such torques
+    #: largest disturbance torques for which a filter with these gains could be certified; None if no torques are certified
     largest: JointTorque | None
-    #: smallest fraction of the guide width that remains free under the certified torques; negative without certified torques
+    #: smallest fraction of the guide width that remains free under the certified torques; -inf if no torques are certified
     margin: float
 
 
 class PromiseLimits:
-    """Conditions that limit the certified disturbance torques of a guide filter. The limits of the drives are computed once."""
+    """Conditions that limit the certified disturbance torques of a guide filter.
+
+    The conditions of the drives do not depend on the assistance factor, so they are computed once.
+    """
 
     def __init__(self, guide: GuideFilter) -> None:
-        """Compute the limits of torque, speed and torque rate.
+        """Compute the conditions that do not depend on the assistance factor: torque, speed and torque rate of the drives.
 
         Args:
             guide: filter with shape, gains and gait; it is not changed.
@@ -141,7 +144,9 @@ class PromiseLimits:
         return sorted(found, key=lambda limit: limit.scale)
 
     def largest(self, xi: float) -> float:
-        """Return the largest certifiable torques as a multiple of the requested torques; at most 0 if there are none.
+        """Return the largest torques that can be certified, as a multiple of the requested torques.
+
+        The result is at most 0 if no torques can be certified.
 
         Args:
             xi: assistance factor in [0, 1].
@@ -192,7 +197,7 @@ def _limit(room: Vector, reach: Vector, steps: int, what: str) -> Limit:
 
 
 class _Horizon:
-    """Condition on a multiple of the requested torques: one cycle after the prediction, the error is within the guide.
+    """Condition on the motion after the prediction: one cycle after the last predicted cycle, the error must be within the guide.
 
     At the end of the horizon, fast motions have decayed. The error one cycle beyond the horizon is therefore the error at the
     end of the horizon times a factor, plus a remainder. The remainder is a linear combination of the errors in any two
@@ -209,8 +214,8 @@ class _Horizon:
         beyond = prediction.beyond * SIZES
         self._factor = (beyond * rows[-1]).sum(axis=1) / (rows[-1] ** 2).sum(axis=1)
         remainder = beyond - self._factor[:, None] * rows[-1]
-        #: two predicted cycles, counted from the start of the prediction, and the weights of the errors of these cycles in
-        #: the remainder
+        #: Each element contains two predicted cycles, counted from the start of the prediction, and the weights with which the
+        #: errors in these cycles sum to the remainder.
         self._pairs: list[tuple[tuple[int, int], Vector]] = []
         for near, far in ((0.1, 0.3), (0.25, 0.5), (0.4, 0.7)):
             lags = round(near * self.cycles), round(far * self.cycles)

@@ -24,12 +24,13 @@ class StepGuideConfig:
     #: stiffnesses of the softer backup policies as fractions of `stiffness`, ascending
     gentler: tuple[float, ...] = (0.78,)
     damping: Pair = (1.3, 0.85)  # damping ratios of the two modes of the backup policy
-    #: Nm, requested disturbance torques at sagittal hip and knee, for which each guide is certified if possible
+    #: Nm, requested disturbance torques at sagittal hip and knee; each guide is certified for these torques if possible
     promise: Pair = (30.0, 18.0)
     mismatch: Mismatch = field(default_factory=Mismatch)
     hand_over: HandOver = field(default_factory=HandOver)
-    torque_reserve: float = 14.0  # Nm, smallest difference between the torque limit of the robot and a predicted torque
-    #: rad/s, smallest difference between the velocity limit of the robot and a predicted speed
+    #: Nm, smallest allowed distance of a predicted torque from the torque limit of the robot
+    torque_reserve: float = 14.0
+    #: rad/s, smallest allowed distance of a predicted speed from the velocity limit of the robot
     speed_reserve: float = 0.2
     zeta: float = 0.01  # s, gain of lambda_d, which increases the weight of the backup torque while h decreases
     idealization: float = 1.0  # intensity of the joint idealization u_i in [0, 1] while the backup torque has weight 0

@@ -57,7 +57,7 @@ class Mismatch:
 
 @dataclass(frozen=True)
 class HandOver:
-    """Hand-over box: the guide certificate holds if the deviations at the start of a step are in this range.
+    """Hand-over box: largest deviations at the start of a step for which the guide certificate holds.
 
     Raises:
         ValueError: If a value is negative or not finite.
@@ -79,7 +79,7 @@ class HandOver:
             raise ValueError(f"torque of the hand-over must be finite and at least 0 Nm, got {self.torque!r}")
 
     def largest(self, values: Vector) -> Vector:
-        """Return the largest absolute value of the re-centring s, s' or s'' for all deviations in the hand-over box.
+        """Return the largest absolute value of s, s' or s'' (re-centring) over all deviations in the hand-over box.
 
         Args:
             values: values of s, s' or s'' for s(0) = 1 rad (first row) and for s'(0) = 1 rad/s (second row), shape (2, n).
@@ -92,7 +92,7 @@ class HandOver:
 
 
 class Leg(NamedTuple):
-    """Swing leg along its nominal trajectory, during a step and during the first cycles of the next step (overlap).
+    """Data of the swing leg along its nominal trajectory, in one step and in the first cycles of the next step (overlap).
 
     The rows are cycles; the columns are SH and SK.
     """
@@ -154,8 +154,7 @@ class Leg(NamedTuple):
         Args:
             mismatch: errors of the model.
             hand_over: largest deviations at the start of a step.
-            blend: factor of the torque that is carried over the stance change, one value per cycle from the change on,
-                shape (m,).
+            blend: fraction of the carried-over torque that remains in each cycle since the stance change, shape (m,).
         """
         moved = hand_over.largest(self.deadbeat.basis(self.time)[2])
         needed = np.abs(self.torque()) + np.abs(self.masses(self.q[:, 1])).sum(axis=2) * moved[:, None]
@@ -185,15 +184,15 @@ class Grid(NamedTuple):
     """Start cycles and lengths [cycles] of the predictions for which `spread` computes the largest output."""
 
     starts: int  # number of start cycles; the start cycles are 0 to starts - 1
-    block: int  # number of consecutive start cycles that share one row of the argument `ahead`
+    block: int  # number of consecutive start cycles that share one row of the argument `ahead` of `spread`
     lags: NDArray[np.int64]  # (lags,) prediction lengths [cycles], ascending
 
 
 def spread(effect: Effect, mobilities: Vector, bounds: Vector, grid: Grid, ahead: Vector) -> Vector:
-    """Compute the largest outputs due to disturbances that begin at each start cycle, or at the start of the step.
+    """Compute the largest outputs that disturbances can cause.
 
-    `ahead` receives the outputs if disturbances begin at a start cycle. The returned array contains the outputs if
-    disturbances begin at the start of the step. In both arrays, columns 0 and 1 are the effects of the budget on the
+    For `ahead`, the disturbances begin at a start cycle of the grid. For the returned array, the disturbances begin at the start
+    of the step. In both arrays, columns 0 and 1 are the effects of the budget on the
     two outputs, and columns 2 and 3 are the effects of the requested promise. Each effect is a sum of absolute values.
 
     Args:

@@ -186,7 +186,7 @@ class GuideFilter:
 
     @property
     def h(self) -> float:
-        """Return h of the last cycle. h >= 0 if the backup policy can keep both joints inside (safe backward image)."""
+        """Return h of the last cycle. h >= 0 if the backup policy can keep both joints inside the guide."""
         return float(self.tables.guards[0].h)
 
     @property
@@ -207,7 +207,7 @@ def tail(inverse: Vector) -> Vector:
 
 
 def narrowest(inverse: Vector, cycles: int) -> Vector:
-    """Return the largest value of 1 / width of the guide within the next `cycles` cycles, for each cycle [1/rad].
+    """Return for each cycle the largest 1 / width of the guide within the next `cycles` cycles [1/rad].
 
     Args:
         inverse: 1 / distance to the guide for each cycle, shape (n, m) [1/rad]; the last row applies to all later cycles.
@@ -283,7 +283,7 @@ def _reference(prediction: Prediction) -> tuple[list[Vector], Vector]:
 
 
 def _smoothed(row: Vector) -> Vector:
-    """Return the mean of `_SMOOTHED` values around each value, shape (n,)."""
+    """Return the moving mean over `_SMOOTHED` values, centred on each value, shape (n,)."""
     padded = np.pad(row, _SMOOTHED // 2, mode="edge")
     return np.convolve(padded, np.full(_SMOOTHED, 1.0 / _SMOOTHED), mode="valid")
 

@@ -17,7 +17,8 @@ from atalante_hal.types import Vector
 
 Pair = tuple[float, float]
 
-#: The kernel converts the ratio x of a torque or speed to its limit into 1 - STEEPNESS * (1 - x), which is 1 at x = 1.
+#: Slope of the conversion of torque and speed ratios. Let x be a predicted torque or speed divided by its limit. The kernel
+#: converts x to 1 - STEEPNESS * (1 - x), which is 1 at x = 1.
 #: The gait alone needs most of the allowed torque and speed, so the gate must rise only close to the limits of torque and speed.
 STEEPNESS = 4.0
 #: Number of elements of the compressed state, from which the predicted errors are computed.
@@ -63,7 +64,7 @@ class Guard:
 
 
 class Lag:
-    """Prediction of the tracking errors a fixed number of cycles ahead. The fixed array shapes make the compiled loops fast."""
+    """Prediction of the tracking errors for one number of cycles ahead. The fixed array shapes make the compiled loops fast."""
 
     #: matrix from the compressed state to the predicted errors e of sagittal hip and knee [rad]
     ahead: Annotated[Vector, (COMPRESSED, 2)]
@@ -77,11 +78,11 @@ class Block:
     middle: Annotated[Vector, (COMPRESSED, 2)]  # mean of the largest and the smallest `Lag.ahead` in the block
     #: half the difference of the largest and the smallest `Lag.ahead` in the block
     spread: Annotated[Vector, (COMPRESSED, 2)]
-    ratio: float  # upper bound of the ratio of predicted error to guide width in the block, for the last control cycle
+    ratio: float  # upper bound of predicted error / guide width in the block, computed in the last control cycle
 
 
 class Few:
-    """Prediction of torque and speed a fixed number of cycles ahead, see `prediction.FEW`."""
+    """Prediction of torque and speed for one number of cycles ahead, see `prediction.FEW`."""
 
     lag: int  # number of cycles ahead
     #: matrix from the state to four predictions: backup acceleration [rad/s2] of hip and knee, then e' [rad/s] of hip and knee
@@ -242,10 +243,10 @@ def _acceleration(hip: float, knee: float, m: tuple[float, float, float], row: V
 
 
 def largest_ratio(guide: GuideTables, cycle: int) -> float:
-    """Return the largest predicted ratio under the backup policy.
+    """Return the largest ratio of a predicted quantity to its limit, under the backup policy and the worst disturbances.
 
-    The ratios are tracking error to width of the guide, torque to torque limit, and speed to speed limit. The effect of the
-    disturbances is included. The ratios of torque and speed are converted with the slope `STEEPNESS`.
+    The quantities are the tracking error (limit: width of the guide), the torque and the speed. The ratios of torque and speed
+    are converted with the slope `STEEPNESS`.
 
     Args:
         guide: tables of the guide filter; `Guard.state` must contain the state of the current cycle.
@@ -307,7 +308,7 @@ def _compressed(guard: Guard) -> tuple[float, float, float, float, float]:
 
 
 def bound_blocks(guide: GuideTables, cycle: int, blocks: int) -> int:
-    """Compute `Block.ratio`, the bound of the ratio of error to width, for each block. Return the index of the largest ratio.
+    """Compute `Block.ratio`, the upper bound of error / width, for each block. Return the index of the largest bound.
 
     In a block, a predicted error differs from `Block.middle` times the compressed state y by at most `Block.spread` times abs(y).
     The disturbances add at most `GuideTables.highest`, and no width is below the width in the columns `NEAR`.

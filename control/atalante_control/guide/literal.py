@@ -122,7 +122,7 @@ class LiteralGuide:
 
 
 def no_promise(shape: str, xi: float) -> Certificate:
-    """Return a certificate without certified torques, because the control law follows the paper literally.
+    """Return the certificate of the control law that follows the paper literally. It contains no certified torques.
 
     Args:
         shape: name of the shape.
@@ -138,7 +138,7 @@ def assistive_torque(tables: LiteralTables, guard: Guard, cycle: int, leg: LegSt
     Args:
         tables: tables of the literal law.
         guard: record of the guide filter. For the telemetry, this record receives the minimum of h and the maximum of
-            the gate over both joints, and the guide.
+            the gate over both joints, and the bounds of the guide.
         cycle: number of cycles since the stance change. A number above the length of the step is replaced by this length.
         leg: measurements of the swing leg.
         rates: q_des' of SH and SK [rad/s].

@@ -22,7 +22,7 @@ Pair = tuple[float, float]
 
 #: Prediction lengths at which torque and speed are computed [cycles].
 FEW = np.array([1, 2, 3, 4, 6, 8, 11, 15, 20, 27, 36, 48, 64, 85, 113, 150, 200, 250, 300])
-#: Typical magnitude of each element of the state, used as its weight in `Prediction.compress`.
+#: Typical magnitude of each element of the state. `Prediction.compress` uses the magnitudes as weights of the elements.
 SIZES = np.repeat([0.07, 1.0, 1.0, 140.0, 140.0], 2)
 
 
@@ -55,8 +55,8 @@ class Assumptions:
 class StartReach(NamedTuple):
     """Largest effects of disturbances in each cycle of a step. The disturbances act from the start of the step on.
 
-    Columns 0 and 1 are the effect of the model errors (`Leg.budget`) on SH and SK. Columns 2 and 3 are the effect of the chosen
-    certified torques on SH and SK.
+    Columns 0 and 1 are the effect of the model errors (`Leg.budget`) on SH and SK. Columns 2 and 3 are the effect of the
+    requested disturbance torques on SH and SK.
     """
 
     error: Vector  # (n, 4) rad, tracking error
@@ -98,8 +98,7 @@ class Prediction:
             policy: gains of the backup policy.
             leg: swing leg along the nominal trajectory, to the end of the overlap.
             assumptions: assumptions of the promise for which the tables are computed.
-            blend: factor of the torque that is carried over the stance change, one value per cycle from the change on,
-                shape (m,).
+            blend: fraction of the carried-over torque that remains in each cycle since the stance change, shape (m,).
             width: largest width of the guides for which the tables are used [rad].
         """
         self.policy, self.leg, self.assumptions = policy, leg, assumptions
@@ -135,7 +134,7 @@ class Prediction:
         whole = Grid(starts, START_CYCLES, np.arange(horizon + 1))
         few, none = whole._replace(lags=FEW), whole._replace(lags=FEW[:0])
 
-        # `reach` is the maximum over all members of `family`, with different errors of inertia and delay.
+        # Each member of `family` has other errors of inertia and delay. `reach` is the maximum over all members.
         # A joint moves faster if the leg is lighter than in the model, or if the command arrives later.
         self.reach = np.zeros((blocks, len(whole.lags), 4))
         # Largest effects of disturbances. Elements of axis 0: torque, speed, speed with the worst errors of inertia and delay.
@@ -173,7 +172,7 @@ _MOST_KEPT = 8
 
 
 def prediction_of(policy: BackupPolicy, leg: Leg, assumptions: Assumptions, blend: Vector, width: float) -> Prediction:
-    """Return the tables of `Prediction`. The last tables are cached, because all guide shapes of a gait share them.
+    """Return the prediction of a leg. The most recent predictions are cached, because all guide shapes of a gait share them.
 
     Args:
         policy: gains of the backup policy.
@@ -196,7 +195,7 @@ def prediction_of(policy: BackupPolicy, leg: Leg, assumptions: Assumptions, blen
 
 
 def _separated(rows: Vector) -> Vector:
-    """Convert matrices for a state with true velocities into matrices for a state with true minus measured velocities."""
+    """Convert matrices for a state in which the true velocity is replaced by the true minus the measured velocity."""
     result = rows.copy()
     result[..., 4:6] += rows[..., 2:4]
     return result

@@ -83,7 +83,9 @@ class StepGuides:
             self.at(percent / 100)
 
     def at(self, xi: float) -> Choice:
-        """Return the softest filter for the requested torques; if there is none, the filter for the largest torques.
+        """Return the softest filter that is certified for the requested torques, with its certified torques.
+
+        If there is no such filter, return the filter with the largest certified torques.
 
         Args:
             xi: assistance factor in [0, 1].

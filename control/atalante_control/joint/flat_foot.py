@@ -1,4 +1,4 @@
-r"""Flat foot: angles that hold the sole of the swing leg level. `tibia attitude -> targets of sagittal and henke ankle (SA, HA)`.
+r"""Flat foot: ankle angles that keep the swing foot level. `tibia attitude -> targets of sagittal and henke ankle (SA, HA)`.
 
 The attitude comes from the tibia IMU. If this IMU is lost, the attitude is computed from the joints and the pelvis IMU. The
 targets replace the nominal angles in the reference of the PID. The attitude of the foot in the world is
@@ -59,7 +59,7 @@ class FlatFoot:
     """
 
     toe_out: float  # rad, rotation of the foot about the vertical axis of the tibia, positive to the left
-    axis: tuple[float, float, float]  # direction of the henke axis in the foot frame, of any length
+    axis: tuple[float, float, float]  # direction of the henke axis in the foot frame; need not be a unit vector
 
     def __post_init__(self) -> None:
         if self.axis[1] != 0.0 or self.axis[0] == 0.0:

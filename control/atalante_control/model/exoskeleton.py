@@ -23,8 +23,8 @@ LEG_LINKS = dict(zip(LEG_JOINTS, ("frontal_hip", "transverse_hip", "thigh", "sha
 class ExoskeletonParameters:
     """Dimensions and masses of an Atalante-like exoskeleton, for the left side. The right side is the mirror image.
 
-    Joint offsets, axes, masses, sole and sensor positions are rounded public numbers. The positions of the masses in their links
-    are assumptions of this project. Thigh and shank are adjusted to the patient.
+    Joint offsets, joint axes, masses, sole dimensions and sensor positions are rounded published values. The positions of the
+    masses in their links are assumptions of this project. Thigh and shank are adjusted to the patient.
     """
 
     thigh_length: float = 0.38  # m, from SH to SK
@@ -51,7 +51,7 @@ class ExoskeletonParameters:
     cell_x: tuple[float, float] = (0.178, -0.064)  # m, x of front and rear force cells relative to the ankle
     cell_y: float = 0.027  # m, lateral distance of the force cells from the middle of the foot
     pad_radius: float = 0.005  # m, radius of the sphere in each corner of the sole; the spheres touch the sole plane
-    pad_mass: float = 0.0015  # kg, mass of each contact sphere, subtracted from the mass of the foot
+    pad_mass: float = 0.0015  # kg, mass of each contact sphere; the foot box has the remaining mass of the foot
 
     torso_imu: Vector3 = (-0.14, 0.0, 0.50)  # m, position of the torso IMU in the pelvis frame
     pelvis_imu: Vector3 = (-0.164, -0.015, 0.191)  # m, position of the pelvis IMU in the pelvis frame
@@ -140,7 +140,7 @@ def _left_leg(p: ExoskeletonParameters) -> list[Link]:
     sk, sa = (0.0, p.knee_lateral, -p.thigh_length), (0.0, p.ankle_lateral, -p.shank_length)
     length, width = p.sole_size
     sole_x, sole_z = p.sole_centre
-    # The boxes of hip, thigh and shank extend from their joint to the next joint. The ankle box encloses its motors.
+    # The box of each hip link, of the thigh and of the shank reaches to the next joint. The ankle box encloses the ankle motors.
     chain = (
         ("FH", p.fh_offset, 0.0, (1.0, 0.0, 0.0), Box(p.frontal_hip_mass, _half(p.th_offset), (0.17, 0.19, 0.12))),
         ("TH", p.th_offset, 0.0, (0.0, 0.0, 1.0), Box(p.transverse_hip_mass, _half(p.sh_offset), (0.20, 0.10, 0.12))),

@@ -1,4 +1,4 @@
-"""Rigid bodies and the links of a tree, with fusion of bodies and reflection in the sagittal plane.
+"""Rigid bodies and links: mass properties, fusion of two bodies, and reflection in the sagittal plane.
 
 `Box` (shape for viewers) -> `Inertia` (mass properties) -> `Link` (body, and the joint that moves this body).
 """
