@@ -65,7 +65,7 @@ class AttitudeObserver:
         self.reset((1.0, 0.0, 0.0, 0.0))
 
     def reset(self, quaternion: Sequence[float]) -> None:
-        """Set the attitude to a measured attitude without heading. Set the velocity to zero.
+        """Set the attitude to a measured attitude with a heading of zero. Set the velocity to zero.
 
         Args:
             quaternion: attitude of the pelvis IMU, unit quaternion wxyz, pelvis to world.
@@ -80,7 +80,7 @@ class AttitudeObserver:
         self._observe(self.records, gyro, accel, velocity)
 
     def follow_heading(self, quaternion: Vector, gain: float) -> None:
-        """Turn the attitude towards a measured heading, relative to the heading at the last `reset`.
+        """Turn the attitude towards a measured heading. The measured heading at the last `reset` counts as zero.
 
         Args:
             quaternion: attitude of the pelvis IMU, unit quaternion wxyz, pelvis to world, shape (4,).

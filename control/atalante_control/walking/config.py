@@ -22,7 +22,7 @@ STEERING = 0.5, 0.15, math.radians(3.0)
 _NO_INTEGRAL = (0.0,) * 6
 #: Largest turn before a periodic step [rad]. Larger turns were not tried.
 TURN_MAX = math.radians(5.0)
-#: Heading gain of an IMU with a heading reference [1/s].
+#: Value of `WalkConfig.heading_gain` for an IMU with a heading reference [1/s].
 HEADING_GAIN = 0.5
 #: Gains without integral terms. With integral terms, the robot began to limp after about 120 steps in MuJoCo.
 #: The integral terms of the two legs drifted apart, because the ankle stabiliser moves the robot too.
@@ -48,16 +48,17 @@ class WalkConfig:
     alpha: float = 0.3  # end of the re-centring, as a fraction of the step duration
     #: True: the periodic steps follow the control law of the paper literally, see `literal`. The guide is then not certified.
     literal_law: bool = False
-    #: m/m, gain of the ankle stabiliser: shift of the centre of pressure / error of the divergent component of motion
+    #: m/m, gain of the ankle stabiliser: shift of the centre of pressure per error of the divergent component of motion
     stabiliser: float = 2.5
     shift_limit: Pair = (0.12, 0.05)  # m, largest shifts of the centre of pressure: along the walk, sideways
-    edge: float = (
-        0.005  # m, smallest distance of the centre of pressure from heel and toes that the stance ankle requests
-    )
+    #: m, smallest permitted distance from the centre of pressure to the front edge and to the rear edge of the stance sole.
+    #: The torque of the sagittal ankle is limited accordingly.
+    edge: float = 0.005
     placement: PlacementConfig = field(default_factory=PlacementConfig)  # parameters of foot placement and step timing
     lean: LeanConfig = field(default_factory=LeanConfig)  # parameters of the lean of the trunk
     flat_foot: bool = True  # whether the ankle of the swing leg holds the sole level
-    #: m/s, downward speed of the swing foot after the nominal end of a step: normal step, stop step
+    #: m/s, downward speed of the swing foot after the nominal end of a step. First value: start step and periodic step.
+    #: Second value: stop step.
     reach_speed: Pair = (0.3, 0.03)
     #: s, longest duration of the downward motion of the swing foot after the nominal end of a step. `reach_knee` can end
     #: the motion earlier.
@@ -78,7 +79,7 @@ class WalkConfig:
     #: integral of the gyro. A value above 0 requires an IMU with a heading reference, because the heading of other IMUs drifts.
     heading_gain: float = 0.0
     loaded: float = 0.3  # smallest load with which a standing foot counts as loaded, as a fraction of the weight
-    #: loads at which the stance gains are fully applied (standing, walking), as fractions of the weight
+    #: loads of a foot at which its leg has the full stance gains, as fractions of the weight: while standing, while walking
     full_gains: Pair = (0.25, 0.5)
     settle: float = 1.0  # s, time for which both feet must be loaded before the robot walks
     posture: float = 2.0  # s, duration of the motion from the measured pose to the standing pose

@@ -57,12 +57,12 @@ from atalante_hal.types import Command, State, SupervisorState, Vector
 _N, _LEG = len(JOINTS), len(LEG_JOINTS)
 _SH, _SK = LEG_JOINTS.index("SH"), LEG_JOINTS.index("SK")
 _PELVIS, _TORSO = IMUS.index("pelvis"), IMUS.index("torso")
-#: Smallest distance [rad] of each desired joint angle of the swing leg from the position limits, kept by the foot placement.
+#: Smallest distance [rad] from a desired joint angle of the swing leg to a position limit that foot placement permits.
 _MARGIN = math.radians(1.0)
 #: Largest valid age of the message of an IMU or a foot [cycles], equal to the timeout of these messages in the DBC.
 _SENSOR_AGE = 10
-#: Change of the load on the stance foot while the other foot swings, as a fraction of the weight. The robot
-#: accelerates, so the load is not exactly the weight.
+#: Permitted deviation of the stance foot load from the weight while the other foot swings, as a fraction of the weight.
+#: The load deviates from the weight, because the robot accelerates.
 _LOAD_ERROR = 0.15
 
 
@@ -228,7 +228,7 @@ class WalkController:
 
     @property
     def walking(self) -> bool:
-        """Return whether the robot steps, or shifts its weight for a step."""
+        """Return whether the robot takes steps, or shifts its weight before the first or after the last step."""
         return self.phase in WALKING
 
     @property
@@ -243,11 +243,11 @@ class WalkController:
         return self._sections[-1].end
 
     def reached(self, step: int, phase: float) -> bool:
-        """Return whether the walk has reached a phase of a periodic step. The result remains True after this phase.
+        """Return whether the walk has reached an instant of a periodic step. The result remains True after this instant.
 
         Args:
             step: index of the step, from 0.
-            phase: nominal time since the start of the step, divided by the duration of a step.
+            phase: nominal time from the start of the step to the instant, divided by the duration of a step.
         """
         steps = self.statistics.steps
         return steps > step or (
@@ -266,7 +266,7 @@ class WalkController:
         return float(self._record.max_dcm_error)
 
     def prepare(self) -> None:
-        """Compute the guides of all assistance factors before a walk in real time, see `StepGuides.prepare`."""
+        """Compute the guides for all assistance factors before a walk in real time, see `StepGuides.prepare`."""
         for section in self._sections:
             section.prepare()
 
@@ -470,7 +470,7 @@ def _ratio(error: float, bound: float) -> float:
 
 
 def _range(robot: Robot, config: WalkConfig) -> tuple[Vector, Vector]:
-    """Return the smallest and the largest desired joint angles of a shifted swing foot, shape (12,) each [rad]."""
+    """Return the smallest and the largest joint angles that foot placement may request, each of shape (12,) [rad]."""
     low, high = robot.position_min + _MARGIN, robot.position_max - _MARGIN
     low[[_SK, _LEG + _SK]] = config.reach_knee
     return low, high

@@ -69,7 +69,7 @@ def pressure_shift(parameters: Stabiliser, error: Vector) -> Pair:
 
 
 def within_sole(parameters: Stabiliser, torque: float, load: float) -> float:
-    """Return the torque of the sagittal ankle with which the centre of pressure stays within the sole [Nm].
+    """Limit the torque of the sagittal ankle so that the centre of pressure stays within the sole, and return the torque [Nm].
 
     With a larger torque, the foot would turn about its heel or its toes. The ankle of a foot that stands on an edge moves only
     the small inertia of the foot, so that the stiff stance gains would make the foot oscillate.

@@ -446,7 +446,9 @@ def _desired(cycle: int, placement: Placement, table: PhaseTable, stage: Stage, 
 
 
 def _lowered(cycles: float, longest: int) -> tuple[float, float]:
-    """Return two ratios of a late swing foot: lowered distance to full speed [s], and present speed to full speed.
+    """Return the lowered distance [m] and the downward speed [m/s] of a late swing foot, for a full speed of 1 m/s.
+
+    For another full speed, multiply both results by the full speed.
 
     Args:
         cycles: cycles since the nominal end of the step, above 0.

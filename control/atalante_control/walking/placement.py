@@ -42,9 +42,9 @@ _FH, _SH, _SK = (LEG_JOINTS.index(name) for name in ("FH", "SH", "SK"))
 _SHIFTING = (_FH, _SH, _SK)
 #: Number of joints from the pelvis to the ankle.
 _LINKS = LEG_JOINTS.index("SA") + 1
-#: m3, smallest determinant of the ankle Jacobian with which the foot is shifted further; a straight leg has determinant 0
+#: m3, smallest determinant of the ankle Jacobian at which the foot is still shifted; a straight leg has the determinant 0
 _SINGULAR = 1e-3
-_RATES = 32  # the cost is computed for this number of phase rates plus one, in geometric order
+_RATES = 32  # number of phase rates for which the cost is computed, minus 1; the rates are in geometric order
 _FASTEST = 3.0  # rad/s, largest desired speed of a joint that shifts the foot
 
 
@@ -73,7 +73,7 @@ class PlacementConfig(NamedTuple):
     #: cost weight of the squared missing offset (needed minus permitted offset), relative to the squared permitted
     #: offset
     missed: float = 30.0
-    #: m, offset of a landing with the same cost as a landing that is earlier or later by the time 1 / w
+    #: m, cost of timing: a landing that is earlier or later by 1 / w costs as much as a landing with this offset
     timing: float = 0.03
     hold: float = 0.1  # s, time in which the reference of the swing foot changes from the pelvis to the stance foot
     slew: float = 15.0  # 1/s, largest change of the phase rate per second
@@ -98,7 +98,7 @@ class Placement:
 
 
 class Motion(NamedTuple):
-    """DCM of a step and its prediction to the nominal landing."""
+    """Present DCM of a step, and data for the prediction of the DCM at the nominal landing."""
 
     error: Pair  # m, measured minus nominal DCM in the walking frame
     nominal: Pair  # m, nominal DCM now
@@ -148,7 +148,7 @@ def landing(config: PlacementConfig, gain: float, motion: Motion) -> tuple[float
     Args:
         config: parameters.
         gain: gain of the ankle stabiliser.
-        motion: DCM and its prediction.
+        motion: present DCM, and data for the prediction.
     """
     x, y = _needed(config, gain, motion, 1.0)
     if x == 0.0 and y == 0.0:
@@ -174,7 +174,7 @@ def _needed(config: PlacementConfig, gain: float, motion: Motion, rate: float) -
     Args:
         config: parameters.
         gain: gain of the ankle stabiliser.
-        motion: DCM and its prediction.
+        motion: present DCM, and data for the prediction.
         rate: phase rate until the landing.
     """
     exponent, growth = motion.exponent / rate, math.exp(motion.exponent)

@@ -40,8 +40,8 @@ class PhaseTable(NamedTuple):
     guided: Vector  # (m, 4) re-centring rows of sagittal hip and knee of the swing leg, which a guide can assist
     reach: Vector  # (2,) rad/s, speeds of hip and knee of the swing leg that lower the swing foot after the last cycle
     lowering: float  # m/s, downward speed of the swing foot at the joint speeds `reach`
-    reach_cycles: int  # number of cycles in which the joints of the swing leg lower the foot after the last row
-    #: largest number of cycles in which a foot that is held relative to the stance foot is lowered after the last row
+    reach_cycles: int  # number of cycles in which the joint speeds `reach` lower the foot after the last row
+    #: number of cycles in which foot placement lowers a swing foot after the last row; used instead of `reach_cycles`
     lowering_cycles: int
 
 
@@ -72,7 +72,7 @@ def step_table(
     yaw = -toe_out if stance == RIGHT else toe_out
     centre, speed, ankle = np.zeros((3, gait.cycles + 1, 3))
     heading, upright = about_z(yaw), about_z(0.0)
-    # Views of the records that `update` overwrites. Creating a view of a field takes longer than the computation of a cycle.
+    # These views are created only once, because creating a view takes longer than the computation of a cycle.
     sole, body = kinematics.chain.soles[stance], kinematics.chain.centre[0]
     rotation, position, linear, angular = sole.rotation, sole.position, sole.linear, sole.angular
     body_position, body_velocity = body.position, body.velocity

@@ -35,8 +35,8 @@ from atalante_hal.types import Vector
 Pair = tuple[float, float]
 
 _N = len(JOINTS)
-#: Number of fully assisted steps with a new gait, one for each leg. They start further from the gait than the certificate of a
-#: guide assumes.
+#: Number of fully assisted steps after a change of the gait, one for each leg. At the start of these steps, the deviation from
+#: the gait is larger than the certificate of a guide assumes.
 _JOINING = 2
 _SH, _SK = LEG_JOINTS.index("SH"), LEG_JOINTS.index("SK")
 
@@ -44,7 +44,8 @@ _SH, _SK = LEG_JOINTS.index("SH"), LEG_JOINTS.index("SK")
 class Section(NamedTuple):
     """Section of a walk: a number of periodic steps with one gait."""
 
-    #: Periodic step, and the stop step after it. The start step is used if the walk begins with this section.
+    #: Periodic step, start step and stop step. The start step is used only if the walk begins with this section. The stop step is
+    #: used only if the walk ends in this section.
     gaits: WalkGaits
     steps: int  # number of periodic steps
 
@@ -63,7 +64,7 @@ class SectionMotion:
     """Phase tables and guides of a section.
 
     Attributes:
-        guided: index of the first periodic step of the walk that can be guided.
+        guided: index (within the walk) of the first periodic step of the section that can be guided.
         end: number of periodic steps of the walk at the end of the section.
         duration: nominal duration of a periodic step [s].
         tables: table of each phase for each stance leg.
@@ -107,7 +108,7 @@ class SectionMotion:
         )
 
     def prepare(self) -> None:
-        """Compute the guides of all assistance factors, see `StepGuides.prepare`."""
+        """Compute the guides for all assistance factors, see `StepGuides.prepare`."""
         if not self._literal_law:
             self._guides.prepare()
 

@@ -137,7 +137,7 @@ class Standing:
         return leg
 
     def _reach(self, q: Vector, foot: int, rotation: Vector, position: Vector) -> Vector:
-        """Return a copy of the pose in which the joints of one leg bring its sole to the target (Newton's method)."""
+        """Return a copy of a pose with new joint angles of one leg, so that its sole is at the target (Newton's method)."""
         q, leg = q.copy(), slice(foot * _LEG, (foot + 1) * _LEG)
         for _ in range(_ITERATIONS):
             now = self.stance(q)

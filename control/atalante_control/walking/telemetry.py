@@ -68,7 +68,7 @@ def write_telemetry(
     balance: Balance,
     up: Vector,
 ) -> None:
-    """Write the telemetry of a cycle. Values that are constant in a phase were written by the controller at the phase start.
+    """Write the telemetry values that change in each cycle. The controller writes all other values at the start of a phase.
 
     Args:
         telemetry: record to write, shape (1,).
