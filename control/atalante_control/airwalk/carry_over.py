@@ -35,7 +35,7 @@ class CarryOver:
     """
 
     def __init__(self, duration: float) -> None:
-        """Compute `blend`, the fading of the compensation, and create the record of the state.
+        """Compute the compensated fractions (`blend`), and create the record of the state.
 
         Args:
             duration: time in which the compensation of the torque jump fades out [s]. With 0, the jump is not compensated.

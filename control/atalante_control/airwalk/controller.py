@@ -173,7 +173,7 @@ class AirwalkController:
         return self.choice(xi).guide
 
     def prepare(self) -> None:
-        """Compute the guides for all assistance factors, see `StepGuides.prepare`. Call this before a walk on the wall clock."""
+        """Compute the guides for all assistance factors, see `StepGuides.prepare`. Call this before a walk in real time."""
         if not self.config.literal_law:
             self._guides.prepare()
 

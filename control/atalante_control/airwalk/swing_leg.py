@@ -13,14 +13,14 @@ from atalante_control.joint.idealization import AssistedInertia
 from atalante_hal.robot import LEG_JOINTS
 
 _SH, _SK = LEG_JOINTS.index("SH"), LEG_JOINTS.index("SK")
-#: Number of cycles of the next step in the predictions of the guides.
+#: Number of cycles of the next step that the predictions of the guides include.
 OVERLAP = 100
 
 
 def swing_leg(
     config: AirwalkConfig, gait: Gait, inertia: AssistedInertia, gravity: Gravity, overlap: int = OVERLAP
 ) -> Leg:
-    """Return the data of the swing leg for the guides, along its nominal trajectory.
+    """Return the data of the swing leg along its nominal trajectory, for the guides.
 
     The data cover one step and the first cycles of the next step, in which the same leg is the stance leg.
 

@@ -39,7 +39,7 @@ class LinkRecord:
     rotation: Annotated[Vector, (3, 3)]  # rotation matrix from link to parent
     down: Annotated[Vector, 3]  # m/s2, gravitational acceleration
     force: Annotated[Vector, 3]  # N, force that holds the link and its descendants
-    moment: Annotated[Vector, 3]  # Nm, moment about the joint, which holds the link and its descendants
+    moment: Annotated[Vector, 3]  # Nm, moment that holds the link and its descendants, about the joint
 
 
 class Gravity:

@@ -61,8 +61,8 @@ class StanceDynamics:
         self._foot, self._swing_foot = (self._fixed.model.getFrameId(name) for name in (STANCE_FOOT, SWING_FOOT))
         pinocchio.forwardKinematics(self._fixed.model, self._data[1], pinocchio.neutral(self._fixed.model))
         pinocchio.updateFramePlacement(self._fixed.model, self._data[1], self._foot)
-        #: Toe-out: rotation from stance foot to pelvis at the zero pose. The stance foot has this rotation in the world, so the
-        #: pelvis faces the walking direction at the zero pose.
+        #: Toe-out: rotation from stance foot to pelvis at the zero pose. In the world, the stance foot is turned by
+        #: this rotation, so the pelvis faces the walking direction at the zero pose.
         self._toe_out = self._data[1].oMf[self._foot].rotation.copy()
 
     def forces(self, position: Vector, velocity: Vector, acceleration: Vector) -> GroundForces:
@@ -145,7 +145,7 @@ class StanceDynamics:
 
 
 def stance_dynamics(robot: Robot, patient: Patient | None = None) -> StanceDynamics:
-    """Build the inverse dynamics of an exoskeleton that stands on its right foot, empty or with a patient.
+    """Build the inverse dynamics of an exoskeleton (empty or with a patient) that stands on its right foot.
 
     Args:
         robot: limits of the joints.

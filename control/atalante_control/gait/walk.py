@@ -36,7 +36,7 @@ FORMAT = "atalante-walk/1"
 DEFAULT_WALK = Path(__file__).parents[1] / "gaits" / "walk.json"
 
 
-#: Kinds of the steps of `WalkGaits`, in their order.
+#: Kind of each step of `WalkGaits`, in the same order.
 WALK_KINDS: tuple[Kind, ...] = ("start", "periodic", "stop")
 
 
@@ -71,7 +71,7 @@ def load_walk(path: Path, robot: Robot) -> WalkGaits:
 
 
 def load_gaits(path: Path, robot: Robot) -> Gait | WalkGaits:
-    """Read a gait file with a periodic step, or a walk file. The key `format` of the file decides.
+    """Read a gait file with a periodic step, or a walk file. The key `format` distinguishes the two files.
 
     Args:
         path: path of the file.

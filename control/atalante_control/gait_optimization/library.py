@@ -201,7 +201,7 @@ class Library:
         return gaits
 
     def rejected(self) -> dict[Index, str]:
-        """Return grid point -> reason for each file that does not count as a solved gait. `generate` solves these gaits again."""
+        """Return the rejected gait files as grid point -> reason of the rejection. `generate` solves these gaits again."""
         return self._read()[1]
 
     def failures(self) -> dict[Index, str]:

@@ -185,7 +185,7 @@ class _Entries(NamedTuple):
 
 
 def _derivatives(block: _Block, p: Symbol) -> tuple[Any, _Entries, _Entries]:
-    """Return three functions: expression, Jacobian, and upper triangle of the Hessian of the weighted sum of the expressions."""
+    """Return functions for the expression, for its Jacobian, and for the upper triangle of the Hessian of its weighted sum."""
     lam = casadi.SX.sym("lam", block.expression.shape[0])
     slopes = casadi.jacobian(block.expression, block.x)
     curvature = casadi.triu(casadi.hessian(casadi.dot(lam, block.expression), block.x)[0])

@@ -21,17 +21,17 @@ class Requirements:
     force_min: float = 300.0  # N, smallest vertical ground force
     sole_share: float = 0.6  # the centre of pressure must be inside this fraction of the sole
     #: At each node, the centre of pressure must be inside this fraction of the rectangle between the force cells.
-    #: Between two nodes, and in gaits of the network, it can be up to 3.2 mm outside this area.
+    #: Between two nodes, and in gaits of the network, the centre of pressure can be up to 3.2 mm outside this area.
     cell_share: float = 0.7
     yaw_lever: float = 0.03  # m, largest ratio of yaw moment about the sole centre to vertical ground force
     #: Required height of the swing sole at mid-swing [m]. At other times this height is multiplied by sin(pi t / T)^2.
     #: In start and stop steps the required height is multiplied by sin(pi t / T)^4.
     clearance: float = 0.05
-    corridor: tuple[float, float] = (0.17, 0.28)  # m, smallest and largest lateral distance of the ankles
+    corridor: tuple[float, float] = (0.17, 0.28)  # m, smallest and largest lateral distance between the ankles
     roll: float = math.radians(5.0)  # rad, largest roll of the pelvis
     pitch: float = math.radians(6.0)  # rad, largest pitch of the pelvis
     yaw: float = math.radians(6.0)  # rad, largest yaw of the pelvis
-    #: m/s, range of the vertical ankle speed of the landing foot, upwards positive
+    #: m/s, range of the vertical speed of the ankle at the landing, upwards positive
     landing_speed: tuple[float, float] = -0.03, -0.003
     #: m/s, range of the vertical speed of each corner of the landing sole, upwards positive
     corner_speed: tuple[float, float] = -0.03, 0.0

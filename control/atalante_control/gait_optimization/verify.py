@@ -43,7 +43,7 @@ class Tolerances(NamedTuple):
 
 #: Tolerances of a solved step, equal to the tolerances of the equality constraints of the optimiser.
 EXACT = Tolerances(1e-6, 1e-6, 1e-6, 1e-6)
-#: Tolerances of a step of the gait network. The network interpolates solved steps, so it meets these conditions approximately.
+#: Tolerances of a step of the gait network. The network interpolates solved steps, so these conditions hold approximately.
 INTERPOLATED = Tolerances(1e-3, math.radians(0.3), POSITION_JUMP, VELOCITY_JUMP)
 
 
@@ -298,7 +298,7 @@ class Verifier:
         return np.asarray(configuration)
 
     def _standing(self, q: Vector, qd: Vector) -> tuple[Vector, Vector, Vector]:
-        """Return configuration, speed, and Jacobian of the right foot, for the floating robot with its right foot at rest."""
+        """Return configuration and speed of the floating robot with its right foot at rest, and the Jacobian of this foot."""
         model, joints = self._articulated.model, self._articulated.v
         configuration, speed = self._on_right_foot(q), np.zeros(model.nv)
         speed[joints] = qd

@@ -181,7 +181,7 @@ def _pair(torque: Vector) -> JointTorque | None:
 
 
 def _limit(room: Vector, reach: Vector, steps: int, what: str) -> Limit:
-    """Return the largest multiple of the requested torques whose whole effect is at most `room`.
+    """Return the largest multiple of the requested torques for which the whole effect is at most `room`.
 
     Args:
         room: largest permitted effect on SH and SK in each cycle, shape (n, 2).

@@ -184,7 +184,7 @@ class Grid(NamedTuple):
     """Start cycles and lengths [cycles] of the predictions for which `spread` computes the largest output."""
 
     starts: int  # number of start cycles; the start cycles are 0 to starts - 1
-    block: int  # number of consecutive start cycles that share one row of the argument `ahead` of `spread`
+    block: int  # number of consecutive start cycles that share one row of `ahead` in `spread`
     lags: NDArray[np.int64]  # (lags,) prediction lengths [cycles], ascending
 
 

@@ -45,7 +45,7 @@ from atalante_hal.types import Vector
 Pair = tuple[float, float]
 
 _SMOOTHED = 11  # number of cycles of the moving mean in `_smoothed`
-#: Fraction of the guide width that must remain at the last predicted cycle, so that the motion stays inside in later cycles.
+#: Fraction of the guide width that must remain free in the last predicted cycle. Then later cycles are inside the guide, too.
 _TAIL_MARGIN = 0.03
 
 

@@ -26,7 +26,7 @@ COMPRESSED = 5
 #: Number of consecutive predicted cycles in a `Block`. `Block.slack` bounds the effect of model errors in all these
 #: cycles.
 SLACK_CYCLES = 10
-#: Number of start cycles in a block. Predictions that start in the same block use the same row of `GuideTables.reach`.
+#: Number of consecutive start cycles for which the predictions use the same row of `GuideTables.reach`.
 START_CYCLES = 4
 
 
@@ -76,7 +76,7 @@ class Block:
     #: matrix from `Guard.magnitude` to the largest change [rad] that model errors can cause in the predicted tracking errors
     slack: Annotated[Vector, (STATES, 2)]
     middle: Annotated[Vector, (COMPRESSED, 2)]  # mean of the largest and the smallest `Lag.ahead` in the block
-    #: half the difference of the largest and the smallest `Lag.ahead` in the block
+    #: half the difference between the largest and the smallest `Lag.ahead` in the block
     spread: Annotated[Vector, (COMPRESSED, 2)]
     ratio: float  # upper bound of predicted error / guide width in the block, computed in the last control cycle
 
@@ -127,7 +127,7 @@ TAIL = 16
 #: Columns 20 to 23 of `step`: maximum of columns 0 to 3 over `SLACK_CYCLES` cycles from this cycle on [1/rad].
 NEAR = 20
 COLUMNS = 24
-#: The last predicted error is compared with the narrowest guide within this number of cycles after the prediction.
+#: Number of cycles after the last predicted cycle. The last predicted error must fit into the narrowest guide of these cycles.
 TAIL_CYCLES = 60
 
 

@@ -122,7 +122,7 @@ class LiteralGuide:
 
 
 def no_promise(shape: str, xi: float) -> Certificate:
-    """Return the certificate of the control law that follows the paper literally. It contains no certified torques.
+    """Return the certificate of the control law that follows the paper literally. The certificate contains no torques.
 
     Args:
         shape: name of the shape.

@@ -134,7 +134,7 @@ class Prediction:
         whole = Grid(starts, START_CYCLES, np.arange(horizon + 1))
         few, none = whole._replace(lags=FEW), whole._replace(lags=FEW[:0])
 
-        # Each member of `family` has other errors of inertia and delay. `reach` is the maximum over all members.
+        # The members of `family` differ in the errors of inertia and delay. `reach` is the maximum over all members.
         # A joint moves faster if the leg is lighter than in the model, or if the command arrives later.
         self.reach = np.zeros((blocks, len(whole.lags), 4))
         # Largest effects of disturbances. Elements of axis 0: torque, speed, speed with the worst errors of inertia and delay.
@@ -195,7 +195,7 @@ def prediction_of(policy: BackupPolicy, leg: Leg, assumptions: Assumptions, blen
 
 
 def _separated(rows: Vector) -> Vector:
-    """Convert matrices for a state in which the true velocity is replaced by the true minus the measured velocity."""
+    """Convert matrices to a state that contains true minus measured velocities in place of true velocities."""
     result = rows.copy()
     result[..., 4:6] += rows[..., 2:4]
     return result

@@ -16,7 +16,7 @@ class GuideStatistics:
     #: smallest h in the first cycle of a step; at h >= 0, the backup policy can keep both joints inside the guide
     min_h_at_start: float = 1.0
     hand_overs_exceeded: int = 0  # number of stance changes with a larger deviation than the certificate assumes
-    factors: set[float] = field(default_factory=set)  # all assistance factors that a step has used
+    factors: set[float] = field(default_factory=set)  # assistance factors of all steps so far
 
     @property
     def inside_fraction(self) -> float:

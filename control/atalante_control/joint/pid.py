@@ -64,8 +64,8 @@ class PidGains:
     integral_limit: float = 10.0  # Nm, largest absolute value of the integral torque
 
 
-#: Gains for the suspended robot. The stance leg carries no load, so TH, SK, SA and HA of this leg have the swing leg
-#: gains. With the gains for the ground, the knee and ankle of a suspended robot would oscillate, because they move
+#: Gains for the suspended robot. The stance leg carries no load, so TH, SK, SA and HA of this leg have the gains of the
+#: swing leg. With the gains for the ground, knee and ankle of a suspended robot would oscillate, because these joints move
 #: small inertias.
 AIR_GAINS = PidGains(
     stance=LegGains(

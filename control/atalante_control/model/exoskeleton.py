@@ -119,7 +119,7 @@ def pad_link(foot: str, cell: str) -> str:
 
 
 def _patient_segments(p: ExoskeletonParameters, patient: Patient) -> dict[str, tuple[Box, Inertia]]:
-    """Return box and mass properties of the patient's segments, by the name of the link that carries each segment.
+    """Return link name -> box and mass properties of the patient's segment that is fused into this link.
 
     The hip of the patient is the intersection of the axes of FH and SH, the knee is on the axis of SK, and the ankle is at SA.
     The lateral offsets of the exoskeleton shift thigh and shank by half a centimetre. The foot is centred along the sole.

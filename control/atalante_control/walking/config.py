@@ -20,7 +20,7 @@ Pair = tuple[float, float]
 STEERING = 0.5, 0.15, math.radians(3.0)
 
 _NO_INTEGRAL = (0.0,) * 6
-#: Largest turn before a periodic step [rad]. Larger turns were not tried.
+#: Largest angle by which the desired line may turn before a periodic step [rad]. Larger angles were not tried.
 TURN_MAX = math.radians(5.0)
 #: Value of `WalkConfig.heading_gain` for an IMU with a heading reference [1/s].
 HEADING_GAIN = 0.5
@@ -50,7 +50,7 @@ class WalkConfig:
     literal_law: bool = False
     #: m/m, gain of the ankle stabiliser: shift of the centre of pressure per error of the divergent component of motion
     stabiliser: float = 2.5
-    shift_limit: Pair = (0.12, 0.05)  # m, largest shifts of the centre of pressure: along the walk, sideways
+    shift_limit: Pair = (0.12, 0.05)  # m, largest shift of the centre of pressure: along the walk; sideways
     #: m, smallest permitted distance from the centre of pressure to the front edge and to the rear edge of the stance sole.
     #: The torque of the sagittal ankle is limited accordingly.
     edge: float = 0.005
@@ -79,7 +79,8 @@ class WalkConfig:
     #: integral of the gyro. A value above 0 requires an IMU with a heading reference, because the heading of other IMUs drifts.
     heading_gain: float = 0.0
     loaded: float = 0.3  # smallest load with which a standing foot counts as loaded, as a fraction of the weight
-    #: loads of a foot at which its leg has the full stance gains, as fractions of the weight: while standing, while walking
+    #: loads of a foot, as fractions of the weight. While the robot stands, a leg has the full stance gains at the first load.
+    #: During a step, the ankle of the stance leg has the full stance gains at the second load.
     full_gains: Pair = (0.25, 0.5)
     settle: float = 1.0  # s, time for which both feet must be loaded before the robot walks
     posture: float = 2.0  # s, duration of the motion from the measured pose to the standing pose

@@ -57,12 +57,12 @@ from atalante_hal.types import Command, State, SupervisorState, Vector
 _N, _LEG = len(JOINTS), len(LEG_JOINTS)
 _SH, _SK = LEG_JOINTS.index("SH"), LEG_JOINTS.index("SK")
 _PELVIS, _TORSO = IMUS.index("pelvis"), IMUS.index("torso")
-#: Smallest distance [rad] from a desired joint angle of the swing leg to a position limit that foot placement permits.
+#: Foot placement requests only joint angles that are at least this far inside the position limits [rad].
 _MARGIN = math.radians(1.0)
 #: Largest valid age of the message of an IMU or a foot [cycles], equal to the timeout of these messages in the DBC.
 _SENSOR_AGE = 10
-#: Permitted deviation of the stance foot load from the weight while the other foot swings, as a fraction of the weight.
-#: The load deviates from the weight, because the robot accelerates.
+#: Largest expected deviation of the load on the stance foot from the weight, while the other foot swings, as a fraction of the
+#: weight. The load deviates from the weight, because the robot accelerates.
 _LOAD_ERROR = 0.15
 
 
@@ -138,7 +138,7 @@ class WalkController:
             toe=middle + half - config.edge,
         )
         force = np.zeros((len(FEET), len(CELLS), 3))
-        self._forces = force.copy()  # forces with an estimate for a lost foot
+        self._forces = force.copy()  # copy of the foot forces in which the forces of a lost foot are estimated
         #: Copy of the torque that the controller requested last, used if the `State` does not contain the sent torque.
         self._sent = np.zeros(_N)
         self._state: State | None = None  # `State` object whose arrays are in `_measured_by`
@@ -205,7 +205,7 @@ class WalkController:
         self._act = specialised(act, 0, measured, table, constants, stabiliser, self._section.assistance, self._parts)
 
     def _forget(self, cycle: int) -> None:
-        """Reset all values of the last walk."""
+        """Clear all data of the last walk."""
         self.phase, self._since, self._loaded, self._stopping, self._landed = Phase.POSTURE, cycle, 0, False, False
         self._stance, self._finishing = RIGHT, False
         self._stage.stance, self._stage.double, self._stage.steering = RIGHT, True, 0.0

@@ -25,7 +25,7 @@ class Stabiliser(NamedTuple):
     gain: float  # m/m, shift of the centre of pressure per DCM error; the error decays if the gain is above 1
     forward: float  # m, largest shift forwards and backwards
     sideways: float  # m, largest shift to each side
-    henke: float  # forward component of the unit Henke axis in the foot frame
+    henke: float  # forward component of the unit henke axis in the foot frame
     toe_out: float  # rad, toe-out of the left foot, positive to the left
     heel: float  # m, rearmost permitted centre of pressure relative to the ankle, negative
     toe: float  # m, foremost permitted centre of pressure relative to the ankle, positive

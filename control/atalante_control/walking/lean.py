@@ -22,7 +22,8 @@ class LeanConfig(NamedTuple):
 
     gain: float = 6.0  # rad/m, lean per DCM error beyond the dead zone; 0: no lean
     dead_zone: float = 0.02  # m, sideways DCM error up to which the trunk does not lean
-    #: m, largest distance of the DCM inwards from the centre of the stance sole at which the trunk leans over the stance foot
+    #: m, the trunk leans over the stance foot only if the DCM is outwards of the centre of the stance sole, or inwards of it by
+    #: less than this distance
     inside: float = 0.015
     outward: float = 0.22  # rad, largest lean over the stance foot
     inward: float = 0.08  # rad, largest lean to the side of the swing foot

@@ -41,7 +41,7 @@ class PhaseTable(NamedTuple):
     reach: Vector  # (2,) rad/s, speeds of hip and knee of the swing leg that lower the swing foot after the last cycle
     lowering: float  # m/s, downward speed of the swing foot at the joint speeds `reach`
     reach_cycles: int  # number of cycles in which the joint speeds `reach` lower the foot after the last row
-    #: number of cycles in which foot placement lowers a swing foot after the last row; used instead of `reach_cycles`
+    #: number of cycles in which the swing foot is lowered after the last row while foot placement holds the foot
     lowering_cycles: int
 
 

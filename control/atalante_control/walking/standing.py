@@ -90,7 +90,7 @@ class Standing:
         return Stance((feet[0].rotation.copy(), feet[1].rotation.copy()), (left, right), centre)
 
     def shift(self, onto: Vector, side: int) -> Shift:
-        """Return the weight shift from the middle between the feet to a pose above one foot.
+        """Return the weight shift from the middle between the feet to a pose with the centre of mass above one foot.
 
         Args:
             onto: angles of a pose with both soles flat on the ground and the centre of mass above one sole, shape (12,) [rad].
@@ -137,7 +137,7 @@ class Standing:
         return leg
 
     def _reach(self, q: Vector, foot: int, rotation: Vector, position: Vector) -> Vector:
-        """Return a copy of a pose with new joint angles of one leg, so that its sole is at the target (Newton's method)."""
+        """Return a copy of a pose in which one leg is moved so that its sole is at the target (Newton's method)."""
         q, leg = q.copy(), slice(foot * _LEG, (foot + 1) * _LEG)
         for _ in range(_ITERATIONS):
             now = self.stance(q)

@@ -42,7 +42,7 @@ class SwingLeg(NamedTuple):
 def swing_leg(
     gait: Gait, alpha: float, worn: ArticulatedModel, kinematics: Kinematics, gravity: Gravity, friction: Friction
 ) -> SwingLeg:
-    """Return the swing leg along the nominal trajectory of a step, up to the landing at the end of the step.
+    """Return the model of the swing leg along the nominal trajectory of a step, up to the landing at the end of the step.
 
     Args:
         gait: right-stance step. By symmetry, the result also applies to the left-stance step.

@@ -68,7 +68,7 @@ def write_telemetry(
     balance: Balance,
     up: Vector,
 ) -> None:
-    """Write the telemetry values that change in each cycle. The controller writes all other values at the start of a phase.
+    """Write the telemetry values that change in each cycle. The controller writes the constant values at the start of a phase.
 
     Args:
         telemetry: record to write, shape (1,).
