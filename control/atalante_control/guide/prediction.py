@@ -195,7 +195,7 @@ def prediction_of(policy: BackupPolicy, leg: Leg, assumptions: Assumptions, blen
 
 
 def _separated(rows: Vector) -> Vector:
-    """Convert matrices to a state that contains true minus measured velocities in place of true velocities."""
+    """Convert matrices so that they apply to a state with true minus measured velocity in place of the true velocity."""
     result = rows.copy()
     result[..., 4:6] += rows[..., 2:4]
     return result

@@ -2,8 +2,8 @@
 
 The gains of a leg depend on whether the leg is in stance or in swing. The integral is a torque with a separate, small limit.
 Anti-windup: if the limiter changed the torque of a joint, the integral of this joint does not grow further towards the requested
-torque. If the virtual guide assists a joint, the baseline controller provides only a share of the torque of this joint. The
-integral gain of the joint is multiplied by this share.
+torque. If the virtual guide assists a joint, the baseline controller provides only a share (0 to 1) of the torque of this
+joint. The integral gain of the joint is multiplied by this share.
 """
 
 from __future__ import annotations
