@@ -69,7 +69,7 @@ class Sensors:
     velocity_bandwidth: float  # Hz, cut-off frequency of the low-pass of the reported velocity
     #: Largest difference [rad] about each axis between two tibia attitudes: from the encoders and from the IMUs.
     attitude_error: float
-    #: Largest change [rad] of the difference between encoders and IMUs while an encoder reading is constant.
+    #: Largest change [rad] of the difference between encoder angle and IMU angle while the encoder reading is constant.
     attitude_change: float
     misalignment: float  # rad, allowance added to `attitude_change` for each rad by which the leg turns
     quaternion_error: float  # largest difference between the squared norm of a quaternion and 1
@@ -91,7 +91,7 @@ class Thresholds:
     position_tolerance: float
     #: Largest torque that a drive may report while it is off [Nm]. A drive that is on may exceed its limit by this torque.
     idle_torque: float
-    surplus_frames: float  # largest number of frames in a cycle besides one frame of each cyclic message
+    surplus_frames: float  # largest number of frames in a cycle in addition to one frame of each cyclic message
 
 
 @dataclass(frozen=True)

@@ -235,7 +235,7 @@ class Transceiver:
         self._bus_off = 0
 
     def faults(self) -> list[Finding]:
-        """Return the faults since the last call, and any bus-off until it is acknowledged. Call this once per cycle."""
+        """Return the faults since the last call. Return a bus-off in each call until it is acknowledged. Call once per cycle."""
         self._refused = self._refused + 1 if self._full_this_cycle else 0
         self._full_this_cycle = False
         self._floods = self._floods + 1 if any(finding.dtc is Dtc.BUS_FLOOD for finding in self._found) else 0

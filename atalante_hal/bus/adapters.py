@@ -1,4 +1,4 @@
-"""Table of the interfaces of python-can: CAN FD support, driver, channel, bit timing, and whether this project tested them.
+"""Table of the interfaces of python-can: CAN FD support, driver, channel, bit timing, and tests with this project.
 
     name of an interface -> `Adapter` -> `refusal()`
 

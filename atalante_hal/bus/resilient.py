@@ -16,7 +16,7 @@ from atalante_hal.wire.frame import Frames
 #: Longest time for which `receive` waits after an error of a lost link [s]. The next call tries the link again.
 RETRY_PERIOD = 0.1
 #: An error message is reported when it has not changed for this time [s].
-#: A removed interface causes two messages. The first one reports that the interface is down, the second one its removal.
+#: A removed interface causes two messages. The first message reports "down", the second message reports "removed".
 SETTLE_TIME = 0.1
 
 

@@ -30,7 +30,7 @@ from atalante_hal.bus.batch import Batches
 from atalante_hal.memory import anonymous_file
 from atalante_hal.wire.frame import FRAME_BYTES, Frames
 
-#: Indices of the counters of each bus end: frames sent, frames received, calls of `step` requested, calls of `step` completed.
+#: Indices of the counters of each bus end: sent frames, received frames, requested calls of `step`, completed calls of `step`.
 _SENT, _RECEIVED, _REQUESTED, _COMPLETED = range(4)
 #: Indices of the flags of each bus end. `_SERVING` is 1 while the end serves. `_SLEEPING` is 1 while the end sleeps.
 #: `_CLOSED` is 1 after the end is closed.

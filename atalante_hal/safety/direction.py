@@ -46,15 +46,15 @@ from atalante_hal.types import PERIOD, Vector
 
 #: Joints of a leg that are tested at the same time, and duration of their pulse [cycles].
 GROUPS = ((("FH", "SH"), 32), (("TH", "SA"), 16), (("SK", "HA"), 16))
-#: Delay [cycles] from a torque command to the first position that shows its effect, without late frames or motors.
+#: Delay [cycles] from a torque command to the first position that shows its effect, if no frame and no motor is late.
 LATENCY = 2
 #: Delays that the test tries [cycles]. States, commands and motors may be late by three cycles in total.
-#: Four cycles would look like a wrong sign, because the pulse of 16 cycles changes its sign every four cycles.
+#: A delay of four more cycles would look like a wrong sign, because the pulse of 16 cycles changes its sign every four cycles.
 LATENCIES = tuple(range(LATENCY, LATENCY + 4))
 #: Peak of the pulse as a multiple of `Robot.breakaway`, in the order of LEG_JOINTS. FH and SH move a whole leg.
 PEAK = (6.0, 3.0, 6.0, 3.0, 3.0, 3.0)
 #: Gains of the HAL's position control in the test, divided by the gains of the drive. The order is LEG_JOINTS.
-#: The position control of the HAL has more delay than that of a drive, so its gains for light joints must be lower.
+#: The position control of the HAL has more delay than that of a drive, so the HAL's gains for light joints are lower.
 STIFFNESS = (1.0, 1.0, 1.25, 0.5, 0.25, 0.25)
 DAMPING = (0.5, 0.5, 0.6, 0.25, 0.25, 0.25)
 #: Integral time of the HAL's position control, which holds the legs during the test [s].
@@ -72,7 +72,7 @@ BOOST = 6.0
 #: Number of unsuccessful tests of a joint after which the joint has failed.
 TRIALS = 2
 #: Smallest mobility [1/(kg m2)] that proves that a joint follows its torque, in the order of LEG_JOINTS.
-#: `MOBILITY` is about half of the smallest mobility that the joint of a suspended robot had in four cases.
+#: `MOBILITY` is about half of the smallest mobility of each joint of the suspended robot in four cases.
 #: The cases are straight legs and bent legs, each without a patient and with a patient of 110 kg.
 MOBILITY = (0.045, 0.23, 0.075, 0.56, 4.6, 6.8)
 
@@ -161,7 +161,7 @@ class DirectionProof:
         self._tests: list[tuple[list[int], int]] = []
         self._trials = [0] * len(JOINTS)
         #: Index in `LATENCIES` of the delay that the last test of more than two joints found.
-        #: A test of one or two joints does not search the delay, because a reversed motor may look like a late motor.
+        #: A test of one or two joints uses this delay. With a free choice, a reversed motor may look like a late motor.
         self._delay = 0
         self._position: list[Vector] = []  # joint positions in each cycle of the current test
         self._force: list[Vector] = []  # vertical force of each foot in each cycle of the current test

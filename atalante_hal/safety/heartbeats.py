@@ -167,7 +167,7 @@ class Heartbeats:
         self.emergencies = {node: active for node, active in self.emergencies.items() if node in still_faulty}
 
     def has_emergency(self, node: str) -> bool:
-        """Return whether a drive has an active emergency. If it has one, its drive state FAULT raises no additional diagnostic.
+        """Return whether a drive has an active emergency. The drive state FAULT then raises no additional diagnostic.
 
         The result is also True in the cycle in which the emergency is cleared, because the drive may still report FAULT.
 

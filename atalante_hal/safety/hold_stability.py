@@ -19,7 +19,7 @@ from atalante_hal.safety.diagnostics import Dtc, Finding
 from atalante_hal.types import Vector
 from atalante_hal.wire.cia402 import DriveState
 
-#: A reversal counts only if the joint exceeds this speed before and after it [rad/s].
+#: A reversal counts only if the joint exceeds this speed [rad/s] before and after the reversal.
 SPEED: Final = 0.5
 #: Longest time between two reversals of an oscillation [cycles].
 INTERVAL: Final = 100

@@ -132,7 +132,8 @@ class Limiter:
         self.saturated = 0
         # Copies of the inputs, because the compiled code accepts only the array type and layout that it was compiled for.
         self._asked, self._motion = np.zeros(_COUNT), np.zeros((2, _COUNT))
-        # Rows of `_past`: torques sent in the last `DELAY` cycles, newest first; last velocity with and without low-pass.
+        # First rows of `_past`: torques sent in the last `DELAY` cycles, newest first.
+        # Last two rows of `_past`: last velocity with low-pass, last velocity without low-pass.
         self._past = np.zeros((DELAY + 2, _COUNT))
         self._apply = specialised(
             limit, self._asked, self._motion, self._limits, self.limit, self.last, self._past, self.cut

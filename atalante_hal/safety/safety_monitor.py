@@ -117,8 +117,8 @@ class SafetyMonitor:
         self.recalled = -RECALL_CYCLES
         self.proof = DirectionProof(robot)
         self._proof_begun = False  # True if the test of the joint directions has begun in the current start
-        self._stalled = 0  # number of cycles of the current start since any drive changed its state
-        self._states_at_start = b""  # drive states in the previous cycle of the current start
+        self._stalled = 0  # during a start: number of cycles since the state of any drive changed
+        self._states_at_start = b""  # during a start: drive states in the previous cycle
         self.lowered: set[str] = set()
         self._hold_stability = HoldStability()
         self.torque_tracking = TorqueTracking(robot.breakaway)
@@ -386,7 +386,7 @@ class SafetyMonitor:
         return state.drive_state.tobytes() == _ENABLED and state.cycle - self.recalled >= RECALL_CYCLES
 
     def _prove_directions(self) -> Refusal | None:
-        """Begin the tests of the directions as soon as all drives are enabled, and evaluate them until they are over.
+        """Begin the direction tests as soon as all drives are enabled. Evaluate the tests in each cycle until all are complete.
 
         Returns:
             The end of the start if a joint failed; None if the start may continue.

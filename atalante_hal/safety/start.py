@@ -135,7 +135,7 @@ def _name(drive_state: float) -> str:
 
 
 def words_towards_operation(drive_state: Vector) -> list[Controlword]:
-    """Return the next controlword of each drive on the path to OPERATION ENABLED. Drives wait for others, so no joint sags.
+    """Return the next controlword of each drive towards OPERATION ENABLED. The drives wait for each other, so no joint sags.
 
     If all drives produce torque, all get ENABLE OPERATION. Until then, a drive that produces torque gets QUICK STOP and holds
     its position. A drive in SWITCHED ON waits until every other drive is in SWITCHED ON or produces torque.

@@ -16,7 +16,7 @@ from typing import Any
 _TEXTS, _FILES = ("robot", "listen"), ("certificate", "private_key", "client_ca", "users")
 
 
-# Valid protocols of an endpoint: _PROTECTED if there is a TLS certificate, otherwise _UNPROTECTED. The first is the default.
+# Valid protocols of an endpoint: _PROTECTED if there is a TLS certificate, otherwise _UNPROTECTED.
 _PROTECTED, _UNPROTECTED = ("tls", "quic"), ("tcp",)
 #: Valid endpoint: protocol, host, port. Zenoh's suffixes `?` and `#` are rejected, because they override TLS settings.
 _ENDPOINT = re.compile(r"(?P<protocol>[^/]+)/(?:[A-Za-z0-9._-]+|\[[0-9A-Fa-f:.]+\]):(?P<port>[0-9]{1,5})", re.ASCII)

@@ -222,7 +222,7 @@ class ReceiveImage:
         return count >= len(self.check) and self._received_in(frames).headers.tobytes() == self._expected_headers
 
     def expected_ages(self) -> dict[int, int]:
-        """Return frame identifier -> age [cycles] of each message that is not older than its DBC timeout."""
+        """Return the age [cycles] of each message that is not older than its DBC timeout, by frame identifier."""
         ages = zip(self.codec.messages, self.age.tolist(), strict=True)
         return {m.frame_id: age for m, age in ages if age <= m.timeout_ms}
 
@@ -357,7 +357,7 @@ def _results(count: int) -> Words:
 def accept_exact(
     words: Words, e2e: E2EState, tag: int, table: SignalTable, values: Vector, values_before: Vector
 ) -> bool:
-    """Commit all rows if the frames are exactly the expected messages: in order, intact, in sequence, in range and of this cycle.
+    """Commit all rows if every expected message arrived in order and is intact, in sequence, in range and of this cycle.
 
     Args:
         words: received frames as a flat array of 64-bit words, shape (rows * 9,).
@@ -482,7 +482,7 @@ def classify_frame(words: Words, row: int, offset: int, e2e: E2EState, tag: int,
             return _CONFLICT
         result = _CONFLICT
     elif tag != _NO_TAG and not back:
-        # Reject a frame that answers no recent SYNC, or that answers an earlier SYNC than the last accepted frame.
+        # Reject a frame that answers no recent SYNC, and a frame that is older than the last accepted frame.
         # A rejected frame does not change the expected counter.
         backwards = expected[row] != NOTHING and counter - expected[row] + 1 & 0xFF >= _HALF_TURN
         if not in_time or backwards:

@@ -22,7 +22,7 @@ DELAY: Final = 2.0
 #: Stiffness and damping of the sling, both per kg of the robot. The weight of the robot stretches the sling by 25 mm.
 STIFFNESS: Final = 400.0  # N/m per kg
 DAMPING: Final = 28.0  # N s/m per kg
-#: Rotational stiffness and damping per kg of the robot, with which the sling turns the pelvis upright.
+#: The sling turns the pelvis upright with this rotational stiffness and damping, both per kg of the robot.
 #: Both values apply while the sling carries the full weight.
 RIGHTING: Final = 100.0  # Nm/rad per kg
 ATTITUDE_DAMPING: Final = 1.5  # Nm s/rad per kg

@@ -16,7 +16,7 @@ HAL_READY = 1
 
 
 class Request(IntEnum):
-    """Button that the operator pressed last. The values are the values of the signal `PENDANT_STATE.Request`."""
+    """Button that the operator pressed last. Each member has the value of the signal `PENDANT_STATE.Request`."""
 
     NONE = 0
     START = 1

@@ -89,7 +89,7 @@ class Unchecked:
 
 
 def _checks(rows: Rows) -> Iterator[_SensorCheck]:
-    """Yield one check of each velocity, of each leg, of torso IMU against pelvis IMU, and of the cells of each foot."""
+    """Yield these checks: one for each joint velocity, one for each leg, one for the trunk IMUs, one for each foot."""
     joints, imus, feet = rows.joint.tolist(), rows.imu.tolist(), rows.foot.tolist()
     for joint, row in enumerate(joints):
         yield _SensorCheck(Dtc.ENC_VELOCITY, JOINT_NODES[joint], [row], f"the velocity of {JOINTS[joint]}")
