@@ -109,7 +109,8 @@ def false_alarms(cycles: int, jobs: int, dask: str, engine: str, as_json: bool) 
     """Walk without a fault, in the air and on the ground with a passive wearer, and count the reported diagnostics.
 
     GUIDE_OUTSIDE and TORQUE_SATURATED are expected: the filter and the limiter report that they act. Every other
-    diagnostic is a false alarm. The exit code is 1 if there is one.
+    diagnostic is a false alarm. The exit code is 1 after a false alarm, or if a walk does not
+    end in ACTIVE.
     """
     from atalante_tools.faults.false_alarms import Quiet, quiet_tasks
 
@@ -235,7 +236,7 @@ def _done(tasks: Sequence[Task], *, engine: str, jobs: int = 1, dask: str = "") 
 
 
 def _table(summary: Summary) -> str:
-    """Return a table with one row per fault: result, and longest fault duration that the walk survives [cycles]."""
+    """Return a table with one row per fault. Column "survived": longest fault duration that the walk survives [cycles]."""
     from atalante_tools.faults.report import number, survived
 
     lasts = {one.id: survived(one) for one in summary.endurance}

@@ -28,7 +28,7 @@ class Absence:
         """
         self._clock, self._emulator = clock, emulator
         self._begun = 0  # number of HAL cycles that have begun
-        self._skipped = 0.0  # time lost by the loop in cycles that began more than a period late [s]
+        self._skipped = 0.0  # sum of the delays of all earlier cycles that began more than one period late [s]
         self._seen = 0  # cycle number of the robot at the end of the last call of `wait`
         self._alone = 0  # number of robot cycles since the last SYNC
 

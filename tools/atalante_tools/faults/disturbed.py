@@ -70,7 +70,7 @@ class TimedStimuli:
     """
 
     def __init__(self, stimuli: Sequence[Stimulus], begins: int) -> None:
-        """Add the start of the case to the start of each fault and action.
+        """Schedule the faults and actions of a case.
 
         Args:
             stimuli: faults and operator actions. Their `start` counts from the start of the case.

@@ -26,7 +26,7 @@ _COMMAND: Final = "COMMAND_LEFT_LEG"
 #: A knee that sinks in LOWER or FAULT is at rest after this time [cycles]. Then its drive can be enabled again.
 _LOWERED: Final = 4500
 
-#: Restarts during the walk, after which a drive must be enabled again.
+#: Name of a case -> faults that restart drives during the walk. A restarted drive must be enabled again.
 _RESTARTED: Final = {
     "one drive restarted": (Fault("reset", _HIP, 0, 3),),
     "two drives restarted": (Fault("reset", _HIP, 0, 3), Fault("reset", "RIGHT_SK", 0, 3)),
@@ -36,7 +36,7 @@ _RESTARTED: Final = {
 def _start_with(name: str, node: str, fault: Fault | float) -> Case:
     """Return a test case in which the first START fails.
 
-    If `fault` is a number, the motor of the node produces `fault` times the torque that the drive reports.
+    If `fault` is a number, it is the true torque of the motor divided by the torque that the drive reports.
     """
     return Case(
         name,
@@ -269,7 +269,7 @@ SCENARIOS: Final = (
             ),
         ),
     ),
-    # The position control of the knee's drive becomes unstable when its motor is eight cycles late.
+    # If the torque of the knee motor is eight cycles late, the position control of the knee drive becomes unstable.
     Scenario(
         "F74",
         tuple(

@@ -1,6 +1,6 @@
 """Walks without a fault: every diagnostic that they report, except the expected ones, is a false alarm.
 
-seed -> walk in the air or on the ground -> number of each reported diagnostic
+seed -> walk in the air or on the ground -> number of reports of each diagnostic
 """
 
 from __future__ import annotations
@@ -34,11 +34,11 @@ class Quiet:
     name: str
     cycles: int  # number of cycles from power-on to the end of the walk
     state: str  # state of the HAL at the end of the walk
-    counts: dict[str, int]  # number of each reported diagnostic
+    counts: dict[str, int]  # diagnostic code -> number of reports
 
     @property
     def alarms(self) -> dict[str, int]:
-        """Return the number of each diagnostic that is not expected."""
+        """Return the number of reports of each unexpected diagnostic."""
         return {code: count for code, count in self.counts.items() if code not in EXPECTED}
 
     @property

@@ -2,14 +2,14 @@
 
     case of the matrix, moment -> run with a schedule of START and STOP -> safety checks, measured extremes
 
-The fault matrix states the reaction to a fault during a walk. At other moments, and for pairs, no reaction is prescribed for each
-fault. The runs check what must be true for every fault at every moment:
+The fault matrix states the reaction to a fault during a walk. The matrix prescribes no reaction for other moments or for
+pairs. The runs check what must be true for every fault at every moment:
 
-- no torque, position, velocity or torque rate beyond its limit;
-- no command that lets a drive produce torque before the operator pressed START;
-- no change to a less severe state without the operator, after the robot has walked;
-- no joint moves by more than `SAG_MAX` from START until the start is complete;
-- no exception.
+- No torque, position, velocity or torque rate exceeds its limit.
+- No command lets a drive produce torque before the operator has pressed START.
+- After the robot has walked, only the operator can cause a change to a less severe state.
+- During a start, no joint moves by more than `SAG_MAX`.
+- The run raises no exception.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ from atalante_tools.faults.scenario import MID_SWING, Case, shifted
 from atalante_tools.faults.verdict import WALKING, automatic_improvements, exception_sentence, limit_violations
 
 _S = SupervisorState
-#: Largest accepted motion of a joint between START and ACTIVE, or in the first `_SETTLED` cycles after START [deg].
+#: Largest accepted motion of a joint during a start [deg]. A start ends in ACTIVE, or `_SETTLED` cycles after START.
 SAG_MAX: Final = 1.0
 _SETTLED: Final = 40
 #: Number of cycles from READY to the operator's START.
@@ -65,7 +65,7 @@ class Schedule:
     """Times of a run, in HAL cycles."""
 
     begins: int  # first faulty cycle
-    starts: tuple[int, ...]  # cycles in which the operator presses START, all before the end of the fault
+    starts: tuple[int, ...]  # cycles in which the operator presses START, without the two presses after the fault
     stop: int | None = None  # cycle in which the operator presses STOP
 
 
@@ -98,11 +98,11 @@ class Extreme(NamedTuple):
 
 @dataclass(frozen=True)
 class Extremes:
-    """Largest joint speed, torque step and joint motions of a run."""
+    """Largest values of a run: speed and torque step of a joint, and motion of a joint during a start and in HOLD."""
 
     speed: Extreme  # joint velocity as a share of its limit
     torque_step: Extreme  # change of the commanded torque in one cycle [Nm]
-    sag: Extreme  # motion [deg] from START to ACTIVE, or in the first `_SETTLED` cycles after START
+    sag: Extreme  # motion during a start [deg], see `SAG_MAX`
     lost: Extreme  # motion since the first cycle in HOLD or a more severe state [deg]
 
 
@@ -209,7 +209,7 @@ def _extremes(run: Observation, starts: Sequence[int]) -> Extremes:
 
     Args:
         run: observation of the run.
-        starts: cycles in which the operator pressed START, all before the end of the fault.
+        starts: cycles in which the operator pressed START, without the two presses after the fault.
     """
     count = len(JOINTS)
     sag, lost, held = np.zeros(count), np.zeros(count), None

@@ -25,7 +25,7 @@ class Line:
     id: str
     passed: bool
     state: str
-    #: reaction time of the worst case [cycles]: of a failed case; if no case failed, of the case closest to its time limit
+    #: reaction time of the worst case [cycles]. A failed case is the worst; without one, the case closest to its time limit
     cycles: int | None
     bound: int
     dtc: str
@@ -137,7 +137,7 @@ class Summary:
         return "\n\n".join(parts) + "\n"
 
     def _moments(self) -> str:
-        """Return a table of the largest values: first one row per `Moment` (all its runs), then one row per fault."""
+        """Return a table of the largest values: one row per `Moment`, one row for the random pairs, one row per fault."""
         single = [run for run in self.moments if len(run.faults) == 1]
         pairs = [run for run in self.moments if len(run.faults) > 1]
         groups = [(f"all, {moment}", [run for run in single if run.moment == moment]) for moment in Moment]
@@ -167,7 +167,7 @@ class Summary:
 
 
 def _moment_row(runs: Sequence[MomentVerdict]) -> list[str]:
-    """Return the numbers of runs, failed runs and restarted runs, and the largest values with their joints, as text."""
+    """Return the cells of a row: numbers of runs, failed runs and restarted runs, then each largest value with its joint."""
     extremes = [run.extremes for run in runs if run.extremes is not None]
     counts = [len(runs), sum(bool(run.failures) for run in runs), sum(run.restarted for run in runs)]
     worst = [

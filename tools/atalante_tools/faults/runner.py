@@ -154,7 +154,7 @@ class CaseRun:
         self._sent = SentFrames()
         self._samples: list[_Sample] = []
         self._events: list[Event] = []  # events that the HAL reported before its shutdown
-        self._copied = 0  # number of events of the HAL when the events were last copied
+        self._copied = 0  # total number of HAL events at the last copy to `_events`
 
     def execute(self, until: Callable[[State], bool]) -> None:
         """Run the HAL and the emulator.

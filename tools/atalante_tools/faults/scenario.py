@@ -87,7 +87,7 @@ class Case:
     reacted: int | None = None  # time limit for the reaction [cycles]; None means as in the fault matrix
     node: str | None = None  # node that the diagnostic must name; None means any node
     recovers: bool = True  # True: START after the fault must lead to ACTIVE; False: it must not
-    #: cycles between the end of the fault and START; for a permanent fault, between the time limit of the reaction and START
+    #: cycles from the end of the fault to START; for a permanent fault: from the time limit of the reaction to START
     observed: int = 60
     seed: int = 0  # seed of the random numbers in the emulator
     checks: tuple[ObservationCheck, ...] = ()  # additional checks of the run

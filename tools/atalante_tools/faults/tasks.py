@@ -206,7 +206,7 @@ def run_task(task: Task) -> Result:
 
 
 def _cycles_until_stop(case: Case, cycles: int) -> int | None:
-    """Run a permanent fault for `cycles` cycles. Return the cycles until the walk stopped; None if it continued."""
+    """Run a case with its permanent fault limited to `cycles` cycles. Return the cycles until the walk stopped, or None."""
     shortened = replace(case, stimuli=tuple(limited(stimulus, cycles) for stimulus in case.stimuli))
     run = observe(shortened, cycles, recovery=False)
     for cycle in range(run.first, run.last + 1):

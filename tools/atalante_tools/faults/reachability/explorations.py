@@ -59,7 +59,7 @@ class Operator(NamedTuple):
 
 
 class Presses(NamedTuple):
-    """Memory of the search `moves`: number of START presses that changed no state yet, and whether a START is in progress."""
+    """Memory of the search `moves`: number of START presses without a state change so far, and whether a START is in progress."""
 
     received: int = 0  # number of presses of START; 2 means two or more
     started: bool = False
@@ -89,7 +89,8 @@ class Cycle(NamedTuple):
     operator: Operator = Operator()
 
 
-#: Results of the reception of pendant frames -> frames that cause them. The last element of a result: whether START was pressed.
+#: Result of receiving pendant frames -> frames that cause this result. A result has three elements: state of the reception,
+#: inputs of the operator, and whether a press of START was received from the pendant.
 _Receptions = dict[tuple[Reception, Inputs, bool], tuple[PendantFrame, ...]]
 
 
@@ -113,9 +114,9 @@ class OperatorPath:
         """Prepare the steps of the HAL.
 
         Args:
-            receives_like: path that receives the same frames in the same way. The new path uses the stored results of
-                this path, because reception is the longest part of a search. None means that there are no stored
-                results.
+            receives_like: path with stored results of the reception. The new path uses these results, because reception takes
+                most of the time of a search. Both paths must receive frames in the same way. None means that the new
+                path computes all results.
         """
         self._steps = HalSteps()
         self._received: Callable[[Reception, Operator], _Receptions]
@@ -172,10 +173,7 @@ class OperatorPath:
                 )
 
     def _receive(self, before: Reception, operator: Operator) -> _Receptions:
-        """Return the possible results of receiving pendant frames. Each result is mapped to the frames that cause it.
-
-        The third element of a result is True if a press of START was received from the pendant.
-        """
+        """Return the possible results of receiving pendant frames. Each result is mapped to the frames that cause it."""
         results: _Receptions = {}
         for frames in arrivals(before, operator):
             presses = [
@@ -204,13 +202,13 @@ class OperatorPath:
         return results
 
     def _command(self, state: Supervision, prevented: bool) -> tuple[bool, bool]:
-        """Return whether the HAL sends ENABLE OPERATION to a drive, and whether the HAL continues to enable drives."""
+        """Return whether the HAL sends ENABLE OPERATION to a drive, and the new value of `Supervision.enabling`."""
         sent = [self._steps.command(state, prevented, drive, "torque") for drive in DriveState]
         return any(word == ENERGISING for word, _ in sent), sent[0][1]
 
 
 def is_move(before: SupervisorState, after: SupervisorState) -> bool:
-    """Return whether a state change starts motion, or leads from a state worse than ACTIVE to a better state."""
+    """Return whether a state change starts motion, or improves a state that is worse than ACTIVE."""
     return (after in MOVING and before not in MOVING) or (after < before and before > _S.ACTIVE)
 
 
@@ -232,8 +230,8 @@ def environments(before: Supervision, suspended: bool = False) -> Iterator[Envir
 def arrivals(before: Reception, operator: Operator) -> Iterator[tuple[PendantFrame, ...]]:
     """Yield all sets of pendant frames that can arrive in a cycle.
 
-    A frame can be in time, lost, doubled, late, damaged, or arrive together with a frame of a second sender. The first
-    set contains one frame that is in time.
+    A frame can be in time, lost, doubled, late or damaged. A frame of a second sender can arrive, too. The first set
+    contains one frame that is in time.
 
     Args:
         before: state of the reception.

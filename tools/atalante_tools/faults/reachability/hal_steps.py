@@ -40,7 +40,7 @@ _PRESSES, _ROGUE_PRESSES = 10, 12
 #: Number of cycles for which a START may still be processed: none, this cycle only, or more.
 NO_START, LAST_START, START = 0, 1, 2
 START_CYCLES: Final = {NO_START: 0, LAST_START: 1, START: 100}
-#: Whether the HAL trusts the pendant -> values of the pendant's `Qualification` that the search tries.
+#: Whether the HAL trusts the pendant -> values of `Qualification` that the search tries in this case.
 QUALIFICATIONS: Final = {
     False: (Qualification(0, 0, False), Qualification(0, REQUALIFY - 1, False)),
     True: (SETTLED, Qualification(FULL - 4, REQUALIFY, True)),
@@ -171,8 +171,8 @@ class HalSteps:
     def _process(self, before: Reception, frames: tuple[PendantFrame, ...]) -> tuple[tuple[Reception, Inputs], ...]:
         """Return the possible results of the HAL. The field `own_request` of each result is 0.
 
-        A state does not contain all counters of the HAL. The other counters are set to each value that gives another
-        result, see the tests.
+        Some counters of the HAL are not part of a search state. For these counters, every value that leads to another
+        result is tried. The tests check the choice of the values.
 
         Args:
             before: state before the cycle.
@@ -316,7 +316,7 @@ class HalSteps:
         monitor._stalled = 0  # constant in the search: `LAST_START` covers all ways in which a START can end
         monitor._ending = monitor._duplicate_found = monitor._ramping = False
         monitor.lowered.clear()
-        # The controlwords during the test of the directions are the same as while other drives are being enabled.
+        # Mark all torque directions as tested. The test of the directions needs the same controlwords as the enabling of drives.
         monitor.proof.proven.fill(True)
         monitor.proof.failed.clear()
         monitor.proof.running = False

@@ -31,8 +31,8 @@ def search(name: str, path: OperatorPath) -> Exploration[Any, Any]:
 
     Args:
         name: key of `SEARCHES`.
-        path: transition function of `moves` and `stops`. The path stores its results, so the second of
-            these searches is faster.
+        path: transition function of the searches `moves` and `stops`. The path stores its results, so the
+            second of these searches is faster.
     """
     match name:
         case "moves":

@@ -54,7 +54,7 @@ def explore(initial: Iterable[S], successors: Callable[[S], Iterable[Transition[
 
 
 def _trace(before: dict[S, tuple[L, S] | None], state: S) -> list[tuple[L, S]]:
-    """Return the inputs and the state after each cycle, from an initial state to a given state."""
+    """Return the cycles from an initial state to a given state: for each cycle, its inputs and the state after it."""
     trace: list[tuple[L, S]] = []
     while (step := before[state]) is not None:
         label, origin = step
