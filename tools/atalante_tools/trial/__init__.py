@@ -143,7 +143,10 @@ def shapes(running: Running, as_json: bool) -> None:
 @_walking()
 @_running("assist")
 def assist(masses: tuple[float, ...], walking: Walking, running: Running, as_json: bool) -> None:
-    """Compare full and partial assistance: eight subjects, each passive and active, four walks of five minutes each."""
+    """Compare full and partial assistance.
+
+    Each of eight subjects walks four times for five minutes: passive and active, with full and with partial assistance.
+    """
     from atalante_tools.trial.findings import assist_findings
     from atalante_tools.trial.plan import PROTOCOL, QUICK_MASSES, QUICK_PROTOCOL, assist_trials
 
@@ -160,7 +163,7 @@ def assist(masses: tuple[float, ...], walking: Walking, running: Running, as_jso
 @_walking()
 @_running("sweep")
 def sweep(days: int, walking: Walking, running: Running, as_json: bool) -> None:
-    """Walk with the assistance factors from 1 down to 0 and back to 1: one active subject, walks of five minutes each."""
+    """Walk with one active subject and assistance factors from 1 down to 0 and back to 1. Each walk takes five minutes."""
     from atalante_tools.trial.findings import sweep_findings
     from atalante_tools.trial.plan import PROTOCOL, QUICK_PROTOCOL, QUICK_SWEEP, SWEEP, sweep_trials
 
@@ -221,7 +224,7 @@ def faults(ids: tuple[str, ...], running: Running, as_json: bool) -> None:
 @click.option(
     "--heading-reference",
     is_flag=True,
-    help="The IMUs have a heading reference, such as a magnetometer, and the controller follows the heading of the pelvis IMU.",
+    help="Give the IMUs a heading reference, such as a magnetometer. The controller then follows the heading of the pelvis IMU.",
 )
 @_walking()
 @_running("protocol")
@@ -235,9 +238,9 @@ def protocol(
     running: Running,
     as_json: bool,
 ) -> None:
-    """Walk 112 steps with full assistance, 38 steps of transition and 225 steps with another assistance factor.
+    """Walk 112 steps with full assistance, then 38 steps in which the factor changes, then 225 steps with the new factor.
 
-    Eight subjects walk, each passive and active, and with each assistance factor.
+    There is one walk for each combination of subject (eight), kind of subject (passive, active) and assistance factor.
     """
     from atalante_tools.trial.findings import protocol_findings
     from atalante_tools.trial.plan import (
@@ -268,9 +271,10 @@ def protocol(
 )
 @_running("robustness")
 def robustness(seeds: int | None, steps: int | None, running: Running, as_json: bool) -> None:
-    """Walk with full assistance, random patients, errors of the model, friction, late motors, lost frames and pushes.
+    """Walk with random patients, model errors, friction, late motors, lost frames and pushes, at full assistance.
 
-    Each trial in which the robot does not walk all steps and stand is repeated with a recording, in the folder `recordings`.
+    If the robot does not complete all steps, or does not stand at the end, the trial is repeated, and its repetition is
+    recorded in the folder `recordings`.
     """
     from atalante_tools.trial.findings import robust_findings
     from atalante_tools.trial.plan import QUICK_ROBUST, ROBUST, robust_trials
@@ -298,7 +302,7 @@ def pushes(running: Running, as_json: bool) -> None:
 
 
 def _record_failures(trials: Sequence[Trial], running: Running) -> None:
-    """Repeat each trial in which the robot did not walk all steps and stand, and record the repetition."""
+    """Repeat and record each trial in which the robot did not complete all steps, or did not stand at the end."""
     from atalante_tools.trial.findings import walked_all_steps
     from atalante_tools.trial.plan import RobustTrial
     from atalante_tools.trial.store import stored

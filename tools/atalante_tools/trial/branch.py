@@ -1,9 +1,10 @@
-"""Branches of a run: copies of this process that wait at a moment of the run and continue it from there, once per request.
+"""Branches of a run. A branch is a copy of the process that waits at one moment of the run.
 
     run --fork--> waiting process --fork per request--> continued run -> answer
 
-The operating system copies the memory of the process only where it changes, so a branch is cheaper than a repetition of
-the run until that moment. Equal requests lead to equal runs, because all time is virtual.
+For each request, a further copy of the process continues the run from this moment. The operating system copies only the memory
+that changes, so a branch takes less time than a repetition of the run from its start. Equal requests lead to equal runs,
+because all time is virtual.
 """
 
 from __future__ import annotations
@@ -17,13 +18,13 @@ from typing import Any
 
 
 class Branch:
-    """Access to a branch, for the process from which the branch was made."""
+    """Connection from the process of the run to a branch of this run."""
 
     def __init__(self, channel: Connection) -> None:
         self._channel = channel
 
     def ask(self, request: Any) -> Any:
-        """Return the answer of a run that continues from the moment of the branch.
+        """Continue the run from the moment of the branch, in a new process. Return the answer of this process.
 
         Args:
             request: object that describes how the run continues.
@@ -83,7 +84,7 @@ def branch() -> Branch | Continuation:
         theirs.close()
         return Branch(ours)
     ours.close()
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the process of the run decides when its branches end
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # only the process of the run ends its branches
     signal.signal(signal.SIGTERM, signal.SIG_DFL)
     try:
         while True:
@@ -96,7 +97,7 @@ def branch() -> Branch | Continuation:
                 theirs.send(_NoAnswer(status))
     except EOFError:  # the process of the run has closed the branch, or has ended
         os._exit(0)
-    except BaseException:  # noqa: BLE001 - an error must not reach the code of the run in this copy
+    except BaseException:  # noqa: BLE001 - in this copy of the process, no error may reach the caller
         os._exit(1)
     return Continuation(request, theirs)
 

@@ -1,4 +1,4 @@
-"""Findings of the experiment `faults`: `results -> falls of each fault, with start times, reasons and longest durations`."""
+"""Findings of the experiment `faults`: `results -> one finding per fault`."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from atalante_tools.trial.findings import Finding, Result
 #: The cases are lost, late and doubled frames; a failed IMU, foot or force cell; an exception of the controller.
 #: The robot must also not fall after a late loop, STOP, or the release of the dead-man switch.
 #: A drive without data for ten cycles is left out, because its joint must not be moved.
-#: After HOLD the robot may fall, because the drives hold at once.
+#: The button HOLD is left out: the drives then hold at once, so the robot may fall.
 NO_FALL: Final = {
     **dict.fromkeys(("F01", "F02", "F03", "F05", "F20", "F24", "F30", "F31", "F32", "F33"), ""),
     "F04": "LEFT|RIGHT|5 frames",
@@ -80,7 +80,7 @@ def _by_case(falls: Sequence[tuple[str, dict[str, Any]]]) -> list[tuple[str, lis
 
 
 def _moments(falls: Sequence[dict[str, Any]]) -> str:
-    """Return a text about the falls in one case: starts of the fault, end states, first diagnostics and reason."""
+    """Return text about all falls in one case: moments, final states, first diagnostics, and the reason of the first fall."""
     moments = ", ".join(run["moment"] for run in falls)
     states = ", ".join(dict.fromkeys(run["state"] for run in falls))
     codes = ", ".join(dict.fromkeys(run["codes"][0] if run["codes"] else "no diagnostic" for run in falls))
@@ -88,7 +88,7 @@ def _moments(falls: Sequence[dict[str, Any]]) -> str:
 
 
 def _longest(result: Result) -> str:
-    """Return as text the longest fault duration without a fall at any moment, and the worst moment."""
+    """Return text: the fault duration up to which the robot falls at no moment, and the moment that limits this duration."""
     limited = [
         (cycles, run["moment"])
         for cycles, run in zip(result["longest"], result["runs"], strict=True)

@@ -14,7 +14,7 @@ from typing import ClassVar, Final, NamedTuple
 
 
 class Moment(NamedTuple):
-    """Moment of the walk at which a fault begins: a time after the start of a phase of the walk."""
+    """Moment of a walk at which a fault begins, as the time since the start of a phase of the walk."""
 
     phase: str  # name of a member of `atalante_control.walking.phases.Phase`
     step: int  # number of steps before the phase
@@ -38,9 +38,9 @@ FURTHER_MOMENTS: Final = {
 }
 #: Names of the moments with both feet on the ground.
 DOUBLE_SUPPORT: Final = frozenset({"weight shift", "shift back", *FURTHER_MOMENTS})
-#: Faults after which the HAL sends no more frames, on a bus or on all buses.
+#: IDs of the faults after which the HAL sends no more frames, on one bus or on all buses.
 NO_FRAMES: Final = frozenset({"F15", "F16", "F41"})
-#: Faults of `--quick`.
+#: IDs of the faults that `--quick` injects.
 QUICK_IDS: Final = ("F05", "F56")
 #: Value of `FaultTrial.index` for the permanent case of a scenario.
 PERMANENT: Final = -1
@@ -54,7 +54,7 @@ class FaultTrial:
     id: str  # fault ID, as in the fault matrix
     index: int  # index of the case in its scenario, or `PERMANENT`
     case: str  # name of the case
-    moments: tuple[str, ...]  # names of `MOMENTS` and `FURTHER_MOMENTS`
+    moments: tuple[str, ...]  # keys of `MOMENTS` and `FURTHER_MOMENTS`
     mass: float  # mass of the wearer [kg]
     height: float  # height of the wearer [m]
     seed: int

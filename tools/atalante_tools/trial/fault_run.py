@@ -1,7 +1,7 @@
 """Run the trials of the experiment `faults`: `trial -> a walk for each start of the fault -> outcomes, diagnostics, durations`.
 
-A first walk without a fault gives the cycles of the moments. All walks with the same seed are equal until the fault begins, so a
-second walk branches off shortly before each moment, and each fault continues a copy of this walk.
+A first walk without a fault gives the cycle of each moment. All walks with the same seed are equal until a fault begins. So a
+second walk makes a branch shortly before each moment, and every walk with a fault continues from one of these branches.
 """
 
 from __future__ import annotations
@@ -55,8 +55,8 @@ _LONGEST: Final = 20_000
 #: The robot is at rest if its pelvis and its joints have been slower than `_STILL` [m/s, rad/s] for `_RESTED` cycles, and
 #: each foot carries a load of at least `_LOADED` [N].
 _STILL, _RESTED, _LOADED = 0.01, 500, 50.0
-#: The robot is considered to walk on if it still walks this time [cycles] after the second landing (`_LANDINGS`) that
-#: follows the fault.
+#: The outcome is "walked" if the robot still walks `_WALKED` cycles after the second landing (`_LANDINGS`) that follows
+#: the fault.
 _WALKED: Final = 400
 _LANDINGS: Final = 2
 #: Phases of the walk that begin with the landing of a foot.
@@ -76,15 +76,14 @@ class FaultRun:
     state: str  # state of the HAL at the end
     #: diagnostics since the first faulty cycle, except information, in the order of their first report
     codes: tuple[str, ...]
-    detected: (
-        int | None
-    )  # number of cycles from the first faulty cycle to the diagnostic of the fault matrix, both included
+    #: number of cycles from the first faulty cycle to the diagnostic of the fault matrix, both included
+    detected: int | None
     reason: str  # reason that the HAL states for its last state, or the exception
     fallen: int | None = None  # number of cycles from the start of the case to the fall
 
 
 class _Request(NamedTuple):
-    """Case that continues a walk from a branch."""
+    """Faults and actions to inject into a walk that continues from a branch."""
 
     stimuli: tuple[Stimulus, ...]  # faults and actions of the operator
     begins: int  # HAL cycle in which the case begins
@@ -92,7 +91,7 @@ class _Request(NamedTuple):
 
 
 class _Answer(NamedTuple):
-    """Result of a walk that has been continued with a case."""
+    """Result of a walk that continued from a branch."""
 
     outcome: str
     state: SupervisorState

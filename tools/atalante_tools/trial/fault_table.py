@@ -7,7 +7,7 @@ from typing import Any, Final
 
 from atalante_tools.trial.fault_plan import FURTHER_MOMENTS, MOMENTS
 
-#: Words of the outcomes of a walk.
+#: Outcome of a walk -> word in the table.
 _WORDS: Final = {"walked": "walks", "hold": "stops", "fell": "FALLS", "exception": "ERROR"}
 
 
@@ -29,7 +29,7 @@ def fault_table(results: Sequence[dict[str, Any]]) -> tuple[list[str], list[list
 
 
 def _survived(result: dict[str, Any]) -> str:
-    """Return the range of the longest durations without a fall. Moments without a fall are left out."""
+    """Return the range of the longest fault durations without a fall. Moments at which the robot never falls are left out."""
     survived = [cycles for cycles in result["longest"] if cycles is not None]
     if not survived:
         return "-"

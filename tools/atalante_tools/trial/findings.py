@@ -26,15 +26,15 @@ _PHASES: Final = np.linspace(0.1, 0.8, 29)
 SAME: Final = 0.02
 STANDING: Final = 1.44  # metabolic rate of quiet standing [W/kg]
 #: A quantity has a falling trend if its rank correlation with the assistance factor is between -1 and -`TREND`.
-#: `ASYMMETRY` limits the difference between the k-th trial of a day and the k-th trial from its end. The difference is averaged
-#: over k and divided by the range of the values.
+#: `ASYMMETRY` limits the difference between the way down and the way up of the assistance factor: the difference between the
+#: k-th trial of a day and the k-th last trial of this day, averaged over k and divided by the range of all values.
 TREND, ASYMMETRY = 0.8, 0.25
 #: Largest coefficient of variation of the baseline metabolic rates of a sweep.
 VARIATION: Final = 0.05
 
 
 #: `CERTIFIED` is the smallest accepted share of certified guides.
-#: `ROBUST` is the smallest accepted share of robots that walk all steps and stand in the experiment `robustness`.
+#: `ROBUST` is the smallest accepted share of robots that complete all steps of `robustness` and stand at the end.
 CERTIFIED, ROBUST = 0.95, 0.98
 #: Largest deviation from the line after the walks of `protocol` [m]: with the gyro alone, and with a heading reference.
 SIDEWAYS, SIDEWAYS_WITH_REFERENCE = 1.5, 0.5
@@ -278,7 +278,7 @@ def step_variation(result: Result) -> float:
 
 
 def _alarms(results: Sequence[Result]) -> str:
-    """Return as text the number of each diagnostic that must not be reported in a walk without a fault."""
+    """Return text: each diagnostic that a walk without a fault must not report, with its number of reports."""
     counts: dict[str, int] = {}
     for result in results:
         for code, count in result["diagnostics"].items():
@@ -367,14 +367,14 @@ def _trend(id_: str, claim: str, walks: Sequence[Result], value: Callable[[Resul
 
 
 def _symmetry(id_: str, claim: str, walks: Sequence[Result], value: Callable[[Result], float]) -> Finding:
-    """Return the finding that the values of a day are nearly the same in the reverse order of the trials."""
+    """Return the finding that the trials of the way down and of the way up have nearly the same values."""
     days: dict[str, list[Result]] = {}
     for walk in walks:
         days.setdefault(walk["trial"]["order"].split("-")[0], []).append(walk)
     pairs, values = list[float](), list[float]()
     for day in days.values():
         factors = [r["trial"]["xi"] for r in day]
-        if factors == factors[::-1]:  # a day with a missing trial is left out
+        if factors == factors[::-1]:  # omit a day with a missing trial
             values += [value(r) for r in day]
             pairs += [abs(value(day[k]) - value(day[-1 - k])) for k in range(len(day) // 2)]
     if not pairs:

@@ -8,8 +8,8 @@ from atalante_tools.faults.catalogue import SCENARIOS
 from atalante_tools.faults.scenario import MID_SWING, Case, HostFault
 from atalante_tools.trial.fault_plan import PERMANENT
 
-#: Fault ID -> cases, for faults without a scenario that can occur in a walk on the ground. A killed HAL sends no
-#: frames. After the given time, the run continues with a HAL in HOLD, whose frames do not move the drives.
+#: Fault ID -> cases, for faults that have no scenario but can occur in a walk on the ground. In F41 the HAL is killed. The
+#: case replaces this by a pause of 6 s. After the pause the HAL is in HOLD, so its frames do not move the drives.
 _GROUND_CASES: Final = {"F41": (Case("no frames for 6 s", (HostFault("late", 0, 1, 6.0),), dtc="CYCLE_GAP"),)}
 #: IDs of all faults with a case.
 FAULT_IDS: Final = tuple(sorted({*SCENARIOS, *_GROUND_CASES}))

@@ -34,7 +34,7 @@ STEP: Final = (0.16, 0.8)
 PARTIAL: Final = 0.5
 SWEEP: Final = (1.0, 0.75, 0.5, 0.25, 0.0, 0.25, 0.5, 0.75, 1.0)
 QUICK_SWEEP: Final = (1.0, 0.5, 0.0, 0.5, 1.0)
-#: Right-stance steps inside each guide shape.
+#: Number of right-stance steps in each guide shape, in a normal run and with `--quick`.
 SHAPE_STEPS, QUICK_SHAPE_STEPS = 30, 2
 #: Duration of the trial on the treadmill [s].
 TREADMILL_TIME: Final = 300
@@ -49,8 +49,8 @@ FRICTION: Final = (0.25, 0.8)
 #: If messages are one cycle late, they time out after four lost frames in a row. If messages were later than one cycle,
 #: they would time out after fewer lost frames than the fault matrix intends.
 LATE_PARTS: Final = 3
-#: Probability of a lost frame, force of a push [N], and number of steps per push. The time of a push within
-#: these steps is random.
+#: Random faults of `robustness`: probability of a lost frame, force of a push [N], and number of steps per push. A push begins
+#: at a random time within these steps.
 LOSS: Final = 0.01
 PUSH: Final = 100.0
 PUSH_STEPS: Final = 10
@@ -114,7 +114,7 @@ class WalkTrial:
 
 @dataclass(frozen=True)
 class RobustTrial:
-    """Walk of a robot that differs from its model: with full assistance, lost frames, late motors and pushes."""
+    """Walk of a robot that differs from its model. The walk has full assistance, lost frames, late motors and pushes."""
 
     kind: ClassVar[str] = "robust"
     number: int
@@ -215,7 +215,7 @@ class WalkSetting:
 
 
 def network_of(path: Path) -> tuple[str, str]:
-    """Return path and SHA-256 of a network file, so that another content is another trial.
+    """Return path and SHA-256 of a network file. Both are part of a trial, so a changed file leads to a new trial.
 
     Args:
         path: path of the file.
@@ -276,7 +276,7 @@ def sweep_trials(setting: WalkSetting, factors: Sequence[float], days: int) -> l
 def protocol_trials(
     setting: WalkSetting, factors: Sequence[float], masses: Sequence[float] = (), kinds: Sequence[str] = KINDS
 ) -> list[Trial]:
-    """Return a trial for each subject, passive and active, and each assistance factor.
+    """Return a trial for each combination of subject, kind (passive or active) and assistance factor.
 
     Args:
         setting: settings that all walks share.

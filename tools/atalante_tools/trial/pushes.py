@@ -46,7 +46,7 @@ def largest_push(trial: PushTrial) -> dict[str, Any]:
 
 
 def _pushed_walk(trial: PushTrial, push: Push) -> tuple[str, dict[str, int]]:
-    """Walk from standing to standing with one push, and return the outcome and the number of each diagnostic.
+    """Walk from standing to standing with one push, and return the outcome and the number of reports of each diagnostic.
 
     Args:
         trial: trial with patient, seed and engine.

@@ -196,7 +196,7 @@ def _number(value: float | None, digits: int) -> str:
 
 
 def _provenance(results: Sequence[Result]) -> list[tuple[str, str]]:
-    """Return versions, seeds, engine and modes of the trials, each with its name."""
+    """Return versions, seeds, engine, options and mode of the trials, as pairs of name and text."""
     versions = {f"{name} {value}" for r in results for name, value in r["versions"].items()}
     rows = [("versions", ", ".join(sorted(versions)))]
     for name, meaning in (

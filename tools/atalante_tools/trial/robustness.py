@@ -41,7 +41,7 @@ _PUSH: Final = 0.2
 _FALLEN: Final = 1000
 #: First cycle with faults of the bus. Before this cycle, the robot is OFF.
 _BEGINS: Final = 1
-_RATE: Final = 100  # Hz, of a recording
+_RATE: Final = 100  # sampling rate of a recording [Hz]
 
 
 def robust_walk(trial: RobustTrial, recording: Path | None = None) -> dict[str, Any]:

@@ -209,7 +209,7 @@ def _task(trial: WalkTrial, gaits: WalkGaits) -> ActiveTask | None:
 
 
 class Motion:
-    """Samples of SH and SK of the swing leg in the periodic steps, until the nominal end of each step."""
+    """Samples of SH and SK of the swing leg during the periodic steps. Samples after the nominal end of a step are omitted."""
 
     def __init__(self, rig: Rig, controller: WalkController) -> None:
         """Create an empty series of samples.
@@ -274,7 +274,7 @@ def _position(ratio: Vector) -> dict[str, Any]:
         ratio: e / q_bound of SH and SK, shape (n, 2).
     """
     return {
-        # share of the time with a joint in the outer half of its guide
+        # share of the samples in which |e| / q_bound of a joint is above 0.5
         "outer": round(float(np.mean(np.abs(ratio).max(axis=1) > 0.5)), 4),
         "spread": round(float(ratio.std(axis=0).mean()), 4),  # standard deviation, averaged over both joints
         "histogram": [np.histogram(ratio[:, k], EDGES)[0].tolist() for k in range(2)],
