@@ -1,9 +1,9 @@
 """Baseline of `decode_cycle` and `encode_cycle`: C code that cantools generates from the DBC, compiled with gcc -O2.
 
-`network -> cantools generate_c_source -> driver -> gcc -> ctypes`. The driver is a C function that does the work of the
-codec. To decode, it unpacks the payload of each message, checks the range of every signal and converts every signal to
-a double. To encode, it does the reverse. As in the HAL, received messages are decoded and sent messages are encoded.
-The clock is read inside the C code, so the measured time excludes all Python code.
+`network -> cantools generate_c_source -> driver -> gcc -> ctypes`. The driver is a C function that does the work of the codec.
+To decode, the driver unpacks the payload of each message, checks the range of every signal and converts every signal to a double.
+To encode, the driver converts every double to a signal, checks its range and packs the payload. As in the HAL, received messages
+are decoded and sent messages are encoded. The clock is read inside the C code, so the measured time excludes all Python code.
 """
 
 from __future__ import annotations

@@ -99,7 +99,7 @@ def validate_against_mdf(effort: Effort) -> Measurement:
 
 
 def _validation(path: Path, frames: Frames) -> Block:
-    """Return a function that measures the validation of a log, and fails if the validator reports a finding."""
+    """Return a block that measures the validation of a log. The block fails if the validator reports a finding."""
     from atalante_dbc.foreign import catalogue
     from atalante_tools.canlog.validate.run import validate_log
 

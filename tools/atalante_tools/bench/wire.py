@@ -210,7 +210,7 @@ def _no_compiler() -> Measurement | None:
 
 
 def _frame_checker() -> tuple[Callable[[bytes, int], bool], tuple[str, ...]]:
-    """Return two results: the baseline of `e2e_check`, and remarks. The baseline checks the CRC of one payload."""
+    """Return the baseline of `e2e_check` and the remarks for the report. The baseline checks the CRC of one payload."""
     try:
         import e2e
     except ModuleNotFoundError:

@@ -1,4 +1,4 @@
-"""Measurement of the time from a SYNC to the frames that answer this SYNC. The times are receive timestamps.
+"""Measurement of the time from a SYNC to the frames that answer this SYNC. Each time is a difference of two receive timestamps.
 
 frames, stamps -> BusTiming -> Latency of states and commands, per bus
 """
@@ -37,7 +37,9 @@ class Latency:
     median_us: float
     p99_us: float
     max_us: float
-    wire_us: float  # largest total transmission time of these states or commands in one cycle, computed from the DBC
+    wire_us: (
+        float  # longest time to transmit all states, or all commands, of one cycle on this bus, computed from the DBC
+    )
     budget_us: float
 
     @property

@@ -320,7 +320,7 @@ def listen(bus: Bus, timing: BusTiming, seconds: float, stop: StopRequest) -> No
 
 
 def stamp_clock(interface: str) -> str:
-    """Return which clock sets the receive timestamps of an interface: hardware, kernel, software or unknown.
+    """Return the clock that sets the receive timestamps of an interface: hardware, kernel, software or unknown.
 
     Args:
         interface: Name of the interface in python-can.

@@ -102,9 +102,9 @@ def command(
     interface goes down, the emulator waits until the interface is up again. The emulator does not start if another robot
     answers on the bus.
 
-    --mass, --height, --thigh and --shank adjust the leg lengths to a patient. Without them, --gait adjusts them to the patient in
-    the file. --network checks that the network covers the patient. Give the same values and files to `atalante airwalk` or
-    `atalante walk`. In the air, the exoskeleton is empty. On the ground, the patient wears the exoskeleton.
+    --mass, --height, --thigh and --shank adjust the leg lengths to a patient. Without these options, --gait adjusts the leg
+    lengths to the patient in the file. --network checks that the network covers the patient. Give the same values and files to
+    `atalante airwalk` or `atalante walk`. In the air, the exoskeleton is empty. On the ground, the patient wears the exoskeleton.
 
     \b
     Example: atalante emulator -i socketcan -c vcan0

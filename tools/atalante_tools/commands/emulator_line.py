@@ -18,10 +18,10 @@ from atalante_hal.wire.e2e import COUNTER_BYTE, check_counter
 from atalante_hal.wire.frame import Frames, new_frames
 from atalante_tools.session.takeover import PendantReader, Takeover
 
-#: The emulated pendant resumes sending after this time without a frame of another pendant [cycles].
+#: If no frame of another pendant arrives for this time [cycles], the emulated pendant resumes sending.
 #: `PENDANT_QUIET` is longer than `QUIET_CYCLES`, so that a pendant in another process resumes before the emulated pendant.
 PENDANT_QUIET: Final = 12
-#: Another robot is on the bus if this number of frames of one emulated message is received with increasing counters.
+#: Another robot is on the bus if one emulated message is received this number of times in a row with increasing counters.
 ROBOT_FRAMES: Final = 3
 
 
@@ -49,7 +49,7 @@ class Line(ResilientBus):
         self._pendant_ids = [m.frame_id for m in network.sent_by("PENDANT")]
         nodes = [node.name for node in network.nodes if node.kind not in ("master", "pendant")]
         self._own = {m.frame_id: m for name in nodes for m in network.sent_by(name)}
-        #: CAN identifier -> last counter, number of frames with increasing counters
+        #: CAN identifier -> last counter, number of frames in a row with increasing counters
         self._in_row: dict[int, tuple[int, int]] = {}
         self.sent = 0
         self.received = 0

@@ -168,7 +168,7 @@ def session(target: Target) -> Iterator[Session]:
 
 
 def open_pendant_bus(target: Target) -> tuple[Network, Bus]:
-    """Load the DBC and open the bus of the pendant. Return both.
+    """Load the DBC, open the bus of the pendant, and return the loaded DBC and the bus.
 
     Args:
         target: Interface and channel, or channel map.

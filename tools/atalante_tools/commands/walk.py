@@ -52,7 +52,7 @@ def _protocol(_ctx: click.Context, _param: click.Parameter, text: str | None) ->
     default=20,
     show_default=True,
     metavar="N",
-    help="Number of steps between start step and stop step, or until the change of --then.",
+    help="Number of periodic steps. With --then: number of periodic steps before the first change.",
 )
 @click.option(
     "--xi",
@@ -106,13 +106,14 @@ def _protocol(_ctx: click.Context, _param: click.Parameter, text: str | None) ->
     default=0.0,
     show_default=True,
     metavar="DEG",
-    help="Angle by which the desired line turns before each periodic step, positive to the left [deg].",
+    help="Angle by which the desired line turns before each periodic step [deg]. A positive angle turns the line to the left.",
 )
 @click.option(
     "--push",
     type=Between(0.0, 1000.0),
     metavar="N",
-    help="Push the pelvis of the emulated robot once, for 0.2 s in the middle of the walk [N].  [default: no push]",
+    help="Push the pelvis of the emulated robot once with this force [N], for 0.2 s in the middle of the walk.  "
+    "[default: no push]",
 )
 @click.option(
     "--push-direction",
@@ -227,10 +228,10 @@ def command(
 
 
 def _require_speed_changes(law: Law, files: GaitFiles) -> None:
-    """Raise an error if the options exclude speed changes.
+    """Raise an error if other options do not permit `--then`.
 
     Raises:
-        click.UsageError: If the control law or the gait file excludes speed changes.
+        click.UsageError: If `--literal` or `--gait` was given.
     """
     if law.literal:
         raise click.UsageError(
@@ -241,14 +242,14 @@ def _require_speed_changes(law: Law, files: GaitFiles) -> None:
 
 
 def _subject(patient: Patient | None, step_length: float, step_duration: float) -> Subject | None:
-    """Return the patient and the step that the user gave, or None if all of them have their defaults."""
+    """Return the patient with the step. Return None if the user gave no patient and the step is the default step."""
     if patient is None and (step_length, step_duration) == DEFAULT_STEP:
         return None
     return _walking_with(patient, step_length, step_duration)
 
 
 def _walking_with(patient: Patient | None, step_length: float, step_duration: float) -> Subject:
-    """Return a patient with a step. The default patient is that of the package."""
+    """Return the patient with the step. If `patient` is None, use the default patient of the package."""
     from atalante_control.gait.subject import Subject
     from atalante_control.model import Patient
 

@@ -132,7 +132,8 @@ def options_as(
     Args:
         name: Name of the argument of the command.
         meaning: Function that computes the argument from the option values. Its parameters have the names of the options.
-        options: Click options, or other decorators that this function returned. The help text shows them in this order.
+        options: Click options, or decorators that an earlier call of this function returned. The help text lists the options
+            in this order.
     """
     parameters = inspect.signature(meaning).parameters
 

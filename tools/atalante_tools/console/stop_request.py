@@ -173,8 +173,8 @@ def ended_by(end: Callable[[], None]) -> Iterator[StopRequest]:
 def deferred() -> Iterator[None]:
     """Delay the exception `Stopped` inside the block until the next call of `check_stop`.
 
-    Use this block around compiled code, which may replace the exception. If no other block of this module is active,
-    this block does not change the signal handlers. So worker processes still ignore Ctrl-C.
+    Use this block around compiled code, which may replace the exception. This block has no effect if no other block of
+    this module is active, for example in a worker process, which ignores Ctrl-C.
     """
     if _request is None:
         yield

@@ -119,8 +119,8 @@ def check(options: CheckOptions, as_json: bool, subject: Subject | None) -> None
 
     A push acts on hip and knee of the swing leg at the same time. The torque at each joint is at most the certified torque, and
     its direction may change at any time. The promise is kept if the ratio |e| / q_bound is at most 1. The column "left at" is
-    the smallest multiple of the promise that moved a joint out of the guide. The exit code is 1 if a promise is broken, but with
-    --push it is 0.
+    the smallest multiple of the promise that moved a joint out of the guide. The exit code is 1 if a promise is broken. With
+    --push, a broken promise does not change the exit code.
 
     \b
     Example: atalante guide check --shape constant --xi 0.5 --quick

@@ -218,7 +218,7 @@ def noise_of(cycles: int, condition: Condition, generator: np.random.Generator) 
 
     Args:
         cycles: number of cycles in a step.
-        condition: size of the noise.
+        condition: deviation of the plant. Only its encoder noise is used.
         generator: source of the random numbers.
 
     Returns:

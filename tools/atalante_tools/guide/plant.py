@@ -69,7 +69,7 @@ class Plant(NamedTuple):
     coulomb: Vector  # dry friction [Nm], shape (2,)
     viscous: Vector  # viscous friction [Nm s/rad], shape (2,)
     friction_speed: float  # speed at which dry friction reaches 76 % of its full value [rad/s]
-    tracking: float  # share by which the difference between command and motor torque falls in a cycle
+    tracking: float  # in each cycle, the difference between command and motor torque falls by this share, 0 to 1
     keep: float  # weight of the old value in the velocity filter, 0 to 1
     torque_max: Vector  # torque limit of the limiter [Nm], shape (2,)
     torque_step: Vector  # largest change of the command in a cycle [Nm], shape (2,)
@@ -90,7 +90,7 @@ def plant(
 
     Args:
         articulated: empty exoskeleton with the pelvis fixed.
-        gait: right-stance step, for the angles of the other joints.
+        gait: right-stance step, which gives the angles of the ten joints at rest.
         robot: limits of the drives.
         friction: dry friction [Nm] and viscous friction [Nm s/rad] that the controller compensates, each of shape (2,), and
             the speed at which dry friction reaches 76 % of its full value [rad/s].

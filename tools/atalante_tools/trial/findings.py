@@ -140,7 +140,7 @@ def sweep_findings(results: Sequence[Result]) -> list[Finding]:
 def protocol_findings(results: Sequence[Result]) -> list[Finding]:
     """Return the findings of `protocol`.
 
-    Walks end standing, inside the guide and near the line. The guides are certified, and no fault is reported.
+    The claims are: the walks end standing, inside the guide and near the line; the guides are certified; no fault is reported.
 
     Args:
         results: results of `walk` trials.

@@ -299,7 +299,7 @@ class Effort:
         self._cycle, self._totals, self._segments = 0, [(0.0, 0.0, 0.0)], list[int]()
 
     def sample(self) -> None:
-        """Count a cycle of the periodic steps, and store the totals at the end of each second."""
+        """Count a cycle of the periodic steps. At the end of each second, store the work and impulse of the muscles so far."""
         if self._controller.phase is not Phase.STEP:
             return
         self._cycle += 1

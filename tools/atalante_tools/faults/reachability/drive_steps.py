@@ -1,7 +1,7 @@
 """One cycle of an emulated drive, as a transition of an exhaustive search.
 
-The search tries every input from the HAL and from the link. The HAL may be silent, frozen, or send any controlword. A frame may
-be lost, late, damaged, or come from a second sender. Each transition calls the functions of a real `Drives`.
+The search tries every input from the HAL and from the link. The HAL may be silent, may be frozen, or may send any controlword.
+A frame may be lost, late or damaged, or may come from a second sender. Each transition calls the functions of a real `Drives`.
 """
 
 from __future__ import annotations
