@@ -39,7 +39,7 @@ COMMANDS = {
 
 
 class Commands(click.Group):
-    """Click group of all commands, which imports a command only when the command is called."""
+    """Click group of all commands. The group imports a command only when the command is called."""
 
     def list_commands(self, ctx: click.Context) -> list[str]:
         """Return the names of all commands in the order of `COMMANDS`."""

@@ -80,7 +80,7 @@ def command(names: tuple[str, ...], quick: bool, one_process: bool, as_json: boo
 
 
 def in_new_process(benchmark: Benchmark) -> Measurement:
-    """Run a benchmark in a new process, which prints its progress.
+    """Run a benchmark in a new process. The new process prints the progress of the benchmark.
 
     Args:
         benchmark: benchmark to run.

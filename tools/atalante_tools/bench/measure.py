@@ -1,4 +1,4 @@
-"""Measurement of a benchmark: the median times of a measured function and a baseline, which run alternately in blocks.
+"""Measurement of a benchmark. A measured function and a baseline run alternately in blocks. Their median times are compared.
 
 Absolute times depend on the machine and the load of the machine. The measured function and the baseline run under the
 same conditions, so the ratio of the two times is comparable between machines. Times also depend on the memory layout of the

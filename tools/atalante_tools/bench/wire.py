@@ -73,7 +73,7 @@ def hal_cycle(effort: Effort) -> Measurement:
 
 
 def decode_cycle(effort: Effort) -> Measurement:
-    """Measure the decoding of all messages that the HAL receives in a cycle, with the range check of every signal."""
+    """Measure the time to decode all messages that the HAL receives in a cycle, and to check the range of every signal."""
     if (missing := _no_compiler()) is not None:
         return missing
     recording = Recording(walk())
@@ -92,7 +92,7 @@ def decode_cycle(effort: Effort) -> Measurement:
 
 
 def encode_cycle(effort: Effort) -> Measurement:
-    """Measure the encoding of all messages that the HAL sends in a cycle, with the range check of every signal."""
+    """Measure the time to encode all messages that the HAL sends in a cycle, and to check the range of every signal."""
     if (missing := _no_compiler()) is not None:
         return missing
     codec = Codec([m for m in walk().network.sent_by("HAL") if m.cycle_ms == 1])
@@ -118,7 +118,7 @@ def encode_cycle(effort: Effort) -> Measurement:
 
 
 def e2e_check(effort: Effort) -> Measurement:
-    """Measure the check of CRC and counter of all messages that the HAL receives in a cycle."""
+    """Measure the time to check CRC and counter of all messages that the HAL receives in a cycle."""
     recording = Recording(walk())
     recording.play()
     count = len(recording.cyclic)

@@ -26,7 +26,7 @@ ROBOT_FRAMES: Final = 3
 
 
 class Line(ResilientBus):
-    """Bus of the emulated robot, which counts frames and detects another robot that sends messages of the emulated nodes.
+    """Bus of the emulated robot. It counts frames, and detects whether another robot sends messages of the emulated nodes.
 
     The frames of the emulated pendant are dropped during and after a takeover by another pendant, see `takeover`.
 

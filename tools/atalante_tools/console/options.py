@@ -211,7 +211,7 @@ def gait_options(command: _Command) -> _Command:
             "--gait",
             type=file,
             metavar="FILE",
-            help="Gait file or walk file of `atalante gait solve`. Without --mass and --height, it states the patient, too.",
+            help="Gait file or walk file of `atalante gait solve`. Without --mass and --height, the file also gives the patient.",
         ),
         network_option,
     ]
@@ -251,7 +251,7 @@ def patient_arguments(patient: Patient) -> str:
 
 
 def subject_options(command: _Command) -> _Command:
-    """Add the options of the patient, `--step-length` and `--step-duration` to a command, which then gets the argument `subject`.
+    """Add the patient options, and `--step-length` and `--step-duration`, to a command. The command gets the argument `subject`.
 
     `subject` is None if the user gave none of the options.
 

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 
 class Absence:
-    """Lock-step clock of the HAL, which advances the emulated robot while the HAL sends no SYNC."""
+    """Lock-step clock of the HAL. While the HAL sends no SYNC, the clock advances the emulated robot."""
 
     def __init__(self, clock: DisturbedClock, emulator: Emulator) -> None:
         """Start the cycle counts of HAL and robot at 0.

@@ -1,4 +1,4 @@
-"""Walks without a fault: every diagnostic that they report, except the expected ones, is a false alarm.
+"""Walks without a fault. Every reported diagnostic is a false alarm, except the expected diagnostics.
 
 seed -> walk in the air or on the ground -> number of reports of each diagnostic
 """

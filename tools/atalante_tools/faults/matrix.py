@@ -28,7 +28,7 @@ class MatrixError(ValueError):
 
 @dataclass(frozen=True)
 class Row:
-    """Row of the fault matrix, which describes one fault."""
+    """Row of the fault matrix: description of one fault."""
 
     id: str
     fault: str  # description of the fault
@@ -67,7 +67,7 @@ class Row:
 
 @functools.cache
 def load_matrix(path: Path = MATRIX_FILE) -> Mapping[str, Row]:
-    """Load all rows of the fault matrix by fault ID, in the order of the file.
+    """Load the fault matrix. Return its rows by fault ID, in the order of the file.
 
     Args:
         path: Markdown file with the table.

@@ -231,7 +231,7 @@ class CaseRun:
 
 
 class _Sample(NamedTuple):
-    """Values of one cycle, which become one row in each array of an `Observation`."""
+    """Values of one cycle. These values are one row in each array of an `Observation`."""
 
     drive_state: list[int]
     torque: Vector

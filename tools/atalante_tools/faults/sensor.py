@@ -43,7 +43,7 @@ def _imu(kind: str, cycles: int, *, tolerated: int) -> tuple[Case, ...]:
 
 
 def _stuck(node: str, cycles: int) -> tuple[Fault, ...]:
-    """Return two faults: a stuck encoder, and later a restart of the drive, which initialises the encoder again."""
+    """Return two faults: a stuck encoder, and a later restart of the drive. The restart initialises the encoder again."""
     return Fault("encoder_stuck", node, 0, cycles), Fault("reset", node, cycles + 30, 3)
 
 
@@ -109,7 +109,7 @@ SCENARIOS: Final = (
         "F27",
         (
             *(Case(node, _stuck(node, 200), node=node) for node in ("LEFT_SH", "RIGHT_SH")),
-            # With a stuck knee encoder, the guide commands the largest torque of the drive, which reveals the fault early.
+            # If the knee encoder is stuck, the guide commands the largest torque of the drive. So the fault is detected early.
             *(
                 Case(f"{_KNEE} at {phase:g} T", _stuck(_KNEE, 200), node=_KNEE, phase=phase, detected=20, reacted=20)
                 for phase in (0.1, MID_SWING, 0.65, 0.8)

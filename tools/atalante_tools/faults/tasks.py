@@ -88,7 +88,7 @@ class CaseTask:
 
 @dataclass(frozen=True)
 class EnduranceTask:
-    """Task to measure how long the fault of `Scenario.permanent` can last until it stops the walk."""
+    """Task to measure the longest duration for which the walk survives the fault of `Scenario.permanent`."""
 
     id: str
     engine: str = PYBULLET

@@ -58,7 +58,7 @@ class CheckOptions:
     quick: bool  # whether to use the small number of steps `QUICK`
     plot: Path | None  # picture file; None means no picture
     table: Path | None  # Markdown file for the table; None means no file
-    results: Path | None  # file of the results, from which an interrupted check is resumed; None means no file
+    results: Path | None  # file of the results; an interrupted check is resumed from this file; None means no file
     law: Law  # control law of the assisted joints
 
     def effort(self) -> Effort:

@@ -117,7 +117,7 @@ class Setup:
 
 
 class IdealLeg:
-    """Left leg of the ideal plant, which swings in one guide at one assistance factor."""
+    """Left leg of the ideal plant. The leg swings in one guide at one assistance factor."""
 
     def __init__(self, setup: Setup, controller: AirwalkController, xi: float) -> None:
         """Sample the nominal motion and the guide.

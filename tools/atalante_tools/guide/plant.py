@@ -1,4 +1,4 @@
-r"""Ideal plant for the search for the worst push: hip and knee of one swing leg in the air, with drives, encoders, limiter.
+r"""Ideal plant for the search for the worst push: hip and knee of one swing leg in the air, with drives, encoders and limiter.
 
 `torque command, push -> motion, measurements`. The plant shares no table with the controller. Its equation of motion is
 
@@ -60,7 +60,7 @@ class Condition:
 
 
 class Plant(NamedTuple):
-    """Constants of the plant, for compiled functions. Index 0 is the hip, index 1 the knee."""
+    """Constants of the plant for compiled functions. Index 0 is the hip, index 1 the knee."""
 
     #: Mass matrix [kg m2], shape (3, 3). Rows: M11, M12, M22. Columns: coefficients of 1, cos q_SK, sin q_SK.
     mass: Vector
@@ -86,7 +86,7 @@ def plant(
     friction: tuple[Vector, Vector, float],
     condition: Condition,
 ) -> Plant:
-    """Return the plant of the left leg, which swings in a right-stance step.
+    """Return the plant of the left leg in a right-stance step. In this step, the left leg swings.
 
     Args:
         articulated: empty exoskeleton with the pelvis fixed.

@@ -34,7 +34,7 @@ from atalante_tools.guide.search import DIRECTIONS, Adversary, Tried
 
 Pair = tuple[float, float]
 
-#: Conditions of the plant and of the robot, by name.
+#: Name of a condition -> condition of the plant and of the robot.
 CONDITIONS: Final = {
     "model": (Condition(),),
     "friction": (Condition(friction=0.8), Condition(friction=1.2)),

@@ -23,7 +23,7 @@ class Moment(NamedTuple):
 
 #: Number of steps of a walk before its stop step.
 STEPS: Final = 2
-#: Moments at which each fault begins, by name. Both feet carry load in the weight shifts before and after the steps.
+#: Name -> moment at which each fault begins. Both feet carry load in the weight shifts before and after the steps.
 MOMENTS: Final = {
     "weight shift": Moment("SHIFT", 0, 0.75),
     **{f"phase {k / 8:g}": Moment("STEP", STEPS - 1, k / 8) for k in range(8)},

@@ -220,8 +220,8 @@ class _Walk:
     """Walk on the ground.
 
     Attributes:
-        begins: first cycle of each phase, by the phase and the number of steps before the phase.
-        branches: branches of the walk, by their cycles.
+        begins: (phase, number of steps before the phase) -> first cycle of the phase.
+        branches: cycle -> branch of the walk at the end of this cycle.
         outcome: how the walk ended, as in `FaultRun`.
         reason: reason of the last state.
     """

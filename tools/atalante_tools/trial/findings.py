@@ -297,7 +297,7 @@ def _complete(result: Result) -> bool:
 
 
 def _by_subject(results: Sequence[Result]) -> list[dict[str, Result]]:
-    """Return the four results of each subject by their condition. A subject with a missing or failed trial is left out."""
+    """Return for each subject its four results by condition. A subject with a missing or failed trial is left out."""
     subjects: dict[float, dict[str, Result]] = {}
     for result in results:
         if _complete(result):

@@ -16,7 +16,7 @@ FAULT_IDS: Final = tuple(sorted({*SCENARIOS, *_GROUND_CASES}))
 
 
 def ground_cases(id_: str) -> dict[int, Case]:
-    """Return the cases of a fault that can begin at any moment of a walk, by their indices.
+    """Return the cases of a fault that can begin at any moment of a walk, as a mapping from index to case.
 
     Cases that begin at power-on or at another phase than `MID_SWING` are left out.
 

@@ -100,7 +100,7 @@ class WalkTrial:
     engine: str
     order: str = ""  # day of the sweep, and position of the trial in this day; empty outside the sweep
     literal: bool = False  # whether the control law follows the paper literally
-    heading_reference: bool = False  # whether the IMUs have a heading reference, which the controller follows
+    heading_reference: bool = False  # whether the IMUs have a heading reference and the controller follows it
     #: path and SHA-256 of the network file of the gaits; empty for the network of the package
     network: tuple[str, ...] = ()
     haptics: bool = False  # whether an active subject responds to the vibration motors
@@ -178,7 +178,7 @@ class TreadmillTrial:
 Trial = ShapeTrial | WalkTrial | TreadmillTrial | RobustTrial | PushTrial | FaultTrial
 
 
-#: Kinds of subjects, by the field `active` of a trial.
+#: Kinds of subjects. The field `active` of a trial is the index: False is 0, True is 1.
 KINDS: Final = "passive", "active"
 
 

@@ -1,4 +1,4 @@
-"""Walk of a robot that differs from its model, with lost frames and pushes: `trial -> rig in lock-step -> result`.
+"""Walk with lost frames and pushes. The robot differs from its model: `trial -> rig in lock-step -> result`.
 
 The controller uses a model with the nominal patient. The emulated robot carries a patient with another mass and stands on a floor
 with random friction. Messages and motors of this robot are late, its buses lose frames, and the robot is pushed at the pelvis.
@@ -100,7 +100,7 @@ def robust_walk(trial: RobustTrial, recording: Path | None = None) -> dict[str, 
 
 
 def _parameters(trial: RobustTrial) -> EmulatorParameters:
-    """Return the parameters of the emulated nodes of a robot on the ground, with motors that react late."""
+    """Return the parameters of the emulated nodes. The robot is on the ground, and its motors react late."""
     drive = replace(GROUND_PARAMETERS.drive, motor=MotorParameters(dead_time=trial.delay[2]))
     return replace(GROUND_PARAMETERS, drive=drive)
 
