@@ -37,9 +37,7 @@ class Latency:
     median_us: float
     p99_us: float
     max_us: float
-    wire_us: (
-        float  # longest time to transmit all states, or all commands, of one cycle on this bus, computed from the DBC
-    )
+    wire_us: float  # longest time to transmit all frames of this kind in one cycle, computed from the DBC
     budget_us: float
 
     @property

@@ -29,7 +29,7 @@ class NodeReport:
 
     node: str
     kind: str
-    age_ms: int | None  # time since the last frame with the node's shortest period. None if no frame was received.
+    age_ms: int | None  # time since the last frame of the node's most frequent messages. None if no frame was received.
     late: bool  # whether the age exceeds the timeout in the DBC
     state: str | None
     dbc_ok: bool | None

@@ -206,7 +206,10 @@ def run_task(task: Task) -> Result:
 
 
 def _cycles_until_stop(case: Case, cycles: int) -> int | None:
-    """Run a case with its permanent fault limited to `cycles` cycles. Return the cycles until the walk stopped, or None."""
+    """Run a case with its permanent fault limited to `cycles` cycles.
+
+    Return the number of cycles until the walk stopped, or None if the walk continued.
+    """
     shortened = replace(case, stimuli=tuple(limited(stimulus, cycles) for stimulus in case.stimuli))
     run = observe(shortened, cycles, recovery=False)
     for cycle in range(run.first, run.last + 1):

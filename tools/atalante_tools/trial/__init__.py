@@ -240,7 +240,7 @@ def protocol(
 ) -> None:
     """Walk 112 steps with full assistance, then 38 steps in which the factor changes, then 225 steps with the new factor.
 
-    There is one walk for each combination of subject (eight), kind of subject (passive, active) and assistance factor.
+    Each of the eight subjects walks passive and active, with each of the new factors.
     """
     from atalante_tools.trial.findings import protocol_findings
     from atalante_tools.trial.plan import (
@@ -271,7 +271,7 @@ def protocol(
 )
 @_running("robustness")
 def robustness(seeds: int | None, steps: int | None, running: Running, as_json: bool) -> None:
-    """Walk with random patients, model errors, friction, late motors, lost frames and pushes, at full assistance.
+    """Walk at full assistance, with random patients, model errors, friction, late motors, lost frames and pushes.
 
     If the robot does not complete all steps, or does not stand at the end, the trial is repeated, and its repetition is
     recorded in the folder `recordings`.

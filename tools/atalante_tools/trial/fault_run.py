@@ -74,7 +74,7 @@ class FaultRun:
     #: "walked" (two steps after the fault, or to the end), "hold" (stopped upright), "fell" or "exception"
     outcome: str
     state: str  # state of the HAL at the end
-    #: diagnostics since the first faulty cycle in the order of their first report, without the severity `info`
+    #: diagnostics since the first faulty cycle, in the order of their first report; the severity `info` is left out
     codes: tuple[str, ...]
     #: number of cycles from the first faulty cycle to the diagnostic of the fault matrix, both included
     detected: int | None

@@ -26,8 +26,8 @@ _PHASES: Final = np.linspace(0.1, 0.8, 29)
 SAME: Final = 0.02
 STANDING: Final = 1.44  # metabolic rate of quiet standing [W/kg]
 #: A quantity has a falling trend if its rank correlation with the assistance factor is between -1 and -`TREND`.
-#: `ASYMMETRY` limits the difference between the way down and the way up of the assistance factor: the difference between the
-#: k-th trial of a day and the k-th last trial of this day, averaged over k and divided by the range of all values.
+#: `ASYMMETRY` limits the influence of the order of the trials: the difference between the k-th and the k-th last trial of a day,
+#: averaged over k and divided by the range of all values.
 TREND, ASYMMETRY = 0.8, 0.25
 #: Largest coefficient of variation of the baseline metabolic rates of a sweep.
 VARIATION: Final = 0.05
@@ -367,7 +367,7 @@ def _trend(id_: str, claim: str, walks: Sequence[Result], value: Callable[[Resul
 
 
 def _symmetry(id_: str, claim: str, walks: Sequence[Result], value: Callable[[Result], float]) -> Finding:
-    """Return the finding that the trials of the way down and of the way up have nearly the same values."""
+    """Return the finding that the values are nearly equal while the assistance factor falls and while it rises."""
     days: dict[str, list[Result]] = {}
     for walk in walks:
         days.setdefault(walk["trial"]["order"].split("-")[0], []).append(walk)
