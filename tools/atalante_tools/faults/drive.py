@@ -279,7 +279,7 @@ SCENARIOS: Final = (
                 node=_KNEE,
                 observed=_LOWERED,
             )
-            for late in (8, 10)
+            for late in (10, 12)
         ),
     ),
     # The HAL detects a torque error above a fifth of the breakaway torque of the joint.
