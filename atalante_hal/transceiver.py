@@ -266,7 +266,8 @@ class Transceiver:
         """Wait until every expected message of `cycle` has arrived in `scratch[first:]`, at most `patience` [s]."""
         missing = cycle.expected_ages()
         shortest = min(patience, _DOUBTFUL_PATIENCE)
-        # If no node has answered so far, receive until the bus is silent, so that no answer is left for the next cycle.
+        # Before the first answer of any node, no message is expected. Then receive until the bus is silent, so that late
+        # answers are not taken for answers of the next cycle.
         until_silent = not missing
         begun = time.monotonic()
         while count < RECEIVE_BUDGET:

@@ -49,7 +49,8 @@ GROUPS = ((("FH", "SH"), 32), (("TH", "SA"), 16), (("SK", "HA"), 16))
 #: Delay [cycles] from a torque command to the first position that shows its effect, if no frame and no motor is late.
 LATENCY = 2
 #: Delays that the test tries [cycles]. States, commands and motors may be late by three cycles in total.
-#: A delay of four more cycles would look like a wrong sign, because the pulse of 16 cycles changes its sign every four cycles.
+#: The pulse of 16 cycles changes its sign every four cycles. So a wrong sign would look like a delay that is four cycles longer,
+#: and the test tries no such delay.
 LATENCIES = tuple(range(LATENCY, LATENCY + 4))
 #: Peak of the pulse as a multiple of `Robot.breakaway`, in the order of LEG_JOINTS. FH and SH move a whole leg.
 PEAK = (6.0, 3.0, 6.0, 3.0, 3.0, 3.0)

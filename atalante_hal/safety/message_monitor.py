@@ -60,7 +60,8 @@ CONFIRMED = {
     Check.REPEATED: Dtc.E2E_FROZEN,
     Check.CONFLICT: Dtc.E2E_FROZEN,
 }
-#: Check results that prove a second sender if another intact frame of the message arrived in the same cycle.
+#: Results of the E2E check of a rejected frame. With one of these results, the frame proves a second sender if another intact
+#: frame of the message arrived in the same cycle.
 _RIVAL = (Check.CONFLICT, Check.WRONG_SEQUENCE)
 #: Results of the E2E check of a rejected frame whose format and CRC are correct.
 _INTACT = (*_RIVAL, Check.RANGE, Check.INVALID)

@@ -140,11 +140,10 @@ class ActivePatient:
         self._plan = np.zeros((cycles, 2))  # learned torque of the current step, without noise
         self._wobble = np.ones((cycles, 2))  # noise factor of the torque in the current step
         self._error, self._slope = np.zeros((cycles, 2)), np.zeros((cycles, 2))
-        self._threshold = np.full(
-            (cycles, 2), parameters.threshold
-        )  # threshold of perception in each cycle of the step
+        #: Threshold of perception in each cycle of the step.
+        self._threshold = np.full((cycles, 2), parameters.threshold)
         self._amplitude = np.zeros(len(MOTORS)) if amplitude is None else amplitude
-        self._swing, self._cycle, self._ready = -1, 0, 0  # no step before the first landing
+        self._swing, self._cycle, self._ready = -1, 0, 0  # -1: before the first landing, no leg swings
         self._air = [False] * len(SIDES)
         self._weight = body.mass * GRAVITY
         self.muscle = np.zeros(len(SIDES) * _LEG)

@@ -218,7 +218,7 @@ def add(imu: int, now: Readings, record: Record, time: float) -> None:
 
 
 def compare(now: Readings, record: Record) -> None:
-    """Add a sample to the means of the comparison of torso and pelvis.
+    """Add a sample to the running averages with which torso and pelvis are compared.
 
     Args:
         now: readings of the sample.

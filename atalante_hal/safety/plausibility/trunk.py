@@ -73,7 +73,7 @@ class Trunk:
         self._found: tuple[Finding, ...] = ()
 
     def follow(self) -> bool:
-        """Follow the motion of the trunk by one cycle. Both IMUs must have new values.
+        """Update the motion of the trunk with the values of one cycle. Both IMUs must have new values.
 
         Returns:
             Whether the finding has changed.

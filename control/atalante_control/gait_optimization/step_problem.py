@@ -354,7 +354,8 @@ class StepProblem:
         """
         foot = self.chain.frames(q, casadi.SX(_N, 1))[self.chain.swing_foot]
         position = self._yaw @ foot.position
-        tilt = _tilt(self._yaw @ self._yaw @ foot.rotation)  # the second rotation removes the toe-out of the swing foot
+        # The first `_yaw` removes the toe-out of the stance foot, the second one the toe-out of the swing foot.
+        tilt = _tilt(self._yaw @ self._yaw @ foot.rotation)
         zero, requirements = np.zeros(3), self.requirements
         error = casadi.vertcat(position[0] - self._length, position[2])
         return [

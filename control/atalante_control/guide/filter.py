@@ -214,7 +214,7 @@ def narrowest(inverse: Vector, cycles: int) -> Vector:
         cycles: number of cycles, including the first one.
     """
     largest = np.concatenate([inverse, np.repeat(inverse[-1:], cycles - 1, axis=0)])
-    covered = 1  # number of cycles over which each row of `largest` is the maximum
+    covered = 1  # row k of `largest` is the maximum of the rows k to k + covered - 1 of the input
     while covered < cycles:
         shift = min(covered, cycles - covered)
         largest = np.maximum(largest[:-shift], largest[shift:])

@@ -51,7 +51,7 @@ _FASTEST = 3.0  # rad/s, largest desired speed of a joint that shifts the foot
 class PlacementConfig(NamedTuple):
     """Parameters of foot placement and step timing."""
 
-    #: m, a DCM error that is predicted for the landing is ignored up to this value; infinity: no placement, no timing
+    #: m, largest predicted DCM error at the landing to which placement and timing do not react; infinity switches both off
     dead_zone: float = 0.015
     forward: float = 0.15  # m, largest offset of a landing forwards and backwards
     outward: float = 0.22  # m, largest offset of a landing away from the stance foot

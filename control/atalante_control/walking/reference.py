@@ -49,7 +49,7 @@ class Reach(NamedTuple):
     """Downward motion of a swing foot that has not landed at the nominal end of a step."""
 
     speed: float  # m/s, downward speed of the foot
-    rate: float  # rad/s, largest speed of sagittal hip and knee, even if the foot then moves more slowly than `speed`
+    rate: float  # rad/s, largest speed of sagittal hip and knee; if necessary, the foot moves more slowly than `speed`
     time: float  # s, longest duration of the downward motion
     knee: float  # rad, smallest knee angle during the downward motion
 

@@ -35,8 +35,8 @@ from atalante_hal.types import Vector
 Pair = tuple[float, float]
 
 _N = len(JOINTS)
-#: Number of fully assisted steps after a change of the gait, one for each leg. At the start of these steps, the deviation from
-#: the gait is larger than the certificate of a guide assumes.
+#: Number of fully assisted steps after a change of the gait: one step with each leg. At the start of each of them, the deviation
+#: from the gait is larger than the certificate of a guide assumes.
 _JOINING = 2
 _SH, _SK = LEG_JOINTS.index("SH"), LEG_JOINTS.index("SK")
 

@@ -38,7 +38,9 @@ class Measurement:
     value: float | None
     baseline: float | None
     remarks: tuple[str, ...] = ()
-    ratios: tuple[float, ...] = ()  # ratio of each process, in ascending order; empty if measured in this process
+    #: Measured time divided by baseline time, in ascending order: one value for each process that measured.
+    #: Empty if only this process measured.
+    ratios: tuple[float, ...] = ()
 
     @property
     def ratio(self) -> float | None:

@@ -273,7 +273,7 @@ def verdicts_table(verdicts: Sequence[Verdict]) -> str:
     default=120,
     show_default=True,
     metavar="N",
-    help="Steps on the ideal plant per shape.",
+    help="Number of steps that are simulated with each shape, on the ideal plant.",
 )
 @click.option("--seed", type=SEED, default=0, show_default=True, metavar="N", help="Seed of shapes and search.")
 @json_option

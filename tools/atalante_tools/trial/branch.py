@@ -68,7 +68,7 @@ class Continuation:
 
 
 class _NoAnswer:
-    """Message of a waiting process whose continued run ended without an answer."""
+    """Result in place of an answer: the copy of the process, which continued the run, ended without an answer."""
 
     def __init__(self, status: int) -> None:
         self.status = status

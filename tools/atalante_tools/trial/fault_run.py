@@ -142,7 +142,7 @@ def _longest(trial: FaultTrial, case: Case, permanent: FaultRun) -> int:
 
 
 def longest_without(falls: Callable[[int], bool], horizon: int, resolution: int) -> int:
-    """Return the longest duration without a fall, by bisection from 0 to `horizon`.
+    """Return the longest duration of a fault with which the robot does not fall, by bisection from 0 to `horizon`.
 
     The robot must walk to the end without a fault. If the robot falls with a fault, it must also fall with each longer fault.
 

@@ -29,7 +29,10 @@ def fault_table(results: Sequence[dict[str, Any]]) -> tuple[list[str], list[list
 
 
 def _survived(result: dict[str, Any]) -> str:
-    """Return the range of the longest fault durations without a fall. Moments at which the robot never falls are left out."""
+    """Return the longest fault durations that the robot survives, from the worst to the best moment.
+
+    Moments at which the robot survives every duration are left out.
+    """
     survived = [cycles for cycles in result["longest"] if cycles is not None]
     if not survived:
         return "-"

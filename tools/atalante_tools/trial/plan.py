@@ -56,7 +56,7 @@ PUSH: Final = 100.0
 PUSH_STEPS: Final = 10
 #: Number of trials and steps of `robustness`.
 ROBUST, QUICK_ROBUST = (100, 60), (2, 4)
-#: Directions [deg] and phases of the pushes of `pushes`, and their forces in rising order [N].
+#: Experiment `pushes`: directions [deg], phases, and forces in rising order [N].
 PUSH_DIRECTIONS: Final = tuple(22.5 * k for k in range(16))
 PUSH_PHASES: Final = tuple(k / 8 for k in range(8))
 PUSH_FORCES: Final = tuple(50.0 * k for k in range(1, 11))

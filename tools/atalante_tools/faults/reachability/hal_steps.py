@@ -313,7 +313,9 @@ class HalSteps:
         monitor._reports.clear()
         monitor.start_wanted, monitor.enabling, monitor.moving, monitor.walking = 0, False, False, False
         monitor.recalled = -RECALL_CYCLES  # skip the wait after QUICK_STOP, so that the search includes more STARTs
-        monitor._stalled = 0  # constant in the search: `LAST_START` covers all ways in which a START can end
+        monitor._stalled = (
+            0  # not varied in the search: it only decides when a START ends, and `LAST_START` covers each end
+        )
         monitor._ending = monitor._duplicate_found = monitor._ramping = False
         monitor.lowered.clear()
         # Mark all torque directions as tested. The test of the directions needs the same controlwords as the enabling of drives.
