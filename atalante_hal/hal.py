@@ -15,6 +15,7 @@ import numpy as np
 from atalante_dbc import Network
 from atalante_hal.bus import Bus
 from atalante_hal.commands import Commands, StatusReport
+from atalante_hal.leg_model import LegModel
 from atalante_hal.record import Record
 from atalante_hal.record_layout import split_bits
 from atalante_hal.robot import JOINTS, Robot
@@ -53,6 +54,8 @@ class Hal:
         controller_fields: Name and length of each field that the controller records, see `types.Controller`.
         gait_hash: CRC-32 of the gait that the controller uses, sent in HAL_STATUS.
         tap: Receiver of a copy of every frame that is sent or received, for a CAN log; None if there is no log.
+        legs: Model of the legs with the patient, for the comparison of the motion with the torques that were sent. None means no
+            comparison.
 
     Raises:
         ValueError: If the assistance factor is not between 0 and 1.
@@ -69,6 +72,7 @@ class Hal:
         controller_fields: Sequence[tuple[str, int]] = (),
         gait_hash: int = 0,
         tap: FrameTap | None = None,
+        legs: LegModel | None = None,
     ) -> None:
         if not 0.0 <= assistance_factor <= 1.0:
             raise ValueError(f"assistance_factor must be between 0 and 1, got {assistance_factor}")
@@ -91,6 +95,8 @@ class Hal:
             self._plausibility,
             self._limiter,
         )
+        if legs is not None:
+            self._safety_monitor.follow_motion(legs)
         #: Log of events, such as new diagnostics and changes of the supervisor state.
         #: Repeats of a diagnostic within a second are logged as one event with a count.
         self.events = self._safety_monitor.memory.events

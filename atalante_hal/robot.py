@@ -112,6 +112,7 @@ class Robot:
     hold_kd: Vector  # Nm s/rad, damping of the position control in the drive
     encoder_noise: Vector  # rad rms
     breakaway: Vector  # Nm, change of the drive torque that is sufficient to overcome the dry friction of the joint
+    torque_error: Vector  # Nm rms, error of the torque that is computed from the motion of the leg
     envelope: Envelope
     derating: Derating
     sensors: Sensors
@@ -160,6 +161,7 @@ _KEYS = {
     "hold": _Key(2, 0.01, 1e5, "Nm/rad and Nm s/rad"),
     "encoder_noise": _Key(1, 1e-9, 1e-2, "rad"),
     "breakaway": _Key(1, 0.01, 400.0, "Nm"),
+    "torque_error": _Key(1, 0.01, 100.0, "Nm"),
 }
 #: Keys of all tables of the robot file except [joints].
 _TABLES = {
@@ -254,6 +256,7 @@ def load_robot(path: Path | None = None) -> Robot:
         hold_kd=both(left["hold"][:, 1]),
         encoder_noise=both(left["encoder_noise"][:, 0]),
         breakaway=both(left["breakaway"][:, 0]),
+        torque_error=both(left["torque_error"][:, 0]),
         envelope=Envelope(**scalars["envelope"]),
         derating=Derating(**scalars["derating"]),
         sensors=Sensors(**scalars["sensors"]),

@@ -15,6 +15,7 @@ from typing import NamedTuple
 import numpy as np
 
 from atalante_dbc import Network
+from atalante_hal.leg_model import LegModel
 from atalante_hal.pendant import Pendant
 from atalante_hal.robot import JOINTS, Robot
 from atalante_hal.safety.diagnostics import Dtc, Finding, Reaction
@@ -26,8 +27,10 @@ from atalante_hal.safety.hold_stability import HoldStability
 from atalante_hal.safety.limiter import Limiter
 from atalante_hal.safety.message_monitor import GROUND_TOLERANCE, NO_TOLERANCE, MessageMonitor, Tolerance
 from atalante_hal.safety.plausibility import Plausibility
+from atalante_hal.safety.plausibility.finding import JOINT_MESSAGES, rows_of
 from atalante_hal.safety.start import ENABLE_CYCLES, Refusal, StartRequest, entry_text, refusal, stop_text
 from atalante_hal.safety.state_machine import MOVING, Conditions, next_state
+from atalante_hal.safety.torque_motion import TorqueMotion
 from atalante_hal.safety.torque_tracking import TorqueTracking
 from atalante_hal.types import PERIOD, State, SupervisorState, Vector
 from atalante_hal.wire.cia402 import DriveState
@@ -76,6 +79,7 @@ class SafetyMonitor:
         recalled: cycle in which QUICK_STOP was last sent to a drive in OPERATION ENABLED.
         proof: test of the directions of all joints, which must be over before the state becomes ACTIVE.
         torque_tracking: comparison of the reported torques with the sent torques while the robot moves.
+        torque_motion: comparison of the motion with the sent torques while the robot moves; None without a model of the legs.
         lowered: DBC names of the drives that cannot hold and are being lowered.
     """
 
@@ -122,6 +126,7 @@ class SafetyMonitor:
         self.lowered: set[str] = set()
         self._hold_stability = HoldStability()
         self.torque_tracking = TorqueTracking(robot.breakaway)
+        self.torque_motion: TorqueMotion | None = None
         self._oscillating: set[str] = set()  # DBC names of the drives whose joints oscillated since the last START
         #: True if `evaluate` may skip a cycle with new data, without a fault, and with unchanged pendant and drive values.
         self._steady = False
@@ -136,6 +141,15 @@ class SafetyMonitor:
         #: Number of the walking step in which FINISH_STEP began, and latest end of FINISH_STEP [cycle number].
         self._finish: tuple[int | None, int] = None, 0
         self._drives_evaluated = b""  # drive states and temperatures of the last evaluation
+
+    def follow_motion(self, legs: LegModel) -> None:
+        """Compare the motion of the joints with the sent torques from now on.
+
+        Args:
+            legs: model of the legs with the patient.
+        """
+        rows = np.array(rows_of(self._image.codec, JOINT_MESSAGES))
+        self.torque_motion = TorqueMotion(self._robot, legs, self._state, self._limiter.last, rows)
 
     def evaluate(self, bus_faults: Sequence[Finding] = ()) -> Verdict | None:
         """Evaluate this cycle, unless all inputs are unchanged. Call this method after the plausibility checks.
@@ -170,6 +184,8 @@ class SafetyMonitor:
         state = self._state
         if self.moving:
             found = self.torque_tracking.check(self._limiter.last, self._limiter.limit, state.torque)
+            if self.torque_motion is not None:
+                found += self.torque_motion.check()
             for finding in found:  # the next START tests the direction of this joint again
                 self.proof.forget(DRIVE_NODES.index(finding.node))
             return found
@@ -451,6 +467,8 @@ class SafetyMonitor:
         if before in MOVING and not self.moving:
             self._hold_stability.restart()
             self.torque_tracking.restart()
+            if self.torque_motion is not None:
+                self.torque_motion.restart()
         self.walking = self.walking and self.moving
         if Dtc.OPERATOR_STOP in reasons:
             text = "the program is ending" if self._ending else stop_text(self._pendant.stop_requested)

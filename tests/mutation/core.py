@@ -52,6 +52,10 @@ CORE = {
     ),
     "hold_stability": (("atalante_hal/safety/hold_stability.py",), ("hal/safety/test_hold_stability.py",)),
     "torque_tracking": (("atalante_hal/safety/torque_tracking.py",), ("hal/safety/test_torque_tracking.py",)),
+    "torque_motion": (
+        ("atalante_hal/safety/torque_motion.py", "atalante_hal/safety/leg_torques.py"),
+        ("hal/safety/test_torque_motion.py", "hal/safety/test_leg_torques.py"),
+    ),
     "direction": (("atalante_hal/safety/direction.py",), ("hal/safety/test_direction.py",)),
     "limiter": (("atalante_hal/safety/limiter.py",), ("hal/safety/test_limiter.py",)),
     "guide": (

@@ -16,6 +16,7 @@ from atalante_control.airwalk.controller import AirwalkController
 from atalante_control.gait.walk import DEFAULT_WALK, load_walk
 from atalante_control.guide.kernel import LegState
 from atalante_control.guide.shapes import CONSTANT
+from atalante_control.joint.leg_model import leg_model
 from atalante_control.model import Patient
 from atalante_control.walking.controller import WalkController
 from atalante_emulator.mechanics import Ground, Mechanics
@@ -240,6 +241,7 @@ def _stack(robot_process: EmbeddedRobot | None) -> Iterator[_Stack]:
             controller_fields=controller.telemetry_fields,
             gait_hash=walking.gait.hash32,
             robot_process=robot_process,
+            legs=leg_model(),
         ) as rig,
         RingWriter(rig.hal.record.nbytes) as ring,
     ):
@@ -265,6 +267,7 @@ def _walking_stack(engine: str) -> Iterator[_Stack]:
             gait_hash=gaits.step.hash32,
             robot_process=EmbeddedRobot(engine),
             mechanics=Mechanics(describe(robot, None, patient), engine, Ground()),
+            legs=leg_model(patient=patient),
         ) as rig,
         RingWriter(rig.hal.record.nbytes) as ring,
     ):

@@ -106,7 +106,9 @@ def run(id_: str, name: str, engine: str, as_json: bool) -> None:
 @engine_option
 @json_option
 def false_alarms(cycles: int, jobs: int, dask: str, engine: str, as_json: bool) -> None:
-    """Walk without a fault, in the air and on the ground with a passive wearer, and count the reported diagnostics.
+    """Walk without a fault, in the air and on the ground with patients, and count the reported diagnostics.
+
+    The true mass of two in three patients differs by 10 % from the mass that the HAL knows. Some patients are active.
 
     GUIDE_OUTSIDE and TORQUE_SATURATED are expected: the filter and the limiter report that they act. Every other
     diagnostic is a false alarm. The exit code is 1 after a false alarm, or if a walk does not

@@ -302,6 +302,27 @@ SCENARIOS: Final = (
             )
         ),
     ),
+    # The drive reports the commanded torque. The torque of HA is less than its dry friction, so its detection takes longer.
+    # A reversed SA is found within 30 cycles, too, but then it already exceeds the speed limit of the scenarios.
+    Scenario(
+        "F82",
+        tuple(
+            Case(
+                f"{node} with {share:g} times its torque",
+                (Fault("torque_weak", node, 0, 600, share=share),),
+                node=node,
+                detected=cycles,
+                reacted=cycles,
+                observed=_LOWERED,
+            )
+            for node, share, cycles in (
+                *((f"LEFT_{joint}", -1.0, 30) for joint in ("FH", "TH", "SH", "SK")),
+                ("LEFT_HA", -1.0, 60),
+                *((f"LEFT_{joint}", 0.0, 100) for joint in ("FH", "TH", "SH", "SK", "SA")),
+                ("LEFT_FH", 0.4, 300),
+            )
+        ),
+    ),
     # A push accelerates the joint beyond its top speed within 25 cycles.
     Scenario(
         "F71",

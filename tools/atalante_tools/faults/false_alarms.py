@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
 
     from atalante_emulator.mechanics import Mechanics
+    from atalante_hal.leg_model import LegModel
     from atalante_hal.types import Controller
 
 #: Number of cycles of a walk in the air. A walk of `_STEPS` steps on the ground has about the same number of cycles.
@@ -25,6 +26,10 @@ _STEPS: Final = 75
 EXPECTED: Final = frozenset({"GUIDE_OUTSIDE", "TORQUE_SATURATED", "OPERATOR_STOP"})
 _SHAPES: Final = ("constant", "pinched")
 _FACTORS: Final = (1.0, 0.75, 0.5, 0.25, 0.0)
+#: True mass of the patient, relative to the mass for which the gait and the model in the HAL are made.
+_MASSES: Final = (1.0, 0.9, 1.1)
+#: Every fourth patient on the ground is active.
+_ACTIVE: Final = 4
 
 
 @dataclass(frozen=True)
@@ -51,7 +56,8 @@ class Quiet:
 class QuietTask:
     """Task to walk without a fault. The number of the task selects the walk, and is the seed of the sensor noise.
 
-    Every second walk is on the ground, with one of the eight patients of the study as a passive wearer.
+    Every second walk is on the ground, with one of the eight patients of the study. The true mass of two in three patients
+    differs by 10 %. Some patients are active.
     """
 
     number: int
@@ -67,6 +73,7 @@ class QuietTask:
         from atalante_control.airwalk.controller import AirwalkConfig, AirwalkController
         from atalante_control.gait.gait import AIRWALK_GAIT, load_gait
         from atalante_control.guide.shapes import SHAPES
+        from atalante_control.joint.leg_model import leg_model
         from atalante_emulator.mechanics import Mechanics
         from atalante_hal.robot import load_robot
         from atalante_tools.session.body import describe
@@ -74,34 +81,44 @@ class QuietTask:
         robot = load_robot()
         controller = AirwalkController(robot, load_gait(AIRWALK_GAIT, robot), SHAPES[shape], AirwalkConfig())
         mechanics, name = Mechanics(describe(robot), self.engine), f"air, {shape}, Xi {xi:g}, seed {self.number}"
-        return self._run(name, controller, xi, mechanics, None, lambda state: state.cycle >= _CYCLES)
+        return self._run(name, controller, xi, (mechanics, leg_model()), None, lambda state: state.cycle >= _CYCLES)
 
     def _on_the_ground(self, half: int, xi: float) -> Quiet:
         from atalante_control.gait.subject import STUDY_PATIENTS, Subject
+        from atalante_control.joint.leg_model import leg_model
+        from atalante_control.model import Patient
         from atalante_control.walking.controller import WalkController
         from atalante_emulator.mechanics import Ground, Mechanics
+        from atalante_emulator.patient import ActiveTask
         from atalante_emulator.wearer import LimbParameters
-        from atalante_hal.robot import load_robot
+        from atalante_hal.robot import LEG_JOINTS, load_robot
         from atalante_tools.session.body import describe
         from atalante_tools.session.walk_options import DEFAULT_STEP, solved_gaits
 
         robot, patient = load_robot(), STUDY_PATIENTS[half % len(STUDY_PATIENTS)]
-        controller = WalkController(robot, patient, solved_gaits(Subject(patient, *DEFAULT_STEP)), _STEPS)
-        mechanics = Mechanics(describe(robot, None, patient), self.engine, Ground(), LimbParameters())
-        name = f"ground, {patient.mass:g} kg, pinched, Xi {xi:g}, seed {self.number}"
+        gaits = solved_gaits(Subject(patient, *DEFAULT_STEP))
+        controller = WalkController(robot, patient, gaits, _STEPS)
+        true, active = Patient(patient.mass * _MASSES[half % len(_MASSES)], patient.height), None
+        name = f"ground, {true.mass:g} kg, pinched, Xi {xi:g}, seed {self.number}"
+        if half % _ACTIVE == 1:
+            first = LEG_JOINTS.index("SH")
+            swing = [(hip, knee) for hip, knee in gaits.step.tables().q[:, first : first + 2].tolist()]
+            active, name = ActiveTask(true.mass, true.height, swing, self.number), f"{name}, active"
+        mechanics = Mechanics(describe(robot, None, true), self.engine, Ground(), LimbParameters(), active)
         pose = controller.standing_pose.tolist()
-        return self._run(name, controller, xi, mechanics, pose, lambda _: controller.done)
+        robot_and_model = mechanics, leg_model(patient=patient)
+        return self._run(name, controller, xi, robot_and_model, pose, lambda _: controller.done)
 
     def _run(
         self,
         name: str,
         controller: Controller,
         xi: float,
-        mechanics: Mechanics,
+        robot: tuple[Mechanics, LegModel],
         pose: list[float] | None,
         done: Callable[[State], bool],
     ) -> Quiet:
-        """Walk until `done`, or until the robot leaves ACTIVE."""
+        """Walk until `done`, or until the robot leaves ACTIVE. `robot` contains the emulated robot and its model in the HAL."""
         from atalante_hal.loop import LockStep, run
         from atalante_tools.session.rig import open_hal
 
@@ -112,7 +129,8 @@ class QuietTask:
             pose=pose,
             assistance_factor=xi,
             controller_fields=controller.telemetry_fields,
-            mechanics=mechanics,
+            mechanics=robot[0],
+            legs=robot[1],
         ) as rig:
 
             def until(state: State) -> bool:

@@ -18,7 +18,9 @@ import atalante_dbc
 from atalante_control.airwalk.controller import AirwalkConfig, AirwalkController
 from atalante_control.gait.gait import AIRWALK_GAIT, PERIOD, Gait, load_gait
 from atalante_control.guide.shapes import SHAPES
+from atalante_control.joint.leg_model import leg_model
 from atalante_dbc import Network
+from atalante_hal.leg_model import LegModel
 from atalante_hal.loop import run
 from atalante_hal.robot import Robot, load_robot
 from atalante_hal.types import State, SupervisorState, Vector
@@ -48,22 +50,24 @@ _RESTART: Final = 300
 
 @dataclass(frozen=True)
 class RunContext:
-    """Network, robot, gait and controller, which all runs of a process share."""
+    """Network, robot, gait, controller and model of the legs, which all runs of a process share."""
 
     network: Network
     robot: Robot
     gait: Gait
     pose: list[float]  # first pose of the gait [rad]
     controller: AirwalkController
+    legs: LegModel
 
 
 @functools.cache
 def run_context() -> RunContext:
-    """Return the network, the robot, the gait and the controller of all runs."""
+    """Return the network, the robot, the gait, the controller and the model of the legs of all runs."""
     network, robot = atalante_dbc.load(), load_robot()
     gait = load_gait(AIRWALK_GAIT, robot)
     pose = gait.tables().q[0].tolist()
-    shared = RunContext(network, robot, gait, pose, AirwalkController(robot, gait, SHAPES["constant"], CONFIG))
+    controller = AirwalkController(robot, gait, SHAPES["constant"], CONFIG)
+    shared = RunContext(network, robot, gait, pose, controller, leg_model())
     # Exclude the permanent objects from later garbage collections. This makes every run faster.
     gc.collect()
     gc.freeze()
@@ -178,6 +182,7 @@ class CaseRun:
             controller_fields=controller.telemetry_fields,
             tap=self._sent,
             faults=self._stimuli.faults,
+            legs=shared.legs,
         ) as rig:
             hal = rig.hal
             hal.bus = DisturbedBus(hal.bus, self._stimuli.host_faults)

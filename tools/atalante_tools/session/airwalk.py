@@ -289,6 +289,7 @@ def _open(
     robot_process: EmbeddedRobot | None,
     exoskeleton: ExoskeletonParameters,
 ) -> Any:
+    from atalante_control.joint.leg_model import leg_model
     from atalante_emulator.mechanics import Mechanics
     from atalante_tools.session.body import describe
     from atalante_tools.session.rig import open_hal
@@ -303,6 +304,7 @@ def _open(
         gait_hash=gait_hash,
         robot_process=robot_process,
         mechanics=Mechanics(describe(robot, exoskeleton), target.engine),
+        legs=leg_model(exoskeleton),
     )
 
 

@@ -20,6 +20,7 @@ from atalante_hal.bus.channel_map import open_channels, parse_channel_map
 from atalante_hal.bus.joined import JoinedBus
 from atalante_hal.bus.pair import lockstep_pair
 from atalante_hal.hal import Hal
+from atalante_hal.leg_model import LegModel
 from atalante_hal.loop import LockStep, Statistics, WallClock, realtime, run
 from atalante_hal.robot import Robot, load_robot
 from atalante_hal.safety.diagnostics import Dtc
@@ -122,6 +123,7 @@ def open_hal(
     faults: Sequence[Fault] = (),
     robot_process: EmbeddedRobot | None = None,
     mechanics: Mechanics | None = None,
+    legs: LegModel | None = None,
 ) -> Iterator[Rig]:
     """Open the buses and create the HAL. For an embedded target, also create the emulated robot. Close them after the block.
 
@@ -141,6 +143,7 @@ def open_hal(
             HAL is in READY. If None, the embedded robot runs in this process.
         mechanics: Engine, exoskeleton, wearer and ground of the embedded robot. None means an empty exoskeleton with default leg
             lengths that is suspended at its pelvis and simulated in the engine of the target.
+        legs: Model of the legs for the HAL, see `Hal`.
 
     Raises:
         ValueError: If both `operator` and `robot_process` are given.
@@ -193,6 +196,7 @@ def open_hal(
             controller_fields=controller_fields,
             gait_hash=gait_hash,
             tap=tap,
+            legs=legs,
         )
         if robot_process is None and not target.embedded:
             hal.listen()

@@ -20,6 +20,7 @@ from atalante_control.gait.gait import AIRWALK_GAIT, load_gait
 from atalante_control.gait.subject import Subject
 from atalante_control.gait.walk import WalkGaits
 from atalante_control.guide.shapes import SHAPES
+from atalante_control.joint.leg_model import leg_model
 from atalante_control.model import Patient
 from atalante_control.walking.config import HEADING_GAIN, WALK_GUIDE, WalkConfig
 from atalante_control.walking.controller import WalkController
@@ -98,6 +99,7 @@ def _shape(trial: ShapeTrial) -> dict[str, Any]:
         controller_fields=controller.telemetry_fields,
         gait_hash=gait.hash32,
         mechanics=Mechanics(describe(robot), trial.engine),
+        legs=leg_model(),
     ) as rig:
 
         def record() -> None:
@@ -165,6 +167,7 @@ def _walk(trial: WalkTrial) -> dict[str, Any]:
             active=_task(trial, gaits),
             parameters=HEADING_REFERENCE_PARAMETERS if trial.heading_reference else None,
         ),
+        legs=leg_model(patient=patient),
     ) as rig:
         observation, dial = Observation(rig, controller, None), Dial(operator, trial.protocol, trial.xi)
         motion, effort = Motion(rig, controller), Effort(rig, controller, trial.protocol)

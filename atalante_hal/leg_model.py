@@ -1,0 +1,30 @@
+"""Rigid-body model of both legs: the data from which the HAL computes joint torques from the motion.
+
+The controller package creates the model from the exoskeleton and the patient, and the HAL gets it as an argument. So masses
+and dimensions are defined only once.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+from atalante_hal.types import Vector
+
+
+class LegModel(NamedTuple):
+    """Links and friction of both legs, left leg first. The links of a leg are in the order of `LEG_JOINTS`.
+
+    The frame of a link is the frame of its joint. The frame of the pelvis IMU is the parent of the first link.
+    """
+
+    offset: Vector  # (2, 6, 3) m, position of the joint in the frame of the parent link
+    #: (2, 6, 3, 3, 3) The rotation matrix from link to parent is turn[0] + sin(q) turn[1] + (1 - cos(q)) turn[2].
+    turn: Vector
+    axis: Vector  # (2, 6, 3) unit vector of the joint axis in the frame of the link
+    mass: Vector  # (2, 6) kg
+    centre: Vector  # (2, 6, 3) m, position of the centre of mass
+    inertia: Vector  # (2, 6, 3, 3) kg m2, inertia about the origin of the link frame
+    cell: Vector  # (2, 4, 3) m, positions of the force cells in the frame of the last link
+    dry: Vector  # (2, 6) Nm, dry friction of the joints
+    viscous: Vector  # (2, 6) Nm s/rad, viscous friction of the joints
+    friction_speed: float  # rad/s, joint speed at which dry friction reaches 76 % of its full value

@@ -1,0 +1,285 @@
+"""Torques that the motors of a leg produce, computed from its motion: `positions, pelvis IMU, foot forces -> produced torques`.
+
+*Averages.* The second difference of positions at distances of `HALF` cycles is the mean acceleration over the last 2 * `HALF`
+cycles with triangular weights. Sent torques, specific force and the forces on the foot are averaged with the same weights. So
+all values belong to the same time, also in fast motions.
+
+*Inverse dynamics.* The recursive Newton-Euler algorithm (Featherstone, Rigid Body Dynamics Algorithms, 5.3) starts at the
+pelvis IMU. Its accelerometer measures the acceleration minus gravity, so the attitude of the pelvis is not needed. The force
+cells measure all forces on the foot. Dry and viscous friction of the joint are added, so the result is the torque of the motor.
+
+*Validity.* A lost frame repeats the last position, which would be a large acceleration. So the three positions of each joint must
+have the same age. IMU and foot may repeat their values for `REPEATED` cycles.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Final, NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from atalante_hal.leg_model import LegModel
+from atalante_hal.robot import CELLS, FEET, IMUS, JOINTS, LEG_JOINTS
+from atalante_hal.types import PERIOD, Vector
+
+#: Half of the time over which the acceleration is averaged [cycles].
+HALF: Final = 8
+#: Number of cycles that the averages need.
+SPAN: Final = 2 * HALF + 1
+#: A torque moves the joints this number of cycles after the cycle in which the HAL reports it as sent.
+DELAY: Final = 1
+#: Largest age of the positions [cycles]. The frames of a node may be late by one cycle in every cycle.
+LATE: Final = 1
+#: Largest number of consecutive cycles in which the values of IMU or foot are repeated.
+REPEATED: Final = 2
+_LEG: Final = len(LEG_JOINTS)
+_PELVIS: Final = IMUS.index("pelvis")
+
+Vector3 = tuple[float, float, float]
+Cycles = npt.NDArray[np.int64]
+
+
+class Sample(NamedTuple):
+    """Values of one cycle, as views whose array objects are the same in every cycle."""
+
+    sent: Vector  # (12,) Nm, torques sent in the last cycle
+    position: Vector  # (12,) rad
+    accel: Vector  # (4, 3) m/s2, specific force at each IMU
+    gyro: Vector  # (4, 3) rad/s
+    force: Vector  # (2, 4, 3) N
+    age: Cycles  # (rows,) age of each row of the process image [cycles]
+    rows: Cycles  # (12,) row of each joint in the process image
+
+
+class History(NamedTuple):
+    """Values of the last `SPAN` cycles. The oldest row is overwritten."""
+
+    cycles: Cycles  # (1,) number of stored cycles since the restart
+    sent: Vector  # (SPAN, 12)
+    position: Vector  # (SPAN, 12)
+    age: Cycles  # (SPAN, 12)
+    accel: Vector  # (SPAN, 3) specific force at the pelvis IMU
+    gyro: Vector  # (SPAN, 3) angular velocity of the pelvis IMU
+    force: Vector  # (SPAN, 2, 4, 3)
+    #: (3,) Number of consecutive cycles in which the values of pelvis IMU, left and right foot did not change, and
+    #: (3,) number of cycles since more than `REPEATED` such cycles in a row.
+    repeats: Cycles
+    good: Cycles
+
+
+class Torques(NamedTuple):
+    """Torques of one leg, and workspace of the inverse dynamics."""
+
+    sent: Vector  # (6,) Nm, mean of the sent torques
+    produced: Vector  # (6,) Nm, torques that the motors produced, computed from the motion
+    speed: Vector  # (6,) rad/s, mean velocities
+    acceleration: Vector  # (6,) rad/s2, mean accelerations
+    load: Vector  # (4, 3) N, mean forces on the foot
+    rotation: Vector  # (6, 3, 3) rotation matrix from each link to its parent
+    force: Vector  # (6, 3) N, force on each link from its parent
+    moment: Vector  # (6, 3) Nm, moment about the origin of the link
+
+
+def make_history() -> History:
+    """Return an empty history."""
+    joints, foot = (SPAN, len(JOINTS)), (SPAN, len(FEET), len(CELLS), 3)
+    watched = 1 + len(FEET)
+    return History(
+        np.zeros(1, np.int64), np.zeros(joints), np.zeros(joints), np.zeros(joints, np.int64),
+        np.zeros((SPAN, 3)), np.zeros((SPAN, 3)), np.zeros(foot), np.zeros(watched, np.int64), np.zeros(watched, np.int64),
+    )  # fmt: skip
+
+
+def make_torques() -> Torques:
+    """Return empty torques of a leg."""
+    return Torques(
+        np.zeros(_LEG), np.zeros(_LEG), np.zeros(_LEG), np.zeros(_LEG),
+        np.zeros((len(CELLS), 3)), np.zeros((_LEG, 3, 3)), np.zeros((_LEG, 3)), np.zeros((_LEG, 3)),
+    )  # fmt: skip
+
+
+def store(sample: Sample, history: History) -> None:
+    """Store the values of one cycle.
+
+    Args:
+        sample: values of the cycle.
+        history: values of the last cycles. Updated here.
+    """
+    row, last = history.cycles[0] % SPAN, (history.cycles[0] - 1) % SPAN
+    history.cycles[0] += 1
+    for joint in range(len(sample.sent)):
+        history.sent[row, joint], history.position[row, joint] = sample.sent[joint], sample.position[joint]
+        history.age[row, joint] = sample.age[sample.rows[joint]]
+    changed = False
+    for axis in range(3):
+        history.accel[row, axis], history.gyro[row, axis] = sample.accel[_PELVIS, axis], sample.gyro[_PELVIS, axis]
+        changed |= history.accel[row, axis] != history.accel[last, axis]
+    _count(history, 0, changed)
+    for foot in range(len(sample.force)):
+        changed = False
+        for cell in range(sample.force.shape[1]):
+            for axis in range(3):
+                history.force[row, foot, cell, axis] = sample.force[foot, cell, axis]
+                changed |= history.force[row, foot, cell, axis] != history.force[last, foot, cell, axis]
+        _count(history, 1 + foot, changed)
+
+
+def _count(history: History, sensor: int, changed: bool) -> None:
+    """Count the cycles in which the values of a sensor did not change.
+
+    Args:
+        history: values of the last cycles. Updated here.
+        sensor: 0 for the pelvis IMU, 1 and 2 for the feet.
+        changed: whether the values changed in this cycle.
+    """
+    history.repeats[sensor] = 0 if changed else history.repeats[sensor] + 1
+    history.good[sensor] = 0 if history.repeats[sensor] > REPEATED else history.good[sensor] + 1
+
+
+def compute(leg: int, model: LegModel, history: History, torques: Torques) -> bool:
+    """Compute the sent and the produced torques of a leg. Return False if the values do not suffice.
+
+    Args:
+        leg: index in `SIDES`.
+        model: links and friction of the legs.
+        history: values of the last cycles.
+        torques: output for the torques.
+    """
+    newest = history.cycles[0] - 1
+    if history.cycles[0] < SPAN or min(history.good[0], history.good[1 + leg]) < SPAN:
+        return False
+    now, middle, first = newest % SPAN, (newest - HALF) % SPAN, (newest - 2 * HALF) % SPAN
+    time = HALF * PERIOD
+    for i in range(_LEG):
+        joint = leg * _LEG + i
+        age = history.age[now, joint]
+        if age > LATE or age != history.age[middle, joint] or age != history.age[first, joint]:
+            return False
+        after, angle, before = (
+            history.position[now, joint],
+            history.position[middle, joint],
+            history.position[first, joint],
+        )
+        torques.speed[i] = (after - before) / (2.0 * time)
+        torques.acceleration[i] = (after - 2.0 * angle + before) / (time * time)
+        sine, versine, turn = math.sin(angle), 1.0 - math.cos(angle), model.turn[leg, i]
+        for j in range(3):
+            for k in range(3):
+                torques.rotation[i, j, k] = turn[0, j, k] + sine * turn[1, j, k] + versine * turn[2, j, k]
+    base = _average(leg, newest, history, torques)
+    _inverse_dynamics(leg, model, base, torques)
+    for i in range(_LEG):
+        speed = torques.speed[i]
+        dry = model.dry[leg, i] * math.tanh(speed / model.friction_speed)
+        torques.produced[i] += dry + model.viscous[leg, i] * speed
+    return True
+
+
+def _average(leg: int, newest: int, history: History, torques: Torques) -> tuple[Vector3, Vector3, Vector3]:
+    """Average the sent torques and the loads, and return specific force, angular velocity and acceleration of the pelvis.
+
+    Args:
+        leg: index in `SIDES`.
+        newest: number of the newest stored cycle.
+        history: values of the last cycles.
+        torques: output for the mean sent torques and the mean loads.
+    """
+    torques.sent[:], torques.load[:] = 0.0, 0.0
+    ax, ay, az = 0.0, 0.0, 0.0
+    wx, wy, wz = 0.0, 0.0, 0.0
+    dx, dy, dz = 0.0, 0.0, 0.0
+    for past in range(2 * HALF):
+        row = (newest - past) % SPAN
+        weight = (HALF - abs(past + 1 - HALF)) / (HALF * HALF)
+        before = (newest - past - DELAY) % SPAN
+        for i in range(_LEG):
+            torques.sent[i] += weight * history.sent[before, leg * _LEG + i]
+        for cell in range(torques.load.shape[0]):
+            for axis in range(3):
+                torques.load[cell, axis] += weight * history.force[row, leg, cell, axis]
+        x, y, z = history.accel[row]
+        ax, ay, az = ax + weight * x, ay + weight * y, az + weight * z
+        x, y, z = history.gyro[row]
+        share = 0.5 / HALF
+        wx, wy, wz = wx + share * x, wy + share * y, wz + share * z
+        # The difference between the means of both halves, divided by their distance in time, is the angular acceleration.
+        share = (1.0 if past < HALF else -1.0) / (HALF * HALF * PERIOD)
+        dx, dy, dz = dx + share * x, dy + share * y, dz + share * z
+    return (ax, ay, az), (wx, wy, wz), (dx, dy, dz)
+
+
+def _inverse_dynamics(leg: int, model: LegModel, base: tuple[Vector3, Vector3, Vector3], torques: Torques) -> None:
+    """Compute the torques about the joint axes without friction.
+
+    Args:
+        leg: index in `SIDES`.
+        model: links of the legs.
+        base: specific force [m/s2], angular velocity [rad/s] and angular acceleration [rad/s2] at the pelvis IMU.
+        torques: motion of the joints, rotation matrices and loads; output for the torques.
+    """
+    accel, rate, turn = base
+    force, moment = torques.force, torques.moment
+    for i in range(_LEG):
+        down, offset, axis = torques.rotation[i].T, model.offset[leg, i], model.axis[leg, i]
+        x, y, z = _swept(accel, rate, turn, offset)
+        accel, rate, turn = _product(down, (x, y, z)), _product(down, rate), _product(down, turn)
+        speed, gain = torques.speed[i], torques.acceleration[i]
+        x, y, z = _cross(rate, axis)
+        turn = (
+            turn[0] + gain * axis[0] + speed * x,
+            turn[1] + gain * axis[1] + speed * y,
+            turn[2] + gain * axis[2] + speed * z,
+        )
+        rate = (rate[0] + speed * axis[0], rate[1] + speed * axis[1], rate[2] + speed * axis[2])
+        mass, centre, inertia = model.mass[leg, i], model.centre[leg, i], model.inertia[leg, i]
+        x, y, z = _swept(accel, rate, turn, centre)
+        force[i, 0], force[i, 1], force[i, 2] = mass * x, mass * y, mass * z
+        swing, lever, gyroscopic = _product(inertia, turn), _cross(centre, accel), _cross(rate, _product(inertia, rate))
+        for k in range(3):
+            moment[i, k] = swing[k] + gyroscopic[k] + mass * lever[k]
+    for cell in range(torques.load.shape[0]):
+        arm = _cross(model.cell[leg, cell], torques.load[cell])
+        for k in range(3):
+            force[_LEG - 1, k] -= torques.load[cell, k]
+            moment[_LEG - 1, k] -= arm[k]
+    for i in range(_LEG - 1, -1, -1):
+        axis = model.axis[leg, i]
+        torques.produced[i] = axis[0] * moment[i, 0] + axis[1] * moment[i, 1] + axis[2] * moment[i, 2]
+        if i > 0:
+            pull, twist = _product(torques.rotation[i], force[i]), _product(torques.rotation[i], moment[i])
+            arm = _cross(model.offset[leg, i], pull)
+            for k in range(3):
+                force[i - 1, k] += pull[k]
+                moment[i - 1, k] += twist[k] + arm[k]
+
+
+def _swept(accel: Vector3, rate: Vector3, turn: Vector3, offset: Vector) -> Vector3:
+    """Return the acceleration of a point of a rigid body.
+
+    Args:
+        accel: acceleration of the origin [m/s2].
+        rate: angular velocity [rad/s].
+        turn: angular acceleration [rad/s2].
+        offset: position of the point [m].
+    """
+    tangential, centripetal = _cross(turn, offset), _cross(rate, _cross(rate, offset))
+    return (
+        accel[0] + tangential[0] + centripetal[0],
+        accel[1] + tangential[1] + centripetal[1],
+        accel[2] + tangential[2] + centripetal[2],
+    )
+
+
+def _product(matrix: Vector, v: Vector | Vector3) -> Vector3:
+    a, b, c = v[0], v[1], v[2]
+    return (
+        matrix[0, 0] * a + matrix[0, 1] * b + matrix[0, 2] * c,
+        matrix[1, 0] * a + matrix[1, 1] * b + matrix[1, 2] * c,
+        matrix[2, 0] * a + matrix[2, 1] * b + matrix[2, 2] * c,
+    )
+
+
+def _cross(a: Vector | Vector3, b: Vector | Vector3) -> Vector3:
+    return a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]

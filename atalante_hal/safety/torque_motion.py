@@ -1,0 +1,251 @@
+"""Check that the motion of each joint agrees with the torque that the HAL sends: `LegModel, motion -> findings`.
+
+A drive whose current sensor or motor is wrong may report the commanded torque although its motor produces another one:
+reversed, none, too little or too much. The reported torque then agrees with the command (`torque_tracking`), but the
+motion does not. The module `leg_torques` computes the torque that each motor produced from the motion.
+
+*External torque.* A push on a joint, or a muscle of the patient, moves the joint like a wrong motor torque. But an external
+torque does not depend on the command. While the produced torque e deviates from the sent torque t, the check compares two
+explanations:
+
+    external torque:  e = t + p with a constant p
+    faulty motor:     e = s t   with a share s in `SHARES`
+
+A drive is reported if the mean square error of the first explanation is more than `RATIO` times as large as that of the second
+one. So the check needs a torque that changes. After a fault, the controller changes the torque of the joint within a few cycles.
+An external torque that opposes each change of the torque, such as an obstacle that stops the joint, looks like a dead motor.
+
+*Changes.* The values at the start of a deviation are averages over the time before and after it (`leg_torques.SPAN`), so they are
+left out. The same applies while a deviation falls, because an external torque may be ending.
+
+*Isolation.* A wrong motor torque changes only the computed torque of its own joint, because the motion of all joints is
+measured. A wrong encoder, IMU or force cell, or a load on the leg that the force cells do not measure, changes several computed
+torques. So a deviation counts only while the other joints of the leg agree with their torques.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Final, NamedTuple
+
+import numpy as np
+import numpy.typing as npt
+
+from atalante_hal.compiled import specialised
+from atalante_hal.leg_model import LegModel
+from atalante_hal.robot import JOINTS, LEG_JOINTS, Robot
+from atalante_hal.safety.diagnostics import Dtc, Finding
+from atalante_hal.safety.leg_torques import History, Sample, Torques, compute, make_history, make_torques, store
+from atalante_hal.types import State, Vector
+
+#: Interval between two checks of a leg [cycles]. The legs are checked alternately.
+INTERVAL: Final = 4
+#: Shares of the sent torque that a faulty motor produces: reversed to weak, and strong.
+SHARES: Final = ((-1.5, 0.6), (1.4, 2.2))
+#: A drive is reported if the error of the explanation by an external torque is this number of times as large.
+RATIO: Final = 2.5
+#: Number of consecutive checks with this result.
+CONFIRM: Final = 2
+#: Least deviation of a torque, relative to `Robot.torque_error`, plus a share of the sent torque.
+BAND: Final = 2.0
+_BAND_SHARE: Final = 0.2
+#: Deviation of another joint of the leg above which a deviation does not count, in the same form.
+OTHER_BAND: Final = 4.5
+_OTHER_SHARE: Final = 0.25
+#: Weights of the values of the last check, for a fast and a slow evaluation: means over 20 and 100 cycles.
+DECAY: Final = (0.8, 0.96)
+#: Number of checks at the start of a deviation that are left out.
+LEFT_OUT: Final = 2
+#: A deviation ends after this number of consecutive checks without it.
+PAUSE: Final = 5
+#: Least size of a deviation, relative to its largest size, and factor of the largest size from check to check.
+_FALLEN: Final = 0.8
+_FORGET: Final = 0.97
+#: Least number of checks in a mean.
+_ENOUGH: Final = 2.4
+#: A joint closer to its position limit than this angle [rad] is at its end stop.
+_AT_STOP: Final = 0.005
+_LEG: Final = len(LEG_JOINTS)
+
+
+class Tolerances(NamedTuple):
+    """Properties of the joints that the check uses, shape (12,) each."""
+
+    error: Vector  # Nm rms, error of the produced torque
+    low: Vector  # rad, position below which a joint is at its lower end stop
+    high: Vector  # rad
+
+
+class Deviations(NamedTuple):
+    """State of the check of each joint."""
+
+    sums: Vector  # (2, 12, 6) sums of 1, t, e, t t, e t and e e with the weights of `DECAY`
+    length: npt.NDArray[np.int64]  # (12,) number of checks with a deviation
+    pause: npt.NDArray[np.int64]  # (12,) number of checks since the last deviation
+    largest: Vector  # (12,) Nm, largest deviation
+    found: npt.NDArray[np.int64]  # (12,) number of consecutive checks whose result is a faulty motor
+    share: Vector  # (12,) share of the sent torque that the motor produced in the last check
+
+
+class Memory(NamedTuple):
+    """Memory of the check of both legs."""
+
+    history: History
+    torques: Torques
+    deviations: Deviations
+
+
+def _check(sample: Sample, model: LegModel, tolerances: Tolerances, memory: Memory) -> bool:
+    """Store the values of one cycle, check the leg whose turn it is, and return whether a drive is faulty.
+
+    Args:
+        sample: values of the cycle.
+        model: links and friction of the legs.
+        tolerances: properties of the joints.
+        memory: memory of the check. Updated here.
+    """
+    store(sample, memory.history)
+    turn = memory.history.cycles[0] % INTERVAL
+    leg = 2 * turn // INTERVAL
+    if 2 * turn % INTERVAL or not compute(leg, model, memory.history, memory.torques):
+        return False
+    faulty = False
+    deviating = 0
+    for i in range(_LEG):
+        deviating += _deviates(leg, i, sample.position, tolerances, memory.torques, OTHER_BAND, _OTHER_SHARE)
+    for i in range(_LEG):
+        others = deviating - _deviates(leg, i, sample.position, tolerances, memory.torques, OTHER_BAND, _OTHER_SHARE)
+        joint = leg * _LEG + i
+        if others:
+            _forget(joint, memory.deviations)
+        elif not _deviates(leg, i, sample.position, tolerances, memory.torques, BAND, _BAND_SHARE):
+            memory.deviations.pause[joint] += 1
+            if memory.deviations.pause[joint] > PAUSE:
+                _forget(joint, memory.deviations)
+        else:
+            faulty |= _compare(joint, memory.torques.sent[i], memory.torques.produced[i], tolerances, memory.deviations)
+    return faulty
+
+
+def _deviates(
+    leg: int, i: int, position: Vector, tolerances: Tolerances, torques: Torques, band: float, share: float
+) -> bool:
+    """Return whether the produced torque of a joint deviates from its sent torque.
+
+    An end stop holds a joint against the torque of its motor. So a joint at its end stop deviates only if the produced torque is
+    on the other side.
+
+    Args:
+        leg: index in `SIDES`.
+        i: index in `LEG_JOINTS`.
+        position: joint positions, shape (12,) [rad].
+        tolerances: properties of the joints.
+        torques: torques of the leg.
+        band: least deviation relative to the error of the produced torque.
+        share: share of the sent torque that is added to the least deviation.
+    """
+    joint = leg * _LEG + i
+    deviation = torques.produced[i] - torques.sent[i]
+    if abs(deviation) <= band * tolerances.error[joint] + share * abs(torques.sent[i]):
+        return False
+    stopped = (position[joint] < tolerances.low[joint] and deviation > 0.0) or (
+        position[joint] > tolerances.high[joint] and deviation < 0.0
+    )
+    return not stopped
+
+
+def _forget(joint: int, deviations: Deviations) -> None:
+    """Forget the deviation of a joint.
+
+    Args:
+        joint: index in `JOINTS`.
+        deviations: state of the check. Updated here.
+    """
+    deviations.sums[:, joint] = 0.0
+    deviations.length[joint] = deviations.pause[joint] = deviations.found[joint] = 0
+    deviations.largest[joint] = 0.0
+
+
+def _compare(joint: int, sent: float, produced: float, tolerances: Tolerances, deviations: Deviations) -> bool:
+    """Add a deviation to the sums of a joint, and return whether a faulty motor explains the sums.
+
+    Args:
+        joint: index in `JOINTS`.
+        sent: sent torque t [Nm].
+        produced: produced torque e [Nm].
+        tolerances: properties of the joints.
+        deviations: state of the check. Updated here.
+    """
+    size = abs(produced - sent)
+    deviations.length[joint] += 1
+    deviations.pause[joint] = 0
+    deviations.largest[joint] = max(size, _FORGET * deviations.largest[joint])
+    if deviations.length[joint] <= LEFT_OUT or size < _FALLEN * deviations.largest[joint]:
+        return False
+    faulty = False
+    for window in range(len(DECAY)):
+        sums, keep = deviations.sums[window, joint], DECAY[window]
+        for k, value in enumerate((1.0, sent, produced, sent * sent, sent * produced, produced * produced)):
+            sums[k] = keep * sums[k] + value
+        count, t, e, tt, et, ee = sums
+        if count < _ENOUGH:
+            continue
+        external = ee - 2.0 * et + tt - (e - t) ** 2 / count
+        share, best = et / max(tt, 1e-9), math.inf
+        for low, high in SHARES:
+            s = min(max(share, low), high)
+            best = min(best, ee - 2.0 * s * et + s * s * tt)
+        if external > RATIO * (best + count * tolerances.error[joint] ** 2):
+            faulty = True
+            deviations.share[joint] = share
+    deviations.found[joint] = deviations.found[joint] + 1 if faulty else 0
+    return bool(deviations.found[joint] >= CONFIRM)
+
+
+class TorqueMotion:
+    """Check of all drives while the HAL sends the torques of the controller.
+
+    Args:
+        robot: position limits and errors of the produced torques.
+        model: links and friction of the legs.
+        state: state of the HAL, whose arrays are the same in every cycle.
+        sent: torques sent in the last cycle, shape (12,) [Nm]. The array is the same in every cycle.
+        rows: row of each joint in the process image, shape (12,).
+    """
+
+    def __init__(self, robot: Robot, model: LegModel, state: State, sent: Vector, rows: npt.NDArray[np.int64]) -> None:
+        joints = len(JOINTS)
+        self._memory = Memory(
+            make_history(),
+            make_torques(),
+            Deviations(
+                np.zeros((len(DECAY), joints, 6)), np.zeros(joints, np.int64), np.zeros(joints, np.int64),
+                np.zeros(joints), np.zeros(joints, np.int64), np.zeros(joints),
+            ),
+        )  # fmt: skip
+        sample = Sample(sent, state.position, state.imu_accel, state.imu_gyro, state.foot_force, state.age, rows)
+        limits = Tolerances(robot.torque_error, robot.position_min + _AT_STOP, robot.position_max - _AT_STOP)
+        self._arguments = sample, model, limits, self._memory
+        self._check = specialised(_check, *self._arguments)
+        self.restart()
+
+    def restart(self) -> None:
+        """Forget all values, because the drives did not follow the controller until now."""
+        for record in (self._memory.history, self._memory.deviations):
+            for values in record:
+                values[:] = 0
+
+    def check(self) -> tuple[Finding, ...]:
+        """Check the motion of this cycle, and return one finding for each drive with a faulty motor."""
+        if not self._check(*self._arguments):
+            return ()
+        found, shares = self._memory.deviations.found.tolist(), self._memory.deviations.share.tolist()
+        return tuple(
+            Finding(
+                Dtc.TORQUE_MOTION, joint.upper(), share, True,
+                f"the motion of {joint} must agree with the torque that was sent, "
+                f"got a motion as with {share:.2f} times this torque",
+            )
+            for joint, checks, share in zip(JOINTS, found, shares, strict=True)
+            if checks >= CONFIRM
+        )  # fmt: skip
