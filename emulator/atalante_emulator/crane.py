@@ -17,7 +17,7 @@ from atalante_hal.types import PERIOD, SupervisorState, Vector
 #: Speed of the hook [m/s].
 SPEED: Final = 0.1
 #: Time in ACTIVE after which the crane lowers the robot [s]. In this time, the walking controller moves the legs to the standing
-#: pose. #: On the floor, friction would hold the feet, and the robot would stand with the wrong distance between its feet.
+#: pose. On the floor, friction would hold the feet, and the robot would stand with the wrong distance between its feet.
 DELAY: Final = 2.0
 #: Stiffness and damping of the sling, both per kg of the robot. The weight of the robot stretches the sling by 25 mm.
 STIFFNESS: Final = 400.0  # N/m per kg
