@@ -161,9 +161,9 @@ class DirectionProof:
         #: Tests still to be done: joints of the test, and duration of its pulse [cycles].
         self._tests: list[tuple[list[int], int]] = []
         self._trials = [0] * len(JOINTS)
-        #: Index in `LATENCIES` of the delay that the last test of more than two joints found.
+        #: Number of cycles by which the effect of a torque came later than `LATENCY` in the last test of more than two joints.
         #: A test of one or two joints uses this delay. With a free choice, a reversed motor may look like a late motor.
-        self._delay = 0
+        self.late = 0
         self._position: list[Vector] = []  # joint positions in each cycle of the current test
         self._force: list[Vector] = []  # vertical force of each foot in each cycle of the current test
         self._torque: list[Vector] = []  # sent torques in each cycle of the current test
@@ -249,8 +249,8 @@ class DirectionProof:
             return ""
         mobility, explained = mobilities_of(np.array(self._torque)[:, joints], np.array(self._position)[:, joints])
         if len(joints) > len(SIDES):
-            self._delay = int(np.argmax(np.maximum(explained, 0.0).sum(axis=1)))
-        self.mobility[joints] = mobility[self._delay]
+            self.late = int(np.argmax(np.maximum(explained, 0.0).sum(axis=1)))
+        self.mobility[joints] = mobility[self.late]
         return self._evaluate_test(joints, duration)
 
     def _evaluate_test(self, joints: Sequence[int], duration: int) -> str:

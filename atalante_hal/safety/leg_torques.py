@@ -28,8 +28,11 @@ from atalante_hal.types import PERIOD, Vector
 HALF: Final = 8
 #: Number of cycles that the averages need.
 SPAN: Final = 2 * HALF + 1
-#: A torque moves the joints this number of cycles after the cycle in which the HAL reports it as sent.
+#: A torque moves the joints this number of cycles after the cycle in which the HAL reports it as sent, if no frame and no motor
+#: is late.
 DELAY: Final = 1
+#: Largest further delay of the torques [cycles]: states, commands and motors together.
+MORE: Final = 3
 #: Largest age of the positions [cycles]. The frames of a node may be late by one cycle in every cycle.
 LATE: Final = 1
 #: Largest number of consecutive cycles in which the values of IMU or foot are repeated.
@@ -54,10 +57,10 @@ class Sample(NamedTuple):
 
 
 class History(NamedTuple):
-    """Values of the last `SPAN` cycles. The oldest row is overwritten."""
+    """Values of the last `SPAN` cycles, and sent torques of `MORE` cycles more. The oldest row is overwritten."""
 
     cycles: Cycles  # (1,) number of stored cycles since the restart
-    sent: Vector  # (SPAN, 12)
+    sent: Vector  # (SPAN + MORE, 12)
     position: Vector  # (SPAN, 12)
     age: Cycles  # (SPAN, 12)
     accel: Vector  # (SPAN, 3) specific force at the pelvis IMU
@@ -87,7 +90,7 @@ def make_history() -> History:
     joints, foot = (SPAN, len(JOINTS)), (SPAN, len(FEET), len(CELLS), 3)
     watched = 1 + len(FEET)
     return History(
-        np.zeros(1, np.int64), np.zeros(joints), np.zeros(joints), np.zeros(joints, np.int64),
+        np.zeros(1, np.int64), np.zeros((SPAN + MORE, len(JOINTS))), np.zeros(joints), np.zeros(joints, np.int64),
         np.zeros((SPAN, 3)), np.zeros((SPAN, 3)), np.zeros(foot), np.zeros(watched, np.int64), np.zeros(watched, np.int64),
     )  # fmt: skip
 
@@ -108,9 +111,10 @@ def store(sample: Sample, history: History) -> None:
         history: values of the last cycles. Updated here.
     """
     row, last = history.cycles[0] % SPAN, (history.cycles[0] - 1) % SPAN
+    sent = history.cycles[0] % len(history.sent)
     history.cycles[0] += 1
     for joint in range(len(sample.sent)):
-        history.sent[row, joint], history.position[row, joint] = sample.sent[joint], sample.position[joint]
+        history.sent[sent, joint], history.position[row, joint] = sample.sent[joint], sample.position[joint]
         history.age[row, joint] = sample.age[sample.rows[joint]]
     changed = False
     for axis in range(3):
@@ -138,17 +142,18 @@ def _count(history: History, sensor: int, changed: bool) -> None:
     history.good[sensor] = 0 if history.repeats[sensor] > REPEATED else history.good[sensor] + 1
 
 
-def compute(leg: int, model: LegModel, history: History, torques: Torques) -> bool:
+def compute(leg: int, model: LegModel, late: int, history: History, torques: Torques) -> bool:
     """Compute the sent and the produced torques of a leg. Return False if the values do not suffice.
 
     Args:
         leg: index in `SIDES`.
         model: links and friction of the legs.
+        late: further delay of the torques, 0 to `MORE` [cycles].
         history: values of the last cycles.
         torques: output for the torques.
     """
     newest = history.cycles[0] - 1
-    if history.cycles[0] < SPAN or min(history.good[0], history.good[1 + leg]) < SPAN:
+    if history.cycles[0] < SPAN + late or min(history.good[0], history.good[1 + leg]) < SPAN:
         return False
     now, middle, first = newest % SPAN, (newest - HALF) % SPAN, (newest - 2 * HALF) % SPAN
     time = HALF * PERIOD
@@ -168,7 +173,7 @@ def compute(leg: int, model: LegModel, history: History, torques: Torques) -> bo
         for j in range(3):
             for k in range(3):
                 torques.rotation[i, j, k] = turn[0, j, k] + sine * turn[1, j, k] + versine * turn[2, j, k]
-    base = _average(leg, newest, history, torques)
+    base = _average(leg, newest, late, history, torques)
     _inverse_dynamics(leg, model, base, torques)
     for i in range(_LEG):
         speed = torques.speed[i]
@@ -177,12 +182,13 @@ def compute(leg: int, model: LegModel, history: History, torques: Torques) -> bo
     return True
 
 
-def _average(leg: int, newest: int, history: History, torques: Torques) -> tuple[Vector3, Vector3, Vector3]:
+def _average(leg: int, newest: int, late: int, history: History, torques: Torques) -> tuple[Vector3, Vector3, Vector3]:
     """Average the sent torques and the loads, and return specific force, angular velocity and acceleration of the pelvis.
 
     Args:
         leg: index in `SIDES`.
         newest: number of the newest stored cycle.
+        late: further delay of the torques [cycles].
         history: values of the last cycles.
         torques: output for the mean sent torques and the mean loads.
     """
@@ -193,7 +199,7 @@ def _average(leg: int, newest: int, history: History, torques: Torques) -> tuple
     for past in range(2 * HALF):
         row = (newest - past) % SPAN
         weight = (HALF - abs(past + 1 - HALF)) / (HALF * HALF)
-        before = (newest - past - DELAY) % SPAN
+        before = (newest - past - DELAY - late) % len(history.sent)
         for i in range(_LEG):
             torques.sent[i] += weight * history.sent[before, leg * _LEG + i]
         for cell in range(torques.load.shape[0]):

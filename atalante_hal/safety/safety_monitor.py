@@ -185,7 +185,7 @@ class SafetyMonitor:
         if self.moving:
             found = self.torque_tracking.check(self._limiter.last, self._limiter.limit, state.torque)
             if self.torque_motion is not None:
-                found += self.torque_motion.check()
+                found += self.torque_motion.check(self.proof.late)
             for finding in found:  # the next START tests the direction of this joint again
                 self.proof.forget(DRIVE_NODES.index(finding.node))
             return found

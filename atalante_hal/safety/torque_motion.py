@@ -95,10 +95,11 @@ class Memory(NamedTuple):
     deviations: Deviations
 
 
-def _check(sample: Sample, model: LegModel, tolerances: Tolerances, memory: Memory) -> bool:
+def _check(late: int, sample: Sample, model: LegModel, tolerances: Tolerances, memory: Memory) -> bool:
     """Store the values of one cycle, check the leg whose turn it is, and return whether a drive is faulty.
 
     Args:
+        late: further delay of the torques [cycles], see `leg_torques.compute`.
         sample: values of the cycle.
         model: links and friction of the legs.
         tolerances: properties of the joints.
@@ -107,7 +108,7 @@ def _check(sample: Sample, model: LegModel, tolerances: Tolerances, memory: Memo
     store(sample, memory.history)
     turn = memory.history.cycles[0] % INTERVAL
     leg = 2 * turn // INTERVAL
-    if 2 * turn % INTERVAL or not compute(leg, model, memory.history, memory.torques):
+    if 2 * turn % INTERVAL or not compute(leg, model, late, memory.history, memory.torques):
         return False
     faulty = False
     deviating = 0
@@ -226,7 +227,7 @@ class TorqueMotion:
         sample = Sample(sent, state.position, state.imu_accel, state.imu_gyro, state.foot_force, state.age, rows)
         limits = Tolerances(robot.torque_error, robot.position_min + _AT_STOP, robot.position_max - _AT_STOP)
         self._arguments = sample, model, limits, self._memory
-        self._check = specialised(_check, *self._arguments)
+        self._check = specialised(_check, 0, *self._arguments)
         self.restart()
 
     def restart(self) -> None:
@@ -235,9 +236,14 @@ class TorqueMotion:
             for values in record:
                 values[:] = 0
 
-    def check(self) -> tuple[Finding, ...]:
-        """Check the motion of this cycle, and return one finding for each drive with a faulty motor."""
-        if not self._check(*self._arguments):
+    def check(self, late: int = 0) -> tuple[Finding, ...]:
+        """Check the motion of this cycle, and return one finding for each drive with a faulty motor.
+
+        Args:
+            late: number of cycles by which a torque moves the joints later than usual, because states, commands or motors are
+                late, 0 to `leg_torques.MORE`.
+        """
+        if not self._check(late, *self._arguments):
             return ()
         found, shares = self._memory.deviations.found.tolist(), self._memory.deviations.share.tolist()
         return tuple(

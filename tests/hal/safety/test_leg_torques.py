@@ -14,6 +14,7 @@ from atalante_hal.safety.leg_torques import (
     DELAY,
     HALF,
     LATE,
+    MORE,
     REPEATED,
     SPAN,
     Sample,
@@ -42,7 +43,7 @@ class Motion:
         self.force = np.zeros((cycles, 2, len(CELLS), 3)) + noise[:, None, None, :]
         self.age = np.zeros((cycles, len(JOINTS)), np.int64)
 
-    def torques(self, leg: int = 0, model=None) -> Torques | None:
+    def torques(self, leg: int = 0, model=None, late: int = 0) -> Torques | None:
         """Return the torques of a leg after the last cycle; None if the values do not suffice."""
         history, torques = make_history(), make_torques()
         for k in range(len(self.sent)):
@@ -52,7 +53,7 @@ class Motion:
             age = np.concatenate([[99], self.age[k]])
             rows = np.arange(1, 1 + len(JOINTS))
             store(Sample(self.sent[k], self.position[k], accel, gyro, self.force[k], age, rows), history)
-        return torques if compute(leg, model or leg_model(), history, torques) else None
+        return torques if compute(leg, model or leg_model(), late, history, torques) else None
 
 
 def accelerated(generator: np.random.Generator) -> tuple[Motion, np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
@@ -106,13 +107,15 @@ def test_friction_is_added_to_the_torque_of_the_motor(sign: float) -> None:
     np.testing.assert_allclose(with_friction.produced - without.produced, expected, atol=1e-9)
 
 
-def test_mean_of_the_sent_torques_has_the_weights_of_the_acceleration() -> None:
+@pytest.mark.parametrize("late", range(MORE + 1))
+def test_mean_of_the_sent_torques_has_the_weights_of_the_acceleration(late: int) -> None:
     # A torque of one cycle moves the joint by the second difference of the positions from this cycle on.
-    for cycle in range(SPAN):
-        motion = Motion()
+    cycles = SPAN + MORE
+    for cycle in range(cycles):
+        motion = Motion(cycles)
         motion.sent[cycle, 8] = 7.0
-        motion.position[:, 8] = np.maximum(np.arange(SPAN) - cycle - DELAY + 1, 0) * 7.0 * PERIOD**2
-        torques = motion.torques(1)
+        motion.position[:, 8] = np.maximum(np.arange(cycles) - cycle - DELAY - late + 1, 0) * 7.0 * PERIOD**2
+        torques = motion.torques(1, late=late)
         assert torques is not None
         assert torques.sent[2] == pytest.approx(torques.acceleration[2], abs=1e-9), cycle
 
@@ -120,6 +123,8 @@ def test_mean_of_the_sent_torques_has_the_weights_of_the_acceleration() -> None:
 def test_too_few_cycles_give_no_torques() -> None:
     assert Motion(SPAN - 1).torques() is None
     assert Motion(SPAN).torques() is not None
+    assert Motion(SPAN + MORE - 1).torques(late=MORE) is None
+    assert Motion(SPAN + MORE).torques(late=MORE) is not None
 
 
 @pytest.mark.parametrize(
