@@ -298,7 +298,7 @@ def upward(quaternion: Vector) -> tuple[float, float, float]:
     return 2.0 * (x * z - w * y), 2.0 * (y * z + w * x), 1.0 - 2.0 * (x * x + y * y)
 
 
-def to_world(quaternion: Vector, vector: Vector) -> tuple[float, float, float]:
+def to_world(quaternion: Vector, vector: Vector | tuple[float, float, float]) -> tuple[float, float, float]:
     """Return a vector of the sensor frame in world axes.
 
     Args:

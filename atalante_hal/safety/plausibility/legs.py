@@ -7,11 +7,12 @@ is Rx(FH) Rz(TH) Ry(SH + SK). The two IMUs give these three angles, and the four
 *Drift.* An encoder that drifts at the rate `d` [rad/s] is detected `DRIFT_SAMPLES` samples after the time
 `attitude_error / d`. A drift of more than 0.035 rad/s is detected within 1000 cycles, and a slower drift takes longer.
 Some drifts cannot be detected, and some drifting encoders cannot be distinguished. The foot has no IMU, so a drift of
-SA or HA is detected only on the ground, by the module `soles`. Opposite drifts of SH and SK cancel and are not
-detected, and a drift of SH cannot be distinguished from a drift of SK. A drift of an IMU has the same effect as a drift
-of an encoder. The heading of an IMU without a fault also drifts without a limit. This heading drift affects only TH. The check
-of TH therefore subtracts an estimate of the heading drift. The estimate changes by at most `_HEADING_DRIFT` per sample.
-The estimate also follows a slower drift of the encoder of TH, so such a drift is not detected.
+SA or HA is detected only on the ground, by the module `soles`. Opposite drifts of SH and SK cancel, and are detected
+only while the leg moves, by the module `knees`. A drift of SH cannot be distinguished from a drift of SK. A drift of an
+IMU has the same effect as a drift of an encoder. The heading of an IMU without a fault also drifts without a limit. This
+heading drift affects only TH. The check of TH therefore subtracts an estimate of the heading drift. The estimate changes
+by at most `_HEADING_DRIFT` per sample. The estimate also follows a slower drift of the encoder of TH, so such a drift is
+not detected.
 
 *Standstill.* While the reading of an encoder is constant and its joint is at rest, the difference between encoders and
 IMUs about the axis of the joint is also constant. If the joint moves while its encoder is stuck, this difference changes by

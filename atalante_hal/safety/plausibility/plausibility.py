@@ -1,7 +1,7 @@
 """Schedule of the plausibility checks in each cycle.
 
     process image -> one slow check in turn (standstill, velocity, feet, legs, support, soles, inertial, checks that lack data)
-    -> jump, range, IMUs, trunk -> state
+    -> jump, range, IMUs, trunk, knees -> state
 
 Each cycle checks the encoders and the IMUs, and runs at most one slow check. If the new values of a joint or an IMU
 fail a check, they are rejected: the process image keeps the previous values, and the age of these values grows. The
@@ -14,6 +14,8 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
+import numpy as np
+
 from atalante_hal.robot import IMUS, Robot
 from atalante_hal.safety.diagnostics import Dtc, Finding
 from atalante_hal.safety.plausibility.encoders import EncoderChecks
@@ -21,6 +23,7 @@ from atalante_hal.safety.plausibility.feet import FootChecks
 from atalante_hal.safety.plausibility.finding import JOINT_NODES, Ages, Rows, signals_of
 from atalante_hal.safety.plausibility.imus import Imus
 from atalante_hal.safety.plausibility.inertial import Inertial
+from atalante_hal.safety.plausibility.knees import KNEE_IMUS, KNEE_JOINTS, Knees
 from atalante_hal.safety.plausibility.legs import Legs
 from atalante_hal.safety.plausibility.rejections import Rejections
 from atalante_hal.safety.plausibility.soles import Soles
@@ -42,6 +45,8 @@ _PERIOD = 32
 _INERTIAL_INTERVALS = (15, 17)
 #: Largest age of values that the trunk check uses [cycles]. A message may be late by one cycle in every cycle.
 _LATE = 1
+#: Largest age of values that the knee checks use [cycles]. With older values, their filters restart.
+_HELD = 4
 _FRESH = int(Check.SOME_LOST)
 
 
@@ -71,8 +76,10 @@ class Plausibility:
         self._soles = Soles(robot, now)
         self._inertial = Inertial(robot, now, self._imus.limits, _INERTIAL_INTERVALS, period)
         self._trunk = Trunk(now, period)
+        self._knees = Knees(robot, now, period)
         self._rows = Rows(codec)
         self._trunk_rows = self._rows.imu[[IMUS.index("torso"), IMUS.index("pelvis")]]
+        self._knee_rows = np.concatenate((self._rows.joint[KNEE_JOINTS], self._rows.imu[KNEE_IMUS]))
         self._rejections = Rejections()
         self._unchecked = Unchecked(self._rows, image.check, SLOW)
         self._joint_rows, self._imu_rows = self._rows.joint.tolist(), self._rows.imu.tolist()
@@ -121,14 +128,18 @@ class Plausibility:
         settled = fresh and self._settled and self.findings is self._evaluated and not self._rejections.pending
         if settled and self._encoders.within_reach() and self._imus.usable():
             self._encoders.follow()
-            changed = self._stillness.follow()
-            if self._trunk.follow() or changed:
+            changed = self._stillness.follow(), self._trunk.follow(), self._knees.follow()
+            if any(changed):
                 self._collect()
         else:
             self._evaluated = self.findings
             self._check_rows()
             if (self._image.age[self._trunk_rows] <= _LATE).all():
                 self._trunk.follow()
+            if (self._image.age[self._knee_rows] <= _HELD).all():
+                self._knees.follow()
+            else:
+                self._knees.restart()
             self._collect()
         if self.findings:
             self._set_faulty_cells_to_zero()
@@ -227,6 +238,7 @@ class Plausibility:
             *self._soles.findings(),
             *self._inertial.findings(),
             *self._trunk.findings(),
+            *self._knees.findings(),
             *self._unchecked.findings(),
         )
         if often := self._rejections.findings():

@@ -28,7 +28,7 @@ HEIGHT_CYCLES = 64
 #: The load is reported after it has been on the wrong leg for this time [cycles].
 WEIGHT_CYCLES = 128
 #: Mean length of a thigh or a shank [m]. The real lengths are adjusted to the patient.
-_SEGMENT = 0.4
+SEGMENT = 0.4
 #: Lateral distance of the ankles while both legs are parallel [m].
 ANKLE_DISTANCE = 0.188
 #: A foot cannot carry load if it is above the other foot by more than this height [m].
@@ -127,7 +127,7 @@ def posture_of(pelvis: Sequence[float], tibiae: Sequence[Sequence[float]], knees
         shank_x, shank_y, shank_z = 2.0 * (x * z + w * y), 2.0 * (y * z - w * x), 1.0 - 2.0 * (x * x + y * y)
         # World component z of axis z of the thigh. The thigh is the shank turned by minus the knee angle.
         thigh_z = math.cos(knee) * shank_z - math.sin(knee) * 2.0 * (x * z - w * y)
-        drops.append(_SEGMENT * (thigh_z + shank_z))
+        drops.append(SEGMENT * (thigh_z + shank_z))
         lean += (shank_x * left_x + shank_y * left_y) / (length * len(SIDES))
     w, x, y, z = pelvis
     return Posture(drops[1] - drops[0] + ANKLE_DISTANCE * 2.0 * (y * z + w * x), lean)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Final
 
 from atalante_emulator.faults import Fault
@@ -180,6 +181,22 @@ SCENARIOS: Final = (
                 recovers=False,
             )
             for node, rate in (("LEFT_SH", 0.1), (_KNEE, -0.1), ("RIGHT_SH", -0.1), ("RIGHT_SK", 0.1))
+        ),
+    ),
+    Scenario(
+        "F83",
+        tuple(
+            Case(
+                f"{side}_SH {rate:+g} deg/s and {side}_SK {-rate:+g} deg/s",
+                (
+                    Fault("encoder_drift", f"{side}_SH", rate=math.radians(rate)),
+                    Fault("encoder_drift", f"{side}_SK", rate=math.radians(-rate)),
+                ),
+                node=f"{side}_SK",
+                recovers=False,
+            )
+            for side in ("LEFT", "RIGHT")
+            for rate in (2.5, -2.5)
         ),
     ),
     Scenario("F30", _imu("imu_invalid", 30, tolerated=5), permanent=Case("torso", (Fault("imu_invalid", _IMUS[0]),))),

@@ -1,0 +1,248 @@
+"""Knee checks, which compare the knee encoders with the accelerometers of pelvis and tibiae.
+
+The attitude of a tibia depends only on the sum of SH and SK. So the module `legs` does not detect a drift of SK with an opposite
+drift of SH. Such drifts turn the computed thigh, so they change the computed position of the tibia IMU. The difference of the
+accelerometers of tibia and pelvis, in world axes, is the second derivative of the true position `r` of the tibia IMU relative to
+the pelvis IMU. Gravity cancels. An error `e` of the knee angle changes the computed position by `lever * e`:
+
+    difference of the accelerometers = second derivative of (r - lever * e), with lever = derivative of r with respect to SK
+
+Integration and a high-pass of third order give both sides as positions in metres, without the constant errors of accelerometers
+and attitudes. A regression over about a second explains their difference by two unknowns: the error of the knee angle, and the
+difference of the segment lengths from their mean value `SEGMENT`, because both segments are adjusted to the patient.
+
+The check needs a thigh that turns, so it cannot decide while the robot stands. It decides in each walk, also in the air. If the
+error of the knee angle explains only a small part of the difference, the cause is not the encoder, but for example a faulty
+accelerometer. Then nothing is reported here.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from atalante_hal.compiled import specialised
+from atalante_hal.robot import IMUS, JOINTS, LEG_JOINTS, SIDES, Robot
+from atalante_hal.safety.diagnostics import Dtc, Finding
+from atalante_hal.safety.plausibility.finding import JOINT_NODES, Signals
+from atalante_hal.safety.plausibility.inertial import to_world
+from atalante_hal.safety.plausibility.support import SEGMENT
+from atalante_hal.types import Vector
+
+#: Pelvis IMU in the pelvis frame [m].
+PELVIS_IMU = (-0.164, -0.015, 0.191)
+#: Joint FH of the left leg in the pelvis frame: y [m].
+FRONTAL_HIP = 0.089
+#: Joint TH relative to joint FH, in the axes of the frontal hip: x, y of the left leg [m]. Joint SH is at y, -x from here.
+TRANSVERSE_HIP = (-0.135, 0.169)
+#: Tibia IMU: x relative to SK, y of the left leg relative to SH, z relative to SA [m].
+TIBIA_IMU = (-0.13, -0.069, 0.018)
+#: Time constant of the integration and of the high-pass [s].
+_FILTER_TIME = 0.15
+#: Time constant of the mean values [s].
+_MEAN_TIME = 0.75
+#: Time after the start in which the filters settle, before the mean values begin [s].
+_SETTLING_TIME = 2.0
+#: Least root mean square of the filtered lever, without the part that a change of length explains [m]. In a walk it is about
+#: 0.012 m.
+_LEAST_LEVER = 0.007
+#: Least part of the mean square of the difference that the error of the knee angle must explain. The part that a change of
+#: length explains does not count.
+_SHARE = 0.25
+#: Number of filters of each leg and axis.
+_FILTERS = 11
+_PELVIS = IMUS.index("pelvis")
+_TIBIA = IMUS.index("left_tibia")
+_FH, _TH, _SK = (JOINTS.index(f"left_{joint}") for joint in ("FH", "TH", "SK"))
+#: Indices in JOINTS and in IMUS of the sensors that the check needs.
+KNEE_JOINTS = [JOINTS.index(f"{side}_{joint}") for side in SIDES for joint in ("FH", "TH", "SK")]
+KNEE_IMUS = [_PELVIS, *(IMUS.index(f"{side}_tibia") for side in SIDES)]
+
+_Vector3 = tuple[float, float, float]
+
+
+class Readings(NamedTuple):
+    """Signals from which the check computes the motion of both legs."""
+
+    position: Vector  # (12,) rad, on the motor side
+    to_joint: Vector  # (12,) factor from motor side to joint side
+    quaternion: Vector  # (4, 4) wxyz, sensor to world
+    accel: Vector  # (4, 3) m/s2
+
+
+class Filters(NamedTuple):
+    """Values of the filters of both legs."""
+
+    low: Vector  # (2, 33) low-passes of each leg: `_FILTERS` for each axis
+    time: Vector  # (1,) time since the start, up to `_SETTLING_TIME` [s]
+    #: Mean products, shape (2, 6): lever and lever, lever and growth, growth and growth, lever and difference, growth
+    #: and difference, difference and difference. Lever and growth are the derivatives of the position with respect to SK and to
+    #: the length of a segment.
+    moments: Vector
+
+
+class Knees:
+    """Checks of both knee encoders.
+
+    Args:
+        robot: sensor thresholds of the robot.
+        now: signals decoded in this cycle.
+        period: cycle time [s].
+    """
+
+    def __init__(self, robot: Robot, now: Signals, period: float) -> None:
+        legs = len(SIDES)
+        self._filters = Filters(np.zeros((legs, 3 * _FILTERS)), np.zeros(1), np.zeros((legs, 6)))
+        self._error = np.zeros(legs)
+        #: Arguments of the function `follow`. The array objects are the same in every call.
+        self._arguments = (
+            Readings(now.position, robot.polarity / robot.gear, now.quaternion, now.accel), self._filters, self._error,
+            2.0 * robot.sensors.attitude_error, period,
+        )  # fmt: skip
+        self._follow = specialised(follow, *self._arguments)
+        self.restart()
+        self._found: dict[int, Finding] = {}
+
+    def restart(self) -> None:
+        """Restart the filters, because signals of the check were too old."""
+        for values in self._filters:
+            values.fill(0.0)
+
+    def follow(self) -> bool:
+        """Follow the motion of both legs by one cycle.
+
+        Returns:
+            Whether the findings have changed.
+        """
+        if not self._follow(*self._arguments) and not self._found:
+            return False
+        found = {
+            leg: self._found.get(leg) or _drift(leg, error) for leg, error in enumerate(self._error.tolist()) if error
+        }
+        changed = found.keys() != self._found.keys()
+        self._found = found
+        return changed
+
+    def findings(self) -> tuple[Finding, ...]:
+        """Return the current findings of the knee checks."""
+        return tuple(self._found.values())
+
+
+def follow(now: Readings, filters: Filters, error: Vector, limit: float, period: float) -> bool:
+    """Update the filters by one cycle, and compute the errors of both knee angles.
+
+    Args:
+        now: signals of the cycle.
+        filters: values of the filters. Updated here.
+        error: output for the error of each knee angle that exceeds the limit, otherwise 0, shape (2,) [rad]. It keeps its value
+            while the thigh does not turn.
+        limit: largest error of a knee angle [rad].
+        period: cycle time [s].
+
+    Returns:
+        Whether an error exceeds the limit.
+    """
+    settled = filters.time[0] >= _SETTLING_TIME
+    # In the first cycle, the filters begin with the values of this cycle.
+    share = period / _FILTER_TIME if filters.time[0] > 0.0 else 1.0
+    for leg in range(len(error)):
+        products = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+        position, lever, growth, accel = motion(leg, now)
+        low = filters.low[leg]
+        for axis in range(3):
+            first = _FILTERS * axis
+            moved = low_pass(low, first, share, low_pass(low, first + 1, share, accel[axis])) * _FILTER_TIME**2
+            computed = high_pass(low, first + 2, share, high_pass(low, first + 3, share, position[axis]))
+            d = high_pass(low, first + 4, share, moved - computed)
+            s, g = high_pass_3(low, first + 5, share, lever[axis]), high_pass_3(low, first + 8, share, growth[axis])
+            ss, sg, gg, sd, gd, dd = products
+            products = ss + s * s, sg + s * g, gg + g * g, sd + s * d, gd + g * d, dd + d * d
+        if settled:
+            for i in range(len(products)):
+                filters.moments[leg, i] += period / _MEAN_TIME * (products[i] - filters.moments[leg, i])
+            error[leg] = knee_error(filters.moments[leg], limit, error[leg])
+    if not settled:
+        filters.time[0] += period
+    return bool(error[0] != 0.0 or error[1] != 0.0)
+
+
+def knee_error(moments: Vector, limit: float, before: float) -> float:
+    """Return the error of a knee angle if it exceeds the limit, otherwise 0 [rad].
+
+    Args:
+        moments: mean products, see `Filters`, shape (6,).
+        limit: largest error [rad].
+        before: last result, which is returned if the thigh does not turn [rad].
+    """
+    ss, sg, gg, sd, gd, dd = moments[0], moments[1], moments[2], moments[3], moments[4], moments[5]
+    # Subtract the part of lever and difference that a change of length explains.
+    lever, product, difference = ss * gg - sg * sg, sd * gg - sg * gd, dd * gg - gd * gd
+    if lever <= _LEAST_LEVER**2 * gg:
+        return before
+    error = -product / lever
+    return float(error) if abs(error) > limit and product**2 > _SHARE * lever * difference else 0.0
+
+
+def motion(leg: int, now: Readings) -> tuple[_Vector3, _Vector3, _Vector3, _Vector3]:
+    """Return the motion of a tibia IMU relative to the pelvis IMU, in world axes.
+
+    Args:
+        leg: index in SIDES.
+        now: signals of the cycle.
+
+    Returns:
+        Position [m], its derivatives with respect to SK [m/rad] and to the length of both segments [m/m], and difference of the
+        specific forces [m/s2].
+    """
+    first, side, tibia = len(LEG_JOINTS) * leg, 1.0 - 2.0 * leg, _TIBIA + leg
+    fh = now.position[first + _FH] * now.to_joint[first + _FH]
+    th = now.position[first + _TH] * now.to_joint[first + _TH]
+    sk = now.position[first + _SK] * now.to_joint[first + _SK]
+    # Joint SH relative to the pelvis IMU, in the axes of the pelvis.
+    x, y = TRANSVERSE_HIP[0] * (1.0 - math.cos(th)), side * TRANSVERSE_HIP[1] - TRANSVERSE_HIP[0] * math.sin(th)
+    y, z = y * math.cos(fh) + side * FRONTAL_HIP, y * math.sin(fh)
+    hip = x - PELVIS_IMU[0], y - PELVIS_IMU[1], z - PELVIS_IMU[2]
+    # Direction of both segments together and tibia IMU relative to SH, in the axes of the tibia. The thigh is turned by -SK.
+    sine, cosine = math.sin(sk), math.cos(sk)
+    x, z = sine, -1.0 - cosine
+    thigh = SEGMENT * x + TIBIA_IMU[0], side * TIBIA_IMU[1], SEGMENT * z + TIBIA_IMU[2]
+    pelvis, shank = now.quaternion[_PELVIS], now.quaternion[tibia]
+    hx, hy, hz = to_world(pelvis, hip)
+    tx, ty, tz = to_world(shank, thigh)
+    px, py, pz = to_world(pelvis, now.accel[_PELVIS])
+    sx, sy, sz = to_world(shank, now.accel[tibia])
+    lever, growth = to_world(shank, (SEGMENT * cosine, 0.0, SEGMENT * sine)), to_world(shank, (x, 0.0, z))
+    return (hx + tx, hy + ty, hz + tz), lever, growth, (sx - px, sy - py, sz - pz)
+
+
+def low_pass(low: Vector, index: int, share: float, value: float) -> float:
+    """Update a low-pass of first order, and return its output.
+
+    Args:
+        low: outputs of all low-passes, shape (33,). Updated here.
+        index: index of the low-pass in `low`.
+        share: period divided by the time constant.
+        value: new input.
+    """
+    low[index] += share * (value - low[index])
+    return float(low[index])
+
+
+def high_pass(low: Vector, index: int, share: float, value: float) -> float:
+    """Update a high-pass of first order, which is the input minus a low-pass, and return its output. See `low_pass`."""
+    return value - low_pass(low, index, share, value)
+
+
+def high_pass_3(low: Vector, index: int, share: float, value: float) -> float:
+    """Update a high-pass of third order with three low-passes, and return its output. See `low_pass`."""
+    return high_pass(low, index, share, high_pass(low, index + 1, share, high_pass(low, index + 2, share, value)))
+
+
+def _drift(leg: int, error: float) -> Finding:
+    joint = JOINTS.index(f"{SIDES[leg]}_SK")
+    text = f"encoder of {JOINTS[joint]}: its angle differs by {math.degrees(error):+.1f} degrees from"
+    return Finding(
+        Dtc.ENC_DRIFT, JOINT_NODES[joint], error, True, f"{text} the accelerometers of pelvis and {SIDES[leg]} tibia"
+    )
