@@ -161,3 +161,12 @@ class TestImusAlone:
         assert not imus.accept(2, 1, frozen=True)
         assert imus.accept(2, 1, frozen=False)
         assert imus.findings() == ()
+
+
+@imus
+def test_frozen_imu_has_no_pending_diagnostic_because_the_standstill_check_reports_it(imu: int):
+    now = signals()
+    now.quaternion[:, 0] = 1.0
+    checks = Imus(ROBOT, CODEC, now)
+    assert not checks.accept(imu, 1, frozen=True)
+    assert checks.tolerated(imu) is None

@@ -315,7 +315,9 @@ class TestUnchecked:
         found = line.run(32, empty)
         assert {(f.dtc, f.node) for f in found} == unchecked
         assert not any(f.confirmed for f in found)
-        found = line.run(UNCHECKED_CYCLES, empty)
+        for _ in range(UNCHECKED_CYCLES):
+            found = line.cycle(empty)
+            assert all(f.confirmed == (f.value >= UNCHECKED_CYCLES) for f in found)
         assert {(f.dtc, f.node) for f in found if f.confirmed} == unchecked
         assert all(f"could not be checked for {f.value:.0f} cycles" in f.text for f in found)
         line.disturb = lambda frames, before: frames[:0]
