@@ -280,9 +280,12 @@ SCENARIOS: Final = (
             ),
             # The controller moves the joint to compensate the drift, until the joint reaches its mechanical limit.
             # The reported position leaves its range only at the mechanical limit, so the detection takes up to 400 cycles.
+            # The mechanical limit stops the joint against the torque of its motor. This looks like a motor without torque (F82).
             Case(
                 "RIGHT_SA at 2 rad/s",
                 (Fault("encoder_drift", "RIGHT_SA", rate=2.0),),
+                state=SupervisorState.LOWER,
+                dtc="TORQUE_MOTION|POSITION_RANGE",
                 node="RIGHT_SA",
                 detected=400,
                 reacted=400,
