@@ -267,7 +267,6 @@ def _walking_stack(engine: str) -> Iterator[_Stack]:
             gait_hash=gaits.step.hash32,
             robot_process=EmbeddedRobot(engine),
             mechanics=Mechanics(describe(robot, None, patient), engine, Ground()),
-            legs=leg_model(patient=patient),
         ) as rig,
         RingWriter(rig.hal.record.nbytes) as ring,
     ):

@@ -85,7 +85,6 @@ class QuietTask:
 
     def _on_the_ground(self, half: int, xi: float) -> Quiet:
         from atalante_control.gait.subject import STUDY_PATIENTS, Subject
-        from atalante_control.joint.leg_model import leg_model
         from atalante_control.model import Patient
         from atalante_control.walking.controller import WalkController
         from atalante_emulator.mechanics import Ground, Mechanics
@@ -106,15 +105,14 @@ class QuietTask:
             active, name = ActiveTask(true.mass, true.height, swing, self.number), f"{name}, active"
         mechanics = Mechanics(describe(robot, None, true), self.engine, Ground(), LimbParameters(), active)
         pose = controller.standing_pose.tolist()
-        robot_and_model = mechanics, leg_model(patient=patient)
-        return self._run(name, controller, xi, robot_and_model, pose, lambda _: controller.done)
+        return self._run(name, controller, xi, (mechanics, None), pose, lambda _: controller.done)
 
     def _run(
         self,
         name: str,
         controller: Controller,
         xi: float,
-        robot: tuple[Mechanics, LegModel],
+        robot: tuple[Mechanics, LegModel | None],
         pose: list[float] | None,
         done: Callable[[State], bool],
     ) -> Quiet:

@@ -95,7 +95,6 @@ def _walk(
         child: Subprocess that writes the outputs.
         as_json: Whether to print a JSON object instead of text.
     """
-    from atalante_control.joint.leg_model import leg_model
     from atalante_control.walking.config import HEADING_GAIN, WALK_GUIDE, WalkConfig
     from atalante_control.walking.controller import WalkController
     from atalante_hal.robot import load_robot
@@ -142,7 +141,6 @@ def _walk(
                 gait_hash=gaits.step.hash32,
                 robot_process=robot_process,
                 mechanics=mechanics,
-                legs=leg_model(patient=patient),
             )
         )
         telemetry = recorder = summary = None

@@ -15,7 +15,6 @@ from typing import TYPE_CHECKING, Any, Final, NamedTuple
 import numpy as np
 
 from atalante_control.gait.subject import Subject
-from atalante_control.joint.leg_model import leg_model
 from atalante_control.model import Patient
 from atalante_control.walking.controller import WalkController
 from atalante_control.walking.phases import Phase
@@ -269,7 +268,6 @@ class _Walk:
             controller_fields=walk.telemetry_fields,
             gait_hash=gaits.step.hash32,
             mechanics=Mechanics(describe(robot, None, patient), engine, Ground(), LimbParameters()),
-            legs=leg_model(patient=patient),
         ) as rig:
             try:
                 self._walk(rig, walk, operator)

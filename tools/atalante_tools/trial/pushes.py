@@ -5,7 +5,6 @@ from __future__ import annotations
 from typing import Any, Final
 
 from atalante_control.gait.subject import Subject
-from atalante_control.joint.leg_model import leg_model
 from atalante_control.model import Patient
 from atalante_control.walking.controller import WalkController
 from atalante_emulator.mechanics import Ground, Mechanics
@@ -66,7 +65,6 @@ def _pushed_walk(trial: PushTrial, push: Push) -> tuple[str, dict[str, int]]:
         controller_fields=controller.telemetry_fields,
         gait_hash=gaits.step.hash32,
         mechanics=Mechanics(describe(robot, None, patient), trial.engine, Ground(), LimbParameters()),
-        legs=leg_model(patient=patient),
     ) as rig:
         ending = Ending(rig, lambda: controller.done, Observation(rig, controller, push))
         with deferred():

@@ -14,7 +14,6 @@ from typing import Any, Final
 import numpy as np
 
 from atalante_control.gait.subject import Subject
-from atalante_control.joint.leg_model import leg_model
 from atalante_control.model import Patient
 from atalante_control.walking.controller import WalkController
 from atalante_control.walking.phases import Phase
@@ -67,7 +66,6 @@ def robust_walk(trial: RobustTrial, recording: Path | None = None) -> dict[str, 
             describe(robot, None, true), trial.engine, Ground(friction=trial.friction), parameters=_parameters(trial)
         ),
         faults=bus_faults(trial),
-        legs=leg_model(patient=known),
     ) as rig:
         pushes = Pushes(controller, trial)
         assert rig.emulator is not None

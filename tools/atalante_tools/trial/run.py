@@ -167,7 +167,6 @@ def _walk(trial: WalkTrial) -> dict[str, Any]:
             active=_task(trial, gaits),
             parameters=HEADING_REFERENCE_PARAMETERS if trial.heading_reference else None,
         ),
-        legs=leg_model(patient=patient),
     ) as rig:
         observation, dial = Observation(rig, controller, None), Dial(operator, trial.protocol, trial.xi)
         motion, effort = Motion(rig, controller), Effort(rig, controller, trial.protocol)
