@@ -134,8 +134,10 @@ def test_every_joint_with_the_right_sign_passes_with_its_mobility(joints: Joints
 
 @pytest.mark.parametrize("late", range(1, len(LATENCIES)))
 def test_joints_pass_although_their_torque_acts_late(joints: Joints, late: int):
+    assert joints.proof.late == 0
     joints.delay(late)
     assert joints.run() == ("", ONCE)
+    assert joints.proof.late == late
     assert joints.proof.mobility == pytest.approx(1.0 / INERTIA, rel=0.2)
 
 
