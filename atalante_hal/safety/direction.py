@@ -142,6 +142,8 @@ class DirectionProof:
         mobility: last measured mobility of each joint, shape (12,) [1/(kg m2)]; 0 if it was not measured.
         failed: indices in JOINTS of the joints that failed in this start.
         running: True from `begin` until all joints are tested, or one has failed.
+        late: number of cycles by which the effect of a torque came later than `LATENCY` in the last test of more than two
+            joints; 0 before the first test.
     """
 
     def __init__(self, robot: Robot) -> None:
@@ -161,8 +163,8 @@ class DirectionProof:
         #: Tests still to be done: joints of the test, and duration of its pulse [cycles].
         self._tests: list[tuple[list[int], int]] = []
         self._trials = [0] * len(JOINTS)
-        #: Number of cycles by which the effect of a torque came later than `LATENCY` in the last test of more than two joints.
-        #: A test of one or two joints uses this delay. With a free choice, a reversed motor may look like a late motor.
+        # A test of one or two joints uses the delay of an earlier test. With a free choice, a reversed motor may look like a late
+        # motor.
         self.late = 0
         self._position: list[Vector] = []  # joint positions in each cycle of the current test
         self._force: list[Vector] = []  # vertical force of each foot in each cycle of the current test

@@ -23,6 +23,7 @@ import numpy.typing as npt
 from atalante_hal.leg_model import LegModel
 from atalante_hal.robot import CELLS, FEET, IMUS, JOINTS, LEG_JOINTS
 from atalante_hal.types import PERIOD, Vector
+from atalante_hal.vectors import Vector3, cross, rotated
 
 #: Half of the time over which the acceleration is averaged [cycles].
 HALF: Final = 8
@@ -40,7 +41,6 @@ REPEATED: Final = 2
 _LEG: Final = len(LEG_JOINTS)
 _PELVIS: Final = IMUS.index("pelvis")
 
-Vector3 = tuple[float, float, float]
 Cycles = npt.NDArray[np.int64]
 
 
@@ -230,9 +230,9 @@ def _inverse_dynamics(leg: int, model: LegModel, base: tuple[Vector3, Vector3, V
     for i in range(_LEG):
         down, offset, axis = torques.rotation[i].T, model.offset[leg, i], model.axis[leg, i]
         x, y, z = _swept(accel, rate, turn, offset)
-        accel, rate, turn = _product(down, (x, y, z)), _product(down, rate), _product(down, turn)
+        accel, rate, turn = rotated(down, (x, y, z)), rotated(down, rate), rotated(down, turn)
         speed, gain = torques.speed[i], torques.acceleration[i]
-        x, y, z = _cross(rate, axis)
+        x, y, z = cross(rate, axis)
         turn = (
             turn[0] + gain * axis[0] + speed * x,
             turn[1] + gain * axis[1] + speed * y,
@@ -242,11 +242,11 @@ def _inverse_dynamics(leg: int, model: LegModel, base: tuple[Vector3, Vector3, V
         mass, centre, inertia = model.mass[leg, i], model.centre[leg, i], model.inertia[leg, i]
         x, y, z = _swept(accel, rate, turn, centre)
         force[i, 0], force[i, 1], force[i, 2] = mass * x, mass * y, mass * z
-        swing, lever, gyroscopic = _product(inertia, turn), _cross(centre, accel), _cross(rate, _product(inertia, rate))
+        swing, lever, gyroscopic = rotated(inertia, turn), cross(centre, accel), cross(rate, rotated(inertia, rate))
         for k in range(3):
             moment[i, k] = swing[k] + gyroscopic[k] + mass * lever[k]
     for cell in range(torques.load.shape[0]):
-        arm = _cross(model.cell[leg, cell], torques.load[cell])
+        arm = cross(model.cell[leg, cell], torques.load[cell])
         for k in range(3):
             force[_LEG - 1, k] -= torques.load[cell, k]
             moment[_LEG - 1, k] -= arm[k]
@@ -254,8 +254,8 @@ def _inverse_dynamics(leg: int, model: LegModel, base: tuple[Vector3, Vector3, V
         axis = model.axis[leg, i]
         torques.produced[i] = axis[0] * moment[i, 0] + axis[1] * moment[i, 1] + axis[2] * moment[i, 2]
         if i > 0:
-            pull, twist = _product(torques.rotation[i], force[i]), _product(torques.rotation[i], moment[i])
-            arm = _cross(model.offset[leg, i], pull)
+            pull, twist = rotated(torques.rotation[i], force[i]), rotated(torques.rotation[i], moment[i])
+            arm = cross(model.offset[leg, i], pull)
             for k in range(3):
                 force[i - 1, k] += pull[k]
                 moment[i - 1, k] += twist[k] + arm[k]
@@ -270,22 +270,9 @@ def _swept(accel: Vector3, rate: Vector3, turn: Vector3, offset: Vector) -> Vect
         turn: angular acceleration [rad/s2].
         offset: position of the point [m].
     """
-    tangential, centripetal = _cross(turn, offset), _cross(rate, _cross(rate, offset))
+    tangential, centripetal = cross(turn, offset), cross(rate, cross(rate, offset))
     return (
         accel[0] + tangential[0] + centripetal[0],
         accel[1] + tangential[1] + centripetal[1],
         accel[2] + tangential[2] + centripetal[2],
     )
-
-
-def _product(matrix: Vector, v: Vector | Vector3) -> Vector3:
-    a, b, c = v[0], v[1], v[2]
-    return (
-        matrix[0, 0] * a + matrix[0, 1] * b + matrix[0, 2] * c,
-        matrix[1, 0] * a + matrix[1, 1] * b + matrix[1, 2] * c,
-        matrix[2, 0] * a + matrix[2, 1] * b + matrix[2, 2] * c,
-    )
-
-
-def _cross(a: Vector | Vector3, b: Vector | Vector3) -> Vector3:
-    return a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]

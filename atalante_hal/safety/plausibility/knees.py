@@ -30,6 +30,7 @@ from atalante_hal.safety.plausibility.finding import JOINT_NODES, Signals
 from atalante_hal.safety.plausibility.inertial import to_world
 from atalante_hal.safety.plausibility.support import SEGMENT
 from atalante_hal.types import Vector
+from atalante_hal.vectors import Vector3
 
 #: Pelvis IMU in the pelvis frame [m].
 PELVIS_IMU = (-0.164, -0.015, 0.191)
@@ -59,8 +60,6 @@ _FH, _TH, _SK = (JOINTS.index(f"left_{joint}") for joint in ("FH", "TH", "SK"))
 #: Indices in JOINTS and in IMUS of the sensors that the check needs.
 KNEE_JOINTS = [JOINTS.index(f"{side}_{joint}") for side in SIDES for joint in ("FH", "TH", "SK")]
 KNEE_IMUS = [_PELVIS, *(IMUS.index(f"{side}_tibia") for side in SIDES)]
-
-_Vector3 = tuple[float, float, float]
 
 
 class Readings(NamedTuple):
@@ -185,7 +184,7 @@ def knee_error(moments: Vector, limit: float, before: float) -> float:
     return float(error) if abs(error) > limit and product**2 > _SHARE * lever * difference else 0.0
 
 
-def motion(leg: int, now: Readings) -> tuple[_Vector3, _Vector3, _Vector3, _Vector3]:
+def motion(leg: int, now: Readings) -> tuple[Vector3, Vector3, Vector3, Vector3]:
     """Return the motion of a tibia IMU relative to the pelvis IMU, in world axes.
 
     Args:

@@ -45,7 +45,7 @@ _PERIOD = 32
 _INERTIAL_INTERVALS = (15, 17)
 #: Largest age of values that the trunk check uses [cycles]. A message may be late by one cycle in every cycle.
 _LATE = 1
-#: Largest age of values that the knee checks use [cycles]. With older values, their filters restart.
+#: Largest age of a value that the knee checks use [cycles]. If a value is older, the filters of the knee checks restart.
 _HELD = 4
 _FRESH = int(Check.SOME_LOST)
 

@@ -20,8 +20,8 @@ from atalante_control.structured import Records, zeros
 from atalante_hal.compiled import compiled
 from atalante_hal.robot import JOINTS
 from atalante_hal.types import Vector
+from atalante_hal.vectors import cross, rotated
 
-Vector3 = tuple[float, float, float]
 Attitude = tuple[float, float, float, float]  # unit quaternion wxyz
 
 
@@ -112,29 +112,16 @@ def hold(links: Records[LinkRecord], position: Vector, pelvis: Attitude, torque:
             for k in range(3):
                 rotation[j, k] = turn[0, j, k] + sine * turn[1, j, k] + versine * turn[2, j, k]
         down, force, moment, mass = link.down, link.force, link.moment, link.mass
-        down[0], down[1], down[2] = _product(rotation.T, links[link.parent].down)
+        down[0], down[1], down[2] = rotated(rotation.T, links[link.parent].down)
         force[0], force[1], force[2] = -mass * down[0], -mass * down[1], -mass * down[2]
-        moment[0], moment[1], moment[2] = _cross(link.lever, force)
+        moment[0], moment[1], moment[2] = cross(link.lever, force)
     for i in range(len(links) - 1, 0, -1):
         link = links[i]
         axis, moment = link.axis, link.moment
         torque[link.joint] = axis[0] * moment[0] + axis[1] * moment[1] + axis[2] * moment[2]
-        pull, twist = _product(link.rotation, link.force), _product(link.rotation, moment)
-        arm = _cross(link.offset, pull)
+        pull, twist = rotated(link.rotation, link.force), rotated(link.rotation, moment)
+        arm = cross(link.offset, pull)
         parent = links[link.parent]
         for j in range(3):
             parent.force[j] += pull[j]
             parent.moment[j] += twist[j] + arm[j]
-
-
-def _product(matrix: Vector, v: Vector) -> Vector3:
-    a, b, c = v[0], v[1], v[2]
-    return (
-        matrix[0, 0] * a + matrix[0, 1] * b + matrix[0, 2] * c,
-        matrix[1, 0] * a + matrix[1, 1] * b + matrix[1, 2] * c,
-        matrix[2, 0] * a + matrix[2, 1] * b + matrix[2, 2] * c,
-    )
-
-
-def _cross(a: Vector, b: Vector | Vector3) -> Vector3:
-    return a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]

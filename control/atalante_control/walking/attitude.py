@@ -26,11 +26,10 @@ import numpy as np
 from atalante_control.gait.gait import PERIOD
 from atalante_control.model import GRAVITY
 from atalante_control.structured import Records, zeros
-from atalante_control.walking.rotation import about_z, cross, rotation_of
+from atalante_control.walking.rotation import about_z, rotation_of
 from atalante_hal.compiled import compiled
 from atalante_hal.types import Vector
-
-Vector3 = tuple[float, float, float]
+from atalante_hal.vectors import Vector3, cross
 
 
 class Attitude:

@@ -35,10 +35,11 @@ from atalante_control.walking.placement import (
     shift_foot,
 )
 from atalante_control.walking.reference import PhaseTable
-from atalante_control.walking.rotation import cross, rotated, tilt_quaternion
+from atalante_control.walking.rotation import tilt_quaternion
 from atalante_control.walking.telemetry import Telemetry, write_guide, write_telemetry
 from atalante_hal.robot import JOINTS, LEG_JOINTS, MOTORS, SIDES
 from atalante_hal.types import Vector
+from atalante_hal.vectors import Vector3, cross, rotated
 
 _LEG = len(LEG_JOINTS)
 _FH, _TH, _SH, _SK, _SA, _HA = (LEG_JOINTS.index(name) for name in ("FH", "TH", "SH", "SK", "SA", "HA"))
@@ -46,7 +47,6 @@ _ANKLES = (_SA, _HA)
 #: s, time constant with which the downward speed of a swing foot rises after the nominal end of a step
 _REACH_RISE = 0.03
 
-Vector3 = tuple[float, float, float]
 Quaternion = tuple[float, float, float, float]
 
 

@@ -15,10 +15,10 @@ import pinocchio
 
 from atalante_control.model import ArticulatedModel, ExoskeletonParameters
 from atalante_control.structured import Records, zeros
-from atalante_control.walking.rotation import Vector3, cross, rotated
 from atalante_hal.compiled import compiled
 from atalante_hal.robot import JOINTS, SIDES
 from atalante_hal.types import Vector
+from atalante_hal.vectors import Vector3, cross, rotated
 
 
 class Link:

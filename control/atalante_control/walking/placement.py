@@ -30,12 +30,11 @@ from typing import Annotated, NamedTuple
 from atalante_control.gait.gait import PERIOD
 from atalante_control.structured import Records
 from atalante_control.walking.kinematics import Link, turn_link
-from atalante_control.walking.rotation import cross, dot, rotated
 from atalante_hal.robot import LEG_JOINTS
 from atalante_hal.types import Vector
+from atalante_hal.vectors import Vector3, cross, dot, rotated
 
 Pair = tuple[float, float]
-Vector3 = tuple[float, float, float]
 
 _FH, _SH, _SK = (LEG_JOINTS.index(name) for name in ("FH", "SH", "SK"))
 #: Joints of the swing leg with which the foot is shifted.

@@ -1,4 +1,4 @@
-"""Rotation matrices, tilt quaternions and vector products for compiled kernels."""
+"""Rotation matrices and tilt quaternions for compiled kernels."""
 
 from __future__ import annotations
 
@@ -8,8 +8,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from atalante_hal.types import Vector
-
-Vector3 = tuple[float, float, float]
+from atalante_hal.vectors import Vector3
 
 
 def about_z(angle: float) -> Vector:
@@ -47,28 +46,3 @@ def tilt_quaternion(vertical: Vector | Vector3) -> tuple[float, float, float, fl
     x, y, z = vertical[0], vertical[1], vertical[2]
     norm = math.sqrt(2.0 * (1.0 + z))
     return 0.5 * norm, y / norm, -x / norm, 0.0
-
-
-def rotated(matrix: Vector, v: Vector | Vector3) -> Vector3:
-    """Return the product of a matrix and a vector.
-
-    Args:
-        matrix: matrix, shape (3, 3).
-        v: vector of three elements.
-    """
-    a, b, c = v[0], v[1], v[2]
-    return (
-        matrix[0, 0] * a + matrix[0, 1] * b + matrix[0, 2] * c,
-        matrix[1, 0] * a + matrix[1, 1] * b + matrix[1, 2] * c,
-        matrix[2, 0] * a + matrix[2, 1] * b + matrix[2, 2] * c,
-    )
-
-
-def cross(a: Vector | Vector3, b: Vector | Vector3) -> Vector3:
-    """Return the cross product of two vectors of three elements."""
-    return a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]
-
-
-def dot(a: Vector | Vector3, b: Vector | Vector3) -> float:
-    """Return the scalar product of two vectors of three elements."""
-    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]

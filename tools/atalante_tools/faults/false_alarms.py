@@ -81,17 +81,16 @@ class QuietTask:
         robot = load_robot()
         controller = AirwalkController(robot, load_gait(AIRWALK_GAIT, robot), SHAPES[shape], AirwalkConfig())
         mechanics, name = Mechanics(describe(robot), self.engine), f"air, {shape}, Xi {xi:g}, seed {self.number}"
-        return self._run(name, controller, xi, (mechanics, leg_model()), None, lambda state: state.cycle >= _CYCLES)
+        return self._run(name, controller, xi, mechanics, leg_model(), None, lambda state: state.cycle >= _CYCLES)
 
     def _on_the_ground(self, half: int, xi: float) -> Quiet:
         from atalante_control.gait.subject import STUDY_PATIENTS, Subject
         from atalante_control.model import Patient
         from atalante_control.walking.controller import WalkController
         from atalante_emulator.mechanics import Ground, Mechanics
-        from atalante_emulator.patient import ActiveTask
         from atalante_emulator.wearer import LimbParameters
-        from atalante_hal.robot import LEG_JOINTS, load_robot
-        from atalante_tools.session.body import describe
+        from atalante_hal.robot import load_robot
+        from atalante_tools.session.body import active_task, describe
         from atalante_tools.session.walk_options import DEFAULT_STEP, solved_gaits
 
         robot, patient = load_robot(), STUDY_PATIENTS[half % len(STUDY_PATIENTS)]
@@ -100,23 +99,22 @@ class QuietTask:
         true, active = Patient(patient.mass * _MASSES[half % len(_MASSES)], patient.height), None
         name = f"ground, {true.mass:g} kg, pinched, Xi {xi:g}, seed {self.number}"
         if half % _ACTIVE == 1:
-            first = LEG_JOINTS.index("SH")
-            swing = [(hip, knee) for hip, knee in gaits.step.tables().q[:, first : first + 2].tolist()]
-            active, name = ActiveTask(true.mass, true.height, swing, self.number), f"{name}, active"
+            active, name = active_task(gaits, true, self.number), f"{name}, active"
         mechanics = Mechanics(describe(robot, None, true), self.engine, Ground(), LimbParameters(), active)
         pose = controller.standing_pose.tolist()
-        return self._run(name, controller, xi, (mechanics, None), pose, lambda _: controller.done)
+        return self._run(name, controller, xi, mechanics, None, pose, lambda _: controller.done)
 
     def _run(
         self,
         name: str,
         controller: Controller,
         xi: float,
-        robot: tuple[Mechanics, LegModel | None],
+        mechanics: Mechanics,
+        legs: LegModel | None,
         pose: list[float] | None,
         done: Callable[[State], bool],
     ) -> Quiet:
-        """Walk until `done`, or until the robot leaves ACTIVE. `robot` contains the emulated robot and its model in the HAL."""
+        """Walk until `done`, or until the robot leaves ACTIVE."""
         from atalante_hal.loop import LockStep, run
         from atalante_tools.session.rig import open_hal
 
@@ -127,8 +125,8 @@ class QuietTask:
             pose=pose,
             assistance_factor=xi,
             controller_fields=controller.telemetry_fields,
-            mechanics=robot[0],
-            legs=robot[1],
+            mechanics=mechanics,
+            legs=legs,
         ) as rig:
 
             def until(state: State) -> bool:

@@ -9,14 +9,16 @@ from contextlib import contextmanager
 from importlib.util import find_spec
 from typing import TYPE_CHECKING, Final
 
-from atalante_hal.robot import Robot
+from atalante_hal.robot import LEG_JOINTS, Robot
 from atalante_tools.console.options import PYBULLET
 from atalante_tools.console.outcome import Failed
 
 if TYPE_CHECKING:
+    from atalante_control.gait.walk import WalkGaits
     from atalante_control.model import ExoskeletonParameters, Patient
     from atalante_emulator.bodies import Body
     from atalante_emulator.mechanics import Mechanics
+    from atalante_emulator.patient import ActiveParameters, ActiveTask
 
 
 #: Newest Python version for which the package index has a wheel of PyBullet.
@@ -49,6 +51,24 @@ def require_engine(engine: str = PYBULLET) -> None:
     if find_spec(engine) is None:
         hint = engine_hint() if engine == PYBULLET else "pip install 'atalante-hal[mujoco]'"
         raise Failed(f"the emulated robot needs {_NAMES[engine]}; type: {hint}")
+
+
+def active_task(
+    gaits: WalkGaits, patient: Patient, seed: int, parameters: ActiveParameters | None = None
+) -> ActiveTask:
+    """Return the task of an active patient: to track hip and knee of the swing leg in the periodic step.
+
+    Args:
+        gaits: Gaits of the walk.
+        patient: Mass and height of the patient.
+        seed: Seed of the noise of the muscles.
+        parameters: Parameters of the patient. None means the default parameters.
+    """
+    from atalante_emulator.patient import ActiveParameters, ActiveTask
+
+    first = LEG_JOINTS.index("SH")
+    swing = [(hip, knee) for hip, knee in gaits.step.tables().q[:, first : first + 2].tolist()]
+    return ActiveTask(patient.mass, patient.height, swing, seed, parameters or ActiveParameters())
 
 
 def describe(robot: Robot, exoskeleton: ExoskeletonParameters | None = None, wearer: Patient | None = None) -> str:

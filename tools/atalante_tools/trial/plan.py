@@ -83,6 +83,10 @@ class ShapeTrial:
         return f"shape-{self.shape}"
 
 
+#: Kinds of subjects. The field `active` of a trial is the index: False is 0, True is 1.
+KINDS: Final = "passive", "active"
+
+
 @dataclass(frozen=True)
 class WalkTrial:
     """Walk of a virtual subject on the ground, with the protocol of the paper."""
@@ -108,8 +112,7 @@ class WalkTrial:
     @property
     def name(self) -> str:
         """Return a name that is unique in the experiment."""
-        effort = "active" if self.active else "passive"
-        return f"walk{self.order and '-' + self.order}-{self.mass:g}kg-{effort}-xi{self.xi:g}"
+        return f"walk{self.order and '-' + self.order}-{self.mass:g}kg-{KINDS[self.active]}-xi{self.xi:g}"
 
 
 @dataclass(frozen=True)
@@ -176,10 +179,6 @@ class TreadmillTrial:
 
 
 Trial = ShapeTrial | WalkTrial | TreadmillTrial | RobustTrial | PushTrial | FaultTrial
-
-
-#: Kinds of subjects. The field `active` of a trial is the index: False is 0, True is 1.
-KINDS: Final = "passive", "active"
 
 
 @dataclass(frozen=True)

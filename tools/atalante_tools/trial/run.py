@@ -42,7 +42,7 @@ from atalante_hal.robot import LEG_JOINTS, load_robot
 from atalante_hal.types import PERIOD, Vector
 from atalante_tools.console.outcome import Failed
 from atalante_tools.console.stop_request import deferred
-from atalante_tools.session.body import describe
+from atalante_tools.session.body import active_task, describe
 from atalante_tools.session.dial import Dial
 from atalante_tools.session.rig import Rig, open_hal
 from atalante_tools.session.walk_observation import Observation
@@ -164,7 +164,7 @@ def _walk(trial: WalkTrial) -> dict[str, Any]:
             trial.engine,
             Ground(),
             LimbParameters(),
-            active=_task(trial, gaits),
+            active=_task(trial, gaits, patient),
             parameters=HEADING_REFERENCE_PARAMETERS if trial.heading_reference else None,
         ),
     ) as rig:
@@ -198,16 +198,12 @@ def _walk(trial: WalkTrial) -> dict[str, Any]:
     }
 
 
-def _task(trial: WalkTrial, gaits: WalkGaits) -> ActiveTask | None:
-    """Return the task of an active subject; None for a passive subject.
-
-    The task contains the nominal angles of the swing leg.
-    """
+def _task(trial: WalkTrial, gaits: WalkGaits, patient: Patient) -> ActiveTask | None:
+    """Return the task of an active subject; None for a passive subject."""
     if not trial.active:
         return None
-    swing = gaits.step.tables().q[:, _SH : _SH + 2].tolist()
-    parameters = ActiveParameters(vibration=_FELT_VIBRATION) if trial.haptics else ActiveParameters()
-    return ActiveTask(trial.mass, trial.height, [(hip, knee) for hip, knee in swing], trial.seed, parameters)
+    parameters = ActiveParameters(vibration=_FELT_VIBRATION) if trial.haptics else None
+    return active_task(gaits, patient, trial.seed, parameters)
 
 
 class Motion:
