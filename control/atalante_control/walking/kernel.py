@@ -23,7 +23,7 @@ from atalante_control.structured import Records
 from atalante_control.walking.attitude import Attitude, observe
 from atalante_control.walking.dcm import Balance, Stabiliser, ankle_torques, dcm, pressure_shift, within_sole
 from atalante_control.walking.kinematics import Chain, move
-from atalante_control.walking.lean import Lean, LeanConfig, follow_lean, lean_target
+from atalante_control.walking.lean import Lean, LeanConfig, follow_lean, lean_target, leg_target
 from atalante_control.walking.placement import (
     Motion,
     Placement,
@@ -368,6 +368,10 @@ def _place(cycle: int, table: PhaseTable, constants: Constants, gain: float, par
         final = table.dcm[last, 0], table.dcm[last, 1]
         motion = Motion(error, nominal, final, table.frequency * remaining, side)
         placement.target[0], placement.target[1], rate = landing(config, gain, motion)
+    outward = leg_target(constants.lean, balance.dcm[1], side)
+    # In the first cycle, the DCM is still relative to the previous stance foot.
+    if outward != 0.0 and cycle > 0:
+        placement.target[1] = outward
     follow(config, placement, rate)
     lean, target = parts.leans[0], lean_target(constants.lean, error[1], balance.dcm[1], side)
     follow_lean(constants.lean, lean, target)

@@ -1,13 +1,17 @@
-"""Lean of the trunk against sideways pushes: `DCM error -> lean -> offset of the frontal hip (FH) of the stance leg`.
+"""Lean of the trunk and motion of the swing leg against sideways pushes: `DCM error -> lean, outward motion of the swing foot`.
 
 The ankle moves the centre of pressure only within the sole. If the divergent component of motion (DCM, `walking.dcm`) is moved
 beyond the edge of the sole, the ankle alone cannot stop it. A trunk that accelerates its rotation in the direction of the push
 moves the ground force further than the sole reaches. A lean by the angle a moves the DCM back by about J w^2 a / (m g), with the
 moment of inertia J of the rotating parts about the hip, the natural frequency w and the weight m g. The first part of the motion
-counts most, because a DCM error grows with exp(w t). The trunk therefore leans fast and returns slowly.
+counts most, because a DCM error grows with exp(w t). The trunk therefore leans fast and returns slowly. The lean is an offset
+of the frontal hip (FH) of the stance leg.
 
 A push to the side of the stance foot makes the trunk lean over the stance foot, as long as the DCM is near the stance sole or
 outside. A push to the side of the swing foot makes the trunk lean a little to that side, which also lowers the swing foot.
+
+If the DCM is outside, over the stance foot, the swing foot also moves outwards, away from the stance foot. The swing leg then
+turns in the same direction as the trunk, and its mass moves to the other side.
 """
 
 from __future__ import annotations
@@ -30,6 +34,10 @@ class LeanConfig(NamedTuple):
     rise: float = 14.0  # rad/s, natural frequency of the critically damped filter while the lean grows
     fall: float = 5.0  # rad/s, natural frequency of the filter while the lean decreases
     acceleration: float = 25.0  # rad/s2, largest acceleration of the lean
+    leg_gain: float = 8.0  # m/m, outward motion of the swing foot per distance of the DCM beyond `leg_zone`; 0: none
+    #: m, distance of the DCM from the middle of the stance sole, outwards, up to which the swing foot does not move outwards
+    leg_zone: float = 0.02
+    leg: float = 0.15  # m, largest outward motion of the swing foot
 
 
 class Lean:
@@ -66,3 +74,14 @@ def follow_lean(config: LeanConfig, lean: Lean, target: float) -> None:
     pull = w * w * (target - lean.angle) - 2.0 * w * lean.speed
     lean.speed += PERIOD * min(max(pull, -config.acceleration), config.acceleration)
     lean.angle += PERIOD * lean.speed
+
+
+def leg_target(config: LeanConfig, dcm: float, side: float) -> float:
+    """Return the requested outward motion of the swing foot to the left [m]; 0 without such a motion.
+
+    Args:
+        config: parameters.
+        dcm: sideways position of the DCM relative to the middle of the stance sole, positive to the left [m].
+        side: direction from stance foot to swing foot: 1 left, -1 right.
+    """
+    return side * min(max(config.leg_gain * (-side * dcm - config.leg_zone), 0.0), config.leg)

@@ -78,7 +78,7 @@ def pushed(
     check: Callable[[WalkController, State], None] | None = None,
 ) -> bool:
     """Push the pelvis for 0.2 s from phase 0.2 of the second step; return whether the robot walks three more steps."""
-    lean = LeanConfig() if math.isfinite(dead_zone) else LeanConfig(gain=0.0)
+    lean = LeanConfig() if math.isfinite(dead_zone) else LeanConfig(gain=0.0, leg_gain=0.0)
     config = WalkConfig(placement=PlacementConfig(dead_zone=dead_zone), lean=lean, edge=edge)
     controller = WalkController(ROBOT, PATIENT, WALK, 100, config)
     body = make_body("mujoco", urdf(ExoskeletonParameters(), ROBOT, PATIENT), free=True, ground=0.0)

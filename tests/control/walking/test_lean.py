@@ -1,4 +1,4 @@
-"""Lean of the trunk: dead zone, limits, symmetry, and the filter of the lean."""
+"""Lean of the trunk and motion of the swing foot: dead zone, limits, symmetry, and the filter of the lean."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from atalante_control.structured import zeros
-from atalante_control.walking.lean import Lean, LeanConfig, follow_lean, lean_target
+from atalante_control.walking.lean import Lean, LeanConfig, follow_lean, lean_target, leg_target
 from atalante_hal.types import PERIOD
 
 CONFIG = LeanConfig()
@@ -58,3 +58,14 @@ def test_lean_rises_faster_than_it_falls_and_its_acceleration_is_limited() -> No
     assert angles[-1] == pytest.approx(0.0, abs=1e-3)
     assert max(angles) < 0.2 + 1e-3
     assert max(speeds) > -1.5 * min(speeds)
+
+
+@given(st.floats(-CONFIG.leg_zone, 0.3))
+def test_swing_foot_stays_while_the_dcm_is_over_the_sole_or_inwards_of_it(dcm: float) -> None:
+    assert leg_target(CONFIG, dcm, 1.0) == 0.0 == leg_target(CONFIG, -dcm, -1.0)
+
+
+def test_swing_foot_moves_away_from_the_stance_foot_up_to_its_limit() -> None:
+    assert leg_target(CONFIG, -CONFIG.leg_zone - 0.01, 1.0) == pytest.approx(0.01 * CONFIG.leg_gain)
+    assert leg_target(CONFIG, CONFIG.leg_zone + 0.01, -1.0) == pytest.approx(-0.01 * CONFIG.leg_gain)
+    assert leg_target(CONFIG, -0.3, 1.0) == CONFIG.leg == -leg_target(CONFIG, 0.3, -1.0)

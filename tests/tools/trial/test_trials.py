@@ -24,6 +24,7 @@ from atalante_tools.cli import cli
 from atalante_tools.console.outcome import Failed
 from atalante_tools.session.walk_options import Push
 from atalante_tools.trial import lockstep, plan, store
+from atalante_tools.trial.branch import Branch
 from atalante_tools.trial.plan import (
     PROTOCOL,
     PUSH_DIRECTIONS,
@@ -370,14 +371,13 @@ def test_pushes_have_16_directions_and_8_phases() -> None:
 def test_largest_push_is_the_last_one_before_the_robot_falls(monkeypatch: pytest.MonkeyPatch) -> None:
     # Walks with the same push are equal, so each is walked once. `forces` of the trial does not affect a walk.
     walks: dict[Push, tuple[str, dict[str, int]]] = {}
-    module = sys.modules[largest_push.__module__]  # the package has a command of the same name
-    walk = module._pushed_walk
+    ask = Branch.ask
 
-    def walk_once(trial: PushTrial, push: Push) -> tuple[str, dict[str, int]]:
-        walks[push] = walks.get(push) or walk(trial, push)
+    def ask_once(walk: Branch, push: Push) -> tuple[str, dict[str, int]]:
+        walks[push] = walks.get(push) or ask(walk, push)
         return walks[push]
 
-    monkeypatch.setattr(module, "_pushed_walk", walk_once)
+    monkeypatch.setattr(Branch, "ask", ask_once)
     trial = PushTrial(270.0, 0.25, (50.0, 1000.0, 2000.0), 75.0, 1.75, 0, "mujoco")
     result = largest_push(trial)
     assert (result["largest_push_n"], result["end"], result["outcome"]) == (50.0, "fell", "computed")
@@ -385,3 +385,8 @@ def test_largest_push_is_the_last_one_before_the_robot_falls(monkeypatch: pytest
     assert [push.force for push in walks] == [50.0, 1000.0]
     assert largest_push(replace(trial, forces=(1000.0,)))["largest_push_n"] == 0.0
     assert largest_push(replace(trial, forces=(50.0,)))["end"] == "stood"
+
+
+def test_robot_withstands_a_push_at_the_landing_that_moves_the_dcm_over_the_new_stance_foot() -> None:
+    trial = PushTrial(90.0, 0.875, (200.0,), 75.0, 1.75, 0, "mujoco")
+    assert largest_push(trial)["end"] == "stood"

@@ -1,7 +1,12 @@
-"""Find the largest push that the walking robot withstands: `trial -> walks with rising force, in lock-step -> result`."""
+"""Find the largest push that the walking robot withstands: `trial -> walks with rising force, in lock-step -> result`.
+
+All walks with the same patient, seed and engine are equal until the push. So one walk branches off shortly before the pushed
+step, and each push continues from this branch.
+"""
 
 from __future__ import annotations
 
+from functools import cache
 from typing import Any, Final
 
 from atalante_control.gait.subject import Subject
@@ -12,12 +17,14 @@ from atalante_emulator.pendant import Operator
 from atalante_emulator.wearer import LimbParameters
 from atalante_hal.loop import LockStep, run
 from atalante_hal.robot import load_robot
+from atalante_hal.types import State
 from atalante_tools.console.stop_request import check_stop, deferred
 from atalante_tools.session.body import describe
-from atalante_tools.session.rig import open_hal
+from atalante_tools.session.rig import Rig, open_hal
 from atalante_tools.session.walk_observation import Observation
 from atalante_tools.session.walk_options import Push, solved_gaits
 from atalante_tools.session.walk_result import diagnostics
+from atalante_tools.trial.branch import Branch, Continuation, branch
 from atalante_tools.trial.lockstep import Ending, target
 from atalante_tools.trial.plan import STEP, PushTrial
 
@@ -25,6 +32,8 @@ from atalante_tools.trial.plan import STEP, PushTrial
 _PUSHED: Final = 3
 #: Number of periodic steps after the pushed step.
 _AFTER: Final = 4
+#: Phase of the step before the pushed step at which the walk branches off.
+_LEAD: Final = 0.875
 
 
 def largest_push(trial: PushTrial) -> dict[str, Any]:
@@ -35,38 +44,91 @@ def largest_push(trial: PushTrial) -> dict[str, Any]:
     Args:
         trial: trial to run.
     """
+    walk = _branch(trial.mass, trial.height, trial.seed, trial.engine)
     largest, end, found = 0.0, "stood", dict[str, int]()
     for force in trial.forces:
         check_stop()
-        end, found = _pushed_walk(trial, Push(force, trial.direction, step=_PUSHED, phase=trial.phase))
+        end, found = walk.ask(Push(force, trial.direction, step=_PUSHED, phase=trial.phase))
         if end != "stood":
             break
         largest = force
     return {"outcome": "computed", "largest_push_n": largest, "end": end, "diagnostics": found}
 
 
-def _pushed_walk(trial: PushTrial, push: Push) -> tuple[str, dict[str, int]]:
-    """Walk from standing to standing with one push, and return the outcome and the number of reports of each diagnostic.
+@cache
+def _branch(mass: float, height: float, seed: int, engine: str) -> Branch:
+    """Walk to the moment shortly before the pushed step, and return a branch of the walk at this moment.
 
     Args:
-        trial: trial with patient, seed and engine.
-        push: push during the walk.
+        mass: mass of the wearer [kg].
+        height: height of the wearer [m].
+        seed: seed of the sensor noise.
+        engine: physics engine of the emulated robot.
+
+    Raises:
+        RuntimeError: If the robot does not reach this moment.
     """
-    robot, patient = load_robot(), Patient(trial.mass, trial.height)
+    robot, patient = load_robot(), Patient(mass, height)
     gaits = solved_gaits(Subject(patient, *STEP))
     controller = WalkController(robot, patient, gaits, _PUSHED + 1 + _AFTER)
     with open_hal(
-        target(trial.engine),
+        target(engine),
         robot=robot,
-        seed=trial.seed,
+        seed=seed,
         pose=controller.standing_pose.tolist(),
         operator=Operator(),
         assistance_factor=1.0,
         controller_fields=controller.telemetry_fields,
         gait_hash=gaits.step.hash32,
-        mechanics=Mechanics(describe(robot, None, patient), trial.engine, Ground(), LimbParameters()),
+        mechanics=Mechanics(describe(robot, None, patient), engine, Ground(), LimbParameters()),
     ) as rig:
-        ending = Ending(rig, lambda: controller.done, Observation(rig, controller, push))
-        with deferred():
-            run(rig.hal, controller, LockStep(), until=ending)
-        return ending.outcome, diagnostics(rig.hal)
+        walk = _Walk(rig, controller)
+        try:
+            with deferred():
+                run(rig.hal, controller, LockStep(), until=walk.over)
+        finally:
+            if walk.continuation is not None:
+                walk.finish(walk.continuation)
+    if walk.branch is None:
+        raise RuntimeError(f"a robot without a push must walk to the pushed step, got {walk.ending.outcome}")
+    return walk.branch
+
+
+class _Walk:
+    """End condition of a walk that branches off before the pushed step.
+
+    Attributes:
+        ending: end condition of the walk after the branch, with the push.
+        branch: branch of the walk; None until the branch.
+        continuation: push that continues the walk; None in the process that branches off.
+    """
+
+    def __init__(self, rig: Rig, controller: WalkController) -> None:
+        self._rig, self._controller = rig, controller
+        self.branch: Branch | None = None
+        self.continuation: Continuation | None = None
+        self.ending = self._ending(None)
+
+    def _ending(self, push: Push | None) -> Ending:
+        return Ending(self._rig, lambda: self._controller.done, Observation(self._rig, self._controller, push))
+
+    def over(self, state: State) -> bool:
+        """Return whether the walk is over: at the branch, or after the push at the end condition.
+
+        Args:
+            state: state of the HAL after the cycle.
+        """
+        if self.continuation is None and self._controller.reached(_PUSHED - 1, _LEAD):
+            one = branch()
+            if isinstance(one, Branch):
+                self.branch = one
+                return True
+            self.continuation, self.ending = one, self._ending(one.request)
+        return self.ending(state)
+
+    def finish(self, continuation: Continuation) -> None:
+        """Send outcome and number of reports of each diagnostic, and end the process."""
+        try:
+            continuation.finish((self.ending.outcome, diagnostics(self._rig.hal)))
+        finally:
+            continuation.abandon()
