@@ -9,6 +9,23 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
+#: N, largest twist (see `contact_force`) that the noise of four correct cells causes
+_LARGEST_TWIST = 60.0
+
+
+def contact_force(load: float, twist: float) -> float:
+    """Return the vertical force of the floor on a foot [N], although one cell can be wrong.
+
+    The sole is a rigid plate on four equal cells. Wherever the floor acts, the sum of the forces on FL and RR is equal to the sum
+    on FR and RL. The difference, the twist, is therefore the error of a wrong cell. The force of a cell that reads too much is
+    corrected. If a cell reads too little, the result is too small.
+
+    Args:
+        load: sum of the vertical forces on all cells [N].
+        twist: FL - FR - RL + RR, vertical forces on the cells [N].
+    """
+    return load - abs(twist) if abs(twist) > _LARGEST_TWIST else load
+
 
 @dataclass(frozen=True)
 class ImpactConfig:

@@ -30,7 +30,7 @@ from atalante_control.model import GRAVITY, ExoskeletonParameters, Patient, pino
 from atalante_control.structured import Records, zeros
 from atalante_control.walking.attitude import AttitudeObserver
 from atalante_control.walking.config import WalkConfig
-from atalante_control.walking.contact import ImpactDetector
+from atalante_control.walking.contact import ImpactDetector, contact_force
 from atalante_control.walking.dcm import Balance, Stabiliser
 from atalante_control.walking.kernel import (
     Constants,
@@ -160,9 +160,10 @@ class WalkController:
         guarded = [name for name, width in TELEMETRY_FIELDS for _ in range(width)].index("error")
         #: Consecutive fields `error`, `q_bound`, `h` and `gate` of the telemetry, shape (6,).
         self._guarded = self.telemetry[guarded : guarded + 6]
-        self._stage, self._load, self._step, self._heading = (
+        self._stage, self._load, self._twist, self._step, self._heading = (
             stages[0],
             sensed[0].load,
+            sensed[0].twist,
             sensed[0].step,
             sensed[0].heading,
         )
@@ -214,7 +215,7 @@ class WalkController:
         self._command.walking = False
         self._command.vibration.fill(0.0)
         self._command.outside = self._command.guide_left = self._command.hand_over_exceeded = False
-        self._load[:] = 0.0
+        self._load[:] = self._twist[:] = 0.0
         self._pid.reset()
         self._section = self._sections[0]
         self._table = self._section.tables[Phase.POSTURE, RIGHT]
@@ -385,7 +386,9 @@ class WalkController:
             # `cycle` is the row of the phase table. With a phase rate of 1 (no step timing), this row is the number of
             # cycles.
             cycle = int(self._clock[0] + self._pace[0])
-            landed = self._landed = self._impact.update(load[1 - self._stance], cycle / nominal)
+            swing = 1 - self._stance
+            contact = contact_force(load[swing], float(self._twist[swing]))
+            landed = self._landed = self._impact.update(contact, cycle / nominal)
         steps = self.statistics.steps + (phase is Phase.STEP)
         loaded, stopping = self._loaded >= self._settled, self._stopping or steps >= self.steps_wanted
         return Facts(cycle, nominal, self._rest, self._timeout, landed, loaded, stopping)

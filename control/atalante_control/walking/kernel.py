@@ -37,13 +37,14 @@ from atalante_control.walking.placement import (
 from atalante_control.walking.reference import PhaseTable
 from atalante_control.walking.rotation import tilt_quaternion
 from atalante_control.walking.telemetry import Telemetry, write_guide, write_telemetry
-from atalante_hal.robot import JOINTS, LEG_JOINTS, MOTORS, SIDES
+from atalante_hal.robot import CELLS, JOINTS, LEG_JOINTS, MOTORS, SIDES
 from atalante_hal.types import Vector
 from atalante_hal.vectors import Vector3, cross, rotated
 
 _LEG = len(LEG_JOINTS)
 _FH, _TH, _SH, _SK, _SA, _HA = (LEG_JOINTS.index(name) for name in ("FH", "TH", "SH", "SK", "SA", "HA"))
 _ANKLES = (_SA, _HA)
+_FL, _FR, _RL, _RR = (CELLS.index(name) for name in ("FL", "FR", "RL", "RR"))
 #: s, time constant with which the downward speed of a swing foot rises after the nominal end of a step
 _REACH_RISE = 0.03
 
@@ -89,6 +90,8 @@ class Sensed:
     #: N, the smaller of filtered and unfiltered vertical force. The smaller force drops without delay when a foot
     #: leaves the ground.
     bearing: Annotated[Vector, 2]
+    #: N, filtered vertical force on each foot, FL - FR - RL + RR. With four correct cells, it is 0, see `contact_force`.
+    twist: Annotated[Vector, 2]
     heading: Annotated[Vector, 2]  # rad, heading of each foot without the toe-out
     step: Annotated[Vector, 3]  # m, position of the right sole relative to the left sole, world axes
 
@@ -153,10 +156,12 @@ def sense(measured: Measured, table: PhaseTable, constants: Constants, stabilise
     stage, sensed, balance = parts.stages[0], parts.sensed[0], parts.balances[0]
     soles, centre, load = parts.chain.soles, parts.chain.centre[0], sensed.load
     for side in range(len(SIDES)):
-        force = 0.0
-        for cell in range(measured.force.shape[1]):
-            force += measured.force[side, cell, 2]
+        cells, force = measured.force[side], 0.0
+        for cell in range(len(cells)):
+            force += cells[cell, 2]
+        twist = cells[_FL, 2] - cells[_FR, 2] - cells[_RL, 2] + cells[_RR, 2]
         load[side] += (1.0 - constants.keep) * (force - load[side])
+        sensed.twist[side] += (1.0 - constants.keep) * (twist - sensed.twist[side])
         sensed.bearing[side] = min(force, load[side])
     move(parts.chain, measured.q, measured.qd)
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from atalante_control.gait.gait import step_over
-from atalante_control.walking.contact import ImpactConfig, ImpactDetector
+from atalante_control.walking.contact import ImpactConfig, ImpactDetector, contact_force
 
 CONFIG = ImpactConfig(impact_force=80.0, release_force=30.0, debounce=5, earliest=0.5)
 
@@ -62,3 +62,29 @@ def test_step_is_over_after_its_duration():
 def test_invalid_configuration_is_rejected(bad: dict[str, float]):
     with pytest.raises(ValueError, match=r"got "):
         ImpactConfig(**bad)  # type: ignore[arg-type]
+
+
+def read(cells: list[float]) -> float:
+    """Return the contact force for the vertical forces on the cells FL, FR, RL, RR [N]."""
+    front_left, front_right, rear_left, rear_right = cells
+    return contact_force(sum(cells), front_left - front_right - rear_left + rear_right)
+
+
+@pytest.mark.parametrize("wrong", range(4))
+@pytest.mark.parametrize(
+    ("along", "across"), [(0.0, 0.0), (1.1, 2.0), (-1.1, -2.0)], ids=["middle", "front left", "rear right"]
+)
+def test_cell_that_reads_too_much_does_not_change_the_contact_force(along: float, across: float, wrong: int) -> None:
+    for force in (0.0, 200.0, 1000.0):
+        cells = [0.25 * force * (1.0 + along * x + across * y) for x in (1, -1) for y in (1, -1)]
+        assert read(cells) == pytest.approx(force)
+        cells[wrong] += 400.0
+        assert read(cells) == pytest.approx(force)
+
+
+@pytest.mark.parametrize("dead", range(4))
+def test_landing_is_detected_although_one_cell_is_dead(dead: int) -> None:
+    cells = [250.0] * 4
+    cells[dead] = 0.0
+    assert read(cells) == pytest.approx(500.0)
+    assert read(cells) > ImpactConfig().impact_force

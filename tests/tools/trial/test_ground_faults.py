@@ -117,6 +117,16 @@ def test_f41_robot_with_both_feet_on_the_ground_stands_when_the_hal_is_killed() 
     assert (swing["outcome"], swing["state"], swing["codes"][0]) == ("fell", "HOLD", "CYCLE_GAP")
 
 
+def test_force_cell_of_the_swing_foot_that_is_stuck_at_400_n_causes_no_fall() -> None:
+    trial = next(trial for trial in fault_trials(("F33",), False, 0, "mujoco") if trial.case == "FOOT_LEFT FL at 400 N")
+    (run,) = run_fault(replace(trial, moments=("phase 0.5",)))["runs"]
+    assert (run["outcome"], run["codes"][0]) == ("walked", "FOOT_CELL")
+
+
+def test_cases_that_replace_the_forces_on_a_foot_are_left_out() -> None:
+    assert not [trial.case for trial in fault_trials(("F04",), False, 0, "mujoco") if "swing leg" in trial.case]
+
+
 def test_command_injects_a_fault_and_writes_the_report(tmp_path: Path) -> None:
     arguments = ["trial", "faults", "F05", "--quick", "--jobs", "1", "--out", str(tmp_path), "--json"]
     outcome = CliRunner().invoke(cli, arguments)

@@ -101,6 +101,7 @@ SCENARIOS: Final = (
                     reacted=reacted,
                     recovers=False,
                     observed=40,  # few cycles, because foot forces that stay constant for 100 cycles are a fault
+                    suspended=True,
                 )
                 for frames, state, dtc, reacted in (
                     (5, SupervisorState.FINISH_STEP, "JOINT_TIMEOUT", 5),

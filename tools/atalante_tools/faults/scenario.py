@@ -92,6 +92,8 @@ class Case:
     seed: int = 0  # seed of the random numbers in the emulator
     checks: tuple[ObservationCheck, ...] = ()  # additional checks of the run
     engine: str = PYBULLET  # physics engine of the emulated robot
+    #: whether the case is only for a suspended robot, because it replaces the forces on a foot
+    suspended: bool = False
 
     @property
     def ends(self) -> int | None:

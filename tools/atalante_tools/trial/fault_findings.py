@@ -18,7 +18,7 @@ from atalante_tools.trial.findings import Finding, Result
 #: The button HOLD is left out: the drives then hold at once, so the robot may fall.
 NO_FALL: Final = {
     **dict.fromkeys(("F01", "F02", "F03", "F05", "F20", "F24", "F30", "F31", "F32", "F33"), ""),
-    "F04": "LEFT|RIGHT|5 frames",
+    "F04": "LEFT|RIGHT",
     "F06": "[0-4] cycles|by 4 cycles",
     "F19": "IMU|FOOT",
     **dict.fromkeys(("F44", "F45"), ""),

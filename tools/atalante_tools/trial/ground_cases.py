@@ -18,14 +18,14 @@ FAULT_IDS: Final = tuple(sorted({*SCENARIOS, *_GROUND_CASES}))
 def ground_cases(id_: str) -> dict[int, Case]:
     """Return the cases of a fault that can begin at any moment of a walk, as a mapping from index to case.
 
-    Cases that begin at power-on or at another phase than `MID_SWING` are left out.
+    Cases that begin at power-on or at another phase than `MID_SWING` are left out, and so are cases for a suspended robot.
 
     Args:
         id_: fault ID, one of `FAULT_IDS`.
     """
     scenario = SCENARIOS.get(id_)
     cases = _GROUND_CASES[id_] if scenario is None else scenario.cases
-    chosen = {index: case for index, case in enumerate(cases) if case.phase == MID_SWING}
+    chosen = {index: case for index, case in enumerate(cases) if case.phase == MID_SWING and not case.suspended}
     if scenario is not None and scenario.permanent is not None:
         chosen[PERMANENT] = scenario.permanent
     return chosen
