@@ -226,6 +226,7 @@ SCENARIOS: Final = (
                 (*_standing(_FEET[0], left), *_standing(_FEET[1], right)),
                 first_faulty=600,
                 observed=1000,
+                suspended=True,
             )
             for name, left, right in (
                 ("both feet lift", 600, 600),

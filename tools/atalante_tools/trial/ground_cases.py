@@ -4,13 +4,28 @@ from __future__ import annotations
 
 from typing import Final
 
+from atalante_emulator.faults import Fault
+from atalante_hal.robot import CELLS
+from atalante_hal.safety.plausibility.finding import FOOT_NODES
 from atalante_tools.faults.catalogue import SCENARIOS
 from atalante_tools.faults.scenario import MID_SWING, Case, HostFault
 from atalante_tools.trial.fault_plan import PERMANENT
 
-#: Fault ID -> cases, for faults that have no scenario but can occur in a walk on the ground. In F41 the HAL is killed. The
-#: case replaces this by a pause of 6 s. After the pause the HAL is in HOLD, so its frames do not move the drives.
-_GROUND_CASES: Final = {"F41": (Case("no frames for 6 s", (HostFault("late", 0, 1, 6.0),), dtc="CYCLE_GAP"),)}
+
+def _no_load(*feet: str) -> tuple[Fault, ...]:
+    """Return faults with which the cells of feet report no vertical force."""
+    return tuple(Fault("value", f"{foot}_STATE", 0, None, **{f"{cell}_ForceZ": 0.0 for cell in CELLS}) for foot in feet)
+
+
+#: Fault ID -> cases that are possible only in a walk on the ground. In F41 the HAL is killed. The case replaces this by a pause
+#: of 6 s. After the pause the HAL is in HOLD, so its frames do not move the drives.
+_GROUND_CASES: Final = {
+    "F34": (
+        Case("both feet report no load", _no_load(*FOOT_NODES)),
+        *(Case(f"{foot} reports no load", _no_load(foot), dtc="FOOT_CELL") for foot in FOOT_NODES),
+    ),
+    "F41": (Case("no frames for 6 s", (HostFault("late", 0, 1, 6.0),), dtc="CYCLE_GAP"),),
+}
 #: IDs of all faults with a case.
 FAULT_IDS: Final = tuple(sorted({*SCENARIOS, *_GROUND_CASES}))
 
@@ -24,7 +39,7 @@ def ground_cases(id_: str) -> dict[int, Case]:
         id_: fault ID, one of `FAULT_IDS`.
     """
     scenario = SCENARIOS.get(id_)
-    cases = _GROUND_CASES[id_] if scenario is None else scenario.cases
+    cases = (*(() if scenario is None else scenario.cases), *_GROUND_CASES.get(id_, ()))
     chosen = {index: case for index, case in enumerate(cases) if case.phase == MID_SWING and not case.suspended}
     if scenario is not None and scenario.permanent is not None:
         chosen[PERMANENT] = scenario.permanent
