@@ -3,7 +3,8 @@
 The suffix determines the format: `.log` (candump), `.asc`, `.blf`, `.log.gz` or `.asc.gz`. Each bus of the network is a channel.
 In `.log` and `.log.gz` the channel is the name of the bus (left_leg). In the other formats the channel is the number of the
 bus in the order of the DBC, starting at 1. In `.log` and `.blf`, two logs of the same frames are identical. In `.asc`
-and `.gz`, they differ, because such files contain the date of writing.
+and `.gz`, they differ, because such files contain the date of writing. An `.asc` file contains times relative to its first
+frame. A frame that is older than the first frame gets the time of the first frame.
 """
 
 from __future__ import annotations
@@ -67,6 +68,8 @@ class CanLog(Closing):
         self.finished = False  # True if the file was closed and contains every frame passed to `write`
         names = (*buses, FOREIGN)
         by_name = suffix.startswith(".log")
+        self._relative = suffix.startswith(".asc")
+        self._first_ns: int | None = None  # time of the first frame [ns]; None before the first frame
         self._channels: dict[str, str | int] = {name: name if by_name else number for number, name in enumerate(names)}
         self._channel_of = {frame_id: self._channels[bus] for frame_id, bus in bus_of.items()}
         try:
@@ -88,6 +91,10 @@ class CanLog(Closing):
             SinkError: If the file cannot be written.
         """
         foreign = self._channels[FOREIGN]
+        if self._relative and len(stamps):
+            # The writer of python-can stores an older frame with its absolute time, about 1.7e9 s in a file of relative times.
+            self._first_ns = int(stamps[0]) if self._first_ns is None else self._first_ns
+            stamps = np.maximum(stamps, self._first_ns)
         columns = (frames[name].tolist() for name in ("can_id", "len", "flags"))
         data = frames["data"].tobytes()
         try:

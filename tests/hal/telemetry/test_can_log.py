@@ -103,6 +103,17 @@ class TestFormats:
                 log.write(frames, np.arange(2000) * 1_000_000, np.zeros(2000, np.uint8))
         assert (tmp_path / f"one{suffix}").read_bytes() == (tmp_path / f"two{suffix}").read_bytes()
 
+    @pytest.mark.parametrize("suffix", FORMATS)
+    def test_frame_older_than_the_first_frame_keeps_the_time_of_the_log(
+        self, suffix: str, network: atalante_dbc.Network, tmp_path: Path
+    ) -> None:
+        begin = 1_700_000_000_000_000_000
+        stamps = np.array([begin, begin - 300_000, begin + 1_000_000])
+        with open_log(tmp_path / f"run{suffix}", network) as log:
+            log.write(random_frames(network, 3), stamps, np.array([1, 0, 0], np.uint8))
+        times = np.array([message.timestamp for message in read(tmp_path / f"run{suffix}")])
+        assert np.allclose(times - times[0], [0.0, 0.0, 1e-3], atol=0.5e-3)
+
     @pytest.mark.parametrize("name", ["run.db", "run.csv", "run.trc", "run.blf.gz", "run.txt", "run", "run.log.bz2"])
     def test_lossy_format_is_rejected_with_the_valid_formats(self, name: str, tmp_path: Path) -> None:
         with pytest.raises(SinkError, match=r"end its name in one of \.log, \.asc, \.blf"):
