@@ -193,6 +193,19 @@ def test_several_chunks_and_channels_are_written(tmp_path: Path, monkeypatch: py
     assert {"/can/LEFT_FH_STATE", "/can/can1/LEFT_FH_STATE"} <= topics
 
 
+def test_logs_of_different_channels_have_their_own_topics(tmp_path: Path) -> None:
+    logs = [tmp_path / f"can{number}.log" for number in range(2)]
+    for number, log in enumerate(logs):
+        log.write_text(f"({number + 1}.000000) can{number} 181##5" + "00" * 12 + "\n")
+    run("decode", *logs, "-o", tmp_path / "out.mcap")
+    with (tmp_path / "out.mcap").open("rb") as file:
+        found = [(c.topic, c.metadata["channel"], m.log_time) for _, c, m in make_reader(file).iter_messages()]
+    assert found == [
+        ("/can/LEFT_FH_STATE", "can0", 1_000_000_000),
+        ("/can/can1/LEFT_FH_STATE", "can1", 2_000_000_000),
+    ]
+
+
 def test_log_without_known_messages_fails(tmp_path: Path) -> None:
     log = tmp_path / "empty.log"
     log.write_text("(1700000001.000000) can1 7FF##100\n")

@@ -40,7 +40,8 @@ class McapSink:
         self._writer = Writer(self._file, compression=CompressionType.ZSTD)
         self._writer.start(profile="", library="atalante decode")
         self._writer.add_metadata("dbc", {"file": plan.catalogue.path.name, "crc32": f"{plan.catalogue.hash32:08X}"})
-        self._topics: dict[tuple[int, int], int] = {}
+        #: Topic number of each message (index in the plan) on each channel (name in the log).
+        self._topics: dict[tuple[int, str], int] = {}
         self._schemas: dict[int, int] = {}
         #: Messages to write at the next `flush`: (index in the chunk, topic number, time stamp [ns], payload).
         self._buffered: list[tuple[int, int, int, bytes]] = []
@@ -62,7 +63,7 @@ class McapSink:
                     layout, [(f.name, c.values.dtype.kind) for f, c in zip(decoded.codec.fields, columns, strict=True)]
                 ),
             )
-        topics = np.array([self._topic(decoded.row, channel, channels) for channel in decoded.channels.tolist()])
+        topics = np.array([self._topic(decoded.row, channels[channel]) for channel in decoded.channels.tolist()])
         masks = [c.present for c in columns]
         patterns = np.array([np.ones(len(topics), np.bool_) if m is None else m for m in masks]).T
         self.values += int(patterns.sum())
@@ -85,7 +86,7 @@ class McapSink:
             self._writer.add_message(topic, stamp, payload, stamp)
         self._buffered.clear()
 
-    def _topic(self, row: int, channel: int, channels: Sequence[str]) -> int:
+    def _topic(self, row: int, channel: str) -> int:
         """Return the MCAP topic number of a message on a log channel.
 
         The topic name is `/can/MESSAGE` on the first channel with this message, and `/can/CHANNEL/MESSAGE` on further
@@ -95,8 +96,8 @@ class McapSink:
         if topic is None:
             layout = self._plan.layouts[row]
             first = not any(known == row for known, _ in self._topics)
-            name = f"/can/{layout.name}" if first else f"/can/{channels[channel]}/{layout.name}"
-            metadata = {f.name: f.unit for f in layout.fields if f.unit} | {"channel": channels[channel]}
+            name = f"/can/{layout.name}" if first else f"/can/{channel}/{layout.name}"
+            metadata = {f.name: f.unit for f in layout.fields if f.unit} | {"channel": channel}
             topic = self._writer.register_channel(name, "protobuf", self._schemas[row], metadata)
             self._topics[row, channel] = topic
         return topic
