@@ -228,6 +228,18 @@ def _on(message: can.Message, channel: int) -> can.Message:
     return copy
 
 
+def test_channel_that_is_silent_at_first_is_assigned_to_its_bus(plan: Plan) -> None:
+    validator = Validator(plan)
+    for channel, name in enumerate(("LEFT_FH_STATE", "RIGHT_FH_STATE")):
+        layout = plan.layouts[plan.row_of[name]]
+        frames = new_frames(3)
+        frames["can_id"], frames["len"] = layout.frame_id, layout.length
+        stamps = np.arange(3, dtype=np.int64) * 1_000_000 + channel * 1_000_000_000
+        chunk = Chunk(frames, stamps, np.full(3, channel, np.uint8), np.full(3, NO_DIRECTION, np.int8))
+        validator.check(chunk, ["can0", "can1"])
+    assert [plan.buses[bus] for bus in validator.channel_map.bus_of_channel] == ["left_leg", "right_leg"]
+
+
 def test_unknown_identifiers_beyond_one_hundred_are_combined(plan: Plan) -> None:
     """20,000 frames with random identifiers give 100 findings and one for all other identifiers."""
     generator = np.random.default_rng(0)

@@ -34,10 +34,12 @@ class ChannelMap:
         self._named = dict(named)
         #: Bus number of each known channel of the log; `UNKNOWN` for a channel with messages of several buses.
         self.bus_of_channel: list[int] = []
+        #: Channels without a known frame so far. Their bus is derived from their first known frames.
+        self._silent: set[int] = set()
         self._channel_of_row = np.full(len(plan.layouts) + len(plan.refused), UNKNOWN, np.int16)
 
     def update(self, chunk: Chunk, rows: Rows, names: list[str]) -> None:
-        """Assign a bus to each new channel, and a channel to each new message of a chunk.
+        """Assign a bus to each channel with its first known frames, and a channel to each new message of a chunk.
 
         Args:
             chunk: next frames of the log.
@@ -45,8 +47,14 @@ class ChannelMap:
             names: channels of the log so far.
         """
         known = (rows >= 0) & (rows < len(self._plan.layouts))
-        for channel in range(len(self.bus_of_channel), len(names)):
-            self.bus_of_channel.append(self._bus_of(names[channel], rows[known & (chunk.channels == channel)]))
+        # The log reader reads ahead, and a live bus lists all channels from the start. So a channel may have no frame yet.
+        self._silent.update(range(len(self.bus_of_channel), len(names)))
+        self.bus_of_channel += [UNKNOWN] * (len(names) - len(self.bus_of_channel))
+        for channel in sorted(self._silent):
+            of_channel = rows[known & (chunk.channels == channel)]
+            self.bus_of_channel[channel] = self._bus_of(names[channel], of_channel)
+            if len(of_channel):
+                self._silent.remove(channel)
         if bool((self._channel_of_row[: len(self._plan.layouts)] != UNKNOWN).all()):
             return
         seen, first = np.unique(rows, return_index=True)
