@@ -74,10 +74,12 @@ class Heartbeats:
         self._status_of = {codec.messages[s.row].frame_id: s for s in self._statuses}
         self._amplitude, self._amplitude_row = codec.slice("Amplitude"), codec.rows["HAPTICS_STATE"]
         self._seen = 0  # cycle of the last call of `image.new_cycle`
-        #: Diagnostic and error code of the active emergency of each node. A cleared emergency is removed.
+        #: Diagnostic and error code of the active emergency of each node. A cleared emergency is removed. If a node has several
+        #: active emergencies, this is the newest one with the most severe reaction.
         self.emergencies: dict[str, tuple[Dtc, int]] = {}
         self._cleared: set[str] = set()  # nodes whose emergency was cleared in this cycle
-        #: Emergencies with the reaction INFO since the last `evaluate`, as (node, diagnostic, error code).
+        #: Emergencies since the last `evaluate` that cause no reaction, as (node, diagnostic, error code). Their reaction is
+        #: INFO, or milder than the reaction to the active emergency of the node.
         #: `_notices` also contains an entry with error code 0 for each frame of an error passive node.
         self._notices: list[tuple[str, Dtc, int]] = []
         self._reset: set[str] = set()  # nodes that restarted since the last `evaluate`
@@ -226,6 +228,8 @@ class Heartbeats:
                 self._cleared.add(node)
         elif dtc.reaction is Reaction.INFO:
             self._notices.append((node, dtc, code))
+        elif node in self.emergencies and dtc.reaction < self.emergencies[node][0].reaction:
+            self._notices.append((node, dtc, code))  # a milder emergency does not end the reaction to the active one
         else:
             self.emergencies[node] = dtc, code
 

@@ -199,6 +199,29 @@ def test_several_emergencies_in_one_cycle_are_all_reported(running: Nodes):
     ]
 
 
+@pytest.mark.parametrize("same_cycle", [False, True])
+@pytest.mark.parametrize(("worst", "code"), [(0x2310, "EMCY_2xxx"), (0x4310, "OVER_TEMP")])
+def test_milder_emergency_does_not_replace_a_worse_one(running: Nodes, worst: int, code: str, same_cycle: bool):
+    frames = [running.frame("LEFT_SK", "EMCY", ErrorCode=error) for error in (worst, 0x3220)]
+    if same_cycle:
+        running.receive(*frames)
+    else:
+        running.receive(frames[0])
+        assert running.evaluate() == {(code, "LEFT_SK"): True}
+        running.receive(frames[1])
+    assert running.evaluate() == {(code, "LEFT_SK"): True, ("UNDER_VOLTAGE", "LEFT_SK"): False}
+    running.now += 1
+    assert running.evaluate() == {(code, "LEFT_SK"): True}
+    running.receive(running.frame("LEFT_SK", "EMCY", ErrorCode=0))
+    assert running.evaluate() == {}
+
+
+def test_worse_emergency_replaces_a_milder_one(running: Nodes):
+    for error in (0x3220, 0x4310):
+        running.receive(running.frame("LEFT_SK", "EMCY", ErrorCode=error))
+    assert running.evaluate() == {("OVER_TEMP", "LEFT_SK"): True}
+
+
 def test_acknowledge_keeps_emergencies_of_faulty_drives(running: Nodes):
     for node in ("LEFT_SK", "LEFT_SA"):
         running.receive(running.frame(node, "EMCY", ErrorCode=0x4310))
