@@ -22,7 +22,8 @@ times out, the robot goes to HOLD without a delay.
 
 In a walk on the ground, both legs are treated like a swing leg, and the timeouts of the joints are three cycles longer. A walk
 then continues after five lost frames in a row even if the messages are one cycle late: the first frame after five lost frames is
-rejected (E2E_SEQUENCE), so the data is up to seven cycles old.
+rejected (E2E_SEQUENCE), so the data is up to seven cycles old. A frame that is received after its timeout in the DBC ends the
+walk (JOINT_TIMEOUT), because the plausibility checks do not use such old values.
 """
 
 from __future__ import annotations
@@ -82,7 +83,8 @@ class Tolerance(NamedTuple):
 
     #: Indices of the legs in SIDES. A brief timeout in these legs leads to FINISH_STEP instead of HOLD.
     legs: Collection[int] = ()
-    longer: int = 0  # cycles that are added to the DBC timeouts of the joints in these legs
+    #: Cycles that are added to the DBC timeouts of the joints in these legs while no frame is accepted.
+    longer: int = 0
 
 
 NO_TOLERANCE = Tolerance()
@@ -219,7 +221,9 @@ class MessageMonitor:
     ) -> None:
         sender, two_senders = self._senders[row], self._check_senders(cycle, memory, row, rival)
         tolerated, timeout = self._legs[row] in tolerance.legs, self._timeouts[row]
-        fresh, late = check <= Check.SOME_LOST, age >= timeout + tolerance.longer * tolerated
+        fresh = check <= Check.SOME_LOST
+        # The longer timeout is for lost frames. Frames that are received with this delay are too old for the plausibility checks.
+        late = age >= timeout + tolerance.longer * (tolerated and not fresh)
         # Impossible signal values do not reduce the trust, because the frame was transmitted correctly.
         good = (fresh or check >= Check.RANGE) and not rival
         now = self.qualification[row] = qualify(self.qualification[row], good=good, timed_out=late or two_senders)

@@ -450,6 +450,14 @@ class TestTolerantLeg:
         assert bench.cycle().active == {("E2E_SEQUENCE", "LEFT_SK"): False}
         assert bench.cycle().active == {}
 
+    @pytest.mark.parametrize("by", range(3, 11))
+    def test_frames_with_a_delay_above_the_timeout_end_a_walk_on_the_ground(self, bench: MonitorBench, by: int):
+        bench.tolerance = GROUND_TOLERANCE
+        bench.cycle(late(bench, KNEE, by), times=by + 20)
+        timeout = {("JOINT_TIMEOUT", "LEFT_SK"): True} if 5 <= by < 10 else {}
+        assert bench.active == {("NODE_LATE", "LEFT_SK"): by >= 10} | timeout
+        assert bench.message_monitor.valid[KNEE] == (by < 5)
+
     def test_timeout_of_imu_and_foot_is_not_longer_in_a_walk_on_the_ground(self, bench: MonitorBench):
         bench.tolerance = GROUND_TOLERANCE
         assert bench.cycle(lose(IMU, FOOT), times=10).active == {
