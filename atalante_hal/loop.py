@@ -184,8 +184,7 @@ def run(
             late = clock.wait()
             began = time.perf_counter()
             lost = drift.add(late)
-            if late:
-                late_in_row = _check_lateness(hal, statistics, late, late_in_row, lost)
+            late_in_row = _check_lateness(hal, statistics, late, late_in_row, lost) if late else 0
             state = hal.read()
             if hal.moving:
                 try:

@@ -97,6 +97,7 @@ def test_controller_exception_leads_to_hold_and_the_loop_continues(make_rig):
         ({400: 1.5e-3}, S.ACTIVE),
         ({400: 1.5e-3, 401: 1.5e-3}, S.ACTIVE),
         ({400: 1.5e-3, 401: 1.5e-3, 402: 1.5e-3}, S.HOLD),
+        ({400: 1.1e-3, 405: 1.1e-3, 410: 1.1e-3}, S.ACTIVE),
         ({400: 4e-3}, S.ACTIVE),
         ({400: GAP_TO_HOLD + 1e-3}, S.HOLD),
         ({400: 0.9e-3, 401: 0.9e-3, 402: 0.9e-3}, S.ACTIVE),
