@@ -223,9 +223,13 @@ class Hal:
         state, control, safety_monitor = self.state, self._commands.control, self._safety_monitor
         if safety_monitor.lowered:
             control[[node in safety_monitor.lowered for node in DRIVE_NODES]] = Controlword.DISABLE_VOLTAGE
-        if safety_monitor.start_wanted and state.supervisor in (_S.LOWER, _S.FAULT):
-            # The operator acknowledged the faults, so reset the drives in FAULT. All other drives continue to hold.
+        if safety_monitor.start_wanted and (
+            state.supervisor in (_S.LOWER, _S.FAULT) or (state.supervisor is _S.HOLD and safety_monitor.start_prevented)
+        ):
+            # The operator acknowledged the faults, so reset the drives in FAULT. All other drives continue to hold. In HOLD, the
+            # emergency of a drive in FAULT prevents the start until the drive is reset.
             control[state.drive_state == DriveState.FAULT] = Controlword.FAULT_RESET
+            safety_monitor.enabling = False
         elif (
             safety_monitor.start_wanted
             and state.supervisor in (_S.READY, _S.HOLD)

@@ -161,6 +161,19 @@ def test_drive_that_leaves_operation_leads_to_hold_in_one_cycle(rig):
     assert "RIGHT_TH" in rig.hal.reason
 
 
+def test_start_in_hold_resets_a_drive_in_fault(rig):
+    rig.until(S.ACTIVE)
+    drives = rig.emulator.drives
+    drives.supply(KNEE, 10.0)  # the power stage switches off, and the emergency of a voltage leads to HOLD
+    rig.until(S.HOLD, 10)
+    drives.leave(KNEE, DriveState.FAULT)
+    drives.supply(KNEE, 48.0)
+    rig.run(20)
+    assert drives.state[KNEE] is DriveState.FAULT
+    rig.operator.start()
+    rig.until(S.ACTIVE, 150)
+
+
 def test_drive_fault_is_latched_until_start(rig):
     rig.until(S.ACTIVE)
     drives = rig.emulator.drives
