@@ -52,7 +52,10 @@ class Access:
             if path is not None and path.stat().st_mode & 0o077:
                 raise AccessError(f"{name} {path} must be readable only by its owner; type: chmod 600 {path}")
         if self.users is not None:
-            lines = self.users.read_text(encoding="utf-8").splitlines()
+            try:
+                lines = self.users.read_text(encoding="utf-8").splitlines()
+            except (OSError, UnicodeDecodeError) as error:
+                raise AccessError(f"users {self.users} must be a readable file in UTF-8: {error}") from error
             if not lines or not all(name and password for name, _, password in (line.partition(":") for line in lines)):
                 raise AccessError(f"users {self.users} must contain only lines name:password, one for each user")
 

@@ -299,6 +299,11 @@ class TestTelemetryFile:
         with pytest.raises(AccessError, match="name:password"):
             Access(users=users)
 
+    def test_user_file_that_is_not_utf_8_is_rejected(self, users: Path) -> None:
+        users.write_bytes(b"lab:\xff\xfe")
+        with pytest.raises(AccessError, match="must be a readable file in UTF-8"):
+            Access(users=users)
+
     def test_f54_invalid_telemetry_file_is_rejected_before_the_run(self, folder: Path) -> None:
         (folder / "telemetry.toml").write_text("lisen = 1")
         arguments = ["demo", "--telemetry", str(folder / "telemetry.toml"), "--out", str(folder / "run")]

@@ -54,6 +54,12 @@ def test_report_lists_requirement_test_measurement_and_source():
     assert "2 of 2 requirements passed" in result.stderr
 
 
+def test_choice_without_any_requirement_is_refused():
+    result = run("FOOT_LEFT", "--only", "NODE-03", "--without", "NODE-03")
+    assert result.exit_code == 2
+    assert "at least one requirement must be tested, but --only and --without leave none" in result.stderr
+
+
 def test_json_is_one_object_per_requirement():
     result = run("FOOT_LEFT", "--json", "--without", "NODE-03", "--without", "node-10")
     assert result.exit_code == 0

@@ -98,7 +98,10 @@ def _chosen(requirements: list[Requirement], only: tuple[str, ...], without: tup
     ids = [requirement.id for requirement in requirements]
     selected = sorted({find(name, ids, "requirement") for name in only}) if only else range(len(ids))
     skipped = {find(name, ids, "requirement") for name in without}
-    return [requirements[index] for index in selected if index not in skipped]
+    chosen = [requirements[index] for index in selected if index not in skipped]
+    if not chosen:
+        raise click.UsageError("at least one requirement must be tested, but --only and --without leave none")
+    return chosen
 
 
 @contextmanager

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gzip
 import json
 import threading
 import time
@@ -180,6 +181,12 @@ def test_all_lines_before_a_truncated_line_are_checked(good: Path) -> None:
 
 
 @pytest.mark.filterwarnings("ignore:unclosed file:ResourceWarning")  # asammdf leaves a damaged file open
+def test_complete_compressed_blf_log_is_not_reported_as_truncated(tmp_path: Path) -> None:
+    path = tmp_path / "night.blf.gz"
+    path.write_bytes(gzip.compress(write(tmp_path / "night.blf", MESSAGES).read_bytes()))
+    assert rules_of(run("validate", path, "--node", "LEFT_FH", "--json")) == set()
+
+
 @pytest.mark.parametrize("suffix", [".asc", ".blf", ".mf4", ".log", ".csv"])
 @pytest.mark.parametrize("share", [0.0, 0.03, 0.5, 0.97])
 def test_truncated_log_is_reported(suffix: str, share: float, tmp_path: Path) -> None:

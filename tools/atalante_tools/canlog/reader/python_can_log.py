@@ -110,7 +110,7 @@ def _remark(log: LogFile, count: int, broken: str, ends_within: bool, warnings: 
         log.remark("log-truncated", f"{log.path} cannot be read after frame {count}: {broken}", 1, -1)
     elif ends_within:
         log.remark("log-truncated", f"{log.path} ends within a line; its last frame was not checked", 1, -1)
-    elif log.suffix == ".blf" and (missing := _missing_bytes(log.path)):
+    elif log.suffix == ".blf" and not log.compressed and (missing := _missing_bytes(log.path)):
         log.remark(
             "log-truncated",
             f"{log.path} is truncated: according to its header {missing} bytes are missing; {count} frames were read",
