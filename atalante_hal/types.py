@@ -59,7 +59,7 @@ class State:
     joints_valid: bool  # True if all twelve joint states are valid
     imu_rows: tuple[int, ...] = ()  # indices of the IMU messages in `valid` and `age`; empty if unknown
     foot_rows: tuple[int, ...] = ()  # indices of the foot messages in `valid` and `age`; empty if unknown
-    torque_sent: Vector | None = None  # (12,) Nm, last torques that were sent, after the limits; None if unknown
+    torque_sent: Vector | None = None  # (12,) Nm, last torques after the limits, not sent in HOLD; None if unknown
 
 
 @dataclass(slots=True)

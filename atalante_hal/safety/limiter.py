@@ -31,8 +31,8 @@ below the torque of the last cycle, the torque approaches the new limit at this 
 
 *Guarantee.* The inequalities below hold for every pair (k-1, k) of command frames that both have ENABLE_OPERATION for a joint.
 u is the TargetTorque and M the MaxTorque of a frame. q and v are the position and velocity in the last good state frame of the
-joint before frame k, or in an earlier good frame not older than the timeout of the node. r = torque_rate_max * 1 ms, and e is
-the resolution of TargetTorque.
+joint before frame k, or in an earlier good frame not older than the timeout of the node. In a walk on the ground, this timeout is
+longer than in the DBC (`message_monitor.GROUND_TOLERANCE`). r = torque_rate_max * 1 ms, and e is the resolution of TargetTorque.
 
 - |u_k| <= torque_max, M_k <= torque_max
 - |u_k - u_(k-1)| <= r + e
