@@ -226,6 +226,8 @@ class TestCommand:
                 ["library", "--out", "x", "--mass", "60,a"],
                 "levels must be numbers separated by commas (58,75,91), got '60,a'",
             ),
+            (["library", "--out", "x", "--height", "1.62,175"], "height must have at least 3 levels, got [1.62, 1.75]"),
+            (["library", "--out", "x", "--step-length", "10,0.2"], "levels, got [0.1, 0.2]"),
             (["fit", "--library", "nowhere", "--out", "x.npz"], "nowhere contains no library"),
             (["check", "--network", "nowhere.npz"], "nowhere.npz"),
         ],

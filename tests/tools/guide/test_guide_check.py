@@ -267,6 +267,13 @@ def test_results_of_another_task_are_not_mixed_in(tmp_path: Path, content: str, 
     assert "results.jsonl" in done.stderr
 
 
+def test_results_file_without_text_is_named_in_the_error(tmp_path: Path):
+    results = tmp_path / "a.jsonl"
+    results.write_bytes(b"\xff\xfe")
+    with pytest.raises(ValueError, match=r"a\.jsonl must be text in UTF-8"):
+        Results(results, {})
+
+
 def test_picture_cannot_be_drawn_from_results(tmp_path: Path):
     arguments = ["guide", "check", "--results", str(tmp_path / "a.jsonl"), "--plot", str(tmp_path / "a.png")]
     done = CliRunner().invoke(cli, arguments)

@@ -222,6 +222,17 @@ def test_command_interrupted_by_ctrl_c_keeps_its_results(tmp_path: Path) -> None
     assert not (tmp_path / "report.html").exists()
 
 
+@pytest.mark.parametrize(("arguments", "days"), [((), 3), (("--quick",), 1), (("--quick", "--days", "2"), 2)])
+def test_sweep_has_the_typed_number_of_days(
+    arguments: tuple[str, ...], days: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    planned: list[Trial] = []
+    monkeypatch.setattr("atalante_tools.trial._conduct", lambda _name, trials, *_: planned.extend(trials))
+    done = CliRunner().invoke(cli, ["trial", "sweep", *arguments, "--out", str(tmp_path)])
+    assert done.exit_code == 0, done.output
+    assert sum(isinstance(trial, plan.TreadmillTrial) for trial in planned) == days
+
+
 def test_command_uses_stored_results_and_writes_the_report(
     reference: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -63,7 +63,7 @@ def _protocol(_ctx: click.Context, _param: click.Parameter, text: str | None) ->
     help="Assistance factor Xi of the periodic steps: 1 is full assistance. Below 1, the swing leg moves in a guide.",
 )
 @click.option(
-    "--shape", default="pinched", show_default=True, metavar="NAME", help=f"Shape of the guide: {SHAPE_HELP}."
+    "--shape", default="pinched", show_default=True, metavar="NAME|FILE", help=f"Shape of the guide: {SHAPE_HELP}."
 )
 @click.option(
     "--protocol",
@@ -117,11 +117,11 @@ def _protocol(_ctx: click.Context, _param: click.Parameter, text: str | None) ->
 )
 @click.option(
     "--push-direction",
-    type=float,
+    type=Between(-360.0, 360.0),
     default=0.0,
     show_default=True,
     metavar="DEG",
-    help="Direction of the push [deg]: 0 is forwards, 90 to the left.",
+    help="Direction of the push [deg]: 0 is forwards, 90 to the left. Requires --push.",
 )
 @click.option(
     "--friction",
@@ -198,6 +198,10 @@ def command(
     for option, given in emulated.items():
         if given and not target.embedded:
             raise click.UsageError(f"{option} requires the emulated robot of -i embedded")
+    if push is None and _given("push_direction"):
+        raise click.UsageError("--push-direction requires a push: add --push")
+    if out is None and _given("record_rate"):
+        raise click.UsageError("--record-rate requires a recording: add --out")
     if turn and law.literal:
         raise click.UsageError("--turn requires steering, which --literal does not have: remove one of them")
     if then:
@@ -225,6 +229,16 @@ def command(
         out=out,
     )
     walk(target, options, as_json=as_json)
+
+
+def _given(name: str) -> bool:
+    """Return whether the user typed an option of this command.
+
+    Args:
+        name: Name of the option as a parameter of the command, such as "push_direction".
+    """
+    source = click.get_current_context().get_parameter_source(name)
+    return source is click.core.ParameterSource.COMMANDLINE
 
 
 def _require_speed_changes(law: Law, files: GaitFiles) -> None:

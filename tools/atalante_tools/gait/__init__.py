@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from atalante_tools.console.options import SEED, OutputFile, json_option
+from atalante_tools.console.options import SEED, OutputFile, json_option, length
 from atalante_tools.console.outcome import FAILED, Failed
 from atalante_tools.console.stop_request import stop_requested
 from atalante_tools.console.terminal import Progress, print_message, show_json, table
@@ -53,6 +53,15 @@ def levels_of(text: str) -> tuple[float, ...]:
         raise click.BadParameter(f"levels must be numbers separated by commas (58,75,91), got {text!r}") from None
 
 
+def lengths_of(text: str) -> tuple[float, ...]:
+    """Convert comma-separated lengths to the levels of a grid parameter [m]. Each length is in metres or centimetres.
+
+    Raises:
+        click.BadParameter: If the text is not a list of lengths.
+    """
+    return tuple(map(length, text.split(",")))
+
+
 @click.group()
 def command() -> None:
     """Optimise gaits, collect them in a library, fit the gait network of the controller, and check the network and its gaits.
@@ -89,8 +98,12 @@ command.add_command(solve)
     metavar="KG,...",
     help="Patient masses of the grid, in kg.  [default: levels that cover the subjects of the paper]",
 )
-@click.option("--height", type=levels_of, metavar="M,...", help="Patient heights of the grid, in m.")
-@click.option("--step-length", type=levels_of, metavar="M,...", help="Step lengths of the grid, in m.")
+@click.option(
+    "--height", type=lengths_of, metavar="M,...", help="Patient heights of the grid, in m (1.75) or cm (175)."
+)
+@click.option(
+    "--step-length", type=lengths_of, metavar="M,...", help="Step lengths of the grid, in m (0.15) or cm (15)."
+)
 @click.option("--step-duration", type=levels_of, metavar="S,...", help="Step durations of the grid, in s.")
 @click.option(
     "--thigh",

@@ -29,13 +29,16 @@ class Results:
             task: JSON values that determine a verdict, apart from gait, shape and assistance factor.
 
         Raises:
-            ValueError: If the file contains the results of another task, or a line that is not a verdict.
+            ValueError: If the file contains the results of another task, a line that is not a verdict, or other bytes than text.
         """
         self._path, self._task = path, json.loads(json.dumps(task))
         self._known: dict[Key, Verdict] = {}
         if path is None or not path.exists():
             return
-        head, *lines = path.read_text(encoding="utf-8").splitlines() or [""]
+        try:
+            head, *lines = path.read_text(encoding="utf-8").splitlines() or [""]
+        except UnicodeDecodeError as error:
+            raise ValueError(f"{path} must be text in UTF-8, got other bytes: choose another file") from error
         if _decoded(path, 1, head) != self._task:
             raise ValueError(f"{path} must contain results of the task {json.dumps(self._task)}, got {head}")
         for number, line in enumerate(lines, 2):

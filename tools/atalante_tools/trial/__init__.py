@@ -158,17 +158,19 @@ def assist(masses: tuple[float, ...], walking: Walking, running: Running, as_jso
 
 
 @command.command(short_help="Walk with falling and rising assistance factors.")
-@click.option("--days", type=click.IntRange(1), default=3, show_default=True, metavar="N",
-              help="Number of days. A day has one trial on the treadmill and one walk per assistance factor.")  # fmt: skip
+@click.option("--days", type=click.IntRange(1), metavar="N",
+              help="Number of days. A day has one trial on the treadmill and one walk per assistance factor.  "
+                   "[default: 3; with --quick: 1]")  # fmt: skip
 @_walking()
 @_running("sweep")
-def sweep(days: int, walking: Walking, running: Running, as_json: bool) -> None:
+def sweep(days: int | None, walking: Walking, running: Running, as_json: bool) -> None:
     """Walk with one active subject and assistance factors from 1 down to 0 and back to 1. Each walk takes five minutes."""
     from atalante_tools.trial.findings import sweep_findings
-    from atalante_tools.trial.plan import PROTOCOL, QUICK_PROTOCOL, QUICK_SWEEP, SWEEP, sweep_trials
+    from atalante_tools.trial.plan import DAYS, PROTOCOL, QUICK_DAYS, QUICK_PROTOCOL, QUICK_SWEEP, SWEEP, sweep_trials
 
     factors, protocol = (QUICK_SWEEP, QUICK_PROTOCOL) if running.quick else (SWEEP, PROTOCOL)
-    trials = sweep_trials(_setting(walking, running, protocol), factors, 1 if running.quick else days)
+    number = days or (QUICK_DAYS if running.quick else DAYS)
+    trials = sweep_trials(_setting(walking, running, protocol), factors, number)
     _conduct("sweep", trials, sweep_findings, running, as_json)
 
 

@@ -34,6 +34,8 @@ STEP: Final = (0.16, 0.8)
 PARTIAL: Final = 0.5
 SWEEP: Final = (1.0, 0.75, 0.5, 0.25, 0.0, 0.25, 0.5, 0.75, 1.0)
 QUICK_SWEEP: Final = (1.0, 0.5, 0.0, 0.5, 1.0)
+#: Number of days of the sweep, in a normal run and with `--quick`.
+DAYS, QUICK_DAYS = 3, 1
 #: Number of right-stance steps in each guide shape, in a normal run and with `--quick`.
 SHAPE_STEPS, QUICK_SHAPE_STEPS = 30, 2
 #: Duration of the trial on the treadmill [s].

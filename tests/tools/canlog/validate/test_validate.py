@@ -385,6 +385,8 @@ def test_list_rules_as_json_has_every_threshold() -> None:
         (("a.log", "-i", "virtual", "-c", "x"), "(-i socketcan -c can0), got both"),
         (("-i", "virtual"), "virtual needs a channel"),
         (("a.log", "--lockstep"), "--lockstep needs a live bus"),
+        (("a.log", "-c", "can0"), "--channel needs a live bus"),
+        (("a.log", "--for", "3"), "--for needs a live bus"),
         (("a.log", "--node", "NO_NODE"), "--node must be a sender in the DBC"),
     ],
 )

@@ -136,8 +136,10 @@ def command(logs: tuple[Path, ...], options: Options) -> None:
         raise click.UsageError(f"the input must be log files or a live bus (-i socketcan -c can0), got {received}")
     if options.interface and not options.channel:
         raise click.UsageError(f"{options.interface} needs a channel: -c can0")
-    if options.lockstep and not options.interface:
-        raise click.UsageError("--lockstep needs a live bus: -i socketcan -c can0")
+    live = {"--channel": bool(options.channel), "--lockstep": options.lockstep, "--for": options.seconds is not None}
+    for option, given in live.items():
+        if given and not options.interface:
+            raise click.UsageError(f"{option} needs a live bus: -i socketcan -c can0")
     plan, project = _prepare(options)
     results, code = _listen(options, plan, project) if options.interface else _read(logs, plan, project, options.node)
     for result in results:
