@@ -134,6 +134,12 @@ def good(tmp_path: Path) -> Path:
 # -- formats ---------------------------------------------------------------------------------------------------------------
 
 
+def test_complete_compressed_blf_log_is_not_reported_as_truncated(tmp_path: Path) -> None:
+    path = tmp_path / "night.blf.gz"
+    path.write_bytes(gzip.compress(write(tmp_path / "night.blf", MESSAGES).read_bytes()))
+    assert rules_of(run("validate", path, "--node", "LEFT_FH", "--json")) == set()
+
+
 @pytest.mark.parametrize("suffix", [".log", ".asc", ".blf", ".mf4", ".log.gz", ".asc.gz"])
 def test_every_log_format_gives_the_same_findings(suffix: str, tmp_path: Path) -> None:
     damaged = [m for m in MESSAGES if m.arbitration_id != 0x181 or not 0.2 <= m.timestamp - BEGIN <= 0.201]
@@ -181,12 +187,6 @@ def test_all_lines_before_a_truncated_line_are_checked(good: Path) -> None:
 
 
 @pytest.mark.filterwarnings("ignore:unclosed file:ResourceWarning")  # asammdf leaves a damaged file open
-def test_complete_compressed_blf_log_is_not_reported_as_truncated(tmp_path: Path) -> None:
-    path = tmp_path / "night.blf.gz"
-    path.write_bytes(gzip.compress(write(tmp_path / "night.blf", MESSAGES).read_bytes()))
-    assert rules_of(run("validate", path, "--node", "LEFT_FH", "--json")) == set()
-
-
 @pytest.mark.parametrize("suffix", [".asc", ".blf", ".mf4", ".log", ".csv"])
 @pytest.mark.parametrize("share", [0.0, 0.03, 0.5, 0.97])
 def test_truncated_log_is_reported(suffix: str, share: float, tmp_path: Path) -> None:
