@@ -18,6 +18,7 @@ from atalante_tools.console.options import (
     options_as,
     patient_options,
     target_options,
+    typed,
 )
 from atalante_tools.session.law import Law, law_options
 from atalante_tools.session.recording import RECORDING_OPTIONS, RecordingOptions
@@ -198,9 +199,9 @@ def command(
     for option, given in emulated.items():
         if given and not target.embedded:
             raise click.UsageError(f"{option} requires the emulated robot of -i embedded")
-    if push is None and _given("push_direction"):
+    if push is None and typed("push_direction"):
         raise click.UsageError("--push-direction requires a push: add --push")
-    if out is None and _given("record_rate"):
+    if out is None and typed("record_rate"):
         raise click.UsageError("--record-rate requires a recording: add --out")
     if turn and law.literal:
         raise click.UsageError("--turn requires steering, which --literal does not have: remove one of them")
@@ -229,16 +230,6 @@ def command(
         out=out,
     )
     walk(target, options, as_json=as_json)
-
-
-def _given(name: str) -> bool:
-    """Return whether the user typed an option of this command.
-
-    Args:
-        name: Name of the option as a parameter of the command, such as "push_direction".
-    """
-    source = click.get_current_context().get_parameter_source(name)
-    return source is click.core.ParameterSource.COMMANDLINE
 
 
 def _require_speed_changes(law: Law, files: GaitFiles) -> None:

@@ -187,12 +187,21 @@ class GaitFiles:
             raise click.UsageError("--network requires a patient: add --mass and --height")
 
 
+def typed(name: str) -> bool:
+    """Return whether the user typed an option of the current command.
+
+    Args:
+        name: Name of the option as a parameter of the command, such as "push_direction".
+    """
+    source = click.get_current_context().get_parameter_source(name)
+    return source is click.core.ParameterSource.COMMANDLINE
+
+
 def _gait_files(gait: Path | None, network: Path | None) -> GaitFiles:
     if gait is not None and network is not None:
         raise click.UsageError("--gait and --network exclude each other: use only one of them")
-    context = click.get_current_context()
     for name in ("step_length", "step_duration"):
-        if gait is not None and context.get_parameter_source(name) is click.core.ParameterSource.COMMANDLINE:
+        if gait is not None and typed(name):
             raise click.UsageError(
                 f"--{name.replace('_', '-')} has no effect with --gait, because the file contains the step: remove it"
             )
