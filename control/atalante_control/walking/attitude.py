@@ -10,7 +10,7 @@ acceleration :math:`g_b = \hat R^T g` and the velocity error :math:`\tilde v = v
           \dot{\hat R} = \hat R\,[\omega + (w / |g|)^2\,\tilde v \times g_b]_\times
 
 The error of roll and pitch obeys a critically damped equation with natural frequency w. The heading is the integral of the gyro,
-so it drifts. If the IMU has a heading reference, such as a magnetometer, `follow_heading` removes the drift.
+so it drifts. If the IMU has a heading reference, such as a magnetometer, `follow_heading` removes the drift (`walking.heading`).
 (After P. Martin and E. Salaun, Design and implementation of a low-cost observer-based attitude and heading reference system,
 Control Engineering Practice 18, 2010.)
 """
@@ -26,6 +26,7 @@ import numpy as np
 from atalante_control.gait.gait import PERIOD
 from atalante_control.model import GRAVITY
 from atalante_control.structured import Records, zeros
+from atalante_control.walking.heading import HeadingConfig, HeadingFilter
 from atalante_control.walking.rotation import about_z, rotation_of
 from atalante_hal.compiled import compiled
 from atalante_hal.types import Vector
@@ -48,19 +49,19 @@ class AttitudeObserver:
         rotation: rotation matrix from pelvis to world, shape (3, 3), a view of the record that `update` overwrites.
     """
 
-    def __init__(self, bandwidth: float = 2.0) -> None:
+    def __init__(self, bandwidth: float = 2.0, heading: HeadingConfig | None = None) -> None:
         """Allocate the state, and compile the kernel.
 
         Args:
             bandwidth: natural frequency w of the decay of roll and pitch errors [rad/s].
+            heading: parameters of `follow_heading`. If None, the defaults are used.
         """
         self.records: Records[Attitude] = zeros(Attitude, 1)
         self.records[0].bandwidth = bandwidth
         self.rotation: Vector = self.records[0].rotation
-        self._observe, self._follow = compiled(observe), compiled(follow_heading)
+        self._observe, self._headings = compiled(observe), HeadingFilter(heading or HeadingConfig())
         self.reset((1.0, 0.0, 0.0, 0.0))
         self.update(np.zeros(3), np.array([0.0, 0.0, GRAVITY]), (0.0, 0.0, 0.0))
-        self.follow_heading(np.array([1.0, 0.0, 0.0, 0.0]), 0.0)
         self.reset((1.0, 0.0, 0.0, 0.0))
 
     def reset(self, quaternion: Sequence[float]) -> None:
@@ -73,19 +74,25 @@ class AttitudeObserver:
         self._origin = math.atan2(rotation[1, 0], rotation[0, 0])
         record.rotation[:] = about_z(-self._origin) @ rotation
         record.velocity[:] = 0.0
+        self._headings.reset()
 
     def update(self, gyro: Vector, accel: Vector, velocity: Vector3) -> None:
         """Advance the attitude by one cycle, as `observe` does."""
         self._observe(self.records, gyro, accel, velocity)
 
-    def follow_heading(self, quaternion: Vector, gain: float) -> None:
-        """Turn the attitude towards a measured heading. The measured heading at the last `reset` counts as zero.
+    def follow_heading(self, quaternion: Sequence[float]) -> None:
+        """Correct the drift of the heading. Call this method once per cycle, if the IMU has a heading reference.
 
         Args:
-            quaternion: attitude of the pelvis IMU, unit quaternion wxyz, pelvis to world, shape (4,).
-            gain: rate with which a heading error decays [1/s].
+            quaternion: attitude of the pelvis IMU, unit quaternion wxyz, pelvis to world. Its heading at the last `reset`
+                counts as zero.
         """
-        self._follow(self.records, quaternion, self._origin, gain)
+        w, x, y, z = quaternion
+        measured = math.atan2(2.0 * (x * y + w * z), 1.0 - 2.0 * (y * y + z * z)) - self._origin
+        rotation = self.rotation
+        turn = self._headings.correction(measured, math.atan2(rotation[1, 0], rotation[0, 0]))
+        if turn:
+            rotation[:] = about_z(turn) @ rotation
 
 
 def observe(attitudes: Records[Attitude], gyro: Vector, accel: Vector, measured: Vector3) -> None:
@@ -119,26 +126,6 @@ def observe(attitudes: Records[Attitude], gyro: Vector, accel: Vector, measured:
         rotation[row, 1] = b + db + 0.5 * (dc * x - da * z)
         rotation[row, 2] = c + dc + 0.5 * (da * y - db * x)
     _orthonormalise(rotation)
-
-
-def follow_heading(attitudes: Records[Attitude], quaternion: Vector, origin: float, gain: float) -> None:
-    """Turn the attitude about the vertical by the part of the heading error that decays in one cycle.
-
-    Args:
-        attitudes: state of the observer, shape (1,), updated.
-        quaternion: measured attitude, unit quaternion wxyz, pelvis to world, shape (4,).
-        origin: measured heading at which the heading of the observer is zero [rad].
-        gain: rate with which a heading error decays [1/s].
-    """
-    w, x, y, z = quaternion[0], quaternion[1], quaternion[2], quaternion[3]
-    rotation = attitudes[0].rotation
-    measured = math.atan2(2.0 * (x * y + w * z), 1.0 - 2.0 * (y * y + z * z)) - origin
-    error = measured - math.atan2(rotation[1, 0], rotation[0, 0])
-    turn = gain * PERIOD * math.atan2(math.sin(error), math.cos(error))
-    for k in range(3):
-        forward, left = rotation[0, k], rotation[1, k]
-        rotation[0, k] = forward - turn * left
-        rotation[1, k] = left + turn * forward
 
 
 def _orthonormalise(rotation: Vector) -> None:

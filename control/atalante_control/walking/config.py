@@ -22,8 +22,6 @@ STEERING = 0.5, 0.15, math.radians(3.0)
 _NO_INTEGRAL = (0.0,) * 6
 #: Largest angle by which the desired line may turn before a periodic step [rad]. Larger angles were not tried.
 TURN_MAX = math.radians(5.0)
-#: Value of `WalkConfig.heading_gain` for an IMU with a heading reference [1/s].
-HEADING_GAIN = 0.5
 #: Gains without integral terms. With integral terms, the robot began to limp after about 120 steps in MuJoCo.
 #: The integral terms of the two legs drifted apart, because the ankle stabiliser moves the robot too.
 WALK_GAINS = PidGains(
@@ -75,9 +73,9 @@ class WalkConfig:
     landing_timeout: float = 0.4
     load_bandwidth: float = 35.0  # Hz, cut-off frequency of the low-pass of the vertical foot forces
     observer_bandwidth: float = 2.0  # rad/s, natural frequency of the attitude observer
-    #: 1/s, rate with which the estimated heading follows the heading of the pelvis IMU. With 0, the estimated heading is the
-    #: integral of the gyro. A value above 0 requires an IMU with a heading reference, because the heading of other IMUs drifts.
-    heading_gain: float = 0.0
+    #: Whether the estimated heading follows the heading of the pelvis IMU. This requires an IMU with a heading reference, because
+    #: the heading of other IMUs drifts. Without a reference, the estimated heading is the integral of the gyro.
+    heading_reference: bool = False
     loaded: float = 0.3  # smallest load with which a standing foot counts as loaded, as a fraction of the weight
     #: loads of a foot, as fractions of the weight. While the robot stands, a leg has the full stance gains at the first load.
     #: During a step, the ankle of the stance leg has the full stance gains at the second load.
@@ -113,8 +111,6 @@ class WalkConfig:
                 raise ValueError(f"{name} must be at least one cycle ({PERIOD} s), got {getattr(self, name)!r}")
         if not 0.0 <= self.stabiliser <= 10.0:
             raise ValueError(f"stabiliser must be from 0 to 10 m/m, got {self.stabiliser!r}")
-        if not 0.0 <= self.heading_gain <= 10.0:
-            raise ValueError(f"heading_gain must be from 0 to 10 [1/s], got {self.heading_gain!r}")
         if not 0.0 <= self.edge <= 0.1:
             raise ValueError(f"edge must be from 0 to 0.1 m, got {self.edge!r}")
         if not abs(self.turn) <= TURN_MAX:

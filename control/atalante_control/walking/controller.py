@@ -358,8 +358,8 @@ class WalkController:
             self._bind(state)
         lost = bool(state.imu_rows) and state.age[state.imu_rows[_PELVIS]] > _SENSOR_AGE
         self._measured = self._measured_by[_TORSO if lost else _PELVIS]
-        if self.config.heading_gain and not lost:
-            self._observer.follow_heading(state.imu_quaternion[_PELVIS], self.config.heading_gain)
+        if self.config.heading_reference and not lost:
+            self._observer.follow_heading(state.imu_quaternion[_PELVIS].tolist())
         feet = [side for side, row in enumerate(state.foot_rows) if state.age[row] > _SENSOR_AGE]
         if len(feet) == 1:
             self._forces[:] = state.foot_force

@@ -213,9 +213,3 @@ def test_straight_leg_is_not_shifted() -> None:
 def test_invalid_parameter_is_rejected(placement: PlacementConfig, sentence: str) -> None:
     with pytest.raises(ValueError, match=sentence):
         WalkConfig(placement=placement)
-
-
-@pytest.mark.parametrize("gain", [-0.1, 10.1, math.nan])
-def test_invalid_heading_gain_is_rejected(gain: float) -> None:
-    with pytest.raises(ValueError, match=r"heading_gain must be from 0 to 10 \[1/s\], got"):
-        WalkConfig(heading_gain=gain)

@@ -95,7 +95,7 @@ def _walk(
         child: Subprocess that writes the outputs.
         as_json: Whether to print a JSON object instead of text.
     """
-    from atalante_control.walking.config import HEADING_GAIN, WALK_GUIDE, WalkConfig
+    from atalante_control.walking.config import WALK_GUIDE, WalkConfig
     from atalante_control.walking.controller import WalkController
     from atalante_hal.robot import load_robot
     from atalante_hal.types import PERIOD
@@ -111,7 +111,7 @@ def _walk(
     config = replace(
         WalkConfig.literal() if law.literal else WalkConfig(),
         guide=replace(WALK_GUIDE, idealization=law.idealization, feedforward=law.feedforward),
-        heading_gain=HEADING_GAIN if options.heading_reference else 0.0,
+        heading_reference=options.heading_reference,
         turn=math.radians(options.turn),
     )
     controller = WalkController(robot, patient, gaits, options.steps, config, guide_shape(options.shape), then)

@@ -22,7 +22,7 @@ from atalante_control.gait.walk import WalkGaits
 from atalante_control.guide.shapes import SHAPES
 from atalante_control.joint.leg_model import leg_model
 from atalante_control.model import Patient
-from atalante_control.walking.config import HEADING_GAIN, WALK_GUIDE, WalkConfig
+from atalante_control.walking.config import WALK_GUIDE, WalkConfig
 from atalante_control.walking.controller import WalkController
 from atalante_control.walking.phases import Phase
 from atalante_emulator.mechanics import HEADING_REFERENCE_PARAMETERS, Ground, Mechanics
@@ -146,7 +146,7 @@ def _walk(trial: WalkTrial) -> dict[str, Any]:
     config = replace(
         WalkConfig.literal() if trial.literal else WalkConfig(),
         guide=guide,
-        heading_gain=HEADING_GAIN if trial.heading_reference else 0.0,
+        heading_reference=trial.heading_reference,
     )
     controller = WalkController(robot, patient, gaits, steps, config, shape=SHAPES[trial.shape])
     operator = Operator()

@@ -1,0 +1,81 @@
+"""Drift of the heading of a walk: `estimated heading, measured heading -> correction of the estimated heading`.
+
+The integral of a gyro shows changes of the heading precisely, but the bias of the gyro makes it drift without bound. A heading
+reference, such as a magnetometer, has a bounded error, but this error is large and changes slowly. A Kalman filter therefore
+estimates the bias of the gyro. Its state is
+
+    d   error of the estimated heading [rad], d' = b + white noise; at the start the heading is 0 by definition, so d = 0
+    b   bias of the gyro about the vertical [rad/s], b' = white noise
+    o   constant error of the reference at the start [rad]
+
+The measurement is measured heading - estimated heading = o - d + error of the reference. The error of the reference is correlated
+in time. The filter regards this error as white noise with the same spectral density at low frequencies. After each update, the
+estimated heading is corrected by d.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from atalante_control.gait.gait import PERIOD
+
+
+class HeadingConfig(NamedTuple):
+    """Standard deviations of the errors of gyro and heading reference."""
+
+    reference: float = 0.004  # rad, error of the heading reference
+    reference_time: float = 10.0  # s, correlation time of this error
+    gyro_noise: float = 1.7e-4  # rad/sqrt(s), random walk of the integral of the gyro (0.01 deg/s/sqrt(Hz))
+    gyro_bias: float = 5.2e-5  # rad/s, bias of the gyro at the start (0.003 deg/s)
+    bias_walk: float = 1e-6  # rad/s/sqrt(s), random walk of the bias
+    interval: int = 100  # cycles between two updates
+
+
+class HeadingFilter:
+    """Kalman filter that removes the drift of the estimated heading."""
+
+    def __init__(self, config: HeadingConfig) -> None:
+        """Compute the constant matrices of the filter.
+
+        Args:
+            config: standard deviations of the errors.
+        """
+        self._config, time = config, config.interval * PERIOD
+        self._transition = np.array([[1.0, time, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]])
+        self._process = np.diag([config.gyro_noise**2 * time, config.bias_walk**2 * time, 0.0])
+        #: Variance of white noise with the spectral density of the error of the reference at low frequencies.
+        self._noise = 2.0 * config.reference**2 * config.reference_time / time
+        self.reset()
+
+    def reset(self) -> None:
+        """Start again, with an estimated heading that is correct by definition."""
+        config = self._config
+        self._state = np.zeros(3)
+        self._covariance = np.diag([0.0, config.gyro_bias**2, config.reference**2])
+        self._cycle = 0
+
+    def correction(self, measured: float, estimated: float) -> float:
+        """Return the angle by which the estimated heading must be turned in this cycle [rad].
+
+        Most cycles need no correction. In one of `HeadingConfig.interval` cycles, the filter is updated.
+
+        Args:
+            measured: measured heading, relative to the measured heading at the start [rad].
+            estimated: estimated heading [rad].
+        """
+        self._cycle += 1
+        if self._cycle % self._config.interval:
+            return 0.0
+        state = self._transition @ self._state
+        covariance = self._transition @ self._covariance @ self._transition.T + self._process
+        difference = math.remainder(measured - estimated, math.tau)
+        output = np.array([-1.0, 0.0, 1.0])
+        gain = covariance @ output / (output @ covariance @ output + self._noise)
+        state += gain * (difference - output @ state)
+        self._covariance = covariance - np.outer(gain, output @ covariance)
+        drift, state[0] = float(state[0]), 0.0
+        self._state = state
+        return -drift
