@@ -61,6 +61,8 @@ def test_bisection_returns_the_horizon_if_the_robot_never_falls() -> None:
         ("F05", {"outcome": "hold"}, True),
         ("F56", {"case": "dead-man released"}, False),
         ("F56", {"case": "HOLD"}, True),
+        ("F44", {"case": "3 cycles"}, False),
+        ("F44", {"case": "1.5 ms late in every cycle"}, True),
         ("F56", {"case": "HOLD", "codes": []}, False),
         ("F16", {}, True),
         ("F16", {"moment": "weight shift"}, False),
