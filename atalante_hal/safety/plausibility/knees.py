@@ -109,6 +109,16 @@ class Knees:
         for values in self._filters:
             values.fill(0.0)
 
+    def reference(self, leg: int) -> None:
+        """Forget the finding of a leg, because the encoder of its SH or SK has been referenced.
+
+        Args:
+            leg: index of the leg in SIDES.
+        """
+        self._error[leg] = 0.0
+        self._found.pop(leg, None)
+        self.restart()
+
     def follow(self) -> bool:
         """Follow the motion of both legs by one cycle.
 

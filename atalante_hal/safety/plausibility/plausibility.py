@@ -16,7 +16,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from atalante_hal.robot import IMUS, Robot
+from atalante_hal.robot import IMUS, JOINTS, LEG_JOINTS, Robot
 from atalante_hal.safety.diagnostics import Dtc, Finding
 from atalante_hal.safety.plausibility.encoders import EncoderChecks
 from atalante_hal.safety.plausibility.feet import FootChecks
@@ -48,6 +48,8 @@ _LATE = 1
 #: Largest age of a value that the knee checks use [cycles]. If a value is older, the filters of the knee checks restart.
 _HELD = 4
 _FRESH = int(Check.SOME_LOST)
+#: Indices in JOINTS of SH and SK.
+_HIPS_AND_KNEES = frozenset(joint for joint, name in enumerate(JOINTS) if name.endswith(("SH", "SK")))
 
 
 class Plausibility:
@@ -149,6 +151,8 @@ class Plausibility:
     def reference(self, node: str) -> None:
         """Skip the jump check for the next position of a joint whose drive has referenced its encoder.
 
+        A drift of SH and SK that was found before is forgotten.
+
         Args:
             node: DBC name of the drive; the name of any other node has no effect.
         """
@@ -160,6 +164,8 @@ class Plausibility:
         joint = JOINT_NODES.index(node)
         self._encoders.reference(joint)
         self._rejections.forget(joint)
+        if joint in _HIPS_AND_KNEES:
+            self._knees.reference(joint // len(LEG_JOINTS))
         self._measured[self._joint_rows[joint]] = -NEVER
 
     @property

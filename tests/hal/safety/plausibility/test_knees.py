@@ -250,17 +250,35 @@ class WalkingRobot(SimulatedRobot):
 class TestInTheCycle:
     """The checks run in each cycle in which all values are at most four cycles old. Older values restart the filters."""
 
-    def found(self, **changes: dict[int, int]) -> bool:
+    def drifted(self, **changes: dict[int, int]) -> WalkingRobot:
+        """Return a robot that walked with drifts of all hips and knees."""
         robot = WalkingRobot(**changes)
+        robot.run(4000, lambda now: self.drift(robot, now))
+        return robot
 
-        def change(now: Signals) -> None:
-            walk().write(now, robot.cycles)
-            drift = min(robot.cycles * RATE, math.radians(6.0))
-            now.position[SK] += drift * GEAR[SK]
-            now.position[SH] -= drift * GEAR[SH]
+    def drift(self, robot: WalkingRobot, now: Signals) -> None:
+        walk().write(now, robot.cycles)
+        drift = min(robot.cycles * RATE, math.radians(6.0))
+        now.position[SK] += drift * GEAR[SK]
+        now.position[SH] -= drift * GEAR[SH]
 
-        robot.run(4000, change)
-        return any("accelerometers of pelvis" in finding.text for finding in robot.checks.findings)
+    def nodes(self, robot: WalkingRobot) -> set[str]:
+        return {finding.node for finding in robot.checks.findings if "accelerometers of pelvis" in finding.text}
+
+    def found(self, **changes: dict[int, int]) -> bool:
+        return bool(self.nodes(self.drifted(**changes)))
+
+    def test_a_drive_of_hip_or_knee_that_restarts_ends_the_finding_of_its_leg(self):
+        robot = self.drifted()
+        for node, left in (
+            ("LEFT_SA", {"LEFT_SK", "RIGHT_SK"}), ("IMU_PELVIS", {"LEFT_SK", "RIGHT_SK"}), ("LEFT_SH", {"RIGHT_SK"}),
+            ("RIGHT_SK", set()),
+        ):  # fmt: skip
+            robot.checks.reference(node)
+            robot.run(1, lambda now: self.drift(robot, now))
+            assert self.nodes(robot) == left
+        robot.run(4000, lambda now: self.drift(robot, now))
+        assert self.nodes(robot) == {"LEFT_SK", "RIGHT_SK"}
 
     def test_drift_is_found(self):
         assert self.found()
