@@ -10,7 +10,8 @@ estimates the bias of the gyro. Its state is
 
 The measurement is measured heading - estimated heading = o - d + error of the reference. The error of the reference is correlated
 in time. The filter regards this error as white noise with the same spectral density at low frequencies. After each update, the
-estimated heading is corrected by d.
+estimated heading is corrected by d. A measurement that differs from its prediction by more than `outlier` standard deviations is
+not used, because iron near a magnetometer can turn the measured heading by many degrees.
 """
 
 from __future__ import annotations
@@ -31,6 +32,7 @@ class HeadingConfig(NamedTuple):
     gyro_noise: float = 1.7e-4  # rad/sqrt(s), random walk of the integral of the gyro (0.01 deg/s/sqrt(Hz))
     gyro_bias: float = 5.2e-5  # rad/s, bias of the gyro at the start (0.003 deg/s)
     bias_walk: float = 1e-6  # rad/s/sqrt(s), random walk of the bias
+    outlier: float = 5.0  # standard deviations, largest difference between a measurement and its prediction
     interval: int = 100  # cycles between two updates
 
 
@@ -73,9 +75,12 @@ class HeadingFilter:
         covariance = self._transition @ self._covariance @ self._transition.T + self._process
         difference = math.remainder(measured - estimated, math.tau)
         output = np.array([-1.0, 0.0, 1.0])
-        gain = covariance @ output / (output @ covariance @ output + self._noise)
-        state += gain * (difference - output @ state)
-        self._covariance = covariance - np.outer(gain, output @ covariance)
+        surprise, variance = difference - output @ state, output @ covariance @ output
+        if abs(surprise) <= self._config.outlier * math.sqrt(variance + self._config.reference**2):
+            gain = covariance @ output / (variance + self._noise)
+            state += gain * surprise
+            covariance = covariance - np.outer(gain, output @ covariance)
+        self._covariance = covariance
         drift, state[0] = float(state[0]), 0.0
         self._state = state
         return -drift

@@ -43,7 +43,21 @@ def test_the_heading_is_more_exact_than_gyro_and_reference_alone() -> None:
 
 def test_a_reset_forgets_the_estimated_bias() -> None:
     filter_ = HeadingFilter(CONFIG)
-    first = [filter_.correction(0.1, 0.0) for _ in range(1000)]
+    first = [filter_.correction(0.01, 0.0) for _ in range(1000)]
     assert sum(map(bool, first)) == 10
     filter_.reset()
-    assert [filter_.correction(0.1, 0.0) for _ in range(1000)] == first
+    assert [filter_.correction(0.01, 0.0) for _ in range(1000)] == first
+
+
+def test_a_disturbed_reference_is_not_followed() -> None:
+    """Iron near the magnetometer turns the measured heading by 20 degrees for 20 s. The bias of the gyro is estimated before."""
+    filter_, heading, bias = HeadingFilter(CONFIG), 0.0, 0.5 * CONFIG.gyro_bias
+    headings = []
+    for second in range(240):
+        disturbance = math.radians(20.0) if 100 <= second < 120 else 0.0
+        for _ in range(round(1.0 / PERIOD)):
+            heading += bias * PERIOD
+            heading += filter_.correction(disturbance, heading)
+        headings.append(heading)
+    assert abs(headings[119] - headings[99]) < bias * 20.0
+    assert abs(headings[-1]) < 0.25 * bias * 240.0
