@@ -200,6 +200,23 @@ def test_truncated_log_is_reported(suffix: str, share: float, tmp_path: Path) ->
     assert any(word in output for word in ("log-truncated", "log-empty", "cannot be read")), output
 
 
+@pytest.mark.parametrize("suffix", [".blf", ".blf.gz"])
+def test_blf_log_that_was_not_closed_is_reported_as_incomplete(suffix: str, tmp_path: Path) -> None:
+    """The recorder is killed: only full containers are in the file, and the header still states no data."""
+    path = tmp_path / f"night{suffix}"
+    with (tmp_path / "open.blf").open("wb") as file:
+        writer = can.BLFWriter(file, max_container_size=4096)
+        for message in MESSAGES:
+            writer.on_message_received(message)
+        file.flush()
+        content = (tmp_path / "open.blf").read_bytes()
+    path.write_bytes(gzip.compress(content) if suffix.endswith(".gz") else content)
+    result = run("validate", path, "--node", "LEFT_FH", "--json")
+    assert rules_of(result) == {"log-truncated"}
+    assert "was not closed by its recorder" in result.stderr
+    assert result.exit_code == 1
+
+
 @pytest.mark.parametrize("suffix", [".log", ".asc", ".blf", ".mf4", ".trc", ".csv"])
 @pytest.mark.parametrize("content", [b"", b"\n", b"no log at all\n", bytes(range(256)) * 20])
 def test_file_without_frames_is_reported(suffix: str, content: bytes, tmp_path: Path) -> None:

@@ -110,13 +110,8 @@ def _remark(log: LogFile, count: int, broken: str, ends_within: bool, warnings: 
         log.remark("log-truncated", f"{log.path} cannot be read after frame {count}: {broken}", 1, -1)
     elif ends_within:
         log.remark("log-truncated", f"{log.path} ends within a line; its last frame was not checked", 1, -1)
-    elif log.suffix == ".blf" and not log.compressed and (missing := _missing_bytes(log.path)):
-        log.remark(
-            "log-truncated",
-            f"{log.path} is truncated: according to its header {missing} bytes are missing; {count} frames were read",
-            1,
-            -1,
-        )
+    elif log.suffix == ".blf" and (defect := _size_defect(log)):
+        log.remark("log-truncated", f"{log.path} {defect}; {count} frames were read", 1, -1)
     if warnings.count:
         log.remark(
             "log-unreadable",
@@ -236,11 +231,22 @@ def _last_byte(path: Path) -> bytes:
         return file.read(1)
 
 
-def _missing_bytes(path: Path) -> int:
-    """Return the number of bytes that are missing in a .blf file according to the file header."""
-    with path.open("rb") as file:
+def _size_defect(log: LogFile) -> str:
+    """Return how the size of a .blf file differs from the size in its header; empty if the file is complete.
+
+    The recorder writes the size when it closes the log. Before, the header states a smaller size. The size of a
+    compressed log is not compared, only whether the header states any data.
+    """
+    with gzip.open(log.path) if log.compressed else log.path.open("rb") as file:
         header = file.read(_BLF_HEADER.size)
     if len(header) < _BLF_HEADER.size:
-        return 0
-    size: int = _BLF_HEADER.unpack(header)[-2]
-    return max(0, size - path.stat().st_size)
+        return ""
+    _, header_size, *_, stated, _ = _BLF_HEADER.unpack(header)
+    if not log.compressed and stated > log.size:
+        return f"is truncated: according to its header {stated - log.size} bytes are missing"
+    if stated <= header_size if log.compressed else stated < log.size:
+        return (
+            f"was not closed by its recorder, so its last frames are missing: its header states {stated} bytes, "
+            "and the file has more"
+        )
+    return ""

@@ -29,7 +29,7 @@ class Rule:
 RULES = (
     # -- log file ----------------------------------------------------------------------------------------------------
     Rule("log-empty", "The log has no frame", "the log"),
-    Rule("log-truncated", "The log is truncated within a record", "the log"),
+    Rule("log-truncated", "The log is truncated, or its recorder did not close it", "the log"),
     Rule("log-unreadable", "Entries of the log are not CAN frames and were not checked", "the log"),
     Rule("log-unsorted", "The frames of the log are not in order of time", "the log"),
     # -- identity ----------------------------------------------------------------------------------------------------
