@@ -86,6 +86,8 @@ class Project:
 
 #: Rules with one threshold for each signal name, for example for `Position`. A rules file may add signal names.
 _OPEN = ("step",)
+#: Smallest and largest value of the thresholds that have a range, by rule and name.
+_RANGE = {("bus-load", "window_s"): (0.001, 3600.0)}
 
 
 def load_project(path: Path) -> Project:
@@ -129,7 +131,10 @@ def _thresholds(path: Path, rule: str, table: Any) -> dict[str, Threshold]:
             raise ProjectError(
                 f"{path}: the name of a threshold of {rule} must be one of {', '.join(known)}, got {name!r}"
             )
-        found[name] = _value(f"{path}: {rule}.{name}", value, like)
+        found[name] = number = _value(f"{path}: {rule}.{name}", value, like)
+        low, high = _RANGE.get((rule, name), (0.0, math.inf))
+        if isinstance(number, float) and not low <= number <= high:
+            raise ProjectError(f"{path}: {rule}.{name} must be from {low:g} to {high:g}, got {value!r}")
     return found
 
 
