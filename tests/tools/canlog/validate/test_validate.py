@@ -466,6 +466,17 @@ def test_report_without_findings_lists_the_unchecked_signals(good: Path) -> None
     assert result.stdout.splitlines()[-1] == "no findings; see above for the items that were not checked"
 
 
+@pytest.mark.parametrize(("cycles", "unchecked"), [(64, True), (400, False)])
+def test_short_log_lists_the_rules_that_need_more_frames(cycles: int, unchecked: bool, tmp_path: Path) -> None:
+    result = run("validate", write(tmp_path / "short.log", node_frames(cycles)), "--node", "LEFT_FH")
+    for sentence in (
+        "bus-load: the log has no complete time window of 0.1 s",
+        "stuck: fewer than 100 frames in the log (1): LEFT_FH_STATE",
+        "velocity: fewer than 65 frames in the log (1): LEFT_FH_STATE",
+    ):
+        assert (sentence in result.stdout) is unchecked, result.stdout
+
+
 def test_j1939_groups_of_several_senders_have_no_timing_findings(tmp_path: Path) -> None:
     dbc = Path(__file__).parents[3] / "foreign" / "j1939.dbc"
     messages = [

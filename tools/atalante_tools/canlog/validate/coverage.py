@@ -77,6 +77,9 @@ def _of_the_network(validator: Validator) -> Iterator[Unchecked]:
         yield Unchecked(("wrong-bus",), mixed, reason)
     if not validator.load.checked:
         yield Unchecked(("bus-load",), (), "the DBC has neither NominalBitrate nor Baudrate")
+    elif not validator.load.windows:
+        window = validator.project.number("bus-load", "window_s")
+        yield Unchecked(("bus-load",), (), f"the log has no complete time window of {window:g} s")
     if not validator.order.buses:
         yield Unchecked(("sync-order", "state-late"), (), "the DBC has no cyclic message SYNC...")
     if not validator.drives.drives:
@@ -132,6 +135,8 @@ def _of_messages(validator: Validator) -> Iterator[Unchecked]:
     ):  # fmt: skip
         if rows:
             yield Unchecked(rules, _names(validator, rows), reason)
+    for (rule, required), rows in validator.motion.too_short(counts).items():
+        yield Unchecked((rule,), _names(validator, rows), f"fewer than {required} frames in the log")
     absent_rows = [row for row in range(len(plan.layouts)) if not counts[row]]
     reported = {f.message for f in validator.findings.all() if f.rule == "never-seen"}
     if unseen := [row for row in absent_rows if plan.name(row) not in reported]:

@@ -67,6 +67,11 @@ class LoadRules:
         """Return whether the bus load is checked. The check needs a bit rate in the DBC."""
         return self._nominal > 0
 
+    @property
+    def windows(self) -> int:
+        """Return the number of complete time windows, which `finish` checks. The first and the last are incomplete."""
+        return max(0, len(self.load) - 2)
+
     def _layout_time(self, row: int) -> float:
         layout = self._plan.layouts[row]
         if not self._nominal:

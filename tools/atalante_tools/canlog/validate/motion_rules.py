@@ -27,6 +27,7 @@ class MotionRules:
     """Plausibility rules, applied to the signals of all messages."""
 
     def __init__(self, plan: Plan, findings: Findings, project: Project) -> None:
+        self._plan = plan
         self._families = {
             family.rows.start: [
                 rule
@@ -69,6 +70,23 @@ class MotionRules:
             rule.id: [family.codec.fields[p].name for p in rule.indices] for rule in self._families[family.rows.start]
         }
 
+    def too_short(self, counts: npt.NDArray[np.int64]) -> dict[tuple[str, int], list[int]]:
+        """Return the messages with too few frames for a rule.
+
+        Args:
+            counts: number of frames of each message in the log, shape (messages,).
+
+        Returns:
+            For each rule and the number of frames that it requires: the indices of the messages in the plan.
+        """
+        found: dict[tuple[str, int], list[int]] = {}
+        for family in self._plan.families:
+            for rule in self._families[family.rows.start]:
+                if isinstance(rule, (_Velocity, _Stuck)):
+                    rows = [row for row in family.rows if 0 < counts[row] < rule.required]
+                    found.setdefault((rule.id, rule.required), []).extend(rows)
+        return {key: rows for key, rows in found.items() if rows}
+
 
 class _Velocity:
     """Rule that compares the mean of the velocity signal in a time window with the mean slope of the position signal.
@@ -83,6 +101,7 @@ class _Velocity:
         self._findings = findings
         number = project.number
         self._window = max(2, int(number(self.id, "window")))
+        self.required = self._window + 1  # number of frames of a message for the first check
         self._lag, self._relative = number(self.id, "lag_s"), number(self.id, "relative")
         self._absolute = number(self.id, "absolute")
         self._left: dict[int, tuple[npt.NDArray[np.int64], Vector, Vector, npt.NDArray[np.bool_]]] = {}
@@ -274,6 +293,7 @@ class _Stuck:
     def __init__(self, family: Family, indices: Sequence[int], findings: Findings, frames: int) -> None:
         self.indices = list(indices)
         self._family, self._findings, self._frames = family, findings, frames
+        self.required = frames  # number of frames of a message for the first check
         self._columns = _Columns(family, indices)
         #: Number of consecutive frames with an unchanged raw code, shape (fields, messages).
         self._run = np.zeros((len(self.indices), len(family.rows)), np.int64)
