@@ -214,6 +214,17 @@ def test_log_without_known_messages_fails(tmp_path: Path) -> None:
     assert pq.read_metadata(tmp_path / "out.parquet").num_rows == 0
 
 
+@pytest.mark.parametrize("suffix", ["mcap", "parquet"])
+def test_log_without_frames_leaves_the_previous_file(suffix: str, tmp_path: Path) -> None:
+    log, out = tmp_path / "empty.log", tmp_path / f"out.{suffix}"
+    log.touch()
+    out.write_text("of yesterday")
+    result = run("decode", log, "-o", out)
+    assert result.exit_code == 1
+    assert f"a log must have at least one frame to decode, got none; {out} was not written" in result.stderr
+    assert out.read_text() == "of yesterday"
+
+
 @pytest.mark.parametrize(
     ("out", "code", "sentence"),
     [

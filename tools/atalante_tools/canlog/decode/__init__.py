@@ -33,7 +33,7 @@ def command(logs: tuple[Path, ...], out: Path, dbc: Path | None) -> None:
     """Decode CAN logs (.log of candump, .asc, .blf, .mf4, .trc, .csv) to signals in physical units.
 
     The command checks no rules; for that, use `atalante validate`. Frames with an unknown identifier or a payload that
-    is too short are counted and skipped.
+    is too short are counted and skipped. If the logs have no frame, no file is written.
 
     \b
     Example: atalante decode night.log -o night.parquet
@@ -65,6 +65,8 @@ def command(logs: tuple[Path, ...], out: Path, dbc: Path | None) -> None:
             progress.clear()
             for remark in source.remarks:
                 print_message(remark.sentence)
+        if not decoder.frames:
+            raise Failed(f"a log must have at least one frame to decode, got none; {out} was not written")
     print_message(f"{out}: {sink.values} values of {decoder.decoded} frames")
     if decoder.skipped:
         print_message(f"skipped: {decoder.skipped}")
