@@ -193,6 +193,7 @@ def test_command_states_that_the_literal_law_has_no_promise():
     done = CliRunner().invoke(cli, arguments)
     assert done.exit_code == 0, done.stderr
     assert "no promise: the paper's literal law" in done.stderr
+    assert "no push was searched, because there are no certified torques: add --push HIP KNEE" in done.stderr
     pushed = CliRunner().invoke(cli, [*arguments, "--push", "6", "3.6", "--json"])
     verdict = json.loads(pushed.stdout)
     assert not verdict["certified"]

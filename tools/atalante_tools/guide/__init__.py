@@ -120,7 +120,7 @@ def check(options: CheckOptions, as_json: bool, subject: Subject | None) -> None
     A push acts on hip and knee of the swing leg at the same time. The torque at each joint is at most the certified torque, and
     its direction may change at any time. The promise is kept if the ratio |e| / q_bound is at most 1. The column "left at" is
     the smallest multiple of the promise that moved a joint out of the guide. The exit code is 1 if a promise is broken. With
-    --push, a broken promise does not change the exit code.
+    --push, a broken promise does not change the exit code. --literal certifies no torque: a search needs --push.
 
     \b
     Example: atalante guide check --shape constant --xi 0.5 --quick
@@ -139,6 +139,8 @@ def check(options: CheckOptions, as_json: bool, subject: Subject | None) -> None
         click.echo(verdicts_table(verdicts))
     if options.law.literal:
         print_message(verdicts[0].reason)
+        if options.push is None:
+            print_message("no push was searched, because there are no certified torques: add --push HIP KNEE")
     if options.table is not None:
         options.table.write_text(markdown_table(verdicts), encoding="utf-8")
         print_message(f"wrote {options.table}")
