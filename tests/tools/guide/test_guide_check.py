@@ -251,7 +251,7 @@ def test_interrupted_check_is_resumed_from_its_results(tmp_path: Path, monkeypat
     ("content", "error"),
     [
         ("{}\n", "must contain results of the task"),
-        ("", "must be a JSON object"),
+        ("[", "must be a JSON object"),
         ("TASK\n{}\n", "line 2 of .* must be the verdict"),
     ],
 )
@@ -266,6 +266,23 @@ def test_results_of_another_task_are_not_mixed_in(tmp_path: Path, content: str, 
     done = CliRunner().invoke(cli, [*arguments, "--steps", "6"])
     assert done.exit_code == 1
     assert "results.jsonl" in done.stderr
+
+
+@pytest.mark.parametrize("end", [0, 9, -20, -1])
+def test_line_that_a_killed_check_cut_off_is_checked_again(end: int, tmp_path: Path):
+    first = checked_in_turn(tmp_path, "--steps", "5", "--xi", "0.5")
+    results = tmp_path / "results.jsonl"
+    whole = results.read_text()
+    task = json.loads(whole.splitlines()[0])
+    cut = whole[:end]
+    results.write_text(cut)
+    kept = Results(results, task)
+    assert results.read_text() == cut[: cut.rfind("\n") + 1]
+    for line in first:
+        verdict = promise_check.Verdict(**json.loads(line))
+        if kept.find((verdict.gait, verdict.shape, verdict.xi)) is None:
+            kept.add(verdict)
+    assert results.read_text() == whole
 
 
 def test_results_file_without_text_is_named_in_the_error(tmp_path: Path):

@@ -7,6 +7,7 @@ verdict. The file is flushed after each verdict.
 from __future__ import annotations
 
 import json
+import os
 from collections.abc import Mapping
 from dataclasses import asdict
 from pathlib import Path
@@ -24,6 +25,8 @@ class Results:
     def __init__(self, path: Path | None, task: Mapping[str, Any]) -> None:
         """Read the verdicts of an earlier run. A file that does not exist is created with the first verdict.
 
+        A last line without an end was cut off when an earlier run was killed. It is removed from the file.
+
         Args:
             path: JSON-lines file. If None, the verdicts are not stored.
             task: JSON values that determine a verdict, apart from gait, shape and assistance factor.
@@ -36,9 +39,13 @@ class Results:
         if path is None or not path.exists():
             return
         try:
-            head, *lines = path.read_text(encoding="utf-8").splitlines() or [""]
+            written, end, cut_off = path.read_text(encoding="utf-8").rpartition("\n")
         except UnicodeDecodeError as error:
             raise ValueError(f"{path} must be text in UTF-8, got other bytes: choose another file") from error
+        if not end and (json.dumps(self._task)).startswith(cut_off):  # killed within the first line
+            os.truncate(path, 0)
+            return
+        head, *lines = (written if end else cut_off).splitlines() or [""]
         if _decoded(path, 1, head) != self._task:
             raise ValueError(f"{path} must contain results of the task {json.dumps(self._task)}, got {head}")
         for number, line in enumerate(lines, 2):
@@ -46,6 +53,8 @@ class Results:
                 self._keep(Verdict(**_decoded(path, number, line)))
             except TypeError as error:
                 raise ValueError(f"line {number} of {path} must be the verdict of a guide, got {line}") from error
+        if end and cut_off:
+            os.truncate(path, path.stat().st_size - len(cut_off.encode()))
 
     def find(self, key: Key) -> Verdict | None:
         """Return the verdict of a guide; None if the file does not contain it.
@@ -64,7 +73,7 @@ class Results:
         self._keep(verdict)
         if self._path is None:
             return
-        new = not self._path.exists()
+        new = not self._path.exists() or not self._path.stat().st_size
         with self._path.open("a", encoding="utf-8") as file:
             if new:
                 file.write(json.dumps(self._task) + "\n")
