@@ -29,6 +29,13 @@ PATIENT = ("--mass", "75", "--height", "175")
         (["airwalk", "--seed", "-1"], "-1 is not in the range x>=0"),
         (["jog", "left_SK", "--to", "5", "--seed", "-1"], "-1 is not in the range x>=0"),
         (["emulator", "-i", "pcan", "-c", "x", "--seed", "-1"], "-1 is not in the range x>=0"),
+        (["doctor", "--for", "3"], "--for requires a measurement: add --bus"),
+        (["dbc", "c-code", "-o", "none", "--images", "9"], "--images requires a comparison: add --check"),
+        (["conform", "LEFT_SK", "--patience", "9"], "--patience requires a CAN bus"),
+        (
+            ["jog", "LEFT_SK", "--to", "5", "--engine", "mujoco", "-i", "socketcan", "-c", "x"],
+            "--engine requires the emulated robot",
+        ),
         (["gait", "check", "--seed", "-1"], "-1 is not in the range x>=0"),
         (["dbc", "c-code", "-o", "never", "--seed", "-1"], "-1 is not in the range x>=0"),
         (["demo", *PATIENT, "--step-length", "0"], "step length must be 0.05 to 0.4 m, got 0 m"),

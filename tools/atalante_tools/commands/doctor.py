@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Final
 
 import click
 
-from atalante_tools.console.options import EMBEDDED, Between, Target, json_option
+from atalante_tools.console.options import EMBEDDED, Between, Target, json_option, typed
 from atalante_tools.console.outcome import Failed
 from atalante_tools.console.stop_request import StopRequest, stop_requested
 from atalante_tools.console.terminal import show_json, table
@@ -87,7 +87,7 @@ class CheckResult:
     default=2.0,
     show_default=True,
     metavar="SECONDS",
-    help="Listening time of --bus [s].",
+    help="Listening time [s]. Requires --bus.",
 )
 @json_option
 def command(interface: str, channel: str, measure: bool, seconds: float, as_json: bool) -> None:
@@ -107,6 +107,8 @@ def command(interface: str, channel: str, measure: bool, seconds: float, as_json
     """
     if measure and (interface == EMBEDDED or not channel):
         raise click.UsageError("--bus requires an interface and a channel: add for example -i socketcan -c vcan0")
+    if typed("seconds") and not measure:
+        raise click.UsageError("--for requires a measurement: add --bus")
     from atalante_tools.commands.machine import ThisMachine
 
     checks = list(examine(ThisMachine(), interface, channels_of(interface, channel)))

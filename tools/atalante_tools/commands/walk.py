@@ -196,6 +196,7 @@ def command(
     """
     emulated = {"--push": push is not None, "--wearer passive": wearer == "passive", "--protocol": protocol is not None}
     emulated["--robot-process"] = bool(robot_process)
+    emulated |= {"--friction": typed("friction"), "--seed": typed("seed")}
     for option, given in emulated.items():
         if given and not target.embedded:
             raise click.UsageError(f"{option} requires the emulated robot of -i embedded")

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from atalante_tools.console.options import Between, Target, json_option, target_options
+from atalante_tools.console.options import Between, Target, json_option, target_options, typed
 from atalante_tools.console.outcome import FAILED
 from atalante_tools.console.stop_request import check_stop, ended_by
 from atalante_tools.console.terminal import print_message, show_json
@@ -41,7 +41,7 @@ if TYPE_CHECKING:
     default=30.0,
     show_default=True,
     metavar="S",
-    help="Longest wait for the effect of each manual action, in seconds.",
+    help="Longest wait for the effect of each manual action on a real node, in seconds.",
 )
 @json_option
 def command(
@@ -63,6 +63,8 @@ def command(
     Example: atalante conform LEFT_SK
              atalante conform LEFT_SK -i socketcan -c can0 --torque 1
     """
+    if target.embedded and typed("patience"):
+        raise click.UsageError("--patience requires a CAN bus, because no person acts on the emulated node: remove it")
     from datetime import datetime
 
     from atalante_tools.conform.examination import make_safe, requirements_of

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import click
 
-from atalante_tools.console.options import SEED, Between, json_option
+from atalante_tools.console.options import SEED, Between, json_option, typed
 from atalante_tools.console.outcome import FAILED, Failed
 from atalante_tools.console.terminal import print_message, show_json, table
 
@@ -131,7 +131,7 @@ def diff(old: Path, new: Path, as_json: bool) -> None:
     type=click.IntRange(min=1),
     default=10_000,
     show_default=True,
-    help="Number of comparisons by --check, each with one random payload of every message.",
+    help="Number of comparisons, each with one random payload of every message. Requires --check.",
 )
 @click.option("--seed", type=SEED, default=0, show_default=True, metavar="N", help="Seed of the random payloads.")
 @json_option
@@ -142,6 +142,8 @@ def c_code(
 
     The host test is a C program that compares the C code with the Python codec.
     """
+    if typed("images") and not check:
+        raise click.UsageError("--images requires a comparison: add --check")
     from atalante_tools.dbc.build import Build
     from atalante_tools.dbc.c_code import write
     from atalante_tools.dbc.host_test import compile_host_test, run_host_test
