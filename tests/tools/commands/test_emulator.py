@@ -117,8 +117,9 @@ def test_the_legs_are_adjusted_to_the_given_patient(
             ("--ground", "--engine", "mujoco", "--gait", str(DEFAULT_WALK)),
             f"walk -i pcan -c test --gait {DEFAULT_WALK}",
         ),
+        (("--ground", "--engine", "mujoco"), "walk -i pcan -c test"),
     ],
-    ids=["gait", "network", "ground"],
+    ids=["gait", "network", "ground", "ground, default patient"],
 )
 def test_the_legs_are_adjusted_to_the_patient_of_the_gait(
     arguments: tuple[str, ...], other_side: str, network: Network, robot: Robot, monkeypatch: pytest.MonkeyPatch

@@ -104,7 +104,8 @@ def command(
 
     --mass, --height, --thigh and --shank adjust the leg lengths to a patient. Without these options, --gait adjusts the leg
     lengths to the patient in the file. --network checks that the network covers the patient. Give the same values and files to
-    `atalante airwalk` or `atalante walk`. In the air, the exoskeleton is empty. On the ground, the patient wears the exoskeleton.
+    `atalante airwalk` or `atalante walk`. In the air, the exoskeleton is empty. On the ground, the patient wears the
+    exoskeleton: without a patient, the default patient of `atalante walk` (75 kg, 1.75 m).
 
     \b
     Example: atalante emulator -i socketcan -c vcan0
@@ -119,13 +120,14 @@ def command(
         )
     files.require_patient(patient)
     import atalante_dbc
-    from atalante_control.model import ExoskeletonParameters
+    from atalante_control.model import ExoskeletonParameters, Patient
     from atalante_emulator.mechanics import Ground, Mechanics
     from atalante_emulator.wearer import LimbParameters
     from atalante_hal.robot import load_robot
     from atalante_tools.session.body import describe, open_mechanics
     from atalante_tools.session.gait_source import patient_of_files
     from atalante_tools.session.rig import join, open_buses
+    from atalante_tools.session.walk_options import DEFAULT_PATIENT
 
     network, robot, exoskeleton = atalante_dbc.load(), load_robot(), ExoskeletonParameters()
     other_side = f"atalante {'airwalk' if friction is None else 'walk'} {target.arguments}"
@@ -133,6 +135,8 @@ def command(
         other_side += f" {patient_arguments(patient)}"
     other_side += files.arguments
     patient = patient_of_files(files, patient, robot)
+    if patient is None and friction is not None:
+        patient = Patient(*DEFAULT_PATIENT)
     if patient is not None:
         exoskeleton = exoskeleton.fitted(patient)
     ground = None if friction is None else Ground(friction, operator_force=operator_force)
