@@ -589,7 +589,7 @@ class TestTwoSenders:
         assert not bench.message_monitor.in_time(PENDANT)
         bench.cycle()
         assert bench.message_monitor.in_time(PENDANT)
-        bench.cycle(lose(PENDANT), times=9)
+        bench.cycle(lose(PENDANT), times=4)
         assert bench.message_monitor.in_time(PENDANT)
         bench.cycle(lose(PENDANT))
         assert not bench.message_monitor.in_time(PENDANT)

@@ -149,7 +149,7 @@ def test_end_of_the_program_during_a_start_enables_no_drive(rig, cycles):
 def test_pendant_loss_leads_to_hold_exactly_at_its_timeout(rig):
     rig.until(S.ACTIVE)
     rig.bus.to_hal = rig.drop(0x194)
-    assert rig.run(9).supervisor is S.ACTIVE
+    assert rig.run(4).supervisor is S.ACTIVE
     assert rig.cycle().supervisor is S.HOLD
 
 
