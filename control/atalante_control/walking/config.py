@@ -73,8 +73,9 @@ class WalkConfig:
     landing_timeout: float = 0.4
     load_bandwidth: float = 35.0  # Hz, cut-off frequency of the low-pass of the vertical foot forces
     observer_bandwidth: float = 2.0  # rad/s, natural frequency of the attitude observer
-    #: Whether the estimated heading follows the heading of the pelvis IMU. This requires an IMU with a heading reference, because
-    #: the heading of other IMUs drifts. Without a reference, the estimated heading is the integral of the gyro.
+    #: Whether the drift of the gyro is estimated from the heading of the pelvis IMU, see `walking.heading`. This requires an IMU
+    #: with a heading reference, because the heading of other IMUs drifts. If False, the estimated heading is the integral of the
+    #: gyro.
     heading_reference: bool = False
     loaded: float = 0.3  # smallest load with which a standing foot counts as loaded, as a fraction of the weight
     #: loads of a foot, as fractions of the weight. While the robot stands, a leg has the full stance gains at the first load.

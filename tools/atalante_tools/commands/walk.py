@@ -135,8 +135,8 @@ def _protocol(_ctx: click.Context, _param: click.Parameter, text: str | None) ->
 @click.option(
     "--heading-reference",
     is_flag=True,
-    help="Follow the heading of the pelvis IMU, which must have a reference, such as a magnetometer. The headings of the "
-    "emulated IMUs then do not drift.  [default: integral of the gyro]",
+    help="Estimate the drift of the gyro from the heading of the pelvis IMU, which must have a reference, such as a "
+    "magnetometer. The headings of the emulated IMUs then do not drift.  [default: integral of the gyro]",
 )
 @click.option("--seed", type=SEED, default=0, show_default=True, metavar="N", help="Seed of the emulated sensor noise.")
 @click.option(
@@ -194,9 +194,14 @@ def command(
              atalante walk --gait walk.json
              atalante walk --steps 10 --then 10 0.18 0.8
     """
-    emulated = {"--push": push is not None, "--wearer passive": wearer == "passive", "--protocol": protocol is not None}
-    emulated["--robot-process"] = bool(robot_process)
-    emulated |= {"--friction": typed("friction"), "--seed": typed("seed")}
+    emulated = {
+        "--push": push is not None,
+        "--wearer passive": wearer == "passive",
+        "--protocol": protocol is not None,
+        "--robot-process": bool(robot_process),
+        "--friction": typed("friction"),
+        "--seed": typed("seed"),
+    }
     for option, given in emulated.items():
         if given and not target.embedded:
             raise click.UsageError(f"{option} requires the emulated robot of -i embedded")

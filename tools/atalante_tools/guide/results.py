@@ -42,7 +42,7 @@ class Results:
             written, end, cut_off = path.read_text(encoding="utf-8").rpartition("\n")
         except UnicodeDecodeError as error:
             raise ValueError(f"{path} must be text in UTF-8, got other bytes: choose another file") from error
-        if not end and (json.dumps(self._task)).startswith(cut_off):  # killed within the first line
+        if not end and json.dumps(self._task).startswith(cut_off):  # killed within the first line
             os.truncate(path, 0)
             return
         head, *lines = (written if end else cut_off).splitlines() or [""]

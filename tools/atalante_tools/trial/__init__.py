@@ -226,7 +226,7 @@ def faults(ids: tuple[str, ...], running: Running, as_json: bool) -> None:
 @click.option(
     "--heading-reference",
     is_flag=True,
-    help="Give the IMUs a heading reference, such as a magnetometer. The controller then follows the heading of the pelvis IMU.",
+    help="Give the IMUs a heading reference, such as a magnetometer. The controller then estimates the drift of the gyro.",
 )
 @_walking()
 @_running("protocol")

@@ -91,7 +91,7 @@ def _moments(falls: Sequence[dict[str, Any]]) -> str:
 
 
 def _longest(result: Result) -> str:
-    """Return text: the fault duration up to which the robot falls at no moment, and the moment that limits this duration."""
+    """Return the longest fault duration without a fall at any moment, and the moment at which a longer fault ends in a fall."""
     limited = [
         (cycles, run["moment"])
         for cycles, run in zip(result["longest"], result["runs"], strict=True)

@@ -39,7 +39,7 @@ RECEIVED_HOLD: Final = 2
 #: If no new pendant frame arrives after a stop action, the HAL may still enable a drive for this number of cycles.
 SILENT_PENDANT: Final = LOST - 1
 #: Ages of late pendant frames [cycles]: all ages that the HAL accepts, and two ages that the HAL rejects.
-_LATE: Final = (*range(1, LOST + 1), 6, 16)
+_LATE: Final = (*range(1, LOST + 2), 16)
 _BUTTONS: Final = (Request.START, Request.STOP, Request.HOLD)
 #: Largest stored number of cycles since the stop action. Larger numbers are stored as this number.
 _LONG: Final = 6

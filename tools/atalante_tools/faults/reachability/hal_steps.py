@@ -29,8 +29,8 @@ from atalante_hal.wire.frame import Frames, new_frames
 from atalante_hal.wire.process_image import NEVER, TransmitImage
 from atalante_tools.faults.reachability.no_bus import NoBus
 
-#: Age at which pendant data times out [cycles]. The search does not distinguish higher ages.
-LOST: Final = 5
+#: Age at which pendant data times out [cycles of 1 ms]. The search does not distinguish higher ages.
+LOST: Final = atalante_dbc.load().message("PENDANT_STATE").timeout_ms
 #: Cycle number that each step uses. All counters are relative to this number, so its value does not affect the results.
 _CYCLE: Final = 1001
 _TAG: Final = _CYCLE & 0xFF
