@@ -60,6 +60,8 @@ class State:
     imu_rows: tuple[int, ...] = ()  # indices of the IMU messages in `valid` and `age`; empty if unknown
     foot_rows: tuple[int, ...] = ()  # indices of the foot messages in `valid` and `age`; empty if unknown
     torque_sent: Vector | None = None  # (12,) Nm, last torques after the limits, not sent in HOLD; None if unknown
+    #: Cycles by which torques act later than with punctual messages and motors, measured at START, see `safety.direction`
+    delay: int = 0
 
 
 @dataclass(slots=True)

@@ -20,7 +20,8 @@ the start.
 
 *Result.* The mobility of a joint is the inverse of its effective inertia: the least-squares fit of the position by
 the double integral of the sent torque and a polynomial of time. The joints of a test share the delay of their
-torques, so the delay is the one that explains their motions best, all together. Motions against the torque do not
+torques, so the delay is the one that explains their motions best, all together. The delay that explains all tests best
+is more exact, and a controller can use this delay (`State.delay`). Motions against the torque do not
 count: a foot that bounces off the floor may move as if its torque were late and reversed. A joint with a mobility of
 at least `MOBILITY` follows its torque. A mobility of at most -`MOBILITY` shows a wrong sign. A joint between these
 limits does not follow its torque. A disturbance may spoil a test, so a joint fails only after `TRIALS` tests. The
@@ -142,8 +143,8 @@ class DirectionProof:
         mobility: last measured mobility of each joint, shape (12,) [1/(kg m2)]; 0 if it was not measured.
         failed: indices in JOINTS of the joints that failed in this start.
         running: True from `begin` until all joints are tested, or one has failed.
-        late: number of cycles by which the effect of a torque came later than `LATENCY` in the last test of more than two
-            joints; 0 before the first test.
+        late: number of cycles by which the effect of a torque comes later than `LATENCY`: the delay that explains the tests of
+            more than two joints best, all together; 0 before the first test.
     """
 
     def __init__(self, robot: Robot) -> None:
@@ -163,9 +164,11 @@ class DirectionProof:
         #: Tests still to be done: joints of the test, and duration of its pulse [cycles].
         self._tests: list[tuple[list[int], int]] = []
         self._trials = [0] * len(JOINTS)
-        # A test of one or two joints uses the delay of an earlier test. With a free choice, a reversed motor may look like a late
-        # motor.
+        # A test of one or two joints uses the delay of the earlier tests. With a free choice, a reversed motor may look like a
+        # late motor.
         self.late = 0
+        #: Sum of the shares of motion that each delay in `LATENCIES` explains, over all joints that passed a test.
+        self._explained = np.zeros(len(LATENCIES))
         self._position: list[Vector] = []  # joint positions in each cycle of the current test
         self._force: list[Vector] = []  # vertical force of each foot in each cycle of the current test
         self._torque: list[Vector] = []  # sent torques in each cycle of the current test
@@ -184,6 +187,8 @@ class DirectionProof:
         theirs[:] = np.where(left | right, theirs, -ours)
         self._trials = [0] * len(JOINTS)
         self.failed = []
+        if not self.proven.any():
+            self._explained[:] = 0.0
         self._tests = [
             (joints, duration)
             for names, duration in GROUPS
@@ -250,9 +255,14 @@ class DirectionProof:
         if len(self._position) <= duration + LATENCY:
             return ""
         mobility, explained = mobilities_of(np.array(self._torque)[:, joints], np.array(self._position)[:, joints])
+        late = self.late
         if len(joints) > len(SIDES):
-            self.late = int(np.argmax(np.maximum(explained, 0.0).sum(axis=1)))
-        self.mobility[joints] = mobility[self.late]
+            explained = np.maximum(explained, 0.0)
+            late = int(np.argmax(explained.sum(axis=1)))
+            passed = mobility[late] >= self._least[joints]
+            self._explained += explained[:, passed].sum(axis=1)
+            self.late = int(np.argmax(self._explained))
+        self.mobility[joints] = mobility[late]
         return self._evaluate_test(joints, duration)
 
     def _evaluate_test(self, joints: Sequence[int], duration: int) -> str:
@@ -285,9 +295,11 @@ class DirectionProof:
         return supported
 
     def report(self) -> str:
-        """Return the result of the tests as one sentence, with the effective inertia of each joint."""
+        """Return the result of the tests as one sentence, with the effective inertia of each joint and the delay."""
         passed = ", ".join(f"{JOINTS[j]} {1.0 / self.mobility[j]:.2g}" for j in np.flatnonzero(self.proven).tolist())
         text = f"effective inertia [kg m2]: {passed}"
+        if self.late:
+            text += f"; the torques act {self.late} ms late"
         blocked = [JOINTS[j] for j in self._unproven()]
         return f"{text}; not tested under load: {', '.join(blocked)}" if blocked else text
 

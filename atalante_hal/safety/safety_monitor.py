@@ -425,6 +425,7 @@ class SafetyMonitor:
                     self._reports.append(finding)
                 return Refusal("START_FAILED", "error", failure)
             if not proof.running:
+                state.delay = proof.late
                 self.memory.events.append(Event(state.cycle, "DIRECTIONS_PROVEN", proof.report()))
         return None
 
