@@ -114,7 +114,7 @@ class Dtc(StrEnum):
     TORQUE_DIRECTION = "TORQUE_DIRECTION", _R.LOWER, _S.ERROR, "a joint moves against its torque, or does not follow it"
     TORQUE_TRACKING = "TORQUE_TRACKING", _R.LOWER, _S.ERROR, "a drive reports a torque that differs from its command"
     TORQUE_MOTION = "TORQUE_MOTION", _R.LOWER, _S.ERROR, "the motion of a joint contradicts the torque that was sent"
-    HOLD_UNSTABLE = "HOLD_UNSTABLE", _R.LOWER, _S.ERROR, "a joint oscillates although its drive holds its position"
+    HOLD_UNSTABLE = "HOLD_UNSTABLE", _R.LOWER, _S.ERROR, "a drive holds its position, but does not hold its joint"
     # Bus.
     BUS_FLOOD = "BUS_FLOOD", _R.HOLD, _S.ERROR, "more frames arrived than the HAL reads in a cycle"
     BUS_OFF = "BUS_OFF", _R.HOLD, _S.ERROR, "the CAN controller is bus-off"

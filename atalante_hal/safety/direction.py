@@ -20,8 +20,8 @@ the start.
 
 *Result.* The mobility of a joint is the inverse of its effective inertia: the least-squares fit of the position by
 the double integral of the sent torque and a polynomial of time. The joints of a test share the delay of their
-torques, so the delay is the one that explains their motions best, all together. The delay that explains all tests best
-is more exact, and a controller can use this delay (`State.delay`). Motions against the torque do not
+torques, so the delay is the one that explains their motions best, all together. The delay that explains both tests with
+short pulses best is more exact, and a controller can use this delay (`State.delay`). Motions against the torque do not
 count: a foot that bounces off the floor may move as if its torque were late and reversed. A joint with a mobility of
 at least `MOBILITY` follows its torque. A mobility of at most -`MOBILITY` shows a wrong sign. A joint between these
 limits does not follow its torque. A disturbance may spoil a test, so a joint fails only after `TRIALS` tests. The
@@ -47,6 +47,7 @@ from atalante_hal.types import PERIOD, Vector
 
 #: Joints of a leg that are tested at the same time, and duration of their pulse [cycles].
 GROUPS = ((("FH", "SH"), 32), (("TH", "SA"), 16), (("SK", "HA"), 16))
+_SHORT = min(duration for _, duration in GROUPS)
 #: Delay [cycles] from a torque command to the first position that shows its effect, if no frame and no motor is late.
 LATENCY = 2
 #: Delays that the test tries [cycles]. States, commands and motors may be late by three cycles in total.
@@ -143,8 +144,8 @@ class DirectionProof:
         mobility: last measured mobility of each joint, shape (12,) [1/(kg m2)]; 0 if it was not measured.
         failed: indices in JOINTS of the joints that failed in this start.
         running: True from `begin` until all joints are tested, or one has failed.
-        late: number of cycles by which the effect of a torque comes later than `LATENCY`: the delay that explains the tests of
-            more than two joints best, all together; 0 before the first test.
+        late: number of cycles by which the effect of a torque comes later than `LATENCY`: the delay that explains the tests with
+            short pulses and more than two joints best, all together; 0 before the first of these tests.
     """
 
     def __init__(self, robot: Robot) -> None:
@@ -259,9 +260,10 @@ class DirectionProof:
         if len(joints) > len(SIDES):
             explained = np.maximum(explained, 0.0)
             late = int(np.argmax(explained.sum(axis=1)))
-            passed = mobility[late] >= self._least[joints]
-            self._explained += explained[:, passed].sum(axis=1)
-            self.late = int(np.argmax(self._explained))
+            if duration == _SHORT:
+                passed = mobility[late] >= self._least[joints]
+                self._explained += explained[:, passed].sum(axis=1)
+                self.late = int(np.argmax(self._explained))
         self.mobility[joints] = mobility[late]
         return self._evaluate_test(joints, duration)
 
@@ -299,7 +301,7 @@ class DirectionProof:
         passed = ", ".join(f"{JOINTS[j]} {1.0 / self.mobility[j]:.2g}" for j in np.flatnonzero(self.proven).tolist())
         text = f"effective inertia [kg m2]: {passed}"
         if self.late:
-            text += f"; the torques act {self.late} ms late"
+            text += f"; torques {self.late} ms late"
         blocked = [JOINTS[j] for j in self._unproven()]
         return f"{text}; not tested under load: {', '.join(blocked)}" if blocked else text
 

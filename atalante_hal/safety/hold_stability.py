@@ -1,13 +1,21 @@
-"""Check that no joint oscillates while its drive holds its position: `velocity, drive state -> findings`.
+"""Check that each drive that holds its position really holds its joint: `position, velocity, torque, drive state -> findings`.
 
-A drive that holds its position controls the joint by itself, and the HAL does not limit its torque. The joint oscillates if
-the position control of the drive does not suit the joint. Causes are a wrong parameter, a loose gear, or a late motor.
-A joint counts as oscillating if its velocity reverses `REVERSALS` times in a row. A joint that is stopped in motion, pushed or
-carried reverses less often.
+A drive that holds its position controls the joint by itself, and the HAL does not limit its torque. The HAL can only switch off a
+drive that moves the joint, or presses the joint onto an end stop. Two motions show that the drive does not hold the joint:
+
+*Oscillation.* The position control of the drive does not suit the joint. Causes are a wrong parameter, a loose gear, or a late
+motor. A joint counts as oscillating if its velocity reverses `REVERSALS` times in a row. A joint that is stopped in motion,
+pushed or carried reverses less often.
+
+*Overload.* For `OVERLOADED` cycles, a joint is at least `AWAY` from the position in which the hold began, and the drive reports
+about its torque limit (`SATURATED`), but the joint neither moves back nor slows down. Causes are
+a motor that turns in the wrong direction, a motor without torque, exchanged encoders, and a load that exceeds the torque limit.
+When a drive stops a moving joint, its torque may reach the limit for a longer time, but the joint slows down.
 """
 
 from __future__ import annotations
 
+import math
 from typing import Final, NamedTuple
 
 import numpy as np
@@ -25,6 +33,29 @@ SPEED: Final = 0.5
 INTERVAL: Final = 100
 #: A joint is regarded as oscillating after this number of consecutive reversals.
 REVERSALS: Final = 6
+#: Smallest and largest torque that an overloaded drive reports, as shares of its torque limit. A drive that reports a larger
+#: torque reports a wrong torque.
+SATURATED: Final = (0.9, 1.05)
+#: Number of consecutive cycles after which a drive is regarded as overloaded.
+OVERLOADED: Final = 20
+#: Smallest distance from the position in which the hold began [rad]. A drive that only reports a wrong torque still holds its
+#: joint in this position.
+AWAY: Final = math.radians(1.0)
+#: Decrease of the speed that shows that a joint slows down, and smallest speed back that shows that a joint moves back [rad/s].
+#: The noise of the velocities is smaller.
+SLOWER: Final = 0.05
+#: Largest age of the values of a joint with which an overload counts [cycles].
+AGE: Final = 4
+
+
+class Measured(NamedTuple):
+    """Measurements of one cycle, shape (12,) each."""
+
+    position: Vector  # rad
+    velocity: Vector  # rad/s
+    torque: Vector  # torques that the drives report [Nm]
+    drive_state: Vector  # states of the drives
+    age: npt.NDArray[np.int64]  # age of these values [cycles]
 
 
 class Swings(NamedTuple):
@@ -33,6 +64,15 @@ class Swings(NamedTuple):
     direction: npt.NDArray[np.int64]  # sign of the last velocity above `SPEED`; 0 if there is none
     age: npt.NDArray[np.int64]  # number of cycles since the joint first exceeded `SPEED` in its current direction
     reversals: npt.NDArray[np.int64]  # number of consecutive reversals
+
+
+class Loads(NamedTuple):
+    """Record of the overload of all joints, shape (12,) each."""
+
+    held: npt.NDArray[np.bool_]  # whether the drive holds its position
+    start: Vector  # position in which the hold began [rad]
+    speed: Vector  # speed away from `start` when the current count began [rad/s]
+    cycles: npt.NDArray[np.int64]  # number of consecutive cycles with overload
 
 
 def _follow(velocity: Vector, drive_state: Vector, swings: Swings, driven: tuple[float, float]) -> bool:
@@ -57,37 +97,87 @@ def _follow(velocity: Vector, drive_state: Vector, swings: Swings, driven: tuple
     return bool(oscillates)
 
 
+def _watch_load(joints: Measured, limit: Vector, holding: float, loads: Loads) -> bool:
+    """Update the overload of all joints by one cycle, and return whether a drive is overloaded.
+
+    Args:
+        joints: measurements of the cycle.
+        limit: torque limits of the drives, shape (12,) [Nm].
+        holding: state in which a drive holds its position.
+        loads: record to update.
+    """
+    overloaded = False
+    for i in range(len(limit)):
+        if joints.drive_state[i] != holding:
+            loads.held[i], loads.cycles[i] = False, 0
+            continue
+        if joints.age[i] > AGE:
+            continue
+        if not loads.held[i]:
+            loads.held[i], loads.start[i] = True, joints.position[i]
+        direction = 1.0 if joints.position[i] > loads.start[i] else -1.0
+        away, speed = direction * (joints.position[i] - loads.start[i]), direction * joints.velocity[i]
+        saturated = SATURATED[0] * limit[i] <= abs(joints.torque[i]) <= SATURATED[1] * limit[i]
+        if away < AWAY or not saturated or speed < -SLOWER:
+            loads.cycles[i] = 0
+        elif loads.cycles[i] == 0 or speed < loads.speed[i] - SLOWER:
+            loads.cycles[i], loads.speed[i] = 1, speed
+        else:
+            loads.cycles[i] += 1
+        overloaded |= loads.cycles[i] >= OVERLOADED
+    return bool(overloaded)
+
+
 class HoldStability:
     """Check of all joints while the HAL sends no torques of the controller."""
 
     def __init__(self) -> None:
-        """Create the check, and compile its kernel."""
-        self._swings = Swings(*np.zeros((3, len(JOINTS)), np.int64))
+        """Create the check, and compile its kernels."""
+        count = len(JOINTS)
+        self._swings = Swings(*np.zeros((3, count), np.int64))
+        zero = np.zeros(count)
+        self._loads = Loads(np.zeros(count, np.bool_), zero.copy(), zero.copy(), np.zeros(count, np.int64))
         self._driven = (float(DriveState.QUICK_STOP_ACTIVE), float(DriveState.OPERATION_ENABLED))
-        zero = np.zeros(len(JOINTS))
+        joints = Measured(zero, zero, zero, zero, np.zeros(count, np.int64))
         self._follow = specialised(_follow, zero, zero, self._swings, self._driven)
+        self._watch_load = specialised(_watch_load, joints, zero, self._driven[0], self._loads)
         self.restart()
 
     def restart(self) -> None:
-        """Discard all counted reversals, because the controller moved the joints until now."""
-        for record in self._swings:
+        """Discard all records, because the controller moved the joints until now."""
+        for record in (*self._swings, *self._loads):
             record[:] = 0
 
-    def check(self, velocity: Vector, drive_state: Vector) -> tuple[Finding, ...]:
-        """Check the velocities of one cycle, and return one finding for each joint that oscillates.
+    def check(self, joints: Measured, limit: Vector) -> tuple[Finding, ...]:
+        """Check one cycle, and return one finding for each joint that its drive does not hold.
 
         Args:
-            velocity: joint velocities, shape (12,) [rad/s].
-            drive_state: states of the drives, shape (12,).
+            joints: measurements of the cycle.
+            limit: torque limits of the drives, shape (12,) [Nm].
         """
-        if not self._follow(velocity, drive_state, self._swings, self._driven):
+        oscillates = self._follow(joints.velocity, joints.drive_state, self._swings, self._driven)
+        overloaded = self._watch_load(joints, limit, self._driven[0], self._loads)
+        if not (oscillates or overloaded):
             return ()
+        reversals, cycles = self._swings.reversals.tolist(), self._loads.cycles.tolist()
+        fast = f"faster than {np.degrees(SPEED):.0f} deg/s"
+        found = [
+            (joint, count, f"oscillates although its drive holds it: {count} reversals in a row {fast}")
+            for joint, count in enumerate(reversals)
+            if count >= REVERSALS
+        ]
+        found += [
+            (joint, count, f"does not move back although its drive holds it with {abs(joints.torque[joint]):.0f} Nm")
+            for joint, count in enumerate(cycles)
+            if count >= OVERLOADED and reversals[joint] < REVERSALS
+        ]
         return tuple(
             Finding(
-                Dtc.HOLD_UNSTABLE, JOINTS[joint].upper(), float(count), True,
-                f"{JOINTS[joint]} oscillates although its drive holds it: {count} reversals in a row faster than "
-                f"{np.degrees(SPEED):.0f} deg/s; its drive is switched off",
+                Dtc.HOLD_UNSTABLE,
+                JOINTS[joint].upper(),
+                float(count),
+                True,
+                f"{JOINTS[joint]} {motion}; its drive is switched off",
             )
-            for joint, count in enumerate(self._swings.reversals.tolist())
-            if count >= REVERSALS
-        )  # fmt: skip
+            for joint, count, motion in found
+        )

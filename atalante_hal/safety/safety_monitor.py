@@ -23,7 +23,7 @@ from atalante_hal.safety.direction import DirectionProof
 from atalante_hal.safety.events import Event
 from atalante_hal.safety.fault_memory import FaultMemory
 from atalante_hal.safety.heartbeats import Heartbeats
-from atalante_hal.safety.hold_stability import HoldStability
+from atalante_hal.safety.hold_stability import HoldStability, Measured
 from atalante_hal.safety.limiter import Limiter
 from atalante_hal.safety.message_monitor import GROUND_TOLERANCE, NO_TOLERANCE, MessageMonitor, Tolerance
 from atalante_hal.safety.plausibility import Plausibility
@@ -125,9 +125,15 @@ class SafetyMonitor:
         self._states_at_start = b""  # during a start: drive states in the previous cycle
         self.lowered: set[str] = set()
         self._hold_stability = HoldStability()
+        self._held = Measured(
+            state.position, state.velocity, state.torque, state.drive_state, np.zeros(len(JOINTS), np.int64)
+        )
+        self._joint_rows = np.array(rows_of(image.codec, JOINT_MESSAGES))
         self.torque_tracking = TorqueTracking(robot.breakaway)
         self.torque_motion: TorqueMotion | None = None
-        self._oscillating: set[str] = set()  # DBC names of the drives whose joints oscillated since the last START
+        self._not_holding: set[str] = (
+            set()
+        )  # DBC names of the drives that did not hold their joints since the last START
         #: True if `evaluate` may skip a cycle with new data, without a fault, and with unchanged pendant and drive values.
         self._steady = False
         self._reports: list[Finding] = []  # faults that loop and controller reported since the last `evaluate`
@@ -148,8 +154,7 @@ class SafetyMonitor:
         Args:
             legs: model of the legs with the patient.
         """
-        rows = np.array(rows_of(self._image.codec, JOINT_MESSAGES))
-        self.torque_motion = TorqueMotion(self._robot, legs, self._state, self._limiter.last, rows)
+        self.torque_motion = TorqueMotion(self._robot, legs, self._state, self._limiter.last, self._joint_rows)
 
     def evaluate(self, bus_faults: Sequence[Finding] = ()) -> Verdict | None:
         """Evaluate this cycle, unless all inputs are unchanged. Call this method after the plausibility checks.
@@ -177,20 +182,22 @@ class SafetyMonitor:
         return Verdict(state.supervisor, state.assistance_factor, limit, diagnostics, self._acknowledged)
 
     def _check_joints(self) -> tuple[Finding, ...]:
-        """Check the drive torques if the robot moves. Check the joints for oscillations if it does not. Return the faults.
+        """Check the drive torques if the robot moves. Check the held joints if it does not. Return the faults.
 
-        The next START repeats the direction test of a drive with a wrong torque. The drive of an oscillating joint is stored.
+        The next START repeats the direction test of a drive with a wrong torque, and of a drive that does not hold its joint. A
+        drive that does not hold its joint stays off until then.
         """
         state = self._state
         if self.moving:
             found = self.torque_tracking.check(self._limiter.last, self._limiter.limit, state.torque)
             if self.torque_motion is not None:
                 found += self.torque_motion.check(self.proof.late)
-            for finding in found:  # the next START tests the direction of this joint again
-                self.proof.forget(DRIVE_NODES.index(finding.node))
-            return found
-        found = self._hold_stability.check(state.velocity, state.drive_state)
-        self._oscillating.update(finding.node for finding in found)
+        else:
+            self._held.age[:] = state.age[self._joint_rows]
+            found = self._hold_stability.check(self._held, self._limiter.limit)
+            self._not_holding.update(finding.node for finding in found)
+        for finding in found:
+            self.proof.forget(DRIVE_NODES.index(finding.node))
         return found
 
     def accept(self, frames: Frames) -> list[int]:
@@ -382,8 +389,9 @@ class SafetyMonitor:
             self._acknowledged = True
             if not self.proof.running:  # another press of START does not restart a running direction test
                 self._proof_begun = False
-                self.proof.failed.clear()
-                self._oscillating.clear()
+                if state.supervisor in (_S.READY, _S.HOLD):  # in LOWER and FAULT, START does not enable any drive
+                    self.proof.failed.clear()
+                    self._not_holding.clear()
             self.start_wanted = ENABLE_CYCLES if state.supervisor in _STARTABLE else 0
         elif self.start_wanted:
             self.start_wanted -= 1
@@ -511,10 +519,10 @@ class SafetyMonitor:
         """Update the set `lowered`: in LOWER and FAULT, add each drive with a confirmed diagnostic whose reaction is LOWER.
 
         In all other states, `lowered` contains the drives of two kinds of joints: joints that failed in the last test of the
-        directions, and joints that oscillated since the last START.
+        directions, and joints that their drives did not hold since the last START.
         """
         if self._state.supervisor in (_S.LOWER, _S.FAULT):
             lower = frozenset(dtc for dtc in self.memory.confirmed if dtc.reaction is Reaction.LOWER)
             self.lowered.update(node for node in self.memory.nodes_of(lower) if node in DRIVE_NODES)
         else:
-            self.lowered = {DRIVE_NODES[joint] for joint in self.proof.failed} | self._oscillating
+            self.lowered = {DRIVE_NODES[joint] for joint in self.proof.failed} | self._not_holding

@@ -9,7 +9,7 @@ import pytest
 import atalante_dbc
 from atalante_dbc import Network
 from atalante_hal.robot import JOINTS, Robot
-from atalante_hal.wire.cia402 import Controlword
+from atalante_hal.wire.cia402 import Controlword, DriveState
 from atalante_hal.wire.frame import Frames
 from atalante_hal.wire.process_image import TransmitImage
 from atalante_tools.faults.command_check import Commands, SentFrames
@@ -107,6 +107,18 @@ def test_torque_step_is_bounded_by_the_rate_limit_of_the_joint(hal: Hal, robot: 
         f"a torque change above the joint's rate limit was sent to {side}_{JOINTS[0].split('_')[1]} in cycle 3"
         for side in ("left", "right")
     ]
+
+
+@pytest.mark.parametrize(("states", "found"), [("77", 0), ("47", 0), ("74", 0), ("44", 1)])
+def test_torque_step_counts_only_for_a_drive_that_is_enabled(hal: Hal, robot: Robot, states: str, found: int) -> None:
+    """A digit is the state of the drive in a cycle: 4 is OPERATION ENABLED, 7 is QUICK STOP ACTIVE."""
+    names = {"4": DriveState.OPERATION_ENABLED, "7": DriveState.QUICK_STOP_ACTIVE}
+    drive_state = np.full((2, len(JOINTS)), float(DriveState.OPERATION_ENABLED))
+    drive_state[:, KNEE] = [names[state] for state in states]
+    hal.send(1)
+    hal.torque[KNEE] = 100.0
+    hal.send(2)
+    assert len(hal.commands().violations(robot, drive_state)) == found
 
 
 def test_torque_step_over_missing_frames_is_no_violation(hal: Hal, robot: Robot) -> None:

@@ -73,8 +73,13 @@ def test_pair_of_faults_runs_both() -> None:
     assert (verdict.state, verdict.failures) == ("HOLD", ())
 
 
-def patched(monkeypatch: pytest.MonkeyPatch, change: Callable[[Observation], None]) -> MomentVerdict:
-    """Run a case without effect, change its observation, and return the verdict."""
+NO_EFFECT = MomentTask(Moment.READY, (index("F24", "1 frames"),))
+
+
+def patched(
+    monkeypatch: pytest.MonkeyPatch, change: Callable[[Observation], None], task: MomentTask = NO_EFFECT
+) -> MomentVerdict:
+    """Run a task, by default with a case without effect, change its observation, and return the verdict."""
     observe = moments._observe
 
     def changed(case: Case, plan: moments.Schedule) -> Observation:
@@ -83,7 +88,7 @@ def patched(monkeypatch: pytest.MonkeyPatch, change: Callable[[Observation], Non
         return run
 
     monkeypatch.setattr(moments, "_observe", changed)
-    return MomentTask(Moment.READY, (index("F24", "1 frames"),))()
+    return task()
 
 
 def test_sag_during_the_start_fails(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -103,6 +108,30 @@ def test_fast_joint_fails(monkeypatch: pytest.MonkeyPatch) -> None:
     assert verdict.failures == ("a joint was above its velocity limit: left_SK in cycle 101",)
     assert verdict.extremes is not None
     assert verdict.extremes.speed == (pytest.approx(1.25), "left_SK")
+
+
+@pytest.mark.parametrize(("cycle", "failures"), [(0, 0), (moments.FOUND - 1, 0), (-1, 1), (moments.FOUND, 1)])
+def test_a_wrong_motor_may_move_a_joint_fast_until_it_is_found(
+    monkeypatch: pytest.MonkeyPatch, cycle: int, failures: int
+) -> None:
+    case = index("F84", "LEFT_SH in HOLD with 0 times its torque")
+    begins = moments.schedule(Moment.HOLD, ENGINE).begins + SCENARIOS["F84"].cases[case[1]].stimuli[1].start
+
+    def fast(run: Observation) -> None:
+        run.velocity[begins + cycle - 1, 3] = 1.25 * run.robot.velocity_max[3]
+
+    assert len(patched(monkeypatch, fast, MomentTask(Moment.HOLD, (case,))).failures) == failures
+
+
+@pytest.mark.parametrize(("moved", "failures"), [(4.0, 0), (6.0, 1)])
+def test_a_wrong_motor_may_move_a_joint_during_a_start(
+    monkeypatch: pytest.MonkeyPatch, moved: float, failures: int
+) -> None:
+    def sag(run: Observation) -> None:
+        run.position[schedule(Moment.READY, ENGINE).starts[0] + 3, 4] += np.radians(moved)
+
+    task = MomentTask(Moment.READY, (index("F72", "LEFT_SK dead"),))
+    assert len(patched(monkeypatch, sag, task).failures) == failures
 
 
 def test_enabling_before_start_fails(monkeypatch: pytest.MonkeyPatch) -> None:

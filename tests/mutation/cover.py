@@ -27,26 +27,28 @@ def main() -> int:
         path for files, _ in CORE.values() for file in files for root in ROOTS if (path := ROOT / root / file).exists()
     ]
     tests = sorted({f"tests/{test}" for _, tests in CORE.values() for test in tests})
-    include = ",".join(map(str, files))
-    coverage = [sys.executable, "-m", "coverage"]
     with tempfile.TemporaryDirectory() as folder:
+        config = Path(folder) / "coveragerc"
+        config.write_text("[run]\nbranch = true\ninclude =\n" + "".join(f"    {file}\n" for file in files))
         environment = {**os.environ, "COVERAGE_FILE": str(Path(folder) / "coverage"), "PYTHONPATH": str(HERE)}
-        run = [
-            "run",
-            "--branch",
-            f"--include={include}",
+        command = [
+            sys.executable,
             "-m",
             "pytest",
+            "--numprocesses=logical",
+            "--dist=worksteal",
             "-p",
             "interpret_core",
+            "--cov",
+            f"--cov-config={config}",
+            "--cov-report=term-missing:skip-covered",
+            "--cov-fail-under=100",
             "--hypothesis-profile=coverage",
             "-m",
             "not exhaustive",
             *tests,
         ]
-        subprocess.run([*coverage, *run], cwd=ROOT, env=environment, check=True)
-        report = ["report", "--show-missing", "--skip-covered", "--fail-under=100"]
-        return subprocess.run([*coverage, *report], cwd=ROOT, env=environment, check=False).returncode
+        return subprocess.run(command, cwd=ROOT, env=environment, check=False).returncode
 
 
 if __name__ == "__main__":

@@ -5,6 +5,8 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, field, replace
 
+import numpy as np
+
 from atalante_control.gait.gait import PERIOD
 from atalante_control.guide.config import StepGuideConfig
 from atalante_control.guide.disturbance import HandOver
@@ -12,6 +14,8 @@ from atalante_control.joint.pid import PidGains
 from atalante_control.walking.contact import ImpactConfig
 from atalante_control.walking.lean import LeanConfig
 from atalante_control.walking.placement import PlacementConfig
+from atalante_hal.robot import JOINTS
+from atalante_hal.types import Vector
 
 Pair = tuple[float, float]
 
@@ -109,6 +113,21 @@ class WalkConfig:
         parameters of `WalkConfig` apply, because the paper does not define these phases.
         """
         return cls(literal_law=True, gains=PidGains(), steering=(0.0, 0.0, 0.0))
+
+    def leg_gains(self, delay: int = 0) -> Vector:
+        """Return the gains of a swing leg and of a stance leg: Kp [Nm/rad], Kd [Nm s/rad], Ki times the cycle time [Nm/rad].
+
+        Args:
+            delay: further delay of the control loop, `State.delay` [cycles].
+
+        Returns:
+            Gains of both legs in each of the two roles, shape (2, 3, 12).
+        """
+        roles = self.gains.swing, self.gains.stance
+        gains = np.array([[2 * g.kp, 2 * g.kd, np.array(2 * g.ki) * PERIOD] for g in roles])
+        sagittal = [joint.endswith(("SH", "SK", "SA")) for joint in JOINTS]
+        gains[1, 1, sagittal] *= 1.0 - self.damping_loss * delay
+        return gains
 
     def __post_init__(self) -> None:
         for name in ("reach_time", "landing_timeout", "settle", "posture", "shift", "rest", "engage", "release"):

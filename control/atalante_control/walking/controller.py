@@ -55,7 +55,7 @@ from atalante_hal.robot import CELLS, FEET, IMUS, JOINTS, LEG_JOINTS, Robot
 from atalante_hal.types import Command, State, SupervisorState, Vector
 
 _N, _LEG = len(JOINTS), len(LEG_JOINTS)
-_SH, _SK, _SA = (LEG_JOINTS.index(name) for name in ("SH", "SK", "SA"))
+_SH, _SK = LEG_JOINTS.index("SH"), LEG_JOINTS.index("SK")
 _PELVIS, _TORSO = IMUS.index("pelvis"), IMUS.index("torso")
 #: Foot placement requests only joint angles that are at least this far inside the position limits [rad].
 _MARGIN = math.radians(1.0)
@@ -123,7 +123,7 @@ class WalkController:
             keep=math.exp(-2.0 * math.pi * config.load_bandwidth * PERIOD),
             standing_gains=config.full_gains[0] * weight,
             walking_gains=config.full_gains[1] * weight,
-            gains=_gains(config, delay=0),
+            gains=config.leg_gains(),
             placement=config.placement,
             lean=config.lean,
         )
@@ -289,7 +289,7 @@ class WalkController:
             state: measured state of the robot.
         """
         self._forget(state.cycle)
-        self._constants.gains[:] = _gains(self.config, state.delay)
+        self._constants.gains[:] = self.config.leg_gains(state.delay)
         self._observer.reset(state.imu_quaternion[_PELVIS].tolist())
         self._bind(state)
         self._measure(state)
@@ -465,20 +465,6 @@ class WalkController:
             self.statistics.guide.count(cycle, ratio, h, gate > guide.active)
             self._outside = self._outside + 1 if command.outside else max(0, self._outside - 1)
         command.guide_left = self._promised and self._outside > guide.outside_cycles
-
-
-def _gains(config: WalkConfig, delay: int) -> Vector:
-    """Return the gains of a swing leg and of a stance leg: Kp, Kd and Ki times the cycle time, shape (2, 3, 12).
-
-    Args:
-        config: gains, and their dependence on the delay.
-        delay: further delay of the control loop, `State.delay` [cycles].
-    """
-    swing, stance = config.gains.swing, config.gains.stance
-    gains = np.array([[2 * g.kp, 2 * g.kd, np.array(2 * g.ki) * PERIOD] for g in (swing, stance)])
-    sagittal = [side * _LEG + joint for side in (LEFT, RIGHT) for joint in (_SH, _SK, _SA)]
-    gains[1, 1, sagittal] *= 1.0 - config.damping_loss * delay
-    return gains
 
 
 def _ratio(error: float, bound: float) -> float:

@@ -6,6 +6,7 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass
 
+import numpy as np
 import pytest
 
 from atalante_control.model import ExoskeletonParameters, urdf
@@ -38,6 +39,42 @@ def test_patient_walks_from_standing_to_standing(engine: str) -> None:
     assert controller.steering.distance == pytest.approx(4 * 0.16, abs=0.12)
     assert abs(controller.steering.lateral) < 0.05
     assert controller.max_dcm_error < 0.03
+
+
+@pytest.mark.parametrize("delay", [0, 3])
+def test_delay_of_the_loop_lowers_the_damping_of_a_loaded_leg(delay: int) -> None:
+    controller = WalkController(ROBOT, PATIENT, WALK, 3)
+    body = make_body("mujoco", urdf(ExoskeletonParameters(), ROBOT, PATIENT), free=True, ground=0.0)
+    try:
+        hang(body, controller.standing_pose.tolist(), 0.03)
+        robot = Ideal(body)
+        robot.cycle(controller)
+    finally:
+        body.close()
+    state, torques = robot.state, []
+    state.foot_force[:, :, 2] = 200.0
+    state.velocity[:] = 0.0
+    state.delay = delay
+    for velocity in (0.0, 0.1):
+        controller.reset(state)
+        for _ in range(100):  # the filtered loads of the feet reach their final values
+            controller.update(state)
+        state.velocity[:] = velocity
+        torques.append(controller.update(state).torque.copy())
+        state.velocity[:] = 0.0
+    kd, damping = WalkConfig().gains.stance.kd, (torques[0] - torques[1]) / 0.1
+    for hip, knee in ((2, 3), (8, 9)):  # the stabiliser adds torques to the ankles
+        assert damping[hip] == pytest.approx(kd[2] * (0.75 if delay else 1.0), rel=0.02)
+        assert damping[knee] == pytest.approx(kd[3] * (0.75 if delay else 1.0), rel=0.02)
+
+
+def test_delay_lowers_only_the_damping_of_the_sagittal_joints_of_a_stance_leg() -> None:
+    now, late = WalkConfig().leg_gains(), WalkConfig(damping_loss=0.1).leg_gains(2)
+    changed = late != now
+    assert late[changed] == pytest.approx(0.8 * now[changed])
+    assert [tuple(index) for index in np.argwhere(changed).tolist()] == [(1, 1, j) for j in (2, 3, 4, 8, 9, 10)]
+    with pytest.raises(ValueError, match=r"damping_loss must be from 0 to 0\.25 per cycle, got 0\.3"):
+        WalkConfig(damping_loss=0.3)
 
 
 @pytest.mark.parametrize(

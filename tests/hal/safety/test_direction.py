@@ -139,6 +139,26 @@ def test_joints_pass_although_their_torque_acts_late(joints: Joints, late: int):
     assert joints.run() == ("", ONCE)
     assert joints.proof.late == late
     assert joints.proof.mobility == pytest.approx(1.0 / INERTIA, rel=0.2)
+    assert joints.proof.report().endswith(f"; torques {late} ms late")
+
+
+def test_delay_is_measured_again_after_all_drives_restarted(joints: Joints):
+    joints.delay(3)
+    joints.run()
+    joints.proof.proven[:] = np.arange(12) != 0  # one drive restarted: its test alone does not measure the delay
+    joints.delay(0)
+    joints.run()
+    assert joints.proof.late == 3
+    joints.proof.proven[:] = False
+    joints.run()
+    assert joints.proof.late == 0
+
+
+def test_joints_that_fail_do_not_change_the_delay(joints: Joints):
+    joints.delay(2)
+    joints.strength[[4, 10]] = 1e-3
+    joints.run()
+    assert joints.proof.late == 2
 
 
 @pytest.mark.parametrize("late", range(1, len(LATENCIES)))

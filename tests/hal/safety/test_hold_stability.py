@@ -1,17 +1,39 @@
-"""Oscillation of a joint that its drive holds: number, speed and interval of the reversals, and the state of the drive."""
+"""Joints that their drives do not hold: oscillations and overload, their limits, and the state of the drive."""
 
 from __future__ import annotations
 
 import numpy as np
 import pytest
 
-from atalante_hal.robot import JOINTS
+from atalante_hal.robot import JOINTS, load_robot
 from atalante_hal.safety.diagnostics import Dtc, Finding
-from atalante_hal.safety.hold_stability import INTERVAL, REVERSALS, SPEED, HoldStability, _follow
+from atalante_hal.safety.hold_stability import (
+    AGE,
+    AWAY,
+    INTERVAL,
+    OVERLOADED,
+    REVERSALS,
+    SATURATED,
+    SLOWER,
+    SPEED,
+    HoldStability,
+    Measured,
+    _follow,
+    _watch_load,
+)
 from atalante_hal.wire.cia402 import DriveState
 
 KNEE = JOINTS.index("left_SK")
 ABOVE = np.nextafter(SPEED, 1.0)
+LIMIT = load_robot().torque_max
+#: Distance and torque of an overloaded knee.
+FAR, FULL = 1.01 * AWAY, -LIMIT[KNEE]
+
+
+def measured(state: DriveState = DriveState.QUICK_STOP_ACTIVE) -> Measured:
+    """Return the measurements of a robot at rest whose drives are all in one state."""
+    position, velocity, torque = np.zeros((3, len(JOINTS)))
+    return Measured(position, velocity, torque, np.full(len(JOINTS), float(state)), np.zeros(len(JOINTS), np.int64))
 
 
 def oscillate(
@@ -24,12 +46,11 @@ def oscillate(
     state: DriveState = DriveState.QUICK_STOP_ACTIVE,
 ) -> tuple[Finding, ...]:
     """Return the findings after a motion with a number of reversals, which begins forwards."""
-    velocity, states = np.zeros(len(JOINTS)), np.full(len(JOINTS), float(state))
-    found: tuple[Finding, ...] = ()
+    joints, found = measured(state), tuple[Finding, ...]()
     for swing in range(reversals + 1):
-        velocity[joint] = speed * (-1) ** swing
+        joints.velocity[joint] = speed * (-1) ** swing
         for _ in range(interval if swing < reversals else 1):
-            found = check.check(velocity, states)
+            found = check.check(joints, LIMIT)
     return found
 
 
@@ -67,31 +88,27 @@ def test_only_fast_reversals_of_a_driven_joint_count(
 
 
 def test_slow_samples_between_two_swings_do_not_count() -> None:
-    check, states = HoldStability(), np.full(len(JOINTS), float(DriveState.QUICK_STOP_ACTIVE))
-    velocity = np.zeros(len(JOINTS))
-    counted = []
+    check, joints, counted = HoldStability(), measured(), []
     for value in [1.0, 0.0, -0.4, 0.4, 1.0, -1.0] * REVERSALS:
-        velocity[KNEE] = value
-        counted.append(bool(check.check(velocity, states)))
+        joints.velocity[KNEE] = value
+        counted.append(bool(check.check(joints, LIMIT)))
     # one reversal in the first six samples, then two in each six
     assert counted.index(True) == 6 * (REVERSALS // 2)
 
 
 @pytest.mark.parametrize("speeds", [(SPEED, -ABOVE), (ABOVE, -SPEED)])
 def test_both_directions_must_exceed_the_speed(speeds: tuple[float, float]) -> None:
-    check, states = HoldStability(), np.full(len(JOINTS), float(DriveState.QUICK_STOP_ACTIVE))
-    velocity = np.zeros(len(JOINTS))
+    check, joints = HoldStability(), measured()
     for value in speeds * REVERSALS:
-        velocity[KNEE] = value
-        assert check.check(velocity, states) == ()
+        joints.velocity[KNEE] = value
+        assert check.check(joints, LIMIT) == ()
 
 
 def test_pause_ends_the_series() -> None:
     check = HoldStability()
     oscillate(check, REVERSALS - 1)
-    rest, states = np.zeros(len(JOINTS)), np.full(len(JOINTS), float(DriveState.QUICK_STOP_ACTIVE))
     for _ in range(INTERVAL + 1):
-        assert check.check(rest, states) == ()
+        assert check.check(measured(), LIMIT) == ()
     assert oscillate(check, REVERSALS - 1) == ()
     assert oscillate(check, 1)
 
@@ -111,6 +128,135 @@ def test_restart_forgets_the_motion() -> None:
     assert oscillate(check, REVERSALS - 1) == ()
 
 
-def test_kernel_reports_no_oscillation_of_joints_at_rest() -> None:
-    zero, check = np.zeros(len(JOINTS)), HoldStability()
-    assert _follow(zero, zero, check._swings, check._driven) is False
+def test_kernels_report_nothing_of_joints_at_rest() -> None:
+    joints, check = measured(), HoldStability()
+    assert _follow(joints.velocity, joints.drive_state, check._swings, check._driven) is False
+    assert _watch_load(joints, LIMIT, check._driven[0], check._loads) is False
+
+
+def overload(
+    check: HoldStability,
+    cycles: int,
+    *,
+    joint: int = KNEE,
+    away: float = FAR,
+    speed: float = 0.0,
+    torque: float | None = None,
+    state: DriveState = DriveState.QUICK_STOP_ACTIVE,
+    age: int = 0,
+) -> tuple[Finding, ...]:
+    """Begin a hold, then return the findings after a number of equal cycles with a joint away from its position."""
+    joints, found = measured(state), tuple[Finding, ...]()
+    check.check(joints, LIMIT)
+    joints.position[joint], joints.velocity[joint], joints.age[joint] = away, speed, age
+    joints.torque[joint] = -LIMIT[joint] if torque is None else torque
+    for _ in range(cycles):
+        found = check.check(joints, LIMIT)
+    return found
+
+
+@pytest.mark.parametrize("joint", range(len(JOINTS)))
+def test_overloaded_joint_is_found_in_the_last_cycle(joint: int) -> None:
+    assert overload(HoldStability(), OVERLOADED - 1, joint=joint) == ()
+    (finding,) = overload(HoldStability(), OVERLOADED, joint=joint)
+    assert finding == Finding(
+        Dtc.HOLD_UNSTABLE,
+        JOINTS[joint].upper(),
+        OVERLOADED,
+        True,
+        f"{JOINTS[joint]} does not move back although its drive holds it with {LIMIT[joint]:.0f} Nm; its drive is switched off",
+    )
+
+
+@pytest.mark.parametrize(
+    ("motion", "found"),
+    [
+        ({"away": AWAY}, True),
+        ({"away": -AWAY, "torque": -FULL}, True),
+        ({"away": np.nextafter(AWAY, 0.0)}, False),
+        ({"away": -np.nextafter(AWAY, 0.0)}, False),
+        ({"torque": SATURATED[0] * FULL}, True),
+        ({"torque": np.nextafter(SATURATED[0] * FULL, 0.0)}, False),
+        ({"torque": SATURATED[1] * FULL}, True),
+        ({"torque": np.nextafter(SATURATED[1] * FULL, -np.inf)}, False),
+        ({"torque": -FULL}, True),  # the drive pushes its joint away
+        ({"speed": 2.0}, True),
+        ({"speed": -SLOWER}, True),
+        ({"speed": np.nextafter(-SLOWER, -1.0)}, False),
+        ({"away": -FAR, "speed": SLOWER}, True),
+        ({"away": -FAR, "speed": np.nextafter(SLOWER, 1.0)}, False),
+        ({"age": AGE}, True),
+        ({"age": AGE + 1}, False),
+        ({"state": DriveState.OPERATION_ENABLED}, False),
+        ({"state": DriveState.SWITCH_ON_DISABLED}, False),
+    ],
+)
+def test_limits_of_an_overload(motion: dict[str, float], found: bool) -> None:
+    assert bool(overload(HoldStability(), OVERLOADED, **motion)) is found  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize(("slowing", "found"), [(0.9 * SLOWER, True), (1.1 * SLOWER, False)])
+def test_joint_that_slows_down_shows_no_overload(slowing: float, found: bool) -> None:
+    """`slowing` is the decrease of the speed in the time in which an overload is found [rad/s]."""
+    check, joints, counted = HoldStability(), measured(), []
+    check.check(joints, LIMIT)
+    joints.position[KNEE], joints.torque[KNEE] = FAR, FULL
+    for cycle in range(3 * OVERLOADED):
+        joints.velocity[KNEE] = 2.0 - slowing * cycle / (OVERLOADED - 1)
+        counted.append(bool(check.check(joints, LIMIT)))
+    assert any(counted) is found
+
+
+def test_joint_that_moves_back_restarts_the_count() -> None:
+    check = HoldStability()
+    joints = measured()
+    check.check(joints, LIMIT)
+    joints.position[KNEE], joints.torque[KNEE] = FAR, FULL
+    for _ in range(OVERLOADED - 1):
+        assert check.check(joints, LIMIT) == ()
+    joints.velocity[KNEE] = -2.0 * SLOWER
+    assert check.check(joints, LIMIT) == ()
+    joints.velocity[KNEE] = 0.0
+    for _ in range(OVERLOADED - 1):
+        assert check.check(joints, LIMIT) == ()
+    assert check.check(joints, LIMIT)
+
+
+def test_old_values_keep_the_count() -> None:
+    check, joints = HoldStability(), measured()
+    check.check(joints, LIMIT)
+    joints.position[KNEE], joints.torque[KNEE] = FAR, FULL
+    for _ in range(OVERLOADED - 1):
+        assert check.check(joints, LIMIT) == ()
+    joints.age[KNEE] = AGE + 1
+    for _ in range(OVERLOADED):
+        assert check.check(joints, LIMIT) == ()
+    joints.age[KNEE] = 0
+    assert check.check(joints, LIMIT)
+
+
+@pytest.mark.parametrize("ends", ["drive off", "restart"])
+def test_the_position_of_the_next_hold_counts(ends: str) -> None:
+    check, joints = HoldStability(), measured()
+    check.check(joints, LIMIT)
+    joints.position[KNEE], joints.torque[KNEE] = FAR, FULL
+    for _ in range(OVERLOADED):
+        found = check.check(joints, LIMIT)
+    assert found
+    if ends == "restart":
+        check.restart()
+    else:
+        joints.drive_state[KNEE] = DriveState.SWITCH_ON_DISABLED
+        assert check.check(joints, LIMIT) == ()
+        joints.drive_state[KNEE] = DriveState.QUICK_STOP_ACTIVE
+    for _ in range(2 * OVERLOADED):
+        assert check.check(joints, LIMIT) == ()
+
+
+def test_oscillation_and_overload_of_a_joint_are_one_finding() -> None:
+    check, joints, found = HoldStability(), measured(), tuple[Finding, ...]()
+    oscillate(check, REVERSALS)
+    joints.position[KNEE], joints.torque[KNEE] = FAR, FULL
+    for _ in range(OVERLOADED):
+        found = check.check(joints, LIMIT)
+    assert [finding.value for finding in found] == [REVERSALS]

@@ -433,7 +433,10 @@ def test_joint_that_oscillates_in_hold_is_lowered_until_the_next_start(rig):
     assert (np.delete(state.drive_state, KNEE) == DriveState.QUICK_STOP_ACTIVE).all()
     assert rig.codes().count("HOLD_UNSTABLE") == 1
     rig.operator.start()
-    assert rig.until(S.HOLD, 5).drive_state[KNEE] == DriveState.SWITCH_ON_DISABLED
+    rig.until(S.HOLD, 5)
+    state = rig.run(6 * REVERSALS)  # the drive stays off until the START that enables all drives
+    assert (state.supervisor, state.drive_state[KNEE]) == (S.HOLD, DriveState.SWITCH_ON_DISABLED)
+    assert not rig.hal._safety_monitor.proof.proven[KNEE]
     rig.operator.start()
     rig.until(S.ACTIVE, 150)  # the controller moves the joint, its drive does not hold it
     assert rig.run(6 * REVERSALS).supervisor is S.ACTIVE

@@ -62,6 +62,15 @@ def test_report_of_the_start_has_the_inertia_of_every_joint(rig):
     assert len(proven.text.encode()) <= 220  # bytes of the text in an event record
 
 
+@pytest.mark.parametrize("late", [0, 1, 2])
+def test_state_has_the_delay_that_the_start_measured(make_rig, late: int):
+    rig = make_rig()
+    for joint in range(len(JOINTS)):
+        rig.emulator.drives.motors.delay(joint, late)
+    rig.until(S.ACTIVE)
+    assert rig.hal.state.delay == late
+
+
 @pytest.mark.parametrize("stop", ["hold", "release", "stop"])
 def test_stop_during_the_test_ends_it_in_the_same_cycle(make_rig, stop: str):
     rig = make_rig(starts=False)

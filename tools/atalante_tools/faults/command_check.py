@@ -15,7 +15,7 @@ import numpy.typing as npt
 
 from atalante_dbc import Message, Network, Signal
 from atalante_hal.robot import LEG_JOINTS, SIDES, Robot
-from atalante_hal.wire.cia402 import Controlword
+from atalante_hal.wire.cia402 import Controlword, DriveState
 from atalante_hal.wire.frame import FRAME, Frames
 
 Vector = npt.NDArray[np.float64]
@@ -140,13 +140,15 @@ class Commands:
         steps = np.abs(np.diff(leg.torque[:, column]))[leg.consecutive()[:, column]]
         return float(steps.max(initial=0.0))
 
-    def violations(self, robot: Robot) -> list[str]:
+    def violations(self, robot: Robot, drive_state: Vector | None = None) -> list[str]:
         """Return one sentence per foreign identifier, and one sentence per leg for each kind of violation.
 
         The four kinds are: torque too large, torque limit too large, torque change too large, torque with QUICK STOP.
 
         Args:
             robot: torque limits of the joints.
+            drive_state: true states of the drives in each HAL cycle from 1, shape (cycles, 12). If given, a torque change
+                counts only if the drive is in OPERATION ENABLED before and after it: other drives ignore the torque.
         """
         found = [
             f"the HAL must send only its own identifiers, got {can_id:#x}" for can_id in self._foreign_ids.tolist()
@@ -156,6 +158,9 @@ class Commands:
             largest, rate = robot.torque_max[joints], robot.torque_rate_max[joints]
             stopped = leg.word == Controlword.QUICK_STOP
             both = leg.consecutive()
+            if drive_state is not None:
+                enabled = drive_state[leg.cycle - 1, joints] == DriveState.OPERATION_ENABLED
+                both &= enabled[1:] & enabled[:-1]
             step = np.abs(np.diff(leg.torque, axis=0))
             for violation, wrong, cycles in (
                 ("a torque above the joint's limit", np.abs(leg.torque) > largest + _RESOLUTION, leg.cycle),

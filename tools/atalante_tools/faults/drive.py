@@ -25,6 +25,8 @@ _HIP: Final = "LEFT_SH"
 _COMMAND: Final = "COMMAND_LEFT_LEG"
 #: A knee that sinks in LOWER or FAULT is at rest after this time [cycles]. Then its drive can be enabled again.
 _LOWERED: Final = 4500
+#: Time from HOLD until all joints are at rest [cycles].
+_AT_REST: Final = 60
 
 #: Name of a case -> faults that restart drives during the walk. A restarted drive must be enabled again.
 _RESTARTED: Final = {
@@ -267,6 +269,23 @@ SCENARIOS: Final = (
                 )
                 for joint in ("SA", "HA")
             ),
+        ),
+    ),
+    # A reversed motor of any other joint exceeds its speed limit before the HAL can react.
+    Scenario(
+        "F84",
+        tuple(
+            Case(
+                f"{node} in HOLD with {share:g} times its torque",
+                (OperatorAction("hold"), Fault("torque_weak", node, _AT_REST, 600, share=share)),
+                node=node,
+                detected=_AT_REST + 200,
+                observed=_LOWERED,
+            )
+            for node, share in (
+                *((f"LEFT_{joint}", -1.0) for joint in ("FH", "SH")),
+                *((f"LEFT_{joint}", 0.0) for joint in ("FH", "SH", "SK")),
+            )
         ),
     ),
     # If the torque of the knee motor is eight cycles late, the position control of the knee drive becomes unstable.

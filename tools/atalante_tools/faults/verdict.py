@@ -135,19 +135,22 @@ def reacted(run: Observation, state: SupervisorState) -> int | None:
     return None
 
 
-def limit_violations(run: Observation) -> list[str]:
+def limit_violations(run: Observation, unlimited: range = range(0)) -> list[str]:
     """Return a sentence for each limit that a command, a motor or a joint exceeded.
 
     Args:
         run: observation of the run.
+        unlimited: cycles in which the joint velocities are not checked.
     """
     robot = run.robot
-    found = run.commands.violations(robot)
+    found = run.commands.violations(robot, run.drive_state)
+    fast = np.abs(run.velocity) > _VELOCITY_RATIO * robot.velocity_max
+    fast[max(unlimited.start - 1, 0) : max(unlimited.stop - 1, 0)] = False
     for sentence, wrong in (
         ("a motor's torque was above its limit", np.abs(run.torque) > robot.torque_max * (1.0 + 1e-9)),
         ("a joint was outside its position range", run.position > robot.position_max + _OVERSHOOT),
         ("a joint was outside its position range", run.position < robot.position_min - _OVERSHOOT),
-        ("a joint was above its velocity limit", np.abs(run.velocity) > _VELOCITY_RATIO * robot.velocity_max),
+        ("a joint was above its velocity limit", fast),
     ):
         if wrong.any():
             row, joint = (int(index) for index in np.argwhere(wrong)[0])
