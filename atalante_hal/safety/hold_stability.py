@@ -58,7 +58,7 @@ class Measured(NamedTuple):
     velocity: Vector  # rad/s
     torque: Vector  # torques that the drives report [Nm]
     drive_state: Vector  # states of the drives
-    age: npt.NDArray[np.int64]  # age of these values [cycles]
+    age: Vector  # age of these values [cycles]
 
 
 class Swings(NamedTuple):
@@ -72,10 +72,9 @@ class Swings(NamedTuple):
 class Loads(NamedTuple):
     """Record of the overload of all joints, shape (12,) each."""
 
-    held: npt.NDArray[np.bool_]  # whether the drive holds its position
-    start: Vector  # position in which the hold began [rad]
+    start: Vector  # position in which the hold began [rad]; NaN if the drive does not hold its position
     speed: Vector  # speed away from `start` when the current count began [rad/s]
-    cycles: npt.NDArray[np.int64]  # number of consecutive cycles with overload
+    cycles: Vector  # number of consecutive cycles with overload
 
 
 def _follow(velocity: Vector, drive_state: Vector, swings: Swings, driven: tuple[float, float]) -> bool:
@@ -100,34 +99,33 @@ def _follow(velocity: Vector, drive_state: Vector, swings: Swings, driven: tuple
     return bool(oscillates)
 
 
-def _watch_load(joints: Measured, limit: Vector, holding: float, loads: Loads) -> bool:
+def _watch_load(joints: Measured, limit: Vector, driven: tuple[float, float], loads: Loads) -> bool:
     """Update the overload of all joints by one cycle, and return whether a drive is overloaded.
 
     Args:
         joints: measurements of the cycle.
         limit: torque limits of the drives, shape (12,) [Nm].
-        holding: state in which a drive holds its position.
+        driven: states in which a drive controls its joint; in the first, the drive holds its position.
         loads: record to update.
     """
     overloaded = False
     for i in range(len(limit)):
-        if joints.drive_state[i] != holding:
-            loads.held[i], loads.cycles[i] = False, 0
-            continue
         if joints.age[i] > AGE:
             continue
-        if not loads.held[i]:
-            loads.held[i], loads.start[i] = True, joints.position[i]
-        direction = 1.0 if joints.position[i] > loads.start[i] else -1.0
-        away, speed = direction * (joints.position[i] - loads.start[i]), direction * joints.velocity[i]
-        share = abs(joints.torque[i]) / limit[i]
-        plausible = DEAD < share < SATURATED[0] or share > SATURATED[1]
-        if away < AWAY or plausible or speed < -SLOWER:
-            loads.cycles[i] = 0
-        elif loads.cycles[i] == 0 or speed < loads.speed[i] - SLOWER:
-            loads.cycles[i], loads.speed[i] = 1, speed
+        if joints.drive_state[i] != driven[0]:
+            loads.start[i] = math.nan
+        elif math.isnan(loads.start[i]):
+            loads.start[i] = joints.position[i]
+        away = joints.position[i] - loads.start[i]
+        speed = math.copysign(1.0, away) * joints.velocity[i]
+        torque, most = abs(joints.torque[i]), limit[i]
+        plausible = DEAD * most < torque < SATURATED[0] * most or torque > SATURATED[1] * most
+        if not abs(away) >= AWAY or plausible or speed < -SLOWER:
+            loads.cycles[i] = 0.0
+        elif loads.cycles[i] == 0.0 or speed < loads.speed[i] - SLOWER:
+            loads.cycles[i], loads.speed[i] = 1.0, speed
         else:
-            loads.cycles[i] += 1
+            loads.cycles[i] += 1.0
         overloaded |= loads.cycles[i] >= OVERLOADED
     return bool(overloaded)
 
@@ -137,20 +135,20 @@ class HoldStability:
 
     def __init__(self) -> None:
         """Create the check, and compile its kernels."""
-        count = len(JOINTS)
-        self._swings = Swings(*np.zeros((3, count), np.int64))
-        zero = np.zeros(count)
-        self._loads = Loads(np.zeros(count, np.bool_), zero.copy(), zero.copy(), np.zeros(count, np.int64))
+        joints = len(JOINTS)
+        self._swings = Swings(*np.zeros((3, joints), np.int64))
+        self._loads = Loads(*np.zeros((3, joints)))
         self._driven = (float(DriveState.QUICK_STOP_ACTIVE), float(DriveState.OPERATION_ENABLED))
-        joints = Measured(zero, zero, zero, zero, np.zeros(count, np.int64))
-        self._follow = specialised(_follow, zero, zero, self._swings, self._driven)
-        self._watch_load = specialised(_watch_load, joints, zero, self._driven[0], self._loads)
+        at_rest = Measured(*np.zeros((5, joints)))
+        self._follow = specialised(_follow, at_rest.velocity, at_rest.drive_state, self._swings, self._driven)
+        self._watch_load = specialised(_watch_load, at_rest, at_rest.torque, self._driven, self._loads)
         self.restart()
 
     def restart(self) -> None:
         """Discard all records, because the controller moved the joints until now."""
-        for record in (*self._swings, *self._loads):
+        for record in self._swings:
             record[:] = 0
+        self._loads.start[:] = math.nan
 
     def check(self, joints: Measured, limit: Vector) -> tuple[Finding, ...]:
         """Check one cycle, and return one finding for each joint that its drive does not hold.
@@ -160,7 +158,7 @@ class HoldStability:
             limit: torque limits of the drives, shape (12,) [Nm].
         """
         oscillates = self._follow(joints.velocity, joints.drive_state, self._swings, self._driven)
-        overloaded = self._watch_load(joints, limit, self._driven[0], self._loads)
+        overloaded = self._watch_load(joints, limit, self._driven, self._loads)
         if not (oscillates or overloaded):
             return ()
         reversals, cycles = self._swings.reversals.tolist(), self._loads.cycles.tolist()
@@ -171,7 +169,11 @@ class HoldStability:
             if count >= REVERSALS
         ]
         found += [
-            (joint, count, f"does not move back although its drive holds it with {abs(joints.torque[joint]):.0f} Nm")
+            (
+                joint,
+                int(count),
+                f"does not move back although its drive holds it with {abs(joints.torque[joint]):.0f} Nm",
+            )
             for joint, count in enumerate(cycles)
             if count >= OVERLOADED and reversals[joint] < REVERSALS
         ]

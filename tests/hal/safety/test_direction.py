@@ -139,6 +139,7 @@ def test_joints_pass_although_their_torque_acts_late(joints: Joints, late: int):
     assert joints.run() == ("", ONCE)
     assert joints.proof.late == late
     assert joints.proof.mobility == pytest.approx(1.0 / INERTIA, rel=0.2)
+    assert joints.proof.report().startswith("effective inertia [kg m2]: left_FH")
     assert joints.proof.report().endswith(f"; torques {late} ms late")
 
 
@@ -149,9 +150,45 @@ def test_delay_is_measured_again_after_all_drives_restarted(joints: Joints):
     joints.delay(0)
     joints.run()
     assert joints.proof.late == 3
+    joints.delay(3)
+    for _ in range(3):
+        joints.proof.proven[:] = False
+        joints.run()
+    assert joints.proof.late == 3
     joints.proof.proven[:] = False
+    joints.delay(0)
     joints.run()
     assert joints.proof.late == 0
+
+
+def delays(monkeypatch: pytest.MonkeyPatch, joints: Joints, *late: int) -> None:
+    """Let the torques in each of the first tests act with another delay."""
+    sent, ends, count = joints.proof.sent, [0], 0
+    for _, duration in GROUPS:
+        ends.append(ends[-1] + duration + LATENCY + 1)
+
+    def counted(torque: np.ndarray) -> None:
+        nonlocal count
+        if count in ends[: len(late)]:
+            joints.delay(late[ends.index(count)])
+        count += 1
+        sent(torque)
+
+    monkeypatch.setattr(joints.proof, "sent", counted)
+
+
+def test_only_short_pulses_measure_the_delay(joints: Joints, monkeypatch: pytest.MonkeyPatch):
+    delays(monkeypatch, joints, 0, 2, 2)
+    assert joints.run() == ("", ONCE)
+    assert joints.proof.late == 2
+
+
+def test_all_short_pulses_measure_the_delay(joints: Joints, monkeypatch: pytest.MonkeyPatch):
+    """Knee and ankle of the loaded left leg do not move, so fewer joints have the smaller delay."""
+    delays(monkeypatch, joints, 2, 2, 1)
+    joints.strength[[3, 5]] = 0.0
+    assert joints.run(np.array([500.0, 0.0]), within=range(19))[0] == ""
+    assert joints.proof.late == 2
 
 
 def test_joints_that_fail_do_not_change_the_delay(joints: Joints):

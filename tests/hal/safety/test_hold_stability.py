@@ -33,8 +33,8 @@ FAR, FULL = 1.01 * AWAY, -LIMIT[KNEE]
 
 def measured(state: DriveState = DriveState.QUICK_STOP_ACTIVE) -> Measured:
     """Return the measurements of a robot at rest whose drives are all in one state."""
-    position, velocity, torque = np.zeros((3, len(JOINTS)))
-    return Measured(position, velocity, torque, np.full(len(JOINTS), float(state)), np.zeros(len(JOINTS), np.int64))
+    position, velocity, torque, age = np.zeros((4, len(JOINTS)))
+    return Measured(position, velocity, torque, np.full(len(JOINTS), float(state)), age)
 
 
 def oscillate(
@@ -132,7 +132,7 @@ def test_restart_forgets_the_motion() -> None:
 def test_kernels_report_nothing_of_joints_at_rest() -> None:
     joints, check = measured(), HoldStability()
     assert _follow(joints.velocity, joints.drive_state, check._swings, check._driven) is False
-    assert _watch_load(joints, LIMIT, check._driven[0], check._loads) is False
+    assert _watch_load(joints, LIMIT, check._driven, check._loads) is False
 
 
 def overload(
@@ -148,8 +148,9 @@ def overload(
 ) -> tuple[Finding, ...]:
     """Begin a hold, then return the findings after a number of equal cycles with a joint away from its position."""
     joints, found = measured(state), tuple[Finding, ...]()
+    joints.position[:] = 0.5
     check.check(joints, LIMIT)
-    joints.position[joint], joints.velocity[joint], joints.age[joint] = away, speed, age
+    joints.position[joint], joints.velocity[joint], joints.age[joint] = 0.5 + away, speed, age
     joints.torque[joint] = -LIMIT[joint] if torque is None else torque
     for _ in range(cycles):
         found = check.check(joints, LIMIT)
@@ -172,10 +173,10 @@ def test_overloaded_joint_is_found_in_the_last_cycle(joint: int) -> None:
 @pytest.mark.parametrize(
     ("motion", "found"),
     [
-        ({"away": AWAY}, True),
-        ({"away": -AWAY, "torque": -FULL}, True),
-        ({"away": np.nextafter(AWAY, 0.0)}, False),
-        ({"away": -np.nextafter(AWAY, 0.0)}, False),
+        ({"away": 1.0001 * AWAY}, True),
+        ({"away": -1.0001 * AWAY, "torque": -FULL}, True),
+        ({"away": 0.9999 * AWAY}, False),
+        ({"away": -0.9999 * AWAY}, False),
         ({"torque": SATURATED[0] * FULL}, True),
         ({"torque": np.nextafter(SATURATED[0] * FULL, 0.0)}, False),
         ({"torque": SATURATED[1] * FULL}, True),
@@ -197,6 +198,30 @@ def test_overloaded_joint_is_found_in_the_last_cycle(joint: int) -> None:
 )
 def test_limits_of_an_overload(motion: dict[str, float], found: bool) -> None:
     assert bool(overload(HoldStability(), OVERLOADED, **motion)) is found  # type: ignore[arg-type]
+
+
+def test_distance_from_the_start_of_the_hold_is_at_least_its_bound() -> None:
+    check, joints = HoldStability(), measured()
+    check.check(joints, LIMIT)
+    joints.position[KNEE], joints.torque[KNEE] = AWAY, FULL
+    assert [len(check.check(joints, LIMIT)) for _ in range(OVERLOADED)] == [0] * (OVERLOADED - 1) + [1]
+
+
+def test_other_joints_with_old_values_or_drives_that_are_off_change_nothing() -> None:
+    check, joints = HoldStability(), measured()
+    joints.age[0], joints.drive_state[1] = AGE + 1, float(DriveState.SWITCH_ON_DISABLED)
+    check.check(joints, LIMIT)
+    joints.position[KNEE], joints.torque[KNEE] = FAR, FULL
+    assert [len(check.check(joints, LIMIT)) for _ in range(OVERLOADED)] == [0] * (OVERLOADED - 1) + [1]
+
+
+def test_decrease_of_the_speed_by_its_bound_is_not_slower() -> None:
+    check, joints = HoldStability(), measured()
+    check.check(joints, LIMIT)
+    joints.position[KNEE], joints.torque[KNEE], joints.velocity[KNEE] = FAR, FULL, 2.0
+    check.check(joints, LIMIT)
+    joints.velocity[KNEE] = 2.0 - SLOWER
+    assert [len(check.check(joints, LIMIT)) for _ in range(OVERLOADED - 1)] == [0] * (OVERLOADED - 2) + [1]
 
 
 @pytest.mark.parametrize(("slowing", "found"), [(0.9 * SLOWER, True), (1.1 * SLOWER, False)])
