@@ -316,7 +316,8 @@ class FaultyBus(WrappedBus):
             acting = self._acting.get(can_id, ())
             for number, disturbance in enumerate(acting, 1):
                 if disturbance.strikes():
-                    passing.append(frames[unchanged:row].copy())
+                    if unchanged < row:
+                        passing.append(frames[unchanged:row].copy())
                     copies = disturbance.changed(frames[row : row + 1].copy(), self._cycle)
                     for later in acting[number:]:
                         copies = [after for frame in copies for after in later.frames(frame, self._cycle)]
