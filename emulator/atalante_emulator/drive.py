@@ -206,6 +206,9 @@ class Drives:
             speed[jumped] = 0.0
         hold = robot.hold_kp * (self._hold_at - self.encoders.angle) - robot.hold_kd * speed
         np.clip(hold, -limit, limit, out=hold)
+        unknown = np.isnan(hold)
+        if unknown.any():  # the hold began before the first sample of the encoder
+            self._hold_at[unknown], hold[unknown] = self.encoders.angle[unknown], 0.0
         wanted[:] = np.where(self._is_enabled, wanted, np.where(self._is_holding, hold, 0.0))
 
     # -- errors and local reactions ----------------------------------------------------------------------------------

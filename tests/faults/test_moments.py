@@ -134,6 +134,20 @@ def test_a_wrong_motor_may_move_a_joint_during_a_start(
     assert len(patched(monkeypatch, sag, task).failures) == failures
 
 
+def test_motion_that_is_not_a_number_fails(monkeypatch: pytest.MonkeyPatch) -> None:
+    def lose(run: Observation) -> None:
+        run.velocity[100, 3] = np.nan
+
+    assert patched(monkeypatch, lose).failures == ("the motion of a joint was not a number: left_SK in cycle 101",)
+
+
+def test_drive_that_holds_from_power_on_moves_like_any_other() -> None:
+    verdict = MomentTask(Moment.BOOT, (index("F22", "QUICK_STOP_ACTIVE"),))()
+    assert verdict.failures == ()
+    assert verdict.extremes is not None
+    assert verdict.extremes.speed.value < 1.2
+
+
 def test_enabling_before_start_fails(monkeypatch: pytest.MonkeyPatch) -> None:
     def early(run: Observation) -> None:
         run.commands._legs[0].word[49] = Controlword.ENABLE_OPERATION

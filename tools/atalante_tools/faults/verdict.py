@@ -151,6 +151,7 @@ def limit_violations(run: Observation, unlimited: range = range(0)) -> list[str]
         ("a joint was outside its position range", run.position > robot.position_max + _OVERSHOOT),
         ("a joint was outside its position range", run.position < robot.position_min - _OVERSHOOT),
         ("a joint was above its velocity limit", fast),
+        ("the motion of a joint was not a number", np.isnan(run.position + run.velocity + run.torque)),
     ):
         if wrong.any():
             row, joint = (int(index) for index in np.argwhere(wrong)[0])
