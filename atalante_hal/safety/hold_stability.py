@@ -8,9 +8,10 @@ motor. A joint counts as oscillating if its velocity reverses `REVERSALS` times 
 pushed or carried reverses less often.
 
 *Overload.* For `OVERLOADED` cycles, a joint is at least `AWAY` from the position in which the hold began, and the drive reports
-about its torque limit (`SATURATED`) or hardly any torque (`DEAD`), but the joint neither moves back nor slows down. Causes are a
-motor that turns in the wrong direction, a motor without torque, exchanged encoders, and a load that exceeds the torque limit.
-When a drive stops a moving joint, its torque may reach the limit for a longer time, but the joint slows down.
+about its torque limit (`SATURATED`), but the joint neither moves back nor slows down. Causes are a motor that turns in the
+wrong direction, a motor without torque, exchanged encoders, and a load that exceeds the torque limit. When a drive stops a
+moving joint, its torque may reach the limit for a longer time, but the joint slows down. A joint that seems to move although
+its drive reports hardly any torque is not reported: its encoder may be wrong, and then the drive holds the joint.
 """
 
 from __future__ import annotations
@@ -36,9 +37,6 @@ REVERSALS: Final = 6
 #: Smallest and largest torque that an overloaded drive reports, as shares of its torque limit. A drive that reports a larger
 #: torque reports a wrong torque.
 SATURATED: Final = (0.9, 1.05)
-#: Largest torque that a drive without torque reports, as a share of its torque limit. A drive that holds a joint at the distance
-#: `AWAY` requests at least 19 % of the limit.
-DEAD: Final = 0.05
 #: Number of consecutive cycles after which a drive is regarded as overloaded.
 OVERLOADED: Final = 20
 #: Smallest distance from the position in which the hold began [rad]. A drive that only reports a wrong torque still holds its
@@ -119,8 +117,8 @@ def _watch_load(joints: Measured, limit: Vector, driven: tuple[float, float], lo
         away = joints.position[i] - loads.start[i]
         speed = math.copysign(1.0, away) * joints.velocity[i]
         torque, most = abs(joints.torque[i]), limit[i]
-        plausible = DEAD * most < torque < SATURATED[0] * most or torque > SATURATED[1] * most
-        if not abs(away) >= AWAY or plausible or speed < -SLOWER:
+        saturated = SATURATED[0] * most <= torque <= SATURATED[1] * most
+        if not (abs(away) >= AWAY and saturated) or speed < -SLOWER:
             loads.cycles[i] = 0.0
         elif loads.cycles[i] == 0.0 or speed < loads.speed[i] - SLOWER:
             loads.cycles[i], loads.speed[i] = 1.0, speed
