@@ -103,6 +103,20 @@ def test_torque_is_zero_before_operation_is_enabled() -> None:
         assert not bench.cycle().any()
 
 
+def test_hold_before_the_first_sample_of_the_encoder_begins_at_the_first_sample() -> None:
+    bench = DriveBench(SMOOTH)
+    bench.position[:] = 0.1
+    bench.drives.leave(3, DriveState.QUICK_STOP_ACTIVE)
+    bench.word[3] = Controlword.QUICK_STOP
+    for _ in range(5):
+        assert not bench.cycle().any()
+    bench.position[3] += 0.001
+    bench.cycle()
+    torque = [bench.cycle() for _ in range(20)][-1]
+    assert torque[3] == pytest.approx(-0.001 * ROBOT.hold_kp[3], rel=0.02)
+    assert not np.delete(torque, 3).any()
+
+
 def test_unpowered_drive_has_friction_and_brake_torque(bench: DriveBench) -> None:
     bench.velocity[:] = 1.0
     p = bench.parameters.motor
