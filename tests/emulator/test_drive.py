@@ -117,6 +117,17 @@ def test_hold_before_the_first_sample_of_the_encoder_begins_at_the_first_sample(
     assert not np.delete(torque, 3).any()
 
 
+def test_hold_brakes_a_moving_joint_in_its_first_cycle() -> None:
+    bench = DriveBench(SMOOTH)
+    bench.enable()
+    for word in (*[Controlword.ENABLE_OPERATION] * 5, Controlword.QUICK_STOP):
+        bench.position[4] += 0.0005
+        bench.word[4] = word
+        torque = bench.cycle()
+    assert bench.drives.state[4] is DriveState.QUICK_STOP_ACTIVE
+    assert torque[4] < -1.0
+
+
 def test_unpowered_drive_has_friction_and_brake_torque(bench: DriveBench) -> None:
     bench.velocity[:] = 1.0
     p = bench.parameters.motor
