@@ -11,6 +11,7 @@ from atalante_hal.types import SupervisorState
 from atalante_hal.wire.cia402 import Controlword
 from atalante_tools.faults import moments
 from atalante_tools.faults.catalogue import SCENARIOS
+from atalante_tools.faults.matrix import load_matrix
 from atalante_tools.faults.moments import Extreme, Extremes, Moment, MomentTask, MomentVerdict, random_pairs, schedule
 from atalante_tools.faults.observation import Observation
 from atalante_tools.faults.report import Summary
@@ -108,6 +109,12 @@ def test_fast_joint_fails(monkeypatch: pytest.MonkeyPatch) -> None:
     assert verdict.failures == ("a joint was above its velocity limit: left_SK in cycle 101",)
     assert verdict.extremes is not None
     assert verdict.extremes.speed == (pytest.approx(1.25), "left_SK")
+
+
+def test_wrong_motors_are_found_within_the_bound_of_the_fault_matrix() -> None:
+    assert load_matrix()["F84"].detected == moments.FOUND
+    for case in SCENARIOS["F84"].cases:
+        assert case.detected == case.stimuli[1].start + moments.FOUND
 
 
 @pytest.mark.parametrize(("cycle", "failures"), [(0, 0), (moments.FOUND - 1, 0), (-1, 1), (moments.FOUND, 1)])

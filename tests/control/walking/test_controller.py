@@ -30,6 +30,18 @@ def walked(
     return controller, walk_with(controller, engine, finish_after=finish_after, xi=xi, lost_foot=lost_foot)
 
 
+def hung(controller: WalkController) -> State:
+    """Return the state of the suspended robot after the first cycle of a controller."""
+    body = make_body("mujoco", urdf(ExoskeletonParameters(), ROBOT, PATIENT), free=True, ground=0.0)
+    try:
+        hang(body, controller.standing_pose.tolist(), 0.03)
+        robot = Ideal(body)
+        robot.cycle(controller)
+    finally:
+        body.close()
+    return robot.state
+
+
 @pytest.mark.parametrize("engine", ["pybullet", "mujoco"])
 def test_patient_walks_from_standing_to_standing(engine: str) -> None:
     controller, phases = walked(engine, 3)
@@ -44,14 +56,7 @@ def test_patient_walks_from_standing_to_standing(engine: str) -> None:
 @pytest.mark.parametrize("delay", [0, 3])
 def test_delay_of_the_loop_lowers_the_damping_of_a_loaded_leg(delay: int) -> None:
     controller = WalkController(ROBOT, PATIENT, WALK, 3)
-    body = make_body("mujoco", urdf(ExoskeletonParameters(), ROBOT, PATIENT), free=True, ground=0.0)
-    try:
-        hang(body, controller.standing_pose.tolist(), 0.03)
-        robot = Ideal(body)
-        robot.cycle(controller)
-    finally:
-        body.close()
-    state, torques = robot.state, []
+    state, torques = hung(controller), []
     state.foot_force[:, :, 2] = 200.0
     state.velocity[:] = 0.0
     state.delay = delay
@@ -83,14 +88,7 @@ def test_delay_lowers_only_the_damping_of_the_sagittal_joints_of_a_stance_leg() 
 def test_heading_follows_a_pelvis_imu_with_a_heading_reference(reference: bool, lost: bool, follows: bool) -> None:
     """The controller ignores the heading of a pelvis IMU that is lost."""
     controller = WalkController(ROBOT, PATIENT, WALK, 3, WalkConfig(heading_reference=reference))
-    body = make_body("mujoco", urdf(ExoskeletonParameters(), ROBOT, PATIENT), free=True, ground=0.0)
-    try:
-        hang(body, controller.standing_pose.tolist(), 0.03)
-        robot = Ideal(body)
-        robot.cycle(controller)
-    finally:
-        body.close()
-    state = robot.state
+    state = hung(controller)
     state.imu_rows = (2, 3, 4, 5)
     state.age[list(state.imu_rows)] = 100 if lost else 0
     state.imu_gyro[:] = 0.0

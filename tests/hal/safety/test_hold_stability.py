@@ -156,6 +156,14 @@ def overload(
     return found
 
 
+def overloaded() -> tuple[HoldStability, Measured]:
+    """Return a check that has seen the first cycle of a hold, and the measurements of an overloaded knee for the next cycles."""
+    check, joints = HoldStability(), measured()
+    check.check(joints, LIMIT)
+    joints.position[KNEE], joints.torque[KNEE] = FAR, FULL
+    return check, joints
+
+
 @pytest.mark.parametrize("joint", range(len(JOINTS)))
 def test_overloaded_joint_is_found_in_the_last_cycle(joint: int) -> None:
     assert overload(HoldStability(), OVERLOADED - 1, joint=joint) == ()
@@ -213,9 +221,8 @@ def test_other_joints_with_old_values_or_drives_that_are_off_change_nothing() ->
 
 
 def test_decrease_of_the_speed_by_its_bound_is_not_slower() -> None:
-    check, joints = HoldStability(), measured()
-    check.check(joints, LIMIT)
-    joints.position[KNEE], joints.torque[KNEE], joints.velocity[KNEE] = FAR, FULL, 2.0
+    check, joints = overloaded()
+    joints.velocity[KNEE] = 2.0
     check.check(joints, LIMIT)
     joints.velocity[KNEE] = 2.0 - SLOWER
     assert [len(check.check(joints, LIMIT)) for _ in range(OVERLOADED - 1)] == [0] * (OVERLOADED - 2) + [1]
@@ -224,9 +231,7 @@ def test_decrease_of_the_speed_by_its_bound_is_not_slower() -> None:
 @pytest.mark.parametrize(("slowing", "found"), [(0.9 * SLOWER, True), (1.1 * SLOWER, False)])
 def test_joint_that_slows_down_shows_no_overload(slowing: float, found: bool) -> None:
     """`slowing` is the decrease of the speed in the time in which an overload is found [rad/s]."""
-    check, joints, counted = HoldStability(), measured(), []
-    check.check(joints, LIMIT)
-    joints.position[KNEE], joints.torque[KNEE] = FAR, FULL
+    (check, joints), counted = overloaded(), []
     for cycle in range(3 * OVERLOADED):
         joints.velocity[KNEE] = 2.0 - slowing * cycle / (OVERLOADED - 1)
         counted.append(bool(check.check(joints, LIMIT)))
@@ -234,10 +239,7 @@ def test_joint_that_slows_down_shows_no_overload(slowing: float, found: bool) ->
 
 
 def test_joint_that_moves_back_restarts_the_count() -> None:
-    check = HoldStability()
-    joints = measured()
-    check.check(joints, LIMIT)
-    joints.position[KNEE], joints.torque[KNEE] = FAR, FULL
+    check, joints = overloaded()
     for _ in range(OVERLOADED - 1):
         assert check.check(joints, LIMIT) == ()
     joints.velocity[KNEE] = -2.0 * SLOWER
@@ -249,9 +251,7 @@ def test_joint_that_moves_back_restarts_the_count() -> None:
 
 
 def test_old_values_keep_the_count() -> None:
-    check, joints = HoldStability(), measured()
-    check.check(joints, LIMIT)
-    joints.position[KNEE], joints.torque[KNEE] = FAR, FULL
+    check, joints = overloaded()
     for _ in range(OVERLOADED - 1):
         assert check.check(joints, LIMIT) == ()
     joints.age[KNEE] = AGE + 1
@@ -263,9 +263,7 @@ def test_old_values_keep_the_count() -> None:
 
 @pytest.mark.parametrize("ends", ["drive off", "restart"])
 def test_the_position_of_the_next_hold_counts(ends: str) -> None:
-    check, joints = HoldStability(), measured()
-    check.check(joints, LIMIT)
-    joints.position[KNEE], joints.torque[KNEE] = FAR, FULL
+    check, joints = overloaded()
     for _ in range(OVERLOADED):
         found = check.check(joints, LIMIT)
     assert found

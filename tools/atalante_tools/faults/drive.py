@@ -25,8 +25,9 @@ _HIP: Final = "LEFT_SH"
 _COMMAND: Final = "COMMAND_LEFT_LEG"
 #: A knee that sinks in LOWER or FAULT is at rest after this time [cycles]. Then its drive can be enabled again.
 _LOWERED: Final = 4500
-#: A drive that was switched off stays off until START, so its joint need not be at rest before START [cycles].
-_SUNK: Final = 600
+#: Time before START [cycles] if the drive of the joint was switched off. This drive stays off until START, so its joint need not
+#: be at rest.
+_UNTIL_START: Final = 600
 #: Time from HOLD until all joints are at rest [cycles].
 _AT_REST: Final = 60
 
@@ -282,7 +283,7 @@ SCENARIOS: Final = (
                 (OperatorAction("hold"), Fault("torque_weak", node, _AT_REST, 600, share=share)),
                 node=node,
                 detected=_AT_REST + 200,
-                observed=_SUNK,
+                observed=_UNTIL_START,
             )
             for node, share in (
                 *((f"LEFT_{joint}", -1.0) for joint in ("FH", "SH")),
@@ -298,7 +299,7 @@ SCENARIOS: Final = (
                 f"knee in HOLD, {late} cycles late",
                 (OperatorAction("hold"), Fault("torque_late", _KNEE, 0, 600, by=late)),
                 node=_KNEE,
-                observed=_SUNK,
+                observed=_UNTIL_START,
             )
             for late in (10, 12)
         ),
@@ -311,7 +312,7 @@ SCENARIOS: Final = (
                 f"{node} with {share:g} times its torque",
                 (Fault("torque_wrong", node, 0, 600, share=share),),
                 node=node,
-                observed=_SUNK,
+                observed=_UNTIL_START,
             )
             for node, share in (
                 *((f"LEFT_{joint}", -1.0) for joint in LEG_JOINTS),
@@ -334,7 +335,7 @@ SCENARIOS: Final = (
                 node=node,
                 detected=cycles,
                 reacted=cycles,
-                observed=_SUNK,
+                observed=_UNTIL_START,
             )
             for node, share, cycles in (
                 *((f"LEFT_{joint}", -1.0, 30) for joint in ("FH", "TH", "SH", "SK")),
