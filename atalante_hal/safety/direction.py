@@ -29,9 +29,8 @@ legs of a suspended robot whose drives are off sink onto their end stops within 
 joints onto the end stops. So the pulse of a repeated test is `BOOST` times larger for a joint within the position
 tolerance of its limit. If the foot of a leg carries load, the joints of the leg may be blocked. A foot that only touches
 the floor hits the floor during the pulse, and the impact stops the ankle. An impact lasts one or two cycles, so the
-impact hardly changes the mean force. A joint whose foot carried load or hit the floor stays untested, and the next start
-tests the joint again. A joint that passed is not tested again until its drive restarts, because the wiring of a motor
-does not change while its drive is on.
+impact hardly changes the mean force. A joint whose foot carried load or hit the floor stays untested. Each start tests all
+joints again, because motors and encoders may have been exchanged since the last one.
 """
 
 from __future__ import annotations
@@ -138,9 +137,10 @@ class DirectionProof:
 
     Args:
         robot: position limits, hold gains and breakaway torques.
+        groups: joints of a leg that are tested at the same time, and duration of their pulse [cycles]; empty means no test.
 
     Attributes:
-        proven: True for each joint that passed and whose drive did not restart since then, shape (12,).
+        proven: True for each joint that passed in the last start, shape (12,).
         mobility: last measured mobility of each joint, shape (12,) [1/(kg m2)]; 0 if it was not measured.
         failed: indices in JOINTS of the joints that failed in this start.
         running: True from `begin` until all joints are tested, or one has failed.
@@ -148,8 +148,9 @@ class DirectionProof:
             short pulses and more than two joints best, all together; 0 before the first of these tests.
     """
 
-    def __init__(self, robot: Robot) -> None:
+    def __init__(self, robot: Robot, groups: Sequence[tuple[Sequence[str], int]] = GROUPS) -> None:
         both = len(SIDES)
+        self._groups = groups
         self._peak = np.array(PEAK * both) * robot.breakaway
         self._middle = 0.5 * (robot.position_min + robot.position_max)
         self._kp, self._kd = pose_gains(robot)
@@ -175,7 +176,7 @@ class DirectionProof:
         self._torque: list[Vector] = []  # sent torques in each cycle of the current test
 
     def begin(self, position: Vector, torque: Vector) -> None:
-        """Begin the tests of all joints whose direction is not verified yet.
+        """Begin the tests of all joints.
 
         Args:
             position: present joint positions, shape (12,) [rad], which the position control holds.
@@ -188,22 +189,13 @@ class DirectionProof:
         theirs[:] = np.where(left | right, theirs, -ours)
         self._trials = [0] * len(JOINTS)
         self.failed = []
-        if not self.proven.any():
-            self._explained[:] = 0.0
+        self.proven[:] = False
+        self._explained[:] = 0.0
         self._tests = [
-            (joints, duration)
-            for names, duration in GROUPS
-            if (joints := [j for j in self._unproven() if LEG_JOINTS[j % len(LEG_JOINTS)] in names])
+            ([j for j in range(len(JOINTS)) if LEG_JOINTS[j % len(LEG_JOINTS)] in names], duration)
+            for names, duration in self._groups
         ]
         self._next_test()
-
-    def forget(self, joint: int) -> None:
-        """Discard the result of a joint, because its drive restarted.
-
-        Args:
-            joint: index in JOINTS.
-        """
-        self.proven[joint] = False
 
     def torque(self, position: Vector, velocity: Vector) -> Vector:
         """Return the torque of this cycle, shape (12,) [Nm]: position control and pulse.
@@ -263,7 +255,8 @@ class DirectionProof:
             if duration == _SHORT:
                 passed = mobility[late] >= self._least[joints]
                 self._explained += explained[:, passed].sum(axis=1)
-                self.late = int(np.argmax(self._explained))
+                if self._explained.any():
+                    self.late = int(np.argmax(self._explained))
         self.mobility[joints] = mobility[late]
         return self._evaluate_test(joints, duration)
 
@@ -302,7 +295,7 @@ class DirectionProof:
         text = f"effective inertia [kg m2]: {passed}"
         if self.late:
             text += f"; torques {self.late} ms late"
-        blocked = [JOINTS[j] for j in self._unproven()]
+        blocked = [JOINTS[j] for j in np.flatnonzero(~self.proven).tolist()]
         return f"{text}; not tested under load: {', '.join(blocked)}" if blocked else text
 
     def _strength(self, joints: Sequence[int]) -> Vector:
@@ -324,7 +317,3 @@ class DirectionProof:
         self._force.clear()
         self._torque.clear()
         self.running = bool(self._tests)
-
-    def _unproven(self) -> list[int]:
-        proven: list[int] = np.flatnonzero(~self.proven).tolist()
-        return proven

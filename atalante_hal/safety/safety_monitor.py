@@ -182,8 +182,7 @@ class SafetyMonitor:
     def _check_joints(self) -> tuple[Finding, ...]:
         """Check the drive torques if the robot moves. Check the held joints if it does not. Return the faults.
 
-        The next START repeats the direction test of a drive with a wrong torque, and of a drive that does not hold its joint. A
-        drive that does not hold its joint stays off until then.
+        A drive that does not hold its joint stays off until the next START, which tests the directions of all joints.
         """
         state = self._state
         if self.moving:
@@ -194,8 +193,6 @@ class SafetyMonitor:
             self._held.age[:] = state.age[self._joint_rows]
             found = self._hold_stability.check(self._held, self._limiter.limit)
             self._not_holding.update(finding.node for finding in found)
-        for finding in found:
-            self.proof.forget(DRIVE_NODES.index(finding.node))
         return found
 
     def accept(self, frames: Frames) -> list[int]:
@@ -259,8 +256,6 @@ class SafetyMonitor:
         self._heartbeats.evaluate(cycle, memory)
         for node in self._heartbeats.booted:
             self._plausibility.reference(node)
-            if node in DRIVE_NODES:
-                self.proof.forget(DRIVE_NODES.index(node))
         self._heartbeats.booted.clear()
         for finding in (*findings, *self._plausibility.findings, *self._reports):
             memory.raise_finding(cycle, finding)
@@ -385,7 +380,7 @@ class SafetyMonitor:
             }
             self._heartbeats.acknowledge(faulty)
             self._acknowledged = True
-            if not self.proof.running:  # another press of START does not restart a running direction test
+            if not self.start_wanted:  # another press of START during a start does not restart the direction test
                 self._proof_begun = False
                 if state.supervisor in (_S.READY, _S.HOLD):  # in LOWER and FAULT, START does not enable any drive
                     self.proof.failed.clear()

@@ -138,7 +138,7 @@ def test_robot_that_stands_in_hold_can_start_again(robot, engine: str) -> None:
         (),
         "never",
         engine=engine,
-        cycles=4600,
+        cycles=4800,
         presses={3000: "hold", 4500: "start"},
     )
     assert run.states[4400] is S.HOLD

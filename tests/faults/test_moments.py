@@ -111,6 +111,17 @@ def test_fast_joint_fails(monkeypatch: pytest.MonkeyPatch) -> None:
     assert verdict.extremes.speed == (pytest.approx(1.25), "left_SK")
 
 
+@pytest.mark.parametrize(("joint", "share", "failures"), [(3, 1.59, 0), (3, 1.61, 1), (4, 1.01, 1)])
+def test_only_a_strong_motor_may_exceed_its_torque_limit(
+    monkeypatch: pytest.MonkeyPatch, joint: int, share: float, failures: int
+) -> None:
+    def strong(run: Observation) -> None:
+        run.torque[100, joint] = share * run.robot.torque_max[joint]
+
+    task = MomentTask(Moment.READY, (index("F75", "LEFT_SK with 1.6 times its torque"),))
+    assert len(patched(monkeypatch, strong, task).failures) == failures
+
+
 def test_wrong_motors_are_found_within_the_bound_of_the_fault_matrix() -> None:
     assert load_matrix()["F84"].detected == moments.FOUND
     for case in SCENARIOS["F84"].cases:

@@ -143,22 +143,20 @@ def test_joints_pass_although_their_torque_acts_late(joints: Joints, late: int):
     assert joints.proof.report().endswith(f"; torques {late} ms late")
 
 
-def test_delay_is_measured_again_after_all_drives_restarted(joints: Joints):
-    joints.delay(3)
-    joints.run()
-    joints.proof.proven[:] = np.arange(12) != 0  # one drive restarted: its test alone does not measure the delay
-    joints.delay(0)
-    joints.run()
-    assert joints.proof.late == 3
-    joints.delay(3)
-    for _ in range(3):
-        joints.proof.proven[:] = False
+def test_each_start_measures_the_delay_again(joints: Joints):
+    for late in (3, 0, 3):
+        joints.delay(late)
         joints.run()
-    assert joints.proof.late == 3
-    joints.proof.proven[:] = False
-    joints.delay(0)
+        assert joints.proof.late == late
+
+
+def test_start_in_which_no_joint_passes_keeps_the_delay(joints: Joints):
+    joints.delay(3)
     joints.run()
-    assert joints.proof.late == 0
+    joints.strength[:] = 0.0
+    joints.run(np.array([500.0, 500.0]), within=range(1000))
+    assert not joints.proof.proven.any()
+    assert joints.proof.late == 3
 
 
 def delays(monkeypatch: pytest.MonkeyPatch, joints: Joints, *late: int) -> None:
@@ -209,27 +207,23 @@ def test_reversed_motor_fails_although_its_torque_acts_late(joints: Joints, join
 
 @pytest.mark.parametrize("joint", range(6), ids=JOINTS[:6])
 def test_reversed_motor_fails_again_in_a_second_start(joints: Joints, joint: int):
-    """In the second start, only the joint that failed is tested."""
     joints.strength[joint] = -1.0
     assert joints.run()[0]
     joints.position, joints.velocity = MIDDLE.copy(), np.zeros(12)
-    joints.proof.proven[:] = np.arange(12) != joint
     failure, _ = joints.run()
     assert failure.startswith(JOINTS[joint])
 
 
-def test_single_joint_is_tested_with_the_delay_of_a_bus_without_delay(joints: Joints):
-    joints.proof.proven[:] = np.arange(12) != ANKLE
-    assert joints.run() == ("", GROUPS[1][1] + LATENCY + 1)
-    assert joints.proof.mobility[ANKLE] == pytest.approx(1.0 / INERTIA[ANKLE], rel=0.05)
+def test_each_start_tests_all_joints_again(joints: Joints):
+    assert joints.run() == joints.run() == ("", ONCE)
+    joints.strength[ANKLE] = -1.0
+    assert joints.run()[0].startswith(JOINTS[ANKLE])
 
 
-def test_joints_that_passed_are_not_tested_again_until_their_drive_restarts(joints: Joints):
-    joints.run()
-    assert joints.run() == ("", 0)
-    joints.proof.forget(ANKLE)
-    assert joints.run() == ("", GROUPS[1][1] + LATENCY + 1)
-    assert joints.proof.proven.all()
+def test_without_groups_no_joint_is_tested():
+    proof = DirectionProof(ROBOT, ())
+    proof.begin(MIDDLE, np.zeros(12))
+    assert not proof.running
 
 
 @pytest.mark.parametrize("joint", range(12), ids=JOINTS)

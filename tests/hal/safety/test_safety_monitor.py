@@ -14,6 +14,7 @@ from atalante_dbc import Message, load
 from atalante_hal.hal import BRIDGED_ERRORS, SATURATED_CYCLES
 from atalante_hal.robot import JOINTS
 from atalante_hal.safety.diagnostics import Dtc
+from atalante_hal.safety.direction import DirectionProof
 from atalante_hal.safety.hold_stability import REVERSALS
 from atalante_hal.safety.limiter import Limited, Limiter
 from atalante_hal.safety.safety_monitor import FINISH_STEP_CYCLES, RECALL_CYCLES
@@ -120,7 +121,8 @@ def test_start_with_enabled_drives_continues_from_their_torque(make_rig):
 
     rig.emulator.before_send.append(enabled)
     rig.until(S.READY)
-    rig.hal._safety_monitor.proof.proven.fill(True)  # the drives are off, so they cannot move their joints
+    # The drives are off, so they cannot move their joints.
+    rig.hal._safety_monitor.proof = DirectionProof(rig.hal.robot, ())
     rig.operator.start()
     rig.until(S.ACTIVE, 10 + RECALL_CYCLES)
     first = [v for c in rig.last_commands().values() for k, v in c.items() if k.endswith("TargetTorque")]
@@ -436,10 +438,11 @@ def test_joint_that_oscillates_in_hold_is_lowered_until_the_next_start(rig):
     rig.until(S.HOLD, 5)
     state = rig.run(6 * REVERSALS)  # the drive stays off until the START that enables all drives
     assert (state.supervisor, state.drive_state[KNEE]) == (S.HOLD, DriveState.SWITCH_ON_DISABLED)
-    assert not rig.hal._safety_monitor.proof.proven[KNEE]
+    shaking = rig.emulator.before_send.pop()  # during the start, the joint must not oscillate
     rig.operator.start()
-    rig.until(S.ACTIVE, 150)  # the controller moves the joint, its drive does not hold it
-    assert rig.run(6 * REVERSALS).supervisor is S.ACTIVE
+    rig.until(S.ACTIVE, 150)
+    rig.emulator.before_send.append(shaking)
+    assert rig.run(6 * REVERSALS).supervisor is S.ACTIVE  # the controller moves the joint, its drive does not hold it
     rig.operator.hold()
     rig.until(S.LOWER, 6 * REVERSALS)
     rig.run(3)

@@ -11,7 +11,6 @@ from atalante_hal.safety.direction import (
     LATENCY,
     TRAVEL,
 )
-from atalante_hal.safety.safety_monitor import DRIVE_NODES
 from atalante_hal.types import SupervisorState
 from atalante_hal.wire.cia402 import Controlword, DriveState
 
@@ -98,23 +97,30 @@ def test_further_presses_of_start_do_not_restart_the_test(make_rig):
     raise AssertionError("the robot must be ACTIVE although START is pressed every 5 cycles")
 
 
-def test_restart_from_hold_needs_no_new_test(rig):
+@pytest.mark.parametrize("held", [20, 300])
+def test_restart_from_hold_tests_all_joints_again(rig, held: int):
     rig.until(S.ACTIVE)
+    rig.run(600)
     rig.operator.hold()
     rig.until(S.HOLD)
-    rig.run(20)
+    rig.run(held)
     rig.operator.start()
-    rig.until(S.ACTIVE, 20)
-
-
-def test_restarted_drive_is_tested_again(rig):
-    rig.until(S.ACTIVE)
-    rig.operator.hold()
-    rig.until(S.HOLD)
-    rig.emulator._heartbeats.boot(DRIVE_NODES[ANKLE], rig.emulator.cycle)
     rig.run(30)
-    proven = rig.hal._safety_monitor.proof.proven
-    assert np.flatnonzero(~proven).tolist() == [ANKLE]
-    rig.operator.start()
+    assert rig.hal._safety_monitor.proof.running
     rig.until(S.ACTIVE, 100)
-    assert proven.all()
+    assert rig.hal._safety_monitor.proof.proven.all()
+
+
+def test_motor_that_is_reversed_in_hold_prevents_the_restart(rig):
+    rig.until(S.ACTIVE)
+    rig.operator.hold()
+    rig.until(S.HOLD)
+    rig.run(300)
+    rig.operator.start()
+    while not rig.hal._safety_monitor.proof.running:
+        rig.run(1)
+    rig.emulator.drives.motors.set_strength(KNEE, -1.0)
+    rig.run(200)
+    assert [e.text.split()[0] for e in rig.hal.events if e.code == "START_FAILED"] == [JOINTS[KNEE]]
+    assert rig.hal.state.drive_state[KNEE] == D.SWITCH_ON_DISABLED
+    assert rig.hal.state.supervisor is S.LOWER

@@ -25,6 +25,7 @@ from atalante_dbc import Message, Network
 from atalante_hal.bus import Stamps
 from atalante_hal.hal import Hal
 from atalante_hal.robot import JOINTS, Robot, load_robot
+from atalante_hal.safety.direction import DirectionProof
 from atalante_hal.safety.plausibility.inertial import GRAVITY
 from atalante_hal.types import PERIOD, Command, State, SupervisorState, Vector
 from atalante_hal.wire.cia402 import DriveState
@@ -272,7 +273,7 @@ def active_hal() -> RecordedHal:
     recording = Recording(walk())
     bus = RecordedBus(recording)
     hal = Hal(walk().network, walk().robot, bus)
-    hal._safety_monitor.proof.proven.fill(True)  # recorded nodes do not react to test pulses
+    hal._safety_monitor.proof = DirectionProof(walk().robot, ())  # recorded nodes do not react to test pulses
     hal._safety_monitor.torque_tracking.tolerance.fill(np.inf)  # recorded nodes do not follow torque commands
     for _ in range(2 * TURN):
         hal.read()

@@ -25,13 +25,15 @@ from typing import Final, NamedTuple
 
 import numpy as np
 
+from atalante_emulator.faults import Fault
 from atalante_hal.robot import JOINTS
+from atalante_hal.safety.safety_monitor import DRIVE_NODES
 from atalante_hal.types import SupervisorState, Vector
 from atalante_tools.console.options import PYBULLET
 from atalante_tools.faults.catalogue import SCENARIOS
 from atalante_tools.faults.observation import Observation
 from atalante_tools.faults.runner import RECOVERY, CaseRun, milestones, walk_cycle
-from atalante_tools.faults.scenario import MID_SWING, Case, shifted
+from atalante_tools.faults.scenario import MID_SWING, Case, Stimulus, shifted
 from atalante_tools.faults.verdict import WALKING, automatic_improvements, exception_sentence, limit_violations
 
 _S = SupervisorState
@@ -48,8 +50,10 @@ SAG_OF: Final = {
     "value": 5.0,
     "push": math.inf,
 }
+#: Kinds of faults of a motor.
+_MOTOR: Final = ("torque_wrong", "torque_weak")
 #: Kinds of faults that may move a joint above its velocity limit, and cycles in which they are found: bound of F84 in FAULTS.md.
-_UNLIMITED: Final = ("torque_wrong", "torque_weak", "encoder_swapped")
+_UNLIMITED: Final = (*_MOTOR, "encoder_swapped")
 FOUND: Final = 200
 #: Number of cycles from READY to the operator's START.
 _PAUSE: Final = 50
@@ -158,7 +162,7 @@ class MomentTask:
         kinds = [stimulus.kind for stimulus in stimuli]
         fast = [s.start for s in stimuli if s.kind in _UNLIMITED]
         unlimited = range(run.first + min(fast), run.first + max(fast) + FOUND) if fast else range(0)
-        failures = [*limit_violations(run, unlimited), *_premature(run, plan.starts[0])]
+        failures = [*limit_violations(run, unlimited, _strength(stimuli)), *_premature(run, plan.starts[0])]
         if self.moment in (Moment.WALKING, Moment.HOLD):  # at the other moments, START may improve the state
             failures += automatic_improvements(run, before)
         most = max((SAG_OF.get(kind, SAG_MAX) for kind in kinds), default=SAG_MAX)
@@ -214,6 +218,20 @@ def _observe(case: Case, plan: Schedule) -> Observation:
         case_run.presses[plan.stop].append("stop")
     case_run.execute(lambda state: state.cycle >= restart + RECOVERY + _END)
     return case_run.observation(restart)
+
+
+def _strength(stimuli: Sequence[Stimulus]) -> Vector:
+    """Return the largest torque of each motor, divided by the torque of a motor without fault, shape (12,).
+
+    Args:
+        stimuli: faults and actions of the run.
+    """
+    strength = np.ones(len(JOINTS))
+    for stimulus in stimuli:
+        if isinstance(stimulus, Fault) and stimulus.kind in _MOTOR:
+            joint = DRIVE_NODES.index(stimulus.target)
+            strength[joint] = max(strength[joint], abs(float(stimulus["share"])))
+    return strength
 
 
 def _premature(run: Observation, start: int) -> list[str]:

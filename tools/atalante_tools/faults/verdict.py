@@ -18,7 +18,7 @@ import numpy as np
 
 from atalante_hal.robot import JOINTS
 from atalante_hal.safety.events import Event
-from atalante_hal.types import SupervisorState
+from atalante_hal.types import SupervisorState, Vector
 from atalante_hal.wire.cia402 import Controlword
 from atalante_tools.faults.matrix import Row
 from atalante_tools.faults.observation import RESTARTED, Observation, restarted
@@ -135,19 +135,20 @@ def reacted(run: Observation, state: SupervisorState) -> int | None:
     return None
 
 
-def limit_violations(run: Observation, unlimited: range = range(0)) -> list[str]:
+def limit_violations(run: Observation, unlimited: range = range(0), strength: Vector | float = 1.0) -> list[str]:
     """Return a sentence for each limit that a command, a motor or a joint exceeded.
 
     Args:
         run: observation of the run.
         unlimited: cycles in which the joint velocities are not checked.
+        strength: torque of each motor divided by the torque of a motor without fault, shape (12,), at least 1.
     """
     robot = run.robot
     found = run.commands.violations(robot, run.drive_state)
     fast = np.abs(run.velocity) > _VELOCITY_RATIO * robot.velocity_max
     fast[max(unlimited.start - 1, 0) : max(unlimited.stop - 1, 0)] = False
     for sentence, wrong in (
-        ("a motor's torque was above its limit", np.abs(run.torque) > robot.torque_max * (1.0 + 1e-9)),
+        ("a motor's torque was above its limit", np.abs(run.torque) > strength * robot.torque_max * (1.0 + 1e-9)),
         ("a joint was outside its position range", run.position > robot.position_max + _OVERSHOOT),
         ("a joint was outside its position range", run.position < robot.position_min - _OVERSHOOT),
         ("a joint was above its velocity limit", fast),

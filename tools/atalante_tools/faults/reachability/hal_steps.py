@@ -19,6 +19,7 @@ from atalante_hal.hal import Hal
 from atalante_hal.pendant import Pendant
 from atalante_hal.robot import load_robot
 from atalante_hal.safety.diagnostics import Dtc, Finding, Reaction
+from atalante_hal.safety.direction import DirectionProof
 from atalante_hal.safety.fault_memory import FaultMemory
 from atalante_hal.safety.safety_monitor import DRIVE_NODES, RECALL_CYCLES
 from atalante_hal.safety.state_machine import MOVING
@@ -135,6 +136,8 @@ class HalSteps:
         network, robot = atalante_dbc.load(), load_robot()
         self._hal = Hal(network, robot, NoBus())
         self._monitor = self._hal._safety_monitor
+        # Leave out the test of the directions, because it needs the same controlwords as the enabling of drives.
+        self._monitor.proof = DirectionProof(robot, ())
         self._image = self._hal._image
         self._pendant = self._monitor._pendant
         self._scripted = _ScriptedPendant(self._image)
@@ -318,10 +321,6 @@ class HalSteps:
         )
         monitor._ending = monitor._duplicate_found = monitor._ramping = False
         monitor.lowered.clear()
-        # Mark all torque directions as tested. The test of the directions needs the same controlwords as the enabling of drives.
-        monitor.proof.proven.fill(True)
-        monitor.proof.failed.clear()
-        monitor.proof.running = False
         rows = len(self._image.check)
         monitor._message_monitor.qualification = [SETTLED] * rows
         monitor._message_monitor._evidence = [0] * rows
