@@ -144,7 +144,7 @@ class Hal:
         state, image, transceiver = self.state, self._image, self._transceiver
         state.cycle = cycle = state.cycle + 1
         state.time = cycle * PERIOD
-        late = 0 if image.all_fresh else transceiver.receive()  # late answers to the previous SYNC
+        late = 0 if image.all_fresh else transceiver.receive()  # number of late answers to the previous SYNC
         self._commands.synchronise(cycle)
         count = transceiver.receive(late, image, self.patience)
         foreign = image.accept(transceiver.scratch, count, cycle & 0xFF)

@@ -12,17 +12,19 @@ from atalante_hal.types import Vector
 
 
 class LegModel(NamedTuple):
-    """Links and friction of both legs, left leg first. The links of a leg are in the order of `LEG_JOINTS`.
+    """Links and friction of both legs. The first dimension of each array is the leg, left leg first.
 
-    The frame of a link is the frame of its joint. The frame of the pelvis IMU is the parent of the first link.
+    The second dimension is the joint and its link, in the order of `LEG_JOINTS`; in `cell`, it is the force cell. The frame of a
+    link is the frame of its joint. The frame of the pelvis IMU is the parent of the first link.
     """
 
     offset: Vector  # (2, 6, 3) m, position of the joint in the frame of the parent link
-    #: (2, 6, 3, 3, 3) The rotation matrix from link to parent is turn[0] + sin(q) turn[1] + (1 - cos(q)) turn[2].
+    #: (2, 6, 3, 3, 3) three matrices T for each joint, shape (3, 3) each. At the joint angle q, the rotation matrix from link to
+    #: parent is T[0] + sin(q) T[1] + (1 - cos(q)) T[2].
     turn: Vector
     axis: Vector  # (2, 6, 3) unit vector of the joint axis in the frame of the link
     mass: Vector  # (2, 6) kg
-    centre: Vector  # (2, 6, 3) m, position of the centre of mass
+    centre: Vector  # (2, 6, 3) m, position of the centre of mass in the frame of the link
     inertia: Vector  # (2, 6, 3, 3) kg m2, inertia about the origin of the link frame
     cell: Vector  # (2, 4, 3) m, positions of the force cells in the frame of the last link
     dry: Vector  # (2, 6) Nm, dry friction of the joints

@@ -29,7 +29,7 @@ class Demand(NamedTuple):
 
 
 def demand_of(signals: Sequence[float]) -> Demand:
-    """Return the dead-man switch and the stop request of a frame.
+    """Return the dead-man switch, the stop request and the hold request of a frame.
 
     Args:
         signals: Signal values of PENDANT_STATE in the order of the DBC, which begins with DeadMan and Request.
@@ -82,7 +82,7 @@ class Pendant:
         #: Assistance factor Xi in [0, 1]; None if the pendant sets no factor.
         self.assistance_factor: float | None = None
         self._press: float | None = None  # RequestCounter of the last cycle
-        self._pressed = False  # True while a START is stored, because the pendant is not trusted yet
+        self._pressed = False  # True while a START is stored, because the pendant is not qualified yet
 
     def evaluate(
         self, present: bool, *, qualifying: bool = False, new: bool = True, further_frames: Sequence[Vector] = ()

@@ -67,11 +67,11 @@ class Sensors:
     #: Largest mean difference [rad/s at the joint] between the reported velocity and the filtered encoder velocity.
     velocity_error: float
     velocity_bandwidth: float  # Hz, cut-off frequency of the low-pass of the reported velocity
-    #: Largest difference [rad] about each axis between two tibia attitudes: from the encoders and from the IMUs.
+    #: Largest difference [rad] about each axis between the tibia attitude from the encoders and the tibia attitude from the IMUs.
     attitude_error: float
     #: Largest change [rad] of the difference between encoder angle and IMU angle while the encoder reading is constant.
     attitude_change: float
-    misalignment: float  # rad, allowance added to `attitude_change` for each rad by which the leg turns
+    misalignment: float  # rad for each rad, increase of the limit `attitude_change` for each rad by which the leg turns
     quaternion_error: float  # largest difference between the squared norm of a quaternion and 1
     cell_free: float  # N, largest vertical force at which a cell is regarded as unloaded
     cell_twist: float  # N, largest difference between the vertical forces on the two diagonals of a foot's cells
@@ -84,7 +84,8 @@ class Thresholds:
 
     supply_low: float  # V at a drive; below this voltage the battery is nearly empty
     supply_under: float  # V at a drive; below this voltage the drives may soon fail to hold
-    #: Walking is permitted while the torque limit of a hot drive is at least this share of the limit in the other leg.
+    #: Walking is permitted while the torque limit of a hot drive is at least this share of the torque limit of the same drive in
+    #: the other leg.
     derated_imbalance: float
     full_assist_ramp: float  # s, time for the ramp of the assistance factor from 0 to 1 in FULL_ASSIST
     #: Largest accepted angle [rad] outside a position limit. A joint beyond this angle is out of range.

@@ -266,8 +266,8 @@ class Transceiver:
         """Wait until every expected message of `cycle` has arrived in `scratch[first:]`, at most `patience` [s]."""
         missing = cycle.expected_ages()
         shortest = min(patience, _DOUBTFUL_PATIENCE)
-        # Before the first answer of any node, no message is expected. Then receive until the bus is silent, so that late
-        # answers are not taken for answers of the next cycle.
+        # While no node has answered within its timeout, no message is expected. In this case, receive until the bus is silent, so
+        # that late answers are not taken for answers of the next cycle.
         until_silent = not missing
         begun = time.monotonic()
         while count < RECEIVE_BUDGET:

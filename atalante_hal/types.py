@@ -43,7 +43,7 @@ class State:
     cycle: int  # SYNC counter
     time: float  # s, `cycle` times the period
     supervisor: SupervisorState
-    assistance_factor: float  # factor Xi in [0, 1], set by the operator; ramped to 1 in FULL_ASSIST
+    assistance_factor: float  # factor Xi in [0, 1], set by the operator; ramped to 1 in FULL_ASSIST and FINISH_STEP
     position: Vector  # (12,) rad
     velocity: Vector  # (12,) rad/s
     torque: Vector  # (12,) Nm, measured by the drive
@@ -59,8 +59,9 @@ class State:
     joints_valid: bool  # True if all twelve joint states are valid
     imu_rows: tuple[int, ...] = ()  # indices of the IMU messages in `valid` and `age`; empty if unknown
     foot_rows: tuple[int, ...] = ()  # indices of the foot messages in `valid` and `age`; empty if unknown
-    torque_sent: Vector | None = None  # (12,) Nm, last torques after the limits, not sent in HOLD; None if unknown
-    #: Cycles by which torques act later than with punctual messages and motors, measured at START, see `safety.direction`
+    torque_sent: Vector | None = None  # (12,) Nm, last output of the limiter (not sent in HOLD); None if unknown
+    #: Additional delay [cycles] from a torque command to its effect because of late messages or motors; 0 if all are punctual.
+    #: Measured at START, see `safety.direction`.
     delay: int = 0
 
 
@@ -76,7 +77,7 @@ class Command:
     step: int | None = None  # number of the walking step; None for a controller that does not walk
     walking: bool = False  # True while the robot walks on the ground; STOP then ends the walk before HOLD
     outside: bool = False  # True if a joint is outside the virtual guide; raises a pending diagnostic
-    #: True if a joint stays outside a guide with a certificate. Together with `outside`, this leads to FULL_ASSIST.
+    #: True if a joint was outside a certified guide for too many cycles. FULL_ASSIST follows if `outside` is also True.
     guide_left: bool = False
     #: True if a step starts with a larger deviation than the guide certificate assumes; raises a pending diagnostic.
     hand_over_exceeded: bool = False

@@ -1,4 +1,4 @@
-"""Walk inside a virtual guide of your own shape: wide at start and end of the step, 3 degrees in the middle of the step.
+"""Walk inside a virtual guide of your own shape: wide at start and end of the step, +-3 degrees in the middle of the step.
 
 Run it:  python examples/own_guide_shape.py
 

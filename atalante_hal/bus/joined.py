@@ -74,7 +74,7 @@ class JoinedBus:
 
     @property
     def dropped(self) -> int:
-        """Return the number of frames lost on all channels."""
+        """Return how many incoming frames were lost or invalid since the bus was opened: the sum over all channels."""
         return sum(link.dropped for link in self._links)
 
     @property

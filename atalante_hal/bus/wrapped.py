@@ -23,12 +23,12 @@ class WrappedBus:
 
     @property
     def stamps(self) -> Stamps:
-        """Return the receive times at the wrapped bus. Shape (capacity,) int64 [ns]."""
+        """Return the receive time of each frame of the last `receive()` of the wrapped bus. Shape (capacity,), int64 [ns]."""
         return self.bus.stamps
 
     @property
     def dropped(self) -> int:
-        """Return the number of frames that the wrapped bus lost."""
+        """Return how many incoming frames of the wrapped bus were lost or invalid."""
         return self.bus.dropped
 
     def send(self, frames: Frames) -> None:

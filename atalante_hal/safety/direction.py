@@ -53,10 +53,12 @@ LATENCY = 2
 #: The pulse of 16 cycles changes its sign every four cycles. So a wrong sign would look like a delay that is four cycles longer,
 #: and the test tries no such delay.
 LATENCIES = tuple(range(LATENCY, LATENCY + 4))
-#: Peak of the pulse as a multiple of `Robot.breakaway`, in the order of LEG_JOINTS. FH and SH move a whole leg.
+#: Peak of the pulse as a multiple of `Robot.breakaway`, in the order of LEG_JOINTS.
+#: The peaks of FH and SH are larger, because these joints move a whole leg.
 PEAK = (6.0, 3.0, 6.0, 3.0, 3.0, 3.0)
-#: Gains of the HAL's position control in the test, divided by the gains of the drive. The order is LEG_JOINTS.
-#: The position control of the HAL has more delay than that of a drive, so the HAL's gains for light joints are lower.
+#: Stiffness and damping of the HAL's position control in the test, divided by `Robot.hold_kp` and `Robot.hold_kd` of the drives.
+#: The order is LEG_JOINTS. The position control of the HAL has more delay than the position control of a drive. So the HAL uses
+#: lower gains for light joints.
 STIFFNESS = (1.0, 1.0, 1.25, 0.5, 0.25, 0.25)
 DAMPING = (0.5, 0.5, 0.6, 0.25, 0.25, 0.25)
 #: Integral time of the HAL's position control, which holds the legs during the test [s].
@@ -69,13 +71,14 @@ LOAD = 1.0 / 3.0
 #: A foot hit the floor if the sum of its forces in two consecutive cycles exceeds `HIT * cell_free`.
 #: `HIT * cell_free` is four times the noise of the sum. An impact that stops an ankle is at least 1.5 times as large.
 HIT = 2.0
-#: Factor of the torque pulse in the second test of a joint near its end stop. The leg weight may press the joint onto the stop.
+#: If a joint near its end stop is tested a second time, its torque pulse is multiplied by this factor, because the leg weight may
+#: press the joint onto the end stop.
 BOOST = 6.0
 #: Number of unsuccessful tests of a joint after which the joint has failed.
 TRIALS = 2
 #: Smallest mobility [1/(kg m2)] that proves that a joint follows its torque, in the order of LEG_JOINTS.
-#: `MOBILITY` is about half of the smallest mobility of each joint of the suspended robot in four cases.
-#: The cases are straight legs and bent legs, each without a patient and with a patient of 110 kg.
+#: `MOBILITY` is about half of the smallest mobility of each joint in four cases of the suspended robot: straight legs and bent
+#: legs, each without a patient and with a patient of 110 kg.
 MOBILITY = (0.045, 0.23, 0.075, 0.56, 4.6, 6.8)
 
 
@@ -166,10 +169,10 @@ class DirectionProof:
         #: Tests still to be done: joints of the test, and duration of its pulse [cycles].
         self._tests: list[tuple[list[int], int]] = []
         self._trials = [0] * len(JOINTS)
-        # A test of one or two joints uses the delay of the earlier tests. With a free choice, a reversed motor may look like a
-        # late motor.
+        # A test of one or two joints uses the delay `late` from earlier tests with more joints. If such a test chose its own
+        # delay, a reversed motor might look like a late motor.
         self.late = 0
-        #: Sum of the shares of motion that each delay in `LATENCIES` explains, over all joints that passed a test.
+        #: For each delay in `LATENCIES`: share of the motion that the delay explains, summed over the joints that passed a test.
         self._explained = np.zeros(len(LATENCIES))
         self._position: list[Vector] = []  # joint positions in each cycle of the current test
         self._force: list[Vector] = []  # vertical force of each foot in each cycle of the current test

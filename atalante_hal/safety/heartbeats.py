@@ -24,7 +24,7 @@ from atalante_hal.wire.process_image import NEVER, ReceiveImage
 
 #: Values of the signal NodeState (CiA 301): 0 after the node has started, 5 in normal operation.
 BOOT_UP, OPERATIONAL = 0, 5
-#: Highest `Check` result of a frame with new data.
+#: A frame has new data if its `Check` result is at most this value.
 #: The constant is an integer, because numpy compares enum members ten times slower.
 _FRESH = int(Check.SOME_LOST)
 
@@ -75,11 +75,11 @@ class Heartbeats:
         self._amplitude, self._amplitude_row = codec.slice("Amplitude"), codec.rows["HAPTICS_STATE"]
         self._seen = 0  # cycle of the last call of `image.new_cycle`
         #: Diagnostic and error code of the active emergency of each node. A cleared emergency is removed. If a node has several
-        #: active emergencies, this is the newest one with the most severe reaction.
+        #: active emergencies, the entry is the newest of the emergencies with the most severe reaction.
         self.emergencies: dict[str, tuple[Dtc, int]] = {}
         self._cleared: set[str] = set()  # nodes whose emergency was cleared in this cycle
-        #: Emergencies since the last `evaluate` that cause no reaction, as (node, diagnostic, error code). Their reaction is
-        #: INFO, or milder than the reaction to the active emergency of the node.
+        #: Emergencies since the last `evaluate` that are only reported as pending, as (node, diagnostic, error code): emergencies
+        #: with the reaction INFO, and emergencies with a milder reaction than the active emergency of the node.
         #: `_notices` also contains an entry with error code 0 for each frame of an error passive node.
         self._notices: list[tuple[str, Dtc, int]] = []
         self._reset: set[str] = set()  # nodes that restarted since the last `evaluate`

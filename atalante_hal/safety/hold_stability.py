@@ -42,10 +42,10 @@ OVERLOADED: Final = 20
 #: Smallest distance from the position in which the hold began [rad]. A drive that only reports a wrong torque still holds its
 #: joint in this position.
 AWAY: Final = math.radians(1.0)
-#: Decrease of the speed that shows that a joint slows down, and smallest speed back that shows that a joint moves back [rad/s].
-#: The noise of the velocities is smaller.
+#: A joint moves back if its speed towards `Loads.start` exceeds this value [rad/s]. A joint slows down if its speed away from
+#: `Loads.start` has decreased by more than this value. The noise of the velocities is smaller.
 SLOWER: Final = 0.05
-#: Largest age of the values of a joint with which an overload counts [cycles].
+#: The overload check skips a joint in each cycle in which the values of the joint are older than this [cycles].
 AGE: Final = 4
 
 
@@ -71,7 +71,7 @@ class Loads(NamedTuple):
     """Record of the overload of all joints, shape (12,) each."""
 
     start: Vector  # position in which the hold began [rad]; NaN if the drive does not hold its position
-    speed: Vector  # speed away from `start` when the current count began [rad/s]
+    speed: Vector  # speed away from `start` when the count in `cycles` began [rad/s]
     cycles: Vector  # number of consecutive cycles with overload
 
 

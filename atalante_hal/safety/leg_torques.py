@@ -32,11 +32,11 @@ SPAN: Final = 2 * HALF + 1
 #: A torque moves the joints this number of cycles after the cycle in which the HAL reports it as sent, if no frame and no motor
 #: is late.
 DELAY: Final = 1
-#: Largest further delay of the torques [cycles]: states, commands and motors together.
+#: Largest delay of the torques in addition to `DELAY` [cycles]: the sum of the delays of states, commands and motors.
 MORE: Final = 3
 #: Largest age of the positions [cycles]. The frames of a node may be late by one cycle in every cycle.
 LATE: Final = 1
-#: Largest number of consecutive cycles in which the values of IMU or foot are repeated.
+#: Largest permitted number of consecutive cycles in which the values of the pelvis IMU or of a foot do not change.
 REPEATED: Final = 2
 _LEG: Final = len(LEG_JOINTS)
 _PELVIS: Final = IMUS.index("pelvis")
@@ -51,24 +51,24 @@ class Sample(NamedTuple):
     position: Vector  # (12,) rad
     accel: Vector  # (4, 3) m/s2, specific force at each IMU
     gyro: Vector  # (4, 3) rad/s
-    force: Vector  # (2, 4, 3) N
+    force: Vector  # (2, 4, 3) N, force on each cell of each foot
     age: Cycles  # (rows,) age of each row of the process image [cycles]
     rows: Cycles  # (12,) row of each joint in the process image
 
 
 class History(NamedTuple):
-    """Values of the last `SPAN` cycles, and sent torques of `MORE` cycles more. The oldest row is overwritten."""
+    """Values of the last `SPAN` cycles; for `sent`, of the last `SPAN + MORE` cycles. A new cycle overwrites the oldest row."""
 
     cycles: Cycles  # (1,) number of stored cycles since the restart
-    sent: Vector  # (SPAN + MORE, 12)
-    position: Vector  # (SPAN, 12)
-    age: Cycles  # (SPAN, 12)
-    accel: Vector  # (SPAN, 3) specific force at the pelvis IMU
-    gyro: Vector  # (SPAN, 3) angular velocity of the pelvis IMU
-    force: Vector  # (SPAN, 2, 4, 3)
-    #: (3,) Number of consecutive cycles in which the values of pelvis IMU, left and right foot did not change, and
-    #: (3,) number of cycles since more than `REPEATED` such cycles in a row.
+    sent: Vector  # (SPAN + MORE, 12) Nm, see `Sample.sent`
+    position: Vector  # (SPAN, 12) rad
+    age: Cycles  # (SPAN, 12) age of each position [cycles]
+    accel: Vector  # (SPAN, 3) m/s2, specific force at the pelvis IMU
+    gyro: Vector  # (SPAN, 3) rad/s, angular velocity of the pelvis IMU
+    force: Vector  # (SPAN, 2, 4, 3) N, force on each cell of each foot
+    #: (3,) number of consecutive cycles in which the values of the pelvis IMU, the left foot and the right foot did not change
     repeats: Cycles
+    #: (3,) number of consecutive cycles in which `repeats` was at most `REPEATED`, in the same order
     good: Cycles
 
 
@@ -79,7 +79,7 @@ class Torques(NamedTuple):
     produced: Vector  # (6,) Nm, torques that the motors produced, computed from the motion
     speed: Vector  # (6,) rad/s, mean velocities
     acceleration: Vector  # (6,) rad/s2, mean accelerations
-    load: Vector  # (4, 3) N, mean forces on the foot
+    load: Vector  # (4, 3) N, mean force on each cell of the foot
     rotation: Vector  # (6, 3, 3) rotation matrix from each link to its parent
     force: Vector  # (6, 3) N, force on each link from its parent
     moment: Vector  # (6, 3) Nm, moment about the origin of the link
@@ -96,7 +96,7 @@ def make_history() -> History:
 
 
 def make_torques() -> Torques:
-    """Return empty torques of a leg."""
+    """Return the torques and the workspace of a leg, filled with 0."""
     return Torques(
         np.zeros(_LEG), np.zeros(_LEG), np.zeros(_LEG), np.zeros(_LEG),
         np.zeros((len(CELLS), 3)), np.zeros((_LEG, 3, 3)), np.zeros((_LEG, 3)), np.zeros((_LEG, 3)),

@@ -90,8 +90,8 @@ class JointLimits(NamedTuple):
     position_max: Vector  # (12,) highest position [rad]
     velocity_max: Vector  # (12,) highest velocity [rad/s]
     look_ahead: float  # prediction time of the position [s], at constant velocity
-    position_margin: float  # distance outside a position limit at which the torque is zero [rad]
-    velocity_margin: float  # excess over `velocity_max` at which the torque is zero [rad/s]
+    position_margin: float  # distance outside a position limit at which the limit of the outward torque is zero [rad]
+    velocity_margin: float  # excess over `velocity_max` at which the limit of the accelerating torque is zero [rad/s]
     inertia: Vector  # (12,) smallest effective inertia of each joint [kg m2]
     period: float  # duration of a cycle [s]
     filter_lag: float  # delay of the low-pass of the reported velocity [s]

@@ -45,7 +45,7 @@ from atalante_hal.wire.process_image import NEVER, ReceiveImage
 #: Result of the E2E check of a rejected message -> diagnostic that becomes pending.
 PENDING = {
     Check.REPEATED: Dtc.E2E_REPEATED,
-    Check.CONFLICT: Dtc.E2E_REPEATED,  # if the cycle has no second frame of the message, see `rivals_of`
+    Check.CONFLICT: Dtc.E2E_REPEATED,  # only if the frame does not prove a second sender, see `rivals_of`
     Check.WRONG_SEQUENCE: Dtc.E2E_SEQUENCE,
     Check.CRC: Dtc.E2E_CRC,
     Check.LENGTH: Dtc.FRAME_LENGTH,
@@ -222,7 +222,8 @@ class MessageMonitor:
         sender, two_senders = self._senders[row], self._check_senders(cycle, memory, row, rival)
         tolerated, timeout = self._legs[row] in tolerance.legs, self._timeouts[row]
         fresh = check <= Check.SOME_LOST
-        # The longer timeout is for lost frames. Frames that are received with this delay are too old for the plausibility checks.
+        # `tolerance.longer` extends the timeout only while no frame is accepted. If a frame is accepted after the timeout in the
+        # DBC, its values are too old for the plausibility checks, so the message is late.
         late = age >= timeout + tolerance.longer * (tolerated and not fresh)
         # Impossible signal values do not reduce the trust, because the frame was transmitted correctly.
         good = (fresh or check >= Check.RANGE) and not rival

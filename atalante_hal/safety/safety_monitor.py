@@ -39,7 +39,7 @@ from atalante_hal.wire.frame import Frames
 from atalante_hal.wire.process_image import ReceiveImage
 
 #: Maximum duration of FINISH_STEP [cycles].
-#: It is longer than the rest of a step, a stop step and the weight shift back take together.
+#: The rest of a step, a stop step and the weight shift back together take less time.
 FINISH_STEP_CYCLES = 6000
 
 #: If a drive does not report QUICK STOP within this time [cycles] after the command QUICK_STOP, the command was lost.
@@ -132,7 +132,8 @@ class SafetyMonitor:
         self._not_holding: set[str] = (
             set()
         )  # DBC names of the drives that did not hold their joints since the last START
-        #: True if `evaluate` may skip a cycle with new data, without a fault, and with unchanged pendant and drive values.
+        #: False if the next cycle must be evaluated. If True, `evaluate` skips the next cycle, provided that its data is new,
+        #: there is no fault, and the values of pendant and drives are unchanged.
         self._steady = False
         self._reports: list[Finding] = []  # faults that loop and controller reported since the last `evaluate`
         self._acknowledged = False  # True if START was pressed in this cycle
@@ -230,7 +231,7 @@ class SafetyMonitor:
         self._ending, self._steady = True, False
 
     def check_timeouts(self) -> None:
-        """Check whether a status message timed out, or whether repeats of an event must be logged.
+        """Request an evaluation of the next cycle if a status message timed out or if repeats of an event must be logged.
 
         Call this periodically, because cycles without a fault are not evaluated.
         """
@@ -316,7 +317,8 @@ class SafetyMonitor:
     def _tolerance(self) -> Tolerance:
         """Return the tolerance of timeouts in this cycle.
 
-        In a walk on the ground, both legs are tolerant. Otherwise only a swing leg is, while the other foot is on the ground.
+        In a walk on the ground, timeouts of both legs are tolerated. Otherwise, timeouts are tolerated only in a swing leg while
+        the other foot is on the ground.
         """
         if self.walking:
             return GROUND_TOLERANCE
@@ -406,7 +408,7 @@ class SafetyMonitor:
         """Begin the direction tests as soon as all drives are enabled. Evaluate the tests in each cycle until all are complete.
 
         Returns:
-            The end of the start if a joint failed; None if the start may continue.
+            Refusal that ends the start if a joint failed; None if the start may continue.
         """
         state, proof = self._state, self.proof
         if not self._all_enabled() or not self.start_wanted or state.supervisor not in (_S.READY, _S.HOLD):
@@ -414,7 +416,9 @@ class SafetyMonitor:
             return None
         self._stalled = 0
         if not self._proof_begun:
-            if not self.enabling:  # in the cycle before the test, the drives get the torques that they report
+            # The test begins with the last torques of the limiter. If `enabling` is False, the limiter has not yet taken over the
+            # torques that the drives report.
+            if not self.enabling:
                 return None
             self._proof_begun = True
             proof.begin(state.position, self._limiter.last)

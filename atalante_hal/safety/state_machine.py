@@ -19,13 +19,15 @@ class Conditions:
 
     diagnostics: frozenset[Dtc] = frozenset()
     nodes_ready: bool = False  # every required node is trusted and has sent its status
-    drives_enabled: bool = False  # all twelve drives are in OPERATION ENABLED
+    #: All twelve drives are in OPERATION ENABLED. In a start from READY or HOLD, the test of the joint directions is also over.
+    drives_enabled: bool = False
     dead_man: bool = False  # the pendant has not timed out and its dead-man switch is pressed
-    #: One of three is true: HOLD requested, STOP requested outside a walk on the ground, program ending.
+    #: True if HOLD is requested, if STOP is requested outside a walk on the ground, or if the program is ending.
     stop_requested: bool = False
     start_wanted: bool = False  # START was pressed, and this start has not ended yet
     step_finished: bool = False  # the walking step has ended, the robot does not walk, or FINISH_STEP took too long
-    #: During a walk on the ground, one of three is true: STOP requested, dead-man released, pendant timed out.
+    #: True during a walk on the ground if STOP is requested, the dead-man is released, or the pendant has timed out.
+    #: False if HOLD is requested.
     walk_end_requested: bool = False
     #: confirmed diagnostics that lead to FINISH_STEP instead of HOLD, because the robot walks on the ground
     walk_ends: frozenset[Dtc] = frozenset()

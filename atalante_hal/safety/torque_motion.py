@@ -40,28 +40,32 @@ from atalante_hal.types import State, Vector
 
 #: Interval between two checks of a leg [cycles]. The legs are checked alternately.
 INTERVAL: Final = 4
-#: Shares of the sent torque that a faulty motor produces: reversed to weak, and strong.
+#: Ranges of the share s of a faulty motor (produced torque = s times sent torque): reversed, dead or weak motor; strong motor.
 SHARES: Final = ((-1.5, 0.6), (1.4, 2.2))
-#: A drive is reported if the error of the explanation by an external torque is this number of times as large.
+#: A check suspects the motor if the mean square error of the explanation by an external torque is more than this number of
+#: times as large as that of the explanation by a faulty motor, to which the square of `Robot.torque_error` is added.
 RATIO: Final = 2.5
-#: Number of consecutive checks with this result.
+#: Number of consecutive checks that must suspect the motor before the drive is reported.
 CONFIRM: Final = 2
-#: Least deviation of a torque, relative to `Robot.torque_error`, plus a share of the sent torque.
+#: A produced torque deviates if it differs from the sent torque by more than `BAND` times `Robot.torque_error` plus
+#: `_BAND_SHARE` times the sent torque.
 BAND: Final = 2.0
 _BAND_SHARE: Final = 0.2
-#: Deviation of another joint of the leg above which a deviation does not count, in the same form.
+#: A deviation does not count while another joint of the leg deviates by more than `OTHER_BAND` times `Robot.torque_error` plus
+#: `_OTHER_SHARE` times the sent torque.
 OTHER_BAND: Final = 4.5
 _OTHER_SHARE: Final = 0.25
-#: Weights of the values of the last check, for a fast and a slow evaluation: means over 20 and 100 cycles.
+#: Factors by which `Deviations.sums` decay from check to check. The two sums average over about 20 and 100 cycles.
 DECAY: Final = (0.8, 0.96)
-#: Number of checks at the start of a deviation that are left out.
+#: Number of checks at the start of a deviation whose torques are not added to `Deviations.sums`.
 LEFT_OUT: Final = 2
 #: A deviation ends after this number of consecutive checks without it.
 PAUSE: Final = 5
-#: Least size of a deviation, relative to its largest size, and factor of the largest size from check to check.
+#: A deviation smaller than `_FALLEN` times its largest size is not added to `Deviations.sums`.
+#: The stored largest size is multiplied by `_FORGET` in each check.
 _FALLEN: Final = 0.8
 _FORGET: Final = 0.97
-#: Least number of checks in a mean.
+#: Least sum of the decayed weights of the checks in `Deviations.sums`. The third check exceeds this sum.
 _ENOUGH: Final = 2.4
 #: A joint closer to its position limit than this angle [rad] is at its end stop.
 _AT_STOP: Final = 0.005
@@ -79,7 +83,9 @@ class Tolerances(NamedTuple):
 class Deviations(NamedTuple):
     """State of the check of each joint."""
 
-    sums: Vector  # (2, 12, 6) sums of 1, t, e, t t, e t and e e with the weights of `DECAY`
+    #: (2, 12, 6), for each factor of `DECAY` and each joint: decaying sums of 1, t, e, t*t, e*t and e*e,
+    #: with the sent torque t and the produced torque e
+    sums: Vector
     length: npt.NDArray[np.int64]  # (12,) number of checks with a deviation
     pause: npt.NDArray[np.int64]  # (12,) number of checks since the last deviation
     largest: Vector  # (12,) Nm, largest deviation
@@ -133,8 +139,8 @@ def _deviates(
 ) -> bool:
     """Return whether the produced torque of a joint deviates from its sent torque.
 
-    An end stop holds a joint against the torque of its motor. So a joint at its end stop deviates only if the produced torque is
-    on the other side.
+    An end stop holds a joint against the torque of its motor. So at the lower end stop a produced torque above the sent torque
+    is no deviation, and at the upper end stop a produced torque below the sent torque is no deviation.
 
     Args:
         leg: index in `SIDES`.

@@ -17,7 +17,7 @@ from atalante_hal.types import PERIOD, SupervisorState, Vector
 #: Speed of the hook [m/s].
 SPEED: Final = 0.1
 #: Time in ACTIVE after which the crane lowers the robot [s]. In this time, the walking controller moves the legs to the standing
-#: pose. On the floor, friction would hold the feet, and the robot would stand with the wrong distance between its feet.
+#: pose. If the feet stood on the floor during this motion, friction would keep the wrong distance between the feet.
 DELAY: Final = 2.0
 #: Stiffness and damping of the sling, both per kg of the robot. The weight of the robot stretches the sling by 25 mm.
 STIFFNESS: Final = 400.0  # N/m per kg
@@ -26,7 +26,8 @@ DAMPING: Final = 28.0  # N s/m per kg
 #: Both values apply while the sling carries the full weight.
 RIGHTING: Final = 100.0  # Nm/rad per kg
 ATTITUDE_DAMPING: Final = 1.5  # Nm s/rad per kg
-#: Slack of the sling at which lowering ends [m]. The pelvis of a walking robot rises by less, so the sling stays slack.
+#: Slack of the sling at which lowering ends [m]. After that, the sling exerts no force until a call of `lift`.
+#: The slack exceeds the vertical motion of the pelvis of a walking robot.
 SLACK: Final = 0.15
 _ACTIVE: Final = (SupervisorState.ACTIVE, SupervisorState.FULL_ASSIST)
 

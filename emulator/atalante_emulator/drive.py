@@ -114,8 +114,8 @@ class Drives:
         self.encoders = Encoders(robot, parameters.velocity_bandwidth, signals.position, signals.velocity)
         self.motors = Motors(robot, parameters.motor, signals.torque, signals.temperature)
         self._slow_phase = 0
-        #: Last evaluated controlwords if they changed nothing; empty otherwise.
-        #: The drives evaluate new controlwords only if they differ from `_steady`.
+        #: Controlwords of the last evaluation if this evaluation changed no drive; otherwise empty.
+        #: Received controlwords that are equal to `_steady` are not evaluated.
         self._steady = b""
         self._hold_at = np.zeros(len(JOINTS))  # setpoint of the local hold of each drive [rad]
         self._target, self._limit = np.zeros((2, len(JOINTS)))

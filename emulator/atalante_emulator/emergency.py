@@ -76,7 +76,11 @@ class Emergency(NamedTuple):
 
 
 class Errors:
-    """Active errors of several nodes. Each change adds an emergency to `outbox`, the list of emergencies to send."""
+    """Active errors of several nodes.
+
+    When an error or a warning begins, and when a warning or the last error of a node ends, an emergency is added to `outbox`, the
+    list of emergencies to send.
+    """
 
     def __init__(self, nodes: Sequence[str], outbox: list[Emergency]) -> None:
         self._nodes, self._outbox = nodes, outbox

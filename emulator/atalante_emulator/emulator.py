@@ -171,7 +171,7 @@ class Emulator:
         self._rx.values.fill(0.0)  # values until the first command: zero torque, zero vibration, HAL state OFF
         self._scratch = new_frames(_RECEIVE_BUDGET)
         self._scratch_from = [self._scratch[offset:] for offset in range(_RECEIVE_BUDGET)]
-        #: Number of frames that arrived before the SYNC of their cycle. The scratch buffer keeps these frames for the next call.
+        #: Number of frames that arrived before the SYNC of their cycle. The scratch buffer keeps these frames for the next poll.
         self._waiting = 0
 
         self._sync_rows = [self._rx.codec.rows[m.name] for m in syncs]
@@ -183,8 +183,8 @@ class Emulator:
         self._whole = [self._tx.frames]
         #: For each leg: index of its SYNC message in the list of SYNC messages.
         self._leg_syncs = [[m.name for m in syncs].index(f"SYNC_{side.upper()}_LEG") for side in SIDES]
-        #: For each SYNC: answer that the nodes send if this SYNC arrives late.
-        #: The answers are copies from the last cycle with a missing or late frame.
+        #: For each SYNC: copy of its answer in the last imperfect cycle (a frame was missing, rejected or late).
+        #: If a SYNC of that cycle arrives after the cycle was run, the nodes send the copy.
         self._answered = self._shares
         batch = new_frames(_BATCH)
         self._batch = batch.view(np.uint8).data
@@ -416,7 +416,7 @@ class Emulator:
         self._sealed = True
 
     def _complete_answer(self, number: int) -> None:
-        """Write alive counter and CRC into the answer to a SYNC. Keep an answer that was already encoded for this SYNC.
+        """Encode the answer to a SYNC, unless the answer is already encoded for this cycle number and no signal has changed.
 
         Args:
             number: cycle number received in SYNC.

@@ -248,7 +248,7 @@ class Fault:
 
         Args:
             kind: name of the kind, a key of `KINDS`.
-            target: name of a message, node or bus.
+            target: name of a message, node or bus, or `BATTERY`.
             start: first cycle of the fault, as a cycle number of the emulator.
             cycles: duration in cycles. With None, the fault is permanent.
             **parameters: parameters of the kind. Some kinds also take signals of the target message, as signal name = value.

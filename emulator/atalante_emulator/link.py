@@ -311,7 +311,7 @@ class FaultyBus(WrappedBus):
     def _passed(self, frames: Frames, *, from_hal: bool) -> list[Frames]:
         """Apply all active faults to each frame. Return the frames that are sent in this cycle."""
         passing: list[Frames] = []
-        unchanged = 0  # all frames from this row to the current row pass unchanged
+        unchanged = 0  # first row that is not in `passing` yet; the frames from here up to `row - 1` pass unchanged
         for row, can_id in enumerate(frames["can_id"].tolist()):
             acting = self._acting.get(can_id, ())
             for number, disturbance in enumerate(acting, 1):

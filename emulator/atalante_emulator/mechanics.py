@@ -1,6 +1,7 @@
-"""Description of the mechanics of an emulated robot. It creates the body, the crane, the wearer and the virtual operator.
+"""Description of the mechanics of an emulated robot: URDF, physics engine, floor, wearer and parameters of the nodes.
 
-A description can be pickled, so it can be sent to another process.
+The methods of the description create the body, and add crane, wearer and virtual operator to the emulator. A description can be
+pickled, so it can be sent to another process.
 """
 
 from __future__ import annotations

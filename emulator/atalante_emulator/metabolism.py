@@ -2,7 +2,7 @@
 
 The metabolic rate M is the rate of quiet standing plus the rate of the muscles of `patient.ActivePatient`:
 
-    M = m standing + P+ / positive + P- / negative + activation * |u|
+    M = mass * standing + P+ / positive + P- / negative + activation * |u|
 
 P+ is the power of muscles that shorten, P- the magnitude of the power of muscles that lengthen, |u| the sum of the magnitudes of
 the muscle torques. The oxygen uptake and the carbon dioxide output follow the metabolic rate with first-order lags. The

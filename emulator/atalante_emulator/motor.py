@@ -33,9 +33,9 @@ _MOTORS = np.arange(len(JOINTS))
 #: Largest delay of a motor torque that the emulator supports [cycles].
 MOST_LATE = 20
 
-# Rows 0 to 3 of the motor array: torque setpoint, true torque / measured torque, dry friction, damping.
+# Rows 0 to 3 of the motor array: torque setpoint, ratio of true torque to measured torque, dry friction, damping.
 # Rows 4 to 6 of the motor array: external torque, resulting joint torque, torque of the wearer's limb.
-# Row 7 of the motor array: measured torque / setpoint.
+# Row 7 of the motor array: ratio of measured torque to torque setpoint.
 _WANTED, _STRENGTH, _DRY, _DAMPING, _PUSH, _JOINT, _LIMB, _GAIN = range(8)
 
 

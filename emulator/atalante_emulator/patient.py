@@ -5,10 +5,10 @@
 The patient is part of the emulator. The HAL and the controller have no access to this module. A passive patient is
 `wearer.PassiveWearer` alone: limbs without muscle torque.
 
-After each step, the learned torque u is updated with the perceived error e: `u <- f u + g e`. This model describes motor
-adaptation as a greedy minimisation of error and effort: without error, the effort decays (Emken, Benitez, Sideris, Bobrow,
-Reinkensmeyer, "Motor adaptation as a greedy optimization of error and effort", J. Neurophysiol. 97, 2007). All
-experiments use the same parameters.
+After each step, the learned torque u is updated with the perceived error e: `u <- f u + g e`, where f is `forgetting` and g is
+`learning` times `gain`. This model describes motor adaptation as a greedy minimisation of error and effort: without error, the
+effort decays (Emken, Benitez, Sideris, Bobrow, Reinkensmeyer, "Motor adaptation as a greedy optimization of error and effort",
+J. Neurophysiol. 97, 2007). All experiments use the same parameters.
 """
 
 from __future__ import annotations
@@ -69,9 +69,9 @@ class ActiveParameters:
     #: Source: Anderson, Madigan, Nussbaum, J. Biomech. 40, 2007.
     strength: Pair = (0.113, 0.087)
     fraction: float = 1.0  # strength of this patient as a fraction of the strength of an able-bodied person
-    #: Amplitude from which the patient feels a vibration motor, 0 to 1. The motors of the thigh belong to the hip, those of the
-    #: shank to the knee. While the patient feels a motor, the threshold of its joint is 0. With infinity, the patient ignores the
-    #: motors.
+    #: Amplitude from which the patient feels a vibration motor, 0 to 1. With infinity, the patient feels no motor.
+    #: While the patient feels a motor of the thigh, the threshold of the hip is 0.
+    #: While the patient feels a motor of the shank, the threshold of the knee is 0.
     vibration: float = math.inf
 
     def __post_init__(self) -> None:
@@ -94,7 +94,7 @@ class ActiveTask:
 
     mass: float  # mass of the patient [kg]
     height: float  # height of the patient [m]
-    #: nominal hip and knee angles of the swing leg in each cycle from landing to landing, shape (n + 1, 2) [rad]
+    #: nominal hip and knee angles of the swing leg, shape (n + 1, 2) [rad]: one row per cycle, row 0 and row n are at landings
     swing: Sequence[Pair]
     seed: int = 0
     parameters: ActiveParameters = ActiveParameters()
@@ -143,7 +143,7 @@ class ActivePatient:
         #: Threshold of perception in each cycle of the step.
         self._threshold = np.full((cycles, 2), parameters.threshold)
         self._amplitude = np.zeros(len(MOTORS)) if amplitude is None else amplitude
-        self._swing, self._cycle, self._ready = -1, 0, 0  # -1: before the first landing, no leg swings
+        self._swing, self._cycle, self._ready = -1, 0, 0  # `_swing` is -1 before the first landing: no muscle acts
         self._air = [False] * len(SIDES)
         self._weight = body.mass * GRAVITY
         self.muscle = np.zeros(len(SIDES) * _LEG)
@@ -190,7 +190,7 @@ class ActivePatient:
                 self._begin(1 - side)
 
     def _begin(self, swing: int) -> None:
-        """Learn from the last step, and begin a step of a leg (0 left, 1 right)."""
+        """Learn from the last step, and begin the step of the leg `swing` (0 left, 1 right)."""
         if self._swing >= 0:
             self._learn(min(self._cycle, len(self._nominal)))
         self._swing, self._cycle = swing, 0

@@ -19,7 +19,7 @@ _log = logging.getLogger(__name__)
 
 #: Largest lean of the pelvis at which the operator exerts no force [rad]. The pelvis of a walking robot leans by less.
 DEADBAND: Final = 0.1
-STIFFNESS: Final = 2000.0  # force per angle by which the lean exceeds `DEADBAND` [N/rad]
+STIFFNESS: Final = 2000.0  # force divided by (lean - `DEADBAND`) [N/rad]
 DAMPING: Final = 300.0  # force per lean rate [N s/rad]
 #: An intervention of the operator ends after this time without a force [cycles].
 _PAUSE: Final = 200

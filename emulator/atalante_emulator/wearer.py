@@ -20,7 +20,7 @@ class LimbParameters:
 
     stiffness: tuple[float, ...] = (20.0, 10.0, 20.0, 15.0, 15.0, 5.0)  # stiffness of each joint [Nm/rad]
     damping: tuple[float, ...] = (2.0, 1.0, 2.0, 1.5, 1.0, 0.5)  # damping of each joint [Nm s/rad]
-    rest: tuple[float, ...] = (0.0, 0.0, -0.2, 0.4, -0.1, 0.0)  # joint angles with no stiffness torque [rad]
+    rest: tuple[float, ...] = (0.0, 0.0, -0.2, 0.4, -0.1, 0.0)  # joint angles at which the stiffness torque is 0 [rad]
 
 
 def _impedance(

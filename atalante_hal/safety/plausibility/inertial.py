@@ -51,9 +51,9 @@ _FORCE_CLIP = 5.0
 #: If the attitude turns faster than this [rad/s], the specific force is not compared with gravity.
 #: For example, bent legs fall to their end stops when the drives are switched off.
 _MOVING_RATE = 0.5
-#: Two measurements of one angular velocity may differ by this root mean square while the IMU hardly turns [rad/s].
+#: Largest root mean square of the difference between two measurements of one angular velocity, if the IMU does not turn [rad/s].
 _RATE_ERROR = 0.1
-#: While the IMU turns, the mean square of the difference may be larger by this share of the mean square angular velocity.
+#: If the IMU turns, the limit of the mean square difference is _RATE_ERROR^2 + _RATE_SHARE * mean square angular velocity.
 _RATE_SHARE = 0.25
 _TORSO, _PELVIS = IMUS.index("torso"), IMUS.index("pelvis")
 

@@ -34,11 +34,12 @@ from atalante_hal.vectors import Vector3
 
 #: Pelvis IMU in the pelvis frame [m].
 PELVIS_IMU = (-0.164, -0.015, 0.191)
-#: Joint FH of the left leg in the pelvis frame: y [m].
+#: Position y of joint FH of the left leg in the pelvis frame [m]. Its x and z are 0.
 FRONTAL_HIP = 0.089
-#: Joint TH relative to joint FH, in the axes of the frontal hip: x, y of the left leg [m]. Joint SH is at y, -x from here.
+#: Position (x, y) of joint TH of the left leg relative to joint FH, in the axes of the frontal hip [m].
+#: Joint SH has the position (-x, 0) relative to joint TH, in the axes of the transverse hip.
 TRANSVERSE_HIP = (-0.135, 0.169)
-#: Tibia IMU: x relative to SK, y of the left leg relative to SH, z relative to SA [m].
+#: Position of the left tibia IMU in the axes of the tibia [m]. The origin of x is joint SK, of y joint SH, and of z joint SA.
 TIBIA_IMU = (-0.13, -0.069, 0.018)
 #: Time constant of the integration and of the high-pass [s].
 _FILTER_TIME = 0.15
@@ -46,11 +47,11 @@ _FILTER_TIME = 0.15
 _MEAN_TIME = 0.75
 #: Time after the start in which the filters settle, before the mean values begin [s].
 _SETTLING_TIME = 2.0
-#: Least root mean square of the filtered lever, without the part that a change of length explains [m]. In a walk it is about
-#: 0.012 m.
+#: The error of a knee angle is computed only if the root mean square of the filtered lever exceeds this value [m]. The part of
+#: the lever that an error of the segment length explains is subtracted before. In a walk, the root mean square is about 0.012 m.
 _LEAST_LEVER = 0.007
-#: Least part of the mean square of the difference that the error of the knee angle must explain. The part that a change of
-#: length explains does not count.
+#: An error of a knee angle is reported only if it explains more than this share of the mean square of the difference between the
+#: measured and the computed position. The part that an error of the segment length explains is subtracted before.
 _SHARE = 0.25
 #: Number of filters of each leg and axis.
 _FILTERS = 11
@@ -76,9 +77,9 @@ class Filters(NamedTuple):
 
     low: Vector  # (2, 33) low-passes of each leg: `_FILTERS` for each axis
     time: Vector  # (1,) time since the start, up to `_SETTLING_TIME` [s]
-    #: Mean products, shape (2, 6): lever and lever, lever and growth, growth and growth, lever and difference, growth
-    #: and difference, difference and difference. Lever and growth are the derivatives of the position with respect to SK and to
-    #: the length of a segment.
+    #: (2, 6) means of the products ss, sg, gg, sd, gd, dd of three filtered values. Here s is the lever: the derivative of the
+    #: position of the tibia IMU with respect to SK. g is the growth: the derivative with respect to the length of both segments.
+    #: d is the difference between the measured and the computed position.
     moments: Vector
 
 
@@ -120,7 +121,7 @@ class Knees:
         self.restart()
 
     def follow(self) -> bool:
-        """Follow the motion of both legs by one cycle.
+        """Update the filters and the findings by one cycle.
 
         Returns:
             Whether the findings have changed.
@@ -186,7 +187,7 @@ def knee_error(moments: Vector, limit: float, before: float) -> float:
         before: last result, which is returned if the thigh does not turn [rad].
     """
     ss, sg, gg, sd, gd, dd = moments[0], moments[1], moments[2], moments[3], moments[4], moments[5]
-    # Subtract the part of lever and difference that a change of length explains.
+    # Subtract the parts of lever and difference that an error of the segment length explains.
     lever, product, difference = ss * gg - sg * sg, sd * gg - sg * gd, dd * gg - gd * gd
     if lever <= _LEAST_LEVER**2 * gg:
         return before
@@ -213,7 +214,8 @@ def motion(leg: int, now: Readings) -> tuple[Vector3, Vector3, Vector3, Vector3]
     x, y = TRANSVERSE_HIP[0] * (1.0 - math.cos(th)), side * TRANSVERSE_HIP[1] - TRANSVERSE_HIP[0] * math.sin(th)
     y, z = y * math.cos(fh) + side * FRONTAL_HIP, y * math.sin(fh)
     hip = x - PELVIS_IMU[0], y - PELVIS_IMU[1], z - PELVIS_IMU[2]
-    # Direction of both segments together and tibia IMU relative to SH, in the axes of the tibia. The thigh is turned by -SK.
+    # All in the axes of the tibia, in which the thigh is turned by -SK. (x, z) is the sum of the unit vectors along thigh and
+    # shank. `thigh` is the position of the tibia IMU relative to joint SH.
     sine, cosine = math.sin(sk), math.cos(sk)
     x, z = sine, -1.0 - cosine
     thigh = SEGMENT * x + TIBIA_IMU[0], side * TIBIA_IMU[1], SEGMENT * z + TIBIA_IMU[2]

@@ -171,7 +171,8 @@ class Legs:
                 continue
             change = comparison.errors[axis] - moved.errors[axis]
             turned = max(abs(angle - moved.angles[i]) for i, angle in enumerate(comparison.angles))
-            # If the deviation changes while the leg does not turn, the encoder is not stuck: it jumped or drifts.
+            # The encoder is stuck only if the leg turned and the deviation changed. A change of the deviation without a turn of
+            # the leg means that the encoder jumped or drifts.
             allowed = self._attitude_change + self._misalignment * turned + comparison.uncertainty + moved.uncertainty
             if min(abs(change), turned) <= allowed:
                 self._turned[joint] = 0

@@ -1,6 +1,6 @@
 """Schedule of the plausibility checks in each cycle.
 
-    process image -> one slow check in turn (standstill, velocity, feet, legs, support, soles, inertial, checks that lack data)
+    process image -> one slow check in turn (standstill, velocity, feet, legs, support, soles, inertial, `Unchecked`)
     -> jump, range, IMUs, trunk, knees -> state
 
 Each cycle checks the encoders and the IMUs, and runs at most one slow check. If the new values of a joint or an IMU
@@ -43,7 +43,8 @@ SLOW = 16
 _PERIOD = 32
 #: Alternating intervals of the inertial checks [cycles].
 _INERTIAL_INTERVALS = (15, 17)
-#: Largest age of values that the trunk check uses [cycles]. A message may be late by one cycle in every cycle.
+#: Largest age of values that the trunk check uses [cycles].
+#: If a node always answers one cycle late, its values have the age 1 in every cycle.
 _LATE = 1
 #: Largest age of a value that the knee checks use [cycles]. If a value is older, the filters of the knee checks restart.
 _HELD = 4
@@ -151,7 +152,7 @@ class Plausibility:
     def reference(self, node: str) -> None:
         """Skip the jump check for the next position of a joint whose drive has referenced its encoder.
 
-        A drift of SH and SK that was found before is forgotten.
+        If the joint is SH or SK, also discard the finding of the knee checks about its leg.
 
         Args:
             node: DBC name of the drive; the name of any other node has no effect.
@@ -183,7 +184,8 @@ class Plausibility:
         return self._unchecked.evaluate(None if ages is None else self._image.age)
 
     def _check_inertial(self, ages: Ages | None) -> bool:
-        if frozen := self._stillness.imus:  # the frozen values are rejected later in the cycle
+        # The values of an IMU with a frozen gyro are rejected later in this cycle. Here they are marked as too old.
+        if frozen := self._stillness.imus:
             ages = ages or self._rows.ages(self._image.age)
             ages.imu[frozen] = NEVER
         return self._inertial.evaluate(ages)

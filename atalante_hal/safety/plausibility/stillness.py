@@ -80,11 +80,11 @@ class Readings(NamedTuple):
 class Drive(NamedTuple):
     """Torque of each joint since its encoder reading last changed, and the motion that this torque would cause. Shape (12,) each.
 
-    The motion is computed for a joint with the inertia `_INERTIA` that breaks away at `breakaway`.
+    The motion is computed for a joint whose inertia is `_INERTIA` and whose breakaway torque is `breakaway`.
     """
 
     cycles: Vector  # number of cycles since the encoder reading last changed
-    rest: Vector  # torque [Nm] after the first `_AT_REST` cycles, when the joint came to rest
+    rest: Vector  # torque of the joint at rest [Nm]: torque in cycle `_AT_REST` of the constant reading
     low: Vector  # lowest torque [Nm]
     high: Vector  # highest torque [Nm]
     momentum: Vector  # angular momentum that the torque would cause [Nm s]

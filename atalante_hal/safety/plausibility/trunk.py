@@ -30,9 +30,9 @@ from atalante_hal.types import Vector
 TORSO_HEIGHT = 0.309
 #: Time constant of both high-pass filters [s].
 _FILTER_TIME = 0.1
-#: Time constant of the mean values [s].
+#: Time constant of the mean values `Filters.moments` [s].
 _MEAN_TIME = 0.25
-#: Time that the filters need to settle after the start [s]. The mean values begin after this time.
+#: Time that the filters need to settle after the start [s]. `Filters.moments` is updated only after this time.
 _SETTLING_TIME = 0.3
 #: The check decides only above this root mean square of the filtered angular velocity [rad/s].
 #: At rest, the noise of the gyroscopes is up to 0.004 rad/s rms.
@@ -63,9 +63,9 @@ class Trunk:
     """
 
     def __init__(self, now: Signals, period: float) -> None:
-        #: Arguments of the function `follow`. The array objects are the same in every call.
         speed, slow_speed, slow_rate, slower_rate, moments = np.zeros((5, 2))
         filters = Filters(speed, slow_speed, slow_rate, slower_rate, np.zeros(1), moments)
+        #: Arguments of the function `follow`. The array objects are the same in every call.
         self._arguments = now.gyro, now.accel, filters, period
         self._follow = specialised(follow, *self._arguments)
         for values in filters:

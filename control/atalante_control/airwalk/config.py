@@ -22,7 +22,7 @@ class AirwalkConfig(StepGuideConfig):
     #: If true, no guide is certified for a disturbance torque.
     literal_law: bool = False
     gains: PidGains = AIR_GAINS
-    alpha: float = 0.4  # end of the re-centring, as a fraction of the step duration
+    alpha: float = 0.4  # end of the re-centring (see `gait.recentering`), as a fraction of the step duration
     flat_foot: bool = True  # whether the ankle of the swing leg holds the sole level
     ankle_offset: float = math.radians(1.0)  # rad, offset added to the desired angles of both sagittal ankles
     startup: float = 2.0  # s, shortest duration of the motion from the measured pose to the first pose of the gait

@@ -189,7 +189,7 @@ class AirwalkController:
 
     @property
     def blend(self) -> Vector:
-        """Return the compensated fraction of the torque jump for each cycle since the stance change, shape (n,)."""
+        """Return the compensated fraction of the torque jump in each cycle since the stance change, shape (n,)."""
         return self._carry.blend
 
     def certificate(self, xi: float) -> Certificate:
@@ -203,7 +203,7 @@ class AirwalkController:
         return self._guides.certificate(xi)
 
     def reset(self, state: State) -> None:
-        """Restart the motion from the measured pose and torque of the joints.
+        """Discard the last motion. Begin the start motion at the measured pose, and the carry-over at the measured torque.
 
         Args:
             state: measured state of the robot.

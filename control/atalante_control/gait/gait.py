@@ -1,7 +1,7 @@
 """Gait: twelve joint trajectories of one right-stance step as Bezier polynomials, read from a file.
 
 `gait file -> Gait -> StepTables (one row per ms)`. The left-stance step is the right-stance step of the mirrored robot:
-the legs are swapped and each joint angle is multiplied by its MIRROR_SIGN. A gait that is not continuous at the step
+the legs are swapped and each joint angle is multiplied by its MIRROR_SIGN. A gait that is not continuous at the stance
 change, or that exceeds the limits of the robot, is rejected when the file is read.
 """
 
@@ -271,7 +271,7 @@ def gait_from(document: Mapping[str, Any], where: str) -> Gait:
 
 
 def check_kind(gait: Gait, kind: Kind, where: str) -> None:
-    """Raise `GaitError` if a gait is of another kind.
+    """Raise `GaitError` if a gait is not of the required kind.
 
     Args:
         gait: gait to check.
@@ -484,7 +484,7 @@ def _control_points(where: str, key: str, table: Any) -> Vector:
 
 
 def _is_number(value: Any) -> bool:
-    # For a very large integer, math.isfinite raises an exception, but a comparison with the largest float is possible.
+    # math.isfinite raises an exception for an integer above the largest float. The comparison works for every integer.
     return type(value) in (int, float) and abs(value) <= sys.float_info.max
 
 

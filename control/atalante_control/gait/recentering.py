@@ -1,7 +1,7 @@
 """Re-centring ("deadbeat" in the paper): a cubic that leads from the pose at a stance change to the nominal trajectory.
 
-`stance change -> (q - q_nom, q' - q_nom') -> s(t) -> q_des(t) = q_nom(t) + s(t)`. The tracking error is exactly zero at the step
-change. At the time alpha T after the stance change, the desired trajectory reaches the nominal trajectory (T is the
+`stance change -> (q - q_nom, q' - q_nom') -> s(t) -> q_des(t) = q_nom(t) + s(t)`. The tracking error is exactly zero at the
+stance change. At the time alpha T after the stance change, the desired trajectory reaches the nominal trajectory (T is the
 step duration). s is linear in the deviations: `s(t) = s(0) c0(t) + s'(0) c1(t)`. The guide filter can therefore compute
 the responses to the basis cubics c0 and c1 in advance.
 

@@ -36,7 +36,7 @@ HIDDEN = (64, 64)
 ITERATIONS = 1500  # largest number of L-BFGS iterations
 RESOLUTION = math.radians(0.003)  # rad, largest rms error caused by the omitted principal directions
 JUMP_KEPT = 0.4  # the fit keeps this fraction of the speed jump that each gait has at the stance change
-END_WEIGHT = 40.0  # weight of the samples at start and end of a step; the other samples have weight 1
+END_WEIGHT = 40.0  # weight of the squared angle errors at start and end of a step; the weight is 1 at the other samples
 ACCELERATION_WEIGHT = 5e-2  # s2, weight of an acceleration error [rad/s2] relative to an angle error [rad]
 #: Root mean square of the learnt coordinates after scaling. L-BFGS stops if an iteration reduces the squared error by less than
 #: 2e-9. With coordinates of size 1, L-BFGS would stop too early.
@@ -109,7 +109,7 @@ def inputs(gait: Gait) -> Vector:
 
 
 def _metric(duration: float) -> Vector:
-    """Return the matrix M of the squared distance `d' M d` of two gaits, shape (96, 96).
+    """Return the matrix M of the squared distance `d^T M d` of two gaits, shape (96, 96).
 
     d is the difference of the control points of the two gaits. The squared distance is the weighted mean of squared
     errors along the step.

@@ -286,7 +286,7 @@ class Library:
 
 
 def solve_subject(subject: Subject) -> SolvedGait:
-    """Solve the gait of a subject, and verify it with Pinocchio. If the solver fails, it starts a second time.
+    """Solve the gait of a subject, and verify it with Pinocchio. After a failure, start again, see `solve_with_second_start`.
 
     Args:
         subject: patient and step parameters.

@@ -185,7 +185,7 @@ class _Entries(NamedTuple):
 
 
 def _derivatives(block: _Block, p: Symbol) -> tuple[Any, _Entries, _Entries]:
-    """Return functions for the expression, for its Jacobian, and for the upper triangle of the Hessian of its weighted sum."""
+    """Return functions for the expression, its Jacobian, and the upper triangle of the Hessian of dot(lam, expression)."""
     lam = casadi.SX.sym("lam", block.expression.shape[0])
     slopes = casadi.jacobian(block.expression, block.x)
     curvature = casadi.triu(casadi.hessian(casadi.dot(lam, block.expression), block.x)[0])

@@ -25,7 +25,7 @@ class Requirements:
     cell_share: float = 0.7
     yaw_lever: float = 0.03  # m, largest ratio of yaw moment about the sole centre to vertical ground force
     #: Required height of the swing sole at mid-swing [m]. At other times this height is multiplied by sin(pi t / T)^2.
-    #: In start and stop steps the required height is multiplied by sin(pi t / T)^4.
+    #: In start and stop steps the factor is sin(pi t / T)^4.
     clearance: float = 0.05
     corridor: tuple[float, float] = (0.17, 0.28)  # m, smallest and largest lateral distance between the ankles
     roll: float = math.radians(5.0)  # rad, largest roll of the pelvis

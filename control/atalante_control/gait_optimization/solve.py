@@ -42,7 +42,8 @@ _OPTIONS: dict[str, Any] = {
     "print_time": False,
     "error_on_fail": False,
     "calc_lam_p": False,
-    "no_nlp_grad": True,  # The gradient is needed only for sensitivities, which compiled functions do not provide.
+    # No function nlp_grad: CasADi uses it only for sensitivities, and compiled functions do not provide the derivatives for it.
+    "no_nlp_grad": True,
 }
 #: IPOPT options of a warm start: a small initial barrier parameter mu, and bound multipliers computed from mu.
 #: A warm start takes 17 to 21 iterations with these options, and 34 to 36 iterations with the default options.

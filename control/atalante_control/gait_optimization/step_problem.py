@@ -289,7 +289,7 @@ class StepProblem:
         return wrench[3:] * _MOMENT - casadi.cross(casadi.DM([x, 0.0, z]), wrench[:3] * _FORCE)
 
     def _ground(self, wrench: Symbol) -> list[Rows]:
-        """Return the constraints of friction cone, centre of pressure and yaw moment, written as forces >= 0."""
+        """Return the constraints on friction, centre of pressure and yaw moment: forces that must be at least 0 N."""
         requirements, exo = self.requirements, self.exoskeleton
         force, moment = wrench[:3] * _FORCE, self._pressure_moment(wrench)
         length, width = exo.sole_size
@@ -301,7 +301,8 @@ class StepProblem:
         def within(value: Symbol, lever: float) -> Symbol:
             return casadi.vertcat(force[2] - value / lever, force[2] + value / lever)
 
-        # A difference of squares is smooth everywhere. The division by the scale of the force gives the unit N.
+        # The friction cone is written with squares, because the norm of the horizontal force is not differentiable at 0. The
+        # division by `_FORCE` gives the unit N.
         cone = (force[2] ** 2 - (force[0] ** 2 + force[1] ** 2) / requirements.friction**2) / _FORCE
         return [
             _positive("ground friction", "N", _FORCE, cone),

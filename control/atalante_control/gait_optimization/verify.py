@@ -29,11 +29,11 @@ _SLIDE = 0.04  # m/s, accepted horizontal speed of a corner of the sole at the l
 _DROP = 0.035  # m/s, accepted downward speed of a corner of the sole at the landing
 _LIFT = 0.005  # m/s, accepted upward speed of a corner of the sole at the landing
 _SHORTFALL = 2e-3  # m, accepted distance of the swing sole below its intended height
-_SINKING = 1e-3  # m, accepted depth of the swing sole below the ground at the start of the swing
+_SINKING = 1e-3  # m, accepted depth of the swing sole below the ground at any sample of the step
 
 
 class Tolerances(NamedTuple):
-    """Accepted errors of the conditions that a solved step satisfies exactly."""
+    """Accepted errors of the conditions that the optimiser enforces as equality constraints."""
 
     landing_height: float  # m, height error of the landing foot
     landing_rotation: float  # rad, rotation error of the landing foot about each axis
@@ -127,7 +127,7 @@ class Verifier:
     def impact(self, q: Vector, qd: Vector) -> tuple[Vector, Vector, Vector]:
         """Compute the impact of the left foot, which lands flat and does not rebound.
 
-        The equation is [M -J'; J 0] (v+, impulse) = (M v-, 0), where J is the Jacobian of the foot that lands.
+        The equation is [M -J^T; J 0] (v+, impulse) = (M v-, 0), where J is the Jacobian of the foot that lands.
 
         Args:
             q: joint angles, shape (12,) [rad].

@@ -68,7 +68,7 @@ class JointTorque:
 class Limit(NamedTuple):
     """Condition that limits the disturbance torques for which a guide can be certified."""
 
-    #: largest disturbance torques that meet this condition, as a multiple of the requested torques; negative if none meet it
+    #: largest multiple of the requested disturbance torques that meets this condition; negative if not even zero torques meet it
     scale: float
     what: str  # condition in words, for a message
 
@@ -83,7 +83,7 @@ class Certificate:
     reason: str  # sentence that states what limits the certified torques, or why there are none
     #: certified disturbance torques, which the running filter assumes; None if no torques are certified
     promise: JointTorque | None
-    #: largest disturbance torques for which a filter with these gains could be certified; None if no torques are certified
+    #: largest disturbance torques for which a filter with the same gains can be certified; None if no torques are certified
     largest: JointTorque | None
     #: smallest fraction of the guide width that remains free under the certified torques; -inf if no torques are certified
     margin: float
@@ -214,8 +214,9 @@ class _Horizon:
         beyond = prediction.beyond * SIZES
         self._factor = (beyond * rows[-1]).sum(axis=1) / (rows[-1] ** 2).sum(axis=1)
         remainder = beyond - self._factor[:, None] * rows[-1]
-        #: Each element contains two predicted cycles, counted from the start of the prediction, and the weights with which the
-        #: errors in these cycles sum to the remainder.
+        #: Each element contains the numbers of two predicted cycles, counted from the start of the prediction, and a matrix.
+        #: The remainder is a linear combination of the errors in these cycles. The matrix contains the absolute values of the
+        #: factors.
         self._pairs: list[tuple[tuple[int, int], Vector]] = []
         for near, far in ((0.1, 0.3), (0.25, 0.5), (0.4, 0.7)):
             lags = round(near * self.cycles), round(far * self.cycles)

@@ -44,7 +44,7 @@ class Mismatch:
     """
 
     friction: float = 0.2  # largest error of the friction torque, as a fraction of the friction torque
-    inertia: float = 0.1  # largest error of mass and inertia of the leg, as a fraction; one factor for the whole leg
+    inertia: float = 0.1  # largest relative error of mass and inertia; the error is the same for all links of the leg
     residual: Pair = (1.0, 1.0)  # Nm, allowance for all other torque errors at hip and knee
 
     def __post_init__(self) -> None:
@@ -63,7 +63,7 @@ class HandOver:
         ValueError: If a value is negative or not finite.
     """
 
-    deviation: float = math.radians(2.7)  # rad, largest angle deviation |s(0)| of hip and knee
+    deviation: float = math.radians(2.7)  # rad, largest angle deviation |s(0)| of sagittal hip and knee
     rate: float = 0.25  # rad/s, largest speed deviation |s'(0)| of sagittal hip and knee
     #: Nm, largest torques of sagittal hip and knee that the carry-over adds at the start of a step
     torque: Pair = (25.0, 13.0)
@@ -176,7 +176,7 @@ class Effect(NamedTuple):
     #: (lags + 1, 2, 2) response to an acceleration just before a prediction starts; (0, 2, 2) if this response is left out.
     #: A prediction starts with an error, because the measured velocity does not yet contain the effect of the last acceleration.
     hidden: Vector
-    #: (n, 2, 2) matrix for each cycle of the step. The output is this matrix times the response.
+    #: (n, 2, 2) matrix for each cycle of the step. The response is multiplied by this matrix from the left to get the output.
     left: Vector
 
 

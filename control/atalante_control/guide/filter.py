@@ -45,7 +45,8 @@ from atalante_hal.types import Vector
 Pair = tuple[float, float]
 
 _SMOOTHED = 11  # number of cycles of the moving mean in `_smoothed`
-#: Fraction of the guide width that must remain free in the last predicted cycle. Then later cycles are inside the guide, too.
+#: Fraction of the guide width that must remain free in the last predicted cycle, so that the error is inside the guide in the
+#: cycles after the prediction, too.
 _TAIL_MARGIN = 0.03
 
 
@@ -196,9 +197,9 @@ class GuideFilter:
 
 
 def tail(inverse: Vector) -> Vector:
-    """Return for each cycle the inverse width of the guide at its narrowest point in the next `TAIL_CYCLES` cycles.
+    """Return for each cycle the largest 1 / width of the guide in this cycle and the next `TAIL_CYCLES` cycles [1/rad].
 
-    A margin is added to the inverse width.
+    The largest value is multiplied by 1 + `_TAIL_MARGIN`.
 
     Args:
         inverse: 1 / distance to the guide for each cycle, shape (n, m) [1/rad].
@@ -207,7 +208,7 @@ def tail(inverse: Vector) -> Vector:
 
 
 def narrowest(inverse: Vector, cycles: int) -> Vector:
-    """Return for each cycle the largest 1 / width of the guide within the next `cycles` cycles [1/rad].
+    """Return for each cycle the largest 1 / width of the guide in `cycles` cycles, from this cycle on [1/rad].
 
     Args:
         inverse: 1 / distance to the guide for each cycle, shape (n, m) [1/rad]; the last row applies to all later cycles.

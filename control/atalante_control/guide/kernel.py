@@ -26,7 +26,7 @@ COMPRESSED = 5
 #: Number of consecutive predicted cycles in a `Block`. `Block.slack` bounds the effect of model errors in all these
 #: cycles.
 SLACK_CYCLES = 10
-#: Number of consecutive start cycles for which the predictions use the same row of `GuideTables.reach`.
+#: Number of consecutive cycles of a step whose predictions use the same row of `GuideTables.reach`.
 START_CYCLES = 4
 
 
@@ -50,17 +50,18 @@ class Guard:
     xi: float  # assistance factor of the step
     fresh: bool  # True until the first cycle of a step is computed
     motor: Annotated[Vector, 2]  # Nm, estimated torques of the motors
-    lag: Annotated[Vector, 2]  # rad/s, estimated true velocity minus measured velocity
+    lag: Annotated[Vector, 2]  # rad/s, estimate of true velocity minus measured velocity
     state: Annotated[Vector, STATES]  # state of the last cycle, see `backup_policy`
-    #: absolute values of the elements of `state`, with true minus measured e' in place of the true e'
+    #: absolute values of the elements of `state`, but abs(true e' - measured e') in place of abs(true e')
     magnitude: Annotated[Vector, STATES]
     compression: Annotated[Vector, (COMPRESSED, STATES)]  # matrix from the state to the compressed state
     compressed: Annotated[Vector, COMPRESSED]  # compressed state of the last cycle
     few_slack: Annotated[Vector, (STATES, 2)]  # elementwise maximum of `Few.slack` over all prediction lengths
     h: float  # h of the last cycle; at h >= 0, the backup policy can keep both joints inside the guide
-    rate: float  # 1/s, dh/dt
-    gate: float  # gate, the weight of the backup torque: `lambda + (1 - lambda) lambda_d`
-    bounds: Annotated[Vector, 4]  # rad, distances to the bounds: hip upper, hip lower, knee upper, knee lower
+    rate: float  # 1/s, dh/dt after the low-pass filter
+    gate: float  # weight of the backup torque: `lambda + (1 - lambda) lambda_d`, but at least `FLOOR` and last gate - `release`
+    #: rad, distances from q_des to the bounds: hip upper, hip lower, knee upper, knee lower
+    bounds: Annotated[Vector, 4]
 
 
 class Lag:
@@ -75,8 +76,9 @@ class Block:
 
     #: matrix from `Guard.magnitude` to the largest change [rad] that model errors can cause in the predicted tracking errors
     slack: Annotated[Vector, (STATES, 2)]
-    middle: Annotated[Vector, (COMPRESSED, 2)]  # mean of the largest and the smallest `Lag.ahead` in the block
-    #: half the difference between the largest and the smallest `Lag.ahead` in the block
+    #: elementwise mean of the largest and the smallest `Lag.ahead` in the block
+    middle: Annotated[Vector, (COMPRESSED, 2)]
+    #: half the elementwise difference between the largest and the smallest `Lag.ahead` in the block
     spread: Annotated[Vector, (COMPRESSED, 2)]
     ratio: float  # upper bound of predicted error / guide width in the block, computed in the last control cycle
 
@@ -85,7 +87,7 @@ class Few:
     """Prediction of torque and speed for one number of cycles ahead, see `prediction.FEW`."""
 
     lag: int  # number of cycles ahead
-    #: matrix from the state to four predictions: backup acceleration [rad/s2] of hip and knee, then e' [rad/s] of hip and knee
+    #: matrix from the state to four predictions: feedback -Kv e - Dv e' [rad/s2] of hip and knee, then e' [rad/s] of hip and knee
     ahead: Annotated[Vector, (STATES, 4)]
     #: matrix from `Guard.magnitude` to the largest change [rad/s] that model errors can cause in the predicted e' of hip and
     #: knee
@@ -101,16 +103,18 @@ class GuideTables(NamedTuple):
     blocks: Records[Block]  # (blocks,) bounds of the predicted tracking errors
     few: Records[Few]  # (rows,) predictions of torque and speed, in ascending order of `Few.lag`
     #: (starts, lags, 4) rad, largest errors of sagittal hip and knee.
-    #: Columns 0 and 1: due to model errors. Columns 2 and 3: due to the requested disturbances.
+    #: Axis 0: blocks of `START_CYCLES` cycles in which a prediction starts. Axis 1: number of cycles ahead.
+    #: Columns 0 and 1 of axis 2: due to model errors. Columns 2 and 3: due to the requested disturbances.
     reach: Vector
     highest: Vector  # (starts, blocks, 4) maximum of `reach` over each block of cycles ahead [rad]
-    #: (starts, rows, 12) largest effects of disturbances on the torques [Nm] and speeds [rad/s] of sagittal hip and knee.
-    #: Columns 0 to 3: torques and speeds due to model errors.
-    #: Columns 4 to 7: torques and speeds due to the requested disturbances.
-    #: Columns 8 and 9: speeds due to model errors, with the worst inertia and delay.
-    #: Columns 10 and 11: speeds due to the requested disturbances, with the worst inertia and delay.
+    #: (starts, rows, 12) largest effects on the torques [Nm] and speeds [rad/s] of sagittal hip and knee (SH, SK).
+    #: Columns 0 to 3: torque of SH, torque of SK, speed of SH, speed of SK, due to model errors.
+    #: Columns 4 to 7: torque of SH, torque of SK, speed of SH, speed of SK, due to the requested disturbances.
+    #: Columns 8 and 9: speeds of SH and SK due to model errors, with the worst inertia and delay.
+    #: Columns 10 and 11: speeds of SH and SK due to the requested disturbances, with the worst inertia and delay.
     few_reach: Vector
-    step: Vector  # (horizon + 1, COLUMNS) values of each cycle of the step; the column numbers are defined below
+    #: (n, COLUMNS) values of each cycle of the step and of the overlap with the next step. The columns are defined below.
+    step: Vector
 
 
 INVERSE = 0  # columns 0 to 3 of `step`: 1 / distance to the upper and lower bound of the hip, then of the knee [1/rad]
@@ -120,9 +124,10 @@ BASE = 8  # columns 8 and 9 of `step`: torque that moves the leg along q_des [Nm
 MASS = 10  # columns 10 to 12 of `step`: mass matrix M11, M12 and M22 along q_des [kg m2]
 SPEED = 13  # columns 13 and 14 of `step`: velocity of q_des [rad/s]
 #: Column 15 of `step`: lower bound of the gate. The bound is 1 at the start of a step, when the filter takes over the
-#: joints.
+#: joints, and falls to 0 with `CarryOver.blend`.
 FLOOR = 15
-#: Columns 16 to 19 of `step`: maximum of columns 0 to 3 over the next `TAIL_CYCLES` cycles, plus a margin [1/rad].
+#: Columns 16 to 19 of `step`: maximum of columns 0 to 3 over this cycle and the next `TAIL_CYCLES` cycles, plus a margin [1/rad].
+#: See `filter.tail`.
 TAIL = 16
 #: Columns 20 to 23 of `step`: maximum of columns 0 to 3 over `SLACK_CYCLES` cycles from this cycle on [1/rad].
 NEAR = 20
@@ -132,7 +137,7 @@ TAIL_CYCLES = 60
 
 
 class LegState(NamedTuple):
-    """Measurements of sagittal hip and knee of the swing leg in one cycle."""
+    """Measurements, q_des, sent torques and gravity torques of sagittal hip and knee (SH, SK) of the swing leg in one cycle."""
 
     hip: float  # rad, q of SH
     knee: float  # rad, q of SK
@@ -147,7 +152,7 @@ class LegState(NamedTuple):
 
 
 def leg_state(hip: int, q: Vector, qd: Vector, desired: Vector, sent: Vector, gravity: Pair) -> LegState:
-    """Return the measurements of the swing leg.
+    """Return the `LegState` of the swing leg.
 
     Args:
         hip: index of SH of the swing leg in JOINTS; SK is the next joint.
@@ -174,6 +179,8 @@ def leg_state(hip: int, q: Vector, qd: Vector, desired: Vector, sent: Vector, gr
 
 def tick(guide: GuideTables, cycle: int, leg: LegState) -> Pair:
     """Compute the torques of sagittal hip and knee for one cycle: (1 - gate) u_free + gate u_B.
+
+    u_free is the sum of u_i and u_f, each multiplied by its intensity. u_B is the backup torque, see `backup_policy`.
 
     Args:
         guide: tables of the guide filter; the results of the tick are written to `GuideTables.guards`.

@@ -4,7 +4,7 @@ This law is for comparisons with the paper. Its certificate contains no certifie
 inside the guide under any disturbance torque.
 Each joint is treated as a separate inertia, J q'' = u_v + u_f + u_ext. The backup torque u_b is the PD part of the baseline PID.
 In each cycle the motion under u_b is integrated to the end of the step twice: with the largest and with the smallest constant
-u_ext. h is the smaller of the two results, and
+u_ext. h is 1 - r^2 with the largest r = |e| / q_bound of both motions, and
 
     lambda = (1 + (Xi^10 - 1) h)^3,   lambda_d = -zeta dh/dt,   u_v = (lambda + (1 - lambda) lambda_d) u_b.
 
@@ -158,7 +158,7 @@ def assistive_torque(tables: LiteralTables, guard: Guard, cycle: int, leg: LegSt
 
 
 def _guide_torque(tables: LiteralTables, cycle: int, joint: int, e: float, rate: float) -> tuple[float, float, float]:
-    """Return h, the gate (factor of the backup torque u_b) and the guide torque u_v [Nm] of a joint."""
+    """Return three values of a joint: h; the gate, which is the factor of the backup torque u_b; the guide torque u_v [Nm]."""
     letter = tables.letters[0]
     ratio = max(_largest_ratio(tables, cycle, joint, e, rate, 1.0), _largest_ratio(tables, cycle, joint, e, rate, -1.0))
     h = 1.0 - ratio * ratio

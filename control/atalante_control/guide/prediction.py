@@ -22,7 +22,7 @@ Pair = tuple[float, float]
 
 #: Prediction lengths at which torque and speed are computed [cycles].
 FEW = np.array([1, 2, 3, 4, 6, 8, 11, 15, 20, 27, 36, 48, 64, 85, 113, 150, 200, 250, 300])
-#: Typical magnitude of each element of the state. `Prediction.compress` uses the magnitudes as weights of the elements.
+#: Typical magnitude of each state element, see `backup_policy.STATES`. The magnitudes are weights in `Prediction.compress`.
 SIZES = np.repeat([0.07, 1.0, 1.0, 140.0, 140.0], 2)
 
 
@@ -195,7 +195,7 @@ def prediction_of(policy: BackupPolicy, leg: Leg, assumptions: Assumptions, blen
 
 
 def _separated(rows: Vector) -> Vector:
-    """Convert matrices so that they apply to a state with true minus measured velocity in place of the true velocity."""
+    """Return equivalent matrices for a state in which quantity 2 (see `STATES`) is true minus measured e' instead of true e'."""
     result = rows.copy()
     result[..., 4:6] += rows[..., 2:4]
     return result

@@ -1,7 +1,8 @@
 """Shapes of the virtual guide: width of the guide along a step, above and below the desired trajectory.
 
 `shape, assistance factor -> bounds over the phase`. The guide filter, the certificate and the plots use the bounds. The paper
-does not define the shape. The half-width without a shape is taken from the paper: 0.5 + 7 (1 - Xi) degrees.
+does not define the shape. It defines only a half-width, 0.5 + 7 (1 - Xi) degrees. A shape multiplies this half-width by
+fractions.
 """
 
 from __future__ import annotations
@@ -26,7 +27,7 @@ _CHECKED_FACTORS = np.linspace(0.0, 1.0, 21).tolist()
 
 
 def half_width(xi: float) -> float:
-    """Return the half-width [rad] of the guide without a shape: 0.5 + 7 (1 - Xi) degrees at the assistance factor Xi.
+    """Return the half-width of the paper [rad]: 0.5 + 7 (1 - Xi) degrees. A shape multiplies this half-width by a fraction.
 
     Args:
         xi: assistance factor in [0, 1].

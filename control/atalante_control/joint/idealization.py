@@ -1,6 +1,7 @@
 """Joint idealization: torques u_i with which an assisted joint moves like a free inertia. `q, q', u_g -> u_i`.
 
-The law of the paper is u_i = k_d sign(q') + k_v q' + u_g. This module differs from the paper in three points:
+The law of the paper is u_i = k_d sign(q') + k_v q' + u_g, with the gravity torque u_g. This module differs from the paper in
+three points:
 
 - The paper prints sign(q) and k_v q. Friction opposes the velocity, so this module uses q'.
 - The sign is smoothed to tanh(q' / v_s). At rest, noise changes the sign of the measured velocity from cycle to cycle. Without
@@ -143,7 +144,7 @@ def law_of(friction: Friction, inertia: AssistedInertia) -> Records[Law]:
 
 
 def idealization(law: Law, knee: float, hip_rate: float, knee_rate: float, gravity: Pair) -> Pair:
-    """Return u_i of sagittal hip and knee, the sum of friction compensation, velocity torques and u_g [Nm].
+    """Return u_i of sagittal hip and knee, the sum of friction compensation, velocity torques and gravity torques u_g [Nm].
 
     Args:
         law: result of `law_of`.

@@ -1,4 +1,4 @@
-"""Model of the legs for the HAL, which compares the motion of each joint with its torque: `exoskeleton, patient -> LegModel`."""
+"""Model of the legs: `exoskeleton, patient -> LegModel`. With this model, the HAL compares motion and torque of each joint."""
 
 from __future__ import annotations
 
@@ -70,7 +70,10 @@ def _fused(link: Link, tree: dict[str, Link]) -> Inertia:
 
 
 def _turn(link: Link) -> Vector:
-    """Return the three matrices of `LegModel.turn` for a link, shape (3, 3, 3)."""
+    """Return `LegModel.turn` of a link, shape (3, 3, 3).
+
+    The rotation matrix from link to parent is turn[0] + sin(q) turn[1] + (1 - cos(q)) turn[2].
+    """
     cos, sin = math.cos(link.yaw), math.sin(link.yaw)
     fixed = np.array([[cos, -sin, 0.0], [sin, cos, 0.0], [0.0, 0.0, 1.0]])
     x, y, z = link.axis

@@ -19,15 +19,15 @@ from atalante_hal.types import Vector
 
 Pair = tuple[float, float]
 
-#: Default steering gains: 0.5 rad per rad of heading error, 0.15 rad per m of sideways deviation, at most 3 degrees per
-#: step.
+#: Default of `WalkConfig.steering`: hip offset of 0.5 rad per rad of heading error and 0.15 rad per m of sideways deviation, at
+#: most 3 degrees in each step.
 STEERING = 0.5, 0.15, math.radians(3.0)
 
 _NO_INTEGRAL = (0.0,) * 6
 #: Largest angle by which the desired line may turn before a periodic step [rad]. Larger angles were not tried.
 TURN_MAX = math.radians(5.0)
 #: Gains without integral terms. With integral terms, the robot began to limp after about 120 steps in MuJoCo.
-#: The integral terms of the two legs drifted apart, because the ankle stabiliser moves the robot too.
+#: The PIDs act against the ankle stabiliser, so the integral terms of the two legs drifted apart.
 WALK_GAINS = PidGains(
     stance=replace(PidGains().stance, ki=_NO_INTEGRAL), swing=replace(PidGains().swing, ki=_NO_INTEGRAL)
 )
@@ -86,8 +86,8 @@ class WalkConfig:
     #: gyro.
     heading_reference: bool = False
     loaded: float = 0.3  # smallest load with which a standing foot counts as loaded, as a fraction of the weight
-    #: loads of a foot, as fractions of the weight. While the robot stands, a leg has the full stance gains at the first load.
-    #: During a step, the ankle of the stance leg has the full stance gains at the second load.
+    #: Smallest load of a foot at which its leg has the full stance gains, as a fraction of the weight. First value: each leg
+    #: while the robot stands. Second value: ankle of the stance leg during a step.
     full_gains: Pair = (0.25, 0.5)
     settle: float = 1.0  # s, time for which both feet must be loaded before the robot walks
     posture: float = 2.0  # s, duration of the motion from the measured pose to the standing pose
@@ -98,7 +98,7 @@ class WalkConfig:
     #: With the smaller value `alpha`, the re-centring of the heavy leg would need more torque than the drives have.
     #: All other joints use `alpha`, because the robot would fall if they were re-centred as slowly as sagittal hip and knee.
     guided_alpha: float = 0.5
-    #: s, first part of a guided step, in which the smallest allowed weight of the backup torque falls from 1 to 0
+    #: s, time after the start of a guided step in which the smallest allowed weight of the backup torque falls from 1 to 0
     engage: float = 0.02
     #: s, time after a guided step in which the baseline controller takes over sagittal hip and knee of the leg that was guided
     release: float = 0.03

@@ -14,11 +14,11 @@ _LARGEST_TWIST = 60.0
 
 
 def contact_force(load: float, twist: float) -> float:
-    """Return the vertical force of the floor on a foot [N], although one cell can be wrong.
+    """Return the vertical force of the floor on a foot [N], corrected for one cell that reads too much.
 
     The sole is a rigid plate on four equal cells. Wherever the floor acts, the sum of the forces on FL and RR is equal to the sum
-    on FR and RL. The difference, the twist, is therefore the error of a wrong cell. The force of a cell that reads too much is
-    corrected. If a cell reads too little, the result is too small.
+    on FR and RL. The difference, the twist, is therefore the error of a wrong cell. A twist that is larger than the noise is
+    subtracted from the load. If a cell reads too little, the result is therefore too small.
 
     Args:
         load: sum of the vertical forces on all cells [N].

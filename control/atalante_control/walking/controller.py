@@ -137,7 +137,7 @@ class WalkController:
             toe=middle + half - config.edge,
         )
         force = np.zeros((len(FEET), len(CELLS), 3))
-        self._forces = force.copy()  # copy of the foot forces in which the forces of a lost foot are estimated
+        self._forces = force.copy()  # copy of the foot forces; contains the estimated forces of a lost foot
         #: Copy of the torque that the controller requested last, used if the `State` does not contain the sent torque.
         self._sent = np.zeros(_N)
         self._state: State | None = None  # `State` object whose arrays are in `_measured_by`
@@ -150,7 +150,8 @@ class WalkController:
         placements: Records[Placement] = placed
         placements[0].low[:], placements[0].high[:] = _range(robot, config)
         leans: Records[Lean] = zeros(Lean, 1)
-        #: Row of the phase table and its change per cycle, shape (1,). Fields of arrays are read faster than fields of records.
+        # Views of two fields of `Placement`, each of shape (1,): row of the phase table, and change of the row per cycle.
+        # Python reads a view faster than the field of a record.
         self._clock, self._pace = placed["clock"], placed["pace"]
         outputs: Records[Outputs] = zeros(Outputs, 1)
         telemetry = zeros(Telemetry, 1)
@@ -239,7 +240,7 @@ class WalkController:
 
     @property
     def steps_wanted(self) -> int:
-        """Return the number of periodic steps until the stop step."""
+        """Return the number of periodic steps between the start step and the stop step."""
         return self._sections[-1].end
 
     def reached(self, step: int, phase: float) -> bool:
@@ -369,7 +370,10 @@ class WalkController:
             self._sent[:] = self._pid.requested
 
     def _load_without(self, side: int) -> float:
-        """Return the vertical load on a foot whose data is lost [N]: the share of the weight that the other foot does not carry.
+        """Estimate the vertical load on a foot whose data is lost [N] from the load on the other foot.
+
+        The estimate follows from the fraction of the weight that the other foot does not carry. It is 0 up to the fraction
+        `_LOAD_ERROR`, and rises linearly to the weight at the fraction 1.
 
         Args:
             side: index of the foot in FEET.

@@ -25,14 +25,14 @@ from atalante_control.gait.gait import PERIOD
 
 
 class HeadingConfig(NamedTuple):
-    """Standard deviations of the errors of gyro and heading reference."""
+    """Parameters of the heading filter. The error parameters are standard deviations."""
 
     reference: float = 0.004  # rad, error of the heading reference
-    reference_time: float = 10.0  # s, correlation time of this error
+    reference_time: float = 10.0  # s, correlation time of the error of the heading reference
     gyro_noise: float = 1.7e-4  # rad/sqrt(s), random walk of the integral of the gyro (0.01 deg/s/sqrt(Hz))
     gyro_bias: float = 5.2e-5  # rad/s, bias of the gyro at the start (0.003 deg/s)
     bias_walk: float = 1e-6  # rad/s/sqrt(s), random walk of the bias
-    outlier: float = 5.0  # standard deviations, largest difference between a measurement and its prediction
+    outlier: float = 5.0  # standard deviations; a measurement that differs more from its prediction is not used
     interval: int = 100  # cycles between two updates
 
 
@@ -48,7 +48,8 @@ class HeadingFilter:
         self._config, time = config, config.interval * PERIOD
         self._transition = np.array([[1.0, time, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]])
         self._process = np.diag([config.gyro_noise**2 * time, config.bias_walk**2 * time, 0.0])
-        #: Variance of white noise with the spectral density of the error of the reference at low frequencies.
+        #: Variance of the white noise with which the filter replaces the correlated error of the reference [rad2]. Both have the
+        #: same spectral density at low frequencies.
         self._noise = 2.0 * config.reference**2 * config.reference_time / time
         self.reset()
 
@@ -62,7 +63,7 @@ class HeadingFilter:
     def correction(self, measured: float, estimated: float) -> float:
         """Return the angle by which the estimated heading must be turned in this cycle [rad].
 
-        Most cycles need no correction. In one of `HeadingConfig.interval` cycles, the filter is updated.
+        The filter is updated every `HeadingConfig.interval` cycles. In all other cycles, the result is 0.
 
         Args:
             measured: measured heading, relative to the measured heading at the start [rad].

@@ -59,7 +59,7 @@ class Measured(NamedTuple):
     imu: Vector  # (3,) m, position of the IMU in the pelvis frame; the axes of IMU and pelvis are parallel
     gyro: Vector  # (3,) rad/s, angular velocity of the IMU in the axes of the IMU
     accel: Vector  # (3,) m/s2, specific force at the IMU in the axes of the IMU
-    force: Vector  # (2, 4, 3) N, forces of all cells
+    force: Vector  # (2, 4, 3) N, force at each force cell in the foot frame; the axes are foot, cell and x/y/z
     sent: Vector  # (12,) Nm, torque command of the previous cycle after the limiter
 
 
@@ -90,7 +90,7 @@ class Sensed:
     #: N, the smaller of filtered and unfiltered vertical force. The smaller force drops without delay when a foot
     #: leaves the ground.
     bearing: Annotated[Vector, 2]
-    #: N, filtered vertical force on each foot, FL - FR - RL + RR. With four correct cells, it is 0, see `contact_force`.
+    #: N, filtered twist FL - FR - RL + RR of each foot, see `contact_force`. With four correct cells, the twist is 0.
     twist: Annotated[Vector, 2]
     heading: Annotated[Vector, 2]  # rad, heading of each foot without the toe-out
     step: Annotated[Vector, 3]  # m, position of the right sole relative to the left sole, world axes
@@ -101,8 +101,8 @@ class Constants(NamedTuple):
 
     weight: float  # N, weight of robot and patient
     keep: float  # factor of the previous value in the low-pass of the foot forces
-    standing_gains: float  # N, while standing: load of a foot at which its leg has the full stance gains
-    walking_gains: float  # N, while walking: load of the stance foot at which its ankle has full stance gains
+    standing_gains: float  # N, while standing: smallest load of a foot at which its leg has the full stance gains
+    walking_gains: float  # N, in a step: smallest load of the stance foot at which its ankle has the full stance gains
     gains: Vector  # (2, 3, 12) gains of swing leg and stance leg: Kp [Nm/rad], Kd [Nm s/rad], Ki times the cycle time [Nm/rad]
     placement: PlacementConfig  # parameters of foot placement and step timing
     lean: LeanConfig  # parameters of the lean
@@ -112,8 +112,8 @@ class Assistance(NamedTuple):
     """Guide of the swing leg in the current step."""
 
     guide: GuideTables  # `GuideFilter.tables`
-    literal: LiteralTables  # `LiteralGuide.tables`, used instead of the guide if `Stage.literal`
-    unmodelled: Vector  # (n + 1, 2) Nm, `SwingLeg.unmodelled`: torque of hip and knee in each cycle of the step
+    literal: LiteralTables  # `LiteralGuide.tables`, used instead of `guide` if `Stage.literal` is True
+    unmodelled: Vector  # (n + 1, 2) Nm, `SwingLeg.unmodelled`, added to u_g of hip and knee in each cycle of the step
     fade: Vector  # (m,) factor of `Stage.excess` in each cycle after the nominal end of the step; falls from 1 to 0
 
 

@@ -26,8 +26,8 @@ class LeanConfig(NamedTuple):
 
     gain: float = 6.0  # rad/m, lean per DCM error beyond the dead zone; 0: no lean
     dead_zone: float = 0.02  # m, sideways DCM error up to which the trunk does not lean
-    #: m, the trunk leans over the stance foot only if the DCM is outwards of the centre of the stance sole, or inwards of it by
-    #: less than this distance
+    #: m, largest inward distance of the DCM from the middle of the stance sole at which the trunk leans over the stance foot;
+    #: the inward distance is negative if the DCM is outwards of the middle
     inside: float = 0.015
     outward: float = 0.22  # rad, largest lean over the stance foot
     inward: float = 0.08  # rad, largest lean to the side of the swing foot
@@ -35,7 +35,7 @@ class LeanConfig(NamedTuple):
     fall: float = 5.0  # rad/s, natural frequency of the filter while the lean decreases
     acceleration: float = 25.0  # rad/s2, largest acceleration of the lean
     leg_gain: float = 8.0  # m/m, outward motion of the swing foot per distance of the DCM beyond `leg_zone`; 0: none
-    #: m, distance of the DCM from the middle of the stance sole, outwards, up to which the swing foot does not move outwards
+    #: m, largest outward distance of the DCM from the middle of the stance sole at which the swing foot does not move outwards
     leg_zone: float = 0.02
     leg: float = 0.15  # m, largest outward motion of the swing foot
 
@@ -77,7 +77,7 @@ def follow_lean(config: LeanConfig, lean: Lean, target: float) -> None:
 
 
 def leg_target(config: LeanConfig, dcm: float, side: float) -> float:
-    """Return the requested outward motion of the swing foot to the left [m]; 0 without such a motion.
+    """Return the requested outward motion of the swing foot [m], positive to the left; 0 if no motion is requested.
 
     Args:
         config: parameters.

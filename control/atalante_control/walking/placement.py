@@ -43,7 +43,7 @@ _SHIFTING = (_FH, _SH, _SK)
 _LINKS = LEG_JOINTS.index("SA") + 1
 #: m3, smallest determinant of the ankle Jacobian at which the foot is still shifted; a straight leg has the determinant 0
 _SINGULAR = 1e-3
-_RATES = 32  # number of phase rates for which the cost is computed, minus 1; the rates are in geometric order
+_RATES = 32  # the cost is computed for `_RATES` + 1 phase rates in geometric order
 _FASTEST = 3.0  # rad/s, largest desired speed of a joint that shifts the foot
 
 
@@ -69,8 +69,7 @@ class PlacementConfig(NamedTuple):
     bandwidth: float = 25.0  # rad/s, natural frequency of the critically damped filter of the landing offset
     speed: float = 1.2  # m/s, largest rate of change of the landing offset
     acceleration: float = 25.0  # m/s2, largest acceleration of the landing offset
-    #: cost weight of the squared missing offset (needed minus permitted offset), relative to the squared permitted
-    #: offset
+    #: cost weight of the squared missing offset (needed minus permitted offset); the squared permitted offset has the weight 1
     missed: float = 30.0
     #: m, cost of timing: a landing that is earlier or later by 1 / w costs as much as a landing with this offset
     timing: float = 0.03
@@ -88,10 +87,10 @@ class Placement:
     target: Annotated[Vector, 2]  # m, requested offset of the landing in the walking frame
     offset: Annotated[Vector, 2]  # m, current offset of the swing foot in the walking frame
     speed: Annotated[Vector, 2]  # m/s, speed of the offset
-    change: Annotated[Vector, 3]  # rad, changes of frontal hip, sagittal hip and knee of the swing leg
+    change: Annotated[Vector, 3]  # rad, sum of the changes of FH, SH and SK by `shift_foot` in this phase
     low: Annotated[Vector, 12]  # rad, smallest desired angles of the joints
     high: Annotated[Vector, 12]  # rad, largest desired angles of the joints
-    rotation: Annotated[Vector, (3, 3)]  # rotation matrix from the last link to the pelvis
+    rotation: Annotated[Vector, (3, 3)]  # rotation matrix from the ankle link to the pelvis
     origin: Annotated[Vector, (_LINKS, 3)]  # m, positions of the joints of the swing leg in the pelvis frame
     axis: Annotated[Vector, (_LINKS, 3)]  # joint axes of the swing leg in the axes of the pelvis
 

@@ -39,10 +39,10 @@ class PhaseTable(NamedTuple):
     frequency: float  # rad/s, natural frequency w of the pendulum
     recentring: Vector  # (m, 4) re-centring rows of all joints without a guide, see `flat_foot.recentring_rows`
     guided: Vector  # (m, 4) re-centring rows of sagittal hip and knee of the swing leg, which a guide can assist
-    reach: Vector  # (2,) rad/s, speeds of hip and knee of the swing leg that lower the swing foot after the last cycle
+    reach: Vector  # (2,) rad/s, speeds of SH and SK of the swing leg with which the swing foot moves down after the last row
     lowering: float  # m/s, downward speed of the swing foot at the joint speeds `reach`
     reach_cycles: int  # number of cycles in which the joint speeds `reach` lower the foot after the last row
-    #: number of cycles in which the swing foot is lowered after the last row while foot placement holds the foot
+    #: number of cycles in which foot placement lowers a held swing foot after the last row; does not depend on the knee angle
     lowering_cycles: int
 
 

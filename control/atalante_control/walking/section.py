@@ -1,7 +1,7 @@
 """Sections of a walk: `gaits, number of steps -> phase tables, swing leg and guides of these steps`.
 
 A walk has one section for each periodic gait, in walking order. A speed change is the end of a section: the next step has the
-gait of the next section. It starts at the last pose of the old gait, and the re-centring leads it to the new gait.
+gait of the next section. This step starts at the last pose of the old gait, and the re-centring leads to the new gait.
 """
 
 from __future__ import annotations

@@ -69,7 +69,7 @@ class Steering:
         self.yaw = float(headings.mean()) - self._origin
 
     def turn(self) -> None:
-        """Turn the line about the middle between the feet. The deviation from the line stays the same."""
+        """Turn the line about the middle between the feet. The sideways deviation from the line stays the same."""
         self._origin += self._turn
         self.yaw -= self._turn
         c, s = math.cos(self._turn), math.sin(self._turn)

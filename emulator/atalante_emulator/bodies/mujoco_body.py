@@ -32,7 +32,7 @@ class Contact(NamedTuple):
     """
 
     solref: tuple[float, float] = (0.02, 1.0)  # time constant [s] and damping ratio
-    solimp: tuple[float, float] = (0.99, 0.99)  # two impedances: without penetration and at full penetration
+    solimp: tuple[float, float] = (0.99, 0.99)  # constraint impedance (0 to 1) at zero and at full penetration
     impratio: float = 1.0  # friction impedance divided by normal impedance
 
 

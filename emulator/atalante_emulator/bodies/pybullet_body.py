@@ -137,7 +137,8 @@ class PyBulletBody:
             row for row, link in enumerate(self._imus) if self._free or _is_movable(link, set(self._joints), infos)
         ]
         self._moving_links = [self._imus[row] for row in self._moving]
-        # For the root link, PyBullet returns the pose of the inertial frame.
+        # For the root link, PyBullet sets and returns the pose of the inertial frame. These transforms convert between this pose
+        # and the pose of the link frame.
         dynamics = pybullet.getDynamicsInfo(self._body, _BASE, physicsClientId=client)
         self._inertial_in_base = dynamics[3], dynamics[4]
         self._base_in_inertial = pybullet.invertTransform(*self._inertial_in_base)

@@ -125,7 +125,8 @@ def _plate(cell: Vector, corner: Vector) -> Vector:
     matrix = np.zeros((len(cell), 3, len(corner), 3))
     share = 1.0 / len(cell)
     matrix[:, 2, :, 2] = share + np.outer(a, x) / (a @ a) + np.outer(b, y) / (b @ b)
-    # A horizontal force turns the plate about its centre by the yaw moment x F_y - y F_x, which the cells resist.
+    # A horizontal force on the corner (x, y) has the yaw moment x F_y - y F_x about the centre of the plate. Horizontal forces of
+    # the cells, proportional to the distance of each cell from the centre, carry this moment.
     polar = a @ a + b @ b
     matrix[:, 0, :, 0] = share + np.outer(b, y) / polar
     matrix[:, 0, :, 1] = -np.outer(b, x) / polar

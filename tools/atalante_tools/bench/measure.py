@@ -38,8 +38,7 @@ class Measurement:
     value: float | None
     baseline: float | None
     remarks: tuple[str, ...] = ()
-    #: Measured time divided by baseline time, in ascending order: one value for each process that measured.
-    #: Empty if only this process measured.
+    #: `ratio` of each process that ran the benchmark, in ascending order. Empty if the benchmark ran only in this process.
     ratios: tuple[float, ...] = ()
 
     @property
@@ -50,6 +49,8 @@ class Measurement:
 
 def median(measured: Sequence[Measurement]) -> Measurement:
     """Return the measurement with the median ratio. Its field `ratios` contains the ratios of all measurements.
+
+    If a time was not measured, return the first measurement.
 
     Args:
         measured: measurements of the same benchmark in an odd number of processes.

@@ -127,7 +127,7 @@ class Recording:
         image.values[image.codec.slice("SupplyVoltage")] = 48.0
         gap = max(m.cycle_ms for m in slow) // len(slow)
         #: Messages with long periods: (message, period in cycles, phase in cycles).
-        #: The phases of the messages are spread evenly, so that every block of ten cycles has the same number of frames.
+        #: The phases of the messages differ, so that a cycle has only few of these messages.
         self.slow = tuple((m, m.cycle_ms, gap * row % m.cycle_ms) for row, m in enumerate(slow))
         self._slow = _seal(image, image.values[None, :])
         self._slow_turn = [0] * len(slow)

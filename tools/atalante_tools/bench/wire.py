@@ -17,7 +17,7 @@ from atalante_tools.bench.generated_c import COMPILER, GeneratedC, available
 from atalante_tools.bench.measure import Effort, Measurement, require, timed
 from atalante_tools.bench.nodes import FilterOnly, RecordedHal, Recording, active_hal, walk
 
-#: Number of cycles that are timed together as one block. After ten cycles, the schedule of the slow messages repeats.
+#: Number of cycles that are timed together as one block.
 _BLOCK: Final = 10
 #: Number of repetitions of a short Python function in a block.
 _MANY: Final = 100

@@ -87,7 +87,7 @@ class ColumnCodec:
     def _plan(self) -> None:
         """Choose for each field the 64-bit word from which the field is extracted.
 
-        This is a word of the payload (Intel), a byte-swapped word of the payload (Motorola), or a word joined from two.
+        The word is a payload word (Intel), a byte-swapped payload word (Motorola), or a word joined from two payload words.
         """
         rows: dict[tuple[str, int], int] = {}
         self._little: list[int] = []  # Intel words

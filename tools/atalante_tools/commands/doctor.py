@@ -179,7 +179,7 @@ def examine(machine: Machine, interface: str, channels: Sequence[str]) -> Iterat
 def _packages(machine: Machine, interface: str) -> Iterator[CheckResult]:
     for name, (purpose, extra) in PACKAGES.items():
         found = machine.package(name)
-        # The embedded robot needs one physics engine.
+        # The embedded robot needs PyBullet or MuJoCo. If both are missing, only the check of PyBullet is marked as needed.
         needed = not extra or (name == "pybullet" and interface == EMBEDDED and not machine.package("mujoco"))
         text = f"{'installed' if found else 'not installed'}, for {purpose}"
         fix = engine_hint() if name == "pybullet" else f"pip install 'atalante-hal{extra}'"

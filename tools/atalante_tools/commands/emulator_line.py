@@ -19,7 +19,7 @@ from atalante_hal.wire.frame import Frames, new_frames
 from atalante_tools.session.takeover import PendantReader, Takeover
 
 #: If no frame of another pendant arrives for this time [cycles], the emulated pendant resumes sending.
-#: `PENDANT_QUIET` is longer than `QUIET_CYCLES`, so that a pendant in another process resumes before the emulated pendant.
+#: A pendant in another process must resume before the emulated pendant, so this time is longer than `takeover.QUIET_CYCLES`.
 PENDANT_QUIET: Final = 12
 #: Another robot is on the bus if one emulated message is received this number of times in a row with increasing counters.
 ROBOT_FRAMES: Final = 3

@@ -52,7 +52,11 @@ class JointReport:
 
 @dataclass(frozen=True)
 class Report:
-    """State of all nodes and joints. Bus load and frame counts cover the time since the previous report."""
+    """State of all nodes and joints.
+
+    `load`, `frames` and `foreign` cover the time since the previous report (`seconds`). `crc_errors` covers the time since the
+    start of the observation, and `dropped` the time since the bus was opened.
+    """
 
     seconds: float
     supervisor: str | None

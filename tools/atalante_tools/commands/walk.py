@@ -107,7 +107,8 @@ def _protocol(_ctx: click.Context, _param: click.Parameter, text: str | None) ->
     default=0.0,
     show_default=True,
     metavar="DEG",
-    help="Angle by which the desired line turns before each periodic step [deg]. A positive angle turns the line to the left.",
+    help="Angle by which the desired walking line turns before each periodic step [deg]. A positive angle turns the "
+    "line to the left.",
 )
 @click.option(
     "--push",
@@ -135,8 +136,9 @@ def _protocol(_ctx: click.Context, _param: click.Parameter, text: str | None) ->
 @click.option(
     "--heading-reference",
     is_flag=True,
-    help="Estimate the drift of the gyro from the heading of the pelvis IMU, which must have a reference, such as a "
-    "magnetometer. The headings of the emulated IMUs then do not drift.  [default: integral of the gyro]",
+    help="Use the heading of the pelvis IMU to estimate the drift of the gyro. The pelvis IMU must have a heading "
+    "reference, such as a magnetometer. With this option, the headings of the emulated IMUs do not drift.  "
+    "[default: the estimated heading is the integral of the gyro rate]",
 )
 @click.option("--seed", type=SEED, default=0, show_default=True, metavar="N", help="Seed of the emulated sensor noise.")
 @click.option(
@@ -253,14 +255,14 @@ def _require_speed_changes(law: Law, files: GaitFiles) -> None:
 
 
 def _subject(patient: Patient | None, step_length: float, step_duration: float) -> Subject | None:
-    """Return the patient with the step. Return None if the user gave no patient and the step is the default step."""
+    """Return patient, step length and step duration as a subject. Return None for the default step without a patient."""
     if patient is None and (step_length, step_duration) == DEFAULT_STEP:
         return None
     return _walking_with(patient, step_length, step_duration)
 
 
 def _walking_with(patient: Patient | None, step_length: float, step_duration: float) -> Subject:
-    """Return the patient with the step. If `patient` is None, use the default patient of the package."""
+    """Return patient, step length and step duration as a subject. If `patient` is None, use the default patient."""
     from atalante_control.gait.subject import Subject
     from atalante_control.model import Patient
 

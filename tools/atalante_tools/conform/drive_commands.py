@@ -54,7 +54,7 @@ def ignores_unknown_controlwords(tester: NodeTester) -> Outcome:
 
 
 def ignores_invalid_codes(tester: NodeTester) -> Outcome:
-    """Test DRIVE-11: a command with an invalid code has no effect."""
+    """Test DRIVE-11: a command in which a signal has its invalid code (`InvalidRaw` in the DBC) has no effect."""
     axis, found, passed = Axis(tester), [], True
     message = tester.command.message
     axis.enable()

@@ -28,7 +28,7 @@ from atalante_tools.conform.technician import Action
 
 _S, _C = DriveState, Controlword
 
-#: Largest number of cycles from QUICK_STOP to QUICK STOP ACTIVE.
+#: Largest number of cycles from the command QUICK_STOP to the state QUICK STOP ACTIVE.
 STOP: Final = 5
 #: Largest movement of a joint in QUICK STOP ACTIVE [rad].
 MOVEMENT: Final = math.radians(1.0)

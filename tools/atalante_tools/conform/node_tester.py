@@ -119,7 +119,7 @@ class NodeTester:
     """Tester of one node: sends SYNC and commands, and records every frame of the node.
 
     Attributes:
-        received: frames of the node since the start of the examination.
+        received: recorded frames of the node. The test of the start-up (NODE-01) empties this list.
         frame_count: number of frames of the node recorded so far, including the frames that were removed from `received`.
         cycle_number: number of past cycles of 1 ms, with or without SYNC.
     """

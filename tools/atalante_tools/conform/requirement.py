@@ -81,7 +81,7 @@ def _result(tester: NodeTester, requirement: Requirement) -> Result:
 def _silence(tester: NodeTester, frames: int, cycle: int) -> str:
     """Return a remark if the test received no frame of the node, otherwise an empty text.
 
-    A test that runs no cycles evaluates all frames that were received earlier.
+    A test that runs no cycles evaluates the frames received before the test. For such a test, these frames count as received.
 
     Args:
         tester: tester of the node.

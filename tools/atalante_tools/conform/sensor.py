@@ -17,7 +17,8 @@ GRAVITY: Final = 9.81  # m/s2
 _MEASURED: Final = 100
 NORM: Final = 1e-3  # largest deviation of a quaternion from unit length
 SPECIFIC_FORCE: Final = 0.3  # largest deviation of the mean acceleration from gravity [m/s2]
-TILT: Final = math.radians(3.0)  # largest angle between the mean acceleration and the vertical of the quaternion [rad]
+#: Largest angle between the mean acceleration and the vertical direction according to the quaternion [rad].
+TILT: Final = math.radians(3.0)
 RATE: Final = 0.05  # largest deviation of the mean gyro rate from the rate of change of the attitude [rad/s]
 UNLOADED: Final = 10.0  # largest mean force on an axis of an unloaded force cell [N]
 
@@ -173,7 +174,7 @@ def _vectors(tester: NodeTester, vector: str, axes: Sequence[str]) -> Vector:
 
 
 def _signals(tester: NodeTester, names: Sequence[str]) -> Vector:
-    """Return the named signals of the state frames in `_MEASURED` cycles. Shape (frames, names)."""
+    """Run `_MEASURED` cycles and return the named signals of all received state frames. Shape (frames, names)."""
     received = tester.states(tester.idle(_MEASURED))
     if not received:
         raise NotTested("no state frame received")

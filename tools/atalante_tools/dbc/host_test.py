@@ -246,7 +246,7 @@ def _size(build: Build, message: Message) -> int:
 
 
 def _message(build: Build, message: Message, other: Message) -> str:
-    """Return the C test function of a message. The E2E check is also called with the Data ID of the message `other`."""
+    """Return the C test function of a message. The test also expects a CRC error for the Data ID of the message `other`."""
     body = ""
     if received := build.received(message):
         body += _receive(build, message, received, other)
@@ -263,7 +263,7 @@ def _receive(build: Build, message: Message, received: tuple[Signal, ...], other
     names = [camel_to_snake_case(s.name) for s in received]
     values = "\n".join(f"        EXPECT({prefix}_{name}_decode(message.{name}) == next(&in_p));" for name in names)
     wrong_id = f"{build.name}_e2e_check(&copy, payload, sizeof(payload), sizeof(payload), {other.data_id:#06x}u)"
-    # A network with a single message has no other Data ID.
+    # Omit the test of the wrong Data ID if there is only one message, because no other Data ID exists.
     other_id = f"            EXPECT({wrong_id} == {upper}_E2E_CRC);\n" if other is not message else ""
     return f"""
     {{

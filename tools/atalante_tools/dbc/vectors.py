@@ -60,7 +60,7 @@ class Vectors:
         self._order = self._stream_order()
 
     def _stream_order(self) -> npt.NDArray[np.intp]:
-        """Return for each byte of an image its index in the arrays that `images` concatenates."""
+        """Return the index of each byte of an image in the concatenated arrays of `images`."""
         build, codec = self._build, self._codec
         rows = len(build.messages)
         parts = (FRAME_BYTES * rows, FRAME_BYTES * rows, 8 * codec.size, 8 * codec.size, rows)

@@ -108,11 +108,11 @@ def run(id_: str, name: str, engine: str, as_json: bool) -> None:
 def false_alarms(cycles: int, jobs: int, dask: str, engine: str, as_json: bool) -> None:
     """Walk without a fault, in the air and on the ground with patients, and count the reported diagnostics.
 
-    The true mass of two in three patients differs by 10 % from the mass that the HAL knows. Some patients are active.
+    The true mass of two in three patients differs by 10 % from the mass that the HAL knows. In every fourth walk on the ground,
+    the muscles of the patient are active.
 
-    GUIDE_OUTSIDE and TORQUE_SATURATED are expected: the filter and the limiter report that they act. Every other
-    diagnostic is a false alarm. The exit code is 1 after a false alarm, or if a walk does not
-    end in ACTIVE.
+    GUIDE_OUTSIDE, TORQUE_SATURATED and OPERATOR_STOP are expected. Every other diagnostic is a false alarm. The exit code is 1
+    after a false alarm, or if a walk does not end in ACTIVE.
     """
     from atalante_tools.faults.false_alarms import Quiet, quiet_tasks
 

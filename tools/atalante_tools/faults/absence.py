@@ -1,7 +1,7 @@
 """Clock of the HAL that lets the emulated robot move while no SYNC is sent: `delay of the HAL loop -> robot cycles`.
 
-In lock-step, the emulated robot runs one cycle per SYNC. If a fault of the host suppresses the SYNC or delays the loop, the robot
-would stand still. A robot on the ground would then not fall.
+In lock-step, the emulated robot runs one cycle per SYNC. Without this clock, the robot would stand still while a fault of the
+host suppresses the SYNC or delays the loop, and a robot on the ground would not fall.
 """
 
 from __future__ import annotations

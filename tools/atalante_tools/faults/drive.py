@@ -25,8 +25,8 @@ _HIP: Final = "LEFT_SH"
 _COMMAND: Final = "COMMAND_LEFT_LEG"
 #: A knee that sinks in LOWER or FAULT is at rest after this time [cycles]. Then its drive can be enabled again.
 _LOWERED: Final = 4500
-#: Time before START [cycles] if the drive of the joint was switched off. This drive stays off until START, so its joint need not
-#: be at rest.
+#: Time from the end of the fault to START [cycles], if the HAL has switched the drive of the joint off. The drive stays off until
+#: START, so the joint need not be at rest.
 _UNTIL_START: Final = 600
 #: Time from HOLD until all joints are at rest [cycles].
 _AT_REST: Final = 60
@@ -274,7 +274,8 @@ SCENARIOS: Final = (
             ),
         ),
     ),
-    # A reversed motor of any other joint exceeds its speed limit before the HAL can react.
+    # Only FH and SH have a case with a reversed motor. A reversed motor moves any other joint above the velocity limit of the
+    # joint before the HAL can react.
     Scenario(
         "F84",
         tuple(
@@ -291,7 +292,7 @@ SCENARIOS: Final = (
             )
         ),
     ),
-    # If the torque of the knee motor is eight cycles late, the position control of the knee drive becomes unstable.
+    # If the torque of the knee motor is ten or more cycles late, the position control of the knee drive becomes unstable.
     Scenario(
         "F74",
         tuple(
@@ -324,8 +325,9 @@ SCENARIOS: Final = (
             )
         ),
     ),
-    # The drive reports the commanded torque. The torque of HA is less than its dry friction, so its detection takes longer.
-    # A reversed SA is found within 30 cycles, too, but then it already exceeds the speed limit of the scenarios.
+    # The drive reports the commanded torque. The torque of HA is less than the dry friction of HA, so the detection takes longer.
+    # There is no case with a reversed motor of SA. The HAL detects this fault within 30 cycles, too, but SA then already moves
+    # faster than the verdict of a case accepts.
     Scenario(
         "F82",
         tuple(
@@ -345,7 +347,7 @@ SCENARIOS: Final = (
             )
         ),
     ),
-    # A push accelerates the joint beyond its top speed within 25 cycles.
+    # Each push accelerates the joint above its top speed within the time limit of F71, which is 25 cycles.
     Scenario(
         "F71",
         tuple(

@@ -28,7 +28,7 @@ _SHAPES: Final = ("constant", "pinched")
 _FACTORS: Final = (1.0, 0.75, 0.5, 0.25, 0.0)
 #: True mass of the patient, relative to the mass for which the gait and the model in the HAL are made.
 _MASSES: Final = (1.0, 0.9, 1.1)
-#: Every fourth patient on the ground is active.
+#: In one of `_ACTIVE` walks on the ground, the muscles of the patient are active.
 _ACTIVE: Final = 4
 
 
@@ -57,7 +57,7 @@ class QuietTask:
     """Task to walk without a fault. The number of the task selects the walk, and is the seed of the sensor noise.
 
     Every second walk is on the ground, with one of the eight patients of the study. The true mass of two in three patients
-    differs by 10 %. Some patients are active.
+    differs by 10 % from the mass that the HAL knows. In every fourth walk on the ground, the muscles of the patient are active.
     """
 
     number: int

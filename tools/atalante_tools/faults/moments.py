@@ -5,8 +5,8 @@
 The fault matrix states the reaction to a fault during a walk. The matrix prescribes no reaction for other moments or for
 pairs. The runs check what must be true for every fault at every moment:
 
-- No torque, position, velocity or torque rate exceeds its limit. A wrong motor or exchanged encoders may move a joint faster
-  until the fault is found (`FOUND`): while a drive holds, only the drive could prevent this.
+- No torque, position, velocity or torque rate exceeds its limit. Exception: for `FOUND` cycles, a wrong motor or exchanged
+  encoders may move a joint above its velocity limit, because the HAL cannot limit the speed while the drive holds its position.
 - No command lets a drive produce torque before the operator has pressed START.
 - After the robot has walked, only the operator can cause a change to a less severe state.
 - During a start, no joint moves by more than `SAG_MAX`. A wrong motor, a wrong encoder or a push moves its joint, so these
@@ -40,8 +40,8 @@ _S = SupervisorState
 #: Largest accepted motion of a joint during a start [deg]. A start ends in ACTIVE, or `_SETTLED` cycles after START.
 SAG_MAX: Final = 1.0
 _SETTLED: Final = 40
-#: Kinds of faults that move a joint during a start, and largest accepted motion of a joint [deg]. A wrong motor or encoder moves
-#: its joint until the test of the joint directions finds it (F72). A push may exceed the torque that holds the joint.
+#: Kind of a fault that moves a joint during a start -> largest accepted motion of a joint [deg]. A wrong motor or encoder moves
+#: the joint until the test of the joint directions finds the fault (F72). A push may exceed the torque that holds the joint.
 SAG_OF: Final = {
     "torque_wrong": 5.0,
     "torque_weak": 5.0,
@@ -52,8 +52,9 @@ SAG_OF: Final = {
 }
 #: Kinds of faults of a motor.
 _MOTOR: Final = ("torque_wrong", "torque_weak")
-#: Kinds of faults that may move a joint above its velocity limit, and cycles in which they are found: bound of F84 in FAULTS.md.
+#: Kinds of faults that may move a joint above its velocity limit.
 _UNLIMITED: Final = (*_MOTOR, "encoder_swapped")
+#: Number of cycles within which the HAL must find a fault of `_UNLIMITED`: time limit of F84 in FAULTS.md.
 FOUND: Final = 200
 #: Number of cycles from READY to the operator's START.
 _PAUSE: Final = 50
@@ -74,7 +75,7 @@ class Moment(StrEnum):
 
     BOOT = "boot"  # in the first cycle of the HAL
     READY = "ready"  # in READY, before the operator's START
-    START = "start"  # in the cycle after START, while the drives are enabled
+    START = "start"  # in the cycle after the operator's START, while the HAL enables the drives
     WALKING = "walking"  # in the first walking step, when the left leg swings fastest
     HOLD = "hold"  # in HOLD, after the operator's STOP during the walk
     RESTART = "restart"  # in the cycle after the operator's START that restarts the walk from HOLD

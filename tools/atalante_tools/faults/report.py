@@ -20,14 +20,17 @@ from atalante_tools.faults.verdict import Verdict
 
 @dataclass(frozen=True)
 class Line:
-    """Result of one fault, taken from the worst of its test cases. The field names are the keys of `--json`."""
+    """Result of one fault. The field names are the keys of `--json`.
+
+    The fields `state`, `cycles`, `bound` and `dtc` come from the worst test case. If a case failed, a failed case is the worst.
+    If all cases passed, the case closest to its time limit is the worst.
+    """
 
     id: str
     passed: bool
     state: str
-    #: reaction time of the worst case [cycles]. A failed case is the worst; without one, the case closest to its time limit
-    cycles: int | None
-    bound: int
+    cycles: int | None  # reaction time [cycles]; None if there was no reaction and no diagnostic
+    bound: int  # time limit for `cycles`
     dtc: str
     cases: int
     failures: tuple[str, ...]  # description of each failure: name of the case and a sentence
@@ -80,7 +83,7 @@ class Summary:
 
     @property
     def passed(self) -> bool:
-        """Return whether all faults, all pairs, and all runs with other start times passed."""
+        """Return whether all faults, all pairs, and all runs in `moments` passed."""
         failed = [*(pair.failures for pair in self.pairs), *(run.failures for run in self.moments)]
         return all(line.passed for line in self.lines) and not any(failed)
 

@@ -21,7 +21,7 @@ _FEET: Final = tuple(f"FOOT_{name.upper()}" for name in FEET)
 #: Share of doubled frames that the HAL tolerates permanently. The HAL does not tolerate a share above 0.2.
 _OFTEN: Final = 0.15
 #: Permanent communication faults that must not prevent the detection of a sensor fault.
-#: The messages of a joint and of the pelvis IMU are late, because the sensor checks use these messages.
+#: The delayed messages include those of a joint and of the pelvis IMU, because the sensor checks use these two messages.
 #: Only some frames are doubled, because a message that is doubled in every cycle is itself a fault (F63).
 _TOLERATED: Final = {
     "FOOT_LEFT often doubled": Fault("duplicate", "FOOT_LEFT_STATE", p=_OFTEN),

@@ -117,9 +117,9 @@ def evaluate(row: Row, case: Case, run: Observation) -> Verdict:
 def reacted(run: Observation, state: SupervisorState) -> int | None:
     """Return the first cycle with the expected reaction, or None.
 
-    The reaction is the expected state or a more severe state. If HOLD or a more severe state is expected, a cycle in
-    which no drive gets the command ENABLE OPERATION is also a reaction. If ACTIVE is expected, any more severe state is
-    a reaction.
+    If ACTIVE is expected, only a more severe state is a reaction. If another state is expected, this state or a more severe
+    state is a reaction. If HOLD or a more severe state is expected, a cycle in which no drive gets the command ENABLE
+    OPERATION is also a reaction.
 
     Args:
         run: observation of the run.

@@ -52,10 +52,10 @@ class CheckOptions:
     patients: bool  # whether to check the network gaits of several patients, too
     conditions: tuple[str, ...]  # names of conditions; empty means all
     push: tuple[float, float] | None  # largest push at hip and knee [Nm]; None means the certified torques
-    steps: int | None  # number of steps on the plant per guide; None means the number in `effort`
-    robot_steps: int | None  # number of steps on the emulated robot per guide; None means the number in `effort`
+    steps: int | None  # number of steps on the plant per guide; None means the number of `QUICK` or `COMPLETE`
+    robot_steps: int | None  # number of steps on the emulated robot per guide; None means as in `QUICK` or `COMPLETE`
     seed: int  # seed of the search and of the noise
-    quick: bool  # whether to use the small number of steps `QUICK`
+    quick: bool  # whether to search with the effort `QUICK` instead of `COMPLETE`
     plot: Path | None  # picture file; None means no picture
     table: Path | None  # Markdown file for the table; None means no file
     results: Path | None  # file of the results; an interrupted check is resumed from this file; None means no file

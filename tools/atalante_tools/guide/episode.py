@@ -136,7 +136,7 @@ class IdealLeg:
         x: Vector = np.minimum(time / end, 1.0)[:, None]
         #: q_nom [rad], q_nom' [rad/s] and q_nom'' [rad/s2] of hip and knee, each of shape (cycles + 1, 2).
         self.nominal: tuple[Vector, Vector, Vector] = motion(coefficients, duration, phase)
-        # The re-centring s(t) is a cubic polynomial with given s(0) and s'(0). At the time `end`, s and s' are zero.
+        # The re-centring is a cubic polynomial of time: s(t) = s(0) * _s[0] + s'(0) * _s[1]. From `end` on, s and s' are zero.
         self._s = 1.0 - 3.0 * x**2 + 2.0 * x**3, end * (x - 2.0 * x**2 + x**3)
         self._sd = (-6.0 * x + 6.0 * x**2) / end, 1.0 - 4.0 * x + 3.0 * x**2
         self.bounds: Vector = controller.guide_at(xi).shape.bounds(phase, xi)

@@ -85,7 +85,7 @@ class Task:
 
 @dataclass(frozen=True)
 class Verdict:
-    """Result of a check. The fields up to `left_at` are the JSON keys of `--json`."""
+    """Result of a check. The field names are the keys of `--json`."""
 
     shape: str
     xi: float

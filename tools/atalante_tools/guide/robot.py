@@ -1,8 +1,9 @@
 """Pushes on the emulated robot: `controller, pushes -> |e| / q_bound of each step`.
 
 The robot walks in PyBullet, through the HAL in lock-step. A push is a real torque on the sagittal hip and knee of both legs.
-The push is added to the torque of the motor. The swing leg gets a push of the adversary. The stance leg gets a push that is
-constant during a step and random from step to step, so that this leg begins its next swing with a deviation.
+The push is added to the torque of the motor. The swing leg gets a push of a given list, for example a push that the
+search has found. The push of the stance leg is constant during a step and random from step to step, so that this leg begins its
+next swing with a deviation.
 """
 
 from __future__ import annotations

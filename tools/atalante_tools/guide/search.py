@@ -184,7 +184,7 @@ class Adversary:
             yield "feedback", Push(np.tile(bias, (cycles, 1)), feedback)
 
     def _switching(self, cycles: int) -> Iterator[tuple[str, Push]]:
-        """Yield pushes that switch after random times, at each joint separately or at both joints together."""
+        """Yield pushes whose sign changes at random times, at hip and knee separately or at both joints together."""
         while True:
             signs, slowest = np.ones((cycles, 2)), float(self._generator.choice([15.0, 40.0, 100.0, 250.0]))
             together = self._generator.random() < 0.5

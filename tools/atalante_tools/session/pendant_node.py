@@ -153,7 +153,11 @@ class PendantNode:
             self._tx.values[self._at[name]] = value
 
     def _release_start(self) -> None:
-        """Reset the request START. After a pause, the HAL would interpret a changed request counter as a new press of START."""
+        """Replace the request START with NONE, so that START is not pressed again when this pendant resumes sending.
+
+        The request counter of this pendant may then differ from the last counter that the HAL received. With the request START,
+        the HAL would interpret the difference as a new press.
+        """
         if self._tx.values[self._at["Request"]] == Request.START:
             self._tx.values[self._at["Request"]] = Request.NONE
 

@@ -166,9 +166,10 @@ class Session:
         print_message("the dead-man switch is released; type start to press it again, with START")
 
     def _elapsed(self) -> float:
-        """Return the time since the start [s].
+        """Return the running time of the pendant [s].
 
-        After the first answer, this time is the number of answered SYNCs times `PERIOD`.
+        Before the first answer to a SYNC, this is the time since the call of `run`. After the first answer, it is the number of
+        answered SYNCs times `PERIOD`.
         """
         return self.node.answered * PERIOD if self.node.answered else self._now() - self._begun
 

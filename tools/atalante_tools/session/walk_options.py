@@ -19,9 +19,9 @@ if TYPE_CHECKING:
     from atalante_control.walking.section import Section
     from atalante_hal.robot import Robot
 
-#: Patient of the walk file of this project: mass [kg] and height [m].
+#: Patient of the default walk file: mass [kg] and height [m].
 DEFAULT_PATIENT: Final = (75.0, 1.75)
-#: Step of the walk file of this project: length [m] and duration [s].
+#: Step of the default walk file: length [m] and duration [s].
 DEFAULT_STEP: Final = (0.16, 0.8)
 
 
@@ -58,7 +58,7 @@ class WalkOptions:
     files: GaitFiles
     seed: int  # seed of the sensor noise
     friction: float  # coefficient of friction between soles and floor
-    push: Push | None  # push in the middle of the walk; None means no push
+    push: Push | None  # push at the pelvis; None means no push
     law: Law  # control law of the periodic steps
     #: Three numbers of steps: with full assistance, then in the transition to `xi`, then with `xi`. None: `xi` in all steps.
     protocol: tuple[int, int, int] | None = None
@@ -70,7 +70,7 @@ class WalkOptions:
     #: The controller then corrects its estimated heading with the measured heading.
     heading_reference: bool = False
     then: tuple[SpeedChange, ...] = ()  # speed changes, in walking order
-    turn: float = 0.0  # angle by which the line turns before each periodic step, positive to the left [deg]
+    turn: float = 0.0  # angle by which the walking line turns before each periodic step, positive to the left [deg]
     out: Path | None = None  # folder for summary.json, trace.npz and walk.png; None means no files
 
 
@@ -102,7 +102,7 @@ def gaits_of(options: WalkOptions, robot: Robot) -> tuple[Patient, WalkGaits]:
 
 
 def sections_of(options: WalkOptions, robot: Robot) -> list[Section]:
-    """Return the sections of a walk after each speed change, in walking order.
+    """Return one section of the walk for each speed change, in walking order. The section begins at the speed change.
 
     Args:
         options: Options of the user.

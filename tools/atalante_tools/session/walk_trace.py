@@ -44,7 +44,10 @@ class WalkTrace:
             self._rows.append(self._controller.telemetry.copy())
 
     def columns(self) -> dict[str, Vector]:
-        """Return the samples of each telemetry field (shape (n, width)) by its name, and the array `time` [s] (shape (n,))."""
+        """Return the samples as a mapping from the name of each telemetry field to an array of shape (n, width).
+
+        The key `time` contains the times of the samples [s], shape (n,).
+        """
         from atalante_hal.types import PERIOD
 
         fields = self._controller.telemetry_fields

@@ -21,7 +21,7 @@ from atalante_hal.bus.wrapped import WrappedBus
 from atalante_hal.transceiver import FrameTap
 from atalante_hal.wire.frame import Frames, as_words
 
-#: Largest number of delayed frames that one call of `send` or `receive` can release.
+#: Largest number of delayed frames that one call of `send` or `receive` passes on. Further frames that are due are lost.
 _BATCH: Final = 128
 
 

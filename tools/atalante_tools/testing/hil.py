@@ -110,7 +110,7 @@ def connect(hal_bus: Bus, emulator: Emulator) -> Callable[[], object] | None:
 
 
 class Stepper:
-    """HAL loop that a test advances cycle by cycle. The default `controller` holds the pose at the change to ACTIVE."""
+    """HAL loop that a test advances cycle by cycle. The default `controller` holds the pose in which the robot became ACTIVE."""
 
     def __init__(self, hal: Hal, clock: Clock) -> None:
         self.hal = hal

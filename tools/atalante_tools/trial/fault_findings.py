@@ -91,7 +91,7 @@ def _moments(falls: Sequence[dict[str, Any]]) -> str:
 
 
 def _longest(result: Result) -> str:
-    """Return the longest fault duration without a fall at any moment, and the moment at which a longer fault ends in a fall."""
+    """Return text: the longest fault duration without a fall at the worst moment, and the name of this moment."""
     limited = [
         (cycles, run["moment"])
         for cycles, run in zip(result["longest"], result["runs"], strict=True)

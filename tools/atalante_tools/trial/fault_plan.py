@@ -59,7 +59,7 @@ class FaultTrial:
     height: float  # height of the wearer [m]
     seed: int
     engine: str
-    sources: str  # hash of the scenarios and of the rig
+    sources: str  # hash of the source files of `atalante_tools.faults` and `atalante_tools.session`
 
     @property
     def name(self) -> str:

@@ -62,7 +62,7 @@ _LANDINGS: Final = 2
 #: Phases of the walk that begin with the landing of a foot.
 _LANDED: Final = frozenset({Phase.STEP, Phase.STOP, Phase.BACK})
 _PELVIS: Final = IMUS.index("pelvis")
-#: Largest accepted error of the measured longest fault duration without a fall [cycles].
+#: The bisection finds the longest fault duration without a fall with at most this error [cycles].
 RESOLUTION: Final = 10
 
 
@@ -76,7 +76,7 @@ class FaultRun:
     state: str  # state of the HAL at the end
     #: diagnostics since the first faulty cycle, in the order of their first report; the severity `info` is left out
     codes: tuple[str, ...]
-    #: number of cycles from the first faulty cycle to the diagnostic of the fault matrix, both included
+    #: number of cycles from the first faulty cycle to the diagnostic expected by the fault matrix, both included; None if missing
     detected: int | None
     reason: str  # reason that the HAL states for its last state, or the exception
     fallen: int | None = None  # number of cycles from the start of the case to the fall
@@ -192,7 +192,7 @@ def diagnosed(events: Sequence[Event], expected: str, first: int) -> tuple[tuple
 
 @cache
 def _branches(mass: float, height: float, seed: int, engine: str) -> dict[str, tuple[int, Branch]]:
-    """Return the first cycle of each moment, and a branch of a walk shortly before this cycle.
+    """Return for each moment the cycle in which the fault begins, and a branch of the walk shortly before this cycle.
 
     Args:
         mass: mass of the wearer [kg].

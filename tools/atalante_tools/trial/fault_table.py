@@ -29,9 +29,9 @@ def fault_table(results: Sequence[dict[str, Any]]) -> tuple[list[str], list[list
 
 
 def _survived(result: dict[str, Any]) -> str:
-    """Return the longest fault durations that the robot survives, from the worst to the best moment.
+    """Return text: the longest fault duration without a fall [cycles], as a range from the worst to the best moment.
 
-    Moments at which the robot survives every duration are left out.
+    A moment at which the robot does not fall with the permanent fault is left out.
     """
     survived = [cycles for cycles in result["longest"] if cycles is not None]
     if not survived:

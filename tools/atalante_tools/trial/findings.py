@@ -26,8 +26,8 @@ _PHASES: Final = np.linspace(0.1, 0.8, 29)
 SAME: Final = 0.02
 STANDING: Final = 1.44  # metabolic rate of quiet standing [W/kg]
 #: A quantity has a falling trend if its rank correlation with the assistance factor is between -1 and -`TREND`.
-#: `ASYMMETRY` limits the influence of the order of the trials: the difference between the k-th and the k-th last trial of a day,
-#: averaged over k and divided by the range of all values.
+#: `ASYMMETRY` is the largest accepted influence of the order of the trials: the mean of |v[k] - v[-1 - k]| over all k and days,
+#: divided by the range of all values. v[k] is the value of the k-th walk of a day; walks k and -1 - k have the same factor.
 TREND, ASYMMETRY = 0.8, 0.25
 #: Largest coefficient of variation of the baseline metabolic rates of a sweep.
 VARIATION: Final = 0.05

@@ -30,8 +30,9 @@ PROTOCOL: Final = (112, 38, 225)
 QUICK_PROTOCOL: Final = (2, 1, 3)
 #: Step of all walks: length [m] and duration [s].
 STEP: Final = (0.16, 0.8)
-#: Assistance factor of partial assistance, and the assistance factors of the sweep in the order of the trials.
+#: Assistance factor of partial assistance.
 PARTIAL: Final = 0.5
+#: Assistance factors of the sweep in the order of the trials, in a normal run and with `--quick`.
 SWEEP: Final = (1.0, 0.75, 0.5, 0.25, 0.0, 0.25, 0.5, 0.75, 1.0)
 QUICK_SWEEP: Final = (1.0, 0.5, 0.0, 0.5, 1.0)
 #: Number of days of the sweep, in a normal run and with `--quick`.
@@ -44,19 +45,21 @@ TREADMILL_TIME: Final = 300
 SWEEP_SUBJECT: Final = (75.0, 1.75)
 #: Masses of the subjects of `assist --quick` [kg].
 QUICK_MASSES: Final = (58.0, 75.0)
-#: Ranges of the random parameters of `robustness`: true mass divided by known mass, and coefficient of friction.
+#: Range of the random ratio of true mass to known mass in `robustness`.
 MASS_SHARE: Final = (0.9, 1.1)
+#: Range of the random coefficient of friction between soles and floor in `robustness`.
 FRICTION: Final = (0.25, 0.8)
-#: Parts of the control loop of `robustness` that can be a cycle late: state messages, command messages, motors.
-#: If messages are one cycle late, they time out after four lost frames in a row. If messages were later than one cycle,
-#: they would time out after fewer lost frames than the fault matrix intends.
+#: Number of parts of the control loop that can be one cycle late in `robustness`: state messages, command messages, motors.
+#: Messages that are one cycle late time out after four lost frames in a row. With a longer delay, messages would time out after
+#: fewer lost frames than the fault matrix intends.
 LATE_PARTS: Final = 3
-#: Random faults of `robustness`: probability of a lost frame, force of a push [N], and number of steps per push. A push begins
-#: at a random time within these steps.
+#: Probability of a lost frame in `robustness`.
 LOSS: Final = 0.01
+#: Force of a push in `robustness` [N].
 PUSH: Final = 100.0
+#: Number of steps per push in `robustness`. A push begins at a random time within these steps.
 PUSH_STEPS: Final = 10
-#: Number of trials and steps of `robustness`.
+#: Number of trials and number of steps per trial of `robustness`, in a normal run and with `--quick`.
 ROBUST, QUICK_ROBUST = (100, 60), (2, 4)
 #: Experiment `pushes`: directions [deg], phases, and forces in rising order [N].
 PUSH_DIRECTIONS: Final = tuple(22.5 * k for k in range(16))

@@ -32,7 +32,7 @@ from atalante_tools.trial.plan import STEP, PushTrial
 _PUSHED: Final = 3
 #: Number of periodic steps after the pushed step.
 _AFTER: Final = 4
-#: Phase of the step before the pushed step at which the walk branches off.
+#: The walk branches off at this phase of the step that precedes the pushed step.
 _LEAD: Final = 0.875
 
 
@@ -100,7 +100,7 @@ class _Walk:
     Attributes:
         ending: end condition of the walk after the branch, with the push.
         branch: branch of the walk; None until the branch.
-        continuation: push that continues the walk; None in the process that branches off.
+        continuation: continued walk with a push; None in the process of the walk without a push.
     """
 
     def __init__(self, rig: Rig, controller: WalkController) -> None:
@@ -113,7 +113,9 @@ class _Walk:
         return Ending(self._rig, lambda: self._controller.done, Observation(self._rig, self._controller, push))
 
     def over(self, state: State) -> bool:
-        """Return whether the walk is over: at the branch, or after the push at the end condition.
+        """Return whether the walk is over.
+
+        The walk without a push ends at the branch. A walk that continues from the branch has a push, and ends as `ending` states.
 
         Args:
             state: state of the HAL after the cycle.

@@ -55,10 +55,10 @@ from atalante_tools.trial.robustness import robust_walk
 
 _SH, _LEG = LEG_JOINTS.index("SH"), len(LEG_JOINTS)
 _RIGHT: Final = 1
-#: Amplitude from which a subject who responds to the vibration motors feels a motor, 0 to 1; an assumption.
+#: Smallest amplitude of a vibration motor that a subject feels in a trial with `haptics`, 0 to 1. The value is an assumption.
 _FELT_VIBRATION: Final = 0.1
 _SAMPLING = 20  # cycles between two samples of the motion
-#: Number of swings of the left leg that a result contains as curves.
+#: Number of swings of the left leg whose curves are stored in a result.
 _CURVES: Final = 15
 #: Edges of the histogram of e / q_bound.
 EDGES: Final = tuple(round(-1.0 + 0.05 * k, 2) for k in range(41))

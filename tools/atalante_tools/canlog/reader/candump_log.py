@@ -88,7 +88,7 @@ def _fill(file: io.RawIOBase | gzip.GzipFile, memory: memoryview) -> tuple[int, 
     """Read from the file until the given memory is full or the file ends.
 
     Returns:
-        The number of bytes read, and the read error if no byte could be read.
+        The number of bytes read, and the text of the read error. The text is empty if bytes were read or the file has ended.
     """
     if not isinstance(file, gzip.GzipFile):
         return file.readinto(memory) or 0, ""

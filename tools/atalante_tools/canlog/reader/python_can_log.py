@@ -234,8 +234,8 @@ def _last_byte(path: Path) -> bytes:
 def _size_defect(log: LogFile) -> str:
     """Return how the size of a .blf file differs from the size in its header; empty if the file is complete.
 
-    The recorder writes the size when it closes the log. Before, the header states a smaller size. The size of a
-    compressed log is not compared, only whether the header states any data.
+    The recorder writes the final size into the header when it closes the log. Until then, the header states a smaller
+    size. For a compressed log, this function checks only whether the header states any data.
     """
     with gzip.open(log.path) if log.compressed else log.path.open("rb") as file:
         header = file.read(_BLF_HEADER.size)

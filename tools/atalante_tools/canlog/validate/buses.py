@@ -17,10 +17,10 @@ _MAJORITY = 0.9
 class ChannelMap:
     """Bus of each channel and expected channel of each message, derived from the frames.
 
-    A channel with the name of a bus is assigned to this bus. Any other channel is assigned to the bus to which most
-    frames on the channel belong. A channel with the frames of several buses (such as all four buses on one vcan0) is
-    assigned to no bus. A message is expected on the channel of its bus. If this bus has no channel, the message is
-    expected on the channel of its first frame.
+    A channel with the name of a bus is assigned to this bus. Any other channel is assigned to a bus if at least
+    `_MAJORITY` of the known frames on the channel belong to this bus. A channel with the frames of several buses (such as
+    all four buses on one vcan0) is assigned to no bus. A message is expected on the channel of its bus. If this bus has
+    no channel, the message is expected on the channel of its first frame.
     """
 
     def __init__(self, plan: Plan, named: Mapping[str, str]) -> None:
@@ -32,14 +32,16 @@ class ChannelMap:
         """
         self._plan = plan
         self._named = dict(named)
-        #: Bus number of each known channel of the log; `UNKNOWN` for a channel with messages of several buses.
+        #: Bus number of each channel of the log; `UNKNOWN` if the channel has messages of several buses or no known frame.
         self.bus_of_channel: list[int] = []
-        #: Channels without a known frame so far. Their bus is derived from their first known frames.
+        #: Channels without a known frame so far. The bus of such a channel is derived from its first known frames.
         self._silent: set[int] = set()
         self._channel_of_row = np.full(len(plan.layouts) + len(plan.refused), UNKNOWN, np.int16)
 
     def update(self, chunk: Chunk, rows: Rows, names: list[str]) -> None:
-        """Assign a bus to each channel with its first known frames, and a channel to each new message of a chunk.
+        """Assign buses to the channels, and expected channels to the messages that a chunk contains for the first time.
+
+        For a channel without the name of a bus, the bus is derived from the first chunk with known frames of the channel.
 
         Args:
             chunk: next frames of the log.

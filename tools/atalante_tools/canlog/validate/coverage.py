@@ -165,8 +165,8 @@ def unseen_signals(validator: Validator) -> list[tuple[Layout, str]]:
 def _is_checked(validator: Validator, layout: Layout, field: Field) -> bool:
     """Return whether a rule can reject a value of the field.
 
-    Such a field has a limited range, an invalid code or a value table. A hash and a multiplexer with unused codes are
-    also such fields.
+    A rule can reject a value if the field has a limited range, an invalid code or a complete value table, if the field
+    contains the DBC hash, or if the field is a multiplexer with unused codes.
     """
     if is_limited(field) or is_enumeration(field) or field.invalid_raw is not None:
         return True

@@ -16,7 +16,8 @@ Stamps = npt.NDArray[np.int64]
 #: Maximum number of unknown identifiers that get a finding of their own. All others share the finding `OTHERS`.
 MAX_UNKNOWN_IDS = 100
 OTHERS = "(others)"
-#: Rules about unknown identifiers. The number of messages in the DBC does not limit the number of their findings.
+#: Rules with one finding per unknown identifier. A log can have any number of unknown identifiers, so `MAX_UNKNOWN_IDS` limits
+#: the number of these findings.
 _UNBOUNDED = ("unknown-id",)
 
 
@@ -150,7 +151,7 @@ class Findings:
             )
 
     def add_whole(self, rule: str, row: int, first: int, last: int, *, shown: float, count: int = 1) -> None:
-        """Add one violation by one message. The violation lasts from time stamp `first` to time stamp `last` [ns]."""
+        """Add a finding with `count` violations by one message, from time stamp `first` to time stamp `last` [ns]."""
         worst = _text(shown, RULE_OF[rule].worst, "")
         self._merge(
             Finding(

@@ -146,7 +146,8 @@ class LoadRules:
     def _bus(self, chunk: Chunk, known: npt.NDArray[np.bool_], rows: npt.NDArray[np.int16]) -> npt.NDArray[np.int64]:
         """Return the column of `load` to which each frame belongs. Shape (n,).
 
-        This column is the bus of the channel. On a channel with several buses, the column is the bus of the message.
+        A frame on a channel with a bus belongs to the column of this bus. A frame on a channel without a bus belongs to
+        the column of the bus of its message, or to the column of the channel if the bus of the message is unknown.
         """
         buses = len(self._plan.buses)
         of_channel = np.array(self._channel_map.bus_of_channel, np.int64)

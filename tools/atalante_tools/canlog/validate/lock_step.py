@@ -89,7 +89,7 @@ class LockStepClock:
         return Chunk(chunk.frames, stamps, chunk.channels, chunk.sent)
 
     def _of_channel(self, channel: _Channel, chunk: Chunk, rows: npt.NDArray[np.int16]) -> Stamps:
-        """Return the stamps in robot time of all frames on one channel. Shape (n,) [ns]."""
+        """Return the stamp of each frame on one channel in robot time [ns]. Shape (n,)."""
         wall = chunk.stamps
         if channel.sync < 0:
             known = np.flatnonzero(np.isin(rows, list(self._codecs)))

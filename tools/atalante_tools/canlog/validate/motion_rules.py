@@ -101,7 +101,7 @@ class _Velocity:
         self._findings = findings
         number = project.number
         self._window = max(2, int(number(self.id, "window")))
-        self.required = self._window + 1  # number of frames of a message for the first check
+        self.required = self._window + 1  # smallest number of frames of a message that the rule can check
         self._lag, self._relative = number(self.id, "lag_s"), number(self.id, "relative")
         self._absolute = number(self.id, "absolute")
         self._left: dict[int, tuple[npt.NDArray[np.int64], Vector, Vector, npt.NDArray[np.bool_]]] = {}
@@ -293,7 +293,7 @@ class _Stuck:
     def __init__(self, family: Family, indices: Sequence[int], findings: Findings, frames: int) -> None:
         self.indices = list(indices)
         self._family, self._findings, self._frames = family, findings, frames
-        self.required = frames  # number of frames of a message for the first check
+        self.required = frames  # smallest number of frames of a message that the rule can check
         self._columns = _Columns(family, indices)
         #: Number of consecutive frames with an unchanged raw code, shape (fields, messages).
         self._run = np.zeros((len(self.indices), len(family.rows)), np.int64)

@@ -46,7 +46,7 @@ class TimingRules:
         self._first = np.full(count, _NEVER, np.int64)
         self._last_share = np.full(count, np.inf)
         self._last_steps = np.zeros(count, np.int64)
-        #: Histogram of the intervals of each message, without the intervals in which a frame was lost.
+        #: Histogram of the intervals of each message, without intervals with lost, repeated or rejected frames.
         self.histogram = np.zeros((count, BINS), np.int64)
         #: Number of intervals in the histogram of each message.
         self.intervals = np.zeros(count, np.int64)
@@ -195,7 +195,7 @@ class TimingRules:
         steps: Steps,
         rejected_before: Steps | None,
     ) -> None:
-        """Add all intervals without lost frames to the interval statistics of the messages."""
+        """Add the intervals to the statistics, except timeouts and intervals with lost, repeated or rejected frames."""
         bins = np.minimum(np.maximum(share * BINS_A_CYCLE, 0.0), float(BINS - 1)).astype(np.int64)
         bins += (np.arange(len(stream.present)) * BINS).repeat(stream.stops - stream.starts)
         # Exclude the intervals with lost, repeated or rejected frames from the statistics.

@@ -38,8 +38,9 @@ _TAG: Final = _CYCLE & 0xFF
 #: `_PRESSES` is the RequestCounter in the last accepted frame of the pendant.
 #: `_ROGUE_PRESSES` is the RequestCounter in a frame in which a second sender reports a press.
 _PRESSES, _ROGUE_PRESSES = 10, 12
-#: Number of cycles for which a START may still be processed: none, this cycle only, or more.
+#: Cycles in which the HAL may still process a START: none, only this cycle, or this cycle and further cycles.
 NO_START, LAST_START, START = 0, 1, 2
+#: Value of `start_wanted` in the safety monitor for `NO_START`, `LAST_START` and `START` [cycles].
 START_CYCLES: Final = {NO_START: 0, LAST_START: 1, START: 100}
 #: Whether the HAL trusts the pendant -> values of `Qualification` that the search tries in this case.
 QUALIFICATIONS: Final = {
@@ -136,7 +137,7 @@ class HalSteps:
         network, robot = atalante_dbc.load(), load_robot()
         self._hal = Hal(network, robot, NoBus())
         self._monitor = self._hal._safety_monitor
-        # Leave out the test of the directions, because it needs the same controlwords as the enabling of drives.
+        # Omit the test of the joint directions. The HAL sends the same controlwords during this test and while it enables drives.
         self._monitor.proof = DirectionProof(robot, ())
         self._image = self._hal._image
         self._pendant = self._monitor._pendant
@@ -316,9 +317,9 @@ class HalSteps:
         monitor._reports.clear()
         monitor.start_wanted, monitor.enabling, monitor.moving, monitor.walking = 0, False, False, False
         monitor.recalled = -RECALL_CYCLES  # skip the wait after QUICK_STOP, so that the search includes more STARTs
-        monitor._stalled = (
-            0  # not varied in the search: it only decides when a START ends, and `LAST_START` covers each end
-        )
+        # `_stalled` only decides in which cycle a START ends. The search lets a START end in every cycle (`LAST_START`), so the
+        # value of `_stalled` can be constant.
+        monitor._stalled = 0
         monitor._ending = monitor._duplicate_found = monitor._ramping = False
         monitor.lowered.clear()
         rows = len(self._image.check)
