@@ -54,6 +54,7 @@ def test_plan_contains_every_case_and_every_pair_once() -> None:
     }
 
 
+@pytest.mark.long
 def test_results_in_subprocesses_equal_those_in_process() -> None:
     here = list(campaign.results(OVERRUN))
     assert by_case(list(campaign.results(OVERRUN, jobs=2))) == by_case(here)
@@ -61,6 +62,7 @@ def test_results_in_subprocesses_equal_those_in_process() -> None:
 
 
 @pytest.mark.filterwarnings("ignore")  # dask's own
+@pytest.mark.long
 def test_results_in_a_cluster_equal_those_in_process() -> None:
     with LocalCluster(n_workers=1, threads_per_worker=2, host="127.0.0.1", dashboard_address=None) as cluster:
         there = list(campaign.results(OVERRUN, dask=cluster.scheduler_address))

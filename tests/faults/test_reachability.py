@@ -43,6 +43,7 @@ def path() -> OperatorPath:
 
 
 @pytest.mark.parametrize("name", SEARCHES)
+@pytest.mark.long
 def test_no_sequence_of_inputs_breaks_a_property(name: str, path: OperatorPath):
     found = search(name, path)
     assert found.broken == "", found.trace
@@ -85,6 +86,7 @@ def test_restart_without_start_is_found_and_its_scenario_shows_it(path: Operator
     assert automatic_improvements(run, run.last)
 
 
+@pytest.mark.long
 def test_ignored_dead_man_is_found_and_its_scenario_shows_it(path: OperatorPath, monkeypatch: pytest.MonkeyPatch):
     def ignores(state, conditions):
         return next_state(state, replace(conditions, dead_man=True, stop_requested=False))
@@ -109,6 +111,7 @@ def test_second_move_of_a_start_is_found(path: OperatorPath, monkeypatch: pytest
     assert OperatorPath(path).moves().broken in (MOVE_PROPERTY, RESTART_PROPERTY)
 
 
+@pytest.mark.long
 def test_late_watchdog_is_found_and_its_scenario_shows_it(monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(emulated, "WATCHDOG", 8)
     found = DriveSteps().search()
@@ -118,6 +121,7 @@ def test_late_watchdog_is_found_and_its_scenario_shows_it(monkeypatch: pytest.Mo
     assert run.drive_state[row, 0] == DriveState.OPERATION_ENABLED
 
 
+@pytest.mark.long
 def test_released_latch_is_found(monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(emulated, "next_state", lambda state, word, *, latched: cia402.next_state(state, word))
     assert DriveSteps().search().broken in (LATCH_PROPERTY, WATCHDOG_PROPERTY)

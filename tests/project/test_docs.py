@@ -95,6 +95,7 @@ def test_documented_command_is_accepted_by_the_parser(line: str, tmp_path: Path,
 
 
 @pytest.mark.parametrize("page", [page for page in PAGES if runnable(page)])
+@pytest.mark.long
 def test_commands_of_a_page_succeed_in_order(page: str, tmp_path: Path):
     """Run the commands in a temporary copy of the project root, to which they write their output."""
     for name in ("atalante_hal", "dbc", "examples", "tests"):

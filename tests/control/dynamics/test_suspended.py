@@ -147,6 +147,7 @@ def test_gait_without_feedforward_is_checked_with_its_inverse_dynamics() -> None
         check_suspended(AIRWALK, weak, articulated, gravity, 0.0)
 
 
+@pytest.mark.long
 def test_200_gaits_of_the_network_are_accepted() -> None:
     network = load_network()
     for subject in random_subjects(network.low, network.high, 200, seed=12):

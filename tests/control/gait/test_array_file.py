@@ -172,6 +172,7 @@ def little_memory() -> Iterator[None]:
 
 
 @pytest.mark.parametrize("corrupt", [flipped, cut, swapped, misdescribed, oversized])
+@pytest.mark.long
 def test_corrupted_network_is_rejected_or_unchanged(corrupt: Callable[[random.Random], bytes], tmp_path: Path) -> None:
     intact, path, rejected = load_network(), tmp_path / "network.npz", 0
     contents = [corrupt(random.Random(seed)) for seed in range(SEEDS)]

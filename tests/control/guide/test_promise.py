@@ -36,6 +36,7 @@ def worst(shape: str, xi: float, factor: float, count: int, seed: int = 0) -> fl
 
 @pytest.mark.parametrize("shape", SHAPES)
 @pytest.mark.parametrize("xi", [0.5, 0.75])
+@pytest.mark.long
 def test_joints_stay_inside_under_the_promised_torque(shape: str, xi: float):
     assert worst(shape, xi, 1.0, 1) <= 1.0
 

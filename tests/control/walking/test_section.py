@@ -31,6 +31,7 @@ def changing(first: tuple[float, float], second: tuple[float, float], steps: int
 
 @pytest.mark.parametrize("xi", [1.0, 0.5])
 @pytest.mark.parametrize(("first", "second"), [(SHORT, LONG), (LONG, SHORT)], ids=["faster", "slower"])
+@pytest.mark.long
 def test_speed_changes_within_a_walk(first: tuple[float, float], second: tuple[float, float], xi: float) -> None:
     controller = changing(first, second)
     assert walk_with(controller, "mujoco", xi=xi) == list(Phase)

@@ -45,6 +45,7 @@ def lines() -> dict[str, dict[str, Any]]:
     return {line["name"]: line for line in map(json.loads, result.stdout.splitlines())}
 
 
+@pytest.mark.long
 def test_json_has_one_line_per_benchmark_in_order(lines: dict[str, dict[str, Any]]) -> None:
     names = [benchmark.name for benchmark in BENCHMARKS]
     assert list(lines) == names
@@ -52,6 +53,7 @@ def test_json_has_one_line_per_benchmark_in_order(lines: dict[str, dict[str, Any
 
 
 @pytest.mark.parametrize("benchmark", BENCHMARKS, ids=lambda b: b.name)
+@pytest.mark.long
 def test_json_line_has_the_documented_keys(benchmark: Benchmark, lines: dict[str, dict[str, Any]]) -> None:
     line = lines[benchmark.name]
     assert list(line) == KEYS

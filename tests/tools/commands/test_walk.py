@@ -53,6 +53,7 @@ def test_turn_is_refused_without_steering() -> None:
     assert "--turn requires steering, which --literal does not have" in errors
 
 
+@pytest.mark.long
 def test_step_length_and_duration_change_during_a_walk(tmp_path: Path) -> None:
     arguments = ("--steps", "3", "--step-length", "0.12", "--step-duration", "0.9", "--then", "3", "0.18", "0.8")
     options = ("--xi", "0.5", "--wearer", "passive", "--engine", "mujoco", "--json", "--out", str(tmp_path / "walk"))
@@ -122,6 +123,7 @@ def test_protocol_lowers_the_assistance_step_by_step() -> None:
     assert 0.0 < result["cpu_per_second"] < 10.0
 
 
+@pytest.mark.long
 def test_walk_with_push_and_dial_has_the_same_result_and_frames_in_two_processes(tmp_path: Path) -> None:
     arguments = (
         "--protocol",

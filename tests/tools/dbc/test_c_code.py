@@ -40,6 +40,7 @@ def whole(tmp_path_factory: pytest.TempPathFactory) -> tuple[Build, Path, Path]:
     return build, folder, compile_host_test(build, folder)
 
 
+@pytest.mark.long
 def test_c_and_python_agree_on_random_images_of_the_whole_network(whole):
     build, _, program = whole
     assert len(build.messages) == len(load().messages)

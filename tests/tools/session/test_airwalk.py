@@ -160,6 +160,7 @@ def test_the_recording_holds_every_joint_at_its_rate(demo):
     assert max(knee) - min(knee) > 0.5
 
 
+@pytest.mark.long
 def test_equal_seeds_give_equal_can_logs_and_other_seeds_give_other_logs(demo, tmp_path: Path):
     _, out = demo
     again, other = tmp_path / "again.log", tmp_path / "other.log"

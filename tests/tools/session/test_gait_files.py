@@ -66,6 +66,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     ],
     ids=["walk file", "gait file", "network"],
 )
+@pytest.mark.long
 def test_walk_to_the_end_with_the_given_gait(folder: Path, options: tuple[str, ...]) -> None:
     done = atalante("walk", *WALKED, *options, "--out", "walked", folder=folder)
     assert done.returncode == 0, done.stderr
@@ -82,6 +83,7 @@ def test_walk_to_the_end_with_the_given_gait(folder: Path, options: tuple[str, .
     [("--gait", "walk.json"), ("--gait", "periodic.json"), ("--network", "network.npz", *PATIENT)],
     ids=["walk file", "gait file", "network"],
 )
+@pytest.mark.long
 def test_walk_in_the_air_to_the_end_with_the_given_gait(folder: Path, command: str, options: tuple[str, ...]) -> None:
     run = ("--shape", "pinched", "--steps", "2", "--out", "flown", "--json")
     done = atalante(command, *run, *options, folder=folder)

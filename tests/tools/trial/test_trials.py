@@ -154,12 +154,14 @@ def test_results_contain_what_the_findings_need(reference: Path) -> None:
     assert sum(rate) / len(rate) == pytest.approx(MetabolismParameters().standing, rel=0.15)
 
 
+@pytest.mark.long
 def test_two_processes_give_the_same_files_as_one(reference: Path, tmp_path: Path) -> None:
     assert len(list(compute(TINY, tmp_path, jobs=2))) == len(TINY)
     assert content(tmp_path) == content(reference)
 
 
 @pytest.mark.filterwarnings("ignore")  # dask's own
+@pytest.mark.long
 def test_a_dask_cluster_on_loopback_gives_the_same_files(reference: Path, tmp_path: Path) -> None:
     from distributed import LocalCluster
 
@@ -170,6 +172,7 @@ def test_a_dask_cluster_on_loopback_gives_the_same_files(reference: Path, tmp_pa
     assert content(tmp_path) == content(reference)
 
 
+@pytest.mark.long
 def test_a_killed_run_is_resumed_with_the_same_files(reference: Path, tmp_path: Path) -> None:
     with subprocess.Popen([sys.executable, "-c", PROGRAM, str(tmp_path)], stderr=subprocess.PIPE, text=True) as process:
         await_result(tmp_path, process)
@@ -283,6 +286,7 @@ def test_unknown_subject_is_a_usage_error(tmp_path: Path) -> None:
     assert not (tmp_path / "x").exists()
 
 
+@pytest.mark.long
 def test_trial_walks_with_the_gaits_of_the_given_network(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     file = tmp_path / "network.npz"
     file.write_bytes(DEFAULT_NETWORK.read_bytes())
@@ -340,6 +344,7 @@ def robust_trial(steps: int) -> RobustTrial:
     return replace(trial, mass=SUBJECT.mass, height=SUBJECT.height, pushes=((0.4, 90.0),), delay=(1, 1, 1), loss=0.001)
 
 
+@pytest.mark.long
 def test_robust_walk_is_pushed_and_its_recording_is_readable(tmp_path: Path) -> None:
     trial = robust_trial(1)
     result = robust_walk(trial, tmp_path / "walk.mcap")
@@ -365,6 +370,7 @@ def test_robot_that_cannot_start_ends_the_trial(monkeypatch: pytest.MonkeyPatch)
     assert (result["outcome"], result["steps"], result["safe"]) == ("no start", 0, True)
 
 
+@pytest.mark.long
 def test_robust_walk_that_falls_ends_in_a_safe_state() -> None:
     result = robust_walk(replace(robust_trial(1), force=2000.0))
     assert (result["outcome"], result["safe"]) == ("fell", True)
