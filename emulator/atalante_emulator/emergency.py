@@ -119,7 +119,7 @@ class Errors:
         """
         active = self._active[node]
         self._active[node] = {code: True for code, persists in active.items() if persists}
-        if active and not self._active[node]:
+        if active and not self._active_codes(node):
             self._report(node, ERROR_RESET)
 
     def any_persists(self, node: int) -> bool:
@@ -166,10 +166,15 @@ class Errors:
         if not self._warnings:
             return
         self._warnings = {warning: age + 1 for warning, age in self._warnings.items() if age + 1 < _REPEATABLE}
-        over = [node for (node, _), age in self._warnings.items() if age == _ENDED and not self._active[node]]
+        over = [node for (node, _), age in self._warnings.items() if age == _ENDED and not self._active_codes(node)]
         for node in dict.fromkeys(over):
             self._report(node, ERROR_RESET)
 
+    def _active_codes(self, node: int) -> list[int]:
+        """Return the codes of all active errors and warnings of a node."""
+        warnings = [code for (other, code), age in self._warnings.items() if other == node and age < _ENDED]
+        return [*self._active[node], *warnings]
+
     def _report(self, node: int, code: int) -> None:
-        register = register_of([*self._active[node], code] if code != ERROR_RESET else [])
+        register = register_of([*self._active_codes(node), code] if code != ERROR_RESET else [])
         self._outbox.append(Emergency(self._nodes[node], register, code))

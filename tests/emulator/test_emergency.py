@@ -127,6 +127,26 @@ class TestWarnings:
         errors.advance()
         assert [e.code for e in sent] == [0x8110, 0x8200, 0]
 
+    def test_end_of_a_warning_is_not_reported_while_another_one_is_active(
+        self, errors: Errors, sent: list[Emergency]
+    ) -> None:
+        errors.warn(0, 0x8110)
+        errors.advance()
+        errors.warn(0, 0x4210)
+        assert sent[-1] == Emergency("LEFT", register_of([0x8110, 0x4210]), 0x4210)
+        errors.advance()
+        assert len(sent) == 2
+        errors.advance()
+        assert sent[2:] == [Emergency("LEFT", 0, 0)]
+
+    def test_acknowledged_error_is_not_reported_as_the_end_of_a_warning(
+        self, errors: Errors, sent: list[Emergency]
+    ) -> None:
+        errors.begin(0, 0x8250)
+        errors.warn(0, 0x8110)
+        errors.acknowledge(0)
+        assert [e.code for e in sent] == [0x8250, 0x8110]
+
     def test_end_of_a_warning_does_not_end_an_error(self, errors: Errors, sent: list[Emergency]) -> None:
         errors.warn(0, 0x8110)
         errors.begin(0, 0x8250)

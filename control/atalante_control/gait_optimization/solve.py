@@ -52,9 +52,12 @@ _WARM: dict[str, Any] = {"ipopt.mu_init": 1e-3, "ipopt.bound_mult_init_method": 
 _SOURCES = (
     *(
         f"gait_optimization/{module}.py"
-        for module in ("symbolic_dynamics", "guess", "step_problem", "nlp", "requirements", "solve")
+        for module in (
+            "symbolic_dynamics", "guess", "step_problem", "nlp", "requirements", "solve", "compiled", "reach",
+            "result", "second_start", "verify",
+        )
     ),
-    *("gait/gait.py", "dynamics/gravity.py", "dynamics/stance.py", "model/*.py"),
+    *("gait/gait.py", "gait/subject.py", "dynamics/gravity.py", "dynamics/stance.py", "model/*.py", "structured.py"),
 )
 
 

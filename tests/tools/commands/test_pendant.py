@@ -256,7 +256,7 @@ def test_press_of_a_new_pendant_takes_effect_once(world: World) -> None:
     new.start_sending()
     assert world.run(20) is HOLD
     new.press(Request.START)
-    assert world.run(30) is ACTIVE
+    assert world.run(150) is ACTIVE
 
 
 def test_a_pendant_that_keeps_sending_prevents_the_takeover_and_the_repeated_frames_lead_to_hold(world: World) -> None:
@@ -591,7 +591,7 @@ def test_typed_commands_are_executed(world: World, capsys: pytest.CaptureFixture
     operator.node.dead_man = True
     for line, state in (("start", ACTIVE), (" XI 0.25 ", ACTIVE), ("hold", HOLD), ("start", ACTIVE), ("stop", HOLD)):
         operator.execute(line)
-        operator.answer_syncs(60)
+        operator.answer_syncs(150)
         assert operator.node.hal is state, line
     assert world.hal.state.assistance_factor == pytest.approx(0.25, abs=1e-4)
     for line in ("xi 1.5", "xi", "run", "start now", "", "xi nan"):
@@ -611,7 +611,7 @@ def test_ctrl_c_sends_stop_before_the_dead_man_is_released(world: World) -> None
     before = world.hal.state.cycle
     operator.node.dead_man = True
     operator.execute("start")
-    operator.answer_syncs(50)
+    operator.answer_syncs(150)
     assert world.hal.state.supervisor is ACTIVE
     stop.ask(2)
     operator.run(None)
@@ -650,6 +650,23 @@ def test_missing_hal_is_reported_once_while_the_pendant_waits(world: World, caps
         "the pendant is active",
         "no SYNC received on pcan test: waiting for a HAL",
     ]
+
+
+@pytest.mark.parametrize("returns", [1.5, 10.0])
+def test_duration_includes_the_time_without_a_hal(world: World, returns: float) -> None:
+    operator = world.session()
+    operator.take_over()
+    begun = world.now
+
+    class Gone(Keyboard):
+        def lines(self) -> list[str]:
+            world.running = world.now - begun < 0.5 or world.now - begun > returns
+            return []
+
+    operator._keyboard = Gone(None)
+    operator.run(3.0)
+    # At the end, the command presses STOP. Without a HAL, it waits twice for a SYNC.
+    assert 2.5 < world.now - begun < 3.2 + 2.0 * pendant_session.HAL_TIMEOUT
 
 
 def test_a_start_without_effect_is_reported(world: World, capsys: pytest.CaptureFixture[str]) -> None:

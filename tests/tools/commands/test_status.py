@@ -155,7 +155,9 @@ def test_a_different_dbc_and_damaged_frames_are_reported(network: Network, robot
     for frames in damaged:
         frames["data"][0, 5] ^= 0x10
     observer, now = observe(network, robot, damaged)
-    assert observer.report(now).crc_errors == 100
+    first, second = observer.report(now, 7), observer.report(now + 1.0, 9)
+    assert (first.crc_errors, first.dropped) == (100, 7)
+    assert (second.crc_errors, second.dropped) == (0, 2)
 
 
 def test_the_bus_load_is_the_wire_time_of_the_received_frames(

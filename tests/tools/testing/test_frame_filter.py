@@ -99,6 +99,20 @@ def test_delayed_frame_arrives_the_given_cycles_later_unchanged(ends: BusEnds, c
     assert ends.cycle()[1] == list(STATES)
 
 
+def test_delayed_frames_that_do_not_fit_into_the_receive_buffer_arrive_later(ends: BusEnds):
+    ends.filter.delay("*_STATE", 3, frames=3)
+    for _ in range(3):
+        ends.cycle()
+    ends.filter.clear()
+    ends.filter.send(ends.hal.seal())
+    ends.theirs.receive(ends._scratch)
+    counts = [ends.filter.receive(new_frames(2)) for _ in range(4)]
+    assert counts == [2, 1, 0, 0]  # the three frames of the first cycle are due
+    ends.theirs.send(ends.nodes.seal())
+    ends.filter._cycle += 2
+    assert [ends.filter.receive(new_frames(2)) for _ in range(6)] == [2, 2, 2, 2, 1, 0]
+
+
 def test_delayed_command_arrives_the_given_cycles_later(ends: BusEnds):
     ends.filter.delay("COMMAND_LEFT_LEG", 2, frames=1)
     assert [ends.cycle()[0].count("COMMAND_LEFT_LEG") for _ in range(4)] == [0, 1, 2, 1]

@@ -52,11 +52,7 @@ class JointReport:
 
 @dataclass(frozen=True)
 class Report:
-    """State of all nodes and joints.
-
-    `load`, `frames` and `foreign` cover the time since the previous report (`seconds`). `crc_errors` covers the time since the
-    start of the observation, and `dropped` the time since the bus was opened.
-    """
+    """State of all nodes and joints. Bus load and counts cover the time since the previous report."""
 
     seconds: float
     supervisor: str | None
@@ -93,10 +89,10 @@ class Observer:
         }
         self._worst = network.bus_load()
         self._aged_to = now
-        self._begin(now)
+        self._begin(now, 0)
 
-    def _begin(self, now: float) -> None:
-        self._since = now
+    def _begin(self, now: float, dropped: int) -> None:
+        self._since, self._dropped, self._crc_errors = now, dropped, self._image.crc_errors
         self._busy = dict.fromkeys(self._network.buses, 0.0)
         self._frames = self._foreign = 0
 
@@ -122,11 +118,11 @@ class Observer:
                 self._busy[known[0]] += known[1]
 
     def report(self, now: float, dropped: int = 0) -> Report:
-        """Return the current report, and restart the measurement of bus load and frame counts.
+        """Return the current report, and restart the measurement of bus load and counts.
 
         Args:
             now: Current time [s].
-            dropped: Number of frames that the bus dropped.
+            dropped: Number of frames that the bus has dropped since it was opened.
         """
         hal = next(node for node in self._network.nodes if node.kind == "master")
         sync = max(self._fast(hal), key=lambda m: -self._age(m))
@@ -148,10 +144,10 @@ class Observer:
             load={bus: (self._busy[bus] / seconds, self._worst[bus]) for bus in self._network.buses},
             frames=self._frames,
             foreign=self._foreign,
-            crc_errors=self._image.crc_errors,
-            dropped=dropped,
+            crc_errors=self._image.crc_errors - self._crc_errors,
+            dropped=dropped - self._dropped,
         )
-        self._begin(now)
+        self._begin(now, dropped)
         return report
 
     def _fast(self, node: Node) -> list[Message]:

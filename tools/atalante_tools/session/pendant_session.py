@@ -68,7 +68,8 @@ class Session:
         self._start_typed = False  # the operator typed start; START is pressed when the HAL accepts requests
         self._target, self._keyboard, self._now = target, keyboard, now
         self._begun = self._synced_at = now()
-        self._hal_present = True
+        self._hal_present, self._hal_found = True, False
+        self._absent = 0.0  # time without a HAL since the first SYNC [s]
         self._hal: object = None
         self._pressed_at: int | None = None
         self._losses, self._lost_before = losses, 0
@@ -169,9 +170,12 @@ class Session:
         """Return the running time of the pendant [s].
 
         Before the first answer to a SYNC, this is the time since the call of `run`. After the first answer, it is the number of
-        answered SYNCs times `PERIOD`.
+        answered SYNCs times `PERIOD`, plus the time without a HAL.
         """
-        return self.node.answered * PERIOD if self.node.answered else self._now() - self._begun
+        if not self.node.answered:
+            return self._now() - self._begun
+        absent = 0.0 if self._hal_present else self._now() - self._synced_at
+        return self.node.answered * PERIOD + self._absent + absent
 
     def press_stop(self) -> None:
         """Press STOP for some cycles, then release the dead-man switch."""
@@ -218,8 +222,10 @@ class Session:
 
         START is due if the operator typed start, or if `start_wanted` is True and the HAL is in READY or HOLD.
         """
-        node = self.node
-        self._synced_at, self._hal_present = self._now(), True
+        node, now = self.node, self._now()
+        if not self._hal_present and self._hal_found:
+            self._absent += now - self._synced_at
+        self._synced_at, self._hal_present, self._hal_found = now, True, True
         if node.hal is not self._hal and node.hal is not None:
             self._hal = node.hal
             print_message(f"the HAL is {node.hal.name}")

@@ -11,7 +11,6 @@ import difflib
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from fnmatch import fnmatchcase
-from typing import Final
 
 import numpy as np
 
@@ -20,9 +19,6 @@ from atalante_hal.bus import Bus
 from atalante_hal.bus.wrapped import WrappedBus
 from atalante_hal.transceiver import FrameTap
 from atalante_hal.wire.frame import Frames, as_words
-
-#: Largest number of delayed frames that one call of `send` or `receive` passes on. Further frames that are due are lost.
-_BATCH: Final = 128
 
 
 @dataclass
@@ -172,7 +168,7 @@ class FrameFilter(WrappedBus):
         if not self._syncs.isdisjoint(frames["can_id"].tolist()):
             self._cycle += 1
         if self.faults or self._delayed[0]:
-            frames = self._apply_faults(frames, self._delayed[0])
+            frames = self._apply_faults(frames, self._delayed[0], len(frames) + len(self._delayed[0]))
         if len(frames):
             self.bus.send(frames)
             if self.tap is not None:
@@ -193,21 +189,25 @@ class FrameFilter(WrappedBus):
             timeout = 0.0
         count = self.bus.receive(frames, timeout)
         if self.faults or self._delayed[1]:
-            kept = self._apply_faults(frames[:count], self._delayed[1])[: len(frames)]
+            kept = self._apply_faults(frames[:count], self._delayed[1], len(frames))
             count = len(kept)
             as_words(frames)[:count] = as_words(kept)
         if self.tap is not None and count:
             self.tap.received(frames, count)
         return count
 
-    def _apply_faults(self, frames: Frames, delayed: list[tuple[int, Frames]]) -> Frames:
+    def _apply_faults(self, frames: Frames, delayed: list[tuple[int, Frames]], room: int) -> Frames:
         """Apply the faults to new frames. Return one array: first the delayed frames that are due, then the new frames.
 
         The new frames that are dropped or delayed are not in this array.
+
+        Args:
+            frames: new frames, shape (n,).
+            delayed: delayed frames of this direction. Updated here.
+            room: largest number of frames to return. Further frames are due in the next call.
         """
-        due = [frame for cycle, frame in delayed if cycle <= self._cycle][:_BATCH]
+        arriving = [frame for cycle, frame in delayed if cycle <= self._cycle]
         delayed[:] = [(cycle, frame) for cycle, frame in delayed if cycle > self._cycle]
-        arriving = due
         for row, frame_id in enumerate(frames["can_id"].tolist()):
             frame: Frames = frames[row : row + 1].copy()
             fault = next((f for f in self.faults if frame_id in f.ids and self._hits(f, frame_id)), None)
@@ -219,7 +219,8 @@ class FrameFilter(WrappedBus):
                 self._damage(frame, fault)
                 arriving.append(frame)
         self.faults = [fault for fault in self.faults if not fault.over]
-        return np.concatenate(arriving) if arriving else frames[:0]
+        delayed[:0] = [(self._cycle, frame) for frame in arriving[room:]]
+        return np.concatenate(arriving[:room]) if arriving else frames[:0]
 
     def _hits(self, fault: Fault, frame_id: int) -> bool:
         so_far = fault.hits.get(frame_id, 0)

@@ -59,7 +59,7 @@ class FaultTrial:
     height: float  # height of the wearer [m]
     seed: int
     engine: str
-    sources: str  # hash of the source files of `atalante_tools.faults` and `atalante_tools.session`
+    sources: str  # hash of the source files of `atalante_tools.faults`
 
     @property
     def name(self) -> str:
@@ -77,13 +77,12 @@ def fault_trials(ids: Sequence[str], quick: bool, seed: int, engine: str) -> lis
         engine: physics engine of the emulated robot.
     """
     import atalante_tools.faults
-    import atalante_tools.session
     from atalante_control.gait.subject import STUDY_PATIENTS
     from atalante_tools.trial.ground_cases import FAULT_IDS, ground_cases
     from atalante_tools.trial.plan import SWEEP_SUBJECT, source_hash
 
     patient = next(patient for patient in STUDY_PATIENTS if patient.mass == SWEEP_SUBJECT[0])
-    sources = source_hash([Path(next(iter(one.__path__))) for one in (atalante_tools.faults, atalante_tools.session)])
+    sources = source_hash([Path(next(iter(atalante_tools.faults.__path__)))])
     return [
         FaultTrial(
             id_, index, case.name, QUICK_MOMENTS if quick else _moments(id_), patient.mass, patient.height,

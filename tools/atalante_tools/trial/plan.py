@@ -363,8 +363,11 @@ def push_trials(
 @cache
 def versions() -> dict[str, str]:
     """Return the versions of Python, this project, its source text, and the packages that compute a trial."""
+    import atalante_tools.session
+
     folder = Path(__file__).parent
-    source = source_hash([*_roots(), folder], [folder / name for name in _REPORTING])
+    session = Path(next(iter(atalante_tools.session.__path__)))
+    source = source_hash([*_roots(), session, folder], [folder / name for name in _REPORTING])
     found = {"python": platform.python_version(), "atalante-hal": version("atalante-hal"), "source": source}
     for package in _PACKAGES:
         try:
@@ -385,7 +388,9 @@ def key(trial: Trial) -> str:
 
 
 #: Files of this package that do not affect the results.
-_REPORTING: Final = ("__init__.py", "findings.py", "fault_findings.py", "figures.py", "report.py", "store.py")
+_REPORTING: Final = (
+    "__init__.py", "findings.py", "fault_findings.py", "fault_table.py", "figures.py", "report.py", "store.py",
+)  # fmt: skip
 
 
 def _roots() -> list[Path]:

@@ -227,7 +227,9 @@ def test_line_longer_than_the_buffer_is_unreadable(tmp_path: Path, monkeypatch: 
     path.write_text("(0.000001) can0 100#00\n" + "x" * 2000 + "\n(0.000002) can0 100#00\n")
     log = open_log(path)
     assert sum(map(len, log.chunks())) == 2
-    assert [remark.rule for remark in log.remarks] == ["log-unreadable"]
+    (remark,) = log.remarks
+    assert (remark.rule, remark.count) == ("log-unreadable", 1)
+    assert "the first is 'xxx" in remark.sentence
 
 
 def read(path: Path) -> tuple[Log, list[Chunk]]:

@@ -549,3 +549,29 @@ def test_mutation_violates_only_its_rule(
     assert {finding.rule for finding in found} == {rule}, [finding.as_json() for finding in found]
     _, in_pieces = validate(text, tmp_path / "mutant.log", dbc, pieces=1601)
     assert [f.as_json() for f in in_pieces] == [f.as_json() for f in found]
+
+
+def test_stuck_value_ends_at_its_first_change_although_frames_were_repeated(
+    recording: Recording, network: Plan, tmp_path: Path
+) -> None:
+    log = recording.copy()
+    frozen_gyro(log)
+    frozen = log.starting_at(log.at("IMU_PELVIS_STATE"))
+    for line in frozen[:40]:
+        log.insert(line, dataclasses.replace(line))
+    _, found = validate(text_of(log), tmp_path / "stuck.log", network)
+    (stuck,) = (finding for finding in found if finding.rule == "stuck")
+    assert stuck.first == frozen[150].stamp
+
+
+def test_repeated_frames_do_not_change_the_mean_interval(recording: Recording, network: Plan, tmp_path: Path) -> None:
+    log = recording.copy()
+    lines = log.of("LEFT_FH_STATE")
+    for line in lines[100:400:4]:
+        log.insert(line, dataclasses.replace(line, stamp=line.stamp + 4 * MS // 10))
+    log.sort()
+    for pieces in (None, 1601):
+        validator, found = validate(text_of(log), tmp_path / "repeated.log", network, pieces=pieces)
+        assert "counter-repeated" in {finding.rule for finding in found}
+        row = next(i for i, layout in enumerate(network.layouts) if layout.name == "LEFT_FH_STATE")
+        assert validator.timing.mean_ms(row) == pytest.approx(1.0, abs=1e-3)

@@ -42,12 +42,18 @@ def read(log: LogFile, chunk_frames: int) -> Iterator[Chunk]:
             if not stop:
                 kept += got
                 if kept == _TEXT_BYTES:
+                    if not line_too_long:
+                        example = example if unreadable else memory[MARGIN : MARGIN + 100].tobytes()
+                        unreadable += 1
                     kept, line_too_long = 0, True
                 continue
-            parsed = candump.parse(text, MARGIN, stop, log.channels)
+            start = MARGIN
+            if line_too_long:  # leave out the end of this line
+                start += int(np.argmax(text[MARGIN:stop] == ord("\n"))) + 1
+                line_too_long = False
+            parsed = candump.parse(text, start, stop, log.channels)
             example = example if unreadable else parsed.first_unreadable
-            unreadable += parsed.unreadable + line_too_long
-            line_too_long = False
+            unreadable += parsed.unreadable
             if len(parsed.chunk):
                 gathered.append(parsed.chunk)
             kept = end - stop

@@ -313,10 +313,9 @@ class _Stuck:
         for row, first, end in stream.bounds(decoded.family):
             number = row - self._family.rows.start
             stamps = stream.stamps[decoded.span][first:end]
-            fresh = np.flatnonzero(~repeated[first:end]) if bool(repeated[first:end].any()) else None
+            fresh = slice(None) if not bool(repeated[first:end].any()) else ~repeated[first:end]
             for at in range(len(self.indices)):
-                part = still[at, first:end]
-                self._check_column(at, number, part if fresh is None else part[fresh], stamps)
+                self._check_column(at, number, still[at, first:end][fresh], stamps[fresh])
             self._stamp[number] = stamps[-1]
 
     def _check_column(self, at: int, number: int, still: npt.NDArray[np.bool_], stamps: npt.NDArray[np.int64]) -> None:
@@ -329,7 +328,7 @@ class _Stuck:
         runs[0] += int(self._run[at, number])
         long = runs >= self._frames
         if bool(long.any()):
-            self._report(at, number, stamps[np.minimum(moves[long], len(stamps) - 1)], runs[long])
+            self._report(at, number, stamps[moves[long]], runs[long])
         self._run[at, number] = len(still) - 1 - int(moves[-1])
 
     def finish(self, end: int) -> None:

@@ -198,14 +198,16 @@ class TimingRules:
         """Add the intervals to the statistics, except timeouts and intervals with lost, repeated or rejected frames."""
         bins = np.minimum(np.maximum(share * BINS_A_CYCLE, 0.0), float(BINS - 1)).astype(np.int64)
         bins += (np.arange(len(stream.present)) * BINS).repeat(stream.stops - stream.starts)
-        # Exclude the intervals with lost, repeated or rejected frames from the statistics.
+        # Exclude the intervals with lost, repeated or rejected frames from the statistics, and the intervals after repeated frames.
         # Keep the intervals of messages without an alive counter (`NO_STEP`), because a loss is not detectable.
         incomplete = (
             odd[steps[odd] >= REPEATED]
             if rejected_before is None
             else odd[(steps[odd] >= REPEATED) | (rejected_before[odd] > 0)]
         )
-        left_out = np.unique(np.concatenate([incomplete, timed_out, np.flatnonzero(np.isinf(share))]))
+        # The interval that follows a repeated frame does not begin at a new frame.
+        after_repeated = np.flatnonzero(stream.before(steps, self._last_steps) == REPEATED)
+        left_out = np.unique(np.concatenate([incomplete, timed_out, np.flatnonzero(np.isinf(share)), after_repeated]))
         dump = len(stream.present) * BINS
         sums = np.add.reduceat(intervals, stream.starts)
         numbers = stream.stops - stream.starts

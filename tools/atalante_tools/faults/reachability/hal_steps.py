@@ -320,7 +320,7 @@ class HalSteps:
         # `_stalled` only decides in which cycle a START ends. The search lets a START end in every cycle (`LAST_START`), so the
         # value of `_stalled` can be constant.
         monitor._stalled = 0
-        monitor._ending = monitor._duplicate_found = monitor._ramping = False
+        monitor._ending = monitor._duplicate_found = monitor._ramping = monitor._proof_begun = False
         monitor.lowered.clear()
         rows = len(self._image.check)
         monitor._message_monitor.qualification = [SETTLED] * rows
