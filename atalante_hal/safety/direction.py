@@ -50,8 +50,8 @@ _SHORT = min(duration for _, duration in GROUPS)
 #: Delay [cycles] from a torque command to the first position that shows its effect, if no frame and no motor is late.
 LATENCY = 2
 #: Delays that the test tries [cycles]. States, commands and motors may be late by three cycles in total.
-#: The largest and the smallest value of the pulse of 16 cycles are 4.6 cycles apart. So a wrong sign would look like a delay that is
-#: four to five cycles longer, and the test tries no such delay.
+#: The largest and the smallest value of the pulse of 16 cycles are 4.6 cycles apart. So a wrong sign would look like a delay that
+#: is four to five cycles longer, and the test tries no such delay.
 LATENCIES = tuple(range(LATENCY, LATENCY + 4))
 #: Peak of the pulse as a multiple of `Robot.breakaway`, in the order of LEG_JOINTS.
 #: The peaks of FH and SH are larger, because these joints move a whole leg.

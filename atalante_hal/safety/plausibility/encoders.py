@@ -7,6 +7,10 @@ rejected values in a row, the loss of the encoder's reference is confirmed. The 
 back to the expected position, or when its drive has restarted (see `reference`). The expected position includes the
 motion since the jump.
 
+*Exchange.* If the encoders of a joint are exchanged between the legs, both jump, each to the expected position of the other
+one. A drive that holds its joint with the encoder of the other leg moves its joint away, so both drives must be switched
+off.
+
 *Overspeed.* A larger change is real motion and not a jump if two conditions hold (`continues`). First, the encoder
 already moved in the same direction at more than half of top_speed in the cycle before. Second, the velocity grew by at
 most top_speed. A value that meets both conditions is used, so that the encoder keeps its reference. After
@@ -30,7 +34,7 @@ import numpy as np
 import numpy.typing as npt
 
 from atalante_hal.compiled import specialised
-from atalante_hal.robot import JOINTS, Robot
+from atalante_hal.robot import JOINTS, LEG_JOINTS, Robot
 from atalante_hal.safety.diagnostics import Dtc, Finding
 from atalante_hal.safety.plausibility.finding import JOINT_NODES, Cycles, Signals
 from atalante_hal.types import Vector
@@ -270,7 +274,9 @@ class EncoderChecks:
         """Return the current findings of the encoder checks."""
         if not (self.outside or self.too_fast or any(self.jumps)):
             return self._wrong_findings
-        jumps = (self._jump(joint) for joint, jumps in enumerate(self.jumps) if jumps)
+        jumps = [self._jump(joint) for joint, jumps in enumerate(self.jumps) if jumps]
+        if len(jumps) > 1:
+            jumps += [self._exchange(joint) for joint in range(len(JOINTS)) if self._exchanged(joint)]
         too_fast = (self._overspeed(joint, *found) for joint, found in self.too_fast.items())
         return (*jumps, *too_fast, *map(self._outside, self.outside), *self._wrong_findings)
 
@@ -280,6 +286,24 @@ class EncoderChecks:
         if confirmed:
             text += "; it is not used until it jumps back or its drive restarts"
         return Finding(Dtc.ENC_JUMP, JOINT_NODES[joint], size, confirmed, text)
+
+    def _exchanged(self, joint: int) -> bool:
+        """Return whether the encoder of a joint reads the position of the same joint of the other leg, and vice versa.
+
+        Args:
+            joint: index of the joint in JOINTS.
+        """
+        pair = joint, (joint + len(LEG_JOINTS)) % len(JOINTS)
+        if min(self.jumps[one] for one in pair) < JUMPS_TO_CONFIRM:
+            return False
+        ours, theirs = (self._lost[one] for one in pair)
+        reach = JUMPS_TO_CONFIRM * float(self._travel[joint]) + float(self._noise[joint])
+        return abs(ours.last - theirs.expected) <= reach and abs(theirs.last - ours.expected) <= reach
+
+    def _exchange(self, joint: int) -> Finding:
+        other = JOINTS[(joint + len(LEG_JOINTS)) % len(JOINTS)]
+        text = f"the encoder of {JOINTS[joint]} reads the position of {other}, and vice versa; both drives are switched off"
+        return Finding(Dtc.TORQUE_DIRECTION, JOINT_NODES[joint], self._jump_of[joint], True, text)
 
     def _overspeed(self, joint: int, speed: float, values: int) -> Finding:
         limit = np.degrees(self._top_speed[joint])

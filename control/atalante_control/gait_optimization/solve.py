@@ -53,8 +53,17 @@ _SOURCES = (
     *(
         f"gait_optimization/{module}.py"
         for module in (
-            "symbolic_dynamics", "guess", "step_problem", "nlp", "requirements", "solve", "compiled", "reach",
-            "result", "second_start", "verify",
+            "symbolic_dynamics",
+            "guess",
+            "step_problem",
+            "nlp",
+            "requirements",
+            "solve",
+            "compiled",
+            "reach",
+            "result",
+            "second_start",
+            "verify",
         )
     ),
     *("gait/gait.py", "gait/subject.py", "dynamics/gravity.py", "dynamics/stance.py", "model/*.py", "structured.py"),

@@ -492,7 +492,10 @@ def broken_logs(folder: Path) -> dict[str, tuple[Path, str]]:
     cases = {
         "missing": (folder / "nowhere.log", "nowhere.log cannot be opened as a CAN log: No such file"),
         "folder": (folder, "the log format must be"),
-        "suffix": (folder / "run.pcap", "the log format must be one that python-can reads, such as .log .*, got '.pcap'"),
+        "suffix": (
+            folder / "run.pcap",
+            "the log format must be one of python-can, such as .log .*, got '.pcap'",
+        ),
         "no suffix": (folder / "run", "the log format must be"),
         "csv": (folder / "run.csv", "cannot store CAN FD frames completely; record the log as .log, .asc or .blf"),
         "db": (folder / "run.db", "cannot store CAN FD frames completely"),

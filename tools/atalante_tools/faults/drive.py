@@ -274,6 +274,23 @@ SCENARIOS: Final = (
             ),
         ),
     ),
+    # There is no case with TH: both joints are at nearly the same position, so their encoders do not jump.
+    Scenario(
+        "F85",
+        tuple(
+            Case(
+                f"encoders of {joint} exchanged{' in HOLD' if hold else ''}",
+                (*hold, Fault("encoder_swapped", f"LEFT_{joint}", start, other=f"RIGHT_{joint}")),
+                node=f"LEFT_{joint}",
+                detected=start + 5,
+                reacted=start + 5,
+                recovers=False,
+            )
+            for hold, start in (((), 0), ((OperatorAction("hold"),), _AT_REST))
+            for joint in LEG_JOINTS
+            if joint != "TH"
+        ),
+    ),
     # Only FH and SH have a case with a reversed motor. A reversed motor moves any other joint above the velocity limit of the
     # joint before the HAL can react.
     Scenario(

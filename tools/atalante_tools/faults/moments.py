@@ -50,11 +50,10 @@ SAG_OF: Final = {
     "value": 5.0,
     "push": math.inf,
 }
-#: Kinds of faults of a motor.
+#: Kinds of faults of a motor. They may move a joint above its velocity limit until the HAL finds them: for `FOUND` cycles after
+#: the fault begins, and after each START.
 _MOTOR: Final = ("torque_wrong", "torque_weak")
-#: Kinds of faults that may move a joint above its velocity limit.
-_UNLIMITED: Final = (*_MOTOR, "encoder_swapped")
-#: Number of cycles within which the HAL must find a fault of `_UNLIMITED`: time limit of F84 in FAULTS.md.
+#: Number of cycles within which the HAL must find a faulty motor: time limit of F84 in FAULTS.md.
 FOUND: Final = 200
 #: Number of cycles from READY to the operator's START.
 _PAUSE: Final = 50
@@ -161,8 +160,10 @@ class MomentTask:
             return MomentVerdict(self.moment, names, "-", False, None, (exception_sentence(error),))
         extremes, before = _extremes(run, plan.starts), run.last_before_start
         kinds = [stimulus.kind for stimulus in stimuli]
-        fast = [s.start for s in stimuli if s.kind in _UNLIMITED]
-        unlimited = range(run.first + min(fast), run.first + max(fast) + FOUND) if fast else range(0)
+        begins = [run.first + s.start for s in stimuli if s.kind in _MOTOR]
+        presses = (*plan.starts, run.last_before_start + 1, run.last_before_start + 1 + RECOVERY)
+        starts = [cycle for cycle in presses if cycle >= min(begins, default=math.inf)]
+        unlimited = [range(cycle, cycle + FOUND) for cycle in (*begins, *starts)]
         failures = [*limit_violations(run, unlimited, _strength(stimuli)), *_premature(run, plan.starts[0])]
         if self.moment in (Moment.WALKING, Moment.HOLD):  # at the other moments, START may improve the state
             failures += automatic_improvements(run, before)

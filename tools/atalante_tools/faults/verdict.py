@@ -11,6 +11,7 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Final
 
@@ -135,18 +136,19 @@ def reacted(run: Observation, state: SupervisorState) -> int | None:
     return None
 
 
-def limit_violations(run: Observation, unlimited: range = range(0), strength: Vector | float = 1.0) -> list[str]:
+def limit_violations(run: Observation, unlimited: Sequence[range] = (), strength: Vector | float = 1.0) -> list[str]:
     """Return a sentence for each limit that a command, a motor or a joint exceeded.
 
     Args:
         run: observation of the run.
-        unlimited: cycles in which the joint velocities are not checked.
+        unlimited: ranges of cycles in which the joint velocities are not checked.
         strength: torque of each motor divided by the torque of a motor without fault, shape (12,), at least 1.
     """
     robot = run.robot
     found = run.commands.violations(robot, run.drive_state)
     fast = np.abs(run.velocity) > _VELOCITY_RATIO * robot.velocity_max
-    fast[max(unlimited.start - 1, 0) : max(unlimited.stop - 1, 0)] = False
+    for cycles in unlimited:
+        fast[max(cycles.start - 1, 0) : max(cycles.stop - 1, 0)] = False
     for sentence, wrong in (
         ("a motor's torque was above its limit", np.abs(run.torque) > strength * robot.torque_max * (1.0 + 1e-9)),
         ("a joint was outside its position range", run.position > robot.position_max + _OVERSHOOT),

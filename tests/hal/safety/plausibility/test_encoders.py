@@ -24,13 +24,40 @@ from simulated_robot import (
 )
 
 from atalante_hal.robot import JOINTS
-from atalante_hal.safety.diagnostics import Dtc
+from atalante_hal.safety.diagnostics import Dtc, Reaction
 from atalante_hal.safety.limiter import Limiter
 from atalante_hal.safety.plausibility import Finding, Plausibility
-from atalante_hal.safety.plausibility.encoders import EncoderChecks
+from atalante_hal.safety.plausibility.encoders import JUMPS_TO_CONFIRM, EncoderChecks
 from atalante_hal.safety.plausibility.finding import Signals, signals_of
 from atalante_hal.wire.e2e import Check
 from atalante_hal.wire.process_image import NEVER, ReceiveImage
+
+
+class Pair:
+    """Robot at rest, with one joint at different positions in both legs.
+
+    Attributes:
+        positions: position of the joint in the left and in the right leg [rad].
+        nodes: drives of both joints.
+    """
+
+    def __init__(self, joint: int) -> None:
+        self._robot, self._joints = SimulatedRobot(amplitude=0.0), [joint, joint + 6]
+        apart = 0.3 * (ROBOT.position_max[joint] - ROBOT.position_min[joint])
+        self.positions = (float(MIDDLE[joint] - apart), float(MIDDLE[joint + 6] + apart))
+        self.nodes = [JOINTS[joint].upper() for joint in self._joints]
+        for node in self.nodes:
+            self._robot.checks.reference(node)
+        for _ in range(5):
+            assert not any(f.dtc is Dtc.ENC_JUMP for f in self.readings(*self.positions))
+
+    def readings(self, left: float, right: float) -> tuple[Finding, ...]:
+        """Run one cycle with the given readings of both encoders [rad], and return the findings."""
+
+        def read(now: Signals) -> None:
+            now.position[self._joints] = np.array([left, right]) * GEAR[self._joints]
+
+        return self._robot.cycle(read)
 
 
 class TestEncoderJump:
@@ -246,6 +273,46 @@ class TestEncoderJump:
         found = robot.cycle(lambda now: now.position.__setitem__(slice(1, 8, 6), 0.0))
         assert [f.node for f in found] == ["LEFT_TH", "RIGHT_TH"]
         assert robot.rejected == {row("left_TH"): 1, row("right_TH"): 1}
+
+    @pytest.mark.parametrize("joint", range(6), ids=JOINTS[:6])
+    def test_exchanged_encoders_are_reported_with_the_fifth_jump(self, joint: int):
+        robot = Pair(joint)
+        for cycle in range(1, 8):
+            found = robot.readings(*robot.positions[::-1])
+            exchanged = [f for f in found if f.dtc is Dtc.TORQUE_DIRECTION]
+            assert [f.node for f in exchanged] == robot.nodes * (cycle >= 5)
+            assert all(f.confirmed and f.dtc.reaction is Reaction.LOWER for f in exchanged)
+        assert f"reads the position of {JOINTS[joint + 6]}, and vice versa" in exchanged[0].text
+        assert exchanged[0].value == pytest.approx(robot.positions[1] - robot.positions[0])
+
+    @pytest.mark.parametrize(("share", "exchanged"), [(-0.98, 2), (0.98, 2), (-1.02, 0), (1.02, 0)])
+    @pytest.mark.parametrize("side", [0, 1])
+    def test_exchanged_encoders_read_the_position_of_the_other_leg(self, side: int, share: float, exchanged: int):
+        """Between the last good value and the fifth jump, each joint may move as far as it can in five cycles."""
+        robot = Pair(3)
+        readings = list(robot.positions[::-1])
+        readings[side] += share * (JUMPS_TO_CONFIRM * ROBOT.top_speed[3] * PERIOD + 3.0 * ROBOT.encoder_noise[3])
+        for _ in range(6):
+            found = robot.readings(*readings)
+        assert [f.dtc for f in found].count(Dtc.ENC_JUMP) == 2
+        assert [f.dtc for f in found].count(Dtc.TORQUE_DIRECTION) == exchanged
+
+    def test_one_encoder_that_jumps_to_the_position_of_the_other_leg_is_no_exchange(self):
+        robot = Pair(3)
+        for _ in range(6):
+            found = robot.readings(robot.positions[1], robot.positions[1])
+        assert only(found).dtc is Dtc.ENC_JUMP
+
+    def test_jumps_of_two_joints_of_a_leg_are_no_exchange(self):
+        robot = SimulatedRobot(amplitude=0.0)
+        robot.run(5)
+
+        def away(now: Signals) -> None:
+            now.position[[2, 3]] += 0.5 * GEAR[[2, 3]]
+
+        for _ in range(6):
+            found = robot.cycle(away)
+        assert [f.dtc for f in found] == [Dtc.ENC_JUMP, Dtc.ENC_JUMP]
 
     def test_first_position_is_no_jump(self):
         image = ReceiveImage(MESSAGES)  # all values are NaN

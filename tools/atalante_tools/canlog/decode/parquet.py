@@ -141,7 +141,9 @@ class ParquetSink:
 def _exact(field: Field, values: npt.NDArray[Any]) -> Any:
     """Return the column `integer`: exact values as decimals, or only nulls if float64 represents all values exactly."""
     codes = raw_range(field) if field.kind != "float" else range(0)
-    largest = max((abs(code * field.factor + field.offset) for code in (codes[0], codes[-1])), default=0) if codes else 0
+    largest = (
+        max((abs(code * field.factor + field.offset) for code in (codes[0], codes[-1])), default=0) if codes else 0
+    )
     if values.dtype.kind == "f" or largest <= _EXACT:
         return pa.nulls(len(values), _DECIMAL)
     if values.dtype.kind == "O":

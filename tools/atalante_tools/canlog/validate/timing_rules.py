@@ -198,7 +198,7 @@ class TimingRules:
         """Add the intervals to the statistics, except timeouts and intervals with lost, repeated or rejected frames."""
         bins = np.minimum(np.maximum(share * BINS_A_CYCLE, 0.0), float(BINS - 1)).astype(np.int64)
         bins += (np.arange(len(stream.present)) * BINS).repeat(stream.stops - stream.starts)
-        # Exclude the intervals with lost, repeated or rejected frames from the statistics, and the intervals after repeated frames.
+        # Exclude from the statistics the intervals with lost, repeated or rejected frames, and those after repeated frames.
         # Keep the intervals of messages without an alive counter (`NO_STEP`), because a loss is not detectable.
         incomplete = (
             odd[steps[odd] >= REPEATED]
