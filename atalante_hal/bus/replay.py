@@ -152,7 +152,8 @@ def _open(path: Path) -> can.io.generic.MessageReader:
         )
     if kind not in can.io.player.MESSAGE_READERS:
         raise LogUnreadable(
-            f"{path}: the log format must be one of python-can, such as .log (candump -L), .asc or .blf, got {kind or 'no suffix'!r}"
+            f"{path}: the log format must be one of python-can, such as .log (candump -L), .asc or .blf, "
+            f"got {kind or 'no suffix'!r}"
         )
     try:
         size = path.stat().st_size

@@ -128,6 +128,14 @@ def test_mcap_values_are_equal_to_cantools(dbc: Path, tmp_path: Path) -> None:
     assert check(found, {k: v for k, v in expected.items() if k not in wide}) > 200
 
 
+def test_parquet_integer_is_exact_with_a_large_offset(tmp_path: Path) -> None:
+    dbc, log, out = (tmp_path / name for name in ("offset.dbc", "offset.log", "out.parquet"))
+    dbc.write_text(f'VERSION ""\nBU_: A\nBO_ 256 M: 8 A\n SG_ S : 0|8@1+ (1,{2**60}) [0|0] "" A\n')
+    log.write_text("(0.000001) can0 100#0100000000000000\n")
+    assert run("decode", log, "--dbc", dbc, "-o", out).exit_code == 0
+    assert [int(row["integer"]) for row in pq.read_table(out).to_pylist()] == [2**60 + 1]
+
+
 def test_parquet_has_the_documented_columns(tmp_path: Path) -> None:
     log, _ = random_log(atalante_dbc.DBC_FILE, tmp_path / "random.log", 200)
     run("decode", log, "-o", tmp_path / "out.parquet")
