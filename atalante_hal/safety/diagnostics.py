@@ -84,7 +84,7 @@ class Dtc(StrEnum):
     DERATED = "DERATED", _R.HOLD, _S.WARNING, "a hot drive has less torque; confirmed if far less than the other leg"
     UNDER_VOLTAGE = "UNDER_VOLTAGE", _R.HOLD, _S.ERROR, "the supply voltage is too low"
     SUPPLY_LOW = "SUPPLY_LOW", _R.FINISH_STEP, _S.WARNING, "the supply voltage is low"
-    # Faults that drives report. A drive then holds its position without a command of the HAL.
+    # Faults that drives report. A drive that reports SYNC_LOST or CMD_TIMEOUT already holds its position.
     SYNC_LOST = "SYNC_LOST", _R.HOLD, _S.ERROR, "a node receives no SYNC"
     CMD_SOME_LOST = "CMD_SOME_LOST", _R.INFO, _S.INFO, "a drive missed 1 to 4 commands"
     CMD_TIMEOUT = "CMD_TIMEOUT", _R.HOLD, _S.ERROR, "a drive receives no commands"

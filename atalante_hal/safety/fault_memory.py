@@ -166,7 +166,9 @@ class FaultMemory:
         return frozenset(dtc for dtc in self.confirmed if dtc.reaction is reaction is not Reaction.INFO)
 
     def walk_ends(self, drives: Collection[str]) -> frozenset[Dtc]:
-        """Return those confirmed codes with which a walking robot may end its walk before HOLD, see `permits_walk_end`.
+        """Return those confirmed codes with which a walking robot may first end its walk on both feet, see `permits_walk_end`.
+
+        With all other codes, the drives hold at once.
 
         A code may be confirmed for several nodes. The code is left out if one of these nodes does not permit the end of
         the walk.

@@ -46,7 +46,7 @@ _KILLED = 0.1
 _SESSION_END = 2.0
 #: A restarted subprocess must be ready within this time [s], see `tend`.
 _RESTART = 30.0
-#: The first subprocess must be ready within this time [s]. A run may begin earlier.
+#: The first subprocess must be ready within this time [s]. A run may begin before the subprocess is ready.
 #: A subprocess that is not ready in time is ended, and `tend` starts another one.
 _JOIN = 60.0
 

@@ -102,7 +102,7 @@ class Motors:
         self._motors[_STRENGTH, motor] = strength
 
     def set_gain(self, motor: int, gain: float) -> None:
-        """Set the ratio of measured torque to setpoint of a motor. The true torque changes with the measured torque.
+        """Set the ratio of the torque to its setpoint, both for the true and for the measured torque of a motor.
 
         Args:
             motor: index of the motor.

@@ -222,7 +222,7 @@ class ActivePatient:
         for k, joint in enumerate((first + _SH, first + _SK)):
             self._error[cycle, k] = self._nominal[cycle, k] - position[joint]
             self._slope[cycle, k] = self._rate[cycle, k] - velocity[joint]
-            if self._p.vibration <= 1.0:  # otherwise the patient feels no motor, and the threshold is constant
+            if self._p.vibration <= 1.0:  # the patient feels motors whose amplitude is at least `vibration`
                 felt_motor = self._amplitude[_MOTORS[self._swing][k]].max() >= self._p.vibration
                 self._threshold[cycle, k] = 0.0 if felt_motor else self._p.threshold
         self._cycle += 1

@@ -47,8 +47,9 @@ _FILTER_TIME = 0.15
 _MEAN_TIME = 0.75
 #: Time after the start in which the filters settle, before the mean values begin [s].
 _SETTLING_TIME = 2.0
-#: The error of a knee angle is computed only if the root mean square of the filtered lever exceeds this value [m]. The part of
-#: the lever that an error of the segment length explains is subtracted before. In a walk, the root mean square is about 0.012 m.
+#: The lever is the derivative of the position of the tibia IMU with respect to SK. The error of a knee angle is computed only if
+#: the root mean square of the filtered lever exceeds this value [m], without the part of the lever that an error of the segment
+#: length explains. In a walk, the root mean square is about 0.012 m.
 _LEAST_LEVER = 0.007
 #: An error of a knee angle is reported only if it explains more than this share of the mean square of the difference between the
 #: measured and the computed position. The part that an error of the segment length explains is subtracted before.
@@ -75,7 +76,7 @@ class Readings(NamedTuple):
 class Filters(NamedTuple):
     """Values of the filters of both legs."""
 
-    low: Vector  # (2, 33) low-passes of each leg: `_FILTERS` for each axis
+    low: Vector  # (2, 33) outputs of the low-passes: for each leg, three axes with `_FILTERS` low-passes each
     time: Vector  # (1,) time since the start, up to `_SETTLING_TIME` [s]
     #: (2, 6) means of the products ss, sg, gg, sd, gd, dd of three filtered values. Here s is the lever: the derivative of the
     #: position of the tibia IMU with respect to SK. g is the growth: the derivative with respect to the length of both segments.

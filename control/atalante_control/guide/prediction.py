@@ -195,7 +195,7 @@ def prediction_of(policy: BackupPolicy, leg: Leg, assumptions: Assumptions, blen
 
 
 def _separated(rows: Vector) -> Vector:
-    """Return equivalent matrices for a state in which quantity 2 (see `STATES`) is true minus measured e' instead of true e'."""
+    """Return the same matrices for a state vector in which the true minus the measured e' replaces the true e' (see `STATES`)."""
     result = rows.copy()
     result[..., 4:6] += rows[..., 2:4]
     return result

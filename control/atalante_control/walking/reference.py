@@ -41,7 +41,7 @@ class PhaseTable(NamedTuple):
     guided: Vector  # (m, 4) re-centring rows of sagittal hip and knee of the swing leg, which a guide can assist
     reach: Vector  # (2,) rad/s, speeds of SH and SK of the swing leg with which the swing foot moves down after the last row
     lowering: float  # m/s, downward speed of the swing foot at the joint speeds `reach`
-    reach_cycles: int  # number of cycles in which the joint speeds `reach` lower the foot after the last row
+    reach_cycles: int  # number of cycles after the last row in which the foot moves down with the joint speeds `reach`
     #: number of cycles in which foot placement lowers a held swing foot after the last row; does not depend on the knee angle
     lowering_cycles: int
 

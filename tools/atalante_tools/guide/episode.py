@@ -144,7 +144,9 @@ class IdealLeg:
         self._row = np.concatenate([self._mean, np.zeros(len(JOINTS))])
 
     def goal(self, start: Start) -> Goal:
-        """Return the desired motion q_nom + s of a step, and the guide around this motion.
+        """Return the desired motion of a step, and the guide around this motion.
+
+        The desired motion is the nominal motion plus a polynomial that removes the deviation at the stance change.
 
         Args:
             start: state at the stance change.

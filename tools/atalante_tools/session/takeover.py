@@ -21,7 +21,8 @@ from atalante_hal.wire.e2e import COUNTER_BYTE, MAX_DELTA, Check
 from atalante_hal.wire.frame import Frames
 from atalante_hal.wire.process_image import ReceiveImage
 
-#: Shortest time for which a new pendant sends before it may stop [cycles]. The older pendant stops sending in this time.
+#: A new pendant sends for at least this time [cycles], in which the older pendant stops sending. If the older pendant continues,
+#: the new pendant may stop after this time.
 TAKEOVER_CYCLES: Final = 50
 #: After a pendant has resumed sending, it must send for at least this time before it may stop again [cycles].
 RETRY_CYCLES: Final = 8

@@ -160,7 +160,7 @@ class FrameFilter(WrappedBus):
         return fault
 
     def send(self, frames: Frames) -> None:
-        """Apply the faults and send the other frames; see `Bus.send`.
+        """Apply the faults, and send all frames that are not dropped or delayed; see `Bus.send`.
 
         Args:
             frames: frames to send, shape (n,).

@@ -29,8 +29,9 @@ def fault_table(results: Sequence[dict[str, Any]]) -> tuple[list[str], list[list
 
 
 def _survived(result: dict[str, Any]) -> str:
-    """Return text: the longest fault duration without a fall [cycles], as a range from the worst to the best moment.
+    """Return the longest fault duration without a fall [cycles] as text.
 
+    The duration depends on the moment at which the fault begins. The text is the range from the smallest to the largest duration.
     A moment at which the robot does not fall with the permanent fault is left out.
     """
     survived = [cycles for cycles in result["longest"] if cycles is not None]

@@ -129,7 +129,7 @@ class _Walk:
         return self.ending(state)
 
     def finish(self, continuation: Continuation) -> None:
-        """Send outcome and number of reports of each diagnostic, and end the process."""
+        """Send the outcome of the walk and the number of reports of each diagnostic, and end the process."""
         try:
             continuation.finish((self.ending.outcome, diagnostics(self._rig.hal)))
         finally:

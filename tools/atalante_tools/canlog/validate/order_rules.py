@@ -32,8 +32,8 @@ class _Bus:
     #: number of cycles between the last two state frames, by message index
     jump_of: dict[int, int] = field(default_factory=dict)
     #: State frames to be checked with the next chunk: message index -> time stamp [ns].
-    #: Such a state frame is the second frame of its message in one cycle.
-    #: The state frame arrived before its SYNC if the next cycle has no frame of the same message.
+    #: Such a state frame is the second frame of its message in one cycle. If the next cycle has no frame of this message, the
+    #: frame belongs to the next cycle and arrived before the SYNC of that cycle. Otherwise, the frame is a surplus frame.
     doubtful: dict[int, int] = field(default_factory=dict)
 
 

@@ -65,11 +65,11 @@ class Project:
         return value
 
     def text(self, rule: str, name: str) -> str:
-        """Return a threshold that is a name, e.g. of a signal."""
+        """Return a parameter of a rule that is a name, such as the name of a signal."""
         return str(self.threshold(rule, name))
 
     def names(self, rule: str, name: str) -> tuple[str, ...]:
-        """Return a threshold that is a list of names."""
+        """Return a parameter of a rule that is a list of names."""
         value = self.threshold(rule, name)
         assert isinstance(value, tuple)
         return value
