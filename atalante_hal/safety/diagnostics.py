@@ -111,7 +111,12 @@ class Dtc(StrEnum):
         _S.ERROR,
         "the load on the feet contradicts ground and posture",
     )
-    TORQUE_DIRECTION = "TORQUE_DIRECTION", _R.LOWER, _S.ERROR, "a joint moves against its torque, or does not follow it"
+    TORQUE_DIRECTION = (
+        "TORQUE_DIRECTION",
+        _R.LOWER,
+        _S.ERROR,
+        "a joint moves against its torque or not at all, or its encoder is that of the other leg",
+    )
     TORQUE_TRACKING = "TORQUE_TRACKING", _R.LOWER, _S.ERROR, "a drive reports a torque that differs from its command"
     TORQUE_MOTION = "TORQUE_MOTION", _R.LOWER, _S.ERROR, "the motion of a joint contradicts the torque that was sent"
     HOLD_UNSTABLE = "HOLD_UNSTABLE", _R.LOWER, _S.ERROR, "a drive holds its position, but does not hold its joint"
