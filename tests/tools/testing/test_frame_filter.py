@@ -113,6 +113,14 @@ def test_delayed_frames_that_do_not_fit_into_the_receive_buffer_arrive_later(end
     assert [ends.filter.receive(new_frames(2)) for _ in range(6)] == [2, 2, 2, 2, 1, 0]
 
 
+def test_full_receive_buffer_keeps_the_delayed_frames(ends: BusEnds):
+    ends.filter.delay("*_STATE", 1, frames=1)
+    ends.cycle()
+    ends.filter.send(ends.hal.seal())
+    counts = [ends.filter.receive(new_frames(room)) for room in (0, 2, 2)]
+    assert counts == [0, 2, 1]
+
+
 def test_delayed_command_arrives_the_given_cycles_later(ends: BusEnds):
     ends.filter.delay("COMMAND_LEFT_LEG", 2, frames=1)
     assert [ends.cycle()[0].count("COMMAND_LEFT_LEG") for _ in range(4)] == [0, 1, 2, 1]

@@ -220,7 +220,7 @@ class FrameFilter(WrappedBus):
                 arriving.append(frame)
         self.faults = [fault for fault in self.faults if not fault.over]
         delayed[:0] = [(self._cycle, frame) for frame in arriving[room:]]
-        return np.concatenate(arriving[:room]) if arriving else frames[:0]
+        return np.concatenate([frames[:0], *arriving[:room]])
 
     def _hits(self, fault: Fault, frame_id: int) -> bool:
         so_far = fault.hits.get(frame_id, 0)
