@@ -140,12 +140,13 @@ class Errors:
         return self._active[node].get(code, False)
 
     def clear(self, node: int) -> None:
-        """Remove all errors of a node that restarts. The node does not report this removal.
+        """Remove all errors and warnings of a node that restarts. The node does not report this removal.
 
         Args:
             node: index of the node.
         """
         self._active[node] = {}
+        self._warnings = {warning: age for warning, age in self._warnings.items() if warning[0] != node}
 
     def warn(self, node: int, code: int) -> None:
         """Report a warning, unless the same warning was reported a short time ago. A warning is an error without a reaction.

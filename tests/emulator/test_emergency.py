@@ -147,6 +147,17 @@ class TestWarnings:
         errors.acknowledge(0)
         assert [e.code for e in sent] == [0x8250, 0x8110]
 
+    def test_warning_of_a_node_that_restarts_is_forgotten(self, errors: Errors, sent: list[Emergency]) -> None:
+        for node in (0, 1):
+            errors.warn(node, 0x8110)
+        errors.clear(0)
+        errors.begin(0, 0x4310)
+        assert sent[2:] == [Emergency("LEFT", register_of([0x4310]), 0x4310)]
+        errors.acknowledge(0)
+        errors.advance()
+        errors.advance()
+        assert sent[3:] == [Emergency("LEFT", 0, 0), Emergency("RIGHT", 0, 0)]
+
     def test_end_of_a_warning_does_not_end_an_error(self, errors: Errors, sent: list[Emergency]) -> None:
         errors.warn(0, 0x8110)
         errors.begin(0, 0x8250)
