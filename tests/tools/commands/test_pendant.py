@@ -669,6 +669,24 @@ def test_duration_includes_the_time_without_a_hal(world: World, returns: float) 
     assert 2.5 < world.now - begun < 3.2 + 2.0 * pendant_session.HAL_TIMEOUT
 
 
+def test_duration_includes_the_time_without_a_hal_that_vanished_after_the_takeover(world: World) -> None:
+    world.sending()
+    world.run(100)
+    operator = world.session()
+    operator.take_over()
+    assert operator.node.answered
+    world.running, begun = False, world.now
+
+    class Returns(Keyboard):
+        def lines(self) -> list[str]:
+            world.running = world.now - begun > 2.0
+            return []
+
+    operator._keyboard = Returns(None)
+    operator.run(3.0)
+    assert 2.5 < world.now - begun < 3.2
+
+
 def test_a_start_without_effect_is_reported(world: World, capsys: pytest.CaptureFixture[str]) -> None:
     operator = world.session()
     operator.take_over()

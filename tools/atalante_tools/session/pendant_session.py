@@ -131,7 +131,8 @@ class Session:
             Failed: If another pendant does not stop sending.
         """
         node = self.node
-        self._begun = self._now()
+        self._begun = self._synced_at = self._now()
+        self._hal_found = node.answered > 0  # during a takeover, the node has already answered SYNCs
         while not self.stop.wanted and (seconds is None or self._elapsed() < seconds):
             if node.poll(POLL_TIMEOUT):
                 self._react_to_sync()
