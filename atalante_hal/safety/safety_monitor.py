@@ -129,9 +129,9 @@ class SafetyMonitor:
         self._joint_rows = np.array(rows_of(image.codec, JOINT_MESSAGES))
         self.torque_tracking = TorqueTracking(robot.breakaway)
         self.torque_motion: TorqueMotion | None = None
-        self._not_holding: set[str] = (
-            set()
-        )  # DBC names of the drives that did not hold their joints since the last START
+        #: DBC names of the drives that stay off until a test of the directions is passed: drives that did not hold their joints,
+        #: and drives whose joints failed the test.
+        self._kept_off: set[str] = set()
         #: False if the next cycle must be evaluated. If True, `evaluate` skips the next cycle, provided that its data is new,
         #: there is no fault, and the values of pendant and drives are unchanged.
         self._steady = False
@@ -183,7 +183,7 @@ class SafetyMonitor:
     def _check_joints(self) -> tuple[Finding, ...]:
         """Check the drive torques if the robot moves. Check the held joints if it does not. Return the faults.
 
-        A drive that does not hold its joint stays off until the next START, which tests the directions of all joints.
+        A drive that does not hold its joint stays off until a START in which the test of the joint directions is passed.
         """
         state = self._state
         if self.moving:
@@ -193,7 +193,7 @@ class SafetyMonitor:
         else:
             self._held.age[:] = state.age[self._joint_rows]
             found = self._hold_stability.check(self._held, self._limiter.limit)
-            self._not_holding.update(finding.node for finding in found)
+            self._kept_off.update(finding.node for finding in found)
         return found
 
     def accept(self, frames: Frames) -> list[int]:
@@ -384,9 +384,6 @@ class SafetyMonitor:
             self._acknowledged = True
             if not self.start_wanted:  # another press of START during a start does not restart the direction test
                 self._proof_begun = False
-                if state.supervisor in (_S.READY, _S.HOLD):  # in LOWER and FAULT, START does not enable any drive
-                    self.proof.failed.clear()
-                    self._not_holding.clear()
             self.start_wanted = ENABLE_CYCLES if state.supervisor in _STARTABLE else 0
         elif self.start_wanted:
             self.start_wanted -= 1
@@ -424,12 +421,14 @@ class SafetyMonitor:
             proof.begin(state.position, self._limiter.last)
         elif proof.running:
             if failure := proof.evaluate(state.position, state.foot_force[..., 2].sum(axis=1)):
+                self._kept_off.update(DRIVE_NODES[joint] for joint in proof.failed)
                 for joint in proof.failed:
                     finding = Finding(Dtc.TORQUE_DIRECTION, DRIVE_NODES[joint], proof.mobility[joint], True, failure)
                     self.memory.raise_finding(state.cycle, finding)
                     self._reports.append(finding)
                 return Refusal("START_FAILED", "error", failure)
             if not proof.running:
+                self._kept_off.clear()
                 state.delay = proof.late
                 self.memory.events.append(Event(state.cycle, "DIRECTIONS_PROVEN", proof.report()))
         return None
@@ -515,11 +514,11 @@ class SafetyMonitor:
     def _update_lowered(self) -> None:
         """Update the set `lowered`: in LOWER and FAULT, add each drive with a confirmed diagnostic whose reaction is LOWER.
 
-        In all other states, `lowered` contains the drives of two kinds of joints: joints that failed in the last test of the
-        directions, and joints that their drives did not hold since the last START.
+        In all other states, `lowered` contains the drives in `_kept_off`. A START enables these drives only until it ends: if it
+        ends before the test is passed, the drives are switched off again.
         """
         if self._state.supervisor in (_S.LOWER, _S.FAULT):
             lower = frozenset(dtc for dtc in self.memory.confirmed if dtc.reaction is Reaction.LOWER)
             self.lowered.update(node for node in self.memory.nodes_of(lower) if node in DRIVE_NODES)
         else:
-            self.lowered = {DRIVE_NODES[joint] for joint in self.proof.failed} | self._not_holding
+            self.lowered = set(self._kept_off)

@@ -87,6 +87,28 @@ def test_stop_during_the_test_ends_it_in_the_same_cycle(make_rig, stop: str):
     assert not rig.hal._safety_monitor.proof.proven.any()
 
 
+@pytest.mark.parametrize("joint", [KNEE, 5], ids=["left_SK", "left_HA"])
+def test_drive_that_failed_the_test_stays_off_if_the_next_start_is_stopped(make_rig, joint: int):
+    rig = make_rig(starts=False)
+    rig.emulator.drives.motors.set_strength(joint, -1.0)
+    rig.until(S.READY)
+    rig.operator.start()
+    rig.run(160)
+    assert "START_FAILED" in rig.codes()
+    rig.operator.start()
+    while not rig.hal._safety_monitor.proof.running:
+        rig.run(1)
+    rig.run(3)
+    rig.operator.stop()
+    anchor = rig.emulator.body.position[joint]
+    rig.run(5)
+    assert rig.hal.state.drive_state[joint] == D.SWITCH_ON_DISABLED
+    assert abs(rig.emulator.body.position[joint] - anchor) < TRAVEL
+    rig.run(200)
+    assert rig.hal.state.supervisor is S.READY
+    assert not rig.events_of("OVERSPEED", "HOLD_UNSTABLE")
+
+
 def test_further_presses_of_start_do_not_restart_the_test(make_rig):
     rig = make_rig(starts=False)
     rig.until(S.READY)
