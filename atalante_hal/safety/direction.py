@@ -243,9 +243,12 @@ class DirectionProof:
             excess = self._kp * np.abs(travel - np.roll(travel, len(LEG_JOINTS)))
             joint = int(far[np.argmax(excess[far])])
             self._fail(far.tolist())
-            moved, most = (f"{math.degrees(angle):.1f} deg" for angle in (travel[joint], TRAVEL))
+            farthest = int(np.argmax(travel))
+            moved, largest, most = (f"{math.degrees(angle):.1f} deg" for angle in (travel[joint], travel.max(), TRAVEL))
+            other = "" if farthest == joint else f", and {JOINTS[farthest]} moved by {largest}"
             return (
-                f"{JOINTS[joint]} moved by {moved} in the test of its direction; each joint may move by at most {most}"
+                f"{JOINTS[joint]} moved by {moved} in the test of its direction{other}; "
+                f"each joint may move by at most {most}"
             )
         joints, duration = self._tests[0]
         if len(self._position) <= duration + LATENCY:

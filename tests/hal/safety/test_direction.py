@@ -397,5 +397,6 @@ def test_large_motion_names_the_joint_that_its_pose_control_holds_most_strongly(
     moved[[0, 2, 5, 8]] += 0.9 * TRAVEL, 0.6 * TRAVEL, 1.1 * TRAVEL, 0.6 * TRAVEL
     failure = joints.proof.evaluate(moved, NO_FORCE)
     motion = f"moved by {0.9 * 1.5:.1f} deg in the test of its direction"
-    assert failure == f"left_FH {motion}; each joint may move by at most 1.5 deg"
+    other = f"{JOINTS[5]} moved by {1.1 * 1.5:.1f} deg"
+    assert failure == f"left_FH {motion}, and {other}; each joint may move by at most 1.5 deg"
     assert joints.proof.failed == [0, 2, 5, 8]
