@@ -129,8 +129,8 @@ class SafetyMonitor:
         self._joint_rows = np.array(rows_of(image.codec, JOINT_MESSAGES))
         self.torque_tracking = TorqueTracking(robot.breakaway)
         self.torque_motion: TorqueMotion | None = None
-        #: DBC names of the drives that stay off until a test of the directions is passed: drives that did not hold their joints,
-        #: and drives whose joints failed the test.
+        #: DBC names of the drives that stay off until a test of the directions is passed: drives with a wrong torque, drives that
+        #: did not hold their joints, and drives whose joints failed the test.
         self._kept_off: set[str] = set()
         #: False if the next cycle must be evaluated. If True, `evaluate` skips the next cycle, provided that its data is new,
         #: there is no fault, and the values of pendant and drives are unchanged.
@@ -183,7 +183,8 @@ class SafetyMonitor:
     def _check_joints(self) -> tuple[Finding, ...]:
         """Check the drive torques if the robot moves. Check the held joints if it does not. Return the faults.
 
-        A drive that does not hold its joint stays off until a START in which the test of the joint directions is passed.
+        A drive with a wrong torque, or one that does not hold its joint, stays off until a START in which the test of the joint
+        directions is passed.
         """
         state = self._state
         if self.moving:
@@ -193,7 +194,7 @@ class SafetyMonitor:
         else:
             self._held.age[:] = state.age[self._joint_rows]
             found = self._hold_stability.check(self._held, self._limiter.limit)
-            self._kept_off.update(finding.node for finding in found)
+        self._kept_off.update(finding.node for finding in found)
         return found
 
     def accept(self, frames: Frames) -> list[int]:

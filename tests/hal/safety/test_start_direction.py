@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 
 from atalante_hal.robot import JOINTS, load_robot
+from atalante_hal.safety.diagnostics import Dtc, Finding
 from atalante_hal.safety.direction import (
     GROUPS,
     LATENCY,
     TRAVEL,
 )
+from atalante_hal.safety.safety_monitor import DRIVE_NODES
 from atalante_hal.types import SupervisorState
 from atalante_hal.wire.cia402 import Controlword, DriveState
 
@@ -106,6 +110,36 @@ def test_drive_that_failed_the_test_stays_off_if_the_next_start_is_stopped(make_
     assert abs(rig.emulator.body.position[joint] - anchor) < TRAVEL
     rig.run(200)
     assert rig.hal.state.supervisor is S.READY
+    assert not rig.events_of("OVERSPEED", "HOLD_UNSTABLE")
+
+
+@pytest.mark.parametrize("check", ["torque_tracking", "torque_motion"])
+def test_drive_with_a_wrong_torque_stays_off_if_the_next_start_is_stopped(rig, monkeypatch, check: str):
+    rig.until(S.ACTIVE)
+    rig.run(100)
+    rig.emulator.drives.motors.set_strength(KNEE, -1.0)
+    monitor = rig.hal._safety_monitor
+    dtc = Dtc(check.upper())
+    with monkeypatch.context() as patch:
+        finding = Finding(dtc, DRIVE_NODES[KNEE], 0.0, True, "wrong torque")
+        checks = SimpleNamespace(check=lambda *_: (finding,), restart=lambda: None)
+        patch.setattr(monitor, check, checks)
+        rig.until(S.LOWER, 5)
+    rig.run(1500)
+    rig.operator.start()
+    rig.until(S.HOLD, 5)
+    rig.run(100)
+    rig.operator.start()
+    while not monitor.proof.running:
+        rig.run(1)
+    rig.run(3)
+    rig.operator.stop()
+    anchor = rig.emulator.body.position[KNEE]
+    rig.run(5)
+    assert rig.hal.state.drive_state[KNEE] == D.SWITCH_ON_DISABLED
+    assert abs(rig.emulator.body.position[KNEE] - anchor) < TRAVEL
+    rig.run(200)
+    assert rig.hal.state.supervisor is S.HOLD
     assert not rig.events_of("OVERSPEED", "HOLD_UNSTABLE")
 
 
