@@ -193,6 +193,7 @@ class DirectionProof:
         self._trials = [0] * len(JOINTS)
         self.failed = []
         self.proven[:] = False
+        self.mobility[:] = 0.0
         self._explained[:] = 0.0
         self._tests = [
             ([j for j in range(len(JOINTS)) if LEG_JOINTS[j % len(LEG_JOINTS)] in names], duration)

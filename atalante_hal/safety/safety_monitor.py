@@ -454,6 +454,7 @@ class SafetyMonitor:
             missing=self.missing(),
             drive_state=state.drive_state,
             torque=state.torque,
+            velocity=state.velocity,
         )
 
     def _end_start(self, ended: Refusal) -> None:

@@ -24,6 +24,8 @@ from atalante_hal.wire.cia402 import Controlword, DriveState, controlword_toward
 ENABLE_CYCLES = 200
 #: A start ends if no drive changes its state for this time [cycles]. A command and its answer may each be lost four times.
 STALLED_CYCLES = 10
+#: In HOLD, a START is refused while a joint is faster than this [rad/s]. The test of the joint directions needs joints at rest.
+AT_REST = 0.3
 #: Prefix of the event text for a refused START.
 REFUSED = "START refused: "
 #: Last words of the reason for FINISH_STEP and for the HOLD after it, if the operator ends a walk on the ground.
@@ -65,6 +67,7 @@ class StartRequest(NamedTuple):
     missing: Collection[str]  # DBC names of the nodes that make `nodes_ready` False
     drive_state: Vector  # (12,) values of `DriveState`
     torque: Vector  # (12,) Nm, torque reported by each drive
+    velocity: Vector  # (12,) rad/s, velocity of each joint
 
 
 class Refusal(NamedTuple):
@@ -87,6 +90,8 @@ def refusal(robot: Robot, request: StartRequest) -> Refusal | None:
     """
     if request.pressed:
         reason = _stop_reason(request) or (request.diagnostic if request.supervisor is _S.OFF else "")
+        if not reason and request.supervisor is _S.HOLD:
+            reason = moving_joint(request.velocity)
     else:
         reason = _reason(request)
         if not reason and (text := _failure(request)):
@@ -194,6 +199,20 @@ def entry_text(state: SupervisorState, missing: Collection[str], stop_requested:
             return stop_text(stop_requested) + WALK_ENDS
         case _:
             return "the operator acknowledged the fault with START"
+
+
+def moving_joint(velocity: Vector) -> str:
+    """Return a sentence about the fastest joint if it is not at rest; empty if all joints are at rest.
+
+    Args:
+        velocity: joint velocities, shape (12,) [rad/s].
+    """
+    speed = np.abs(velocity)
+    joint = int(np.nanargmax(speed)) if np.isfinite(speed).any() else 0
+    if not speed[joint] > AT_REST:
+        return ""
+    moving, most = np.degrees(speed[joint]), np.degrees(AT_REST)
+    return f"{JOINTS[joint]} still moves at {moving:.0f} deg/s; must be at most {most:.0f} deg/s"
 
 
 def stop_text(stop_requested: bool) -> str:

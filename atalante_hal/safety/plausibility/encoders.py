@@ -7,9 +7,8 @@ rejected values in a row, the loss of the encoder's reference is confirmed. The 
 back to the expected position, or when its drive has restarted (see `reference`). The expected position includes the
 motion since the jump.
 
-*Exchange.* If the encoders of a joint are exchanged between the legs, both jump, each to the expected position of the other
-one. A drive that holds its joint with the encoder of the other leg moves its joint away, so both drives must be switched
-off.
+*Exchange.* If the encoders of a joint are exchanged between the legs, both jump, each to the position of the other one. A
+drive that holds its joint with the encoder of the other leg moves its joint away, so both drives must be switched off.
 
 *Overspeed.* A larger change is real motion and not a jump if two conditions hold (`continues`). First, the encoder
 already moved in the same direction at more than half of top_speed in the cycle before. Second, the velocity grew by at
@@ -296,9 +295,11 @@ class EncoderChecks:
         pair = joint, (joint + len(LEG_JOINTS)) % len(JOINTS)
         if min(self.jumps[one] for one in pair) < JUMPS_TO_CONFIRM:
             return False
-        ours, theirs = (self._lost[one] for one in pair)
+        # `Lost.expected` follows the motion since the jump, so the differences are the sizes of the jumps.
+        ours, theirs = (self._lost[one].last - self._lost[one].expected for one in pair)
+        apart = float(self._before.position[pair[1]] - self._before.position[pair[0]])
         reach = JUMPS_TO_CONFIRM * float(self._travel[joint]) + float(self._noise[joint])
-        return abs(ours.last - theirs.expected) <= reach and abs(theirs.last - ours.expected) <= reach
+        return abs(ours - apart) <= reach and abs(theirs + apart) <= reach
 
     def _exchange(self, joint: int) -> Finding:
         other = JOINTS[(joint + len(LEG_JOINTS)) % len(JOINTS)]

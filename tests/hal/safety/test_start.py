@@ -9,7 +9,16 @@ import pytest
 
 from atalante_hal.robot import JOINTS, load_robot
 from atalante_hal.safety.diagnostics import Dtc
-from atalante_hal.safety.start import REFUSED, StartRequest, entry_text, implausible_torque, powered, refusal
+from atalante_hal.safety.start import (
+    AT_REST,
+    REFUSED,
+    Refusal,
+    StartRequest,
+    entry_text,
+    implausible_torque,
+    powered,
+    refusal,
+)
 from atalante_hal.types import SupervisorState
 from atalante_hal.wire.cia402 import Controlword, DriveState
 
@@ -64,6 +73,7 @@ ENABLING = StartRequest(
     missing=(),
     drive_state=np.full(12, float(D.SWITCH_ON_DISABLED)),
     torque=np.zeros(12),
+    velocity=np.zeros(12),
 )
 PRESSED = ENABLING._replace(pressed=True, cycles_left=200)
 ILL = {"diagnostic": "an encoder is stuck"}
@@ -366,3 +376,22 @@ def test_start_refused_by_a_diagnostic_enables_no_drive(make_rig):
         rig.run(1)
         assert Controlword.ENABLE_OPERATION not in rig.controlwords()
     assert rig.hal.state.supervisor is not S.ACTIVE
+
+
+@pytest.mark.parametrize("state", [S.READY, S.HOLD])
+@pytest.mark.parametrize("joint", [0, 3, 11])
+@pytest.mark.parametrize("sign", [-1.0, 1.0])
+def test_start_in_hold_is_refused_while_a_joint_moves(state: SupervisorState, joint: int, sign: float):
+    velocity = np.full(12, np.nan)
+    velocity[joint] = sign * AT_REST
+    request = PRESSED._replace(supervisor=state, velocity=velocity)
+    assert refusal(ROBOT, request) is None
+    velocity[joint] = sign * 1.0
+    refused = refusal(ROBOT, request)
+    text = f"{REFUSED}{JOINTS[joint]} still moves at 57 deg/s; must be at most 17 deg/s"
+    assert refused == (Refusal("START_REFUSED", "warning", text) if state is S.HOLD else None)
+    assert refusal(ROBOT, request._replace(pressed=False, cycles_left=100)) is None  # the test moves the joints
+
+
+def test_unknown_velocities_do_not_refuse_a_start():
+    assert refusal(ROBOT, PRESSED._replace(supervisor=S.HOLD, velocity=np.full(12, np.nan))) is None

@@ -167,6 +167,27 @@ def test_restart_from_hold_tests_all_joints_again(rig, held: int):
     assert rig.hal._safety_monitor.proof.proven.all()
 
 
+@pytest.mark.parametrize("held", [1, 5, 10, 15, 20, 40])
+def test_start_in_hold_switches_off_no_drive_although_a_joint_moves(rig, held: int):
+    rig.until(S.ACTIVE)
+    torque = np.zeros(12)
+    torque[JOINTS.index("left_SH")] = -60.0
+    for _ in range(60):
+        rig.cycle(torque)
+    rig.operator.hold()
+    rig.until(S.HOLD)
+    assert np.abs(rig.hal.state.velocity).max() > 1.0
+    rig.run(held)
+    rig.operator.start()
+    rig.run(150)
+    assert not {"START_FAILED", "LOWER"} & set(rig.codes())
+    if "START_REFUSED" in rig.codes():
+        assert rig.hal.state.supervisor is S.HOLD
+        rig.operator.start()
+        rig.until(S.ACTIVE, 150)
+    assert rig.hal.state.supervisor is S.ACTIVE
+
+
 def test_motor_that_is_reversed_in_hold_prevents_the_restart(rig):
     rig.until(S.ACTIVE)
     rig.operator.hold()

@@ -297,6 +297,15 @@ class TestEncoderJump:
         assert [f.dtc for f in found].count(Dtc.ENC_JUMP) == 2
         assert [f.dtc for f in found].count(Dtc.TORQUE_DIRECTION) == exchanged
 
+    @pytest.mark.parametrize("speed", [-0.95, -0.3, 0.3, 0.95])
+    def test_exchange_is_found_while_the_legs_move_fast_in_opposite_directions(self, speed: float):
+        robot, moved = Pair(3), speed * ROBOT.top_speed[3] * PERIOD
+        left, right = robot.positions
+        for cycle in range(1, 20):
+            left, right = left + moved, right - moved
+            found = robot.readings(*((left, right) if cycle < 5 else (right, left)))
+            assert [f.dtc for f in found].count(Dtc.TORQUE_DIRECTION) == 2 * (cycle >= 9)
+
     def test_one_encoder_that_jumps_to_the_position_of_the_other_leg_is_no_exchange(self):
         robot = Pair(3)
         for _ in range(6):
