@@ -514,13 +514,12 @@ class SafetyMonitor:
             state.assistance_factor = target
 
     def _update_lowered(self) -> None:
-        """Update the set `lowered`: in LOWER and FAULT, add each drive with a confirmed diagnostic whose reaction is LOWER.
+        """Update the set `lowered` with the drives that have a confirmed diagnostic whose reaction is LOWER.
 
-        In all other states, `lowered` contains the drives in `_kept_off`. A START enables these drives only until it ends: if it
-        ends before the test is passed, the drives are switched off again.
+        In LOWER and FAULT, drives are only added. In all other states, `lowered` also contains the drives in `_kept_off`. A START
+        enables these drives only until it ends: if it ends before the test is passed, the drives are switched off again.
         """
-        if self._state.supervisor in (_S.LOWER, _S.FAULT):
-            lower = frozenset(dtc for dtc in self.memory.confirmed if dtc.reaction is Reaction.LOWER)
-            self.lowered.update(node for node in self.memory.nodes_of(lower) if node in DRIVE_NODES)
-        else:
-            self.lowered = set(self._kept_off)
+        lower = frozenset(dtc for dtc in self.memory.confirmed if dtc.reaction is Reaction.LOWER)
+        off = {node for node in self.memory.nodes_of(lower) if node in DRIVE_NODES} if lower else set()
+        kept = self.lowered if self._state.supervisor in (_S.LOWER, _S.FAULT) else self._kept_off
+        self.lowered = kept | off

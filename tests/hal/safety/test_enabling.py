@@ -193,3 +193,19 @@ def test_feet_that_touch_the_floor_lightly_do_not_prevent_the_start():
         assert started.hal.state.supervisor is S.ACTIVE, started.hal.reason
         (proven,) = [event.text for event in started.hal.events if event.code == "DIRECTIONS_PROVEN"]
         assert "not tested under load: left_SA" in proven
+
+
+@pytest.mark.parametrize("cycle", [100, 140])
+@pytest.mark.parametrize("joint", ["SH", "SK", "SA"])
+def test_encoders_that_are_exchanged_during_a_start_switch_both_drives_off(cycle: int, joint: str):
+    fault = Fault("encoder_swapped", f"LEFT_{joint}", cycle, other=f"RIGHT_{joint}")
+    with robot(None, fault, pose=[*POSE[:6], 0.1, 0.1, -0.4, 0.4, 0.1, 0.1]) as started:
+        started.until(S.READY)
+        assert started.hal.state.cycle < cycle
+        moved = started.start(400)
+        pair = [JOINTS.index(f"{side}_{joint}") for side in ("left", "right")]
+        assert not {D.OPERATION_ENABLED, D.QUICK_STOP_ACTIVE} & set(started.drives.signals.state[pair].tolist())
+        (refused,) = [event.text for event in started.hal.events if event.code == "START_REFUSED"]
+        assert f"the encoder of left_{joint} reads the position of right_{joint}" in refused
+        assert np.abs(started.body.velocity).max() < ROBOT.velocity_max.min()
+        assert moved[pair].max() < np.radians(20.0)
