@@ -24,7 +24,8 @@ from atalante_hal.wire.cia402 import Controlword, DriveState, controlword_toward
 ENABLE_CYCLES = 200
 #: A start ends if no drive changes its state for this time [cycles]. A command and its answer may each be lost four times.
 STALLED_CYCLES = 10
-#: In HOLD, a START is refused while a joint is faster than this [rad/s]. The test of the joint directions needs joints at rest.
+#: In HOLD, a START is refused while a joint is faster than this although its drive is on [rad/s]: the test of the joint directions
+#: needs joints at rest. A joint whose drive is off may sink, because the START first lets this drive hold its joint.
 AT_REST = 0.3
 #: Prefix of the event text for a refused START.
 REFUSED = "START refused: "
@@ -91,7 +92,7 @@ def refusal(robot: Robot, request: StartRequest) -> Refusal | None:
     if request.pressed:
         reason = _stop_reason(request) or (request.diagnostic if request.supervisor is _S.OFF else "")
         if not reason and request.supervisor is _S.HOLD:
-            reason = moving_joint(request.velocity)
+            reason = moving_joint(request.velocity, powered(request.drive_state))
     else:
         reason = _reason(request)
         if not reason and (text := _failure(request)):
@@ -201,15 +202,16 @@ def entry_text(state: SupervisorState, missing: Collection[str], stop_requested:
             return "the operator acknowledged the fault with START"
 
 
-def moving_joint(velocity: Vector) -> str:
-    """Return a sentence about the fastest joint if it is not at rest; empty if all joints are at rest.
+def moving_joint(velocity: Vector, on: npt.NDArray[np.bool_]) -> str:
+    """Return a sentence about the fastest joint whose drive is on; empty if all these joints are at rest.
 
     Args:
         velocity: joint velocities, shape (12,) [rad/s].
+        on: whether the drive of each joint is on, shape (12,).
     """
-    speed = np.abs(velocity)
-    joint = int(np.nanargmax(speed)) if np.isfinite(speed).any() else 0
-    if not speed[joint] > AT_REST:
+    speed = np.where(on & np.isfinite(velocity), np.abs(velocity), 0.0)
+    joint = int(np.argmax(speed))
+    if speed[joint] <= AT_REST:
         return ""
     moving, most = np.degrees(speed[joint]), np.degrees(AT_REST)
     return f"{JOINTS[joint]} still moves at {moving:.0f} deg/s; must be at most {most:.0f} deg/s"

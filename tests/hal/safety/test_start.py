@@ -384,14 +384,25 @@ def test_start_refused_by_a_diagnostic_enables_no_drive(make_rig):
 def test_start_in_hold_is_refused_while_a_joint_moves(state: SupervisorState, joint: int, sign: float):
     velocity = np.full(12, np.nan)
     velocity[joint] = sign * AT_REST
-    request = PRESSED._replace(supervisor=state, velocity=velocity)
+    holding = np.full(12, float(D.QUICK_STOP_ACTIVE))
+    request = PRESSED._replace(supervisor=state, velocity=velocity, drive_state=holding)
     assert refusal(ROBOT, request) is None
     velocity[joint] = sign * 1.0
     refused = refusal(ROBOT, request)
     text = f"{REFUSED}{JOINTS[joint]} still moves at 57 deg/s; must be at most 17 deg/s"
     assert refused == (Refusal("START_REFUSED", "warning", text) if state is S.HOLD else None)
     assert refusal(ROBOT, request._replace(pressed=False, cycles_left=100)) is None  # the test moves the joints
+    holding[joint] = D.SWITCH_ON_DISABLED
+    assert refusal(ROBOT, request) is None  # the joint sinks, because its drive is off
 
 
 def test_unknown_velocities_do_not_refuse_a_start():
-    assert refusal(ROBOT, PRESSED._replace(supervisor=S.HOLD, velocity=np.full(12, np.nan))) is None
+    assert (
+        refusal(
+            ROBOT,
+            PRESSED._replace(
+                supervisor=S.HOLD, velocity=np.full(12, np.nan), drive_state=np.full(12, float(D.QUICK_STOP_ACTIVE))
+            ),
+        )
+        is None
+    )
