@@ -24,8 +24,8 @@ from atalante_hal.wire.cia402 import Controlword, DriveState, controlword_toward
 ENABLE_CYCLES = 200
 #: A start ends if no drive changes its state for this time [cycles]. A command and its answer may each be lost four times.
 STALLED_CYCLES = 10
-#: In HOLD, a START is refused while a joint is faster than this although its drive is on [rad/s]: the test of the joint directions
-#: needs joints at rest. A joint whose drive is off may sink, because the START first lets this drive hold its joint.
+#: In HOLD, a START is refused while a joint whose drive is on is faster than this [rad/s], because the test of the joint
+#: directions needs joints at rest. A joint whose drive is off may sink, because the START first lets this drive hold its joint.
 AT_REST = 0.3
 #: Prefix of the event text for a refused START.
 REFUSED = "START refused: "
