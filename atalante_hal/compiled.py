@@ -58,7 +58,7 @@ def compiled(function: Function) -> Function:
 
 
 def interpreted(_function: Callable[..., Any]) -> bool:
-    """Return whether a function runs as plain Python, because NUMBA_DISABLE_JIT is set."""
+    """Return whether NUMBA_DISABLE_JIT is set, so that each function runs as plain Python."""
     return os.environ.get("NUMBA_DISABLE_JIT", "0") not in ("", "0")
 
 

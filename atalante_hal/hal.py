@@ -110,7 +110,8 @@ class Hal:
         #: Names of the messages, in the order of the elements of `State.valid` and `State.age`.
         self.messages = tuple(m.name for m in fast)
         parts = self._parts = Record(ReceiveImage(fast).codec, controller_fields)
-        #: All values of this cycle in one contiguous vector. `layout` gives the name and the slice of each field.
+        #: `record` has all values of this cycle in one contiguous vector. `layout` gives the name and the slice of each field.
+        #: `controller_record` is the part of `record` with the fields of the controller.
         self.record, self.layout, self.controller_record = parts.values, parts.layout, parts.controller
         self._header = parts.header
         self._header[3] = assistance_factor
@@ -168,7 +169,7 @@ class Hal:
         return state
 
     def _apply(self, verdict: Verdict) -> None:
-        """Apply the safety monitor's verdict on this cycle: set the drive commands and the header of the record.
+        """Apply the safety monitor's verdict on this cycle: set HalState, MaxTorque and the header of the record.
 
         Args:
             verdict: Verdict of the current cycle.
@@ -215,6 +216,9 @@ class Hal:
     def hold(self) -> Vector:
         """Send HOLD. During a start, send the next CiA 402 controlword on the path to OPERATION ENABLED instead.
 
+        A drive in `SafetyMonitor.lowered` is switched off instead, and its brake lets the joint sink slowly. If START is pressed
+        to acknowledge faults, each drive in FAULT is reset.
+
         Returns:
             Torques that were sent, shape (12,) [Nm], valid until the next call.
         """
@@ -247,12 +251,13 @@ class Hal:
         return self._send_command()
 
     def _follow_drives(self) -> None:
-        """Set the start value of the rate limit to the torques that the drives report.
+        """Set the torque commands to the torques that the drives report, or to 0 while any drive is off.
 
         While any drive is off, the commands are 0: a drive that is off produces no torque, and a drive that holds its
         position ignores its command. As soon as all drives produce torque, the command of each drive is the torque that
-        the drive reports. So no joint sags before the controller's first torque. The first call of a start, and every
-        call while a drive is off, apply only the torque limit. All other calls apply all limits.
+        the drive reports. So no joint sags before the controller's first torque. In the first call of a start, and in every call
+        while a drive is off, the reported torques are the start value of the rate limit, and only the torque limit applies to
+        them. In all other calls, all limits of the limiter apply.
         """
         on = powered(self.state.drive_state)
         torque = np.where(on, self.state.torque, 0.0)

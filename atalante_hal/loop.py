@@ -42,7 +42,7 @@ class Clock(Protocol):
 
 
 class LockStep:
-    """Clock for lock-step: a cycle begins as soon as the nodes have answered the SYNC of the last cycle."""
+    """Clock for lock-step: a cycle begins as soon as the nodes have answered the SYNC of the previous cycle."""
 
     def wait(self) -> float:
         """Return a lateness of 0 s without waiting."""

@@ -81,7 +81,7 @@ class Pendant:
         self.started = False
         #: Assistance factor Xi in [0, 1]; None if the pendant sets no factor.
         self.assistance_factor: float | None = None
-        self._press: float | None = None  # RequestCounter of the last cycle
+        self._press: float | None = None  # RequestCounter of the last evaluated frame; None if there is none
         self._pressed = False  # True while a START is stored, because the pendant is not qualified yet
 
     def evaluate(

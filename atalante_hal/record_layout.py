@@ -62,7 +62,7 @@ class Layout:
         return cls((name, length) for name, length in json.loads(text))
 
 
-#: Number of bits in the field "diagnostics". A number of the record represents 53 bits exactly.
+#: Number of bits in the field "diagnostics". A value of the record (float64) represents integers of up to 53 bits exactly.
 LOW_BITS = 48
 
 

@@ -90,7 +90,7 @@ class Thresholds:
     full_assist_ramp: float  # s, time for the ramp of the assistance factor from 0 to 1 in FULL_ASSIST
     #: Largest accepted angle [rad] outside a position limit. A joint beyond this angle is out of range.
     position_tolerance: float
-    #: Largest torque that a drive may report while it is off [Nm]. A drive that is on may exceed its limit by this torque.
+    #: Largest torque that a drive may report while it is off [Nm]. A drive that is on may exceed `torque_max` by this torque.
     idle_torque: float
     surplus_frames: float  # largest number of frames in a cycle in addition to one frame of each cyclic message
 

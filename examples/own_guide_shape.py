@@ -3,7 +3,7 @@
 Run it:  python examples/own_guide_shape.py
 
 Prints whether the guide is certified for the assistance factor 0.5, and the largest ratio |e| / q_bound during two steps in the
-air. e is the tracking error, and q_bound is the distance from the desired trajectory to the guide. If the ratio is
+air. e is the tracking error, and q_bound is the distance from the desired trajectory to the bound of the guide. If the ratio is
 below 1, hip and knee of the swing leg stayed inside the guide.
 """
 

@@ -34,7 +34,7 @@ class BusDown(BusError):  # noqa: N818
 
 
 class BusFull(BusError):  # noqa: N818
-    """Error of a full transmit queue: only the first `sent` frames of the batch were accepted."""
+    """Error of a full transmit queue: only `sent` frames of the batch were accepted, on each channel the first ones."""
 
     def __init__(self, message: str, sent: int = 0) -> None:
         super().__init__(message)

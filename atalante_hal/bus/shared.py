@@ -32,7 +32,7 @@ from atalante_hal.wire.frame import FRAME_BYTES, Frames
 
 #: Indices of the counters of each bus end: sent frames, received frames, requested calls of `step`, completed calls of `step`.
 _SENT, _RECEIVED, _REQUESTED, _COMPLETED = range(4)
-#: Indices of the flags of each bus end. `_SERVING` is 1 while the end serves. `_SLEEPING` is 1 while the end sleeps.
+#: Indices of the flags of each bus end. `_SERVING` is 1 after the end has called `serve`. `_SLEEPING` is 1 while the end sleeps.
 #: `_CLOSED` is 1 after the end is closed.
 _SERVING, _SLEEPING, _CLOSED = range(4, 7)
 #: Number of 64-bit header words of each bus end: one cache line.
@@ -40,7 +40,7 @@ _END_WORDS = 8
 _HEADER_BYTES = mmap.PAGESIZE
 #: A waiting bus end polls for this time [s] before it sleeps. The time is longer than the computing time of a cycle.
 _POLL_TIME = 500e-6
-#: If a bus end finds no frame by polling, it does not poll in the next waits. This is the number of these waits.
+#: If a bus end had to sleep, because polling was not sufficient, it does not poll in this number of further waits.
 _WAITS_WITHOUT_POLLING = 32
 #: Longest sleep of a waiting bus end before it reads the shared memory again [ms].
 #: A sleep must be limited, because a wake-up byte may arrive before the new value in the shared memory is visible.

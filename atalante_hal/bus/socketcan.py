@@ -292,7 +292,7 @@ class SocketCanBus:
         if code != LINK_DOWN and code not in LINK_REMOVED:
             return None
         self._drop_queued()
-        # An interface goes down before it is removed. `_drop_queued` may have dropped the error message about the removal.
+        # An interface goes down before it is removed. `_drop_queued` may have dropped the error code of the removal.
         # A removed interface is therefore detected by its socket, which the kernel unbinds.
         if code == LINK_DOWN and self._is_bound():
             return BusDown(f"{self.name} is down: type `ip link set {self.name} up`")
@@ -405,7 +405,7 @@ def _bound_socket(channel: str, receive_buffer: int) -> socket.socket:
 
 
 def _headers(frames: Frames, control: Frames | None) -> tuple[Frames, Frames]:
-    """Create one `iovec` and one `mmsghdr` for each frame. The caller must keep both arrays."""
+    """Create one `iovec` and one `mmsghdr` for each frame. The kernel reads both arrays, so the caller must keep them."""
     index = np.arange(len(frames), dtype=np.uint64)
     vectors = np.zeros(len(frames), IOVEC)
     vectors["base"] = _address(frames) + index * FRAME_BYTES

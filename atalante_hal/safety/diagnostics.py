@@ -21,8 +21,8 @@ class Reaction(IntEnum):
     FULL_ASSIST = 2  # ramp the assistance factor to 1
     FINISH_STEP = 3  # finish the walking step, then HOLD
     HOLD = 4  # all drives hold their positions
-    LOWER = 5  # lower the affected joint slowly; all other drives hold their positions
-    FAULT = 6  # latched until the operator acknowledges the fault
+    LOWER = 5  # switch off the affected drive, so that its joint sinks slowly; all other drives hold their positions
+    FAULT = 6  # the drives hold their positions until the operator acknowledges the fault
 
 
 class Severity(StrEnum):

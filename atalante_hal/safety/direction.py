@@ -106,7 +106,7 @@ def pose_gains(robot: Robot) -> tuple[Vector, Vector]:
 
 
 def mobilities_of(torque: Vector, position: Vector) -> tuple[Vector, Vector]:
-    """Return the mobility (inverse of the effective inertia) of each joint, for each delay in `LATENCIES`.
+    """Return the mobility (inverse of the effective inertia) and the explained motion of each joint, for all `LATENCIES`.
 
     A wrong delay makes the mobility of a light joint several times too small.
 
@@ -172,7 +172,8 @@ class DirectionProof:
         # A test of one or two joints uses the delay `late` from earlier tests with more joints. If such a test chose its own
         # delay, a reversed motor might look like a late motor.
         self.late = 0
-        #: For each delay in `LATENCIES`: share of the motion that the delay explains, summed over the joints that passed a test.
+        #: Share of the motion that each delay in `LATENCIES` explains, summed over the joints that passed a test with a short
+        #: pulse.
         self._explained = np.zeros(len(LATENCIES))
         self._position: list[Vector] = []  # joint positions in each cycle of the current test
         self._force: list[Vector] = []  # vertical force of each foot in each cycle of the current test

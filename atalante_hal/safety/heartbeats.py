@@ -78,11 +78,11 @@ class Heartbeats:
         #: active emergencies, the entry is the newest of the emergencies with the most severe reaction.
         self.emergencies: dict[str, tuple[Dtc, int]] = {}
         self._cleared: set[str] = set()  # nodes whose emergency was cleared in this cycle
-        #: Emergencies since the last `evaluate` that are only reported as pending, as (node, diagnostic, error code): emergencies
-        #: with the reaction INFO, and emergencies with a milder reaction than the active emergency of the node.
+        #: Emergencies since the last `evaluate` that cause no reaction and are reported as pending: node, diagnostic, error code.
+        #: The reaction of such an emergency is INFO, or is milder than the reaction of the node's active emergency.
         #: `_notices` also contains an entry with error code 0 for each frame of an error passive node.
         self._notices: list[tuple[str, Dtc, int]] = []
-        self._reset: set[str] = set()  # nodes that restarted since the last `evaluate`
+        self._reset: set[str] = set()  # nodes that were not OPERATIONAL since the last `evaluate`
         #: Row of the process image -> counter that detects two senders of this message, from 0 to `FULL`.
         self._evidence: defaultdict[int, int] = defaultdict(int)
         #: Nodes that sent a boot-up message. The safety monitor empties this set after each use.

@@ -42,8 +42,8 @@ OVERLOADED: Final = 20
 #: Smallest distance from the position in which the hold began [rad]. A drive that only reports a wrong torque still holds its
 #: joint in this position.
 AWAY: Final = math.radians(1.0)
-#: A joint moves back if its speed towards `Loads.start` exceeds this value [rad/s]. A joint slows down if its speed away from
-#: `Loads.start` has decreased by more than this value. The noise of the velocities is smaller.
+#: The overload count of a joint restarts if the speed towards `Loads.start` exceeds this value [rad/s], or if the speed away from
+#: `Loads.start` has decreased by more than this value since the count began. The noise of the velocities is smaller.
 SLOWER: Final = 0.05
 #: The overload check skips a joint in each cycle in which the values of the joint are older than this [cycles].
 AGE: Final = 4

@@ -66,7 +66,8 @@ class History(NamedTuple):
     accel: Vector  # (SPAN, 3) m/s2, specific force at the pelvis IMU
     gyro: Vector  # (SPAN, 3) rad/s, angular velocity of the pelvis IMU
     force: Vector  # (SPAN, 2, 4, 3) N, force on each cell of each foot
-    #: (3,) number of consecutive cycles in which the values of the pelvis IMU, the left foot and the right foot did not change
+    #: (3,) number of consecutive cycles without a change of the specific force at the pelvis IMU, of the forces on the left foot,
+    #: and of the forces on the right foot
     repeats: Cycles
     #: (3,) number of consecutive cycles in which `repeats` was at most `REPEATED`, in the same order
     good: Cycles
@@ -82,7 +83,7 @@ class Torques(NamedTuple):
     load: Vector  # (4, 3) N, mean force on each cell of the foot
     rotation: Vector  # (6, 3, 3) rotation matrix from each link to its parent
     force: Vector  # (6, 3) N, force on each link from its parent
-    moment: Vector  # (6, 3) Nm, moment about the origin of the link
+    moment: Vector  # (6, 3) Nm, moment on each link from its parent, about the origin of the link
 
 
 def make_history() -> History:

@@ -120,7 +120,8 @@ class MessageMonitor:
         #: True for each row with new, intact, trusted and plausible data, shape (rows,).
         self.valid: npt.NDArray[np.bool_] = np.zeros(len(messages), np.bool_)
         self.joints_valid = False
-        #: True if all rows are trusted and all leaky buckets are empty. A cycle with new data in all rows then changes nothing.
+        #: True if all rows have new data and are trusted, and all counters and leaky buckets are 0. Then a further cycle with
+        #: new data in all rows changes nothing.
         self.settled = False
 
     @property

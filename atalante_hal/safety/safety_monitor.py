@@ -62,7 +62,7 @@ class Verdict(NamedTuple):
     assistance_factor: float  # Xi in [0, 1]
     torque_limit: Vector  # (12,) Nm, torque limit of the drives in this cycle; the limiter owns the array
     diagnostics: int  # bit set of the active diagnostics, see `diagnostics.dtcs_of`
-    acknowledged: bool  # True if the operator pressed START and thereby acknowledged a bus-off
+    acknowledged: bool  # True if the operator pressed START in this cycle, which also acknowledges a bus-off
 
 
 class SafetyMonitor:
@@ -77,7 +77,7 @@ class SafetyMonitor:
             processed.
         enabling: True while drives are being enabled. In this time, the limiter follows the torques that the drives report.
         recalled: cycle in which QUICK_STOP was last sent to a drive in OPERATION ENABLED.
-        proof: test of the directions of all joints, which must be over before the state becomes ACTIVE.
+        proof: test of the directions of all joints, which must be over before the state changes from READY or HOLD to ACTIVE.
         torque_tracking: comparison of the reported torques with the sent torques while the robot moves.
         torque_motion: comparison of the motion with the sent torques while the robot moves; None without a model of the legs.
         lowered: DBC names of the drives that cannot hold and are being lowered.
@@ -517,7 +517,8 @@ class SafetyMonitor:
         """Update the set `lowered` with the drives that have a confirmed diagnostic whose reaction is LOWER.
 
         In LOWER and FAULT, drives are only added. In all other states, `lowered` also contains the drives in `_kept_off`. A START
-        enables these drives only until it ends: if it ends before the test is passed, the drives are switched off again.
+        enables the drives in `_kept_off`, too. If the START ends before the test of the joint directions is passed, these drives
+        are switched off again.
         """
         lower = frozenset(dtc for dtc in self.memory.confirmed if dtc.reaction is Reaction.LOWER)
         off = {node for node in self.memory.nodes_of(lower) if node in DRIVE_NODES} if lower else set()

@@ -114,7 +114,7 @@ def _reason(request: StartRequest) -> str:
 
 
 def _failure(request: StartRequest) -> str:
-    """Return why the start failed, and name the drives that caused it. Return an empty text if the start may continue."""
+    """Return why the start failed, with the names of the drives that delay it, or an empty text if the start may continue."""
     if not request.cycles_left:
         within = f"within {ENABLE_CYCLES} cycles"
     elif request.supervisor in _ENABLING and request.stalled >= STALLED_CYCLES:

@@ -1,8 +1,8 @@
 """Check that the motion of each joint agrees with the torque that the HAL sends: `LegModel, motion -> findings`.
 
-A drive whose current sensor or motor is wrong may report the commanded torque although its motor produces another one:
-reversed, none, too little or too much. The reported torque then agrees with the command (`torque_tracking`), but the
-motion does not. The module `leg_torques` computes the torque that each motor produced from the motion.
+A drive with a faulty current sensor or motor may report the commanded torque although its motor produces a reversed torque, no
+torque, or a torque that is too low or too high. The reported torque then agrees with the command (`torque_tracking`), but the
+motion does not. From the motion, the module `leg_torques` computes the torque that each motor produced.
 
 *External torque.* A push on a joint, or a muscle of the patient, moves the joint like a wrong motor torque. But an external
 torque does not depend on the command. While the produced torque e deviates from the sent torque t, the check compares two
@@ -15,8 +15,9 @@ A drive is reported if the mean square error of the first explanation is more th
 one. So the check needs a torque that changes. After a fault, the controller changes the torque of the joint within a few cycles.
 An external torque that opposes each change of the torque, such as an obstacle that stops the joint, looks like a dead motor.
 
-*Changes.* The values at the start of a deviation are averages over the time before and after it (`leg_torques.SPAN`), so they are
-left out. The same applies while a deviation falls, because an external torque may be ending.
+*Changes.* Sent and computed torques are averages over `leg_torques.SPAN` cycles. At the start of a deviation, these averages also
+contain cycles before the deviation, so the first torques are left out. The torques are also left out while a deviation decreases,
+because an external torque may then be ending.
 
 *Isolation.* A wrong motor torque changes only the computed torque of its own joint, because the motion of all joints is
 measured. A wrong encoder, IMU or force cell, or a load on the leg that the force cells do not measure, changes several computed
@@ -77,7 +78,7 @@ class Tolerances(NamedTuple):
 
     error: Vector  # Nm rms, error of the produced torque
     low: Vector  # rad, position below which a joint is at its lower end stop
-    high: Vector  # rad
+    high: Vector  # rad, position above which a joint is at its upper end stop
 
 
 class Deviations(NamedTuple):
@@ -90,7 +91,7 @@ class Deviations(NamedTuple):
     pause: npt.NDArray[np.int64]  # (12,) number of checks since the last deviation
     largest: Vector  # (12,) Nm, largest deviation
     found: npt.NDArray[np.int64]  # (12,) number of consecutive checks whose result is a faulty motor
-    share: Vector  # (12,) share of the sent torque that the motor produced in the last check
+    share: Vector  # (12,) share s computed in the last check whose result was a faulty motor
 
 
 class Memory(NamedTuple):

@@ -1,8 +1,8 @@
 """Check that each drive produces the torque that the HAL sends: `torques sent, torques reported -> findings`.
 
-A drive that stays in OPERATION ENABLED may still produce another torque: a power stage that is off, exchanged phases, or a
-wrong current. If the drive measures its torque correctly, the reported torque shows the fault. The drive state does not
-show the fault.
+A drive that stays in OPERATION ENABLED may still produce a wrong torque, for example because its power stage is off, its phases
+are exchanged, or its current is wrong. If the drive measures its torque correctly, the reported torque shows the fault. The drive
+state does not show the fault.
 
 *Range.* A drive follows a command within two milliseconds. If commands are lost, the drive repeats the last command for up to
 four cycles. The frame of the drive may be late by four cycles. So a reported torque must lie in the range of the torques sent in

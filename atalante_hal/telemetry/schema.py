@@ -25,7 +25,7 @@ def _pool() -> Any:
 
 @cache
 def descriptor_set() -> bytes:
-    """Return the serialised FileDescriptorSet with its imports, which is the schema of the MCAP channels."""
+    """Return the serialised FileDescriptorSet of `messages.proto` and its imports: the schema of the MCAP channels."""
     return DESCRIPTORS.read_bytes()
 
 

@@ -54,7 +54,8 @@ class Service:
         sinks: Each sink for messages, with the number of cycles from one message of a stream to the next.
         loop_every: Number of cycles from one message of loop statistics to the next.
         can_log: Writer of the CAN log; None without a CAN log.
-        recorder: The element of `sinks` that writes the recording; the header of the ring reports how many records are saved.
+        recorder: Element of `sinks` that writes the recording; None without a recording. The service writes the number of saved
+            records to the header of the ring of cycle records.
     """
 
     def __init__(

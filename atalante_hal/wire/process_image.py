@@ -67,7 +67,7 @@ _FOREIGN = -1
 NEVER = 1 << 30
 #: Lowest age at which an answer to a SYNC is rejected as replayed [cycles].
 LATEST = 16
-#: Half a counter period. A counter at least this far ahead of the expected counter marks an old frame.
+#: Half a counter period. A frame is old if its counter is at least this far ahead of the last accepted counter.
 #: After a gap of this number of cycles, a counter does not show whether a frame is old.
 _HALF_TURN = 128
 
@@ -83,7 +83,7 @@ class E2EState(NamedTuple):
     spans: Words  # (rows, 3) begin and end of the payload [bytes] and Data ID, see `e2e.protected_spans`
     expected: Words  # (rows,) expected counter of the next frame; `NOTHING` before the first frame
     silent: Words  # (rows,) cycles since the last change of the expected counter
-    kept: Octets  # (rows * 72,) last frame with correct format, CRC and sequence
+    kept: Octets  # (rows * 72,) last frame with correct format and CRC whose counter was accepted, see `classify_frame`
 
 
 class RowStatus(NamedTuple):
@@ -127,7 +127,7 @@ class ReceiveImage:
         #: Rows whose sender is error passive according to a frame of this cycle. The frame may be damaged.
         self.error_passive: list[int] = []
         self._restarts = restarts
-        #: For each row, the last frame with correct format, CRC and sequence, shape (rows,).
+        #: For each row, the last frame with correct format and CRC whose counter was accepted, see `classify_frame`.
         self.frames = self.codec.template()
         self._e2e = E2EState(
             headers=as_words(self.frames)[:, 0].astype(np.int64),
@@ -144,7 +144,7 @@ class ReceiveImage:
         self._age_before: npt.NDArray[np.int64] = self.age.copy()
         #: True if every row was committed with the expected frame in the last `accept` (a perfect cycle).
         self.all_fresh = self._was_fresh = False
-        #: Frames given to the last `accept_each`, with the row and `Check` of each frame.
+        #: Frames given to the last `accept_each`, with the row and `Check` of each frame. None after a perfect cycle.
         self._offered: tuple[Frames, Words] | None = None
         self._ordered = _Received(new_frames(count), count)
         self._received = self._ordered
@@ -446,7 +446,8 @@ def row_of(header: int, headers: Words) -> int:
 def classify_frame(words: Words, row: int, offset: int, e2e: E2EState, tag: int, restarts: bool) -> int:
     """Check format, CRC and counter of a frame.
 
-    If the counter is accepted, the expected counter is updated and the frame is stored in `kept`.
+    If the counter is accepted, the expected counter is updated and the frame is stored in `kept`. A counter that jumped forward
+    is also accepted: the result is WRONG_SEQUENCE, but the next frame continues from this counter.
 
     Args:
         words: received frames as a flat array of 64-bit words.
@@ -470,7 +471,7 @@ def classify_frame(words: Words, row: int, offset: int, e2e: E2EState, tag: int,
     counter = int(octets[begin + COUNTER_BYTE])
     in_time = tag == _NO_TAG or tag - counter & 0xFF < LATEST
     # After a gap of at least half a counter period, the counter does not show whether a frame is new or old.
-    # After a long gap, a frame counts as new if it answers one of the last `LATEST` SYNCs.
+    # After such a gap, the counter of a frame is accepted if the frame answers one of the last `LATEST` SYNCs.
     back = tag != _NO_TAG and in_time and expected[row] != NOTHING and silent[row] >= _HALF_TURN
     result = classify_counter(expected[row], counter)
     if back and result == _REPEATED:

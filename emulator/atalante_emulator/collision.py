@@ -15,7 +15,7 @@ from atalante_hal.wire.frame import Frames
 class Senders:
     """Detector of two senders of one message.
 
-    The emulator runs the detector only in cycles with missing, rejected or extra frames.
+    The emulator runs the detector only in cycles with missing, rejected, late or extra frames.
     """
 
     def __init__(self, message: Message) -> None:

@@ -1,4 +1,4 @@
-"""Crane of an emulated robot: suspends the robot above the floor until the drives are enabled, then lowers it onto its feet.
+"""Crane of an emulated robot: suspends the robot above the floor, and lowers it onto its feet after the time `DELAY` in ACTIVE.
 
 The sling is a spring between the hook and the pelvis. The sling pulls upwards only. While the sling is under tension, the crane
 also keeps the pelvis upright and holds its horizontal position and heading constant. These forces and moments grow in
@@ -16,8 +16,9 @@ from atalante_hal.types import PERIOD, SupervisorState, Vector
 
 #: Speed of the hook [m/s].
 SPEED: Final = 0.1
-#: Time in ACTIVE after which the crane lowers the robot [s]. In this time, the walking controller moves the legs to the standing
-#: pose. If the feet stood on the floor during this motion, friction would keep the wrong distance between the feet.
+#: Time in ACTIVE or FULL_ASSIST after which the crane lowers the robot [s]. In this time, the walking controller moves the legs
+#: to the standing pose. If the feet stood on the floor during this motion, friction would keep the wrong distance between the
+#: feet.
 DELAY: Final = 2.0
 #: Stiffness and damping of the sling, both per kg of the robot. The weight of the robot stretches the sling by 25 mm.
 STIFFNESS: Final = 400.0  # N/m per kg

@@ -6,12 +6,12 @@ the HAL. `drive` computes the torques of the next millisecond.
 The drives are the last safety layer. They react to errors without the HAL, in one of two ways:
 
 - Local hold. Causes: the last valid command is `WATCHDOG` cycles old, no SYNC for `WATCHDOG` cycles, two senders of one
-  command, low supply voltage. The drive stays in QUICK STOP ACTIVE until the HAL acknowledges the hold, and the motor
-  holds the present position of the drive's own encoder. If the encoder jumps during the hold, the setpoint jumps by the
-  same angle, so the joint does not move.
-- Lowering. Causes: over-temperature, over-current, encoder error. The drive cannot hold the joint. The drive enters FAULT
-  REACTION ACTIVE and then FAULT. The power stage is off, and the brake lets the joint sink slowly. The same brake acts in every
-  drive whose power stage is off, so the HAL can lower a joint with DISABLE_VOLTAGE.
+  command, supply voltage below `hold_below`. The drive stays in QUICK STOP ACTIVE until the HAL acknowledges the hold. The
+  motor holds the joint at the position that the drive's own encoder measured at the start of the hold. If the encoder jumps
+  during the hold, the setpoint jumps by the same angle, so the joint does not move.
+- Lowering. Causes: over-temperature, over-current, encoder error, supply voltage below `off_below`. The drive cannot hold the
+  joint. The drive enters FAULT REACTION ACTIVE and then FAULT. The power stage is off, and the brake lets the joint sink
+  slowly. The same brake acts in every drive whose power stage is off, so the HAL can lower a joint with DISABLE_VOLTAGE.
 """
 
 from __future__ import annotations
@@ -52,10 +52,10 @@ class DriveParameters:
     cool_enough: float = 100.0  # highest winding temperature at which an over-temperature error can end [degC]
     supply: float = 48.0  # nominal supply voltage [V]
     hold_below: float = 40.0  # supply voltage below which a drive starts its local hold [V]
-    #: Highest plausible joint speed, computed from two encoder samples [rad/s]. A higher speed is an encoder error.
+    #: Joint speed, computed from two encoder samples, above which the local hold assumes that the encoder jumped [rad/s].
     jump_speed: float = 20.0
     off_below: float = 20.0  # lowest supply voltage at which the power stage works [V]
-    rest_speed: float = 0.05  # joint speed below which the controlled lowering of a leg ends [rad/s]
+    rest_speed: float = 0.05  # joint speed below which the lowering of a joint ends [rad/s]
 
 
 class DriveSignals(NamedTuple):

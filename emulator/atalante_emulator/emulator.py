@@ -280,7 +280,8 @@ class Emulator:
             count: number of frames already in the scratch buffer.
 
         Returns:
-            Number of frames in the scratch buffer; 0 if there is no SYNC yet. Then the frames are kept for the next call.
+            Number of frames in the scratch buffer; 0 if there is no SYNC yet. In this case the frames
+            are kept for the next call.
         """
         ids = self._scratch["can_id"]
         deadline = None
@@ -506,7 +507,10 @@ class Emulator:
                 alone_from += PERIOD
 
     def idle(self) -> None:
-        """Run one millisecond without a HAL. Enabled drives start their local hold, and the nodes send only slow messages."""
+        """Run one millisecond without a HAL. Enabled drives start their local hold.
+
+        The nodes send only slow messages and emergencies.
+        """
         for leg in range(len(SIDES)):
             self.drives.hold(leg, LIFE_GUARD)
         self.run_without_sync()

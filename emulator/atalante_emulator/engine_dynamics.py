@@ -37,7 +37,8 @@ class EngineDynamics(Closing):
         self._client = pybullet.connect(pybullet.DIRECT)
         try:
             self._body = load_urdf(urdf, self._client)
-            self._free = load_urdf(urdf, self._client, fixed=False)  # a fixed base would have mass 0
+            # The link masses are read from a body with a free base, because PyBullet sets the mass of a fixed base to 0.
+            self._free = load_urdf(urdf, self._client, fixed=False)
         except ValueError:
             self.close()
             raise

@@ -214,9 +214,10 @@ _EFFECTS: Final[dict[str, Callable[[_Disturbance, Frames, Message, int], Sequenc
 class FaultyBus(WrappedBus):
     """Bus of the emulated nodes with injected communication faults.
 
-    Delayed frames, and frames that a fault adds, are sent when the SYNC of their cycle arrives. The nodes receive these frames
-    before the frames of the HAL. The HAL receives these frames before the answers of the nodes. Added frames reach
-    both the HAL and the nodes, except error frames, which reach only the HAL.
+    Delayed frames, and frames that a fault adds, are sent when the SYNC of their cycle arrives. A delayed frame of the HAL
+    reaches the nodes, and a delayed frame of a node reaches the HAL. Added frames reach both the HAL and the nodes, except
+    error frames, which reach only the HAL. The nodes receive delayed and added frames before the other frames of the HAL. The
+    HAL receives delayed and added frames before the answers of the nodes.
     """
 
     def __init__(

@@ -62,7 +62,7 @@ class Commands(click.Group):
         """Run the command, and replace known errors by `Failed`.
 
         Raises:
-            Failed: If the command line is invalid, or the command raised a known error. Its message is one sentence.
+            Failed: If the command line is invalid, or the command raised a known error. The message of `Failed` is one sentence.
         """
         try:
             return super().invoke(ctx)

@@ -10,7 +10,7 @@ motion since the jump.
 *Exchange.* If the encoders of a joint are exchanged between the legs, both jump, each to the position of the other one. A
 drive that holds its joint with the encoder of the other leg moves its joint away, so both drives must be switched off.
 
-*Overspeed.* A larger change is real motion and not a jump if two conditions hold (`continues`). First, the encoder
+*Overspeed.* A change above the limit of the jump check is real motion if two conditions hold (`continues`). First, the encoder
 already moved in the same direction at more than half of top_speed in the cycle before. Second, the velocity grew by at
 most top_speed. A value that meets both conditions is used, so that the encoder keeps its reference. After
 `OVERSPEED_TO_CONFIRM` such values in a row, the overspeed is confirmed.
@@ -39,11 +39,11 @@ from atalante_hal.safety.plausibility.finding import JOINT_NODES, Cycles, Signal
 from atalante_hal.types import Vector
 from atalante_hal.wire.process_image import NEVER
 
-#: Number of consecutive jumps after which the diagnostic is confirmed.
+#: Number of consecutive rejected positions of an encoder after which ENC_JUMP is confirmed.
 JUMPS_TO_CONFIRM = 5
 #: Overspeed is confirmed after this number of consecutive values above the top speed. A single such value may be a small jump.
 OVERSPEED_TO_CONFIRM = 2
-#: Number of consecutive wrong velocities after which the diagnostic is raised.
+#: Number of consecutive wrong velocities of a drive after which ENC_VELOCITY is raised.
 VELOCITY_SAMPLES = 3
 _ALL = b"\1" * len(JOINTS)
 
@@ -123,7 +123,7 @@ class EncoderChecks:
     def follow(self) -> None:
         """Advance the low-pass of all joints by one cycle.
 
-        All joints must have good positions in this cycle and in the last one.
+        All joints must have good positions in this cycle and in the previous cycle.
         """
         self._low_pass(*self._motion)
 

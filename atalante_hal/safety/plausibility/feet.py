@@ -11,8 +11,9 @@ constant is detected earlier, by the module `stillness`.
 foot is on the ground, and a negative offset of all cells, as soon as the foot carries no load.
 
 *Contact.* Walking has no flight phase. So a robot that stood on the ground cannot swing both feet. The check is armed after
-both feet have carried load together for `STANDING_CYCLES`. A robot that hangs on a crane and is set down does not arm the check.
-The check is disarmed if the robot has been lifted for `LIFTED_CYCLES`. A lifted robot is in HOLD and requires a new START.
+both feet have carried load together for `STANDING_CYCLES`. A robot on a crane that touches the floor for a shorter time does
+not arm the check. The check is disarmed if the robot has been lifted for `LIFTED_CYCLES`. A lifted robot is in HOLD and requires
+a new START.
 """
 
 from __future__ import annotations

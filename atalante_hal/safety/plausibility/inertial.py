@@ -44,7 +44,7 @@ SAMPLES = 64
 #: The tibiae need more samples, because the drives are off before READY, and bent legs sink.
 FIRST_SAMPLES = (4, 4, 16, 16)
 GRAVITY = 9.81  # m/s2
-#: Largest mean difference between specific force and gravity [m/s2]. In walks and falls of a healthy robot it is up to 2.2 m/s2.
+#: Limit of the mean difference between specific force and gravity [m/s2]. A healthy robot reaches 2.2 m/s2 in walks and falls.
 _FORCE_ERROR = 3.0
 #: Each sample of the difference between specific force and gravity is clipped to this magnitude [m/s2].
 _FORCE_CLIP = 5.0
@@ -77,7 +77,7 @@ class Record(NamedTuple):
     samples: Vector
     force: Vector  # (4, 3) mean difference between specific force and gravity, in world axes [m/s2]
     #: Mean square of the difference of two measurements of one angular velocity, shape (5, 3) [rad2/s2].
-    #: Rows: gyroscope and attitude of each IMU (4), torso and pelvis (1).
+    #: Rows: gyroscope against change of attitude of each IMU (4), gyroscope of the torso against gyroscope of the pelvis (1).
     rate_error: Vector
     rate: Vector  # (5, 3) mean square of the angular velocity [rad2/s2], with the rows of `rate_error`
     tilt: Vector  # (3,) mean difference of the upward directions of torso and pelvis
@@ -175,7 +175,7 @@ def follow(
             add(imu, now, record, period * (interval + record.age[imu] - age[imu]))
         elif imu in (_TORSO, _PELVIS):
             comparable = False
-        if age[imu] >= NEVER:  # another check has found a fault of this IMU
+        if age[imu] >= NEVER:  # the values are too old: another check reports this IMU
             record.force[imu] = 0.0
             record.rate_error[imu] = 0.0
             if imu in (_TORSO, _PELVIS):
@@ -218,7 +218,7 @@ def add(imu: int, now: Readings, record: Record, time: float) -> None:
 
 
 def compare(now: Readings, record: Record) -> None:
-    """Add a sample to the running averages with which torso and pelvis are compared.
+    """Add a sample to the means with which torso and pelvis are compared.
 
     Args:
         now: readings of the sample.
@@ -244,7 +244,7 @@ def count(record: Record, row: int) -> float:
 
 
 def add_rates(record: Record, row: int, axis: int, share: float, rates: tuple[float, float]) -> None:
-    """Update the means of a row with two measurements of the same angular velocity about one axis [rad/s]."""
+    """Add two measurements of the same angular velocity about one axis [rad/s] to the means of a row."""
     first, second = rates
     record.rate_error[row, axis] += share * ((first - second) ** 2 - record.rate_error[row, axis])
     record.rate[row, axis] += share * (first**2 - record.rate[row, axis])

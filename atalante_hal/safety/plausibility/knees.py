@@ -1,15 +1,17 @@
 """Knee checks, which compare the knee encoders with the accelerometers of pelvis and tibiae.
 
-The attitude of a tibia depends only on the sum of SH and SK. So the module `legs` does not detect a drift of SK with an opposite
-drift of SH. Such drifts turn the computed thigh, so they change the computed position of the tibia IMU. The difference of the
-accelerometers of tibia and pelvis, in world axes, is the second derivative of the true position `r` of the tibia IMU relative to
-the pelvis IMU. Gravity cancels. An error `e` of the knee angle changes the computed position by `lever * e`:
+The sagittal hip SH and the sagittal knee SK affect the attitude of the tibia only by their sum. So the module `legs` does not
+detect a drift of SK with an opposite drift of SH. Such drifts turn the computed thigh, so they change the computed position `r`
+of the tibia IMU relative to the pelvis IMU. An error `e` of the knee angle changes `r` by `lever * e`, so the true position is
+`r - lever * e`. The difference of the accelerometers of tibia and pelvis, in world axes, is the second derivative of the true
+position, because gravity cancels:
 
     difference of the accelerometers = second derivative of (r - lever * e), with lever = derivative of r with respect to SK
 
-Integration and a high-pass of third order give both sides as positions in metres, without the constant errors of accelerometers
-and attitudes. A regression over about a second explains their difference by two unknowns: the error of the knee angle, and the
-difference of the segment lengths from their mean value `SEGMENT`, because both segments are adjusted to the patient.
+Integration and a high-pass of third order give the measured position (from the accelerometers) and the computed position in
+metres, without the constant errors of accelerometers and attitudes. A regression over about a second explains the difference of
+the two positions by two unknowns: the error of the knee angle, and the deviation of the segment lengths from their mean value
+`SEGMENT`, because both segments are adjusted to the patient.
 
 The check needs a thigh that turns, so it cannot decide while the robot stands. It decides in each walk, also in the air. If the
 error of the knee angle explains only a small part of the difference, the cause is not the encoder, but for example a faulty
@@ -39,17 +41,17 @@ FRONTAL_HIP = 0.089
 #: Position (x, y) of joint TH of the left leg relative to joint FH, in the axes of the frontal hip [m].
 #: Joint SH has the position (-x, 0) relative to joint TH, in the axes of the transverse hip.
 TRANSVERSE_HIP = (-0.135, 0.169)
-#: Position of the left tibia IMU in the axes of the tibia [m]. The origin of x is joint SK, of y joint SH, and of z joint SA.
+#: Position of the left tibia IMU in the axes of the tibia [m]: x relative to joint SK, y to joint SH, and z to joint SA.
 TIBIA_IMU = (-0.13, -0.069, 0.018)
 #: Time constant of the integration and of the high-pass [s].
 _FILTER_TIME = 0.15
-#: Time constant of the mean values [s].
+#: Time constant of the mean values `Filters.moments` [s].
 _MEAN_TIME = 0.75
-#: Time after the start in which the filters settle, before the mean values begin [s].
+#: Time that the filters need to settle after the start [s]. `Filters.moments` is updated only after this time.
 _SETTLING_TIME = 2.0
-#: The lever is the derivative of the position of the tibia IMU with respect to SK. The error of a knee angle is computed only if
-#: the root mean square of the filtered lever exceeds this value [m], without the part of the lever that an error of the segment
-#: length explains. In a walk, the root mean square is about 0.012 m.
+#: The lever is the derivative of the position of the tibia IMU with respect to SK. The part of the filtered lever that an error
+#: of the segment length explains is subtracted. The error of a knee angle is computed only if the root mean square of the rest
+#: exceeds this value [m]. In a walk, the root mean square is about 0.012 m.
 _LEAST_LEVER = 0.007
 #: An error of a knee angle is reported only if it explains more than this share of the mean square of the difference between the
 #: measured and the computed position. The part that an error of the segment length explains is subtracted before.
@@ -147,8 +149,8 @@ def follow(now: Readings, filters: Filters, error: Vector, limit: float, period:
     Args:
         now: signals of the cycle.
         filters: values of the filters. Updated here.
-        error: output for the error of each knee angle that exceeds the limit, otherwise 0, shape (2,) [rad]. It keeps its value
-            while the thigh does not turn.
+        error: output, shape (2,) [rad]: error of each knee angle if this error exceeds the limit, otherwise 0. An element keeps
+            its value while the thigh does not turn.
         limit: largest error of a knee angle [rad].
         period: cycle time [s].
 
@@ -215,8 +217,8 @@ def motion(leg: int, now: Readings) -> tuple[Vector3, Vector3, Vector3, Vector3]
     x, y = TRANSVERSE_HIP[0] * (1.0 - math.cos(th)), side * TRANSVERSE_HIP[1] - TRANSVERSE_HIP[0] * math.sin(th)
     y, z = y * math.cos(fh) + side * FRONTAL_HIP, y * math.sin(fh)
     hip = x - PELVIS_IMU[0], y - PELVIS_IMU[1], z - PELVIS_IMU[2]
-    # All in the axes of the tibia, in which the thigh is turned by -SK. (x, z) is the sum of the unit vectors along thigh and
-    # shank. `thigh` is the position of the tibia IMU relative to joint SH.
+    # The next vectors are in the axes of the tibia. In these axes, the thigh is turned by -SK. (x, z) is the sum of the unit
+    # vectors along thigh and shank. `thigh` is the position of the tibia IMU relative to joint SH.
     sine, cosine = math.sin(sk), math.cos(sk)
     x, z = sine, -1.0 - cosine
     thigh = SEGMENT * x + TIBIA_IMU[0], side * TIBIA_IMU[1], SEGMENT * z + TIBIA_IMU[2]

@@ -11,8 +11,8 @@ SA or HA is detected only on the ground, by the module `soles`. Opposite drifts 
 only while the leg moves, by the module `knees`. A drift of SH cannot be distinguished from a drift of SK. A drift of an
 IMU has the same effect as a drift of an encoder. The heading of an IMU without a fault also drifts without a limit. This
 heading drift affects only TH. The check of TH therefore subtracts an estimate of the heading drift. The estimate changes
-by at most `_HEADING_DRIFT` per sample. The estimate also follows a slower drift of the encoder of TH, so such a drift is
-not detected.
+by at most `_HEADING_DRIFT` per sample. If the encoder of TH drifts more slowly than this limit, the estimate follows this drift.
+So such a drift of the encoder of TH is not detected.
 
 *Standstill.* While the reading of an encoder is constant and its joint is at rest, the difference between encoders and
 IMUs about the axis of the joint is also constant. If the joint moves while its encoder is stuck, this difference changes by
@@ -94,7 +94,7 @@ class Legs:
         self._stuck: list[tuple[Finding, ...]] = [() for _ in SIDES]
 
     def check_left(self, ages: Ages | None) -> bool:
-        """Check the left leg. Also check the right leg if one of the right encoders has a constant reading.
+        """Check the left leg. If a right encoder has a constant reading, also run the standstill check of the right leg.
 
         Args:
             ages: ages of the sensor values; a leg with values that are too old is not compared. None if all values are of this
@@ -106,7 +106,7 @@ class Legs:
         return self._check(0, ages)
 
     def check_right(self, ages: Ages | None) -> bool:
-        """Check the right leg. Also check the left leg if one of the left encoders has a constant reading.
+        """Check the right leg. If a left encoder has a constant reading, also run the standstill check of the left leg.
 
         Args:
             ages: ages of the sensor values; a leg with values that are too old is not compared. None if all values are of this

@@ -6,8 +6,9 @@ vertical in the axes of the sole. The components of this direction in the plane 
 `sole_tilt` in `SOLE_SAMPLES` consecutive samples of a flat foot is an error of an ankle encoder or of the tibia IMU. The module
 `legs` compares the tibia IMU with other encoders.
 
-The larger component of the tilt names the joint: an error of SA tilts the sole about its lateral axis, and an error of HA about
-its longitudinal axis. The check assumes a level floor. A suspended robot cannot be checked, because its soles are free.
+The larger component of the tilt determines the reported joint: an error of SA tilts the sole about its lateral axis, and an error
+of HA about its longitudinal axis. The check assumes a level floor. A suspended robot cannot be checked, because its soles are
+free.
 """
 
 from __future__ import annotations

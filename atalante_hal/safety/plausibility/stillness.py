@@ -51,7 +51,8 @@ FROZEN_CYCLES = 100
 _TURN = 0.01
 #: Upper bound of the inertia about any joint [kg m2], including the knee of a leg that carries robot and patient.
 _INERTIA = 100.0
-#: A joint is at rest after this number of cycles with a constant reading. An unbalanced torque would have moved it.
+#: A joint is at rest after this number of cycles with a constant reading. Within this time, an unbalanced torque would have
+#: moved the joint.
 _AT_REST = 3
 #: When a joint has turned by this angle [rad], its encoder reading must have changed. The angle is 20 encoder counts.
 _DRIVEN = 1e-5
@@ -194,7 +195,7 @@ class Stillness:
         return newer[self._row_of]
 
     def _follow_shanks(self) -> None:
-        """Update the angles by which each shank turned since the encoder reading of its ankle last changed."""
+        """Update, for each ankle joint, the turn of its shank since the encoder reading of this ankle joint last changed."""
         on_ground = (self._now.force[:, :, 2].sum(axis=1) > self._loaded)[_FOOT_OF]
         self._turn += self._now.gyro[_SHANK_OF] * self._interval
         self._turn[~on_ground | (self.constant_samples[_ANKLES] <= 1)] = 0.0
@@ -271,7 +272,7 @@ def follow(readings: Readings, drive: Drive, breakaway: Vector, loaded: float, p
         readings: signals of the cycle.
         drive: record of all joints. Updated here.
         breakaway: change of torque that moves each joint, shape (12,) [Nm].
-        loaded: vertical force on a foot that is on the ground [N].
+        loaded: vertical force above which a foot is on the ground [N].
         period: cycle time [s].
 
     Returns:
@@ -295,7 +296,7 @@ def follow_one(joint: int, readings: Readings, drive: Drive, breakaway: float, l
         readings: signals of the cycle.
         drive: record of all joints. Updated here.
         breakaway: change of torque that moves the joint [Nm].
-        limits: vertical force on a foot that is on the ground [N], and time since the last values of the joint [s].
+        limits: vertical force above which a foot is on the ground [N], and time since the last values of the joint [s].
     """
     loaded, time = limits
     foot, held = _HELD_BY[joint], False

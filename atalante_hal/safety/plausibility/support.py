@@ -7,7 +7,7 @@ robot lifts this foot, and exchanged feet in the first swing.
 
 *Weight.* While both feet carry load, the robot moves slowly, so the leg towards which the robot leans carries more load than the
 other leg. If the other leg carries clearly more load for `WEIGHT_CYCLES`, the two feet are exchanged. The exchange is detected
-when the weight is first shifted, before the first step. Both feet are then on the ground, so the robot can hold.
+when the weight is first shifted, before the first step. Both feet are then on the ground, so the robot can stop in HOLD.
 
 The height of a foot above the other foot is computed with the mean length of thigh and shank. Legs of other lengths, the ankles
 and the attitude errors change the computed height by a small part of `_HEIGHT`.

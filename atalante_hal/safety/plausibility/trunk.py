@@ -9,8 +9,9 @@ integral of the difference of their accelerometers is the angular velocity times
 
 Both sides pass the same high-pass of second order, with the time constant `_FILTER_TIME`, because the integral of a constant
 error of an accelerometer has no limit. Centrifugal accelerations are neglected; they are small and of twice the frequency. The
-height is the mean product of both sides, divided by the mean square of the filtered angular velocity. If the IMUs are exchanged,
-the height is negative. The check needs an angular velocity above `_LEAST_RATE`, so it cannot decide while the pelvis is at rest.
+height is the mean product of the filtered integral and the filtered angular velocity, with the signs of these equations, divided
+by the mean square of the filtered angular velocity. If the IMUs are exchanged, the height is negative. The check needs an angular
+velocity above `_LEAST_RATE`, so it cannot decide while the pelvis is at rest.
 The angular velocity is the mean of both gyroscopes, so a gyroscope with a wrong sign does not lead to a wrong decision.
 """
 
@@ -73,7 +74,7 @@ class Trunk:
         self._found: tuple[Finding, ...] = ()
 
     def follow(self) -> bool:
-        """Update the motion of the trunk with the values of one cycle. Both IMUs must have new values.
+        """Update the filters and the finding by one cycle. Both IMUs must have new values.
 
         Returns:
             Whether the finding has changed.

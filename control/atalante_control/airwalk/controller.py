@@ -306,7 +306,8 @@ class AirwalkController:
     def _start_guide(self, xi: float, deviation: Deviation, joints: tuple[int, int]) -> None:
         """Start the guide of a step.
 
-        If the deviation at the start of the step is larger than the certificate assumes, count the step in the statistics.
+        If the deviation at the start of the step is larger than the certificate assumes, count the step in the statistics. Steps
+        before the end of the first right-stance step are not counted.
         """
         hip, knee = joints
         angles = float(deviation.angle[hip]), float(deviation.angle[knee])

@@ -96,8 +96,8 @@ class StartMotion:
     """Quintic trajectory from rest at the measured pose to the first pose and speed of the gait.
 
     Attributes:
-        cycles: duration in cycles. It is longer than the configured duration if a joint is so far from the first pose that
-            it would exceed `SPEED_SHARE` of its velocity limit.
+        cycles: duration in cycles. If the configured duration is so short that a joint would exceed `SPEED_SHARE` of its velocity
+            limit, the duration is longer than configured.
     """
 
     #: Largest speed with which a joint covers the distance to the first pose, as a share of its velocity limit.

@@ -21,7 +21,7 @@ class Telemetry:
     error: Annotated[Vector, 2]  # rad, q - q_des
     q_bound: Annotated[Vector, 2]  # rad, distance from q_des to the guide bound on the side of the error
     guide: Annotated[Vector, 2]  # rad, distances from q_des to upper and lower guide bound of the hip
-    #: h of the paper: at least 0 if the backup policy can keep both joints inside the guide; the same value for both joints
+    #: h of the paper, the same value for both joints. If h >= 0, the backup policy can keep both joints inside the guide.
     h: Annotated[Vector, 2]
     gate: Annotated[Vector, 2]  # weight of the backup torque, the same value for both joints; published as `lambda`
     filter_active: Annotated[Vector, 2]  # 1 while the guide filter is active, else 0; the same for both joints
@@ -77,8 +77,8 @@ def write_telemetry(
         errors: q - q_des of SH and SK of the swing leg [rad].
 
     Returns:
-        Three values: the q_bound [rad] of SH and SK, then the larger of their ratios |e| / q_bound, then whether the guide filter
-        is active.
+        Three values: `q_bound` of SH and SK [rad], then the larger of the ratios |e| / q_bound of SH and SK, then whether the
+        guide filter is active.
     """
     record, active = telemetry[0], guard.gate > step.active
     for i in range(len(record.q_des)):

@@ -4,7 +4,8 @@
 needs only numpy. The network is a perceptron with tanh layers. The weights of the last layer are constrained so that
 every gait satisfies c_7 = S c_0. Here c_0 and c_7 are the first and the last control points, and S swaps and mirrors
 the legs. The angles are therefore continuous at the stance change for every input, even if the fit is poor. The speeds
-are not exactly continuous: the error of the fit causes a jump of less than 0.02 rad/s at the stance change.
+are not exactly continuous: the fit keeps a part of the speed jump at the impact, and the fit error adds to this part. The sum
+is less than 0.02 rad/s.
 """
 
 from __future__ import annotations
@@ -34,7 +35,8 @@ LEG_SEGMENTS = ("thigh", "shank")  # body segments whose length is an input
 OUTPUTS = len(JOINTS) * (DEGREE + 1)
 LAYERS_MAX = 4
 WIDTH_MAX = 128  # largest number of neurons of a layer
-#: Largest accepted angle jump [rad] at the stance change. Rounding errors in the weights of the last layer cause jumps.
+#: Largest accepted angle jump at the stance change due to one row of weights or the bias of the last layer [rad].
+#: Rounding errors in the weights cause such jumps.
 _PERIODICITY_DEFECT = 1e-9
 _ANGLE_MAX = 2.0 * np.pi  # rad, largest accepted absolute value of a control point
 _ROUNDING = 1e-9  # relative tolerance of the range limits, because a ratio of lengths has rounding errors
@@ -107,7 +109,7 @@ class GaitNetwork:
         """Raise `NetworkError` if a patient is outside the range for which the network was fitted.
 
         Args:
-            patient: patient to check, with any step.
+            patient: patient to check. Step length and step duration are set to the middle of the range.
 
         Raises:
             NetworkError: If a parameter is out of range, as in `check`.

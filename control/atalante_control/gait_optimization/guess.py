@@ -20,7 +20,7 @@ _WIDTH = 0.20  # m, lateral distance between the ankles
 _SWAY = 0.03  # m, largest lateral displacement of the pelvis towards the stance foot
 _LIFT = 0.06  # m, largest height of the swing foot
 _CROUCH = {"SH": -0.25, "SK": 0.5, "SA": -0.2}  # rad, start pose of the inverse kinematics; all other joints are at 0
-_ITERATIONS = 50  # largest number of iterations of the inverse kinematics for a pose; then the last iterate is used
+_ITERATIONS = 50  # largest number of iterations per pose; if the error is still too large, the last iterate is used
 _TOLERANCE = 1e-6  # m or rad, largest accepted error of the inverse kinematics
 _LARGEST = 0.2  # rad, largest change of a joint angle in one iteration
 

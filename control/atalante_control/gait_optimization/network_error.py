@@ -27,8 +27,8 @@ class Deviation(NamedTuple):
     angles: Vector  # (n, 12) rad, absolute deviation of the joint angles along the step
     landing_position: float  # m, position deviation of the swing foot at the landing, in the stance foot frame
     landing_attitude: float  # rad, attitude deviation of the swing foot at the landing, in the stance foot frame
-    position_defect: float  # rad, largest jump of a joint angle at the stance change
-    speed_defect: float  # rad/s, largest jump of a joint speed at the stance change
+    position_defect: float  # rad, largest jump of a joint angle at the stance change, in the gait of the network
+    speed_defect: float  # rad/s, largest jump of a joint speed at the stance change, in the gait of the network
     feedforward: float  # rms of the feedforward difference, relative to the rms of the solved feedforward
     within_limits: bool  # whether the gait of the network is valid and within the limits of the robot, see `check_gait`
 

@@ -180,7 +180,8 @@ def _powers(a: Vector, b: Vector, outputs: Vector, cycles: int) -> tuple[Vector,
 def _mode(kappa: float, delta: float, loop: SampledLoop, mobility: float, delay: int) -> tuple[Vector, Vector]:
     """Return A and b of one mode: x(k + 1) = A x(k) + b w(k), where w(k) is the disturbance acceleration in cycle k.
 
-    The state x is (z, z', v, m, p), followed by older commands that are still pending if the delay is longer than one cycle.
+    The state x is (z, z', v, m, p), as defined in the module docstring. If the delay is longer than one cycle, the accelerations
+    of older commands that are still pending follow.
     """
     n, keep, tracking = 4 + delay, loop.keep, loop.tracking
     motor = np.zeros(n)

@@ -216,7 +216,7 @@ class _Horizon:
         remainder = beyond - self._factor[:, None] * rows[-1]
         #: Each element contains the numbers of two predicted cycles, counted from the start of the prediction, and a matrix.
         #: The remainder is a linear combination of the errors in these cycles. The matrix contains the absolute values of the
-        #: factors.
+        #: coefficients of the linear combination.
         self._pairs: list[tuple[tuple[int, int], Vector]] = []
         for near, far in ((0.1, 0.3), (0.25, 0.5), (0.4, 0.7)):
             lags = round(near * self.cycles), round(far * self.cycles)
@@ -230,7 +230,7 @@ class _Horizon:
 
         Args:
             width: distance from q_des to the nearer bound of the guide in each cycle, shape (n, 2) [rad].
-            narrowest: width that the last predicted cycle must keep, shape (n, 2) [rad], see `filter.tail`.
+            narrowest: width that limits the error in the last predicted cycle, shape (n, 2) [rad], see `filter.tail`.
         """
 
         def room(lag: int) -> tuple[Vector, Vector]:
@@ -242,7 +242,8 @@ class _Horizon:
         found = []
         for lags, weights in self._pairs:
             rooms, promises = (np.hstack(parts) for parts in zip(*map(room, lags), strict=True))
-            # Find the largest scale that satisfies the following inequality:
+            # `last` is the room in the last predicted cycle, `end` is the room one cycle later, and `rooms` contains the rooms in
+            # the two earlier cycles. Find the largest scale that satisfies the following inequality:
             # factor * (last - scale * last_promise) + (rooms - scale * promises) @ weights <= end - scale * end_promise.
             have = end - self._factor * last - rooms @ weights
             need = end_promise - self._factor * last_promise - promises @ weights

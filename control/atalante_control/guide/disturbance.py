@@ -171,10 +171,10 @@ _SPEED_MARGIN = 1.0
 class Effect(NamedTuple):
     """Effect of a disturbance on two outputs, one per joint (hip, knee). An output is an error, a torque or a speed."""
 
-    #: (lags + 1, 2, 2) response to an acceleration that lasts one cycle, 0 to `lags` cycles later.
+    #: (n, 2, 2) response to an acceleration that lasts one cycle. Axis 0: number of cycles after the acceleration.
     pushed: Vector
-    #: (lags + 1, 2, 2) response to an acceleration just before a prediction starts; (0, 2, 2) if this response is left out.
-    #: A prediction starts with an error, because the measured velocity does not yet contain the effect of the last acceleration.
+    #: (n, 2, 2) response to an acceleration just before a prediction starts; (0, 2, 2) if this response is left out.
+    #: The measured velocity does not yet contain the effect of this acceleration, so the prediction starts at a wrong velocity.
     hidden: Vector
     #: (n, 2, 2) matrix for each cycle of the step. The response is multiplied by this matrix from the left to get the output.
     left: Vector

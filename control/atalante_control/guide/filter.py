@@ -187,7 +187,7 @@ class GuideFilter:
 
     @property
     def h(self) -> float:
-        """Return h of the last cycle. h >= 0 if the backup policy can keep both joints inside the guide."""
+        """Return h of the last cycle. If h >= 0, the backup policy can keep both joints inside the guide."""
         return float(self.tables.guards[0].h)
 
     @property
@@ -202,7 +202,7 @@ def tail(inverse: Vector) -> Vector:
     The largest value is multiplied by 1 + `_TAIL_MARGIN`.
 
     Args:
-        inverse: 1 / distance to the guide for each cycle, shape (n, m) [1/rad].
+        inverse: 1 / width (distance from q_des to a bound of the guide) for each cycle, shape (n, m) [1/rad].
     """
     return (1.0 + _TAIL_MARGIN) * narrowest(inverse, TAIL_CYCLES + 1)
 
@@ -211,8 +211,9 @@ def narrowest(inverse: Vector, cycles: int) -> Vector:
     """Return for each cycle the largest 1 / width of the guide in `cycles` cycles, from this cycle on [1/rad].
 
     Args:
-        inverse: 1 / distance to the guide for each cycle, shape (n, m) [1/rad]; the last row applies to all later cycles.
-        cycles: number of cycles, including the first one.
+        inverse: 1 / width (distance from q_des to a bound of the guide) for each cycle, shape (n, m) [1/rad]. The last row
+            applies to all later cycles.
+        cycles: number of cycles, including this cycle.
     """
     largest = np.concatenate([inverse, np.repeat(inverse[-1:], cycles - 1, axis=0)])
     covered = 1  # row k of `largest` is the maximum of the rows k to k + covered - 1 of the input

@@ -102,7 +102,7 @@ class GuideTables(NamedTuple):
     lags: Records[Lag]  # (lags,) predictions of the tracking errors, one for each number of cycles ahead
     blocks: Records[Block]  # (blocks,) bounds of the predicted tracking errors
     few: Records[Few]  # (rows,) predictions of torque and speed, in ascending order of `Few.lag`
-    #: (starts, lags, 4) rad, largest errors of sagittal hip and knee.
+    #: (starts, lags, 4) rad, largest tracking errors of sagittal hip and knee.
     #: Axis 0: blocks of `START_CYCLES` cycles in which a prediction starts. Axis 1: number of cycles ahead.
     #: Columns 0 and 1 of axis 2: due to model errors. Columns 2 and 3: due to the requested disturbances.
     reach: Vector
@@ -277,7 +277,8 @@ def _error_ratio(guide: GuideTables, cycle: int) -> float:
 
     Most cycles ahead need not be predicted. `bound_blocks` computes an upper bound of the ratio for each block. The
     block with the largest bound is predicted first. A block whose bound is at most the largest ratio found so far
-    cannot contain a larger ratio.
+    cannot contain a larger ratio. The last block is always predicted, because a narrower width (columns `TAIL`) applies to the
+    last predicted cycle.
     """
     guard, step, reach = guide.guards[0], guide.step, guide.reach[cycle // START_CYCLES]
     promise, size, y0, y1, y2, y3, y4 = guard.promise, guard.magnitude, *_compressed(guard)
@@ -318,7 +319,7 @@ def bound_blocks(guide: GuideTables, cycle: int, blocks: int) -> int:
     """Compute `Block.ratio`, the upper bound of error / width, for each block. Return the index of the largest bound.
 
     In a block, a predicted error differs from `Block.middle` times the compressed state y by at most `Block.spread` times abs(y).
-    The disturbances add at most `GuideTables.highest`, and no width is below the width in the columns `NEAR`.
+    The disturbances add at most `GuideTables.highest`, and 1 / width is at most the value in the columns `NEAR`.
 
     Args:
         guide: tables of the guide filter; `Guard.magnitude` and `Guard.compressed` must belong to the current cycle.

@@ -111,8 +111,8 @@ class LiteralGuide:
 
         Args:
             xi: assistance factor of the whole step.
-            deviation: deviations s(0) of SH and SK at the stance change [rad].
-            rate: deviations s'(0) of SH and SK at the stance change [rad/s].
+            deviation: measured minus nominal angles of SH and SK at the stance change [rad].
+            rate: measured minus nominal speeds of SH and SK at the stance change [rad/s].
         """
         letter, step = self.tables.letters[0], self.tables.step
         step[:, BOUND : BOUND + 4] = self._shape.bounds(self._phase, xi).transpose(1, 0, 2).reshape(-1, 4)

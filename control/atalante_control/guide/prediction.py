@@ -61,8 +61,8 @@ class StartReach(NamedTuple):
 
     error: Vector  # (n, 4) rad, tracking error
     torque: Vector  # (n, 4) Nm, backup torque
-    speed: Vector  # (n, 4) rad/s
-    worst_speed: Vector  # (n, 4) rad/s, speed with the worst errors of inertia and delay
+    speed: Vector  # (n, 4) rad/s, joint speed
+    worst_speed: Vector  # (n, 4) rad/s, joint speed with the worst errors of inertia and delay
     change: Vector  # (n, 4) Nm, change of the backup torque within one cycle
 
 
@@ -134,10 +134,11 @@ class Prediction:
         whole = Grid(starts, START_CYCLES, np.arange(horizon + 1))
         few, none = whole._replace(lags=FEW), whole._replace(lags=FEW[:0])
 
-        # The members of `family` differ in the errors of inertia and delay. `reach` is the maximum over all members.
-        # A joint moves faster if the leg is lighter than in the model, or if the command arrives later.
+        # The members of `family` differ in the errors of inertia and delay. `reach` and `few_ahead[2]` are the maxima over all
+        # members. For example, a joint moves faster if the leg is lighter than in the model, or if the command arrives later.
         self.reach = np.zeros((blocks, len(whole.lags), 4))
-        # Largest effects of disturbances. Elements of axis 0: torque, speed, speed with the worst errors of inertia and delay.
+        # Largest effects of disturbances, for `self.few_reach`.
+        # Elements of axis 0: torque, speed, speed with the worst errors of inertia and delay.
         few_ahead = np.zeros((3, blocks, len(FEW), 4))
         lag = assumptions.loop.velocity_lag
         first, first_rates = [], []
@@ -178,8 +179,7 @@ def prediction_of(policy: BackupPolicy, leg: Leg, assumptions: Assumptions, blen
         policy: gains of the backup policy.
         leg: swing leg along the nominal trajectory, to the end of the overlap.
         assumptions: assumptions of the promise for which the tables are computed.
-        blend: factor of the torque that is carried over the stance change, one value per cycle from the change on,
-            shape (m,).
+        blend: fraction of the carried-over torque that remains in each cycle since the stance change, shape (m,).
         width: largest width of the guides for which the tables are used [rad].
     """
     parts = [leg.time, leg.q, leg.qd, leg.qdd, leg.gravity, leg.inertia.fit, blend]
@@ -195,7 +195,7 @@ def prediction_of(policy: BackupPolicy, leg: Leg, assumptions: Assumptions, blen
 
 
 def _separated(rows: Vector) -> Vector:
-    """Return the same matrices for a state vector in which the true minus the measured e' replaces the true e' (see `STATES`)."""
+    """Return the matrices for a state vector that contains true minus measured e' instead of the true e' (see `STATES`)."""
     result = rows.copy()
     result[..., 4:6] += rows[..., 2:4]
     return result

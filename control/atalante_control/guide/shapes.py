@@ -15,8 +15,8 @@ import numpy as np
 
 from atalante_hal.types import Vector
 
-PINCH_WIDTH = math.radians(1.0)  # rad, smallest half-width of the shape `pinched`
-SNAP_WIDTH = math.radians(0.1)  # rad, smallest half-width of the shape `snap`
+PINCH_WIDTH = math.radians(1.0)  # rad, half-width to which the shape `pinched` closes, if `half_width` is larger
+SNAP_WIDTH = math.radians(0.1)  # rad, half-width to which the shape `snap` closes
 #: Smallest bound of a shape [rad], about two encoder counts at the joint.
 #: With a much smaller bound of the shape, h of the guide filter would overflow.
 NARROWEST = 1e-6

@@ -3,8 +3,10 @@ r"""Flat foot: ankle angles that keep the swing foot level. `tibia attitude -> t
 The attitude comes from the tibia IMU. If this IMU is lost, the attitude is computed from the joints and the pelvis IMU. The
 targets replace the nominal angles in the reference of the PID. The attitude of the foot in the world is
 :math:`R_{tibia} R_z(\text{toe}) R_y(q_{SA}) R_a(q_{HA})`. The sole is level when this rotation maps the normal of the sole to the
-vertical. Let :math:`g` be the vertical in the ankle frame and :math:`a = (a_x, 0, a_z)` the henke axis. The y component of
-:math:`R_a e_z` is :math:`-a_x \sin q_{HA}` and does not depend on SA, so it gives HA. Then SA follows in the x-z plane.
+vertical, so :math:`R_y(q_{SA}) R_a(q_{HA}) e_z = g`, with the sole normal :math:`e_z` in the foot frame and the vertical
+:math:`g` in the ankle frame. With the unit henke axis :math:`a = (a_x, 0, a_z)`, the y component of :math:`R_a e_z` is
+:math:`-a_x \sin q_{HA}`. :math:`R_y` does not change y components, so HA follows from :math:`g_y = -a_x \sin q_{HA}`. SA then
+follows from the x and z components.
 """
 
 from __future__ import annotations
@@ -31,7 +33,8 @@ Vector3 = tuple[float, float, float]
 
 _SA, _HA = LEG_JOINTS.index("SA"), LEG_JOINTS.index("HA")
 _STOP_MARGIN = math.radians(1.0)  # rad, smallest distance between a target and the joint limit
-_STOP_FADE = math.radians(3.0)  # rad, distance to the joint limit below which the target rate is reduced
+#: rad, distance from a target to its limit (`Ankle.low`, `Ankle.high`) below which the rate of the target is reduced
+_STOP_FADE = math.radians(3.0)
 _PELVIS = IMUS.index("pelvis")
 _TIBIAE = tuple(IMUS.index(f"{side}_tibia") for side in SIDES)
 _IMU_AGE = 10  # cycles, largest valid age of an IMU message, equal to the timeout of the message in the DBC

@@ -96,7 +96,7 @@ class Pid:
 
     def __init__(self, gains: PidGains) -> None:
         stance, swing = gains.stance, gains.swing
-        roles = {LEFT: (stance, swing), RIGHT: (swing, stance)}  # left leg, right leg
+        roles = {LEFT: (stance, swing), RIGHT: (swing, stance)}  # stance leg: gains of left and right leg
         self._gains_of = {
             s: np.array([(*left.kp, *right.kp), (*left.kd, *right.kd), (*left.ki, *right.ki)])
             * [[1.0], [1.0], [PERIOD]]

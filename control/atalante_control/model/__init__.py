@@ -2,7 +2,7 @@
 
 `ExoskeletonParameters, Patient -> links (the right leg mirrors the left leg) -> URDF text -> Pinocchio model`. Frames
 follow REP-103: x forward, y left, z up. The frame of a link is the frame of its joint. At the zero pose all frames are parallel
-except the foot frames, which are turned outwards by the toe-out angle.
+except the frames of ankle, foot and contact pads, which are turned outwards by the toe-out angle.
 """
 
 from atalante_control.model.articulated import GRAVITY, ArticulatedModel, pinocchio_model

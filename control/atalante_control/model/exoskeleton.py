@@ -122,7 +122,8 @@ def _patient_segments(p: ExoskeletonParameters, patient: Patient) -> dict[str, t
     """Return link name -> box and mass properties of the patient's segment that is fused into this link.
 
     The hip of the patient is the intersection of the axes of FH and SH, the knee is on the axis of SK, and the ankle is at SA.
-    The lateral offsets of the exoskeleton shift thigh and shank by half a centimetre. The foot is centred along the sole.
+    The offset `knee_lateral` of the exoskeleton shifts the shank outwards relative to the thigh. The foot is
+    centred along the sole.
     """
     hip = (-p.th_offset[0] - p.sh_offset[0], -p.th_offset[1] - p.sh_offset[1], -p.th_offset[2] - p.sh_offset[2])
     heel = (p.sole_centre[0] - 0.5 * patient.length("foot"), 0.0, -0.5 * ANKLE_HEIGHT * patient.height)

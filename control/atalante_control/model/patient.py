@@ -76,7 +76,7 @@ class Patient:
     def body(self, segment: str, proximal: Vector3, axis: int, direction: int) -> tuple[Box, Inertia]:
         """Return the box (for viewers) and the mass properties of a segment, in the frame of the link that carries it.
 
-        The moment of inertia about the transverse axes is m (gyration length)^2. The table has no moment about the long
+        The moment of inertia about the transverse axes is m (`gyration` * length)^2. The table has no moment about the long
         axis of the segment. For this axis, the moment of a square prism with the length and density of the segment is
         used. The box is this prism.
 

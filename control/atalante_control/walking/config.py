@@ -92,7 +92,7 @@ class WalkConfig:
     settle: float = 1.0  # s, time for which both feet must be loaded before the robot walks
     posture: float = 2.0  # s, duration of the motion from the measured pose to the standing pose
     shift: float = 1.5  # s, duration of a weight shift, onto one foot or back to both feet
-    rest: float = 0.3  # s, wait between the weight shift and the first step
+    rest: float = 0.3  # s, wait after each weight shift
     guide: StepGuideConfig = WALK_GUIDE
     #: End of the re-centring of sagittal hip and knee in a guided step, as a fraction of the step duration.
     #: With the smaller value `alpha`, the re-centring of the heavy leg would need more torque than the drives have.

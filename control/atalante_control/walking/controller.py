@@ -372,8 +372,8 @@ class WalkController:
     def _load_without(self, side: int) -> float:
         """Estimate the vertical load on a foot whose data is lost [N] from the load on the other foot.
 
-        The estimate follows from the fraction of the weight that the other foot does not carry. It is 0 up to the fraction
-        `_LOAD_ERROR`, and rises linearly to the weight at the fraction 1.
+        Let f be the fraction of the weight that the other foot does not carry. The estimate is 0 up to f = `_LOAD_ERROR`, and
+        rises linearly to the weight at f = 1.
 
         Args:
             side: index of the foot in FEET.
@@ -456,7 +456,7 @@ class WalkController:
         record.assistance_factor, stage.intensity = xi, intensity(xi)
 
     def _watch_guide(self, cycle: int) -> None:
-        """Add a guided cycle to the statistics, and report to the HAL if the leg is outside the guide."""
+        """Add a guided cycle to the statistics, and report to the HAL if the leg leaves the guide now or in the prediction."""
         command, guide = self._command, self.config.guide
         guided = self._assisted and cycle < len(self._section.assistance.unmodelled)
         command.hand_over_exceeded = guided and cycle == 0 and self._exceeded

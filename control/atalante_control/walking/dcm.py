@@ -44,7 +44,8 @@ def dcm(lever: tuple[float, float, float], speed: tuple[float, float, float], he
     """Return the divergent component of motion (DCM) in the walking frame [m].
 
     Args:
-        lever: position of the centre of mass relative to the reference point, in world axes [m].
+        lever: position of the centre of mass relative to the centre of the stance sole, or to the middle between both soles
+            while standing, in world axes [m]. The DCM is relative to the same point.
         speed: velocity of the centre of mass in world axes [m/s].
         heading: heading of the walking frame [rad].
         frequency: natural frequency w of the pendulum [rad/s].

@@ -6,7 +6,7 @@ estimates the bias of the gyro. Its state is
 
     d   error of the estimated heading [rad], d' = b + white noise; at the start the heading is 0 by definition, so d = 0
     b   bias of the gyro about the vertical [rad/s], b' = white noise
-    o   constant error of the reference at the start [rad]
+    o   constant offset of the measured heading [rad], because the measured heading at the start counts as 0 despite its error
 
 The measurement is measured heading - estimated heading = o - d + error of the reference. The error of the reference is correlated
 in time. The filter regards this error as white noise with the same spectral density at low frequencies. After each update, the

@@ -54,8 +54,8 @@ Quaternion = tuple[float, float, float, float]
 class Measured(NamedTuple):
     """Measurements of this cycle, and torque command of the previous cycle."""
 
-    q: Vector  # (12,) rad
-    qd: Vector  # (12,) rad/s
+    q: Vector  # (12,) rad, joint angles
+    qd: Vector  # (12,) rad/s, joint speeds
     imu: Vector  # (3,) m, position of the IMU in the pelvis frame; the axes of IMU and pelvis are parallel
     gyro: Vector  # (3,) rad/s, angular velocity of the IMU in the axes of the IMU
     accel: Vector  # (3,) m/s2, specific force at the IMU in the axes of the IMU
@@ -315,9 +315,9 @@ def act(
 def _assist(cycle: int, measured: Measured, assistance: Assistance, parts: Parts) -> None:
     """Replace the torques of SH and SK of the swing leg by the torques of the guide filter, and set the vibration levels.
 
-    After the nominal end of the step, the baseline controller lowers the foot. `Stage.excess` is the difference of both
-    torques in the last guided cycle. This difference is added to the torque of the baseline controller and fades out
-    with `fade`, so the command is continuous.
+    After the nominal end of the step, the baseline controller lowers the foot. `Stage.excess` is the torque of the guide
+    filter minus the torque of the baseline controller in the last guided cycle. This difference is added to the torque of
+    the baseline controller and fades out with `fade`, so the command is continuous.
 
     Args:
         cycle: cycles since the start of the step.

@@ -7,11 +7,12 @@ moment of inertia J of the rotating parts about the hip, the natural frequency w
 counts most, because a DCM error grows with exp(w t). The trunk therefore leans fast and returns slowly. The lean is an offset
 of the frontal hip (FH) of the stance leg.
 
-A push to the side of the stance foot makes the trunk lean over the stance foot, as long as the DCM is near the stance sole or
-outside. A push to the side of the swing foot makes the trunk lean a little to that side, which also lowers the swing foot.
+A push to the side of the stance foot makes the trunk lean over the stance foot, if the DCM is outwards of the middle of the
+stance sole or at most `inside` inwards of it. A push to the side of the swing foot makes the trunk lean a little to the side of
+the swing foot. This lean also lowers the swing foot.
 
-If the DCM is outside, over the stance foot, the swing foot also moves outwards, away from the stance foot. The swing leg then
-turns in the same direction as the trunk, and its mass moves to the other side.
+If the DCM is more than `leg_zone` outwards of the middle of the stance sole, the swing foot also moves away from the stance foot.
+The swing leg then turns in the same direction as the trunk, and its mass moves away from the DCM.
 """
 
 from __future__ import annotations

@@ -71,7 +71,8 @@ class PlacementConfig(NamedTuple):
     acceleration: float = 25.0  # m/s2, largest acceleration of the landing offset
     #: cost weight of the squared missing offset (needed minus permitted offset); the squared permitted offset has the weight 1
     missed: float = 30.0
-    #: m, cost of timing: a landing that is earlier or later by 1 / w costs as much as a landing with this offset
+    #: m, cost of timing: a landing that is earlier or later by 1 / w (w: natural frequency) costs as much as a landing with this
+    #: offset
     timing: float = 0.03
     hold: float = 0.1  # s, time in which the reference of the swing foot changes from the pelvis to the stance foot
     slew: float = 15.0  # 1/s, largest change of the phase rate per second
@@ -165,9 +166,9 @@ def landing(config: PlacementConfig, gain: float, motion: Motion) -> tuple[float
 def _needed(config: PlacementConfig, gain: float, motion: Motion, rate: float) -> Pair:
     """Return the offset of the landing with which the DCM is at its nominal position relative to the new stance foot [m].
 
-    Sideways, the centre of pressure c of the nominal motion is taken as constant until the landing, so that
-    xi(t) = c + (xi - c) exp(w t). With this c, the nominal DCM moves from its present value to its value at the nominal
-    landing. Forwards, the ankle makes the DCM follow a faster or slower step.
+    Sideways, the centre of pressure c of the nominal motion is taken as constant until the landing, so the nominal DCM x obeys
+    x(t) = c + (x(0) - c) exp(w t). c follows from the present nominal DCM x(0) and the nominal DCM at the nominal landing.
+    Forwards, the ankle makes the DCM follow a faster or slower step.
 
     Args:
         config: parameters.

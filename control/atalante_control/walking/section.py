@@ -168,7 +168,7 @@ def _tables(gaits: WalkGaits, models: Models, config: WalkConfig) -> dict[tuple[
 
 
 def _held(table: PhaseTable, row: int, duration: float) -> PhaseTable:
-    """Return the table of a phase whose goal is the pose in a row of `table`. Its re-centring rows begin at the measured pose.
+    """Return the table of a phase in which the re-centring leads from the measured pose to the pose in a row of `table`.
 
     Args:
         table: table that contains the row.

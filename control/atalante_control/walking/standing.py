@@ -38,7 +38,7 @@ class Stance(NamedTuple):
 class Shift(NamedTuple):
     """Weight shift from the middle between the feet onto one foot, as Bezier control points along the path."""
 
-    q: Vector  # (12, 8) rad
+    q: Vector  # (12, 8) rad, joint angles
     feedforward: Vector  # (12, 8) Nm, static torques without the gravity torques u_g
     centre: Vector  # (3, 8) m, centre of mass relative to the middle between the soles, in the walking frame
 

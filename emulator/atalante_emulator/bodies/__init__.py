@@ -48,8 +48,8 @@ class Body(Protocol):
 
     The properties that return arrays always return the same array objects. Only `reset` and `step` change their contents.
     Joints and links are found by their names in the URDF. The joints have the names `JOINTS`, the links of the IMUs
-    `imu_<IMU>`, the feet `<foot>_foot`, and the contact pads at the force cells `<foot>_foot_<cell>`. The frame of each of
-    these links is the frame of its sensor.
+    `imu_<IMU>`, the feet `<foot>_foot`, and the contact pads at the force cells `<foot>_foot_<cell>`. The frame of an IMU
+    link is the frame of the IMU. The origin of the frame of a contact pad is the position of the force cell.
     """
 
     @property

@@ -36,8 +36,8 @@ def _sum_contacts(contacts: Vector, count: int, attitude: Vector, force: Vector)
     """Sum the contact forces on each corner of the soles, and transform the sums into the axes of the feet.
 
     Args:
-        contacts: contacts of the time step, shape (n, _CONTACT).
-        count: number of contacts.
+        contacts: array whose first `count` rows are the contacts of the time step, shape (_CONTACTS, _CONTACT).
+        count: number of contacts in the time step.
         attitude: quaternion xyzw of each foot, shape (2, 4).
         force: output for the forces, shape (2, 4, 3) [N].
     """

@@ -3,7 +3,8 @@
 The floor touches a sole at its corners. Four force cells connect the sole to the foot. The cells are equal springs in all three
 directions. So the force of a cell is a linear function of the forces on the corners. Let the cells be at x = x0 +- a and
 y = +- b. If a vertical force F acts at the point (x, y) of the sole, the force of a cell is
-F / 4 (1 +- (x - x0) / a +- y / b). If the point is near the opposite corner, this force is negative: the cell is pulled.
+F / 4 (1 +- (x - x0) / a +- y / b), with the signs of the position of the cell. If the point (x, y) is near the corner opposite
+to the cell, the force of the cell is negative: the cell is pulled.
 """
 
 from __future__ import annotations

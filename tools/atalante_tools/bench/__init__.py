@@ -1,6 +1,7 @@
 """Command `atalante bench`: measure the speed of the stack against baselines in the same run.
 
-The modules `wire`, `motion`, `startup`, `gaits`, `gait_solve` and `log_check` contain the benchmarks, and `catalogue` lists them.
+The modules `wire`, `motion`, `ground`, `startup`, `gaits`, `gait_solve` and `log_check` contain the benchmarks. The module
+`catalogue` lists the benchmarks.
 """
 
 from __future__ import annotations

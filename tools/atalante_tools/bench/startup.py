@@ -1,4 +1,4 @@
-"""Benchmark of the start of a process with HAL and emulator, up to the end of the first cycle."""
+"""Benchmark of the start-up: a process starts HAL and emulator, runs one cycle and exits."""
 
 from __future__ import annotations
 

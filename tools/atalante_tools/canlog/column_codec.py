@@ -1,9 +1,8 @@
-"""Codec for logs and for any DBC. It decodes many frames of one message in one call, and computes E2E CRCs.
+"""Decoder of CAN logs for any DBC: decodes many frames of one message in one call, and computes E2E CRCs.
 
 The codec of the control loop (`codec.Codec`) decodes all messages of one cycle and requires that each signal lies in
-one 64-bit word. The codec in this module decodes many frames of one message, with Intel and Motorola layouts, signals
-across two 64-bit words, 64-bit signals, IEEE floats and multiplexed signals. The decoded values are equal to the values
-of cantools.
+one 64-bit word. The decoder in this module supports Intel and Motorola layouts, signals across two 64-bit words, 64-bit
+signals, IEEE floats and multiplexed signals. The decoded values are equal to the values of cantools.
 """
 
 from __future__ import annotations
@@ -39,8 +38,9 @@ class Column:
     """Values of one signal in many frames.
 
     Attributes:
-        values: physical values, shape (n,), DBC units. The type is float64 if factor or offset in the DBC is not an integer;
-            otherwise int64, uint64, or Python integers for values of more than 64 bits.
+        values: physical values, shape (n,), DBC units. The type is float64 if the signal is an IEEE float, or if its factor or
+            offset in the DBC is not an integer. Otherwise the type is int64, uint64, or `object` with Python integers for values
+            of more than 64 bits.
         present: mask of the frames that contain the signal, shape (n,); None means all frames. A frame without this signal
             contains another multiplexed signal, so the element of `values` for this frame is meaningless.
     """

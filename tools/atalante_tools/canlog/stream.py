@@ -27,9 +27,9 @@ class Stream:
     stamps: npt.NDArray[np.int64]  # time stamp of each frame [ns], shape (n,)
     indices: npt.NDArray[np.intp]  # index of each frame in the chunk, shape (n,)
     frames: Frames
-    present: npt.NDArray[np.intp]  # indices of the messages that have frames, ascending, shape (m,)
-    starts: npt.NDArray[np.intp]  # index of the first frame of each message, shape (m,)
-    stops: npt.NDArray[np.intp]  # 1 + index of the last frame of each message, shape (m,)
+    present: npt.NDArray[np.intp]  # plan indices of the messages that have frames, ascending, shape (m,)
+    starts: npt.NDArray[np.intp]  # for each message, index of its first frame in the stream, shape (m,)
+    stops: npt.NDArray[np.intp]  # for each message, 1 + index of its last frame in the stream, shape (m,)
 
     def __len__(self) -> int:
         return len(self.rows)
@@ -70,7 +70,7 @@ class Stream:
     def bounds(self, family: Family) -> list[tuple[int, int, int]]:
         """Return (message index, first, end) for each message of a family.
 
-        The numbers `first` and `end` are indices into the frames of the whole family.
+        The slice `[first:end]` of the frames of the family contains the frames of the message.
         """
         first, end = self.present.searchsorted((family.rows.start, family.rows.stop)).tolist()
         if first == end:

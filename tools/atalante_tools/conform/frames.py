@@ -47,8 +47,8 @@ class MessageSender:
         Args:
             values: physical value of each signal, in DBC units; signals that are missing are 0.
             raw: raw code per signal, which replaces the encoded value and is not range-checked.
-            counter: alive counter of the frame; None means the next alive counter. The caller sends a command
-                after the next SYNC. So the next alive counter of a command is the alive counter of the SYNC after that.
+            counter: alive counter of the frame; None means the next alive counter. The caller sends a command after the
+                next SYNC. So the next alive counter of a command is the alive counter of the next SYNC plus 1.
                 A given counter does not advance the sequence.
             data_id: E2E Data ID for the CRC; None means the Data ID of the message.
             length: payload length [byte], for which the CRC is valid; None means the length in the DBC.

@@ -153,7 +153,7 @@ def moves_one_motor(tester: NodeTester) -> Outcome:
 
 
 def stays_in_range(tester: NodeTester) -> Outcome:
-    """Test HAPTICS-05: the amplitude of every motor is at most 1 for a commanded level above the DBC range."""
+    """Test HAPTICS-05: a level above the DBC range neither lowers the amplitude of a motor nor raises it above 1."""
     found, passed = [], True
     for code in (201, 230, 254):
         _settle(tester, 0.5)

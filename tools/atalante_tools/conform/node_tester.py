@@ -235,7 +235,7 @@ class NodeTester:
         try:
             self._bus.send(outbox)
         except BusFull:
-            # While the node is switched off, no frame is acknowledged and the transmit queue fills up.
+            # While the node is switched off, no frame is acknowledged and the transmit queue fills up. Discard the frames.
             return
 
     def _listen(self, timeout: float) -> None:

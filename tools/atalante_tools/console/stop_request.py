@@ -4,8 +4,8 @@
 
 A library may catch and discard an exception that a signal handler raises. For example, compiled code discards an
 exception in a callback, and an optimiser counts the exception as a failed evaluation. Therefore the request is stored,
-and `check` raises `Stopped` again before the robot moves. This module has few imports, because no signal is handled
-before the import of this module ends.
+and `check` raises `Stopped` again before the robot moves. Signals are handled only after the import of this module.
+Therefore this module has few imports.
 """
 
 from __future__ import annotations
@@ -49,7 +49,7 @@ class StopRequest:
         """Raise `Stopped` if a stop signal arrived.
 
         Raises:
-            Stopped: If a signal arrived, with its exit code.
+            Stopped: If a signal arrived. The exception carries the exit code of the signal.
         """
         if self.wanted:
             raise Stopped(self.exit_code)
@@ -68,7 +68,7 @@ def check_stop() -> None:
     """Raise `Stopped` if a stop signal arrived. Call this function after library code that may have caught `Stopped`.
 
     Raises:
-        Stopped: If a signal arrived, with its exit code.
+        Stopped: If a signal arrived. The exception carries the exit code of the signal.
     """
     if _request is not None:
         _request.check()
@@ -171,10 +171,10 @@ def ended_by(end: Callable[[], None]) -> Iterator[StopRequest]:
 
 @contextmanager
 def deferred() -> Iterator[None]:
-    """Delay the exception `Stopped` inside the block until the next call of `check_stop`.
+    """Store each SIGINT and SIGTERM inside the block without an exception. Then the next `check_stop` raises `Stopped`.
 
-    Use this block around compiled code, which may replace the exception. This block has no effect if no other block of
-    this module is active, for example in a worker process, which ignores Ctrl-C.
+    Use this block around compiled code, which may replace `Stopped` by another exception. This block has no effect if no
+    other block of this module is active, for example in a worker process, which ignores Ctrl-C.
     """
     if _request is None:
         yield

@@ -91,7 +91,7 @@ class Vectors:
 
         All further images contain random values.
 
-        Call this only once per instance, because a second call would continue the counters and the random numbers.
+        Call this method only once per instance, because a second call would continue the counters and the random numbers.
         """
         for image in range(count):
             encoded = self._next(image)
@@ -103,7 +103,7 @@ class Vectors:
 
         The images contain minimum values, maximum values, invalid codes, and random values.
 
-        Call this only once per instance, because a second call would continue the counters and the random numbers.
+        Call this method only once per instance, because a second call would continue the counters and the random numbers.
         """
         for image, kind in enumerate(("minimum", "maximum", "invalid codes", "random")):
             self._next(image)

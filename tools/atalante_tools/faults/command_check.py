@@ -147,8 +147,9 @@ class Commands:
 
         Args:
             robot: torque limits of the joints.
-            drive_state: true states of the drives in each HAL cycle from 1, shape (cycles, 12). If given, a torque change
-                counts only if the drive is in OPERATION ENABLED before and after it: other drives ignore the torque.
+            drive_state: true states of the drives, shape (cycles, 12). Row k belongs to HAL cycle k + 1. If given, a torque
+                change counts only if the drive is in OPERATION ENABLED before and after the change, because a drive in any other
+                state ignores the torque.
         """
         found = [
             f"the HAL must send only its own identifiers, got {can_id:#x}" for can_id in self._foreign_ids.tolist()

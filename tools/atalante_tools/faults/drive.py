@@ -25,8 +25,8 @@ _HIP: Final = "LEFT_SH"
 _COMMAND: Final = "COMMAND_LEFT_LEG"
 #: A knee that sinks in LOWER or FAULT is at rest after this time [cycles]. Then its drive can be enabled again.
 _LOWERED: Final = 4500
-#: Time from the end of the fault to START [cycles], if the HAL has switched the drive of the joint off. The drive stays off until
-#: START, so the joint need not be at rest.
+#: Time from the end of the fault to START [cycles], if the HAL has switched off the faulty drive. This drive stays off until
+#: START, so its joint need not be at rest.
 _UNTIL_START: Final = 600
 #: Time from HOLD until all joints are at rest [cycles].
 _AT_REST: Final = 60
@@ -274,7 +274,7 @@ SCENARIOS: Final = (
             ),
         ),
     ),
-    # There is no case with TH: both joints are at nearly the same position, so their encoders do not jump.
+    # There is no case with TH. The left and the right TH are at nearly the same position, so an exchange causes no jump.
     Scenario(
         "F85",
         tuple(

@@ -48,7 +48,7 @@ class Quiet:
 
     @property
     def failed(self) -> bool:
-        """Return whether there was a false alarm, or the robot did not walk to the end."""
+        """Return whether there was a false alarm, or the HAL was not in ACTIVE at the end of the walk."""
         return bool(self.alarms) or self.state != SupervisorState.ACTIVE.name
 
 
@@ -114,7 +114,7 @@ class QuietTask:
         pose: list[float] | None,
         done: Callable[[State], bool],
     ) -> Quiet:
-        """Walk until `done`, or until the robot leaves ACTIVE."""
+        """Walk until `done` is True, the HAL leaves ACTIVE, or `2 * _CYCLES` cycles have passed."""
         from atalante_hal.loop import LockStep, run
         from atalante_tools.session.rig import open_hal
 

@@ -86,7 +86,8 @@ SCENARIOS: Final = (
         "F04",
         (
             *(_lost(drive, f"{drive}_STATE", 5, node=drive) for drive in _DRIVES),
-            # The right foot is on the ground, so the left leg must finish its step before the HAL enters HOLD.
+            # Injected forces simulate that the right foot is on the ground. Therefore the left leg finishes its step after 5 lost
+            # frames. The tenth lost frame in a row leads to HOLD at once.
             *(
                 Case(
                     f"{frames or 'all'} frames of the swing leg",

@@ -5,8 +5,8 @@
 The fault matrix states the reaction to a fault during a walk. The matrix prescribes no reaction for other moments or for
 pairs. The runs check what must be true for every fault at every moment:
 
-- No torque, position, velocity or torque rate exceeds its limit. Exception: for `FOUND` cycles, a wrong motor or exchanged
-  encoders may move a joint above its velocity limit, because the HAL cannot limit the speed while the drive holds its position.
+- No torque, position, velocity or torque rate exceeds its limit. Exception: for `FOUND` cycles, a faulty motor may move a joint
+  above its velocity limit, because the HAL cannot limit the speed while the drive holds its position.
 - No command lets a drive produce torque before the operator has pressed START.
 - After the robot has walked, only the operator can cause a change to a less severe state.
 - During a start, no joint moves by more than `SAG_MAX`. A wrong motor, a wrong encoder or a push moves its joint, so these
@@ -37,7 +37,7 @@ from atalante_tools.faults.scenario import MID_SWING, Case, Stimulus, shifted
 from atalante_tools.faults.verdict import WALKING, automatic_improvements, exception_sentence, limit_violations
 
 _S = SupervisorState
-#: Largest accepted motion of a joint during a start [deg]. A start ends in ACTIVE, or `_SETTLED` cycles after START.
+#: Largest accepted motion of a joint during a start [deg]. A start lasts from START to ACTIVE, at most `_SETTLED` cycles.
 SAG_MAX: Final = 1.0
 _SETTLED: Final = 40
 #: Kind of a fault that moves a joint during a start -> largest accepted motion of a joint [deg]. A wrong motor or encoder moves
@@ -50,8 +50,8 @@ SAG_OF: Final = {
     "value": 5.0,
     "push": math.inf,
 }
-#: Kinds of faults of a motor. They may move a joint above its velocity limit until the HAL finds them: for `FOUND` cycles after
-#: the fault begins, and after each START.
+#: Kinds of motor faults. Until the HAL finds a motor fault, the fault may move a joint above its velocity limit. The run accepts
+#: such a speed for `FOUND` cycles after the fault begins, and for `FOUND` cycles after each later START.
 _MOTOR: Final = ("torque_wrong", "torque_weak")
 #: Number of cycles within which the HAL must find a faulty motor: time limit of F84 in FAULTS.md.
 FOUND: Final = 200
@@ -85,7 +85,7 @@ class Schedule:
     """Times of a run, in HAL cycles."""
 
     begins: int  # first faulty cycle
-    starts: tuple[int, ...]  # cycles in which the operator presses START, without the two presses after the fault
+    starts: tuple[int, ...]  # cycles in which the operator presses START, except the two presses after the observation
     stop: int | None = None  # cycle in which the operator presses STOP
 
 
@@ -165,7 +165,8 @@ class MomentTask:
         starts = [cycle for cycle in presses if cycle >= min(begins, default=math.inf)]
         unlimited = [range(cycle, cycle + FOUND) for cycle in (*begins, *starts)]
         failures = [*limit_violations(run, unlimited, _strength(stimuli)), *_premature(run, plan.starts[0])]
-        if self.moment in (Moment.WALKING, Moment.HOLD):  # at the other moments, START may improve the state
+        # At the other moments, a START of the schedule may cause a less severe state after the fault begins.
+        if self.moment in (Moment.WALKING, Moment.HOLD):
             failures += automatic_improvements(run, before)
         most = max((SAG_OF.get(kind, SAG_MAX) for kind in kinds), default=SAG_MAX)
         if extremes.sag.value > most:
@@ -249,7 +250,7 @@ def _extremes(run: Observation, starts: Sequence[int]) -> Extremes:
 
     Args:
         run: observation of the run.
-        starts: cycles in which the operator pressed START, without the two presses after the fault.
+        starts: cycles in which the operator pressed START, except the two presses after the observation of the fault.
     """
     count = len(JOINTS)
     sag, lost, held = np.zeros(count), np.zeros(count), None

@@ -29,7 +29,7 @@ class Line:
     id: str
     passed: bool
     state: str
-    cycles: int | None  # reaction time [cycles]; None if there was no reaction and no diagnostic
+    cycles: int | None  # cycles until the reaction, or else until the diagnostic; None if there was neither
     bound: int  # time limit for `cycles`
     dtc: str
     cases: int

@@ -75,7 +75,7 @@ def run_context() -> RunContext:
 
 
 class Milestones(NamedTuple):
-    """Milestones of a run without a fault, in HAL cycles. All runs have the same milestones."""
+    """Milestones of a run without a fault, in HAL cycles. All runs with the same physics engine have the same milestones."""
 
     ready: int  # first cycle in READY; the operator presses START in the next cycle
     active: int  # first cycle in ACTIVE
@@ -236,7 +236,7 @@ class CaseRun:
 
 
 class _Sample(NamedTuple):
-    """Values of one cycle. These values are one row in each array of an `Observation`."""
+    """Values of one cycle. Each value is one row of the array with the same name in an `Observation`."""
 
     drive_state: list[int]
     torque: Vector

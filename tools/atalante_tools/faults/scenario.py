@@ -86,13 +86,13 @@ class Case:
     detected: int | None = None  # time limit for the diagnostic [cycles]; None means as in the fault matrix
     reacted: int | None = None  # time limit for the reaction [cycles]; None means as in the fault matrix
     node: str | None = None  # node that the diagnostic must name; None means any node
-    recovers: bool = True  # True: START after the fault must lead to ACTIVE; False: it must not
+    recovers: bool = True  # True: START after the fault must lead to ACTIVE; False: START must not lead to ACTIVE
     #: cycles from the end of the fault to START; for a permanent fault: from the time limit of the reaction to START
     observed: int = 60
     seed: int = 0  # seed of the random numbers in the emulator
     checks: tuple[ObservationCheck, ...] = ()  # additional checks of the run
     engine: str = PYBULLET  # physics engine of the emulated robot
-    #: whether the case is only for a suspended robot, because it replaces the forces on a foot
+    #: True for a case that replaces the measured forces on a foot; such a case is only for a suspended robot
     suspended: bool = False
 
     @property

@@ -226,7 +226,8 @@ def _reported(run: Observation, expected: Expectation) -> list[Event]:
 
 
 def _recovery(run: Observation, case: Case, expected: Expectation) -> list[str]:
-    # At power-on the HAL changes to less severe states without the operator, so a case that begins there is not checked.
+    # After power-on, the HAL changes to less severe states without the operator. In a case that begins at power-on, such changes
+    # are therefore accepted.
     found = [] if case.phase is None else automatic_improvements(run, run.last_before_start)
     if run.pressed is None:
         return found

@@ -61,7 +61,7 @@ class Start(NamedTuple):
 
     deviation: Pair  # q - q_nom of SH and SK [rad]
     rate: Pair  # q' - q_nom' of SH and SK [rad/s]
-    carried: Pair  # torque before the stance change minus the torque that the nominal motion needs [Nm]
+    carried: Pair  # torque before the stance change minus the torque for the nominal acceleration q_nom'' [Nm]
     ahead: Pair  # true minus measured speed of SH and SK [rad/s], due to the lag of the velocity filter
 
 
@@ -70,7 +70,7 @@ class Goal(NamedTuple):
 
     q: Vector  # q_des [rad], shape (cycles + 1, 2)
     qd: Vector  # q_des' [rad/s], shape (cycles + 1, 2)
-    bounds: Vector  # distances from q_des to the upper and lower edge of the guide [rad], shape (2, cycles + 1, 2)
+    bounds: Vector  # distances from q_des to the guide edges [rad], shape (2, cycles + 1, 2): joint, cycle, edge (upper, lower)
 
 
 class Walked(NamedTuple):
@@ -79,7 +79,7 @@ class Walked(NamedTuple):
     ratio: float  # largest |e| / q_bound
     cycle: int  # cycle with the largest ratio
     joint: int  # joint with the largest ratio |e| / q_bound: 0 for the hip, 1 for the knee
-    log: Vector  # values of each cycle, zero after the end of the step, shape (cycles + 1, len(LOG))
+    log: Vector  # values of each cycle, shape (cycles + 1, len(LOG)); zero after an early end of the step
 
 
 @dataclass(frozen=True)
@@ -136,7 +136,7 @@ class IdealLeg:
         x: Vector = np.minimum(time / end, 1.0)[:, None]
         #: q_nom [rad], q_nom' [rad/s] and q_nom'' [rad/s2] of hip and knee, each of shape (cycles + 1, 2).
         self.nominal: tuple[Vector, Vector, Vector] = motion(coefficients, duration, phase)
-        # The re-centring is a cubic polynomial of time: s(t) = s(0) * _s[0] + s'(0) * _s[1]. From `end` on, s and s' are zero.
+        # s = q_des - q_nom is a cubic polynomial of time: s(t) = s(0) * _s[0] + s'(0) * _s[1]. From the time `end` on, s is zero.
         self._s = 1.0 - 3.0 * x**2 + 2.0 * x**3, end * (x - 2.0 * x**2 + x**3)
         self._sd = (-6.0 * x + 6.0 * x**2) / end, 1.0 - 4.0 * x + 3.0 * x**2
         self.bounds: Vector = controller.guide_at(xi).shape.bounds(phase, xi)
@@ -175,7 +175,7 @@ class IdealLeg:
         return Walked(float(ratio), int(cycle), int(joint), log)
 
     def image(self, start: Start) -> Vector:
-        """Return the largest and the smallest error e of each joint in the safe backward image.
+        """Return the largest e and the largest -e of each joint in the safe backward image. e is the tracking error.
 
         The safe backward image is the set of states with h >= 0, from which the backup policy can keep both joints inside the
         guide. The angle of the other joint and the speeds of both joints are equal to the desired motion.
@@ -184,7 +184,8 @@ class IdealLeg:
             start: state at the stance change.
 
         Returns:
-            Largest e and largest -e, shape (2, cycles + 1, 2) [rad]; NaN in the cycles between two samples.
+            Largest e and largest -e [rad], shape (2, cycles + 1, 2). The axes are joint, cycle, and sign of e (+, -). The value
+            is NaN in the cycles between two samples.
         """
         goal, controller = self.goal(start), self._controller
         self._change_step(goal.q[0], goal.qd[0], np.zeros(2))
@@ -224,7 +225,7 @@ def noise_of(cycles: int, condition: Condition, generator: np.random.Generator) 
         generator: source of the random numbers.
 
     Returns:
-        Random numbers, shape (cycles + 1, 4).
+        Random numbers, shape (cycles + 1, 4): noise at the hip, noise at the knee, loss of measurement, loss of command.
     """
     noise = np.empty((cycles + 1, 4))
     noise[:, :2] = condition.noise * generator.standard_normal((cycles + 1, 2))
@@ -305,7 +306,8 @@ def safe_errors(goal: Goal, row: Vector, image: Vector, measured: Measured, guid
     Args:
         goal: desired motion and guide.
         row: angles [rad], then speeds [rad/s] of all joints, shape (24,); the values of hip and knee are ignored.
-        image: largest safe errors, shape (2, cycles + 1, 2) [rad], written at every tenth cycle.
+        image: largest safe e and largest safe -e [rad], written at every tenth cycle, shape (2, cycles + 1, 2). The axes are
+            joint, cycle, and sign of e (+, -).
         measured: inputs of the controller, overwritten.
         guide: tables of the guide.
         parts: parts of the controller.

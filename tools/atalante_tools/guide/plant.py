@@ -169,7 +169,7 @@ def inverse_dynamics(constants: Plant, q: Vector, qd: Vector, qdd: Vector) -> Ve
 def dynamics(
     constants: Plant, hip: float, knee: float, hip_rate: float, knee_rate: float
 ) -> tuple[float, float, float, float, float]:
-    """Return M11, M12, M22 [kg m2] and the velocity, gravity and friction torques of hip and knee [Nm].
+    """Return M11, M12, M22 [kg m2], and for hip and knee the sum of velocity, gravity and friction torque [Nm].
 
     Args:
         constants: constants of the plant.

@@ -25,7 +25,8 @@ class Results:
     def __init__(self, path: Path | None, task: Mapping[str, Any]) -> None:
         """Read the verdicts of an earlier run. A file that does not exist is created with the first verdict.
 
-        A last line without an end was cut off when an earlier run was killed. It is removed from the file.
+        The last line is incomplete if an earlier run was killed while it wrote this line. An incomplete last line is removed
+        from the file.
 
         Args:
             path: JSON-lines file. If None, the verdicts are not stored.

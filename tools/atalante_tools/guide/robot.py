@@ -207,7 +207,7 @@ class EncoderNoise:
 
         Args:
             cycle: number of the cycle.
-            values: signals of the nodes, updated.
+            values: signals of the nodes. The noise is added in place.
         """
         noise = self._scale * self._generator.standard_normal(len(JOINTS))
         self._filtered = self._keep * self._filtered + (1.0 - self._keep) * (noise - self._last) / PERIOD

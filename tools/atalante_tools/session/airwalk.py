@@ -77,7 +77,8 @@ class Options:
     #: TOML file with endpoint, TLS certificate and users. If None, the run publishes on the loopback interface only.
     telemetry: Path | None
     law: Law  # control law of the assisted joints
-    #: patient and step parameters: inputs of the gait network. None means the default gait.
+    #: Patient and step parameters. Without a gait file, they are the inputs of the gait network.
+    #: None means the patient of the gait file; without a gait file, None means the default gait.
     subject: Subject | None = None
     files: GaitFiles = field(default_factory=GaitFiles)  # files of the gait
 
@@ -274,7 +275,7 @@ def _controllers(
     config = options.law.config()
     exoskeleton, gait, source = gait_in_the_air(options.files, options.subject, robot)
     controllers = {name: AirwalkController(robot, gait, shape, config, exoskeleton) for name, shape in shapes.items()}
-    if source:  # the gait is valid, because the controllers accepted it
+    if source:  # printed only now, because the controllers have checked the gait; empty for the default gait
         print_message(f"{source}; the exoskeleton is empty")
     return exoskeleton, gait, controllers
 

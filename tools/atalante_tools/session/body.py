@@ -56,7 +56,7 @@ def require_engine(engine: str = PYBULLET) -> None:
 def active_task(
     gaits: WalkGaits, patient: Patient, seed: int, parameters: ActiveParameters | None = None
 ) -> ActiveTask:
-    """Return the task of an active patient: to track hip and knee of the swing leg in the periodic step.
+    """Return the task of an active patient: the hip and knee angles that the swing leg must track in each step.
 
     Args:
         gaits: Gaits of the walk.

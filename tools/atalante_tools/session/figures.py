@@ -24,7 +24,7 @@ _LEFT_HIP = "left_SH"
 _RIGHT_STANCE = 1
 #: Phase that the last step of a run must reach to count as complete, 0 to 1.
 _WHOLE = 0.9
-#: Samples of one walking step: phase, measured angle, desired angle, upper edge and lower edge of the guide [deg].
+#: Samples of one walking step: phase (0 to 1), then four angles [deg]: measured, desired, upper edge, lower edge of the guide.
 _Step = list[tuple[float, ...]]
 
 
@@ -89,7 +89,10 @@ def _panel(axis: Any, run: str, walked: dict[int, _Step]) -> None:
 
 
 def _guide_samples(recording: Path) -> Iterator[tuple[str, Any, float, float]]:
-    """Yield run name, `Guide` message, upper edge and lower edge [rad] for every recorded cycle with a guide."""
+    """Yield run name, `Guide` message, and distances of upper and lower edge from the desired angle [rad].
+
+    Cycles without a guide are left out.
+    """
     classes = {name: message_class(name) for name in ("SystemState", "Guide", "Controller")}
     run, edges = "", (0.0, 0.0)
     pending: Any = None

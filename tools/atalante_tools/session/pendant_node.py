@@ -5,7 +5,8 @@ counter, dead-man switch and assistance factor. The older pendant stops sending 
 
 During the takeover there are two cycles in which both pendants answer the SYNC. Both frames have the same counter, which is the
 low byte of the signal Cycle in SYNC. The HAL accepts the first frame. The HAL reports the second frame as a repetition if the
-contents are equal, and as a second sender if the contents differ. After four such cycles the HAL holds the robot.
+contents are equal, and as a second sender if the contents differ. After four cycles with a second sender, the HAL holds the
+robot.
 """
 
 from __future__ import annotations

@@ -25,8 +25,8 @@ if TYPE_CHECKING:
 class Result:
     """Result of the walk inside one guide shape. The field names are the JSON keys of `--json` and of summary.json.
 
-    `max_ratio`, `inside` and `filter_active` are measured after the first completed step. These fields are None if the run ended
-    before the second step.
+    `max_ratio`, `inside` and `filter_active` are measured after the first completed step. These fields are None if fewer than
+    two steps were completed.
     """
 
     shape: str

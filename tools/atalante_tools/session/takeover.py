@@ -5,10 +5,10 @@
 A pendant answers each SYNC with a frame whose counter is the low byte of the signal Cycle. Only an intact frame with the counter
 of the last SYNC is treated as a frame of another pendant. A damaged, old or replayed frame changes nothing.
 
-A pendant that receives such frames stops sending and listens. If the other pendant continues, the listening pendant gives up. If
-no frame is received, the listening pendant resumes sending. An established pendant stops at once. A new pendant stops at a random
-cycle of its takeover. Two pendants that stop in the same cycle also resume in the same cycle. Each of them then stops after
-a new random time, until one pendant stops alone and gives up.
+A pendant that receives frames of another pendant stops sending and listens. If the other pendant continues, the listening
+pendant gives up. If no frame is received, the listening pendant resumes sending. An established pendant stops at once. A new
+pendant stops at a random cycle of its takeover. Two pendants that stop in the same cycle also resume in the same cycle. Each of
+them then stops after a new random time, until one pendant stops alone and gives up.
 """
 
 from __future__ import annotations

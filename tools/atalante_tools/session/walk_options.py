@@ -161,7 +161,7 @@ def gaits_of_subject(subject: Subject, robot: Robot, network: Path | None = None
     else:
         where = "gait of the network" if network is None else f"gait of the network {network}"
         step = load_network(network).gait(subject, robot)
-        check_gait(step, robot, where)  # before the solver gets it
+        check_gait(step, robot, where)  # an invalid gait is rejected before the solver starts
         gaits = with_start_and_stop(subject, step)
         check_walk(gaits, robot, where)
     check_on_ground(gaits, subject.patient, robot, where)

@@ -37,7 +37,8 @@ class WalkResult:
     xi: float
     shape: str | None  # guide shape; None at Xi = 1, where there is no guide
     certified: bool | None  # whether the guide is certified; None at Xi = 1, where there is no guide
-    #: certified torque at SH [Nm]: up to this disturbance, both joints stay in the guide; None without certificate
+    #: Certified torque at SH [Nm]; None without certificate.
+    #: Both joints stay in the guide under disturbances up to `promise_hip_nm` at SH and `promise_knee_nm` at SK.
     promise_hip_nm: float | None
     #: certified torque at SK [Nm], see `promise_hip_nm`; None without certificate
     promise_knee_nm: float | None

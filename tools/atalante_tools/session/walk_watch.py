@@ -33,7 +33,7 @@ class WalkWatch:
         Args:
             rig: Rig of the walk.
             controller: Controller of the walk.
-            observation: Attitude of the robot.
+            observation: Observer that detects a fall.
             stop: Stop request of the process.
             steps: Number of steps that the user requested.
         """

@@ -421,7 +421,7 @@ def _run_missing(trials: Sequence[Trial], running: Running) -> None:
     missing = [trial for trial in trials if stored(trial, folder) is None]
     if not missing:
         return
-    if not running.dask:  # on a cluster, the engine is needed only on the workers
+    if not running.dask:  # this computer runs the trials, so it needs the engine
         require_engine(running.engine)
     where = f"the workers of {running.dask}" if running.dask else f"{running.jobs} processes"
     print_message(f"{len(missing)} of {len(trials)} trials to run on {where}")

@@ -24,7 +24,7 @@ class Branch:
         self._channel = channel
 
     def ask(self, request: Any) -> Any:
-        """Continue the run from the moment of the branch, in a new process. Return the answer of this process.
+        """Continue the run from the moment of the branch, in a new process. Return the answer of the new process.
 
         Args:
             request: object that describes how the run continues.
@@ -68,7 +68,7 @@ class Continuation:
 
 
 class _NoAnswer:
-    """Result in place of an answer: the copy of the process, which continued the run, ended without an answer."""
+    """Substitute for an answer if the process of the continued run ended without an answer."""
 
     def __init__(self, status: int) -> None:
         self.status = status
@@ -84,7 +84,7 @@ def branch() -> Branch | Continuation:
         theirs.close()
         return Branch(ours)
     ours.close()
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # only the process of the run ends its branches
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C does not end a branch, but a closed channel does
     signal.signal(signal.SIGTERM, signal.SIG_DFL)
     try:
         while True:

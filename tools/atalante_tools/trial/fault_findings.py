@@ -11,11 +11,12 @@ from atalante_tools.faults.matrix import load_matrix
 from atalante_tools.trial.fault_plan import DOUBLE_SUPPORT, NO_FRAMES
 from atalante_tools.trial.findings import Finding, Result
 
-#: Fault ID -> regular expression for the names of the cases in which the robot must not fall.
-#: The cases are lost, late and doubled frames; a failed IMU, foot or force cell; an exception of the controller.
-#: The robot must also not fall after a few late cycles, STOP, or the release of the dead-man switch.
-#: A loop that stays much slower than 1 kHz is left out: joints then move too far in a cycle, and the HAL reports wrong
-#: velocities.
+#: Fault ID -> regular expression for the names of the cases in which the robot must not fall; empty for all cases.
+#: The cases are lost, late and doubled frames; errors on the bus; a failed IMU, foot or force cell; an exception of the
+#: controller. The robot must also not fall after a few late cycles, STOP, the release of the dead-man switch, or the loss of the
+#: pendant.
+#: A loop that stays much slower than 1 kHz is left out. Joints then move too far in a cycle. The HAL takes this for a wrong
+#: velocity, and the drives hold.
 #: A drive without data for ten cycles is left out, because its joint must not be moved.
 #: The button HOLD is left out: the drives then hold at once, so the robot may fall.
 NO_FALL: Final = {
@@ -35,8 +36,9 @@ NO_FALL_IN_DOUBLE_SUPPORT: Final = NO_FRAMES
 def fault_findings(results: Sequence[Result]) -> list[Finding]:
     """Return one finding per fault.
 
-    If `NO_FALL` contains the fault and the case, no run may end in a fall. In all other cases, the HAL must report a
-    diagnostic for each fall, and must have left ACTIVE and FULL_ASSIST. The HAL must not raise an exception in any run.
+    If `NO_FALL` contains the fault and the case, no run may end in a fall. For a fault in `NO_FALL_IN_DOUBLE_SUPPORT`, no run in
+    which the fault begins in double support may end in a fall. After any other fall, the HAL must have reported a diagnostic, and
+    must have left ACTIVE and FULL_ASSIST. The HAL must not raise an exception in any run.
 
     Args:
         results: results of `fault` trials.

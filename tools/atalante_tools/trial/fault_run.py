@@ -55,14 +55,14 @@ _LONGEST: Final = 20_000
 #: The robot is at rest if its pelvis and its joints have been slower than `_STILL` [m/s, rad/s] for `_RESTED` cycles, and
 #: each foot carries a load of at least `_LOADED` [N].
 _STILL, _RESTED, _LOADED = 0.01, 500, 50.0
-#: The outcome is "walked" if the robot still walks `_WALKED` cycles after the second landing (`_LANDINGS`) that follows
-#: the fault.
+#: After the end of a fault, the landings of the feet are counted. The outcome is "walked" if, `_WALKED` [cycles] after landing
+#: number `_LANDINGS`, the robot still walks.
 _WALKED: Final = 400
 _LANDINGS: Final = 2
 #: Phases of the walk that begin with the landing of a foot.
 _LANDED: Final = frozenset({Phase.STEP, Phase.STOP, Phase.BACK})
 _PELVIS: Final = IMUS.index("pelvis")
-#: The bisection finds the longest fault duration without a fall with at most this error [cycles].
+#: Largest error of the bisection for the longest fault duration without a fall [cycles].
 RESOLUTION: Final = 10
 
 
@@ -144,7 +144,8 @@ def _longest(trial: FaultTrial, case: Case, permanent: FaultRun) -> int:
 def longest_without(falls: Callable[[int], bool], horizon: int, resolution: int) -> int:
     """Return the longest duration of a fault with which the robot does not fall, by bisection from 0 to `horizon`.
 
-    The robot must walk to the end without a fault. If the robot falls with a fault, it must also fall with each longer fault.
+    The bisection assumes that the robot does not fall if there is no fault. It also assumes: if the robot falls with a fault of
+    one duration, then the robot falls with every longer duration, too.
 
     Args:
         falls: function that returns whether the robot falls with a fault of the given duration [cycles].

@@ -46,10 +46,10 @@ PUSH_WORST, PUSH_FORWARD = 200.0, 300.0
 
 @dataclass(frozen=True)
 class Finding:
-    """Finding of the paper. The field names are the keys of `--json`."""
+    """Claim that is tested on the results of an experiment. The field names are the keys of `--json`."""
 
     id: str
-    claim: str  # statement of the paper in one short sentence
+    claim: str  # statement of the paper or expected property of the robot, in one short sentence
     statistic: str  # measured values and limit
     passed: bool | None  # whether the results agree with the claim; None if results are missing
 
@@ -164,7 +164,7 @@ def protocol_findings(results: Sequence[Result]) -> list[Finding]:
 
 
 def _line(results: Sequence[Result]) -> Finding:
-    """Return the finding that the robot walks along a line. A robot that fell has no deviation."""
+    """Return the finding that the robot walks along a line. Robots that fell are left out."""
     reference = any(r["trial"]["heading_reference"] for r in results)
     limit = SIDEWAYS_WITH_REFERENCE if reference else SIDEWAYS
     deviations = [abs(r["true_lateral_m"]) for r in results if r["true_lateral_m"] is not None]
@@ -374,7 +374,7 @@ def _symmetry(id_: str, claim: str, walks: Sequence[Result], value: Callable[[Re
     pairs, values = list[float](), list[float]()
     for day in days.values():
         factors = [r["trial"]["xi"] for r in day]
-        if factors == factors[::-1]:  # omit a day with a missing trial
+        if factors == factors[::-1]:  # a day without this symmetry has a missing trial, and is left out
             values += [value(r) for r in day]
             pairs += [abs(value(day[k]) - value(day[-1 - k])) for k in range(len(day) // 2)]
     if not pairs:

@@ -28,7 +28,8 @@ class Ending:
     """End condition of a trial, called once per cycle.
 
     Attributes:
-        outcome: "stood" or "done" after the last step, "fell", "hold", "fault", or "no start".
+        outcome: "stood" (on the ground) or "done" (suspended) after the last step; otherwise "fell", "hold", "fault" or
+            "no start".
     """
 
     def __init__(self, rig: Rig, done: Callable[[], bool], observation: Observation | None = None) -> None:
@@ -37,7 +38,7 @@ class Ending:
         Args:
             rig: rig of the trial.
             done: function that returns whether the controller has ended the walk.
-            observation: attitude of the robot on the ground; None for a suspended robot.
+            observation: observer that detects a fall of a robot on the ground; None for a suspended robot.
         """
         self._rig, self._done, self._observation = rig, done, observation
         self._started, self._halted = False, 0

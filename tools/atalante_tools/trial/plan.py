@@ -57,7 +57,7 @@ LATE_PARTS: Final = 3
 LOSS: Final = 0.01
 #: Force of a push in `robustness` [N].
 PUSH: Final = 100.0
-#: Number of steps per push in `robustness`. A push begins at a random time within these steps.
+#: Number of steps per push in `robustness`. A push begins at a random time in the first 70 % of these steps.
 PUSH_STEPS: Final = 10
 #: Number of trials and number of steps per trial of `robustness`, in a normal run and with `--quick`.
 ROBUST, QUICK_ROBUST = (100, 60), (2, 4)
@@ -362,7 +362,7 @@ def push_trials(
 
 @cache
 def versions() -> dict[str, str]:
-    """Return the versions of Python, this project, its source text, and the packages that compute a trial."""
+    """Return the versions of Python, this project and the packages that compute a trial, a source hash, and the machine."""
     import atalante_tools.session
 
     folder = Path(__file__).parent

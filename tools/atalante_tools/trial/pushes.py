@@ -98,7 +98,7 @@ class _Walk:
     """End condition of a walk that branches off before the pushed step.
 
     Attributes:
-        ending: end condition of the walk after the branch, with the push.
+        ending: end condition of the walk; without a push before the branch, with the push after the branch.
         branch: branch of the walk; None until the branch.
         continuation: continued walk with a push; None in the process of the walk without a push.
     """

@@ -75,7 +75,7 @@ def verdict(finding: Finding) -> str:
 def write_report(
     experiment: str, results: Sequence[Result], findings: Sequence[Finding], quick: bool, missing: int, path: Path
 ) -> None:
-    """Write the HTML report, and its findings as Markdown in the same folder. Without Matplotlib, the report contains no figures.
+    """Write the HTML report, and its tables as Markdown in the same folder. Without Matplotlib, the report contains no figures.
 
     Args:
         experiment: key of `EXPERIMENTS`.
@@ -132,7 +132,7 @@ def _markdown_table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
 
 
 def summary(result: Result) -> dict[str, Any]:
-    """Return a result without its curves and series.
+    """Return a result without curves, time series, guide statistics and versions.
 
     Args:
         result: result of a trial.

@@ -158,7 +158,7 @@ class SafeEnding:
 
     Attributes:
         outcome: "stood", "fell", "hold" or "fault".
-        observation: attitude of the robot.
+        observation: observer that detects a fall, and measures the path of the robot.
         state: state of the HAL in the last cycle.
         safe: whether the walk ended safely. Either the robot stood at the end, or the HAL stopped the controller and no drive
             follows a command.

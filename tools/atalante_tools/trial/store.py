@@ -1,4 +1,4 @@
-"""Results of trials in a folder: one JSON file for each trial, written atomically. A call computes only the missing results.
+"""Results of trials in a folder: one JSON file for each trial, written atomically. Only missing results are computed.
 
 trials -> stored results, missing trials -> processes or a dask cluster -> files -> results
 """

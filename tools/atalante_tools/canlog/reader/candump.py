@@ -4,8 +4,8 @@
      time                channel id fd flags, payload   direction (may be missing)
 
 The array operations accept only lines with exactly this format. A regular expression parses every other line
-individually (remote frame, raw DLC, other spacing). Lines that contain no frame are counted. A damaged line is never
-read as a shorter frame, because the validator would then report a wrong length or a lost frame.
+individually (remote frame, raw DLC, other spacing). Lines that are neither empty nor a frame are counted. A damaged line
+is never read as a shorter frame, because the validator would then report a wrong length or a lost frame.
 """
 
 from __future__ import annotations
@@ -59,11 +59,11 @@ _LINE = re.compile(
 
 @dataclass
 class Parsed:
-    """Frames parsed from a text, and the number of lines that contain no frame."""
+    """Frames parsed from a text, and the unreadable lines (lines that are neither empty nor a frame)."""
 
     chunk: Chunk
-    unreadable: int  # number of lines that contain no frame
-    first_unreadable: bytes
+    unreadable: int  # number of unreadable lines
+    first_unreadable: bytes  # first unreadable line; empty if there is none
 
 
 def parse(text: Text, begin: int, end: int, channels: Channels) -> Parsed:
@@ -328,7 +328,7 @@ def _payloads(lines: _Lines, frames: npt.NDArray[np.void], wanted: npt.NDArray[n
 
 
 def _parse_individually(lines: _Lines, chunk: Chunk, regular: npt.NDArray[np.bool_], channels: Channels) -> Parsed:
-    """Parse the irregular lines one by one; remove and count the lines that contain no frame."""
+    """Parse the irregular lines one by one; remove empty and unreadable lines, and count the unreadable lines."""
     keep = np.ones(len(regular), np.bool_)
     unreadable, first = 0, b""
     for row in np.flatnonzero(~regular).tolist():

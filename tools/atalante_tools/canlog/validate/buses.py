@@ -17,10 +17,10 @@ _MAJORITY = 0.9
 class ChannelMap:
     """Bus of each channel and expected channel of each message, derived from the frames.
 
-    A channel with the name of a bus is assigned to this bus. Any other channel is assigned to a bus if at least
-    `_MAJORITY` of the known frames on the channel belong to this bus. A channel with the frames of several buses (such as
-    all four buses on one vcan0) is assigned to no bus. A message is expected on the channel of its bus. If this bus has
-    no channel, the message is expected on the channel of its first frame.
+    A known frame is a frame of a message in the DBC. A channel with the name of a bus is assigned to this bus. Any other
+    channel is assigned to a bus if at least `_MAJORITY` of the known frames on the channel belong to this bus. A channel
+    with the frames of several buses (such as all four buses on one vcan0) is assigned to no bus. A message is expected on
+    the channel of its bus. If this bus has no channel, the message is expected on the channel of its first frame.
     """
 
     def __init__(self, plan: Plan, named: Mapping[str, str]) -> None:

@@ -31,7 +31,7 @@ LEGAL = {(int(state), int(after)) for (state, _), after in TRANSITIONS.items()} 
     (int(a), int(b)) for a, b in _SPONTANEOUS
 }
 #: Pairs (state, controlword) to which a drive need not respond.
-#: A drive may ignore ENABLE_OPERATION until the quick stop is acknowledged.
+#: In QUICK_STOP_ACTIVE, a drive that stopped without a command may ignore ENABLE_OPERATION until it receives QUICK_STOP.
 #: A drive may ignore FAULT_RESET while the cause of the fault persists.
 EXEMPT = {(int(_S.QUICK_STOP_ACTIVE), int(_C.ENABLE_OPERATION)), (int(_S.FAULT), int(_C.FAULT_RESET))}
 _NOTHING = -1
@@ -64,7 +64,7 @@ class _Drive:
 
 @dataclass(frozen=True)
 class _CommandField:
-    """Field of a command message that carries a controlword."""
+    """Controlword field of a command message."""
 
     row: int  # index of the command message in the plan
     index: int  # index of the field in the fields of its message
@@ -221,7 +221,7 @@ def _command_fields(plan: Plan, command: str) -> list[_CommandField]:
 
     Args:
         plan: compiled DBC.
-        command: quantity in the name of the command signal.
+        command: name of the command signal without the joint, such as `Controlword`.
     """
     found = []
     for family in plan.families:

@@ -35,8 +35,8 @@ class CrcRules:
     def __init__(self, plan: Plan, findings: Findings) -> None:
         self._plan, self._findings = plan, findings
         lengths = np.where(plan.protected, plan.lengths, 0)
-        #: Message indices, one range for each payload length that has a message with a CRC.
-        #: The range covers all messages of this length, with and without a CRC.
+        #: One range of message indices for each payload length of the messages with a CRC.
+        #: The range contains all messages of this length, with and without a CRC.
         self._spans = [
             range(int(r[0]), int(r[-1]) + 1) for n in np.unique(lengths[lengths > 0]) for r in [_at(plan, n)]
         ]

@@ -43,7 +43,7 @@ class _Channel:
     cycle: int = 0  # cycle number of the last SYNC
     begin: int = 0  # time stamp of the last SYNC in robot time [ns]
     wall: int = 0  # time stamp of the last SYNC on the wall clock [ns]
-    count: int = 0  # number of frames since the last SYNC
+    count: int = 0  # number of frames since the last SYNC, including this SYNC
     last: int = -(1 << 62)  # stamp of the last frame [ns]
 
 

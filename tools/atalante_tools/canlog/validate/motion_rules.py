@@ -89,7 +89,7 @@ class MotionRules:
 
 
 class _Velocity:
-    """Rule that compares the mean of the velocity signal in a time window with the mean slope of the position signal.
+    """Rule that compares the mean of the velocity signal in a window of frames with the mean slope of the position signal.
 
     The tolerance allows for the lag of the velocity filter in the drive.
     """
@@ -205,8 +205,8 @@ class _Columns:
         The previous frame may be in an earlier chunk.
 
         Returns:
-            Three arrays: the codes of each frame and the codes of its previous frame, both of shape (fields, n), and the
-            indices of the frames without a previous frame.
+            The codes of each frame, shape (fields, n); the codes of its previous frame, shape (fields, n); the indices of
+            the frames without a previous frame.
         """
         codes = decoded.codes[self._indices]
         before = np.empty_like(codes)

@@ -82,7 +82,7 @@ class OrderRules:
     def _check_lateness(
         self, bus: _Bus, row: int, stamps: npt.NDArray[np.int64], begins: npt.NDArray[np.int64], number: Indices
     ) -> None:
-        """Report the state frames that were received after the deadline of their cycle, but before the next SYNC.
+        """Report the state frames that were received after the deadline, but less than one cycle time after the SYNC.
 
         State frames that were received after the next SYNC are reported by `_check_order`.
         """

@@ -55,27 +55,27 @@ class Project:
     channels: Mapping[str, str] = field(default_factory=dict)  # name of the bus in the DBC for each channel of the log
 
     def threshold(self, rule: str, name: str) -> Threshold:
-        """Return the threshold of a rule with the given name."""
+        """Return the threshold `name` of a rule."""
         return self.thresholds.get(rule, {}).get(name, RULE_OF[rule].thresholds[name])
 
     def number(self, rule: str, name: str) -> float:
-        """Return a threshold that is a number, in the unit of the rule."""
+        """Return a numeric threshold of a rule, in the unit of the rule."""
         value = self.threshold(rule, name)
         assert isinstance(value, float)
         return value
 
     def text(self, rule: str, name: str) -> str:
-        """Return a parameter of a rule that is a name, such as the name of a signal."""
+        """Return a rule parameter that contains a name, such as the name of a signal."""
         return str(self.threshold(rule, name))
 
     def names(self, rule: str, name: str) -> tuple[str, ...]:
-        """Return a parameter of a rule that is a list of names."""
+        """Return a rule parameter that contains a list of names."""
         value = self.threshold(rule, name)
         assert isinstance(value, tuple)
         return value
 
     def quantities(self, rule: str) -> dict[str, float]:
-        """Return all thresholds of a rule that are numbers, by the name of the threshold."""
+        """Return all numeric thresholds of a rule, by the name of the threshold."""
         found = {**RULE_OF[rule].thresholds, **self.thresholds.get(rule, {})}
         return {name: value for name, value in found.items() if isinstance(value, float)}
 

@@ -23,7 +23,7 @@ from atalante_tools.canlog.validate.validator import Validator
 
 #: `_CHECK_PERIOD` is the period of the checks on a live bus [s]. `_RECEIVE_TIMEOUT` is the longest wait for a frame [s].
 _CHECK_PERIOD, _RECEIVE_TIMEOUT = 0.5, 0.02
-_LIVE_FRAMES = 4096  # size of the receive buffer
+_LIVE_FRAMES = 4096  # size of the receive buffer [frames]
 
 
 def validate_log(

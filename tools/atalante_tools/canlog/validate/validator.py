@@ -180,7 +180,8 @@ class Validator:
     def expected(self) -> npt.NDArray[np.bool_]:
         """Return the mask of the messages that must be in the log. Shape (messages,).
 
-        These messages are sent by `node` (None means any node) on the recorded buses.
+        These messages are sent by `node` (None means any node) on the recorded buses. If a channel has no bus, the
+        messages of all buses are selected.
         """
         count = len(self.plan.layouts)
         wanted = np.ones(count, np.bool_)

@@ -55,7 +55,7 @@ class ValueRules:
         }
 
     def check(self, family: Family, stream: Stream) -> Decoded | None:
-        """Decode and check the frames of a message family; return None if the chunk has no such frame."""
+        """Decode and check the frames of a message family; return None if the family has no field or no frame in the chunk."""
         span = stream.span(family.rows)
         if span.start == span.stop or not family.codec.fields:
             return None

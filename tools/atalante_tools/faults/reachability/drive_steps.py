@@ -21,7 +21,7 @@ from atalante_tools.faults.reachability.search import Exploration, Transition, e
 
 #: Controlword that CiA 402 does not define.
 UNKNOWN_WORD: Final = 0x55
-#: Errors that the search injects, one for each local reaction: error code, and whether the cause of the error persists.
+#: Errors that the search injects: error code, and whether the cause of the error persists. Each `FaultReaction` occurs.
 _ERRORS: Final = (
     (emergency.CURRENT, False),
     (emergency.OVER_TEMPERATURE, True),

@@ -38,7 +38,8 @@ NOTHING, RELEASED, STOPPED, HELD = range(4)
 RECEIVED_HOLD: Final = 2
 #: If no new pendant frame arrives after a stop action, the HAL may still enable a drive for this number of cycles.
 SILENT_PENDANT: Final = LOST - 1
-#: Ages of late pendant frames [cycles]: all ages that the HAL accepts, and two ages that the HAL rejects.
+#: Ages of late pendant frames that the search tries [cycles]. From age `LOST` on, the data of the frame has timed out. From age
+#: 16 on, the E2E check rejects the frame.
 _LATE: Final = (*range(1, LOST + 2), 16)
 _BUTTONS: Final = (Request.START, Request.STOP, Request.HOLD)
 #: Largest stored number of cycles since the stop action. Larger numbers are stored as this number.

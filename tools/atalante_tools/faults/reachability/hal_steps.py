@@ -112,7 +112,7 @@ class Decision(NamedTuple):
 
     after: Supervision
     prevented: bool  # whether a diagnostic prevents the HAL from enabling drives
-    entered: bool  # whether the supervisor state changed, so that a stored START is dropped
+    entered: bool  # whether the supervisor state changed; a change drops a stored START
 
 
 class _ScriptedPendant(Pendant):

@@ -134,7 +134,7 @@ class EmbeddedRobot(Closing):
     def close(self) -> None:
         """Close the bus and wait for the end of the child. A second call has no effect.
 
-        Only the thread that created this object may call it, because it restores the cores of that thread.
+        Only the thread that created this object may call this method, because the method restores the cores of this thread.
         """
         self.bus.close()
         if self in self._open:
@@ -182,7 +182,7 @@ def cores_are_idle(others: int, load: Path = _LOAD) -> bool:
         try:
             samples.append(int(load.read_text().split()[3].partition("/")[0]))
         except (OSError, IndexError, ValueError):
-            return True  # the load is not known
+            return True  # if the load cannot be read, the cores are assumed to be idle
         time.sleep(_LOAD_INTERVAL)
     busy = max(1, min(samples))  # smallest number of running threads in a sample; this thread is one of them
     return (os.cpu_count() or 1) - busy >= 1 + others

@@ -1,7 +1,7 @@
 """Main program of the subprocess with the embedded robot. `EmbeddedRobot` starts this subprocess.
 
 Command line: `python -m atalante_tools.session.embedded MEMORY BELL ACCESS`. The program reads the `SpawnConfig` from stdin.
-All other communication uses the bus and the memory of the access. The program ends when the HAL closes the bus.
+All other communication uses the bus and the shared memory of `ServedAccess`. The program ends when the HAL closes the bus.
 """
 
 from __future__ import annotations

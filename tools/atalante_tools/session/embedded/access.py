@@ -36,8 +36,8 @@ _SIZE: Final = 14
 class Stance(NamedTuple):
     """True position of the robot on the ground."""
 
-    x: float  # middle between the feet [m]
-    y: float  # middle between the feet [m]
+    x: float  # x of the point midway between the feet, in world axes [m]
+    y: float  # y of this point [m]
     yaw: float  # mean heading of both feet [rad]
 
 
