@@ -28,22 +28,24 @@ def test_walk_without_a_fault_has_no_false_alarm(number: int, name: str, monkeyp
     assert (quiet.state, quiet.alarms, quiet.failed) == ("ACTIVE", {}, False)
     assert quiet.name.startswith(name)
     assert quiet.cycles > 5000
+    monkeypatch.setattr(false_alarms, "_CYCLES", 1000)  # the walk on the ground cannot end within twice this time
+    assert QuietTask(number, "pybullet")().failed is name.startswith("ground")
 
 
 @pytest.mark.parametrize(
-    ("state", "counts", "failed"),
+    ("finished", "counts", "failed"),
     [
-        ("ACTIVE", {"TORQUE_SATURATED": 3, "GUIDE_OUTSIDE": 1, "OPERATOR_STOP": 1}, False),
-        ("ACTIVE", {"TORQUE_SATURATED": 3, "ENC_DRIFT": 2}, True),
-        ("HOLD", {}, True),
+        (True, {"TORQUE_SATURATED": 3, "GUIDE_OUTSIDE": 1, "OPERATOR_STOP": 1}, False),
+        (True, {"TORQUE_SATURATED": 3, "ENC_DRIFT": 2}, True),
+        (False, {}, True),
     ],
 )
-def test_other_diagnostics_and_other_states_fail(state: str, counts: dict[str, int], failed: bool) -> None:
-    assert Quiet("a walk", 10, state, counts).failed is failed
+def test_other_diagnostics_and_unfinished_walks_fail(finished: bool, counts: dict[str, int], failed: bool) -> None:
+    assert Quiet("a walk", 10, "ACTIVE", counts, finished).failed is failed
 
 
 def test_command_reports_false_alarms(monkeypatch: pytest.MonkeyPatch) -> None:
-    walks = {0: Quiet("first", 10, "ACTIVE", {}), 1: Quiet("second", 20, "ACTIVE", {"ENC_DRIFT": 2})}
+    walks = {0: Quiet("first", 10, "ACTIVE", {}, True), 1: Quiet("second", 20, "ACTIVE", {"ENC_DRIFT": 2}, True)}
     monkeypatch.setattr(campaign, "run_task", lambda task: walks[task.number])
     arguments = ["faults", "false-alarms", "--jobs", "1", "--cycles"]
     result = CliRunner().invoke(cli, [*arguments, "60000"])

@@ -40,6 +40,7 @@ class Quiet:
     cycles: int  # number of cycles from power-on to the end of the walk
     state: str  # state of the HAL at the end of the walk
     counts: dict[str, int]  # diagnostic code -> number of reports
+    finished: bool  # whether the robot walked to the end
 
     @property
     def alarms(self) -> dict[str, int]:
@@ -48,8 +49,8 @@ class Quiet:
 
     @property
     def failed(self) -> bool:
-        """Return whether there was a false alarm, or the HAL was not in ACTIVE at the end of the walk."""
-        return bool(self.alarms) or self.state != SupervisorState.ACTIVE.name
+        """Return whether there was a false alarm, or the robot did not walk to the end."""
+        return bool(self.alarms) or not self.finished
 
 
 @dataclass(frozen=True)
@@ -118,7 +119,7 @@ class QuietTask:
         from atalante_hal.loop import LockStep, run
         from atalante_tools.session.rig import open_hal
 
-        ended, active = SupervisorState.OFF, False
+        ended, active, finished = SupervisorState.OFF, False, False
         with open_hal(
             Target(EMBEDDED, "", lockstep=True, engine=self.engine),
             seed=self.number,
@@ -130,14 +131,15 @@ class QuietTask:
         ) as rig:
 
             def until(state: State) -> bool:
-                nonlocal ended, active
+                nonlocal ended, active, finished
                 ended, now = state.supervisor, state.supervisor is SupervisorState.ACTIVE
                 left, active = active and not now, now
+                finished = now and done(state)
                 return left or done(state) or state.cycle > 2 * _CYCLES
 
             statistics = run(rig.hal, controller, LockStep(), until=until)
             counts = diagnostics(rig.hal)
-        return Quiet(name, statistics.cycles, ended.name, counts)
+        return Quiet(name, statistics.cycles, ended.name, counts, finished)
 
 
 def quiet_tasks(cycles: int, engine: str) -> Iterator[QuietTask]:

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import errno
+import io
+import os
 from pathlib import Path
 
 import can
@@ -230,6 +233,21 @@ def test_line_longer_than_the_buffer_is_unreadable(tmp_path: Path, monkeypatch: 
     (remark,) = log.remarks
     assert (remark.rule, remark.count) == ("log-unreadable", 1)
     assert "the first is 'xxx" in remark.sentence
+
+
+def test_read_error_is_reported_as_a_truncated_log(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = tmp_path / "error.log"
+    path.write_text("(0.000001) can0 100#00\n")
+
+    class Broken(io.FileIO):
+        def readinto(self, memory: object) -> int:
+            raise OSError(errno.EIO, os.strerror(errno.EIO))
+
+    log = open_log(path)
+    monkeypatch.setattr(candump_log, "_open", lambda log: Broken(log.path))
+    assert list(log.chunks()) == []
+    sentences = {remark.rule: remark.sentence for remark in log.remarks}
+    assert os.strerror(errno.EIO) in sentences["log-truncated"]
 
 
 def read(path: Path) -> tuple[Log, list[Chunk]]:

@@ -97,7 +97,10 @@ def _fill(file: io.RawIOBase | gzip.GzipFile, memory: memoryview) -> tuple[int, 
         The number of bytes read, and the text of the read error. The text is empty if bytes were read or the file has ended.
     """
     if not isinstance(file, gzip.GzipFile):
-        return file.readinto(memory) or 0, ""
+        try:
+            return file.readinto(memory) or 0, ""
+        except OSError as error:
+            return 0, str(error)
     total = 0
     while total < len(memory):
         try:
