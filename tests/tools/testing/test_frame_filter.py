@@ -81,9 +81,11 @@ def test_fault_selects_messages_by_node_pattern_or_command_name(ends: BusEnds):
 
 
 def test_fault_without_a_frame_count_lasts_until_cleared(ends: BusEnds):
-    ends.filter.drop("*_STATE")
+    fault = ends.filter.drop("*_STATE")
     assert all(ends.cycle()[1] == [] for _ in range(10))
+    assert not fault.over
     ends.filter.clear()
+    assert fault.over
     assert ends.cycle()[1] == list(STATES)
 
 

@@ -30,6 +30,7 @@ from atalante_tools.trial.plan import (
     PUSH_DIRECTIONS,
     PUSH_FORCES,
     PUSH_PHASES,
+    STEP,
     SWEEP,
     PushTrial,
     RobustTrial,
@@ -335,6 +336,10 @@ def test_robust_trials_are_drawn_from_the_seed_within_their_ranges() -> None:
     assert all(0.9 <= t.mass_share <= 1.1 and 0.25 <= t.friction <= 0.8 for t in trials)
     assert all(len(t.pushes) == 6 and all(0.0 <= time < 48.0 for time, _ in t.pushes) for t in trials)
     assert len({trial.seed for trial in trials}) == 100
+    for trial in robust_trials(20, 4, 0, "mujoco"):
+        assert isinstance(trial, RobustTrial)
+        ((time, _),) = trial.pushes
+        assert time < 0.7 * 4 * STEP[1]  # also the push of a short walk begins
 
 
 def robust_trial(steps: int) -> RobustTrial:

@@ -143,6 +143,8 @@ class FrameFilter(WrappedBus):
 
     def clear(self) -> None:
         """End all faults; delayed frames are still passed on."""
+        for fault in self.faults:
+            fault.end()
         self.faults.clear()
 
     def _add(self, kind: str, name: str, frames: int | None, probability: float) -> Fault:

@@ -314,9 +314,9 @@ def robust_trials(count: int, steps: int, seed: int, engine: str) -> list[Trial]
     for number in range(count):
         draw = random.Random(f"{seed}/{number}")
         patient = draw.choice(STUDY_PATIENTS)
-        slots = max(1, steps // PUSH_STEPS)
+        slots, interval = max(1, steps // PUSH_STEPS), min(PUSH_STEPS, steps) * STEP[1]
         pushes = tuple(
-            (round((k + 0.7 * draw.random()) * PUSH_STEPS * STEP[1], 3), round(draw.uniform(-180.0, 180.0), 1))
+            (round((k + 0.7 * draw.random()) * interval, 3), round(draw.uniform(-180.0, 180.0), 1))
             for k in range(slots)
         )
         trials.append(
