@@ -45,7 +45,7 @@ Cycles = npt.NDArray[np.int64]
 
 
 class Sample(NamedTuple):
-    """Values of one cycle, as views whose array objects are the same in every cycle."""
+    """Values of one cycle. The arrays are the same objects in every cycle; their contents change."""
 
     sent: Vector  # (12,) Nm, torques sent in the last cycle
     position: Vector  # (12,) rad

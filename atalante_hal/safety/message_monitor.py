@@ -223,8 +223,8 @@ class MessageMonitor:
         sender, two_senders = self._senders[row], self._check_senders(cycle, memory, row, rival)
         tolerated, timeout = self._legs[row] in tolerance.legs, self._timeouts[row]
         fresh = check <= Check.SOME_LOST
-        # `tolerance.longer` extends the timeout only while no frame is accepted. If a frame is accepted after the timeout in the
-        # DBC, its values are too old for the plausibility checks, so the message is late.
+        # `tolerance.longer` extends the timeout only while no frame arrives. A frame that is accepted with a larger age than the
+        # timeout in the DBC is late: the plausibility checks use no values of this age.
         late = age >= timeout + tolerance.longer * (tolerated and not fresh)
         # Impossible signal values do not reduce the trust, because the frame was transmitted correctly.
         good = (fresh or check >= Check.RANGE) and not rival

@@ -22,7 +22,8 @@ from atalante_hal.wire.cia402 import Controlword, DriveState, controlword_toward
 
 #: All drives must be in OPERATION ENABLED within this time after START [cycles].
 ENABLE_CYCLES = 200
-#: A start ends if no drive changes its state for this time [cycles]. A command and its answer may each be lost four times.
+#: A start ends if no drive changes its state for this time [cycles]. The time suffices if a command and its answer are each lost
+#: four times in a row.
 STALLED_CYCLES = 10
 #: In HOLD, a START is refused while a joint whose drive is on is faster than this [rad/s], because the test of the joint
 #: directions needs joints at rest. A joint whose drive is off may sink, because the START first lets this drive hold its joint.

@@ -79,7 +79,7 @@ class Mechanics:
         return body
 
     def complete(self, emulator: Emulator) -> None:
-        """Add wearer, crane and virtual operator to the emulator, if the description contains them.
+        """Add wearer, crane and virtual operator to the emulator, as far as the fields of this object describe them.
 
         Args:
             emulator: emulator with the body of `make_body`.

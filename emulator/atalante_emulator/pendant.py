@@ -76,12 +76,12 @@ class Operator:
         self._press(Request.START)
 
     def stop(self) -> None:
-        """Press the STOP button. After that, only a call of `start()` presses START."""
+        """Press the STOP button. After that, the operator no longer presses START without a call of `start()`."""
         self._starts = False
         self._press(Request.STOP)
 
     def hold(self) -> None:
-        """Press the HOLD button. After that, only a call of `start()` presses START."""
+        """Press the HOLD button. After that, the operator no longer presses START without a call of `start()`."""
         self._starts = False
         self._press(Request.HOLD)
 

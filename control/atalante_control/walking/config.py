@@ -100,7 +100,7 @@ class WalkConfig:
     guided_alpha: float = 0.5
     #: s, time after the start of a guided step in which the smallest allowed weight of the backup torque falls from 1 to 0
     engage: float = 0.02
-    #: s, time after a guided step in which the baseline controller takes over sagittal hip and knee of the leg that was guided
+    #: s, duration of the change from the guide to the baseline controller, for sagittal hip and knee, after a guided step
     release: float = 0.03
 
     @classmethod

@@ -89,8 +89,8 @@ class Placement:
     offset: Annotated[Vector, 2]  # m, current offset of the swing foot in the walking frame
     speed: Annotated[Vector, 2]  # m/s, speed of the offset
     change: Annotated[Vector, 3]  # rad, sum of the changes of FH, SH and SK by `shift_foot` in this phase
-    low: Annotated[Vector, 12]  # rad, smallest desired angles of the joints
-    high: Annotated[Vector, 12]  # rad, largest desired angles of the joints
+    low: Annotated[Vector, 12]  # rad, lower limits of the desired angles
+    high: Annotated[Vector, 12]  # rad, upper limits of the desired angles
     rotation: Annotated[Vector, (3, 3)]  # rotation matrix from the ankle link to the pelvis
     origin: Annotated[Vector, (_LINKS, 3)]  # m, positions of the joints of the swing leg in the pelvis frame
     axis: Annotated[Vector, (_LINKS, 3)]  # joint axes of the swing leg in the axes of the pelvis
@@ -265,7 +265,7 @@ def shift_foot(
 
 
 def _step(placement: Placement, desired: Vector, leg: int, k: int, step: float) -> float:
-    """Change the desired angle of a shifting joint within the limits of its angle and its speed, and return the change [rad]."""
+    """Change the desired angle of a joint in `_SHIFTING` within the limits of angle and speed, and return the change [rad]."""
     joint, rate = leg + _SHIFTING[k], len(desired) // 2 + leg + _SHIFTING[k]
     least, most = (-_FASTEST - desired[rate]) * PERIOD, (_FASTEST - desired[rate]) * PERIOD
     angle = desired[joint] + min(max(step, min(least, 0.0)), max(most, 0.0))

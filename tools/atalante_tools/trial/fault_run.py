@@ -55,8 +55,8 @@ _LONGEST: Final = 20_000
 #: The robot is at rest if its pelvis and its joints have been slower than `_STILL` [m/s, rad/s] for `_RESTED` cycles, and
 #: each foot carries a load of at least `_LOADED` [N].
 _STILL, _RESTED, _LOADED = 0.01, 500, 50.0
-#: After the end of a fault, the landings of the feet are counted. The outcome is "walked" if, `_WALKED` [cycles] after landing
-#: number `_LANDINGS`, the robot still walks.
+#: After the end of a fault, the landings of the feet are counted. The outcome is "walked" if the robot still walks `_WALKED`
+#: cycles after the landing with the number `_LANDINGS`.
 _WALKED: Final = 400
 _LANDINGS: Final = 2
 #: Phases of the walk that begin with the landing of a foot.

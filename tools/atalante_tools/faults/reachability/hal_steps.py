@@ -47,7 +47,7 @@ QUALIFICATIONS: Final = {
     False: (Qualification(0, 0, False), Qualification(0, REQUALIFY - 1, False)),
     True: (SETTLED, Qualification(FULL - 4, REQUALIFY, True)),
 }
-#: Source of the RequestCounter that `Pendant.evaluate` read last: none yet, last accepted frame, older frame, second sender.
+#: Frame from which `Pendant.evaluate` read the last RequestCounter: none yet, last accepted frame, older frame, second sender.
 _NONE, _LATEST, _OLDER, _ROGUE = range(4)
 _EVALUATED: Final = {_NONE: None, _LATEST: _PRESSES, _OLDER: _PRESSES - 1, _ROGUE: _ROGUE_PRESSES}
 
@@ -58,7 +58,7 @@ class Reception(NamedTuple):
     age: int = 0  # age of the last accepted frame [cycles]; `LOST` after the timeout
     dead_man: bool = True  # whether the dead-man switch is pressed in the last accepted frame
     request: int = Request.START  # `Request` of the last accepted frame
-    evaluated: int = _LATEST  # source of the RequestCounter that `Pendant.evaluate` read last
+    evaluated: int = _LATEST  # frame of the RequestCounter that `Pendant.evaluate` read last: `_NONE`, `_LATEST`, ...
     rogue: bool = False  # whether the last accepted frame has the RequestCounter of a second sender
     stored: bool = False  # whether a START is stored until the pendant is trusted
     trusted: bool = True
