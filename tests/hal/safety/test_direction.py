@@ -386,7 +386,16 @@ def test_large_motion_names_the_joint_and_not_a_lighter_one_before_it():
     proof.sent(proof.torque(MIDDLE, np.zeros(12)))
     position = MIDDLE.copy()
     position[[JOINTS.index("left_TH"), JOINTS.index("left_SH")]] += [0.6 * TRAVEL, 1.1 * TRAVEL]
-    assert proof.evaluate(position, NO_FORCE).startswith("left_SH moved by 1.6 deg")
+    motion = "left_SH moved by 1.6 deg in the test of its direction; each joint may move by at most 1.5 deg"
+    assert proof.evaluate(position, NO_FORCE) == motion
+
+
+def test_start_that_ends_early_has_no_mobility_of_an_earlier_start(joints: Joints):
+    joints.run()
+    assert joints.proof.mobility.all()
+    joints.weight[0] = 1e4
+    assert "moved by" in joints.run()[0]
+    assert joints.proof.mobility.tolist() == [0.0] * 12
 
 
 def test_large_motion_names_the_joint_that_its_pose_control_holds_most_strongly(joints: Joints):
