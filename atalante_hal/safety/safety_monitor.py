@@ -521,6 +521,6 @@ class SafetyMonitor:
         are switched off again.
         """
         lower = frozenset(dtc for dtc in self.memory.confirmed if dtc.reaction is Reaction.LOWER)
-        off = {node for node in self.memory.nodes_of(lower) if node in DRIVE_NODES} if lower else set()
+        off = {node for node in self.memory.nodes_of(lower) if node in DRIVE_NODES}
         kept = self.lowered if self._state.supervisor in (_S.LOWER, _S.FAULT) else self._kept_off
         self.lowered = kept | off

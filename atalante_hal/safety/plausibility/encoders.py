@@ -292,7 +292,7 @@ class EncoderChecks:
         Args:
             joint: index of the joint in JOINTS.
         """
-        pair = joint, (joint + len(LEG_JOINTS)) % len(JOINTS)
+        pair = joint, opposite(joint)
         if min(self.jumps[one] for one in pair) < JUMPS_TO_CONFIRM:
             return False
         # `Lost.expected` follows the motion since the jump, so the differences are the sizes of the jumps.
@@ -302,7 +302,7 @@ class EncoderChecks:
         return abs(ours - apart) <= reach and abs(theirs + apart) <= reach
 
     def _exchange(self, joint: int) -> Finding:
-        other = JOINTS[(joint + len(LEG_JOINTS)) % len(JOINTS)]
+        other = JOINTS[opposite(joint)]
         text = f"the encoder of {JOINTS[joint]} reads the position of {other}, and vice versa; both drives are switched off"
         return Finding(Dtc.TORQUE_DIRECTION, JOINT_NODES[joint], self._jump_of[joint], True, text)
 
@@ -324,6 +324,15 @@ class EncoderChecks:
         at_joint = error / self._gear[joint]
         text = f"the velocity of {JOINTS[joint]} differs from its encoder by {np.degrees(at_joint):+.0f} deg/s"
         return Finding(Dtc.ENC_VELOCITY, JOINT_NODES[joint], at_joint, True, text)
+
+
+def opposite(joint: int) -> int:
+    """Return the index of the same joint of the other leg.
+
+    Args:
+        joint: index of the joint in JOINTS.
+    """
+    return (joint + len(LEG_JOINTS)) % len(JOINTS)
 
 
 def continues(mean: float, speed: float, top_speed: float) -> bool:

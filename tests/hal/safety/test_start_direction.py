@@ -25,6 +25,26 @@ KNEE, ANKLE = JOINTS.index("left_SK"), JOINTS.index("left_SA")
 ONCE = sum(duration + LATENCY + 1 for _, duration in GROUPS)
 
 
+def start_until_the_test(rig) -> None:
+    """Press START, and run until the test of the directions begins."""
+    rig.operator.start()
+    while not rig.hal._safety_monitor.proof.running:
+        rig.run(1)
+
+
+def stop_during_the_test(rig, joint: int) -> None:
+    """Press START, then STOP during the test of the directions. The drive of the joint must be off, and the joint at rest."""
+    start_until_the_test(rig)
+    rig.run(3)
+    rig.operator.stop()
+    anchor = rig.emulator.body.position[joint]
+    rig.run(5)
+    assert rig.hal.state.drive_state[joint] == D.SWITCH_ON_DISABLED
+    assert abs(rig.emulator.body.position[joint] - anchor) < TRAVEL
+    rig.run(200)
+    assert not rig.events_of("OVERSPEED", "HOLD_UNSTABLE")
+
+
 @pytest.mark.parametrize("joint", range(6), ids=JOINTS[:6])
 def test_start_with_a_reversed_motor_fails_and_names_the_joint(make_rig, joint: int):
     rig = make_rig(starts=False)
@@ -78,9 +98,7 @@ def test_state_has_the_delay_that_the_start_measured(make_rig, late: int):
 def test_stop_during_the_test_ends_it_in_the_same_cycle(make_rig, stop: str):
     rig = make_rig(starts=False)
     rig.until(S.READY)
-    rig.operator.start()
-    while not rig.hal._safety_monitor.proof.running:
-        rig.run(1)
+    start_until_the_test(rig)
     rig.run(10)
     assert rig.controlwords() == {Controlword.ENABLE_OPERATION}
     getattr(rig.operator, stop)()
@@ -99,18 +117,8 @@ def test_drive_that_failed_the_test_stays_off_if_the_next_start_is_stopped(make_
     rig.operator.start()
     rig.run(160)
     assert "START_FAILED" in rig.codes()
-    rig.operator.start()
-    while not rig.hal._safety_monitor.proof.running:
-        rig.run(1)
-    rig.run(3)
-    rig.operator.stop()
-    anchor = rig.emulator.body.position[joint]
-    rig.run(5)
-    assert rig.hal.state.drive_state[joint] == D.SWITCH_ON_DISABLED
-    assert abs(rig.emulator.body.position[joint] - anchor) < TRAVEL
-    rig.run(200)
+    stop_during_the_test(rig, joint)
     assert rig.hal.state.supervisor is S.READY
-    assert not rig.events_of("OVERSPEED", "HOLD_UNSTABLE")
 
 
 @pytest.mark.parametrize("check", ["torque_tracking", "torque_motion"])
@@ -129,18 +137,8 @@ def test_drive_with_a_wrong_torque_stays_off_if_the_next_start_is_stopped(rig, m
     rig.operator.start()
     rig.until(S.HOLD, 5)
     rig.run(100)
-    rig.operator.start()
-    while not monitor.proof.running:
-        rig.run(1)
-    rig.run(3)
-    rig.operator.stop()
-    anchor = rig.emulator.body.position[KNEE]
-    rig.run(5)
-    assert rig.hal.state.drive_state[KNEE] == D.SWITCH_ON_DISABLED
-    assert abs(rig.emulator.body.position[KNEE] - anchor) < TRAVEL
-    rig.run(200)
+    stop_during_the_test(rig, KNEE)
     assert rig.hal.state.supervisor is S.HOLD
-    assert not rig.events_of("OVERSPEED", "HOLD_UNSTABLE")
 
 
 def test_further_presses_of_start_do_not_restart_the_test(make_rig):
@@ -193,9 +191,7 @@ def test_motor_that_is_reversed_in_hold_prevents_the_restart(rig):
     rig.operator.hold()
     rig.until(S.HOLD)
     rig.run(300)
-    rig.operator.start()
-    while not rig.hal._safety_monitor.proof.running:
-        rig.run(1)
+    start_until_the_test(rig)
     rig.emulator.drives.motors.set_strength(KNEE, -1.0)
     rig.run(200)
     assert [e.text.split()[0] for e in rig.hal.events if e.code == "START_FAILED"] == [JOINTS[KNEE]]

@@ -161,7 +161,8 @@ class MomentTask:
         extremes, before = _extremes(run, plan.starts), run.last_before_start
         kinds = [stimulus.kind for stimulus in stimuli]
         begins = [run.first + s.start for s in stimuli if s.kind in _MOTOR]
-        presses = (*plan.starts, run.last_before_start + 1, run.last_before_start + 1 + RECOVERY)
+        restart = before + 1
+        presses = (*plan.starts, restart, restart + RECOVERY)
         starts = [cycle for cycle in presses if cycle >= min(begins, default=math.inf)]
         unlimited = [range(cycle, cycle + FOUND) for cycle in (*begins, *starts)]
         failures = [*limit_violations(run, unlimited, _strength(stimuli)), *_premature(run, plan.starts[0])]
