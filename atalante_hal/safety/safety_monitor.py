@@ -28,7 +28,7 @@ from atalante_hal.safety.limiter import Limiter
 from atalante_hal.safety.message_monitor import GROUND_TOLERANCE, NO_TOLERANCE, MessageMonitor, Tolerance
 from atalante_hal.safety.plausibility import Plausibility
 from atalante_hal.safety.plausibility.finding import JOINT_MESSAGES, rows_of
-from atalante_hal.safety.start import ENABLE_CYCLES, Refusal, StartRequest, entry_text, refusal, stop_text
+from atalante_hal.safety.start import ENABLE_CYCLES, Refusal, StartRequest, entry_text, powered, refusal, stop_text
 from atalante_hal.safety.state_machine import MOVING, Conditions, next_state
 from atalante_hal.safety.torque_motion import TorqueMotion
 from atalante_hal.safety.torque_tracking import TorqueTracking
@@ -129,8 +129,8 @@ class SafetyMonitor:
         self._joint_rows = np.array(rows_of(image.codec, JOINT_MESSAGES))
         self.torque_tracking = TorqueTracking(robot.breakaway)
         self.torque_motion: TorqueMotion | None = None
-        #: DBC names of the drives that stay off until a test of the directions is passed: drives with a wrong torque, drives that
-        #: did not hold their joints, and drives whose joints failed the test.
+        #: DBC names of the drives that stay off until a test of the directions is passed: drives that were off before the START,
+        #: drives with a wrong torque, drives that did not hold their joints, and drives whose joints failed the test.
         self._kept_off: set[str] = set()
         #: False if the next cycle must be evaluated. If True, `evaluate` skips the next cycle, provided that its data is new,
         #: there is no fault, and the values of pendant and drives are unchanged.
@@ -385,6 +385,9 @@ class SafetyMonitor:
             self._acknowledged = True
             if not self.start_wanted:  # another press of START during a start does not restart the direction test
                 self._proof_begun = False
+                # If the start ends before the test is passed, the drives that are off now are switched off again.
+                on = powered(state.drive_state).tolist()
+                self._kept_off.update(node for node, is_on in zip(DRIVE_NODES, on, strict=True) if not is_on)
             self.start_wanted = ENABLE_CYCLES if state.supervisor in _STARTABLE else 0
         elif self.start_wanted:
             self.start_wanted -= 1
@@ -420,6 +423,8 @@ class SafetyMonitor:
                 return None
             self._proof_begun = True
             proof.begin(state.position, self._limiter.last)
+            if not proof.running:
+                self._kept_off.clear()
         elif proof.running:
             if failure := proof.evaluate(state.position, state.foot_force[..., 2].sum(axis=1)):
                 self._kept_off.update(DRIVE_NODES[joint] for joint in proof.failed)

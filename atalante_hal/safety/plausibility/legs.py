@@ -21,6 +21,10 @@ the motion of the joint. The check uses this change, so that a stuck encoder is 
 another axis. If the readings of SH and SK are both constant, both are reported. Unlike the module `stillness`, the
 standstill check needs no torque, so it also covers a joint that other joints move.
 
+*Exchange.* If the encoders of a joint are exchanged between the legs, each leg has an error: the encoder of the other leg gives the angle
+of this leg. So the errors of both legs are opposite, and their size is the difference `d` between the readings of both encoders.
+The joint is found when `d` exceeds `_APART` in `EXCHANGE_SAMPLES` samples. Exchanged tibia IMUs give the same errors, about all axes.
+
 *Age.* Values from earlier cycles are extrapolated to this cycle with the velocity that the same message contains. The
 thresholds are extended by `velocity_error` times the age of the values.
 """
@@ -33,7 +37,7 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from atalante_hal.robot import IMUS, JOINTS, SIDES, Robot
+from atalante_hal.robot import IMUS, JOINTS, LEG_JOINTS, SIDES, Robot
 from atalante_hal.safety.diagnostics import Dtc, Finding
 from atalante_hal.safety.plausibility.finding import JOINT_NODES, Ages, Signals
 from atalante_hal.types import Vector
@@ -43,6 +47,12 @@ from atalante_hal.wire.process_image import NEVER
 DRIFT_SAMPLES = 4
 #: Number of consecutive samples after which a stuck encoder is reported.
 STANDSTILL_SAMPLES = 2
+#: Number of consecutive samples after which exchanged encoders are reported. Both legs are compared in every sample.
+EXCHANGE_SAMPLES = 2
+#: Encoders are compared with those of the other leg if their readings differ by more than this [rad].
+_APART = math.radians(1.2)
+#: The error of a leg agrees with an exchange if it differs from the expected error by at most this share of the expected error.
+_AGREEMENT = 0.35
 #: The standstill check tolerates this drift of the IMUs per sample [rad]. Intact IMUs drift less than a tenth as much.
 _IMU_DRIFT = 2e-5
 #: Largest change [rad] of the estimated heading drift between pelvis IMU and tibia IMU in one sample.
@@ -63,6 +73,7 @@ class _Comparison(NamedTuple):
 
     angles: tuple[float, float, float]  # leg angles from the IMUs: FH, TH and the sum SH + SK [rad]
     errors: tuple[float, float, float]  # encoder angles minus IMU angles [rad]
+    encoders: tuple[float, ...] = ()  # encoder angles of FH, TH, SH and SK [rad]
     uncertainty: float = 0.0  # largest error [rad] that arises if encoder and IMU values are from different cycles
 
 
@@ -92,6 +103,18 @@ class Legs:
         self._turned: dict[int, int] = {}
         self._drifts: list[tuple[Finding, ...]] = [() for _ in SIDES]
         self._stuck: list[tuple[Finding, ...]] = [() for _ in SIDES]
+        #: For each of the first four joints of a leg: number of consecutive samples whose errors agree with exchanged encoders.
+        self._exchanges = [0] * len(_AXIS_OF)
+        #: Findings about exchanged encoders, by index of the joint in a leg. A finding remains until a drive of the joint restarts.
+        self._exchanged: dict[int, tuple[Finding, ...]] = {}
+
+    def reference(self, joint: int) -> None:
+        """Discard the finding about exchanged encoders of a joint whose drive has referenced its encoder.
+
+        Args:
+            joint: index of the joint in JOINTS.
+        """
+        self._exchanged.pop(joint % len(LEG_JOINTS), None)
 
     def check_left(self, ages: Ages | None) -> bool:
         """Check the left leg. If a right encoder has a constant reading, also run the standstill check of the right leg.
@@ -123,11 +146,13 @@ class Legs:
             self._check_drift(leg, comparison)
             self._check_standstill(leg, comparison)
         other = 1 - leg
+        if comparison is not None:
+            self._check_exchange(leg, comparison, ages)
         if self._stuck[other] or self._constant_samples[other].any():
             comparison = self._compare(other, ages)
             if comparison is not None:
                 self._check_standstill(other, comparison)
-        return any(self._drifts) or any(self._stuck)
+        return any(self._drifts) or any(self._stuck) or bool(self._exchanged)
 
     def _compare(self, leg: int, ages: Ages | None) -> _Comparison | None:
         """Compare the encoders and IMUs of a leg in this cycle; return None if a value is too old."""
@@ -146,13 +171,12 @@ class Legs:
         x, z, y = hip_angles(pelvis, tibia)
         turn = 2.0 * math.pi
         errors = math.remainder(fh - x, turn), math.remainder(th - z, turn), math.remainder(sh + sk - y, turn)
-        return _Comparison((x, z, y), errors, uncertainty)
+        return _Comparison((x, z, y), errors, (fh, th, sh, sk), uncertainty)
 
     def _check_drift(self, leg: int, comparison: _Comparison) -> None:
         drifts = []
         counts = self._contradicts[leg]
-        errors, allowed = list(comparison.errors), self._attitude_error + comparison.uncertainty
-        errors[_HEADING] -= self._heading[leg]
+        errors, allowed = self._without_heading(leg, comparison), self._attitude_error + comparison.uncertainty
         for axis, error in enumerate(errors):
             counts[axis] = counts[axis] + 1 if abs(error) > allowed else 0
             if counts[axis] >= DRIFT_SAMPLES:
@@ -183,9 +207,33 @@ class Legs:
                 stuck.append(_stuck(joint, change))
         self._stuck[leg] = tuple(stuck)
 
+    def _check_exchange(self, leg: int, comparison: _Comparison, ages: Ages | None) -> None:
+        ours = self._without_heading(leg, comparison)
+        if max(map(abs, ours)) <= (1.0 - _AGREEMENT) * _APART:
+            self._exchanges = [0] * len(_AXIS_OF)
+            return
+        opposite = self._compare(1 - leg, ages)
+        if opposite is None:
+            return
+        theirs = self._without_heading(1 - leg, opposite)
+        for index, axis in enumerate(_AXIS_OF):
+            apart = comparison.encoders[index] - opposite.encoders[index]
+            allowed = _AGREEMENT * abs(apart)
+            agrees = abs(ours[axis] - apart) <= allowed and abs(theirs[axis] + apart) <= allowed
+            self._exchanges[index] = self._exchanges[index] + 1 if agrees and abs(apart) > _APART else 0
+            if self._exchanges[index] >= EXCHANGE_SAMPLES and index not in self._exchanged:
+                self._exchanged[index] = tuple(_exchange(_HIPS[side] + index, ours[axis]) for side in range(len(SIDES)))
+
+    def _without_heading(self, leg: int, comparison: _Comparison) -> list[float]:
+        """Return the errors of a leg about `_AXES` without the heading drift of the IMUs [rad]."""
+        errors = list(comparison.errors)
+        errors[_HEADING] -= self._heading[leg]
+        return errors
+
     def findings(self) -> tuple[Finding, ...]:
         """Return the current findings of the leg checks."""
-        return (*self._drifts[0], *self._drifts[1], *self._stuck[0], *self._stuck[1])
+        exchanged = (finding for pair in self._exchanged.values() for finding in pair)
+        return (*self._drifts[0], *self._drifts[1], *self._stuck[0], *self._stuck[1], *exchanged)
 
 
 def hip_angles(pelvis: list[float], tibia: list[float]) -> tuple[float, float, float]:
@@ -249,3 +297,11 @@ def _drift(side: str, joints: tuple[str, ...], error: float) -> Finding:
 def _stuck(joint: int, change: float) -> Finding:
     text = f"the encoder of {JOINTS[joint]} has a constant reading while its leg turned by {math.degrees(-change):+.2f} degrees"
     return Finding(Dtc.ENC_STUCK, JOINT_NODES[joint], -change, True, text)
+
+
+def _exchange(joint: int, error: float) -> Finding:
+    text = (
+        f"the encoder of {JOINTS[joint]} reads the angle of the other leg, and vice versa, or the tibia IMUs are exchanged; "
+        "both drives are switched off"
+    )
+    return Finding(Dtc.TORQUE_DIRECTION, JOINT_NODES[joint], error, True, text)

@@ -152,7 +152,8 @@ class Plausibility:
     def reference(self, node: str) -> None:
         """Skip the jump check for the next position of a joint whose drive has referenced its encoder.
 
-        If the joint is SH or SK, also discard the finding of the knee checks about its leg.
+        Also discard the finding that the encoders of this joint are exchanged between the legs. If the joint is SH or SK,
+        also discard the finding of the knee checks about its leg.
 
         Args:
             node: DBC name of the drive; the name of any other node has no effect.
@@ -165,6 +166,7 @@ class Plausibility:
         joint = JOINT_NODES.index(node)
         self._encoders.reference(joint)
         self._rejections.forget(joint)
+        self._legs.reference(joint)
         if joint in _HIPS_AND_KNEES:
             self._knees.reference(joint // len(LEG_JOINTS))
         self._measured[self._joint_rows[joint]] = -NEVER

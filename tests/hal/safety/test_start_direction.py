@@ -103,10 +103,33 @@ def test_stop_during_the_test_ends_it_in_the_same_cycle(make_rig, stop: str):
     assert rig.controlwords() == {Controlword.ENABLE_OPERATION}
     getattr(rig.operator, stop)()
     rig.run(2)  # the pendant answers the next SYNC
-    assert rig.controlwords() == {Controlword.QUICK_STOP}
+    assert rig.controlwords() == {Controlword.DISABLE_VOLTAGE}
     rig.run(100)
     assert rig.hal.state.supervisor is S.READY
+    assert set(rig.hal.state.drive_state) == {D.SWITCH_ON_DISABLED}
     assert not rig.hal._safety_monitor.proof.proven.any()
+
+
+@pytest.mark.parametrize("joint", range(6), ids=JOINTS[:6])
+def test_reversed_motor_does_not_hold_if_the_first_start_is_stopped(make_rig, joint: int):
+    rig = make_rig(starts=False)
+    rig.emulator.drives.motors.set_strength(joint, -1.0)
+    rig.until(S.READY)
+    stop_during_the_test(rig, joint)
+    assert rig.hal.state.supervisor is S.READY
+
+
+def test_drives_hold_if_a_start_in_hold_is_stopped(rig):
+    rig.until(S.ACTIVE)
+    rig.operator.stop()
+    rig.until(S.HOLD, 5)
+    rig.run(100)
+    start_until_the_test(rig)
+    rig.run(10)
+    rig.operator.stop()
+    rig.run(20)
+    assert rig.hal.state.supervisor is S.HOLD
+    assert set(rig.hal.state.drive_state) == {D.QUICK_STOP_ACTIVE}
 
 
 @pytest.mark.parametrize("joint", [KNEE, 5], ids=["left_SK", "left_HA"])

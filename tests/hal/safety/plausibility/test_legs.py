@@ -280,6 +280,121 @@ class TestDrift:
         robot.until_found(Dtc.ENC_DRIFT, 1000, drift)
 
 
+class TestExchange:
+    """The encoders of a joint are exchanged between the legs, so each leg has the reading of the other leg."""
+
+    APART = math.radians(1.2)
+
+    @staticmethod
+    def legs(angles: tuple[Sequence[float], Sequence[float]], readings: tuple[Sequence[float], Sequence[float]]) -> OneLeg:
+        """Return checks with the given true angles and encoder readings FH, TH, SH, SK of both legs [rad]."""
+        legs = OneLeg(0)
+        for leg, side in enumerate(("left", "right")):
+            fh, th, sh, sk = angles[leg]
+            legs.now.quaternion[IMUS.index(f"{side}_tibia")] = tibia_attitude(fh, th, sh + sk)
+            legs.now.position[6 * leg : 6 * leg + 4] = readings[leg]
+        return legs
+
+    @staticmethod
+    def found(legs: OneLeg) -> list[str]:
+        return [finding.node for finding in legs.legs.findings() if finding.dtc is Dtc.TORQUE_DIRECTION]
+
+    def exchanged(self, index: int, apart: float, share: float = 1.0) -> OneLeg:
+        """Return checks of legs whose joint has exchanged encoders. The readings of the joint differ by `apart` [rad].
+
+        Each leg has `share` times the error that an exchange causes.
+        """
+        left, right = [0.1, -0.05, 0.2, 0.3], [0.1, -0.05, 0.2, 0.3]
+        right[index] += share * apart
+        readings = list(left), list(right)
+        readings[0][index], readings[1][index] = left[index] + apart, left[index]
+        if share != 1.0:  # the errors of both legs are +-share * apart
+            left[index], right[index] = left[index] + (1.0 - share) * apart, left[index] + share * apart
+        return self.legs((left, right), readings)
+
+    @pytest.mark.parametrize("index", range(4), ids=["FH", "TH", "SH", "SK"])
+    @signs
+    def test_exchange_is_found_from_the_second_sample_on(self, index: int, sign: float):
+        for apart, expected in ((self.APART * (1.0 - 1e-6), False), (self.APART * (1.0 + 1e-6), True)):
+            legs = self.exchanged(index, sign * apart)
+            legs.compare()
+            assert self.found(legs) == []
+            legs.compare()
+            joint = JOINTS[index].removeprefix("left_")
+            assert self.found(legs) == ([f"LEFT_{joint}", f"RIGHT_{joint}"] if expected else [])
+
+    def test_both_legs_check_the_exchange(self):
+        legs = self.exchanged(0, 0.05)
+        legs.legs.check_left(None)
+        legs.legs.check_right(None)
+        assert self.found(legs) == ["LEFT_FH", "RIGHT_FH"]
+
+    @pytest.mark.parametrize(("share", "expected"), [(0.6, False), (0.7, True), (1.3, True), (1.4, False)])
+    def test_errors_must_agree_with_the_readings(self, share: float, expected: bool):
+        legs = self.exchanged(0, 0.05, share)
+        legs.compare(10)
+        assert bool(self.found(legs)) is expected
+
+    @pytest.mark.parametrize("index", range(4), ids=["FH", "TH", "SH", "SK"])
+    def test_drift_of_one_or_both_encoders_is_no_exchange(self, index: int):
+        for drifts in ((0.1, 0.0), (0.0, 0.1), (0.1, -0.1), (0.1, 0.1)):
+            angles = ([0.1, -0.05, 0.2, 0.3], [0.1, -0.05, 0.2, 0.3])
+            readings = list(angles[0]), list(angles[1])
+            for leg, drift in enumerate(drifts):
+                readings[leg][index] += drift
+            legs = self.legs(angles, readings)
+            legs.compare(10)
+            assert self.found(legs) == []
+
+    def test_legs_with_different_angles_have_no_finding(self):
+        angles = ([0.1, -0.05, 0.2, 0.3], [-0.1, 0.05, -0.2, 0.6])
+        legs = self.legs(angles, angles)
+        legs.compare(10)
+        assert self.found(legs) == []
+
+    def test_single_sample_does_not_count(self):
+        legs = self.exchanged(0, 0.05)
+        wrong = legs.now.position.copy()
+        for _ in range(5):
+            legs.now.position[:] = wrong
+            legs.compare()
+            legs.now.position[[0, 6]] = wrong[[6, 0]]
+            legs.compare()
+        assert self.found(legs) == []
+
+    def test_values_that_are_too_old_neither_count_nor_restart_the_count(self):
+        legs = self.exchanged(0, 0.05)
+        ages = Ages(np.zeros(12, np.int64), np.zeros(4, np.int64), np.zeros(2, np.int64))
+        legs.compare()
+        ages.joint[6] = NEVER
+        legs.compare(5, ages)
+        assert self.found(legs) == []
+        legs.compare()
+        assert self.found(legs) == ["LEFT_FH", "RIGHT_FH"]
+
+    @pytest.mark.parametrize("joint", [0, 6])
+    def test_finding_remains_until_a_drive_of_the_joint_restarts(self, joint: int):
+        legs = self.exchanged(0, 0.05)
+        legs.compare(2)
+        legs.now.position[[0, 6]] = legs.now.position[[6, 0]]
+        legs.compare(10)
+        legs.legs.reference((joint + 1) % 12)
+        assert self.found(legs) == ["LEFT_FH", "RIGHT_FH"]
+        legs.legs.reference(joint)
+        assert self.found(legs) == []
+
+    def test_heading_drift_of_the_imus_is_no_exchange(self):
+        angles = ([0.0, 0.03, 0.0, 0.0], [0.0, -0.03, 0.0, 0.0])
+        legs = self.legs(angles, angles)
+        legs.legs._heading[:] = [-0.06, 0.06]
+        legs.compare(10)
+        assert self.found(legs) == ["LEFT_TH", "RIGHT_TH"]
+        legs = self.legs(angles, ([0.0, -0.03, 0.0, 0.0], [0.0, 0.03, 0.0, 0.0]))
+        legs.legs._heading[:] = [-0.06, 0.06]
+        legs.compare(10)
+        assert self.found(legs) == []
+
+
 class TestStandingEncoder:
     """The reading of an encoder is constant while the IMUs of pelvis and tibia turn. The drive produces no torque."""
 

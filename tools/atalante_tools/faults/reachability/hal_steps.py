@@ -322,6 +322,7 @@ class HalSteps:
         monitor._stalled = 0
         monitor._ending = monitor._duplicate_found = monitor._ramping = monitor._proof_begun = False
         monitor.lowered.clear()
+        monitor._kept_off.clear()
         rows = len(self._image.check)
         monitor._message_monitor.qualification = [SETTLED] * rows
         monitor._message_monitor._evidence = [0] * rows
@@ -350,6 +351,8 @@ class HalSteps:
         monitor.start_wanted, monitor.enabling = START_CYCLES[state.start], state.enabling
         if state.lowered:
             monitor.lowered.add(DRIVE_NODES[0])
+            if state.supervisor not in (SupervisorState.LOWER, SupervisorState.FAULT):
+                monitor._kept_off.add(DRIVE_NODES[0])
 
 
 def _own_request(before: Reception, own: list[int], after: Reception) -> int:
