@@ -128,7 +128,7 @@ class Transceiver:
         return Outgoing(frames)
 
     def send(self, batch: Outgoing) -> None:
-        """Send a batch. Frames that the bus rejects are dropped, and `faults` reports the loss.
+        """Send a batch. Frames that the bus rejects are dropped and not logged, and `faults` reports the loss.
 
         Args:
             batch: Batch that `grant` returned.
@@ -143,11 +143,10 @@ class Transceiver:
         self._asked = False
         try:
             self.bus.send(batch.frames)
-        except BusFull as error:
-            self._full_this_cycle = True
-            self._find(Dtc.BUS_TX_FULL, self._refused + 1 >= PERSISTENT, error.sent, f"{error}")
         except BusError as error:
-            self._find(Dtc.BUS_DOWN, True, 0.0, f"the bus {self.bus.name} cannot send: {error}")
+            self._report_rejected(error)
+            if self.tap is not None and error.sent:
+                self.tap.sent(error.accepted_of(batch.frames))
         else:
             self._asked = True
             if self.tap is not None:
@@ -258,6 +257,14 @@ class Transceiver:
                 f"{self.error_frames} error frames on {self.bus.name} so far: check wiring, termination and bit timing"
             )
             self._find(Dtc.BUS_ERROR, not self._errors.trusted, self.error_frames, text)
+
+    def _report_rejected(self, error: BusError) -> None:
+        """Report that `send` of the bus raised an error."""
+        if isinstance(error, BusFull):
+            self._full_this_cycle = True
+            self._find(Dtc.BUS_TX_FULL, self._refused + 1 >= PERSISTENT, error.sent, f"{error}")
+        else:
+            self._find(Dtc.BUS_DOWN, True, 0.0, f"the bus {self.bus.name} cannot send: {error}")
 
     def _find(self, dtc: Dtc, confirmed: bool, value: float, text: str) -> None:
         self._found.append(Finding(dtc, self._node, value, confirmed, text))

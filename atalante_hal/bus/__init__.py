@@ -22,7 +22,25 @@ Stamps = npt.NDArray[np.int64]
 
 
 class BusError(Exception):
-    """Error of the bus; the message names the cause and the remedy."""
+    """Error of the bus; the message names the cause and the remedy.
+
+    Attributes:
+        sent: Number of frames of the batch that were accepted; 0 unless `send` raised the error.
+        accepted: Accepted frames, shape (sent,). None means the first `sent` frames of the batch.
+    """
+
+    def __init__(self, message: str = "", sent: int = 0) -> None:
+        super().__init__(message)
+        self.sent = sent
+        self.accepted: Frames | None = None
+
+    def accepted_of(self, batch: Frames) -> Frames:
+        """Return the frames that `send` passed to the bus before it raised this error, shape (sent,).
+
+        Args:
+            batch: Frames that were passed to `send`, shape (n,).
+        """
+        return batch[: self.sent] if self.accepted is None else self.accepted
 
 
 class BusAbsent(BusError):  # noqa: N818
@@ -35,10 +53,6 @@ class BusDown(BusError):  # noqa: N818
 
 class BusFull(BusError):  # noqa: N818
     """Error of a full transmit queue: only `sent` frames of the batch were accepted, on each channel the first ones."""
-
-    def __init__(self, message: str, sent: int = 0) -> None:
-        super().__init__(message)
-        self.sent = sent
 
 
 class Bus(Protocol):

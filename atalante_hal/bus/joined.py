@@ -14,9 +14,9 @@ from typing import Final, NamedTuple
 import numpy as np
 
 from atalante_dbc import Network
-from atalante_hal.bus import Bus, BusDown, BusError, BusFull, Stamps
+from atalante_hal.bus import Bus, BusDown, BusError, Stamps
 from atalante_hal.bus.batch import REMEMBERED, Batches
-from atalante_hal.wire.frame import Frames, as_words, new_frames
+from atalante_hal.wire.frame import Frames, as_words, joined, new_frames
 
 #: Polling period of channels that have no file descriptor [s].
 POLLING_PERIOD: Final = 100e-6
@@ -100,25 +100,19 @@ class JoinedBus:
             raise BusDown(f"{self.name} is closed")
         _, headers = self._batches.to_send(frames)
         words = as_words(frames)
-        sent = 0
-        failure: BusError | None = None
-        for share in self._shares.get(headers) or self._divide(headers, frames):
+        failures: dict[int, BusError] = {}  # error of each channel that raised one, by `id()` of its bus object
+        shares = self._shares.get(headers) or self._divide(headers, frames)
+        for share in shares:
             as_words(share.frames)[:] = words[share.indices]
             try:
                 share.link.send(share.frames)
-            except BusFull as error:
-                sent += error.sent
-                failure = failure or error
             except BusError as error:
-                failure = failure or error
+                failures[id(share.link)] = error
                 self._lost(share.link, error)
             else:
-                sent += len(share.indices)
                 self._down.pop(id(share.link), None)
-        if isinstance(failure, BusFull):
-            raise BusFull(str(failure), sent)
-        if failure is not None:
-            raise failure
+        if failures:
+            raise _combined(shares, failures)
 
     def receive(self, frames: Frames, timeout: float = 0.0) -> int:
         """Receive from all channels into `frames[:n]` and return n, see `Bus.receive`.
@@ -206,6 +200,23 @@ class JoinedBus:
             self._shares.clear()
         self._shares[headers] = shares
         return shares
+
+
+def _combined(shares: list[Share], failures: dict[int, BusError]) -> BusError:
+    """Return the first error, with the frames that all channels together accepted.
+
+    Args:
+        shares: Frames of each channel.
+        failures: Error of each channel that raised one, by `id()` of its bus object.
+    """
+    accepted = [
+        share.frames if (error := failures.get(id(share.link))) is None else error.accepted_of(share.frames)
+        for share in shares
+    ]
+    failure = next(iter(failures.values()))
+    failure.accepted = joined(accepted)
+    failure.sent = len(failure.accepted)
+    return failure
 
 
 def _file_of(link: Bus) -> int | None:

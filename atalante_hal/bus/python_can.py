@@ -82,10 +82,10 @@ class PythonCanBus:
                 self._bus.send(message_of(can_id, length, flags, data), timeout=0.0)
             except can.CanOperationError as error:
                 if error.error_code in LINK_LOST:
-                    raise BusDown(f"{self.name} is down: {error}") from error
+                    raise BusDown(f"{self.name} is down: {error}", sent) from error
                 raise BusFull(f"{self.name} accepted {sent} of {len(frames)} frames: {error}", sent) from error
             except self._link_errors as error:
-                raise BusDown(f"{self.name} is down: {error}") from error
+                raise BusDown(f"{self.name} is down: {error}", sent) from error
 
     def receive(self, frames: Frames, timeout: float = 0.0) -> int:
         """Write the received messages to `frames[:n]` and return n, see `Bus.receive`.

@@ -285,7 +285,9 @@ class SocketCanBus:
                 f"acknowledges frames, or enlarge the queue with `ip link set {self.name} txqueuelen 1000`",
                 sent,
             )
-        return self._link_error(code) or BusError(f"{self.name} cannot send: {reason}")
+        error = self._link_error(code) or BusError(f"{self.name} cannot send: {reason}")
+        error.sent = sent
+        return error
 
     def _link_error(self, code: int) -> BusDown | None:
         """Return a `BusDown` and drop the queued frames if the interface is down or removed. Return None for other codes."""

@@ -185,6 +185,22 @@ def test_bus_down_while_sending_is_confirmed_immediately(desk: Desk):
     assert desk.evaluate() == {}
 
 
+@pytest.mark.parametrize("kind", [BusDown, BusFull])
+def test_frames_accepted_before_an_error_are_logged(desk: Desk, kind: type[BusError]):
+    first, second, third = (m.frame_id for m in OURS[:3])
+    batch = desk.transceiver.grant(TransmitImage(OURS[:3]).frames)
+    desk.bus.refuses = kind("no room", 2)
+    desk.transceiver.send(batch)
+    assert desk.tap.sent_ids == [[first, second]]
+    desk.bus.refuses = kind("no room", 2)
+    desk.bus.refuses.accepted = batch.frames[[0, 2]]
+    desk.transceiver.send(batch)
+    assert desk.tap.sent_ids[1:] == [[first, third]]
+    desk.bus.refuses = kind("no room", 0)
+    desk.transceiver.send(batch)
+    assert len(desk.tap.sent_ids) == 2
+
+
 # -- receiving ---------------------------------------------------------------------------------------------------------
 
 

@@ -6,6 +6,7 @@ only create its two ends. The SocketCAN subclasses are in tests/vcan, because th
 
 from __future__ import annotations
 
+import errno
 import gzip
 import threading
 from collections.abc import Iterator
@@ -438,6 +439,22 @@ def test_full_virtual_bus_reports_the_number_of_sent_frames() -> None:
     listener.close()
 
 
+@pytest.mark.parametrize("code", [errno.ENODEV, None])
+def test_lost_virtual_bus_reports_the_number_of_sent_frames(code: int | None, monkeypatch: pytest.MonkeyPatch) -> None:
+    bus = PythonCanBus("virtual", "lost")
+    answers = iter([None, None, can.CanOperationError("gone", code) if code else OSError("gone")])
+
+    def send(message: can.Message, timeout: float) -> None:
+        if (error := next(answers)) is not None:
+            raise error
+
+    monkeypatch.setattr(bus._bus, "send", send)
+    with pytest.raises(BusDown, match="is down: gone") as refusal:
+        bus.send(random_frames(4))
+    assert refusal.value.sent == 2
+    bus.close()
+
+
 @pytest.mark.parametrize(
     ("interface", "options", "sentence"),
     [
@@ -676,6 +693,35 @@ def test_joined_bus_uses_the_other_channels_if_one_is_full_or_closed(network: Ne
         joined.send(syncs)
     for bus in BUSES[1:]:
         receive_all(far[bus], 1)
+
+
+@pytest.mark.parametrize("kind", [BusDown, BusFull])
+def test_error_of_a_joined_bus_contains_the_accepted_frames(network: Network, kind: type[BusError]) -> None:
+    joined, near, far = four_pairs(network)
+    names = ("SYNC_LEFT_LEG", "COMMAND_LEFT_LEG", "SYNC_RIGHT_LEG", "COMMAND_RIGHT_LEG")
+    frames = frames_of(network, *names)
+    if kind is BusDown:
+        near["left_leg"].close()
+        accepted = ["SYNC_RIGHT_LEG", "COMMAND_RIGHT_LEG"]
+    else:
+        limited = FirstFrameBus(near["left_leg"])
+        joined = JoinedBus(network, near | {"left_leg": limited})
+        accepted = ["SYNC_LEFT_LEG", "SYNC_RIGHT_LEG", "COMMAND_RIGHT_LEG"]
+    with pytest.raises(kind) as refusal:
+        joined.send(frames)
+    sent = refusal.value.accepted_of(frames)
+    assert [network.messages[i].name for i in _message_indices(network, sent)] == accepted
+    assert refusal.value.sent == len(accepted)
+    assert sum(end.receive(new_frames(8)) for end in far.values()) == len(accepted)
+
+
+class FirstFrameBus(WrappedBus):
+    """Bus whose transmit queue has room for one frame."""
+
+    def send(self, frames: Frames) -> None:
+        """Send the first frame and reject the others."""
+        super().send(frames[:1].copy())
+        raise BusFull("no room", 1)
 
 
 def test_joined_bus_requires_a_channel_for_every_bus(network: Network) -> None:

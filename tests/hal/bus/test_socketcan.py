@@ -11,7 +11,7 @@ from types import SimpleNamespace
 
 import pytest
 
-from atalante_hal.bus import BusDown, socketcan
+from atalante_hal.bus import BusDown, BusError, socketcan
 from atalante_hal.bus.resilient import ResilientBus
 from atalante_hal.bus.socketcan import SocketCanBus
 from atalante_hal.wire.frame import new_frames
@@ -99,6 +99,22 @@ def test_interface_that_is_down_is_not_opened_again(kernel: Kernel) -> None:
     with pytest.raises(BusDown, match="can0 is down: type `ip link set can0 up`"):
         bus.receive(new_frames(1))
     assert bus.receive(new_frames(1)) == 0
+    bus.close()
+
+
+@pytest.mark.parametrize("code", [errno.ENETDOWN, errno.EIO])
+def test_error_contains_the_number_of_frames_sent_before(kernel: Kernel, code: int) -> None:
+    bus = SocketCanBus(CHANNEL)
+    answers = iter([2, -1])
+
+    def sendmmsg(*_: int) -> int:
+        ctypes.set_errno(code)
+        return next(answers)
+
+    bus._sendmmsg = sendmmsg
+    with pytest.raises(BusError) as refusal:
+        bus.send(new_frames(4))
+    assert refusal.value.sent == 2
     bus.close()
 
 

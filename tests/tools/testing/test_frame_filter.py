@@ -6,7 +6,9 @@ import numpy as np
 import pytest
 
 from atalante_dbc import Network
+from atalante_hal.bus import BusFull
 from atalante_hal.bus.pair import PairBus, lockstep_pair
+from atalante_hal.bus.wrapped import WrappedBus
 from atalante_hal.wire.frame import Frames, new_frames
 from atalante_hal.wire.process_image import TransmitImage
 from atalante_tools.testing.frame_filter import FrameFilter
@@ -67,6 +69,22 @@ def test_drop_removes_the_given_number_of_frames(ends: BusEnds):
     assert received[0] == ["LEFT_FH_STATE", "FOOT_LEFT_STATE"]
     assert fault.hit == 2
     assert ends.filter.faults == []
+
+
+def test_frames_accepted_before_an_error_are_logged(ends: BusEnds):
+    class OneFrameBus(WrappedBus):
+        def send(self, frames: Frames) -> None:
+            raise BusFull("no room", 1)
+
+    logged: list[Frames] = []
+    ends.sent = logged.append
+    ends.filter.bus = OneFrameBus(ends.theirs)
+    ends.filter.drop("SYNC_LEFT_LEG")
+    with pytest.raises(BusFull) as refusal:
+        ends.filter.send(ends.hal.seal())
+    (command,) = ends.hal.frames["can_id"][1:].tolist()
+    assert [frames["can_id"].tolist() for frames in logged] == [[command]]
+    assert refusal.value.accepted_of(ends.hal.frames)["can_id"].tolist() == [command]
 
 
 def test_fault_selects_messages_by_node_pattern_or_command_name(ends: BusEnds):

@@ -15,7 +15,7 @@ from fnmatch import fnmatchcase
 import numpy as np
 
 from atalante_dbc import Network
-from atalante_hal.bus import Bus
+from atalante_hal.bus import Bus, BusError
 from atalante_hal.bus.wrapped import WrappedBus
 from atalante_hal.transceiver import FrameTap
 from atalante_hal.wire.frame import Frames, as_words
@@ -171,10 +171,17 @@ class FrameFilter(WrappedBus):
             self._cycle += 1
         if self.faults or self._delayed[0]:
             frames = self._apply_faults(frames, self._delayed[0], len(frames) + len(self._delayed[0]))
-        if len(frames):
+        if not len(frames):
+            return
+        try:
             self.bus.send(frames)
-            if self.tap is not None:
-                self.tap.sent(frames)
+        except BusError as error:
+            error.accepted = accepted = error.accepted_of(frames)  # the caller does not know the changed batch
+            if self.tap is not None and error.sent:
+                self.tap.sent(accepted)
+            raise
+        if self.tap is not None:
+            self.tap.sent(frames)
 
     def receive(self, frames: Frames, timeout: float = 0.0) -> int:
         """Receive frames and apply the faults; see `Bus.receive`.
