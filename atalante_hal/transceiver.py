@@ -259,11 +259,12 @@ class Transceiver:
             self._find(Dtc.BUS_ERROR, not self._errors.trusted, self.error_frames, text)
 
     def _report_rejected(self, error: BusError) -> None:
-        """Report that `send` of the bus raised an error."""
-        if isinstance(error, BusFull):
+        """Report that `send` of the bus raised an error. One channel may be full while another one is down."""
+        full = error if isinstance(error, BusFull) else error.full
+        if full is not None:
             self._full_this_cycle = True
-            self._find(Dtc.BUS_TX_FULL, self._refused + 1 >= PERSISTENT, error.sent, f"{error}")
-        else:
+            self._find(Dtc.BUS_TX_FULL, self._refused + 1 >= PERSISTENT, full.sent, f"{full}")
+        if full is not error:
             self._find(Dtc.BUS_DOWN, True, 0.0, f"the bus {self.bus.name} cannot send: {error}")
 
     def _find(self, dtc: Dtc, confirmed: bool, value: float, text: str) -> None:

@@ -27,12 +27,14 @@ class BusError(Exception):
     Attributes:
         sent: Number of frames of the batch that were accepted; 0 unless `send` raised the error.
         accepted: Accepted frames, shape (sent,). None means the first `sent` frames of the batch.
+        full: Error of another channel, whose transmit queue was full in the same call of `send`. None if there is none.
     """
 
     def __init__(self, message: str = "", sent: int = 0) -> None:
         super().__init__(message)
         self.sent = sent
         self.accepted: Frames | None = None
+        self.full: BusFull | None = None
 
     def accepted_of(self, batch: Frames) -> Frames:
         """Return the frames that `send` passed to the bus before it raised this error, shape (sent,).

@@ -14,7 +14,7 @@ from typing import Final, NamedTuple
 import numpy as np
 
 from atalante_dbc import Network
-from atalante_hal.bus import Bus, BusDown, BusError, Stamps
+from atalante_hal.bus import Bus, BusDown, BusError, BusFull, Stamps
 from atalante_hal.bus.batch import REMEMBERED, Batches
 from atalante_hal.wire.frame import Frames, as_words, joined, new_frames
 
@@ -92,8 +92,9 @@ class JoinedBus:
             frames: Frames to send, shape (n,).
 
         Raises:
-            BusFull: If a transmit queue accepted only a part of its frames.
-            BusDown: If a channel is closed or down.
+            BusDown: If a channel is closed or down. If a transmit queue was full in the same call, `full` is its error.
+            BusFull: If a transmit queue accepted only a part of its frames, and no channel is closed or down.
+            BusError: If the kernel reports another error. `full` is set as for `BusDown`.
             ValueError: If a frame is not a valid CAN frame or not a message of the network.
         """
         if self._closed:
@@ -125,7 +126,8 @@ class JoinedBus:
             Number of received frames n.
 
         Raises:
-            BusDown: If a channel is closed or down, and no frame was received on the other channels.
+            BusDown: If a channel is closed or down, and no frame was received on the other channels within `timeout`.
+            BusError: If the kernel reports another error, and no frame was received on the other channels within `timeout`.
         """
         if self._closed:
             raise BusDown(f"{self.name} is closed")
@@ -203,7 +205,9 @@ class JoinedBus:
 
 
 def _combined(shares: list[Share], failures: dict[int, BusError]) -> BusError:
-    """Return the first error, with the frames that all channels together accepted.
+    """Return the first error that is not `BusFull`, with the first `BusFull` as its attribute `full`.
+
+    If each error is `BusFull`, return the first one. The errors contain the frames that all channels together accepted.
 
     Args:
         shares: Frames of each channel.
@@ -213,10 +217,15 @@ def _combined(shares: list[Share], failures: dict[int, BusError]) -> BusError:
         share.frames if (error := failures.get(id(share.link))) is None else error.accepted_of(share.frames)
         for share in shares
     ]
-    failure = next(iter(failures.values()))
-    failure.accepted = joined(accepted)
-    failure.sent = len(failure.accepted)
-    return failure
+    frames = joined(accepted)
+    errors = list(failures.values())
+    for error in errors:
+        error.accepted, error.sent = frames, len(frames)
+    others = [error for error in errors if not isinstance(error, BusFull)]
+    if not others:
+        return errors[0]
+    others[0].full = next((error for error in errors if isinstance(error, BusFull)), None)
+    return others[0]
 
 
 def _file_of(link: Bus) -> int | None:

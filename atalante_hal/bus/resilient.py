@@ -48,11 +48,16 @@ class ResilientBus(WrappedBus):
 
         Args:
             frames: Frames to send, shape (n,).
+
+        Raises:
+            BusFull: If a transmit queue accepted only a part of the frames, also if another channel is lost.
         """
         try:
             super().send(frames)
         except BusDown as error:
             self._lost(str(error))
+            if error.full is not None:
+                raise error.full from error
         else:
             self._update_down(proven=True)
 

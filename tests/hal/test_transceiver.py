@@ -201,6 +201,14 @@ def test_frames_accepted_before_an_error_are_logged(desk: Desk, kind: type[BusEr
     assert len(desk.tap.sent_ids) == 2
 
 
+def test_bus_that_is_full_and_down_has_both_faults(desk: Desk):
+    desk.bus.refuses = BusDown("gone")
+    desk.bus.refuses.full = BusFull("no room", 3)
+    for cycle in range(1, 6):
+        desk.transceiver.send(sync(desk))
+        assert desk.evaluate() == {"BUS_DOWN": True, "BUS_TX_FULL": cycle >= 5}
+
+
 # -- receiving ---------------------------------------------------------------------------------------------------------
 
 

@@ -25,6 +25,7 @@ from atalante_hal.bus.joined import JoinedBus
 from atalante_hal.bus.pair import PairBus, lockstep_pair
 from atalante_hal.bus.python_can import PythonCanBus, message_of
 from atalante_hal.bus.replay import LogUnreadable, ReplayBus
+from atalante_hal.bus.resilient import ResilientBus
 from atalante_hal.bus.shared import shared_pair
 from atalante_hal.bus.wrapped import WrappedBus
 from atalante_hal.wire.frame import (
@@ -722,6 +723,26 @@ class FirstFrameBus(WrappedBus):
         """Send the first frame and reject the others."""
         super().send(frames[:1].copy())
         raise BusFull("no room", 1)
+
+
+@pytest.mark.parametrize(("full", "down"), [("left_leg", "right_leg"), ("right_leg", "left_leg")])
+def test_joined_bus_with_a_full_and_a_closed_channel_reports_both(network: Network, full: str, down: str) -> None:
+    joined, near, _ = four_pairs(network)
+    syncs = frames_of(network, "SYNC_LEFT_LEG", "SYNC_RIGHT_LEG", "SYNC_LEFT_SENSE")
+    for _ in range(8):
+        near[full].send(frames_of(network, f"SYNC_{full.upper()}"))
+    near[down].close()
+    with pytest.raises(BusDown, match=f"{down} is closed") as refusal:
+        joined.send(syncs)
+    assert refusal.value.full is not None
+    assert str(refusal.value.full).startswith(f"{full} cannot send")
+    for error in (refusal.value, refusal.value.full):
+        assert error.accepted_of(syncs)["can_id"].tolist() == syncs["can_id"][2:].tolist()
+    assert f"{down} is closed" in joined.down
+    lossy = ResilientBus(joined)
+    with pytest.raises(BusFull, match=f"{full} cannot send"):
+        lossy.send(syncs)
+    assert f"{down} is closed" in lossy.down
 
 
 def test_joined_bus_requires_a_channel_for_every_bus(network: Network) -> None:
