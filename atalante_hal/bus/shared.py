@@ -32,7 +32,7 @@ from atalante_hal.wire.frame import FRAME_BYTES, Frames
 
 #: Indices of the counters of each bus end: sent frames, received frames, requested calls of `step`, completed calls of `step`.
 _SENT, _RECEIVED, _REQUESTED, _COMPLETED = range(4)
-#: Indices of the flags of each bus end. `_SERVING` is 1 after the end has called `serve`. `_SLEEPING` is 1 while the end sleeps.
+#: Indices of the flags of each bus end. `_SERVING` is 1 while the end runs `serve`. `_SLEEPING` is 1 while the end sleeps.
 #: `_CLOSED` is 1 after the end is closed.
 _SERVING, _SLEEPING, _CLOSED = range(4, 7)
 #: Number of 64-bit header words of each bus end: one cache line.
@@ -181,13 +181,17 @@ class SharedBus:
         """
         own, peers = self._own, self._peers
         own[_SERVING] = 1
-        while True:
-            completed = own[_COMPLETED]
-            self._until(lambda: peers[_REQUESTED] != completed, math.inf)  # noqa: B023 - the lambda is called only in this iteration
-            step()
-            own[_COMPLETED] = completed + 1
-            if peers[_SLEEPING]:
-                self._wake_peer()
+        try:
+            while True:
+                completed = own[_COMPLETED]
+                self._until(lambda: peers[_REQUESTED] != completed, math.inf)  # noqa: B023 - the lambda is called only in this iteration
+                step()
+                own[_COMPLETED] = completed + 1
+                if peers[_SLEEPING]:
+                    self._wake_peer()
+        finally:
+            if not self._closed:
+                own[_SERVING] = 0
 
     def run_step(self) -> None:
         """Request a step from the server, and wait until the step is complete. Frames that the server sends stay queued.
@@ -202,13 +206,13 @@ class SharedBus:
             raise BusDown(f"{self.name}: the other end did not complete a step within {self.patience:g} s")
 
     def wait_until_served(self, timeout: float) -> None:
-        """Wait until the other end has called `serve`.
+        """Wait until the other end runs `serve`.
 
         Args:
             timeout: Longest wait [s].
 
         Raises:
-            BusDown: If the other end does not call `serve` within `timeout`, or is closed.
+            BusDown: If the other end does not run `serve` within `timeout`, or is closed.
         """
         peers = self._peers
         if not self._until(lambda: peers[_SERVING], timeout):

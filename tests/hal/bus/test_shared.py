@@ -160,6 +160,36 @@ def test_wait_for_an_end_that_never_serves_times_out(ends: tuple[SharedBus, Shar
         ours.wait_until_served(0.03)
 
 
+def test_end_whose_step_failed_no_longer_serves(ends: tuple[SharedBus, SharedBus]) -> None:
+    ours, theirs = ends
+    ours.patience = 0.01
+    ours.receive(new_frames(1))  # requests a step
+
+    def step() -> None:
+        raise RuntimeError("the step failed")
+
+    with pytest.raises(RuntimeError, match="the step failed"):
+        theirs.serve(step)
+    begun = time.monotonic()
+    assert theirs.receive(new_frames(1), 0.03) == 0
+    assert time.monotonic() - begun >= 0.03
+    with pytest.raises(BusDown, match="did not call `serve`"):
+        ours.wait_until_served(0.0)
+
+
+def test_error_of_a_step_that_closed_its_bus_is_raised(ends: tuple[SharedBus, SharedBus]) -> None:
+    ours, theirs = ends
+    ours.patience = 0.01
+    ours.receive(new_frames(1))
+
+    def step() -> None:
+        theirs.close()
+        raise RuntimeError("the step failed")
+
+    with pytest.raises(RuntimeError, match="the step failed"):
+        theirs.serve(step)
+
+
 def test_full_queue_rejects_whole_batches(ends: tuple[SharedBus, SharedBus]) -> None:
     one, other = ends
     received = []
