@@ -186,6 +186,7 @@ class TelemetryProcess(Closing):
         self._early = child  # subprocess that was started before the first call of `start`; None if there is none
         self._child: TelemetryChild | None = None
         self._restarts = 0
+        self._abandoned = False  # True after a fault that causes no further restart
         self._faults: list[str] = []  # one sentence for each fault of a subprocess
         self._recordings: list[str] = []  # names of the recording files begun so far
         self._last_endpoint: str | None = None  # last endpoint in use; None before the first endpoint was opened
@@ -322,10 +323,11 @@ class TelemetryProcess(Closing):
         if self._closed or self._child is None or (self._restarting is not None and self._restarting.is_alive()):
             return
         fault = self._fault(time.monotonic())
-        if not fault or self._restarts > RESTARTS:
+        if not fault or self._abandoned:
             return
-        self._restarts += 1
-        restart = self._restarts <= RESTARTS
+        restart = self._restarts < RESTARTS
+        self._restarts += restart
+        self._abandoned = not restart
         last = self.records.last()
         cycle = int(np.frombuffer(last)[self.layout["cycle"]][0]) if last else 0
         text = f"telemetry {fault}; it is {'restarted' if restart else f'not restarted after {RESTARTS} restarts'}"

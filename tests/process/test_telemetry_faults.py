@@ -293,9 +293,11 @@ def test_f49_telemetry_is_not_restarted_after_three_failed_restarts(driven: Driv
         if telemetry.alive and pid_of(telemetry) not in killed:
             killed.add(pid_of(telemetry))
             os.kill(pid_of(telemetry), signal.SIGKILL)
-        return telemetry._restarts > process_module.RESTARTS
+        return telemetry._abandoned
 
     driven.until(kill_each_process)
     assert len(killed) == process_module.RESTARTS + 1
-    assert "not restarted after 3 restarts" in telemetry.close().notices[-1]
+    summary = telemetry.close()
+    assert "not restarted after 3 restarts" in summary.notices[-1]
+    assert summary.restarts == process_module.RESTARTS
     driven.compare()
