@@ -166,7 +166,7 @@ def _open(path: Path) -> can.io.generic.MessageReader:
     except UNREADABLE as error:
         reason = os.strerror(errno.ENOENT) if isinstance(error, FileNotFoundError) else error
         raise LogUnreadable(f"{path} cannot be opened as a CAN log: {reason}") from error
-    if isinstance(reader, can.BLFReader) and reader.file_size > size:
+    if plain and isinstance(reader, can.BLFReader) and reader.file_size > size:
         reader.stop()
         raise LogUnreadable(
             f"{path} is truncated: its header states {reader.file_size} bytes, but the file has {size} bytes; "

@@ -537,6 +537,16 @@ def test_invalid_log_is_rejected_with_one_sentence(tmp_path: Path) -> None:
         assert "\n" not in str(refusal.value), name
 
 
+def test_complete_zipped_blf_log_is_replayed(tmp_path: Path) -> None:
+    content = write_log(tmp_path / "run.blf", np.repeat(random_frames(1), 2000)).read_bytes()
+    zipped = tmp_path / "run.blf.gz"
+    zipped.write_bytes(gzip.compress(content))
+    assert zipped.stat().st_size < len(content)
+    bus = ReplayBus(zipped, capacity=4000)
+    assert bus.receive(new_frames(4000)) == 2000
+    bus.close()
+
+
 def test_truncated_zipped_log_is_replayed_up_to_its_end(tmp_path: Path) -> None:
     content = write_log(tmp_path / "run.log", random_frames(2000)).read_bytes()
     zipped = gzip.compress(content)
