@@ -45,7 +45,10 @@ UNREADABLE = (
 
 
 class LogUnreadable(BusError):  # noqa: N818
-    """Error of a log that cannot be read: it is missing, empty or truncated, or its format cannot store CAN FD frames."""
+    """Error of a log that cannot be read.
+
+    The log is missing, empty, truncated or not closed, or its format cannot store CAN FD frames.
+    """
 
 
 class ReplayBus:
@@ -61,7 +64,7 @@ class ReplayBus:
         dropped: Number of records of the log that are not valid CAN frames.
 
     Raises:
-        LogUnreadable: If the log is missing, empty, truncated or in an unknown format.
+        LogUnreadable: If the log is missing, empty, truncated, not closed by its recorder or in an unknown format.
     """
 
     def __init__(self, path: str | Path, cycle_id: int | None = None, capacity: int = 1024) -> None:
@@ -166,13 +169,30 @@ def _open(path: Path) -> can.io.generic.MessageReader:
     except UNREADABLE as error:
         reason = os.strerror(errno.ENOENT) if isinstance(error, FileNotFoundError) else error
         raise LogUnreadable(f"{path} cannot be opened as a CAN log: {reason}") from error
-    if plain and isinstance(reader, can.BLFReader) and reader.file_size > size:
+    if isinstance(reader, can.BLFReader) and (defect := _size_defect(path, reader.file_size, size if plain else None)):
         reader.stop()
-        raise LogUnreadable(
-            f"{path} is truncated: its header states {reader.file_size} bytes, but the file has {size} bytes; "
-            "copy the file again"
-        )
+        raise LogUnreadable(f"{path} {defect}")
     return reader
+
+
+def _size_defect(path: Path, stated: int, size: int | None) -> str:
+    """Return how the size of a .blf log differs from the size in its header; empty if the log is complete.
+
+    The recorder writes the final size into the header when it closes the log. Until then, the header states a smaller size.
+
+    Args:
+        path: Log file.
+        stated: Size in the header [bytes].
+        size: Size of the file [bytes]. With None, the log is compressed, and only a header that states no data is detected.
+    """
+    if size is not None and stated > size:
+        return f"is truncated: its header states {stated} bytes, but the file has {size} bytes; copy the file again"
+    if stated <= BLF_HEADER_BYTES if size is None else stated < size:
+        return (
+            "was not closed by its recorder, so its last frames are missing; `can_logconvert "
+            f"{path} complete.blf` copies the other frames to a complete log"
+        )
+    return ""
 
 
 def _bytes(path: Path, count: int, whence: int) -> bytes:

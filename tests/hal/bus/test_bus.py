@@ -537,6 +537,21 @@ def test_invalid_log_is_rejected_with_one_sentence(tmp_path: Path) -> None:
         assert "\n" not in str(refusal.value), name
 
 
+@pytest.mark.parametrize("suffix", [".blf", ".blf.gz"])
+def test_blf_log_that_was_not_closed_is_rejected(suffix: str, tmp_path: Path) -> None:
+    """The recorder is killed: only full containers are in the file, and the header still states no data."""
+    path = tmp_path / f"killed{suffix}"
+    with (tmp_path / "open.blf").open("wb") as file:
+        writer = can.BLFWriter(file, max_container_size=4096)
+        for can_id, length, flags, _, data in random_frames(400).tolist():
+            writer.on_message_received(message_of(can_id, length, flags, bytes(data)))
+        file.flush()
+        content = (tmp_path / "open.blf").read_bytes()
+    path.write_bytes(gzip.compress(content) if suffix == ".blf.gz" else content)
+    with pytest.raises(LogUnreadable, match=f"killed{suffix} was not closed by its recorder"):
+        ReplayBus(path)
+
+
 def test_complete_zipped_blf_log_is_replayed(tmp_path: Path) -> None:
     content = write_log(tmp_path / "run.blf", np.repeat(random_frames(1), 2000)).read_bytes()
     zipped = tmp_path / "run.blf.gz"
