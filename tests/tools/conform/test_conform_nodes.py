@@ -15,7 +15,7 @@ from atalante_emulator.emulator import EmulatorParameters
 from atalante_emulator.haptics import Haptics, HapticsParameters
 from atalante_emulator.pendant import Operator
 from atalante_hal.wire.e2e import COUNTER_BYTE
-from atalante_hal.wire.frame import FLAG_FDF, Frames, joined
+from atalante_hal.wire.frame import FLAG_FDF, ID_ERROR, ID_EXTENDED, ID_REMOTE, Frames, joined, new_frames
 from atalante_tools.conform.examination import requirements_of
 from atalante_tools.conform.requirement import Verdict, examine
 
@@ -138,6 +138,19 @@ def raises_an_emergency(make_setup: MakeSetup, monkeypatch: Patch) -> NodeSetup:
     setup.wire.from_node = lambda frame: frame
     setup.wire.unsolicited = once
     return setup
+
+
+def _sends_unexpected(flag: int) -> Break:
+    """Return a node that sends a copy of its 300th state frame with a flag in the identifier."""
+
+    def copy(frame: Frames, _message: Message, number: int) -> Frames | None:
+        if number != 300:
+            return None
+        other = frame.copy()
+        other["can_id"] |= flag
+        return joined([frame, other])
+
+    return _sends("STATE", copy)
 
 
 def sends_without_sync(make_setup: MakeSetup, monkeypatch: Patch) -> NodeSetup:
@@ -356,6 +369,8 @@ BROKEN: dict[str, tuple[Break, str]] = {
     "counter slips": (_sends("STATE", _counter_slips), "NODE-11"),
     "wrong Data ID sometimes": (_sends("STATE", _other_data_id), "NODE-12"),
     "no bit rate switch": (_sends("STATUS", _no_bit_rate_switch), "NODE-13"),
+    "29-bit copy of a frame": (_sends_unexpected(ID_EXTENDED), "NODE-13"),
+    "remote frame": (_sends_unexpected(ID_REMOTE), "NODE-13"),
     "sends an invalid code": (_measures(_no_temperature_once), "NODE-14"),
     "sets reserved bits": (_sends("STATE", _reserved_bits), "NODE-15"),
     "quaternion not of unit length": (_measures(_shrunk_quaternion), "IMU-01"),
@@ -410,6 +425,28 @@ def test_defective_node_fails_only_its_requirement(name: str, make_setup: MakeSe
 def test_every_requirement_has_a_defective_node(make_setup: MakeSetup):
     ids = {r.id for node in KINDS for r in requirements_of(make_setup(node).tester)}
     assert {expected for _, expected in BROKEN.values()} == ids
+
+
+@pytest.mark.parametrize(
+    ("flag", "kind"),
+    [(ID_EXTENDED, "29-bit frame"), (ID_REMOTE, "remote frame"), (ID_EXTENDED | ID_REMOTE, "29-bit remote frame")],
+)
+def test_unexpected_frame_is_named(flag: int, kind: str, make_setup: MakeSetup):
+    setup = make_setup(IMU)
+    can_id = setup.message("STATUS").frame_id
+    extra = new_frames(1)
+    setup.wire.from_node = lambda _: wire.NO_FRAME
+    setup.wire.unsolicited = lambda: extra
+    for number in (
+        can_id | flag,
+        can_id | flag | ID_ERROR,
+        0x7FE | flag,
+    ):  # an error frame, and the frame of another node
+        extra["can_id"] = number
+        setup.tester.silent_cycle()
+    (result,) = examine(setup.tester, [r for r in requirements_of(setup.tester) if r.id == "NODE-13"])
+    assert result.verdict is Verdict.FAILED
+    assert f"1 of 1 frames: {kind} with the identifier of {IMU}_STATUS in cycle 1" in result.measured
 
 
 # -- bounds: the requirement passes at half of its bound and fails at twice its bound ------------------------------------

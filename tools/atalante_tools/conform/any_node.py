@@ -142,7 +142,7 @@ def requirements(tester: NodeTester) -> tuple[list[Requirement], list[Requiremen
         ),
         Requirement(
             "NODE-13",
-            "Sends CAN FD frames with bit rate switch and with the length given in the DBC.",
+            "Sends CAN FD data frames with 11-bit identifier, bit rate switch and the length given in the DBC.",
             all_frames,
             "DBC length, VFrameFormat",
             _all(
@@ -150,7 +150,8 @@ def requirements(tester: NodeTester) -> tuple[list[Requirement], list[Requiremen
                     f"{frame.message.name} in cycle {frame.cycle}"
                     for frame in received
                     if not (frame.length_valid and frame.format_valid)
-                ]
+                ],
+                with_unexpected=True,
             ),
         ),
         Requirement(
@@ -197,6 +198,7 @@ def boots_up(tester: NodeTester) -> Outcome:
         tester.request(Action.POWER_UP, is_off)
     tester.technician.fresh = False
     tester.received.clear()
+    tester.unexpected.clear()
     if not tester.run_until(lambda _: len(_statuses(tester)) >= 2):
         return Outcome(False, f"{len(_statuses(tester))} heartbeats within {tester.technician.patience:g} s")
     reported = [NMT.get(int(frame.values["NodeState"]), "unknown NMT state") for frame in _statuses(tester)]
@@ -300,17 +302,26 @@ def _foreign_frames(random: np.random.Generator, known: list[int]) -> Frames:
 # -- all frames received --------------------------------------------------------------------------------------------------
 
 
-def _all(defects_of: Callable[[list[ReceivedFrame]], list[str]]) -> Callable[[NodeTester], Outcome]:
-    """Return a test of all received frames. The test passes if `defects_of` returns no defect."""
+def _all(
+    defects_of: Callable[[list[ReceivedFrame]], list[str]], *, with_unexpected: bool = False
+) -> Callable[[NodeTester], Outcome]:
+    """Return a test of all received frames. The test passes if `defects_of` returns no defect.
+
+    Args:
+        defects_of: function that returns a text for each defect of the received frames.
+        with_unexpected: True if each frame in `NodeTester.unexpected` is a defect.
+    """
 
     def test(tester: NodeTester) -> Outcome:
         if tester.dropped:
             raise NotTested(f"this computer lost {tester.dropped} frames")
-        if not tester.received:
+        unexpected = tester.unexpected if with_unexpected else []
+        count = len(tester.received) + len(unexpected)
+        if not count:
             raise NotTested("no frame of the node received")
-        defects = defects_of(tester.received)
+        defects = unexpected + defects_of(tester.received)
         named = ", ".join(defects[:_LISTED]) + ", ..." * (len(defects) > _LISTED)
-        frames = f"{len(tester.received)} frames"
+        frames = f"{count} frames"
         return Outcome(not defects, f"{len(defects)} of {frames}: {named}" if defects else f"{frames}, no defect")
 
     return test

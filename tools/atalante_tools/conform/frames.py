@@ -96,7 +96,7 @@ class ReceivedFrame:
     cycle: int  # number of the cycle in which the frame was received
     time: float  # receive time [s]
     length_valid: bool
-    format_valid: bool  # CAN FD data frame with bit rate switch
+    format_valid: bool  # CAN FD frame with bit rate switch
     crc_valid: bool
     counter: int
     reserved_zero: bool
@@ -146,7 +146,7 @@ class MessageReceiver:
             cycle=cycle,
             time=time,
             length_valid=length_valid,
-            format_valid=int(frame["flags"][0]) & _FD == _FD and int(frame["can_id"][0]) == message.frame_id,
+            format_valid=int(frame["flags"][0]) & _FD == _FD,
             crc_valid=crc(payload[CRC_BYTES:].tobytes(), self._data_id) == reported,
             counter=int(payload[COUNTER_BYTE]) if length > COUNTER_BYTE else -1,
             reserved_zero=not length_valid or not (payload & self._reserved).any(),

@@ -15,7 +15,7 @@ from atalante_dbc import Message, Network, Node
 from atalante_hal.bus import Bus, BusFull
 from atalante_hal.robot import Robot
 from atalante_hal.types import PERIOD
-from atalante_hal.wire.frame import Frames, as_words, new_frames
+from atalante_hal.wire.frame import ID_ERROR, ID_EXTENDED, ID_REMOTE, Frames, as_words, new_frames
 from atalante_tools.conform.frames import MessageReceiver, MessageSender, ReceivedFrame
 from atalante_tools.conform.technician import Action, Technician
 from atalante_tools.console.outcome import Failed
@@ -120,6 +120,8 @@ class NodeTester:
 
     Attributes:
         received: recorded frames of the node. The test of the start-up (NODE-01) empties this list.
+        unexpected: description of each 29-bit or remote frame with the identifier number of a message of the node. Such a
+            frame is not in `received`. NODE-01 empties this list, too.
         frame_count: number of frames of the node recorded so far, including the frames that were removed from `received`.
         cycle_number: number of past cycles of 1 ms, with or without SYNC.
     """
@@ -137,6 +139,7 @@ class NodeTester:
         self.network, self.robot, self.node, self.clock, self.technician = network, robot, node, clock, technician
         self.limits = limits or Limits()
         self.received: list[ReceivedFrame] = []
+        self.unexpected: list[str] = []
         self.frame_count = 0
         self.cycle_number = 0
         self.sync = MessageSender(network.message(f"SYNC_{self._of_node('STATE').bus.upper()}"))
@@ -262,6 +265,16 @@ class NodeTester:
                 stamp = self.clock.time_of(int(stamps[row]), self.cycle_number)
                 self.received.append(receiver.decode(self._singles[row], self.cycle_number, stamp))
                 self.frame_count += 1
+            elif can_id & (ID_EXTENDED | ID_REMOTE) and not can_id & ID_ERROR:
+                self._record_unexpected(can_id)
+
+    def _record_unexpected(self, can_id: int) -> None:
+        receiver = self._receivers.get(can_id & ~(ID_EXTENDED | ID_REMOTE))
+        if receiver is not None:
+            kind = "29-bit " * bool(can_id & ID_EXTENDED) + ("remote frame" if can_id & ID_REMOTE else "frame")
+            self.unexpected.append(
+                f"{kind} with the identifier of {receiver.message.name} in cycle {self.cycle_number}"
+            )
 
     # -- waiting -------------------------------------------------------------------------------------------------------
 
