@@ -18,7 +18,12 @@ from atalante_hal.types import Vector
 
 
 class Telemetry:
-    """Telemetry of one cycle of a walk."""
+    """Telemetry of one cycle of a walk.
+
+    In the first cycle of a phase (`elapsed` is 0), `dcm` is still relative to the stance foot of the phase before, but the
+    nominal DCM is already relative to the new one. So in this cycle `dcm_error` contains the distance between both, and
+    `pressure_shift` follows from this error.
+    """
 
     q_des: Annotated[Vector, len(JOINTS)]  # rad
     dcm: Annotated[Vector, 2]  # m, measured divergent component of motion (DCM) in the walking frame
