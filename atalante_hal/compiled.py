@@ -35,8 +35,8 @@ Function = TypeVar("Function", bound=Callable[..., Any])
 P = ParamSpec("P")
 R = TypeVar("R")
 
-#: Name of a marker file. It is in the cache folder of each function that creates arrays.
-#: A function that creates arrays cannot be compiled without reference counts.
+#: Name of a marker file in the cache folder of a function. The file means: this function creates arrays.
+#: numba can compile a function that creates arrays only with reference counts.
 _MARK = "creates-arrays"
 #: Function given to `specialised` -> whether this function creates arrays.
 _CREATES_ARRAYS: dict[Callable[..., Any], bool] = {}
@@ -136,14 +136,14 @@ def _compiled(function: FunctionType, counted: bool) -> Any:
 
 
 def _mark(function: Callable[..., Any]) -> None:
-    """Store in the cache that a function creates arrays."""
+    """Create the marker file of a function that creates arrays, see `_MARK`."""
     folder = _folder(cast(FunctionType, function), False)
     if folder is not None:
         (folder / _MARK).touch()
 
 
 def _is_marked(function: Callable[..., Any]) -> bool:
-    """Return whether the cache states that a function creates arrays."""
+    """Return whether the cache folder of a function contains the marker file of functions that create arrays."""
     folder = _folder(cast(FunctionType, function), False)
     return folder is not None and (folder / _MARK).exists()
 

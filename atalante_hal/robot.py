@@ -71,7 +71,8 @@ class Sensors:
     attitude_error: float
     #: Largest change [rad] of the difference between encoder angle and IMU angle while the encoder reading is constant.
     attitude_change: float
-    misalignment: float  # rad for each rad, increase of the limit `attitude_change` for each rad by which the leg turns
+    #: The limit `attitude_change` grows by this angle [rad] for each radian of leg rotation, because an IMU may be mounted askew.
+    misalignment: float
     quaternion_error: float  # largest difference between the squared norm of a quaternion and 1
     cell_free: float  # N, largest vertical force at which a cell is regarded as unloaded
     cell_twist: float  # N, largest difference between the vertical forces on the two diagonals of a foot's cells
@@ -122,7 +123,7 @@ class Robot:
 
     @property
     def top_speed(self) -> Vector:
-        """Return the lowest speed at which the limiter permits no accelerating torque, shape (12,) [rad/s]."""
+        """Return the speed above which the limiter permits only braking torques, shape (12,) [rad/s]."""
         return self.velocity_max + self.envelope.velocity_margin
 
     def torque_limit(self, temperature: Vector) -> Vector:

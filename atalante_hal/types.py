@@ -59,7 +59,8 @@ class State:
     joints_valid: bool  # True if all twelve joint states are valid
     imu_rows: tuple[int, ...] = ()  # indices of the IMU messages in `valid` and `age`; empty if unknown
     foot_rows: tuple[int, ...] = ()  # indices of the foot messages in `valid` and `age`; empty if unknown
-    torque_sent: Vector | None = None  # (12,) Nm, last output of the limiter (not sent in HOLD); None if unknown
+    #: (12,) Nm, last output of the limiter; None if unknown. While the drives hold, 0 is sent to them instead.
+    torque_sent: Vector | None = None
     #: Additional delay [cycles] from a torque command to its effect because of late messages or motors; 0 if all are punctual.
     #: Measured at START, see `safety.direction`.
     delay: int = 0

@@ -54,7 +54,11 @@ class BusDown(BusError):  # noqa: N818
 
 
 class BusFull(BusError):  # noqa: N818
-    """Error of a full transmit queue: only `sent` frames of the batch were accepted, on each channel the first ones."""
+    """Error of a full transmit queue: the queue accepted only a part of the batch.
+
+    Attributes:
+        sent: Number of accepted frames. On each channel, these are the frames that come first in the batch.
+    """
 
 
 class Bus(Protocol):

@@ -33,7 +33,9 @@ def parse_channel_map(text: str, buses: Sequence[str]) -> dict[str, str]:
         )
     if "=" not in text:
         if len(entries) > 1:
-            raise ChannelMapError(f"channel map {text!r} assigns no bus to a channel; write {example}")
+            raise ChannelMapError(
+                f"a channel map with several channels must name the bus of each channel, got {text!r}; write {example}"
+            )
         return dict.fromkeys(buses, entries[0])
     channels: dict[str, str] = {}
     for entry in entries:

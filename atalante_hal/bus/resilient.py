@@ -15,8 +15,8 @@ from atalante_hal.wire.frame import Frames
 
 #: Longest time for which `receive` waits after an error of a lost link [s]. The next call tries the link again.
 RETRY_PERIOD = 0.1
-#: An error message is reported when it has not changed for this time [s].
-#: A removed interface causes two messages. The first message reports "down", the second message reports "removed".
+#: An error message of a lost link is reported after its text has stayed the same for this time [s].
+#: A removed interface causes the error "down" and soon afterwards the error "removed". So only "removed" is reported.
 SETTLE_TIME = 0.1
 
 

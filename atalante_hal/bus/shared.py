@@ -97,7 +97,10 @@ class SharedBus:
 
     @property
     def stamps(self) -> Stamps:
-        """Return the time of the last `receive()` that returned frames, once for each frame. Shape (capacity,), int64 [ns]."""
+        """Return an array of receive times, shape (capacity,), int64 [ns].
+
+        All elements are equal: the time of the last `receive()` that returned frames.
+        """
         self._stamps.fill(self._received_at)
         return self._stamps
 

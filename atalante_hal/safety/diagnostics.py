@@ -152,7 +152,7 @@ class Dtc(StrEnum):
     GAIT_INVALID = "GAIT_INVALID", _R.NOT_READY, _S.ERROR, "the gait was rejected"
 
 
-#: Codes whose reaction is HOLD, although the HAL can still control the robot for some more steps.
+#: Codes whose reaction is HOLD. A walking robot may make some more steps before HOLD, because the HAL can still control it.
 _CONTROLLABLE = frozenset(
     {
         Dtc.E2E_REPEAT_RATE,
@@ -164,8 +164,9 @@ _CONTROLLABLE = frozenset(
         Dtc.OVERRUN,
     }
 )
-#: Codes whose reaction is HOLD. A walking robot may make some more steps before HOLD, except if the affected node is a drive.
-#: The walking controller bridges the loss of an IMU or of a foot until the robot stands.
+#: Codes whose reaction is HOLD. If the affected node is a drive, the robot goes to HOLD at once.
+#: If the affected node is another node, such as an IMU or a foot, a walking robot may make some more steps before HOLD.
+#: Until the robot stands, the walking controller replaces the values of a lost IMU or of lost foot force sensors.
 _CONTROLLABLE_WITHOUT_SENSOR = frozenset(
     {
         Dtc.E2E_SEQUENCE,

@@ -50,8 +50,8 @@ _SHORT = min(duration for _, duration in GROUPS)
 #: Delay [cycles] from a torque command to the first position that shows its effect, if no frame and no motor is late.
 LATENCY = 2
 #: Delays that the test tries [cycles]. States, commands and motors may be late by three cycles in total.
-#: The largest and the smallest value of the pulse of 16 cycles are 4.6 cycles apart. So a wrong sign would look like a delay that
-#: is four to five cycles longer, and the test tries no such delay.
+#: Longer delays are not tried: the inverted pulse of 16 cycles resembles a pulse that comes 4 to 5 cycles later.
+#: So a motor with a wrong sign would look like a late motor.
 LATENCIES = tuple(range(LATENCY, LATENCY + 4))
 #: Peak of the pulse as a multiple of `Robot.breakaway`, in the order of LEG_JOINTS.
 #: The peaks of FH and SH are larger, because these joints move a whole leg.
@@ -66,10 +66,11 @@ INTEGRAL = 0.03
 #: Largest motion of a joint during the test [rad].
 TRAVEL = math.radians(1.5)
 #: A foot is loaded if its mean force during a test exceeds `LOAD * cell_free`.
-#: `LOAD * cell_free` is four times the noise of the mean force.
+#: This threshold `LOAD * cell_free` is four times the noise of the mean force.
 LOAD = 1.0 / 3.0
 #: A foot hit the floor if the sum of its forces in two consecutive cycles exceeds `HIT * cell_free`.
-#: `HIT * cell_free` is four times the noise of the sum. An impact that stops an ankle is at least 1.5 times as large.
+#: This threshold `HIT * cell_free` is four times the noise of the sum.
+#: If an impact stops an ankle, the sum is at least 1.5 times the threshold.
 HIT = 2.0
 #: If a joint near its end stop is tested a second time, its torque pulse is multiplied by this factor, because the leg weight may
 #: press the joint onto the end stop.
@@ -106,17 +107,19 @@ def pose_gains(robot: Robot) -> tuple[Vector, Vector]:
 
 
 def mobilities_of(torque: Vector, position: Vector) -> tuple[Vector, Vector]:
-    """Return the mobility (inverse of the effective inertia) and the explained motion of each joint, for all `LATENCIES`.
+    """Fit the motion of each joint to its torque, once for each delay in `LATENCIES`.
 
-    A wrong delay makes the mobility of a light joint several times too small.
+    The fit assumes that the torque moves the joint after this delay. A wrong delay makes the mobility of a light joint
+    several times too small.
 
     Args:
         torque: torque sent in each cycle, shape (n, joints) [Nm].
         position: position in each cycle, measured before the torque was sent, shape (n, joints) [rad].
 
     Returns:
-        Mobility [1/(kg m2)], 0 for a joint whose torque did not change, and the share of the motion that each delay
-        explains, from 0 to 1, with the sign of the mobility. The shape of both is (delays, joints).
+        Two arrays of shape (delays, joints). The first array is the mobility, the inverse of the effective inertia
+        [1/(kg m2)]. The mobility is 0 for a joint whose torque did not change. The second array is the share of the measured
+        motion that the torque explains. The share is from 0 to 1 and has the sign of the mobility.
     """
     count = len(position)
     response = np.zeros((len(LATENCIES), *torque.shape))
@@ -147,8 +150,8 @@ class DirectionProof:
         mobility: last measured mobility of each joint, shape (12,) [1/(kg m2)]; 0 if it was not measured.
         failed: indices in JOINTS of the joints that failed in this start.
         running: True from `begin` until all joints are tested, or one has failed.
-        late: number of cycles by which the effect of a torque comes later than `LATENCY`: the delay that explains the tests with
-            short pulses and more than two joints best, all together; 0 before the first of these tests.
+        late: delay of the torques in addition to `LATENCY` [cycles]. It is estimated from all tests with a short pulse and more
+            than two joints: with this delay, the torques explain the motions best. 0 before the first such test.
     """
 
     def __init__(self, robot: Robot, groups: Sequence[tuple[Sequence[str], int]] = GROUPS) -> None:
@@ -172,8 +175,8 @@ class DirectionProof:
         # A test of one or two joints uses the delay `late` from earlier tests with more joints. If such a test chose its own
         # delay, a reversed motor might look like a late motor.
         self.late = 0
-        #: Share of the motion that each delay in `LATENCIES` explains, summed over the joints that passed a test with a short
-        #: pulse.
+        #: Quality of the fit with each delay in `LATENCIES`: the share of a joint's motion that its torque explains.
+        #: The shares of all joints that passed a test with a short pulse are added.
         self._explained = np.zeros(len(LATENCIES))
         self._position: list[Vector] = []  # joint positions in each cycle of the current test
         self._force: list[Vector] = []  # vertical force of each foot in each cycle of the current test

@@ -90,11 +90,11 @@ class Entry:
 
 @dataclass(slots=True)
 class Window:
-    """Window of time after a logged event. Equal events in this window are counted."""
+    """Counting window: time of `FOLD_CYCLES` after a logged event, in which equal events are only counted, not logged."""
 
     end: int  # first cycle after the window
-    latest: Event
-    repeats: int = 0
+    latest: Event  # newest of the equal events
+    repeats: int = 0  # number of equal events that were counted in the window
 
 
 class FaultMemory:
@@ -166,12 +166,11 @@ class FaultMemory:
         return frozenset(dtc for dtc in self.confirmed if dtc.reaction is reaction is not Reaction.INFO)
 
     def walk_ends(self, drives: Collection[str]) -> frozenset[Dtc]:
-        """Return those confirmed codes with which a walking robot may first end its walk on both feet, see `permits_walk_end`.
+        """Return the confirmed codes that permit a walking robot to finish its walk before HOLD, see `permits_walk_end`.
 
-        With all other codes, the drives hold at once.
-
-        A code may be confirmed for several nodes. The code is left out if one of these nodes does not permit the end of
-        the walk.
+        With these codes, the robot walks on until it stands on both feet, and then goes to HOLD. With all other codes, the
+        drives hold at once. A code may be confirmed for several nodes. The code is returned only if all these nodes permit the
+        end of the walk.
 
         Args:
             drives: DBC names of the drives.
@@ -203,7 +202,7 @@ class FaultMemory:
             window.latest, window.repeats = event, window.repeats + 1
 
     def window_over(self, cycle: int) -> bool:
-        """Return whether the counting window of any event is over, so that `log_repeats` must be called.
+        """Return whether any counting window has ended, so that `log_repeats` must be called.
 
         Args:
             cycle: number of the current cycle.
@@ -211,11 +210,13 @@ class FaultMemory:
         return any(cycle >= window.end for window in self._windows.values())
 
     def log_repeats(self, cycle: int, *, final: bool = False) -> None:
-        """Remove each window that is over. For a window with repeats, log one event with their count and begin a new window.
+        """Remove each counting window that has ended, and log the number of equal events that were counted in this window.
+
+        If no event was counted, nothing is logged. Otherwise one event with the number is logged and begins a new window.
 
         Args:
             cycle: number of the current cycle.
-            final: True at the end of a run: every window is over.
+            final: True at the end of a run: all windows end, and no new window begins.
         """
         over = [(key, window) for key, window in self._windows.items() if final or cycle >= window.end]
         for key, window in over:

@@ -78,12 +78,15 @@ class Heartbeats:
         #: active emergencies, the entry is the newest of the emergencies with the most severe reaction.
         self.emergencies: dict[str, tuple[Dtc, int]] = {}
         self._cleared: set[str] = set()  # nodes whose emergency was cleared in this cycle
-        #: Emergencies since the last `evaluate` that cause no reaction and are reported as pending: node, diagnostic, error code.
-        #: The reaction of such an emergency is INFO, or is milder than the reaction of the node's active emergency.
+        #: Emergencies that the next `evaluate` only reports as pending. Each entry is (node, diagnostic, error code).
+        #: Such an emergency has the reaction INFO, or a more severe emergency of the same node is already active.
         #: `_notices` also contains an entry with error code 0 for each frame of an error passive node.
         self._notices: list[tuple[str, Dtc, int]] = []
-        self._reset: set[str] = set()  # nodes that were not OPERATIONAL since the last `evaluate`
-        #: Row of the process image -> counter that detects two senders of this message, from 0 to `FULL`.
+        #: Nodes that were reset: they reported a state other than OPERATIONAL at least once since the last `evaluate`.
+        #: The first status message of a node does not count.
+        self._reset: set[str] = set()
+        #: Row of a message in the process image -> counter of the evidence that two nodes send this message, 0 to `FULL`.
+        #: At `FULL`, two senders are confirmed.
         self._evidence: defaultdict[int, int] = defaultdict(int)
         #: Nodes that sent a boot-up message. The safety monitor empties this set after each use.
         self.booted: set[str] = set()

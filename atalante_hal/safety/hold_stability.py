@@ -34,16 +34,17 @@ SPEED: Final = 0.5
 INTERVAL: Final = 100
 #: A joint is regarded as oscillating after this number of consecutive reversals.
 REVERSALS: Final = 6
-#: Smallest and largest torque that an overloaded drive reports, as shares of its torque limit. A drive that reports a larger
-#: torque reports a wrong torque.
+#: Lowest and highest reported torque that count as overload, as shares of the drive's torque limit.
+#: A drive cannot exceed its torque limit that far, so a higher reported torque is wrong.
 SATURATED: Final = (0.9, 1.05)
-#: Number of consecutive cycles after which a drive is regarded as overloaded.
+#: A drive is regarded as overloaded after this number of consecutive cycles with overload.
 OVERLOADED: Final = 20
-#: Smallest distance from the position in which the hold began [rad]. A drive that only reports a wrong torque still holds its
-#: joint in this position.
+#: A drive can be overloaded only if its joint is at least this far from the position in which the hold began [rad].
+#: A drive that only reports a wrong torque keeps its joint closer than this distance.
 AWAY: Final = math.radians(1.0)
-#: The overload count of a joint restarts if the speed towards `Loads.start` exceeds this value [rad/s], or if the speed away from
-#: `Loads.start` has decreased by more than this value since the count began. The noise of the velocities is smaller.
+#: Speed threshold of the overload count [rad/s]. The noise of the velocities is smaller than this threshold.
+#: The count restarts if the joint moves back towards the position in which the hold began, faster than this threshold.
+#: The count also restarts if the motion away from this position has slowed by more than this threshold since the count began.
 SLOWER: Final = 0.05
 #: The overload check skips a joint in each cycle in which the values of the joint are older than this [cycles].
 AGE: Final = 4
@@ -129,7 +130,10 @@ def _watch_load(joints: Measured, limit: Vector, driven: tuple[float, float], lo
 
 
 class HoldStability:
-    """Check of all joints while the HAL sends no torques of the controller."""
+    """Check that each drive holds its joint without oscillation and without overload.
+
+    The check is used while the HAL sends no torques of the controller.
+    """
 
     def __init__(self) -> None:
         """Create the check, and compile its kernels."""

@@ -29,12 +29,12 @@ from atalante_hal.vectors import Vector3, cross, rotated
 HALF: Final = 8
 #: Number of cycles that the averages need.
 SPAN: Final = 2 * HALF + 1
-#: A torque moves the joints this number of cycles after the cycle in which the HAL reports it as sent, if no frame and no motor
-#: is late.
+#: A torque in `Sample.sent` of cycle n moves the joints in cycle n + DELAY, if no frame and no motor is late.
 DELAY: Final = 1
 #: Largest delay of the torques in addition to `DELAY` [cycles]: the sum of the delays of states, commands and motors.
 MORE: Final = 3
-#: Largest age of the positions [cycles]. The frames of a node may be late by one cycle in every cycle.
+#: Largest permitted age of the positions [cycles].
+#: If a node always answers one cycle late, its positions have the age 1 in every cycle.
 LATE: Final = 1
 #: Largest permitted number of consecutive cycles in which the values of the pelvis IMU or of a foot do not change.
 REPEATED: Final = 2
@@ -144,7 +144,9 @@ def _count(history: History, sensor: int, changed: bool) -> None:
 
 
 def compute(leg: int, model: LegModel, late: int, history: History, torques: Torques) -> bool:
-    """Compute the sent and the produced torques of a leg. Return False if the values do not suffice.
+    """Compute the mean sent torques of a leg, and the torques that its motors produced according to the motion.
+
+    The sent torques are shifted by `DELAY + late` cycles, so that both results belong to the same motion.
 
     Args:
         leg: index in `SIDES`.
@@ -152,6 +154,10 @@ def compute(leg: int, model: LegModel, late: int, history: History, torques: Tor
         late: further delay of the torques, 0 to `MORE` [cycles].
         history: values of the last cycles.
         torques: output for the torques.
+
+    Returns:
+        Whether the torques were computed. False if the history has too few cycles, if a position is too old, if the positions
+        of a joint differ in age, or if the values of pelvis IMU or foot did not change for too long.
     """
     newest = history.cycles[0] - 1
     if history.cycles[0] < SPAN + late or min(history.good[0], history.good[1 + leg]) < SPAN:

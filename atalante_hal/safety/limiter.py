@@ -255,10 +255,12 @@ def highest_torque(room: float, acceleration: float, oldest: float, inertia: flo
     """
     room = max(room, 0.0)
     known = max(oldest, 0.0)
-    if acceleration * (delay + known * fall) > room:
+    if acceleration * (delay + known * fall) > room:  # the velocity gets too high even if the torque does not increase
         return max((room / acceleration - delay) / fall, 0.0)
-    # U is the positive root u of  fall * u^2 + (delay + free * fall) * u + free * delay - inertia * room = 0.
-    free = inertia * acceleration - oldest
+    # Above `known`, U solves the inequality of the module docstring with equality. Multiplied by the inertia, the equation is
+    #     fall * U^2 + (delay + free * fall) * U + free * delay - inertia * room = 0.
+    # U is the positive solution.
+    free = inertia * acceleration - oldest  # torque that does not come from the motor [Nm]
     root = math.sqrt((delay - free * fall) ** 2 + 4.0 * fall * inertia * room)
     return max((root - delay - free * fall) / (2.0 * fall), known)
 

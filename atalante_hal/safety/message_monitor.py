@@ -61,8 +61,8 @@ CONFIRMED = {
     Check.REPEATED: Dtc.E2E_FROZEN,
     Check.CONFLICT: Dtc.E2E_FROZEN,
 }
-#: Results of the E2E check of a rejected frame. With one of these results, the frame proves a second sender if another intact
-#: frame of the message arrived in the same cycle.
+#: E2E check results of rejected frames that may come from a second sender.
+#: If another intact frame of the same message arrives in the same cycle, two nodes send this message.
 _RIVAL = (Check.CONFLICT, Check.WRONG_SEQUENCE)
 #: Results of the E2E check of a rejected frame whose format and CRC are correct.
 _INTACT = (*_RIVAL, Check.RANGE, Check.INVALID)
@@ -83,7 +83,8 @@ class Tolerance(NamedTuple):
 
     #: Indices of the legs in SIDES. A brief timeout in these legs leads to FINISH_STEP instead of HOLD.
     legs: Collection[int] = ()
-    #: Cycles that are added to the DBC timeouts of the joints in these legs while no frame is accepted.
+    #: Number of cycles by which the timeouts of the joints in these legs exceed the DBC timeouts.
+    #: A joint has the longer timeout only while no new frame of this joint is accepted.
     longer: int = 0
 
 
@@ -223,8 +224,8 @@ class MessageMonitor:
         sender, two_senders = self._senders[row], self._check_senders(cycle, memory, row, rival)
         tolerated, timeout = self._legs[row] in tolerance.legs, self._timeouts[row]
         fresh = check <= Check.SOME_LOST
-        # `tolerance.longer` extends the timeout only while no frame arrives. A frame that is accepted with a larger age than the
-        # timeout in the DBC is late: the plausibility checks use no values of this age.
+        # The longer timeout holds only while no new frame is accepted. If a frame is accepted, its age must be below the DBC
+        # timeout, because the plausibility checks do not use older values.
         late = age >= timeout + tolerance.longer * (tolerated and not fresh)
         # Impossible signal values do not reduce the trust, because the frame was transmitted correctly.
         good = (fresh or check >= Check.RANGE) and not rival
@@ -260,9 +261,10 @@ def rivals_of(refused: Sequence[tuple[int, Check]], checks: Sequence[int]) -> fr
         refused: row and check result of each rejected frame.
         checks: `Check` of each row, shape (rows,).
     """
+    # Number of intact frames of each row: rejected frames, plus 1 if the row also has an accepted frame.
     intact = Counter(row for row, result in refused if result in _INTACT)
     for row in intact:
-        intact[row] += checks[row] <= _FRESH or checks[row] == Check.IMPLAUSIBLE  # the accepted frame is intact, too
+        intact[row] += checks[row] <= _FRESH or checks[row] == Check.IMPLAUSIBLE
     return frozenset(row for row, result in refused if result in _RIVAL and intact[row] > 1)
 
 

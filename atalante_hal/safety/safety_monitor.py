@@ -77,7 +77,8 @@ class SafetyMonitor:
             processed.
         enabling: True while drives are being enabled. In this time, the limiter follows the torques that the drives report.
         recalled: cycle in which QUICK_STOP was last sent to a drive in OPERATION ENABLED.
-        proof: test of the directions of all joints, which must be over before the state changes from READY or HOLD to ACTIVE.
+        proof: direction test at a start, which checks that each motor turns its joint in the right direction. The state changes
+            from READY or HOLD to ACTIVE only after this test.
         torque_tracking: comparison of the reported torques with the sent torques while the robot moves.
         torque_motion: comparison of the motion with the sent torques while the robot moves; None without a model of the legs.
         lowered: DBC names of the drives that cannot hold and are being lowered.
@@ -120,7 +121,7 @@ class SafetyMonitor:
         self.enabling = False
         self.recalled = -RECALL_CYCLES
         self.proof = DirectionProof(robot)
-        self._proof_begun = False  # True if the test of the joint directions has begun in the current start
+        self._proof_begun = False  # True if the direction test has begun in the current start
         self._stalled = 0  # during a start: number of cycles since the state of any drive changed
         self._states_at_start = b""  # during a start: drive states in the previous cycle
         self.lowered: set[str] = set()
@@ -129,11 +130,12 @@ class SafetyMonitor:
         self._joint_rows = np.array(rows_of(image.codec, JOINT_MESSAGES))
         self.torque_tracking = TorqueTracking(robot.breakaway)
         self.torque_motion: TorqueMotion | None = None
-        #: DBC names of the drives that stay off until a test of the directions is passed: drives that were off before the START,
-        #: drives with a wrong torque, drives that did not hold their joints, and drives whose joints failed the test.
+        #: DBC names of the drives that stay off until the direction test of a start is passed, see `proof`: drives that were off
+        #: before the START, drives with a wrong torque, drives that did not hold their joints, and drives whose joints failed
+        #: the test.
         self._kept_off: set[str] = set()
-        #: False if the next cycle must be evaluated. If True, `evaluate` skips the next cycle, provided that its data is new,
-        #: there is no fault, and the values of pendant and drives are unchanged.
+        #: False if `evaluate` must evaluate the next cycle. If True, `evaluate` skips a normal cycle: fresh data, no fault, and
+        #: unchanged values of pendant and drives.
         self._steady = False
         self._reports: list[Finding] = []  # faults that loop and controller reported since the last `evaluate`
         self._acknowledged = False  # True if START was pressed in this cycle
@@ -198,10 +200,10 @@ class SafetyMonitor:
         return found
 
     def accept(self, frames: Frames) -> list[int]:
-        """Process status messages, emergencies and unknown frames: all frames that are not 1 ms messages to the HAL.
+        """Process the status messages, emergencies and unknown frames of a cycle.
 
         Args:
-            frames: received frames, shape (n,).
+            frames: received frames of a cycle without the cyclic 1 ms messages, shape (n,).
 
         Returns:
             Indices in `frames` of the frames that the DBC does not define as messages to the HAL.
@@ -232,9 +234,10 @@ class SafetyMonitor:
         self._ending, self._steady = True, False
 
     def check_timeouts(self) -> None:
-        """Request an evaluation of the next cycle if a status message timed out or if repeats of an event must be logged.
+        """Request an evaluation of the next cycle if a status message timed out or the counting window of an event is over.
 
-        Call this periodically, because cycles without a fault are not evaluated.
+        At the end of a counting window, the fault memory logs the number of repeats of the event. Call this method periodically,
+        because cycles without a fault are not evaluated.
         """
         cycle = self._state.cycle
         if self._heartbeats.overdue(cycle) or self.memory.window_over(cycle):
@@ -417,8 +420,8 @@ class SafetyMonitor:
             return None
         self._stalled = 0
         if not self._proof_begun:
-            # The test begins with the last torques of the limiter. If `enabling` is False, the limiter has not yet taken over the
-            # torques that the drives report.
+            # The test starts from the last output of the limiter. So wait until the limiter has been restarted with the torques
+            # that the drives report. `enabling` is then True.
             if not self.enabling:
                 return None
             self._proof_begun = True

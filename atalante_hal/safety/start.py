@@ -1,11 +1,12 @@
-"""Refusal of a START: the function `refusal` decides in each cycle whether the drives may be enabled.
+"""Refusal of a start: the function `refusal` decides in each cycle whether the drives may be enabled.
 
     pendant, diagnostics, nodes, drive state, reported torque -> refusal -> safety monitor, event START_REFUSED or START_FAILED
 
-A start has two parts, so that no joint sags. First every drive is enabled and holds its position: a drive that is enabled earlier
-than the others gets QUICK STOP until all drives produce torque (see `words_towards_operation`). Then all drives get ENABLE
-OPERATION in the same cycle. The torque command of each drive is then the torque that the drive reports. So a START is refused if
-a reported torque is impossible. The start ends if no drive changes its state for `STALLED_CYCLES`.
+The button START begins a start. A start takes several cycles and has two parts, so that no joint sags. First every drive is
+enabled and holds its position: a drive that is enabled earlier than the others gets QUICK STOP until all drives produce torque
+(see `words_towards_operation`). Then all drives get ENABLE OPERATION in the same cycle. The torque command of each drive is then
+the torque that the drive reports. So a START is refused if a reported torque is impossible. The start ends if no drive changes
+its state for `STALLED_CYCLES`.
 """
 
 from __future__ import annotations
@@ -26,7 +27,8 @@ ENABLE_CYCLES = 200
 #: four times in a row.
 STALLED_CYCLES = 10
 #: In HOLD, a START is refused while a joint whose drive is on is faster than this [rad/s], because the test of the joint
-#: directions needs joints at rest. A joint whose drive is off may sink, because the START first lets this drive hold its joint.
+#: directions needs joints at rest. A sinking joint whose drive is off does not prevent the START,
+#: because the start first lets this drive stop and hold the joint.
 AT_REST = 0.3
 #: Prefix of the event text for a refused START.
 REFUSED = "START refused: "
@@ -55,7 +57,7 @@ def powered(drive_state: Vector) -> npt.NDArray[np.bool_]:
 
 
 class StartRequest(NamedTuple):
-    """Conditions of a START in one cycle, as the safety monitor has evaluated them."""
+    """Conditions of a start in one cycle, as the safety monitor has evaluated them."""
 
     supervisor: SupervisorState  # state of the state machine
     pressed: bool  # True in the cycle in which START is pressed, False in the later cycles of this start
@@ -73,7 +75,7 @@ class StartRequest(NamedTuple):
 
 
 class Refusal(NamedTuple):
-    """Event that ends a START."""
+    """Event that is logged when a start is refused or fails."""
 
     code: str  # START_REFUSED, or START_FAILED if the drives were not enabled in time
     severity: str  # severity of the event, one of `events.SEVERITIES`
@@ -81,14 +83,14 @@ class Refusal(NamedTuple):
 
 
 def refusal(robot: Robot, request: StartRequest) -> Refusal | None:
-    """Return why a START must end in this cycle; None if it may continue.
+    """Return the reason to end the current start in this cycle; None if the start may continue.
 
     In the cycle in which START is pressed, diagnostics are ignored in all states except OFF, because the same START may
-    have acknowledged them. A released dead-man, a STOP or the end of the program refuses the START at once.
+    have acknowledged them. A released dead-man, a STOP or the end of the program ends the start at once.
 
     Args:
         robot: torque limits, and `idle_torque`, the largest torque that an idle drive may report.
-        request: conditions of the START in this cycle.
+        request: conditions of the start in this cycle.
     """
     if request.pressed:
         reason = _stop_reason(request) or (request.diagnostic if request.supervisor is _S.OFF else "")

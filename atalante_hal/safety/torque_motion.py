@@ -11,8 +11,8 @@ explanations:
     external torque:  e = t + p with a constant p
     faulty motor:     e = s t   with a share s in `SHARES`
 
-A drive is reported if the mean square error of the first explanation is more than `RATIO` times as large as that of the second
-one. So the check needs a torque that changes. After a fault, the controller changes the torque of the joint within a few cycles.
+A drive is reported if the first explanation has a clearly larger mean square error than the second explanation, see `RATIO`. So
+the check needs a torque that changes. After a fault, the controller changes the torque of the joint within a few cycles.
 An external torque that opposes each change of the torque, such as an obstacle that stops the joint, looks like a dead motor.
 
 *Changes.* Sent and computed torques are averages over `leg_torques.SPAN` cycles. At the start of a deviation, these averages also
@@ -41,10 +41,11 @@ from atalante_hal.types import State, Vector
 
 #: Interval between two checks of a leg [cycles]. The legs are checked alternately.
 INTERVAL: Final = 4
-#: Ranges of the share s of a faulty motor (produced torque = s times sent torque): reversed, dead or weak motor; strong motor.
+#: Ranges of the share s of a faulty motor (produced torque = s times sent torque). The first range covers reversed, dead and weak
+#: motors. The second range covers motors that are too strong.
 SHARES: Final = ((-1.5, 0.6), (1.4, 2.2))
-#: A check suspects the motor if the mean square error of the explanation by an external torque is more than this number of
-#: times as large as that of the explanation by a faulty motor, to which the square of `Robot.torque_error` is added.
+#: A check suspects the motor if E > `RATIO` * (F + `Robot.torque_error`^2). E is the mean square error of the explanation
+#: by an external torque. F is the mean square error of the explanation by a faulty motor.
 RATIO: Final = 2.5
 #: Number of consecutive checks that must suspect the motor before the drive is reported.
 CONFIRM: Final = 2
@@ -56,17 +57,19 @@ _BAND_SHARE: Final = 0.2
 #: `_OTHER_SHARE` times the sent torque.
 OTHER_BAND: Final = 4.5
 _OTHER_SHARE: Final = 0.25
-#: Factors by which `Deviations.sums` decay from check to check. The two sums average over about 20 and 100 cycles.
+#: Each check multiplies the two sums in `Deviations.sums` by these factors before it adds the torques of the check. A joint is
+#: checked every `INTERVAL` cycles, so the sums cover about the last 20 and the last 100 cycles.
 DECAY: Final = (0.8, 0.96)
-#: Number of checks at the start of a deviation whose torques are not added to `Deviations.sums`.
+#: The first `LEFT_OUT` checks of a deviation add no torques to `Deviations.sums`.
 LEFT_OUT: Final = 2
-#: A deviation ends after this number of consecutive checks without it.
+#: A deviation ends if more than this number of consecutive checks find no deviation.
 PAUSE: Final = 5
 #: A deviation smaller than `_FALLEN` times its largest size is not added to `Deviations.sums`.
 #: The stored largest size is multiplied by `_FORGET` in each check.
 _FALLEN: Final = 0.8
 _FORGET: Final = 0.97
-#: Least sum of the decayed weights of the checks in `Deviations.sums`. The third check exceeds this sum.
+#: `Deviations.sums` is evaluated only if its first element, the decayed number of added checks, is at least this number. So at
+#: least three checks are needed.
 _ENOUGH: Final = 2.4
 #: A joint closer to its position limit than this angle [rad] is at its end stop.
 _AT_STOP: Final = 0.005
@@ -84,14 +87,14 @@ class Tolerances(NamedTuple):
 class Deviations(NamedTuple):
     """State of the check of each joint."""
 
-    #: (2, 12, 6), for each factor of `DECAY` and each joint: decaying sums of 1, t, e, t*t, e*t and e*e,
+    #: (2, 12, 6), for each factor of `DECAY` and each joint: decaying sums of 1, t, e, t*t, t*e and e*e over the added checks,
     #: with the sent torque t and the produced torque e
     sums: Vector
-    length: npt.NDArray[np.int64]  # (12,) number of checks with a deviation
-    pause: npt.NDArray[np.int64]  # (12,) number of checks since the last deviation
-    largest: Vector  # (12,) Nm, largest deviation
-    found: npt.NDArray[np.int64]  # (12,) number of consecutive checks whose result is a faulty motor
-    share: Vector  # (12,) share s computed in the last check whose result was a faulty motor
+    length: npt.NDArray[np.int64]  # (12,) number of checks that found the current deviation
+    pause: npt.NDArray[np.int64]  # (12,) number of checks since the last check with a deviation
+    largest: Vector  # (12,) Nm, largest size of the current deviation, reduced by `_FORGET` in each check
+    found: npt.NDArray[np.int64]  # (12,) number of consecutive checks that suspected the motor
+    share: Vector  # (12,) share s = produced torque / sent torque, from the last check that suspected the motor
 
 
 class Memory(NamedTuple):
@@ -238,7 +241,7 @@ class TorqueMotion:
         self.restart()
 
     def restart(self) -> None:
-        """Forget all values, because the drives did not follow the controller until now."""
+        """Clear all stored torques and motions. Call this when the controller stops driving the joints."""
         for record in (self._memory.history, self._memory.deviations):
             for values in record:
                 values[:] = 0

@@ -75,9 +75,9 @@ class Service:
         self._runs = [Run(0, "", records.meta["start_ns"], 0)]
         self._cycle, self._timestamp = 0, self._runs[0].start_ns  # cycle number and log time [ns] of the last record
         self._lost, self._lost_reported = 0, -math.inf
-        self._recorder, self._saved = recorder, 0  # recorder, and number of messages it had saved at the last check
+        self._recorder, self._saved = recorder, 0  # recorder, and its number of saved messages at the last check
         self._handled = 0  # number of records whose messages have been passed to all sinks
-        self._kept = 0  # number of records that the header of the ring reports as saved
+        self._kept = 0  # number of records that this service has marked as saved in the ring header
         self.notices: list[str] = []  # faults, one sentence each
 
     def run(self, stop: Sequence[object]) -> None:
@@ -106,8 +106,8 @@ class Service:
 
     def step(self) -> bool:
         """Process all new records and events of the rings, and return whether there were any."""
-        # The control loop writes the note of a run before the events of this run.
-        # The events are read before the notes, so the note of the run of each event is already in the ring.
+        # The control loop writes the note of a run first, and the events of this run later. So once an event was read, the note
+        # of the same run is in the ring. The events must therefore be read before the notes.
         events = [unpack(bytes(event)) for event in self._events.read()]
         records = self._records.read()
         first = self._records.position - len(records)
@@ -194,7 +194,7 @@ class Service:
             self._mark_saved()
 
     def _mark_saved(self) -> None:
-        """Report in the header of the ring that all records processed so far are saved."""
+        """Mark all records processed so far as saved, in the header of the ring."""
         self._records.keep(self._handled - self._kept)
         self._kept = self._handled
 

@@ -25,7 +25,8 @@ Words = npt.NDArray[np.int64]
 WORD, SHIFT, MASK, LARGEST, LOW, HIGH, INVALID = range(7)
 #: Row indices of the scales in the formula  physical value = (raw code + base) * factor + offset.
 BASE, FACTOR, OFFSET = range(3)
-#: Value of `plan[INVALID, i]` if signal i has no invalid code. Also the result of `encode` if all values were encoded.
+#: In the decoding plan: signal i has no invalid code if `plan[INVALID, i]` has this value.
+#: As the result of `encode`: all values were encoded. Any other result is the index of a signal that could not be encoded.
 NO_CODE = -1
 # Results of `read_row`. INSIDE: all signals are in range. OUTSIDE: a signal is out of range, and none has its invalid code.
 # MARKED_INVALID: a signal is out of range, and at least one signal has its invalid code.
@@ -92,7 +93,8 @@ class Codec:
             mask, largest = (1 << s.length) - 1, (1 << s.length - s.signed) - 1
             invalid = NO_CODE if s.invalid_raw is None else s.invalid_raw
             plan.append((row * WORDS + 1 + s.start // 64, s.start % 64, mask, largest, low, high, invalid))
-            # An offset that is a multiple of the factor is added to the code as an integer, because integer addition is exact.
+            # If the offset is a multiple of the factor, the integer offset / factor is added to the raw code before the
+            # multiplication, because a sum of integers is exact. Any other offset is added after the multiplication.
             code = s.offset / s.factor
             exact = code == round(code) and round(code) * s.factor == s.offset
             scales.append((code, s.factor, 0.0) if exact else (0.0, s.factor, s.offset))

@@ -181,7 +181,8 @@ GOOD_CYCLE = 1
 FULL = 64
 #: Number of consecutive good cycles after which a message is trusted. Until then the inputs of a pendant are ignored.
 REQUALIFY = 16
-#: In a cycle with frames of two senders, the counter of `suspect` rises by this number, a quarter of `FULL`.
+#: Increase of the counter that detects two senders (see `suspect`), in a cycle with frames of two senders.
+#: After four such cycles in a row, the counter reaches `FULL`, and two senders are confirmed.
 RIVAL_CYCLE = 16
 
 

@@ -232,7 +232,9 @@ class ReceiveImage:
         return self._received
 
     def _accept(self, received: _Received, tag: int | None) -> bool:
-        """Commit a perfect cycle in one pass. This fast path replaces `new_cycle` and `accept_each`.
+        """Commit all rows in one pass if every expected frame arrived in order and without an error (a perfect cycle).
+
+        This fast path replaces `new_cycle` and `accept_each`, which check the frames one by one.
 
         Args:
             received: frames of the cycle.
@@ -574,7 +576,9 @@ class TransmitImage:
         return self._octets.tobytes()
 
     def seal_prepared(self, prepared: bytes) -> Frames:
-        """Add counter and CRC to frames that `prepare` encoded earlier. Later faults in the values have no effect.
+        """Add counter and CRC to frames that `prepare` encoded earlier.
+
+        The current `values` are not encoded, so a faulty value such as NaN cannot prevent or change these frames.
 
         Args:
             prepared: result of `prepare`.

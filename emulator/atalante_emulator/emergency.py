@@ -26,8 +26,8 @@ COMMAND_TIMEOUT: Final = 0x8250  # command timed out
 _REGISTER: Final = {0x2: 0x03, 0x3: 0x05, 0x4: 0x09, 0x7: 0x21, 0x8: 0x11}
 _GENERIC: Final = 0x01
 
-# Ages of a warning [calls of `Errors.advance`]. A warning ends at the age `_ENDED`.
-# The same warning may be reported again from the age `_REPEATABLE` on.
+# Age of a warning: number of calls of `Errors.advance` since `Errors.warn` has reported or renewed the warning.
+# The warning ends at the age `_ENDED`. `Errors.warn` reports the same warning again only from the age `_REPEATABLE` on.
 _ENDED, _REPEATABLE = 2, 3
 
 

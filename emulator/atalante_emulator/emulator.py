@@ -114,8 +114,9 @@ class Emulator:
         self.before_send: list[Callable[[int, Vector], None]] = []
         self.pelvis_forces: list[Callable[[int], Vector]] = []
         self._pushing = False  # whether a wrench acted on the pelvis in the last time step
-        self.crane: Crane | None = None  # crane of a robot on the ground, also an element of `pelvis_forces`
-        #: Operator who steadies a robot on the ground, also an element of `pelvis_forces`.
+        #: Crane that lowers the robot to the ground; None without crane. The same object is also in `pelvis_forces`.
+        self.crane: Crane | None = None
+        #: Emulated operator who steadies the robot on the ground, or None. The same object is also in `pelvis_forces`.
         self.virtual_operator: VirtualOperator | None = None
         self.wearer: PassiveWearer | ActivePatient | None = None  # wearer whose limbs act on the joints
         self._build_images()
@@ -176,15 +177,15 @@ class Emulator:
 
         self._sync_rows = [self._rx.codec.rows[m.name] for m in syncs]
         self._sync_ids = {m.frame_id for m in syncs}
-        self._shares: list[Frames] = []  # for each SYNC: answer of the nodes on the bus of this SYNC
+        self._shares: list[Frames] = []  # for each SYNC: frames with which the nodes on the bus of this SYNC answer
         for sync in syncs:
             rows = [row for row, m in enumerate(cyclic) if m.bus == sync.bus]
             self._shares.append(self._tx.frames[rows[0] : rows[-1] + 1])
         self._whole = [self._tx.frames]
         #: For each leg: index of its SYNC message in the list of SYNC messages.
         self._leg_syncs = [[m.name for m in syncs].index(f"SYNC_{side.upper()}_LEG") for side in SIDES]
-        #: For each SYNC: copy of its answer in the last imperfect cycle (a frame was missing, rejected or late).
-        #: If a SYNC of that cycle arrives after the cycle was run, the nodes send the copy.
+        #: For each SYNC: copy of the frames with which the nodes answered in the last imperfect cycle. In an imperfect cycle, a
+        #: frame of the HAL is missing, rejected or late. If a SYNC arrives after its cycle was run, the nodes send the copy.
         self._answered = self._shares
         batch = new_frames(_BATCH)
         self._batch = batch.view(np.uint8).data
@@ -396,7 +397,11 @@ class Emulator:
     # -- steps of one cycle ------------------------------------------------------------------------------------------
 
     def _sample_next(self) -> None:
-        """Sample the sensors for the next cycle. If `before_send` is empty, also encode the frames of the next cycle."""
+        """Sample the sensors for the next cycle, and encode the next frames in advance if possible.
+
+        A callable in `before_send` may change the values after the next SYNC. With such a callable, the frames are encoded after
+        that SYNC.
+        """
         body = self.body
         position = body.position
         if self._node_faults is not None:

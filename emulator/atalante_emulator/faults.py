@@ -40,7 +40,8 @@ class Kind:
     does: str  # description of the effect in one line
     targets: str  # valid types of the target: message, node, bus, or a kind of node such as drive
     parameters: Mapping[str, Parameter] = field(default_factory=dict)  # name -> definition
-    signals: bool = False  # whether each signal of the target message is an additional parameter
+    #: True: parameters may also have the names of signals of the target message, for example Position=0.3
+    signals: bool = False
 
 
 def _number(low: float, high: float, unit: str = "", *, default: float | None = None) -> Parameter:

@@ -71,8 +71,8 @@ class ActiveParameters:
     strength: Pair = (0.113, 0.087)
     fraction: float = 1.0  # strength of this patient as a fraction of the strength of an able-bodied person
     #: Amplitude from which the patient feels a vibration motor, 0 to 1. With infinity, the patient feels no motor.
-    #: While the patient feels a motor of the thigh, the threshold of the hip is 0.
-    #: While the patient feels a motor of the shank, the threshold of the knee is 0.
+    #: While the patient feels a motor of the thigh, the patient perceives every error of the hip angle, however small.
+    #: While the patient feels a motor of the shank, the patient perceives every error of the knee angle.
     vibration: float = math.inf
 
     def __post_init__(self) -> None:

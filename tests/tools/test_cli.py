@@ -228,7 +228,7 @@ def test_every_known_error_is_an_exception_class() -> None:
         (
             ["jog", "left_SK", "--to", "5", "-i", "socketcan", "-c", "a,b"],
             2,
-            "assigns no bus to a channel",
+            "must name the bus of each channel",
         ),
         (["jog", "left_SK", "--to", "5", "-i", "socketcan"], 2, "socketcan requires a channel: -c vcan0"),
         (["status", "-i", "socketcan", "-c", "nocan7"], 3, "atalante doctor"),

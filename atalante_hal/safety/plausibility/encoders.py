@@ -57,7 +57,7 @@ class Lost(NamedTuple):
 
 
 class Motion(NamedTuple):
-    """Motor positions and velocities that the low-pass reads, shape (12,) each."""
+    """Motor positions and velocities of one cycle, the inputs of the function `low_pass`. Shape (12,) each."""
 
     position: Vector  # new positions [rad]
     before: Vector  # positions of the previous cycle [rad]
@@ -295,7 +295,7 @@ class EncoderChecks:
         pair = joint, opposite(joint)
         if min(self.jumps[one] for one in pair) < JUMPS_TO_CONFIRM:
             return False
-        # `Lost.expected` follows the motion since the jump, so the differences are the sizes of the jumps.
+        # `Lost.expected` is the position without the jump. So `Lost.last` minus `Lost.expected` is the jump of each encoder.
         ours, theirs = (self._lost[one].last - self._lost[one].expected for one in pair)
         apart = float(self._before.position[pair[1]] - self._before.position[pair[0]])
         reach = JUMPS_TO_CONFIRM * float(self._travel[joint]) + float(self._noise[joint])

@@ -72,10 +72,14 @@ class Imus:
         return usable
 
     def tolerated(self, imu: int) -> Dtc | None:
-        """Return the pending diagnostic of rejected values; None if a diagnostic of these values is confirmed.
+        """Return the diagnostic of the rejected values of an IMU while this diagnostic is pending.
 
         Args:
             imu: index of the IMU in IMUS.
+
+        Returns:
+            The pending diagnostic. None if the diagnostic is confirmed, or if the values were rejected only because the readings
+            do not change.
         """
         if self._confirmed[imu]:
             return None
@@ -131,13 +135,21 @@ def usable_one(quaternion: Vector, gyro: Vector, accel: Vector, limits: ImuLimit
 
 
 def squared_norm(quaternion: Vector) -> float:
-    """Return the squared norm of a quaternion, shape (4,)."""
+    """Return the squared norm of one quaternion.
+
+    Args:
+        quaternion: attitude, shape (4,), wxyz.
+    """
     w, x, y, z = quaternion[0], quaternion[1], quaternion[2], quaternion[3]
     return float(w * w + x * x + y * y + z * z)
 
 
 def largest(readings: Vector) -> float:
-    """Return the largest magnitude of the readings of three axes, shape (3,)."""
+    """Return the largest absolute value of three readings.
+
+    Args:
+        readings: reading of each axis, shape (3,).
+    """
     return float(max(abs(readings[0]), abs(readings[1]), abs(readings[2])))
 
 

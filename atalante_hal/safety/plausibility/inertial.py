@@ -48,8 +48,8 @@ GRAVITY = 9.81  # m/s2
 _FORCE_ERROR = 3.0
 #: Each sample of the difference between specific force and gravity is clipped to this magnitude [m/s2].
 _FORCE_CLIP = 5.0
-#: If the attitude turns faster than this [rad/s], the specific force is not compared with gravity.
-#: For example, bent legs fall to their end stops when the drives are switched off.
+#: If an IMU turns faster than this [rad/s], its specific force is not compared with gravity.
+#: Fast motions cause large accelerations, for example when the drives are switched off and the legs fall to their end stops.
 _MOVING_RATE = 0.5
 #: Largest root mean square of the difference between two measurements of one angular velocity, if the IMU does not turn [rad/s].
 _RATE_ERROR = 0.1

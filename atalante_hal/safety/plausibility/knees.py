@@ -41,7 +41,8 @@ FRONTAL_HIP = 0.089
 #: Position (x, y) of joint TH of the left leg relative to joint FH, in the axes of the frontal hip [m].
 #: Joint SH has the position (-x, 0) relative to joint TH, in the axes of the transverse hip.
 TRANSVERSE_HIP = (-0.135, 0.169)
-#: Position of the left tibia IMU in the axes of the tibia [m]: x relative to joint SK, y to joint SH, and z to joint SA.
+#: Position (x, y, z) of the left tibia IMU in the axes of the tibia [m].
+#: Each coordinate has its own origin: x is relative to joint SK, y to joint SH, and z to joint SA.
 TIBIA_IMU = (-0.13, -0.069, 0.018)
 #: Time constant of the integration and of the high-pass [s].
 _FILTER_TIME = 0.15
@@ -49,12 +50,14 @@ _FILTER_TIME = 0.15
 _MEAN_TIME = 0.75
 #: Time that the filters need to settle after the start [s]. `Filters.moments` is updated only after this time.
 _SETTLING_TIME = 2.0
-#: The lever is the derivative of the position of the tibia IMU with respect to SK. The part of the filtered lever that an error
-#: of the segment length explains is subtracted. The error of a knee angle is computed only if the root mean square of the rest
-#: exceeds this value [m]. In a walk, the root mean square is about 0.012 m.
+#: The error of a knee angle is computed only if the root mean square of the filtered lever exceeds this value [m].
+#: The lever is the derivative of the tibia IMU's position with respect to the knee angle SK.
+#: The component of the lever that looks like a wrong segment length is subtracted first.
+#: In a walk, the root mean square is about 0.012 m.
 _LEAST_LEVER = 0.007
-#: An error of a knee angle is reported only if it explains more than this share of the mean square of the difference between the
-#: measured and the computed position. The part that an error of the segment length explains is subtracted before.
+#: An error of a knee angle is reported only if it explains more than this share of the squared position difference.
+#: The position difference is the measured minus the computed position of the tibia IMU.
+#: The component of the difference that looks like a wrong segment length is subtracted first.
 _SHARE = 0.25
 #: Number of filters of each leg and axis.
 _FILTERS = 11
@@ -80,9 +83,11 @@ class Filters(NamedTuple):
 
     low: Vector  # (2, 33) outputs of the low-passes: for each leg, three axes with `_FILTERS` low-passes each
     time: Vector  # (1,) time since the start, up to `_SETTLING_TIME` [s]
-    #: (2, 6) means of the products ss, sg, gg, sd, gd, dd of three filtered values. Here s is the lever: the derivative of the
-    #: position of the tibia IMU with respect to SK. g is the growth: the derivative with respect to the length of both segments.
-    #: d is the difference between the measured and the computed position.
+    #: (2, 6) for each leg, the running means of six products of the filtered values s, g and d.
+    #: s is the lever: the derivative of the tibia IMU's position with respect to the knee angle SK.
+    #: g is the growth: the derivative of the tibia IMU's position with respect to the length of both segments.
+    #: d is the difference: the measured minus the computed position of the tibia IMU.
+    #: Order of the products: ss, sg, gg, sd, gd, dd.
     moments: Vector
 
 
@@ -190,7 +195,9 @@ def knee_error(moments: Vector, limit: float, before: float) -> float:
         before: last result, which is returned if the thigh does not turn [rad].
     """
     ss, sg, gg, sd, gd, dd = moments[0], moments[1], moments[2], moments[3], moments[4], moments[5]
-    # Subtract the parts of lever and difference that an error of the segment length explains.
+    # Subtract from s (lever) and d (position difference) the component that looks like a wrong segment length: a multiple of g.
+    # `lever` is the mean square of the rest of s, and `difference` the mean square of the rest of d.
+    # `product` is the mean product of both rests. All three values are multiplied by gg.
     lever, product, difference = ss * gg - sg * sg, sd * gg - sg * gd, dd * gg - gd * gd
     if lever <= _LEAST_LEVER**2 * gg:
         return before
@@ -213,12 +220,12 @@ def motion(leg: int, now: Readings) -> tuple[Vector3, Vector3, Vector3, Vector3]
     fh = now.position[first + _FH] * now.to_joint[first + _FH]
     th = now.position[first + _TH] * now.to_joint[first + _TH]
     sk = now.position[first + _SK] * now.to_joint[first + _SK]
-    # Joint SH relative to the pelvis IMU, in the axes of the pelvis.
+    # `hip` is the vector from the pelvis IMU to joint SH, in the axes of the pelvis.
     x, y = TRANSVERSE_HIP[0] * (1.0 - math.cos(th)), side * TRANSVERSE_HIP[1] - TRANSVERSE_HIP[0] * math.sin(th)
     y, z = y * math.cos(fh) + side * FRONTAL_HIP, y * math.sin(fh)
     hip = x - PELVIS_IMU[0], y - PELVIS_IMU[1], z - PELVIS_IMU[2]
-    # The next vectors are in the axes of the tibia. In these axes, the thigh is turned by -SK. (x, z) is the sum of the unit
-    # vectors along thigh and shank. `thigh` is the position of the tibia IMU relative to joint SH.
+    # `thigh` is the vector from joint SH to the tibia IMU, in the axes of the tibia. In these axes, the thigh is rotated by -SK.
+    # (x, z) is the unit vector from hip to knee plus the unit vector from knee to ankle.
     sine, cosine = math.sin(sk), math.cos(sk)
     x, z = sine, -1.0 - cosine
     thigh = SEGMENT * x + TIBIA_IMU[0], side * TIBIA_IMU[1], SEGMENT * z + TIBIA_IMU[2]

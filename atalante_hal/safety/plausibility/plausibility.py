@@ -37,7 +37,8 @@ from atalante_hal.wire.process_image import NEVER, ReceiveImage
 
 #: Interval of the foot checks [cycles].
 FEET = 4
-#: Interval of three checks [cycles]: standstill check, velocity check, monitor `Unchecked`.
+#: Interval of the standstill check, of the velocity check and of the monitor `Unchecked` [cycles].
+#: `Unchecked` reports checks that could not run, because their messages contain no usable values.
 SLOW = 16
 #: Period of the schedule of all slow checks [cycles]. Each leg, each sole and the support are checked once per period.
 _PERIOD = 32
@@ -265,7 +266,10 @@ class Plausibility:
             self._force[cell] = 0.0
 
     def _restore_cells(self) -> None:
-        """Restore the measured forces of faulty cells in feet without new values. The foot checks need these forces."""
+        """Restore the measured forces of faulty cells, which the previous cycle has set to zero in the process image.
+
+        The foot checks need the measured forces. A foot with new values already has its measured forces.
+        """
         for (foot, cell), force in self._measured_forces.items():
             if self._image.check[self._rows.foot[foot]] > _FRESH:
                 self._force[foot, cell] = force

@@ -23,10 +23,10 @@ from atalante_hal.wire.process_image import NEVER
 
 #: Number of consecutive samples of a flat foot after which a tilted sole is reported. A foot is sampled every 32 cycles.
 SOLE_SAMPLES = 4
-#: Load above which a foot may be flat, as a multiple of `cell_free`.
+#: A foot counts as flat on the floor only if its load exceeds this multiple of `cell_free`.
 _LOAD = 4.0
-#: Largest offset of the centre of pressure of a flat foot from the middle of the cells: along the foot, across the foot.
-#: Each offset is divided by the offset of a cell from the middle. At the edges of the sole, the values are 1.1 and 2.0.
+#: A foot counts as flat only if its centre of pressure is within these distances from the middle of its cells: along the foot,
+#: across the foot. Unit: distance of a cell from the middle. The outermost contact points of the sole are at 1.1 and 2.0.
 _CENTRE = (0.8, 1.4)
 #: Outward rotation of the foot about the vertical axis of the tibia [rad].
 TOE_OUT = math.radians(8.0)
@@ -92,7 +92,7 @@ def stands_flat(cells: Sequence[float], loaded: float) -> bool:
 
     Args:
         cells: vertical forces on the four cells, in the order of CELLS [N].
-        loaded: load above which a foot may be flat [N].
+        loaded: load that a flat foot exceeds [N].
     """
     front_left, front_right, rear_left, rear_right = cells
     load = sum(cells)

@@ -2,7 +2,7 @@
 
 All signals are sampled every few cycles, and consecutive samples with exactly the same value are counted. A sample
 skips each signal that has no new value since the last sample. In addition, each cycle updates a record of each joint
-(`Drive`): the range of its torque since its encoder reading last changed, and the motion that this torque would cause.
+(`Drive`): the range of its torque since its encoder reading last changed, and the motion that a free joint would have made.
 
 *Torque.* The reading of an encoder may be constant because the joint is at rest. So an encoder is reported as stuck only under
 two conditions. First, the torque of the drive has varied by at least `breakaway` since the reading last changed. `breakaway` is
@@ -79,17 +79,17 @@ class Readings(NamedTuple):
 
 
 class Drive(NamedTuple):
-    """Torque of each joint since its encoder reading last changed, and the motion that this torque would cause. Shape (12,) each.
+    """Torque of each joint while its encoder reading is constant, and the motion of a free joint. Shape (12,) each.
 
-    The motion is computed for a joint whose inertia is `_INERTIA` and whose breakaway torque is `breakaway`.
+    A free joint has the inertia `_INERTIA`. The change of the torque beyond `breakaway` moves the free joint.
     """
 
     cycles: Vector  # number of cycles since the encoder reading last changed
-    rest: Vector  # torque of the joint at rest [Nm]: torque in cycle `_AT_REST` of the constant reading
-    low: Vector  # lowest torque [Nm]
-    high: Vector  # highest torque [Nm]
-    momentum: Vector  # angular momentum that the torque would cause [Nm s]
-    turn: Vector  # angle by which the torque would turn the joint [rad]
+    rest: Vector  # balanced torque [Nm]: torque in the third cycle (`_AT_REST`) after the encoder reading last changed
+    low: Vector  # lowest torque since the encoder reading last changed [Nm]
+    high: Vector  # highest torque since the encoder reading last changed [Nm]
+    momentum: Vector  # angular momentum of a free joint [Nm s]: time integral of abs(torque - `rest`) - `breakaway`
+    turn: Vector  # angle by which a free joint would have turned [rad]
 
 
 class Stillness:
@@ -119,7 +119,7 @@ class Stillness:
         self._same = np.empty(size, np.bool_)
         self._repeats = np.full(size, 0)
         # Convert the limits from cycles to numbers of samples.
-        # The first sample of a standstill may be late by `every` - 1 cycles, so these cycles are subtracted.
+        # A standstill may begin up to `every` - 1 cycles before its first sample, so each limit is shortened by these cycles.
         limit = np.full(size, _NEVER)
         limit[codec.slice("Position")] = self._to_stuck = (STUCK_CYCLES - every + 1) // every
         limit[codec.slice("Gyro")] = limit[codec.slice("Force")] = to_freeze = (FROZEN_CYCLES - every + 1) // every
@@ -146,7 +146,8 @@ class Stillness:
         self._follow = specialised(follow, *self._readings)
         for joint in range(len(JOINTS)):
             release(self._drive, joint)
-        #: For each ankle of a loaded foot: turn of the shank since the encoder reading last changed, shape (4, 3) [rad].
+        #: Rotation vector of the shank while the encoder reading of an ankle joint is constant [rad], one row per ankle joint,
+        #: shape (4, 3). The row is 0 if the foot is not on the ground.
         self._turn = np.zeros((len(_ANKLES), 3))
         self._to_joint: Vector = robot.polarity / robot.gear
         self._low_stop, self._high_stop = robot.position_min + _AT_STOP, robot.position_max - _AT_STOP
@@ -195,7 +196,10 @@ class Stillness:
         return newer[self._row_of]
 
     def _follow_shanks(self) -> None:
-        """Update, for each ankle joint, the turn of its shank since the encoder reading of this ankle joint last changed."""
+        """Integrate how far each shank rotates while the encoder reading of its ankle joint is constant.
+
+        A row of `_turn` is reset to 0 if the encoder reading has changed, or if the foot is not on the ground.
+        """
         on_ground = (self._now.force[:, :, 2].sum(axis=1) > self._loaded)[_FOOT_OF]
         self._turn += self._now.gyro[_SHANK_OF] * self._interval
         self._turn[~on_ground | (self.constant_samples[_ANKLES] <= 1)] = 0.0

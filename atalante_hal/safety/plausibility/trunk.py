@@ -38,19 +38,23 @@ _SETTLING_TIME = 0.3
 #: The check decides only above this root mean square of the filtered angular velocity [rad/s].
 #: At rest, the noise of the gyroscopes is up to 0.004 rad/s rms.
 _LEAST_RATE = 0.008
-#: The IMUs are exchanged if the computed height is below minus this share of `TORSO_HEIGHT`.
+#: The IMUs of torso and pelvis are exchanged if the computed height is less than -`_SHARE` * `TORSO_HEIGHT`.
 #: In walks, pushes and falls of a healthy robot, the computed height is at least 0.6 times `TORSO_HEIGHT`.
 _SHARE = 0.5
 _TORSO, _PELVIS = IMUS.index("torso"), IMUS.index("pelvis")
 
 
 class Filters(NamedTuple):
-    """Values of the filters along the axes x and y of the IMUs."""
+    """Values of the filters. Element 0 is for the acceleration along x, element 1 for the acceleration along y.
 
-    speed: Vector  # (2,) leaky integral of the difference of the accelerometers [m/s]
+    The rate of element 0 is the angular velocity about y. The rate of element 1 is minus the angular velocity about x.
+    Two high-passes in series filter the rate. Each high-pass subtracts a low-pass from its input.
+    """
+
+    speed: Vector  # (2,) leaky integral of the torso acceleration minus the pelvis acceleration [m/s]
     slow_speed: Vector  # (2,) low-pass of `speed` [m/s]
-    slow_rate: Vector  # (2,) low-pass of the angular velocity about the other axis [rad/s]
-    slower_rate: Vector  # (2,) low-pass of the difference between angular velocity and `slow_rate` [rad/s]
+    slow_rate: Vector  # (2,) low-pass of the rate [rad/s]
+    slower_rate: Vector  # (2,) low-pass of the rate after the first high-pass, which is rate - `slow_rate` [rad/s]
     time: Vector  # (1,) time since the start, up to `_SETTLING_TIME` [s]
     moments: Vector  # (2,) mean product of speed and rate [m/s2], and mean square of the rate [rad2/s2]
 

@@ -64,7 +64,9 @@ class CarryOver:
 
 
 def add_carried(carries: Records[Carry], blend: Vector, cycle: int, torque: Vector) -> None:
-    """Add the fading compensation of the torque jump to the command. The first call after a stance change computes the jump.
+    """Add the opposite of the torque jump at the stance change to the torque command, so that the command does not jump.
+
+    The first call after a stance change computes the added torque. In later calls, the added torque fades out.
 
     Args:
         carries: `CarryOver.records`; `pending` is set to False.

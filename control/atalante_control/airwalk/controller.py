@@ -189,7 +189,7 @@ class AirwalkController:
 
     @property
     def blend(self) -> Vector:
-        """Return the compensated fraction of the torque jump in each cycle since the stance change, shape (n,)."""
+        """Return the fraction of the torque jump that is still compensated in each cycle after a stance change, shape (n,)."""
         return self._carry.blend
 
     def certificate(self, xi: float) -> Certificate:
@@ -203,7 +203,9 @@ class AirwalkController:
         return self._guides.certificate(xi)
 
     def reset(self, state: State) -> None:
-        """Discard the last motion. Begin the start motion at the measured pose, and the carry-over at the measured torque.
+        """Discard the last motion, and prepare the start motion from the measured pose to the gait.
+
+        The first torque command is the measured torque. Its difference from the computed torque then fades out (carry-over).
 
         Args:
             state: measured state of the robot.

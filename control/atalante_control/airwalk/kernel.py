@@ -43,10 +43,12 @@ class Parts(NamedTuple):
     links: Records[LinkRecord]  # (n,) links of the exoskeleton, see `Gravity.links`
     pids: Records[PidRecord]  # (1,) gains and integral torques of the PIDs, see `Pid.records`
     ankles: Records[Ankle]  # (2,) left and right ankle, see `LevelFeet.ankles`
-    cubics: Vector  # (n, 4) basis cubics c0, c1 of the re-centring and c0', c1' in each cycle, see `LevelFeet.cubics`
+    #: (n, 4) c0, c1, c0', c1' in each cycle of a step, see `LevelFeet.cubics`. After a stance change, the cubics c0 and c1 fade
+    #: out the deviations of ankle angle and ankle speed.
+    cubics: Vector
     literal: LiteralTables  # tables of the literal control law, see `LiteralGuide.tables`
     carries: Records[Carry]  # (1,) state of the carry-over, see `CarryOver.records`
-    blend: Vector  # (n,) compensated fraction of the torque jump in each cycle since the stance change, see `CarryOver.blend`
+    blend: Vector  # (n,) fraction of the torque jump that is still compensated in each cycle after a stance change
     outputs: Records[Outputs]  # (1,) results of the cycle
     telemetry: Records[Telemetry]  # (1,) telemetry of the cycle
 
@@ -83,7 +85,8 @@ def run(
     leg = swing * len(LEG_JOINTS)
     hip, knee = leg + _SH, leg + _SK
 
-    for k in range(len(desired)):  # a loop, because `desired[:] = row` would create an array
+    # For `desired[:] = row`, numba would create an array, because source and target could overlap.
+    for k in range(len(desired)):
         desired[k] = row[k]
     if level:
         tibia = _TIBIAE[swing]

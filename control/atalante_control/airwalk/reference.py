@@ -34,11 +34,11 @@ class GaitReference:
     """
 
     def __init__(self, gait: Gait, deadbeat: Deadbeat, ankle_offset: float) -> None:
-        """Sample the trajectories of both steps and the basis cubics of the re-centring.
+        """Tabulate both steps, and the cubics that lead from the measured motion back to the nominal gait.
 
         Args:
             gait: right-stance step that repeats.
-            deadbeat: re-centring of the gait.
+            deadbeat: re-centring, which computes the cubics.
             ankle_offset: angle added to both sagittal ankles [rad].
         """
         self.nominal: dict[int, Vector] = {}
@@ -51,17 +51,19 @@ class GaitReference:
         time: Vector = np.arange(gait.cycles + 1, dtype=np.float64) * PERIOD
         (c0, c1), (c0d, c1d), _ = deadbeat.basis(time)
         end = self._end = int(np.searchsorted(time, deadbeat.end))
-        #: Unit responses of the re-centring, rows (s, s') of each cycle. Element 0 is for s(0) = 1 rad and s'(0) = 0.
-        #: Element 1 is for s(0) = 0 and s'(0) = 1 rad/s.
+        #: Offset s from the nominal angles and its rate s' in each cycle, for a deviation of 1 at the stance change.
+        #: Element 0 is for the angle deviation s(0) = 1 rad, element 1 for the speed deviation s'(0) = 1 rad/s.
+        #: Shape (2, cycles, 24): 12 columns s, then 12 columns s'.
         self._basis = np.zeros((2, end, 2 * _N))
         self._basis[0, :, :_N], self._basis[0, :, _N:] = c0[:end, None], c0d[:end, None]
         self._basis[1, :, :_N], self._basis[1, :, _N:] = c1[:end, None], c1d[:end, None]
         self._added = np.zeros_like(self._basis)
-        # A row has 12 angles s, then 12 speeds s'. `_angles` therefore contains s(0) twice, and `_rates` contains s'(0) twice.
+        # Measured deviations by which the elements of `_basis` are multiplied: `_angles` has s(0) of the 12 joints, `_rates` has
+        # s'(0). Both the columns s and the columns s' are multiplied, so each array contains its 12 deviations twice.
         self._angles, self._rates = np.zeros(2 * _N), np.zeros(2 * _N)
 
     def start_step(self, stance: int, position: Vector, velocity: Vector) -> Deviation:
-        """Re-centre the step on the measured motion.
+        """Start a step with a desired trajectory that begins at the measured motion and returns to the nominal gait.
 
         Args:
             stance: stance leg of the new step, LEFT or RIGHT.
@@ -69,7 +71,7 @@ class GaitReference:
             velocity: measured speeds at the stance change, shape (12,) [rad/s].
 
         Returns:
-            Deviation from the nominal start, overwritten by the next call.
+            Deviation of the measured motion from the nominal start of the step, overwritten by the next call.
         """
         nominal, angles, rates, added = self.nominal[stance], self._angles, self._rates, self._added
         np.subtract(position, nominal[0, :_N], out=angles[:_N])

@@ -1,4 +1,4 @@
-"""Swing leg of the airwalk controller: `gait, gravity of the suspended exoskeleton -> Leg of the guides`."""
+"""Data of the swing leg for the guide filters (`Leg`): `gait, gravity of the suspended exoskeleton -> Leg`."""
 
 from __future__ import annotations
 

@@ -4,8 +4,8 @@
 needs only numpy. The network is a perceptron with tanh layers. The weights of the last layer are constrained so that
 every gait satisfies c_7 = S c_0. Here c_0 and c_7 are the first and the last control points, and S swaps and mirrors
 the legs. The angles are therefore continuous at the stance change for every input, even if the fit is poor. The speeds
-are not exactly continuous: the fit keeps a part of the speed jump at the impact, and the fit error adds to this part. The sum
-is less than 0.02 rad/s.
+are not exactly continuous: a part of the speed jump at the impact remains in the gaits of the fit, and the fit error is added.
+The sum is less than 0.02 rad/s.
 """
 
 from __future__ import annotations
@@ -35,8 +35,8 @@ LEG_SEGMENTS = ("thigh", "shank")  # body segments whose length is an input
 OUTPUTS = len(JOINTS) * (DEGREE + 1)
 LAYERS_MAX = 4
 WIDTH_MAX = 128  # largest number of neurons of a layer
-#: Largest accepted angle jump at the stance change due to one row of weights or the bias of the last layer [rad].
-#: Rounding errors in the weights cause such jumps.
+#: Largest accepted angle jump at the stance change [rad]. The last layer computes a gait as a weighted sum of gaits: the rows of
+#: the weight matrix, and the bias. The jump of each of these gaits is checked. Rounding errors cause small jumps.
 _PERIODICITY_DEFECT = 1e-9
 _ANGLE_MAX = 2.0 * np.pi  # rad, largest accepted absolute value of a control point
 _ROUNDING = 1e-9  # relative tolerance of the range limits, because a ratio of lengths has rounding errors
@@ -253,7 +253,8 @@ def _network(arrays: Mapping[str, npt.NDArray[Any]]) -> GaitNetwork:
     about = {name: arrays[name] for name in ("format", "version", "inputs")}
     for name, array in about.items():
         if array.dtype.kind != "U" or array.ndim != (name == "inputs"):
-            raise ArrayFileError(f"{name} must be text, got {array.dtype} of shape {array.shape}")
+            wanted = "a list of texts" if name == "inputs" else "a single text"
+            raise ArrayFileError(f"{name} must be {wanted}, got {array.dtype} of shape {array.shape}")
     if str(about["format"]) != FORMAT:
         raise ArrayFileError(f"format must be {FORMAT!r}, got {str(about['format'])!r:.40}")
     if about["inputs"].tolist() != list(INPUTS):

@@ -5,8 +5,8 @@ coordinates along the few directions in which the library varies. The last layer
 coordinates to the control points.
 
 1. *Periodic gaits.* The angles are exactly continuous at the stance change, which leaves 84 dimensions. The speeds jump slightly
-   at the impact. The fit keeps the fraction `JUMP_KEPT` of this speed jump. A smaller fraction gives a smoother walk, a
-   larger fraction keeps the accelerations closer to the solved gait.
+   at the impact. Before the fit, each gait is changed so that the fraction `JUMP_KEPT` of its speed jump remains. A
+   smaller fraction gives a smoother walk, a larger fraction keeps the accelerations closer to the solved gait.
 2. *Weighted errors.* The distance between two gaits is the deviation of their angles and accelerations along the step. The
    accelerations determine the feedforward. The ends of the step have a larger weight, because the foot lands there. The
    perceptron learns the principal directions of the library in this metric. The least important directions are omitted.
@@ -35,11 +35,11 @@ from atalante_hal.types import Vector
 HIDDEN = (64, 64)
 ITERATIONS = 1500  # largest number of L-BFGS iterations
 RESOLUTION = math.radians(0.003)  # rad, largest rms error caused by the omitted principal directions
-JUMP_KEPT = 0.4  # the fit keeps this fraction of the speed jump that each gait has at the stance change
+JUMP_KEPT = 0.4  # before the fit, the speed jump of each gait at the stance change is reduced to this fraction
 END_WEIGHT = 40.0  # weight of the squared angle errors at start and end of a step; the weight is 1 at the other samples
 ACCELERATION_WEIGHT = 5e-2  # s2, weight of an acceleration error [rad/s2] relative to an angle error [rad]
-#: Root mean square of the learnt coordinates after scaling. L-BFGS stops if an iteration reduces the squared error by less than
-#: 2e-9. With coordinates of size 1, L-BFGS would stop too early.
+#: The learnt coordinates are scaled to this root mean square. L-BFGS stops if an iteration reduces the squared error by less than
+#: 2e-9, and this limit does not scale with the coordinates. With a root mean square of 1, L-BFGS would stop too early.
 TARGET_SIZE = 10.0
 ALPHA = 1e-5  # penalty on the squared weights of the network; the penalty smooths the gaits between the grid points
 SEED = 1  # seed of the initial weights

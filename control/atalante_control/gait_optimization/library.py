@@ -334,7 +334,7 @@ def _solve(solve: Solve, task: tuple[Index, Subject]) -> tuple[Index, SolvedGait
 
 
 def _status(path: Path) -> str:
-    """Return the reason in the record of a failure. If the record is damaged, return why it cannot be read."""
+    """Return the failure reason from the record of an unsolved gait. If the record is damaged, return the read error."""
     try:
         return str(read_object(path)["status"])
     except GaitError as error:

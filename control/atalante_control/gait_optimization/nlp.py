@@ -211,12 +211,14 @@ class _Sparse:
         self._values: list[Symbol] = []
 
     def add(self, rows: Indices, columns: Indices, values: Symbol) -> None:
-        """Add the entries of all repetitions of an expression.
+        """Add the matrix entries of one expression that is repeated, for example once per node of the step.
+
+        Each repetition adds n entries to the matrix, at the positions in `rows` and `columns`.
 
         Args:
-            rows: row indices, shape (repetitions, n).
-            columns: column indices, shape (repetitions, n).
-            values: values of the entries, shape (n, repetitions).
+            rows: row index of each entry, shape (repetitions, n).
+            columns: column index of each entry, shape (repetitions, n).
+            values: value of each entry, shape (n, repetitions).
         """
         self._keys.append((columns * self._shape[0] + rows).ravel())
         self._values.append(casadi.vec(values))

@@ -18,8 +18,7 @@ _Task = TypeVar("_Task")
 _Result = TypeVar("_Result")
 #: Timeout of the connection to a dask scheduler.
 _CONNECT_TIMEOUT: Final = "10s"
-#: Number of unexpected ends of a process after which the calls run one at a time. If the calls run one at a time, a call
-#: that crashes its process loses only its own result.
+#: Number of process crashes after which the calls run one at a time. A later crash then loses only the result of one call.
 _SHARED_LOSSES: Final = 3
 _REMEDY: Final = "repeat the command, if necessary with fewer --jobs"
 _LOKY_THREAD: Final = "ExecutorManagerThread"

@@ -42,7 +42,10 @@ class Watch(casadi.Callback):
         return str(casadi.nlpsol_out(index))
 
     def get_sparsity_in(self, index: int) -> Any:
-        """Return the sparsity of an input of the callback. The vector of parameter multipliers is empty."""
+        """Return the size of an input of the callback, as a dense CasADi sparsity.
+
+        The callback does not use the parameter multipliers `lam_p`, so the input `lam_p` has size 0.
+        """
         name, rows = self.get_name_in(index), len(self._bounds[0])
         length = {"f": 1, "x": self._unknowns, "lam_x": self._unknowns, "g": rows, "lam_g": rows}.get(name, 0)
         return casadi.Sparsity.dense(length, 1 if length else 0)

@@ -1,9 +1,8 @@
 """Second start of the optimiser after a failure: `subject, attempt -> gait`.
 
-If the second start fails, too, the result states the reasons of both failures.
-
-The second initial guess is the solved gait of the same patient with a moderate step. The result therefore depends only
-on the parameters of the subject, as it does without a second start.
+The initial guess of the second start is a solved gait of the same patient, with the step length and duration in `MODERATE`.
+The result therefore depends only on the parameters of the subject, as it does without a second start. If the second start
+fails, too, the result states the reasons of both failures.
 """
 
 from __future__ import annotations
@@ -24,7 +23,7 @@ from atalante_control.gait_optimization.step_problem import StepProblem
 from atalante_hal.robot import JOINTS, load_robot
 from atalante_hal.types import Vector
 
-MODERATE: Final = (0.15, 0.9)  # m and s, step length and step duration of the gait for the second start
+MODERATE: Final = (0.15, 0.9)  # step length [m] and duration [s] of the gait from which the second start begins
 #: A joint is at a limit if the distance to the limit is below this fraction of a reference value. For angles the reference
 #: value is the joint range. For speeds and torques it is the limit.
 _AT_LIMIT: Final = 1e-3
@@ -34,8 +33,9 @@ Attempt = Callable[[Subject, Gait | None], SolvedGait]
 
 
 def solve_with_second_start(subject: Subject, attempt: Attempt) -> SolvedGait:
-    """Solve a gait. If the optimiser fails, start it again from the gait of the same patient with a moderate step.
+    """Solve a gait. If the optimiser fails, solve the gait a second time, from another initial guess.
 
+    The second initial guess is a solved gait of the same patient, with the step length and duration in `MODERATE`.
     If the patient has no landing pose for the step length, the optimiser does not start, and there is no second start.
 
     Args:
@@ -43,8 +43,8 @@ def solve_with_second_start(subject: Subject, attempt: Attempt) -> SolvedGait:
         attempt: function that solves a gait.
 
     Returns:
-        The gait. After two failures, the gait is the last iterate of the first attempt. The status then states the
-        reasons of both failures, and names the joints that are at a limit in this iterate.
+        The gait. If the second start fails, too, the gait is the last iterate of the first attempt. The status then
+        states the reasons of both failures, and names the joints that are at a limit in the last iterate.
     """
     first = attempt(subject, None)
     if first.solved or first.iterations == 0:

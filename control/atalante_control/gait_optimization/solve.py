@@ -42,7 +42,8 @@ _OPTIONS: dict[str, Any] = {
     "print_time": False,
     "error_on_fail": False,
     "calc_lam_p": False,
-    # No function nlp_grad: CasADi uses it only for sensitivities, and compiled functions do not provide the derivatives for it.
+    # CasADi must not build the function nlp_grad: the compiled functions lack the derivatives that nlp_grad requires.
+    # Only sensitivities of the solution need nlp_grad.
     "no_nlp_grad": True,
 }
 #: IPOPT options of a warm start: a small initial barrier parameter mu, and bound multipliers computed from mu.

@@ -113,11 +113,13 @@ class StepProblem:
         return np.concatenate([-points, np.tile(lower, nodes)]), np.concatenate([points, np.tile(upper, nodes)])
 
     def unknowns(self, coefficients: Vector, parameters: Vector) -> Vector:
-        """Return the unknowns of a motion, shape (unknowns,). Torques and ground wrench come from inverse dynamics.
+        """Build the vector of the optimiser's unknowns for a given motion, shape (unknowns,).
+
+        The unknowns include joint torques and ground wrench. Both are computed from the motion by inverse dynamics.
 
         Args:
-            coefficients: Bezier control points, shape (12, 8) [rad].
-            parameters: parameters of the program.
+            coefficients: Bezier control points of the motion, shape (12, 8) [rad].
+            parameters: values of `symbols` for patient and step.
         """
         motion = np.stack([basis @ coefficients.T for basis in self._bases], axis=1)  # (nodes, 3, 12)
         loads = self._loads.map(len(self.phases))(motion.reshape(len(motion), -1).T, parameters)
@@ -268,7 +270,8 @@ class StepProblem:
         if around is not None:
             end, next_one = (-1, -2) if self.kind == "start" else (0, 1)
             pose, other = around.coefficients[:, end], around.coefficients[:, next_one]
-            # Where two steps meet, the joint speed q' is the same in both steps. Hence dq/ds = q' T is proportional to T.
+            # s is the phase, time / step duration. Where two steps meet, the joint speed is the same in both steps, so dq/ds
+            # is proportional to the step duration. The distance between the two control points is proportional to dq/ds.
             points = {"gait pose": pose, "gait speed": pose + (other - pose) * TRANSITION / around.duration}
             for group in self.program.groups:
                 if group.name in points:
@@ -289,7 +292,11 @@ class StepProblem:
         return wrench[3:] * _MOMENT - casadi.cross(casadi.DM([x, 0.0, z]), wrench[:3] * _FORCE)
 
     def _ground(self, wrench: Symbol) -> list[Rows]:
-        """Return the constraints on friction, centre of pressure and yaw moment: forces that must be at least 0 N."""
+        """Return the constraints on friction, centre of pressure and yaw moment of the stance foot.
+
+        Each constraint is a margin in newtons that must be at least 0. The margin of a moment is the vertical force minus
+        |moment| / lever. The lever is the largest allowed ratio of moment to vertical force [m].
+        """
         requirements, exo = self.requirements, self.exoskeleton
         force, moment = wrench[:3] * _FORCE, self._pressure_moment(wrench)
         length, width = exo.sole_size

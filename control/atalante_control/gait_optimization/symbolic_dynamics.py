@@ -148,7 +148,7 @@ class Chain:
 
         Raises:
             ValueError: If name, parent, joint, yaw or axis of a body differs from the reference robot, or if a number that is
-                zero in the reference robot is not zero.
+                zero in the reference robot is not zero in the given robot.
         """
         robot = bodies(links)
         for body, reference in zip(robot, self.bodies, strict=True):
@@ -161,7 +161,8 @@ class Chain:
         unused = np.delete(numbers, self._used)
         if unused.any():
             raise ValueError(
-                f"masses and lengths that are 0 in the reference robot must be 0, got {unused[unused != 0.0].tolist()}"
+                "masses, inertias and lengths that are 0 in the reference robot must also be 0 in the given robot, "
+                f"got {unused[unused != 0.0].tolist()}"
             )
         return np.asarray(numbers[self._used])
 

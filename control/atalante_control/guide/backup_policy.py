@@ -88,8 +88,9 @@ class BackupPolicy:
 
     stiffness: Pair  # Nm/rad, k of SH and SK
     damping: Pair  # damping ratios of the two coupled modes of motion, the slower mode first
-    #: kg m2, mass matrix elements M11, M12 and M22 at the reference knee angle. At this angle the joint stiffness is `stiffness`.
-    #: At other angles the joint stiffness differs from `stiffness`, because the mass matrix changes and the gains do not.
+    #: kg m2, elements M11, M12 and M22 of the mass matrix M at the reference knee angle. The gains Kv are computed with these
+    #: elements and are the same at all knee angles. The joint stiffness M Kv is `stiffness` at the reference knee angle. At
+    #: other knee angles M is different, so the joint stiffness is different.
     mass: tuple[float, float, float]
 
     def __post_init__(self) -> None:

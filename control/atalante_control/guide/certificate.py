@@ -68,7 +68,8 @@ class JointTorque:
 class Limit(NamedTuple):
     """Condition that limits the disturbance torques for which a guide can be certified."""
 
-    #: largest multiple of the requested disturbance torques that meets this condition; negative if not even zero torques meet it
+    #: Largest factor on the requested disturbance torques at which the guide meets the condition. The factor is negative if the
+    #: guide does not meet the condition even without disturbance torques.
     scale: float
     what: str  # condition in words, for a message
 
@@ -214,9 +215,10 @@ class _Horizon:
         beyond = prediction.beyond * SIZES
         self._factor = (beyond * rows[-1]).sum(axis=1) / (rows[-1] ** 2).sum(axis=1)
         remainder = beyond - self._factor[:, None] * rows[-1]
-        #: Each element contains the numbers of two predicted cycles, counted from the start of the prediction, and a matrix.
-        #: The remainder is a linear combination of the errors in these cycles. The matrix contains the absolute values of the
-        #: coefficients of the linear combination.
+        #: Each element (lags, weights) bounds the remainder by the errors in two predicted cycles.
+        #: `lags` are these two cycles, counted from the start of the prediction. The bound is |remainder| <= |errors| @ weights.
+        #: The four errors are hip and knee in the first cycle, then hip and knee in the second cycle.
+        #: `weights` has the shape (4, 2). Rows: the four errors. Columns: remainder of the hip, remainder of the knee.
         self._pairs: list[tuple[tuple[int, int], Vector]] = []
         for near, far in ((0.1, 0.3), (0.25, 0.5), (0.4, 0.7)):
             lags = round(near * self.cycles), round(far * self.cycles)
@@ -226,14 +228,15 @@ class _Horizon:
         self._reach = prediction.reach[self._starts // START_CYCLES]
 
     def limit(self, width: Vector, narrowest: Vector) -> Limit:
-        """Return the largest multiple of the requested disturbance torques that meets this condition.
+        """Return the largest factor on the requested disturbance torques at which the guide meets the condition.
 
         Args:
             width: distance from q_des to the nearer bound of the guide in each cycle, shape (n, 2) [rad].
-            narrowest: width that limits the error in the last predicted cycle, shape (n, 2) [rad], see `filter.tail`.
+            narrowest: largest allowed error if the prediction ends in the cycle, shape (n, 2) [rad], see `filter.tail`.
         """
 
         def room(lag: int) -> tuple[Vector, Vector]:
+            """Return (width minus effect of model errors, effect of the requested torques), `lag` cycles ahead."""
             added = self._reach[:, min(lag, self.cycles)]
             rooms = narrowest if lag == self.cycles else width
             return rooms[self._starts + lag] - added[:, :2], added[:, 2:]
@@ -242,8 +245,11 @@ class _Horizon:
         found = []
         for lags, weights in self._pairs:
             rooms, promises = (np.hstack(parts) for parts in zip(*map(room, lags), strict=True))
-            # `last` is the room in the last predicted cycle, `end` is the room one cycle later, and `rooms` contains the rooms in
-            # the two earlier cycles. Find the largest scale that satisfies the following inequality:
+            # In each cycle, the error may be at most room - scale * promise. A room is the guide width minus the effect of model
+            # errors. A promise is the effect of the requested disturbance torques on the error.
+            # `last` is the room in the last predicted cycle, `end` is the room one cycle later, and `rooms` are the rooms in the
+            # two earlier cycles. The left side of the inequality is the largest possible error one cycle after the prediction.
+            # Find the largest scale at which this largest error still fits into the guide:
             # factor * (last - scale * last_promise) + (rooms - scale * promises) @ weights <= end - scale * end_promise.
             have = end - self._factor * last - rooms @ weights
             need = end_promise - self._factor * last_promise - promises @ weights

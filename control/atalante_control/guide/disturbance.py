@@ -79,14 +79,16 @@ class HandOver:
             raise ValueError(f"torque of the hand-over must be finite and at least 0 Nm, got {self.torque!r}")
 
     def largest(self, values: Vector) -> Vector:
-        """Return the largest absolute value of s, s' or s'' (re-centring) over all deviations in the hand-over box.
+        """Return the worst-case size of a re-centring curve, for all start deviations up to `deviation` and `rate`.
+
+        Re-centring adds an offset s(t) to the nominal trajectory after a stance change. The curve is s, s' or s''.
 
         Args:
-            values: values of s, s' or s'' for s(0) = 1 rad (first row) and for s'(0) = 1 rad/s (second row), shape (2, n).
+            values: the curve for s(0) = 1 rad (row 0) and for s'(0) = 1 rad/s (row 1) at n times, shape (2, n).
 
         Returns:
-            Largest absolute values, shape (n,). s is linear in the deviations, so a corner of the box is the worst
-            case.
+            Largest absolute value of the curve at each time, shape (n,). The curve is linear in the deviations, so the
+            largest deviations are the worst case.
         """
         return np.asarray(np.abs(values).T @ [self.deviation, self.rate])
 
@@ -137,11 +139,14 @@ class Leg(NamedTuple):
         return np.asarray(needed + self.velocity_torque() + self.gravity)
 
     def mobilities(self, hand_over: HandOver, width: float) -> Vector:
-        """Return the inverse mass matrices that are possible inside the guide, shape (n, postures, 2, 2) [1/(kg m2)].
+        """Return the inverse mass matrices for several knee angles that the leg can have inside the guide, in each cycle.
 
         Args:
             hand_over: largest deviations at the start of a step.
             width: largest distance of SK from the desired trajectory [rad].
+
+        Returns:
+            Inverse mass matrices of SH and SK, shape (n, postures, 2, 2) [1/(kg m2)]. Axis 0: cycle. Axis 1: knee angle.
         """
         moved = width + hand_over.largest(self.deadbeat.basis(self.time)[0])
         knee = self.q[:, 1, None] + moved[:, None] * np.linspace(-1.0, 1.0, _POSTURES)
@@ -181,34 +186,42 @@ class Effect(NamedTuple):
 
 
 class Grid(NamedTuple):
-    """Start cycles and lengths [cycles] of the predictions for which `spread` computes the largest output."""
+    """Predictions for which `spread` computes the worst-case effect of disturbances: start cycles and prediction lengths."""
 
     starts: int  # number of start cycles; the start cycles are 0 to starts - 1
-    block: int  # number of consecutive start cycles that share one row of `ahead` in `spread`
+    #: number of consecutive start cycles in a block; `spread` stores one row per block, the maximum over the block
+    block: int
     lags: NDArray[np.int64]  # (lags,) prediction lengths [cycles], ascending
 
 
 def spread(effect: Effect, mobilities: Vector, bounds: Vector, grid: Grid, ahead: Vector) -> Vector:
-    """Compute the largest outputs that disturbances can cause.
+    """Compute the worst-case change of two outputs that disturbance torques can cause: one output per joint (hip, knee).
 
-    For `ahead`, the disturbances begin at a start cycle of the grid. For the returned array, the disturbances begin at the start
-    of the step. In both arrays, columns 0 and 1 are the effects of the budget on the
-    two outputs, and columns 2 and 3 are the effects of the requested promise. Each effect is a sum of absolute values.
+    An output is an error, a torque or a speed, see `Effect`. The function fills `ahead` and returns a second array.
+    In `ahead`, the disturbances begin when a prediction starts.
+    In the returned array, the disturbances begin at the start of the step.
+
+    In both arrays, columns 0 and 1 are the changes of the hip output and the knee output due to the budget (torque errors of the
+    model). Columns 2 and 3 are the changes due to the requested promise (disturbance torques of the certificate).
+    Each change is a sum of absolute values over the cycles.
 
     Args:
         effect: effect of a disturbance on the outputs.
         mobilities: inverse mass matrices of each cycle, shape (n, postures, 2, 2).
         bounds: torque bounds of SH and SK (rows), budget and requested promise (columns), in each cycle, shape (n, 2, 2) [Nm].
-        grid: start cycles, and numbers of cycles ahead, of the predictions in `ahead`.
-        ahead: shape (blocks, lags, 4), changed in place. The new element is the maximum of the old element and of the
-            outputs for all start cycles in the block. Predictions past the end of `bounds` are left out.
+        grid: start cycles and lengths of the predictions in `ahead`.
+        ahead: worst-case change for each block of start cycles and each prediction length, shape (blocks, lags, 4).
+            The array is changed in place: each element keeps the maximum of the old value and the largest new change.
+            Predictions past the end of `bounds` are left out.
 
     Returns:
-        The largest output in each cycle due to the disturbances since cycle 0, without the response `hidden`, shape (n, 4).
+        The worst-case change in each cycle due to the disturbances since cycle 0, without the response `hidden`, shape (n, 4).
     """
     count, postures = len(bounds), mobilities.shape[1]
     total, added = np.zeros((count, 4)), np.zeros((grid.starts, 4))
-    both = np.zeros((2, 2, 2))  # responses `pushed` and `hidden` of the output, `lag` cycles after the disturbance
+    # Element 0: response `pushed`, `lag` cycles after the disturbance.
+    # Element 1: response `hidden`, `lag` cycles after the prediction starts.
+    both = np.zeros((2, 2, 2))
     column = 0
     for lag in range(count):
         reported = column < len(grid.lags) and grid.lags[column] == lag

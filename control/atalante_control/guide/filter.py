@@ -62,11 +62,15 @@ class GuideConfig:
     rate_limit: float  # Nm, largest allowed change of the backup torque within one cycle
     speed_limit: float  # rad/s, largest allowed speed of sagittal hip and knee in the prediction
     worst_speed_limit: float  # rad/s, largest allowed speed in the prediction with the worst model errors
-    zeta: float = 0.01  # s, gain of lambda_d, which increases the weight of the backup torque while h decreases
+    zeta: float = 0.01  # s, gain on -dh/dt; while the safety value h falls, the weight of the backup torque rises
     derivative_time: float = 0.005  # s, time constant of the low-pass filter on dh/dt
     release: float = 0.03  # s, shortest time in which the weight of the backup torque falls from 1 to 0
-    idealization: float = 1.0  # intensity of the joint idealization u_i in [0, 1] while the backup torque has weight 0
-    feedforward: float = 0.0  # intensity of the feedforward u_f in [0, 1] while the backup torque has weight 0
+    #: Factor on the torque u_i, in [0, 1]. u_i cancels friction, gravity, centrifugal and Coriolis torques (joint idealization).
+    #: The factor applies while the backup torque has weight 0. If the weight rises to 1, the factor rises to 1, too.
+    idealization: float = 1.0
+    #: Factor on the torque u_f, in [0, 1]. u_f accelerates the leg along q_des (feedforward).
+    #: The factor applies while the backup torque has weight 0. If the weight rises to 1, the factor rises to 1, too.
+    feedforward: float = 0.0
 
     def __post_init__(self) -> None:
         for name in ("torque_limit", "rate_limit", "speed_limit", "worst_speed_limit", "release"):
@@ -197,23 +201,25 @@ class GuideFilter:
 
 
 def tail(inverse: Vector) -> Vector:
-    """Return for each cycle the largest 1 / width of the guide in this cycle and the next `TAIL_CYCLES` cycles [1/rad].
+    """Return 1 / width at the narrowest place of the guide in the cycles k to k + `TAIL_CYCLES`, for each cycle k [1/rad].
 
-    The largest value is multiplied by 1 + `_TAIL_MARGIN`.
+    The result is multiplied by 1 + `_TAIL_MARGIN`.
 
     Args:
-        inverse: 1 / width (distance from q_des to a bound of the guide) for each cycle, shape (n, m) [1/rad].
+        inverse: 1 / width, shape (n, m) [1/rad]. Row k is cycle k. A width is the distance from q_des to a bound of the guide.
     """
     return (1.0 + _TAIL_MARGIN) * narrowest(inverse, TAIL_CYCLES + 1)
 
 
 def narrowest(inverse: Vector, cycles: int) -> Vector:
-    """Return for each cycle the largest 1 / width of the guide in `cycles` cycles, from this cycle on [1/rad].
+    """Return the sliding maximum of 1 / width, shape (n, m) [1/rad]: row k is the maximum of rows k to k + cycles - 1.
+
+    The maximum of 1 / width is at the narrowest place of the guide in these rows.
 
     Args:
-        inverse: 1 / width (distance from q_des to a bound of the guide) for each cycle, shape (n, m) [1/rad]. The last row
-            applies to all later cycles.
-        cycles: number of cycles, including this cycle.
+        inverse: 1 / width, shape (n, m) [1/rad]. Row k is cycle k. A width is the distance from q_des to a bound of the guide.
+            The last row applies to all later cycles.
+        cycles: number of rows over which each maximum is taken.
     """
     largest = np.concatenate([inverse, np.repeat(inverse[-1:], cycles - 1, axis=0)])
     covered = 1  # row k of `largest` is the maximum of the rows k to k + covered - 1 of the input

@@ -17,9 +17,10 @@ from atalante_hal.types import Vector
 
 Pair = tuple[float, float]
 
-#: Slope of the conversion of torque and speed ratios. Let x be a predicted torque or speed divided by its limit. The kernel
+#: Slope for the ratios of torque and speed. Let x be a predicted torque or speed divided by its limit. The kernel
 #: converts x to 1 - STEEPNESS * (1 - x), which is 1 at x = 1.
-#: The gait alone needs most of the allowed torque and speed, so the gate must rise only close to the limits of torque and speed.
+#: Normal walking already uses most of the allowed torque and speed. With a steep slope, the weight of the backup torque rises
+#: only close to the limits.
 STEEPNESS = 4.0
 #: Number of elements of the compressed state, from which the predicted errors are computed.
 COMPRESSED = 5
@@ -33,33 +34,39 @@ START_CYCLES = 4
 class Guard:
     """Constants and state of the filter, and results of the last cycle."""
 
-    gains: Annotated[Vector, (2, 4)]  # backup gains of hip (row 0) and knee (row 1): Kv [1/s2], then Dv [1/s]
+    #: Gains of the backup policy. Row 0: acceleration of the hip. Row 1: acceleration of the knee.
+    #: Columns 0 and 1: Kv, gains on the errors of hip and knee [1/s2]. Columns 2 and 3: Dv, on the error rates [1/s].
+    gains: Annotated[Vector, (2, 4)]
     torque_limit: float  # Nm, largest allowed torque in the prediction
     speed_limit: float  # rad/s, largest allowed speed of a joint in the prediction
     worst_speed_limit: float  # rad/s, largest allowed speed of a joint in the prediction with the worst model errors
     tracking: float  # share of a commanded torque change that a motor reaches within one cycle
     keep: float  # weight of the old value in the low-pass of the measured velocity
-    zeta: float  # s, gain of lambda_d, which increases the gate while h decreases
+    zeta: float  # s, gain on -dh/dt; while the safety value h falls, the weight of the backup torque rises
     smoothing: float  # weight of the new value in the low-pass filter of dh/dt
     #: largest decrease of the gate (weight of the backup torque) per cycle; this limit prevents oscillations of the
     #: gate
     release: float
-    idealization: float  # intensity of the joint idealization u_i in [0, 1]
-    feedforward: float  # intensity of the feedforward u_f in [0, 1]
+    #: factor in [0, 1] on the torque u_i, which cancels friction, gravity, centrifugal and Coriolis torques (joint idealization)
+    idealization: float
+    feedforward: float  # factor in [0, 1] on the torque u_f, which accelerates the leg along q_des (feedforward)
     promise: float  # disturbance torques that the filter assumes in this step, as a fraction of `Assumptions.promise`
-    xi: float  # assistance factor of the step
+    xi: float  # assistance factor of the step, from 0 (widest guide) to 1 (narrowest guide)
     fresh: bool  # True until the first cycle of a step is computed
-    motor: Annotated[Vector, 2]  # Nm, estimated torques of the motors
-    lag: Annotated[Vector, 2]  # rad/s, estimate of true velocity minus measured velocity
+    motor: Annotated[Vector, 2]  # Nm, estimated torques of the motors of hip and knee
+    lag: Annotated[Vector, 2]  # rad/s, estimated error of the measured velocities of hip and knee: true minus measured
     state: Annotated[Vector, STATES]  # state of the last cycle, see `backup_policy`
-    #: absolute values of the elements of `state`, but abs(true e' - measured e') in place of abs(true e')
+    #: Sizes of the state elements, for the effect of model errors. Elements 2 and 3: |true e' - measured e'| of hip and knee,
+    #: where e' is the error rate. All other elements: absolute value of the same element of `state`.
     magnitude: Annotated[Vector, STATES]
     compression: Annotated[Vector, (COMPRESSED, STATES)]  # matrix from the state to the compressed state
     compressed: Annotated[Vector, COMPRESSED]  # compressed state of the last cycle
     few_slack: Annotated[Vector, (STATES, 2)]  # elementwise maximum of `Few.slack` over all prediction lengths
-    h: float  # h of the last cycle; at h >= 0, the backup policy can keep both joints inside the guide
+    #: safety value 1 - `largest_ratio`^2 of the last cycle; at h >= 0, the backup policy can keep both joints inside the guide
+    h: float
     rate: float  # 1/s, dh/dt after the low-pass filter
-    gate: float  # weight of the backup torque: `lambda + (1 - lambda) lambda_d`, but at least `FLOOR` and last gate - `release`
+    #: weight of the backup torque: the maximum of `damped_gate`, the lower bound in column `FLOOR`, and (last gate - `release`)
+    gate: float
     #: rad, distances from q_des to the bounds: hip upper, hip lower, knee upper, knee lower
     bounds: Annotated[Vector, 4]
 
@@ -67,18 +74,20 @@ class Guard:
 class Lag:
     """Prediction of the tracking errors for one number of cycles ahead. The fixed array shapes make the compiled loops fast."""
 
-    #: matrix from the compressed state to the predicted errors e of sagittal hip and knee [rad]
+    #: Matrix for the predicted errors e of sagittal hip and knee [rad]: e = compressed state @ `ahead`.
     ahead: Annotated[Vector, (COMPRESSED, 2)]
 
 
 class Block:
-    """Bounds of the predicted tracking errors over `SLACK_CYCLES` consecutive cycles ahead."""
+    """Bounds of the predicted tracking errors over a block: `SLACK_CYCLES` consecutive cycles ahead."""
 
-    #: matrix from `Guard.magnitude` to the largest change [rad] that model errors can cause in the predicted tracking errors
+    #: Matrix for the effect of model errors. `Guard.magnitude` @ `slack` is the largest effect on the predicted tracking errors
+    #: of hip and knee [rad].
     slack: Annotated[Vector, (STATES, 2)]
-    #: elementwise mean of the largest and the smallest `Lag.ahead` in the block
+    #: `Lag.ahead` differs between the cycles of the block. For each matrix element: middle between the smallest and the largest
+    #: value.
     middle: Annotated[Vector, (COMPRESSED, 2)]
-    #: half the elementwise difference between the largest and the smallest `Lag.ahead` in the block
+    #: For each matrix element of `Lag.ahead`: half the difference between the largest and the smallest value in the block.
     spread: Annotated[Vector, (COMPRESSED, 2)]
     ratio: float  # upper bound of predicted error / guide width in the block, computed in the last control cycle
 
@@ -87,10 +96,11 @@ class Few:
     """Prediction of torque and speed for one number of cycles ahead, see `prediction.FEW`."""
 
     lag: int  # number of cycles ahead
-    #: matrix from the state to four predictions: feedback -Kv e - Dv e' [rad/s2] of hip and knee, then e' [rad/s] of hip and knee
+    #: Matrix for four predictions: state @ `ahead`. Columns 0 and 1: feedback -Kv e - Dv e' of hip and knee [rad/s2].
+    #: Columns 2 and 3: error rate e' of hip and knee [rad/s].
     ahead: Annotated[Vector, (STATES, 4)]
-    #: matrix from `Guard.magnitude` to the largest change [rad/s] that model errors can cause in the predicted e' of hip and
-    #: knee
+    #: Matrix for the effect of model errors. `Guard.magnitude` @ `slack` is the largest effect on the predicted error rate e' of
+    #: hip and knee [rad/s].
     slack: Annotated[Vector, (STATES, 2)]
 
 
@@ -101,17 +111,21 @@ class GuideTables(NamedTuple):
     laws: Records[Law]  # (1,) mass matrix and friction
     lags: Records[Lag]  # (lags,) predictions of the tracking errors, one for each number of cycles ahead
     blocks: Records[Block]  # (blocks,) bounds of the predicted tracking errors
-    few: Records[Few]  # (rows,) predictions of torque and speed, in ascending order of `Few.lag`
+    #: (rows,) predictions of torque and speed. Each record is one number of cycles ahead, `Few.lag`, in ascending order.
+    few: Records[Few]
     #: (starts, lags, 4) rad, largest tracking errors of sagittal hip and knee.
     #: Axis 0: blocks of `START_CYCLES` cycles in which a prediction starts. Axis 1: number of cycles ahead.
     #: Columns 0 and 1 of axis 2: due to model errors. Columns 2 and 3: due to the requested disturbances.
     reach: Vector
     highest: Vector  # (starts, blocks, 4) maximum of `reach` over each block of cycles ahead [rad]
     #: (starts, rows, 12) largest effects on the torques [Nm] and speeds [rad/s] of sagittal hip and knee (SH, SK).
-    #: Columns 0 to 3: torque of SH, torque of SK, speed of SH, speed of SK, due to model errors.
+    #: Axis 0: blocks of `START_CYCLES` cycles in which a prediction starts. Axis 1: records of `few`.
+    #: Columns 0 to 7 are computed with the inertia and the delay of the model:
+    #: Columns 0 to 3: torque of SH, torque of SK, speed of SH, speed of SK, due to torque errors of the model.
     #: Columns 4 to 7: torque of SH, torque of SK, speed of SH, speed of SK, due to the requested disturbances.
-    #: Columns 8 and 9: speeds of SH and SK due to model errors, with the worst inertia and delay.
-    #: Columns 10 and 11: speeds of SH and SK due to the requested disturbances, with the worst inertia and delay.
+    #: Columns 8 to 11 are computed with the worst inertia and the worst delay instead:
+    #: Columns 8 and 9: speeds of SH and SK due to torque errors of the model.
+    #: Columns 10 and 11: speeds of SH and SK due to the requested disturbances.
     few_reach: Vector
     #: (n, COLUMNS) values of each cycle of the step and of the overlap with the next step. The columns are defined below.
     step: Vector

@@ -44,24 +44,25 @@ class Letter:
     coulomb: Annotated[Vector, 2]  # Nm, Coulomb friction k_d
     viscous: Annotated[Vector, 2]  # Nm s/rad, viscous friction k_v
     push: Annotated[Vector, 2]  # Nm, largest absolute value of the external torque u_ext
-    zeta: float  # s, gain of lambda_d; lambda_d increases the gate (factor of u_b) while h decreases
-    idealization: float  # intensity of the joint idealization u_i
-    feedforward: float  # intensity of the feedforward u_f
-    xi: float  # assistance factor of the step
+    #: s, gain on -dh/dt; while the safety value h falls, the backup torque u_b gets more weight; while h rises, less weight
+    zeta: float
+    idealization: float  # factor in [0, 1] on the torque u_i, which cancels friction and gravity (joint idealization)
+    feedforward: float  # factor in [0, 1] on the feedforward torque u_f
+    xi: float  # assistance factor of the step, from 0 (widest guide) to 1 (narrowest guide)
     fresh: bool  # True until the first cycle of a step is computed
-    h: Annotated[Vector, 2]  # h of the last cycle
+    h: Annotated[Vector, 2]  # safety value of the last cycle; below 0, u_ext can push the joint out of the guide
 
 
 class LiteralTables(NamedTuple):
-    """Tables of the control law that follows the paper literally. `assistive_torque` changes only `letters`."""
+    """Tables of the control law that follows the paper literally. Of these tables, `assistive_torque` changes only `letters`."""
 
-    letters: Records[Letter]  # (1,) constants and state of the control law
+    letters: Records[Letter]  # (1,) record with the constants and the state of the control law
     step: Vector  # (cycles + 1, 8) values of each cycle of the step; the columns are defined below
 
 
 BOUND = 0  # columns 0 to 3 of `step`: distances to the upper and lower bound of the hip, then of the knee [rad]
 REFERENCE = 4  # columns 4 and 5 of `step`: q_des'' of sagittal hip and knee [rad/s2]
-FEEDFORWARD = 6  # columns 6 and 7 of `step`: feedforward u_f of sagittal hip and knee at full intensity [Nm]
+FEEDFORWARD = 6  # columns 6 and 7 of `step`: u_f of sagittal hip and knee times `LiteralConfig.feedforward` [Nm]
 
 
 @dataclass(frozen=True)
@@ -70,9 +71,10 @@ class LiteralConfig:
 
     gains: LegGains  # gains of the baseline PID of the swing leg
     push: Pair  # Nm, largest absolute value of the external torque u_ext of sagittal hip and knee
-    zeta: float  # s, gain of lambda_d; lambda_d increases the gate (factor of u_b) while h decreases
-    idealization: float  # intensity of the joint idealization u_i, in [0, 1]
-    feedforward: float  # intensity of the feedforward u_f, in [0, 1]
+    #: s, gain on -dh/dt; while the safety value h falls, the backup torque u_b gets more weight; while h rises, less weight
+    zeta: float
+    idealization: float  # factor in [0, 1] on the torque u_i, which cancels friction and gravity (joint idealization)
+    feedforward: float  # factor in [0, 1] on the feedforward torque u_f
 
 
 class LiteralGuide:
@@ -122,7 +124,7 @@ class LiteralGuide:
 
 
 def no_promise(shape: str, xi: float) -> Certificate:
-    """Return the certificate of the control law that follows the paper literally. The certificate contains no torques.
+    """Return the certificate of the literal control law: the law is not certified for any disturbance torque.
 
     Args:
         shape: name of the shape.

@@ -134,11 +134,13 @@ class Prediction:
         whole = Grid(starts, START_CYCLES, np.arange(horizon + 1))
         few, none = whole._replace(lags=FEW), whole._replace(lags=FEW[:0])
 
-        # The members of `family` differ in the errors of inertia and delay. `reach` and `few_ahead[2]` are the maxima over all
-        # members. For example, a joint moves faster if the leg is lighter than in the model, or if the command arrives later.
+        # Each member of `family` is the loop with one combination of inertia error and delay. `reach` and `few_ahead[2]` contain
+        # the largest effect of disturbances over all members. For example, a joint moves faster if the leg is lighter than in the
+        # model, or if the command arrives later.
         self.reach = np.zeros((blocks, len(whole.lags), 4))
-        # Largest effects of disturbances, for `self.few_reach`.
-        # Elements of axis 0: torque, speed, speed with the worst errors of inertia and delay.
+        # Largest effects of disturbances on torque and speed, `FEW` cycles ahead. `self.few_reach` follows from this array.
+        # Axis 0: torque, speed, speed with the worst inertia and delay. Axis 1: block of start cycles. Axis 2: element of `FEW`.
+        # Columns 0 and 1 of axis 3: hip and knee, due to model errors. Columns 2 and 3: due to the requested disturbances.
         few_ahead = np.zeros((3, blocks, len(FEW), 4))
         lag = assumptions.loop.velocity_lag
         first, first_rates = [], []
@@ -195,7 +197,11 @@ def prediction_of(policy: BackupPolicy, leg: Leg, assumptions: Assumptions, blen
 
 
 def _separated(rows: Vector) -> Vector:
-    """Return the matrices for a state vector that contains true minus measured e' instead of the true e' (see `STATES`)."""
+    """Convert matrices of a prediction: in the state, (true e' - measured e') replaces the true error rate e'.
+
+    The prediction does not change: a * true + b * measured = a * (true - measured) + (a + b) * measured. The state is defined at
+    `STATES`.
+    """
     result = rows.copy()
     result[..., 4:6] += rows[..., 2:4]
     return result

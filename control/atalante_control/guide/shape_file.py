@@ -97,7 +97,10 @@ def _shape(document: Mapping[str, Any]) -> GuideShape:
 
 
 def _eased(phase: Vector, knots: Vector) -> Vector:
-    """Return phases at which linear interpolation between the knots equals half-cosine interpolation at `phase`."""
+    """Warp phases for half-cosine interpolation between the knots.
+
+    Linear interpolation at a warped phase gives the value of the half-cosine interpolation at the original phase.
+    """
     at = np.clip(np.searchsorted(knots, phase, side="right") - 1, 0, len(knots) - 2)
     length = knots[at + 1] - knots[at]
     return np.asarray(knots[at] + length * (0.5 - 0.5 * np.cos(math.pi * (phase - knots[at]) / length)))
@@ -130,7 +133,10 @@ def _phases(values: Any) -> Vector:
 
 
 def _distances(table: Any, joint: str, count: int) -> Vector:
-    """Return the distances of a joint, shape (2, count) [deg]. The first row is the upper side, the second the lower side."""
+    """Return the angles from the desired trajectory to the guide bounds of a joint, shape (2, count) [deg].
+
+    Row 0: upper bound. Row 1: lower bound. Columns: the phases of the file; `count` is the number of phases.
+    """
     if not isinstance(table, dict):
         raise ValueError(f"{joint} must be a table with the lists {' and '.join(_SIDES)}, got {table!r}")
     _check_keys(table, _SIDES, (), f"{joint}.")

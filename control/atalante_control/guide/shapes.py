@@ -15,8 +15,9 @@ import numpy as np
 
 from atalante_hal.types import Vector
 
-PINCH_WIDTH = math.radians(1.0)  # rad, half-width to which the shape `pinched` closes, if `half_width` is larger
-SNAP_WIDTH = math.radians(0.1)  # rad, half-width to which the shape `snap` closes
+#: Half-width of the shape `pinched` at the end of the step [rad]. A guide that is narrower from the start keeps its width.
+PINCH_WIDTH = math.radians(1.0)
+SNAP_WIDTH = math.radians(0.1)  # rad, half-width of the shape `snap` in the narrow part of the step
 #: Smallest bound of a shape [rad], about two encoder counts at the joint.
 #: With a much smaller bound of the shape, h of the guide filter would overflow.
 NARROWEST = 1e-6
@@ -27,7 +28,9 @@ _CHECKED_FACTORS = np.linspace(0.0, 1.0, 21).tolist()
 
 
 def half_width(xi: float) -> float:
-    """Return the half-width of the paper [rad]: 0.5 + 7 (1 - Xi) degrees. A shape multiplies this half-width by a fraction.
+    """Return the guide half-width that the paper defines [rad]: 0.5 + 7 (1 - Xi) degrees.
+
+    A guide shape multiplies this half-width by a fraction at each phase of the step.
 
     Args:
         xi: assistance factor in [0, 1].

@@ -1,8 +1,8 @@
 """Virtual guides of a walk, in the air or on the ground: one guide filter for each set of gains, and the selection for each step.
 
 `assistance factor -> guide filter, promise, certificate`. A narrow guide requires a stiff backup policy, but a stiff policy
-reaches the torque limit in a wide guide. Each step uses the softest filter that is certified for the requested promise
-(disturbance torques) at the assistance factor of the step.
+reaches the torque limit in a wide guide. Each step uses the filter with the lowest stiffness that is certified for the
+requested promise (disturbance torques) at the assistance factor of the step.
 """
 
 from __future__ import annotations
@@ -28,18 +28,19 @@ _MIDDLE = math.radians(30.0)
 _ASSISTED = [LEG_JOINTS.index("SH"), LEG_JOINTS.index("SK")]
 #: Largest half-width of a guide [rad]. This width applies at assistance factor 0, see `half_width`.
 _WIDEST = math.radians(7.5)
-#: If no filter withstands the requested torques, this fraction of the largest possible torques is certified.
-#: With the fraction 1, the backup torque would have weight 1 even without a disturbance.
+#: If no filter can be certified for the requested disturbance torques, a filter is certified for smaller torques. The smaller
+#: torques are this fraction of the largest torques for which the filter can be certified.
+#: The fraction 1 would leave no margin, so the backup torque would have weight 1 even without a disturbance.
 _USED = 0.95
 #: Number of decimal digits to which the assistance factor is rounded; the CAN signal has the same resolution.
 _DIGITS = 4
 
 
 class Choice(NamedTuple):
-    """Guide filter of a step, and its certified disturbance torques as a fraction of the requested torques."""
+    """Guide filter of a step, and the disturbance torques for which this filter is certified."""
 
     guide: GuideFilter
-    promise: float
+    promise: float  # certified torques as a fraction of the torques that the configuration requests, in [0, 1]
 
 
 class StepGuides:
@@ -83,9 +84,9 @@ class StepGuides:
             self.at(percent / 100)
 
     def at(self, xi: float) -> Choice:
-        """Return the softest filter that is certified for the requested torques, with its certified torques.
+        """Return the filter with the lowest backup stiffness that is certified for the requested disturbance torques.
 
-        If there is no such filter, return the filter with the largest certified torques.
+        If no filter is certified for the requested torques, return the filter with the largest certified torques.
 
         Args:
             xi: assistance factor in [0, 1].
@@ -140,7 +141,7 @@ def filter_config(config: StepGuideConfig, robot: Robot) -> GuideConfig:
 
 
 def policies(config: StepGuideConfig, inertia: AssistedInertia) -> list[BackupPolicy]:
-    """Return the backup policies, from the softest to the stiffest.
+    """Return the backup policies in ascending order of stiffness.
 
     Args:
         config: stiffness and damping.

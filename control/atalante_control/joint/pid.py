@@ -64,9 +64,9 @@ class PidGains:
     integral_limit: float = 10.0  # Nm, largest absolute value of the integral torque
 
 
-#: Gains for the suspended robot. The stance leg carries no load, so TH, SK, SA and HA of this leg have the gains of the
-#: swing leg. With the gains for the ground, knee and ankle of a suspended robot would oscillate, because these joints move
-#: small inertias.
+#: Gains for the suspended robot. The stance leg then carries no load, so its knee and ankle move only small inertias.
+#: With the stance gains of a robot on the ground, knee and ankle of a suspended robot would oscillate.
+#: Therefore TH, SK, SA and HA of the stance leg have the gains of the swing leg.
 AIR_GAINS = PidGains(
     stance=LegGains(
         kp=(3000.0, 720.0, 3000.0, 900.0, 300.0, 180.0),
@@ -96,7 +96,9 @@ class Pid:
 
     def __init__(self, gains: PidGains) -> None:
         stance, swing = gains.stance, gains.swing
-        roles = {LEFT: (stance, swing), RIGHT: (swing, stance)}  # stance leg: gains of left and right leg
+        # stance leg -> gains of the left leg, gains of the right leg
+        roles = {LEFT: (stance, swing), RIGHT: (swing, stance)}
+        #: Stance leg -> Kp, Kd, and Ki times the cycle time of the twelve joints, shape (3, 12).
         self._gains_of = {
             s: np.array([(*left.kp, *right.kp), (*left.kd, *right.kd), (*left.ki, *right.ki)])
             * [[1.0], [1.0], [PERIOD]]

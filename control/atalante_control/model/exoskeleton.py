@@ -1,4 +1,4 @@
-"""Links of the exoskeleton, with or without a patient: `ExoskeletonParameters (, Patient) -> links`.
+"""Links of the exoskeleton, with or without a patient: `exoskeleton parameters, optional patient -> links`.
 
 The right leg is the mirror image of the left leg. Each segment of a patient is fused into the link that carries it. The joint
 idealization of the controller uses the model of the empty exoskeleton. Gaits are computed with the patient.

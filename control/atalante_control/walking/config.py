@@ -24,7 +24,8 @@ Pair = tuple[float, float]
 STEERING = 0.5, 0.15, math.radians(3.0)
 
 _NO_INTEGRAL = (0.0,) * 6
-#: Largest angle by which the desired line may turn before a periodic step [rad]. Larger angles were not tried.
+#: Largest absolute value of `WalkConfig.turn` [rad]. `turn` is the angle by which the straight path of the robot turns before
+#: each periodic step. Larger angles were not tried.
 TURN_MAX = math.radians(5.0)
 #: Gains without integral terms. With integral terms, the robot began to limp after about 120 steps in MuJoCo.
 #: The PIDs act against the ankle stabiliser, so the integral terms of the two legs drifted apart.
@@ -76,7 +77,8 @@ class WalkConfig:
     #: Steering by an offset of the transverse hip: gain on the heading error [rad/rad], gain on the sideways deviation
     #: [rad/m], limit [rad].
     steering: tuple[float, float, float] = STEERING
-    turn: float = 0.0  # rad, angle by which the desired line turns before each periodic step, positive to the left
+    #: rad, angle by which the straight path of the robot turns before each periodic step, positive to the left
+    turn: float = 0.0
     #: s, time after the nominal end of a step at which the step ends if no landing is detected
     landing_timeout: float = 0.4
     load_bandwidth: float = 35.0  # Hz, cut-off frequency of the low-pass of the vertical foot forces
@@ -98,7 +100,8 @@ class WalkConfig:
     #: With the smaller value `alpha`, the re-centring of the heavy leg would need more torque than the drives have.
     #: All other joints use `alpha`, because the robot would fall if they were re-centred as slowly as sagittal hip and knee.
     guided_alpha: float = 0.5
-    #: s, time after the start of a guided step in which the smallest allowed weight of the backup torque falls from 1 to 0
+    #: s, duration of a ramp from 1 to 0 at the start of a guided step. The weight of the backup torque is never below the ramp.
+    #: The backup torque holds the leg inside the guide.
     engage: float = 0.02
     #: s, duration of the change from the guide to the baseline controller, for sagittal hip and knee, after a guided step
     release: float = 0.03
@@ -134,7 +137,9 @@ class WalkConfig:
             if not (math.isfinite(getattr(self, name)) and getattr(self, name) >= PERIOD):
                 raise ValueError(f"{name} must be at least one cycle ({PERIOD} s), got {getattr(self, name)!r}")
         if not 0.0 <= self.stabiliser <= 10.0:
-            raise ValueError(f"stabiliser must be from 0 to 10 m/m, got {self.stabiliser!r}")
+            raise ValueError(
+                f"stabiliser (shift of the centre of pressure per DCM error) must be from 0 to 10 m/m, got {self.stabiliser!r}"
+            )
         if not 0.0 <= self.damping_loss <= 0.25:
             raise ValueError(f"damping_loss must be from 0 to 0.25 per cycle, got {self.damping_loss!r}")
         if not 0.0 <= self.edge <= 0.1:

@@ -140,8 +140,10 @@ class WalkController:
         self._forces = force.copy()  # copy of the foot forces; contains the estimated forces of a lost foot
         #: Copy of the torque that the controller requested last, used if the `State` does not contain the sent torque.
         self._sent = np.zeros(_N)
-        self._state: State | None = None  # `State` object whose arrays are in `_measured_by`
+        #: `State` object of the last `_bind`. The tuples in `_measured_by` contain the arrays of this object.
+        self._state: State | None = None
         self._measured = Measured(np.zeros(_N), np.zeros(_N), np.zeros(3), np.zeros(3), np.zeros(3), force, self._sent)
+        #: Index of an IMU -> measurements of the kernels with this IMU.
         self._measured_by = {_PELVIS: self._measured, _TORSO: self._measured}
         stages: Records[Stage] = zeros(Stage, 1)
         sensed: Records[Sensed] = zeros(Sensed, 1)

@@ -2,8 +2,9 @@
 
 The divergent component of motion (DCM) of an inverted pendulum moves away from the centre of pressure with the rate w. A
 shift of the centre of pressure by k times the DCM error makes this error decay with the rate (k - 1) w. Let F be the vertical
-force on a foot. The SA torque F d shifts the centre of pressure forwards by d. The HA torque -F d a shifts the centre of pressure
-sideways by d, where a is the forward component of the henke axis. F is measured, so a foot without load gets no torque.
+force on a foot. The SA torque F d shifts the centre of pressure forwards by d. HA turns about the oblique henke axis and tilts
+the foot sideways. The HA torque -F d a shifts the centre of pressure sideways by d, where a is the forward component of the unit
+henke axis. F is measured, so a foot without load gets no torque.
 """
 
 from __future__ import annotations
@@ -85,7 +86,9 @@ def within_sole(parameters: Stabiliser, torque: float, load: float) -> float:
 
 
 def ankle_torques(parameters: Stabiliser, shift: Vector, load: float, side: int) -> Pair:
-    """Return the torques of sagittal and henke ankle that shift the centre of pressure of one foot [Nm].
+    """Return the torques of SA and HA that shift the centre of pressure of one foot [Nm].
+
+    SA is the sagittal ankle (flexion). HA is the henke ankle, which tilts the foot sideways about the oblique henke axis.
 
     Args:
         parameters: geometry of the foot.

@@ -54,7 +54,7 @@ class HeadingFilter:
         self.reset()
 
     def reset(self) -> None:
-        """Start again, with an estimated heading that is correct by definition."""
+        """Restart the filter. The present heading counts as 0, so the estimated heading has no error at the start."""
         config = self._config
         self._state = np.zeros(3)
         self._covariance = np.diag([0.0, config.gyro_bias**2, config.reference**2])

@@ -352,7 +352,9 @@ def _assist(cycle: int, measured: Measured, assistance: Assistance, parts: Parts
 
 
 def _place(cycle: int, table: PhaseTable, constants: Constants, gain: float, parts: Parts) -> None:
-    """Update lean, offset of the landing and phase rate, and apply them to the desired motion.
+    """Update the lean of the trunk, the landing offset and the phase rate. Apply lean and offset to the desired motion.
+
+    The phase rate is the speed of the step relative to the gait. The new phase rate acts from the next cycle on.
 
     Args:
         cycle: cycles since the start of the phase.
@@ -416,7 +418,10 @@ def _hold_foot(row: int, table: PhaseTable, parts: Parts) -> None:
 
 
 def _desired(cycle: int, placement: Placement, table: PhaseTable, stage: Stage, desired: Vector) -> int:
-    """Write q_des and q_des' without foot placement and flat foot, and return the row index in the table.
+    """Write q_des and q_des', and return the current row of the phase table.
+
+    q_des is the sum of the table, the re-centring (fades out the deviation at the start of the phase), the steering and the
+    lowering of a late swing foot. Afterwards, foot placement and flat foot change q_des further.
 
     Args:
         cycle: cycles since the start of the phase.
@@ -455,9 +460,10 @@ def _desired(cycle: int, placement: Placement, table: PhaseTable, stage: Stage, 
 
 
 def _lowered(cycles: float, longest: int) -> tuple[float, float]:
-    """Return the lowered distance [m] and the downward speed [m/s] of a late swing foot, for a full speed of 1 m/s.
+    """Return how far a late swing foot has moved down [m], and the downward speed of the foot [m/s].
 
-    For another full speed, multiply both results by the full speed.
+    A late swing foot has not landed at the nominal end of the step. The speed rises from 0 to 1 m/s. The caller scales
+    both results to the real final speed.
 
     Args:
         cycles: cycles since the nominal end of the step, above 0.

@@ -27,18 +27,20 @@ class LeanConfig(NamedTuple):
 
     gain: float = 6.0  # rad/m, lean per DCM error beyond the dead zone; 0: no lean
     dead_zone: float = 0.02  # m, sideways DCM error up to which the trunk does not lean
-    #: m, largest inward distance of the DCM from the middle of the stance sole at which the trunk leans over the stance foot;
-    #: the inward distance is negative if the DCM is outwards of the middle
+    #: m, the trunk leans over the stance foot only if the DCM is less than this distance inwards of the middle of the stance
+    #: sole, or outwards of the middle. Inwards is the direction to the swing foot.
     inside: float = 0.015
     outward: float = 0.22  # rad, largest lean over the stance foot
     inward: float = 0.08  # rad, largest lean to the side of the swing foot
     rise: float = 14.0  # rad/s, natural frequency of the critically damped filter while the lean grows
     fall: float = 5.0  # rad/s, natural frequency of the filter while the lean decreases
     acceleration: float = 25.0  # rad/s2, largest acceleration of the lean
-    leg_gain: float = 8.0  # m/m, outward motion of the swing foot per distance of the DCM beyond `leg_zone`; 0: none
-    #: m, largest outward distance of the DCM from the middle of the stance sole at which the swing foot does not move outwards
+    #: m/m, shift of the swing foot away from the stance foot, per distance of the DCM beyond `leg_zone`; 0: no shift
+    leg_gain: float = 8.0
+    #: m, the swing foot is shifted only if the DCM is more than this distance outwards of the middle of the stance sole. Outwards
+    #: is the direction away from the swing foot.
     leg_zone: float = 0.02
-    leg: float = 0.15  # m, largest outward motion of the swing foot
+    leg: float = 0.15  # m, largest shift of the swing foot away from the stance foot
 
 
 class Lean:
@@ -78,7 +80,9 @@ def follow_lean(config: LeanConfig, lean: Lean, target: float) -> None:
 
 
 def leg_target(config: LeanConfig, dcm: float, side: float) -> float:
-    """Return the requested outward motion of the swing foot [m], positive to the left; 0 if no motion is requested.
+    """Return the sideways shift of the swing foot away from the stance foot [m].
+
+    The sign gives the direction: positive to the left, negative to the right. 0 means no shift.
 
     Args:
         config: parameters.

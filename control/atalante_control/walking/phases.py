@@ -33,7 +33,9 @@ WALKING = STEPPING | {Phase.SHIFT, Phase.BACK}
 class Facts(NamedTuple):
     """Times and events that decide whether a phase ends in the current cycle."""
 
-    elapsed: int  # cycles since the start of the phase; in a step: row of the phase table, see `walking.placement`
+    #: Cycles since the start of the phase. In a step: current row of the phase table, because step timing makes the step faster
+    #: or slower than one row per cycle.
+    elapsed: int
     nominal: int  # nominal duration of the phase in cycles
     rest: int  # cycles to wait after a weight shift
     timeout: int  # a step without a detected landing ends this number of cycles after its nominal end

@@ -41,39 +41,39 @@ _FH, _SH, _SK = (LEG_JOINTS.index(name) for name in ("FH", "SH", "SK"))
 _SHIFTING = (_FH, _SH, _SK)
 #: Number of joints from the pelvis to the ankle.
 _LINKS = LEG_JOINTS.index("SA") + 1
-#: m3, smallest determinant of the ankle Jacobian at which the foot is still shifted; a straight leg has the determinant 0
+#: m3, lower limit of the absolute determinant of the ankle Jacobian. Below this limit, the leg is almost straight (singular), and
+#: the foot is not shifted further.
 _SINGULAR = 1e-3
-_RATES = 32  # the cost is computed for `_RATES` + 1 phase rates in geometric order
+#: The cost is computed for `_RATES` + 1 phase rates from `slowest` to `fastest`. The ratio of neighbouring rates is constant.
+_RATES = 32
 _FASTEST = 3.0  # rad/s, largest desired speed of a joint that shifts the foot
 
 
 class PlacementConfig(NamedTuple):
     """Parameters of foot placement and step timing."""
 
-    #: m, largest predicted DCM error at the landing to which placement and timing do not react; infinity switches both off
+    #: m, placement and timing react only to a predicted DCM error at the landing above this value; infinity switches both off
     dead_zone: float = 0.015
     forward: float = 0.15  # m, largest offset of a landing forwards and backwards
     outward: float = 0.22  # m, largest offset of a landing away from the stance foot
     inward: float = 0.02  # m, largest offset of a landing towards the stance foot
-    slowest: float = 0.1  # smallest phase rate
+    slowest: float = 0.1  # smallest phase rate; the phase rate is the speed of the step relative to the gait
     fastest: float = 1.6  # largest phase rate
-    #: s, time after the start of a step in which the DCM error is ignored, because the new stance foot is not yet at rest
+    #: s, the DCM error is ignored for this time after the start of a step, because the new stance foot is not yet at rest
     settled: float = 0.08
     #: s, last part of the step before the nominal landing. In this part, the phase rate returns to 1, and `late_landing`
     #: computes the offset of the landing.
     frozen: float = 0.05
-    #: m, largest DCM error (forward, sideways) whose growth the robot can stop. The forward value is below the forward
-    #: limit of the ankle stabiliser (`WalkConfig.shift_limit`), because the PIDs of the stance leg act against the
-    #: stabiliser. The sideways value is above the sideways limit, because the trunk leans.
+    #: m, DCM error (forward, sideways) above which the ankle and the trunk cannot stop the growth of the error. The forward
+    #: value is below the forward limit of the ankle stabiliser (`WalkConfig.shift_limit`), because the PIDs of the stance leg
+    #: act against the stabiliser. The sideways value is above the sideways limit, because the trunk leans.
     capacity: Pair = (0.10, 0.08)
     bandwidth: float = 25.0  # rad/s, natural frequency of the critically damped filter of the landing offset
     speed: float = 1.2  # m/s, largest rate of change of the landing offset
     acceleration: float = 25.0  # m/s2, largest acceleration of the landing offset
-    #: cost weight of the squared missing offset (needed minus permitted offset); the squared permitted offset has the weight 1
+    #: weight of the missing landing offset in the cost, see `_cost`; the missing offset is the needed minus the permitted offset
     missed: float = 30.0
-    #: m, cost of timing: a landing that is earlier or later by 1 / w (w: natural frequency) costs as much as a landing with this
-    #: offset
-    timing: float = 0.03
+    timing: float = 0.03  # m, weight of a change of the landing time in the cost, see `_cost`
     hold: float = 0.1  # s, time in which the reference of the swing foot changes from the pelvis to the stance foot
     slew: float = 15.0  # 1/s, largest change of the phase rate per second
 
@@ -141,7 +141,7 @@ def beyond(value: float, zone: float) -> float:
 def landing(config: PlacementConfig, gain: float, motion: Motion) -> tuple[float, float, float]:
     """Return the offset of the landing in the walking frame, forwards and to the left [m], and the phase rate.
 
-    The candidates for the phase rate are 1 and `_RATES` + 1 rates in geometric order. The rate with the lowest cost is
+    The candidates for the phase rate are 1 and `_RATES` + 1 rates from `slowest` to `fastest`. The rate with the lowest cost is
     returned. This rate may jump between two cycles. `follow` limits the changes of offset and phase rate.
 
     Args:
@@ -164,8 +164,9 @@ def landing(config: PlacementConfig, gain: float, motion: Motion) -> tuple[float
 
 
 def _needed(config: PlacementConfig, gain: float, motion: Motion, rate: float) -> Pair:
-    """Return the offset of the landing with which the DCM is at its nominal position relative to the new stance foot [m].
+    """Return the offset by which the landing must be shifted, forwards and to the left [m].
 
+    With this offset, the DCM at the landing has the nominal position relative to the new stance foot, except for the dead zone.
     Sideways, the centre of pressure c of the nominal motion is taken as constant until the landing, so the nominal DCM x obeys
     x(t) = c + (x(0) - c) exp(w t). c follows from the present nominal DCM x(0) and the nominal DCM at the nominal landing.
     Forwards, the ankle makes the DCM follow a faster or slower step.
@@ -194,7 +195,12 @@ def _permitted(config: PlacementConfig, side: float, x: float, y: float) -> Pair
 
 
 def _cost(config: PlacementConfig, gain: float, motion: Motion, rate: float) -> float:
-    """Return the cost of a phase rate [m2]."""
+    """Return the cost of walking the rest of the step with a candidate phase rate [m2].
+
+    cost = permitted^2 + missed * (needed - permitted)^2 + (timing * w * dt)^2. `needed` is the needed landing offset, and
+    `permitted` is the same offset within its limits. `missed` and `timing` are in `PlacementConfig`. w is the natural frequency,
+    and dt is the change of the landing time due to the phase rate.
+    """
     x, y = _needed(config, gain, motion, rate)
     forward, left = _permitted(config, motion.side, x, y)
     missed = (x - forward) ** 2 + (y - left) ** 2

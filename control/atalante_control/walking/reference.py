@@ -29,7 +29,10 @@ _SH, _SK = LEG_JOINTS.index("SH"), LEG_JOINTS.index("SK")
 
 
 class PhaseTable(NamedTuple):
-    """Desired motion of one phase with n cycles. After the last cycle, the last row is held."""
+    """Desired motion of one phase with n cycles. After the last cycle, the last row is held.
+
+    A late swing foot has not landed at the end of the table. The fields from `reach` on define how a late swing foot moves down.
+    """
 
     rows: Vector  # (n + 1, 24) q_nom [rad], then q_nom' [rad/s]
     feedforward: Vector  # (n + 1, 12) Nm, u_f
@@ -37,12 +40,16 @@ class PhaseTable(NamedTuple):
     #: (n + 1, 3) m, nominal position of the ankle of the swing leg relative to the centre of the stance sole, walking frame
     ankle: Vector
     frequency: float  # rad/s, natural frequency w of the pendulum
-    recentring: Vector  # (m, 4) re-centring rows of all joints without a guide, see `flat_foot.recentring_rows`
-    guided: Vector  # (m, 4) re-centring rows of sagittal hip and knee of the swing leg, which a guide can assist
-    reach: Vector  # (2,) rad/s, speeds of SH and SK of the swing leg with which the swing foot moves down after the last row
-    lowering: float  # m/s, downward speed of the swing foot at the joint speeds `reach`
-    reach_cycles: int  # number of cycles after the last row in which the foot moves down with the joint speeds `reach`
-    #: number of cycles in which foot placement lowers a held swing foot after the last row; does not depend on the knee angle
+    #: (m, 4) re-centring: polynomials that fade out the deviation at the start of the phase. Row k holds c0, c1, c0', c1' of
+    #: cycle k, see `flat_foot.recentring_rows`. These rows apply to all joints that are not guided in this phase.
+    recentring: Vector
+    #: (m, 4) re-centring of sagittal hip and knee (SH, SK) of the swing leg in a guided step, with the columns of `recentring`
+    guided: Vector
+    reach: Vector  # (2,) rad/s, speeds of SH and SK of the swing leg that move a late swing foot down
+    lowering: float  # m/s, downward speed of a late swing foot at the joint speeds `reach`
+    reach_cycles: int  # cycles after the end of the table for which SH and SK move with the speeds `reach`
+    #: cycles after the end of the table for which foot placement lowers a late swing foot. The knee angle can shorten
+    #: `reach_cycles`, but not `lowering_cycles`.
     lowering_cycles: int
 
 

@@ -168,11 +168,14 @@ def _tables(gaits: WalkGaits, models: Models, config: WalkConfig) -> dict[tuple[
 
 
 def _held(table: PhaseTable, row: int, duration: float) -> PhaseTable:
-    """Return the table of a phase in which the re-centring leads from the measured pose to the pose in a row of `table`.
+    """Return the table of a phase that moves the robot from the measured pose to one constant target pose.
+
+    All rows of the result contain the target pose. The motion is the re-centring: a polynomial from the measured pose to the
+    target pose.
 
     Args:
-        table: table that contains the row.
-        row: index of the row.
+        table: table that contains the target pose.
+        row: index of the row with the target pose.
         duration: duration of the motion [s].
     """
     count = round(duration / PERIOD) + 1

@@ -39,7 +39,9 @@ class Shift(NamedTuple):
     """Weight shift from the middle between the feet onto one foot, as Bezier control points along the path."""
 
     q: Vector  # (12, 8) rad, joint angles
-    feedforward: Vector  # (12, 8) Nm, static torques without the gravity torques u_g
+    #: (12, 8) Nm, torques that hold the pose against weight and ground forces, minus the gravity torques u_g of the suspended
+    #: exoskeleton. The controller adds u_g itself.
+    feedforward: Vector
     centre: Vector  # (3, 8) m, centre of mass relative to the middle between the soles, in the walking frame
 
 
@@ -53,7 +55,7 @@ class Standing:
 
         Args:
             articulated: model of the robot with the patient, with a fixed pelvis.
-            gravity: gravity torques u_g, which the controller adds to the feedforward.
+            gravity: gravity torques u_g of the suspended exoskeleton, which the controller adds to the feedforward.
             exoskeleton: geometry of the soles.
             robot: limits of the joints.
         """
@@ -162,7 +164,9 @@ class Standing:
         return q
 
     def _statics(self, q: Vector, rotation: Vector, shares: tuple[float, float], points: list[Vector]) -> Vector:
-        """Return the static torques of a pose minus the gravity torques u_g.
+        """Return the torques that hold a pose on the ground, minus the gravity torques u_g of the suspended exoskeleton.
+
+        The controller adds u_g itself. The result contains the effect of the ground forces and of the patient's weight.
 
         Args:
             q: joint angles, shape (12,) [rad].

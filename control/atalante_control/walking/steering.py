@@ -81,8 +81,8 @@ class Steering:
         """Return the offset of the transverse hip (TH) of the swing leg for the next step, positive to the left [rad]."""
         per_yaw, per_metre, largest = self._gains
         limit = largest + abs(self._turn)
-        # In a steady turn, the stance sole is one turn behind the line, and the other sole is two turns behind the line.
-        # The mean heading is therefore 1.5 turns behind the line.
+        # The line has just turned by the angle `_turn`. In a steady turn, the heading of the stance sole now lags the heading of
+        # the line by `_turn`. The heading of the swing sole lags by 2 `_turn`, so the mean lag of both soles is 1.5 `_turn`.
         error = self.yaw + 1.5 * self._turn
         return -min(max(per_yaw * error + per_metre * self.lateral - self._turn, -limit), limit)
 

@@ -1,9 +1,9 @@
-"""Swing leg of a step on the ground, with the leg of the patient: `gait, kinematics -> Leg of the guides, unmodelled torque`.
+"""Model of the swing leg in a step on the ground: `gait, kinematics -> model for the guide filter, unmodelled torque`.
 
-The guide filter computes the torques of sagittal hip and knee (SH, SK) with the mass matrix of the leg of robot and patient, for
-a fixed pelvis. On the ground, the pelvis moves with the stance leg. The torque u_g + u_f of the gait includes the effect of the
-pelvis motion. A torque computed with the mass matrix for a fixed pelvis does not include this effect. The filter therefore adds
-the missing torque w to the gravity torque. w depends on the time t in the step:
+The guide filter computes the torques of sagittal hip and knee (SH, SK) with the mass matrix of the swing leg. The mass matrix
+includes the leg of the patient, and is computed for a fixed pelvis. On the ground, the pelvis moves with the stance leg. The
+torque u_g + u_f of the gait includes the effect of the pelvis motion. A torque computed with the mass matrix does not include
+this effect. The filter therefore adds the missing torque w to the gravity torque. w depends on the time t in the step:
 
     w(t) = u_f - M(q_nom) q_nom'' - c(q_nom, q_nom')
 
@@ -35,7 +35,7 @@ _SH, _SK = LEG_JOINTS.index("SH"), LEG_JOINTS.index("SK")
 class SwingLeg(NamedTuple):
     """Model of the swing leg in one step, and the torque that this model leaves out."""
 
-    leg: Leg
+    leg: Leg  # model of sagittal hip and knee with a fixed pelvis, for the guide filter
     unmodelled: Vector  # (n + 1, 2) Nm, torque w of sagittal hip and knee, added to the gravity torques u_g
 
 

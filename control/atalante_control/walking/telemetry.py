@@ -98,7 +98,9 @@ def write_telemetry(
 
 
 def write_guide(telemetry: Records[Telemetry], guard: Guard, errors: tuple[float, float]) -> tuple[float, float]:
-    """Write the telemetry of a guided cycle, and return q_bound of SH and SK [rad].
+    """Write the telemetry of a guided cycle, and return the width of the guide at SH and SK [rad].
+
+    The width q_bound is the distance from q_des to the bound of the guide, on the side of the present error.
 
     Args:
         telemetry: record to write, shape (1,).

@@ -100,7 +100,8 @@ class PyBulletBody:
         pybullet.setJointMotorControlArray(
             self._body, self._joints, pybullet.VELOCITY_CONTROL, forces=[0.0] * len(JOINTS), **client
         )
-        self._touches = ground is not None  # only the soles and the floor can be in contact
+        # Contacts are read only if there is a floor, because the links of the robot do not collide with each other.
+        self._touches = ground is not None
         if ground is not None:
             self._add_floor(ground, friction)
         self._force, self._moment = [0.0] * 3, [0.0] * 3  # external force [N] and moment [Nm] on the pelvis

@@ -173,7 +173,7 @@ def test_saved_network_is_loaded_bit_for_bit(tmp_path: Path) -> None:
         ({"format": np.array("atalante-gait-network/9")}, "format must be"),
         ({"format": np.array("atalante-gait-network/2")}, "format must be 'atalante-gait-network/3'"),
         ({"inputs": np.array(["mass"])}, "inputs must be mass, height, step_length, step_duration, thigh, shank"),
-        ({"format": np.zeros(())}, "format must be text"),
+        ({"format": np.zeros(())}, "format must be a single text"),
         ({"surprise": np.zeros(3)}, "each member of the archive must be one of .*, got 'surprise.npy'"),
         ({"bias_1": None}, "bias_1 is missing"),
         ({"weights_3": np.zeros((6, 5))}, "weights_2 is missing"),

@@ -102,5 +102,5 @@ def test_robot_with_another_zero_length_is_rejected(chain: Chain) -> None:
         replace(link, origin=(link.origin[0], 0.01, link.origin[2])) if link.joint == "left_SH" else link
         for link in links(ExoskeletonParameters(), PATIENT)
     ]
-    with pytest.raises(ValueError, match=r"that are 0 in the reference robot must be 0, got \[0\.01\]"):
+    with pytest.raises(ValueError, match=r"must also be 0 in the given robot, got \[0\.01\]"):
         chain.values(worn)

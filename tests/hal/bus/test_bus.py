@@ -608,7 +608,7 @@ def test_channel_map_accepts_the_buses_in_any_order() -> None:
     [
         ("", "empty entry; write one channel for all"),
         ("left_leg=can0,,right_leg=can1", "empty entry"),
-        ("can0,can1", "assigns no bus to a channel"),
+        ("can0,can1", "must name the bus of each channel"),
         ("left_leg=can0,can1", "must be BUS=CHANNEL, got 'can1'"),
         ("left_leg=", "must be BUS=CHANNEL"),
         ("left_arm=can0", "must be one of left_leg, right_leg, left_sense, right_sense, got 'left_arm'"),

@@ -106,7 +106,10 @@ def test_faults_without_fall_are_in_the_matrix() -> None:
 def test_fault_at_power_on_is_refused(tmp_path: Path) -> None:
     outcome = CliRunner().invoke(cli, ["trial", "faults", POWER_ON, "--out", str(tmp_path)])
     assert outcome.exit_code == 2
-    assert "a fault must have a case during a walk, got F53, whose cases begin at power-on" in outcome.output
+    assert (
+        "a fault must be one that can begin during a walk, got F53, which is injected only at power-on"
+        in outcome.output
+    )
 
 
 def test_f41_robot_with_both_feet_on_the_ground_stands_when_the_hal_is_killed() -> None:

@@ -135,10 +135,10 @@ class Plan:
         return rows
 
     def rows_in_other_format(self, can_ids: npt.NDArray[np.uint32]) -> Rows:
-        """Return for each identifier the message that has the same number in the other identifier format. Shape (n,).
+        """Search the number of each identifier in the other identifier format, and return the message indices. Shape (n,).
 
         The number of an 11-bit identifier is searched among the 29-bit identifiers of the DBC, and vice versa.
-        The result is the message index, or `UNKNOWN` if the DBC has no such message.
+        The message index is `UNKNOWN` if the DBC has no such message.
         """
         numbers = can_ids & np.uint32(_ALL_BITS)
         short = self._standard[np.where(numbers < _STANDARD, numbers, 0)]

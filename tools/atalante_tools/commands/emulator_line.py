@@ -18,10 +18,12 @@ from atalante_hal.wire.e2e import COUNTER_BYTE, check_counter
 from atalante_hal.wire.frame import Frames, new_frames
 from atalante_tools.session.takeover import PendantReader, Takeover
 
-#: If no frame of another pendant arrives for this time [cycles], the emulated pendant resumes sending.
-#: A pendant in another process must resume before the emulated pendant, so this time is longer than `takeover.QUIET_CYCLES`.
+#: The silent emulated pendant resumes sending if no frame of another pendant arrives for this time [cycles].
+#: A silent pendant in another process resumes after `takeover.QUIET_CYCLES`. `PENDANT_QUIET` is longer, so that the pendant in
+#: the other process resumes first.
 PENDANT_QUIET: Final = 12
-#: Another robot is on the bus if one emulated message is received this number of times in a row with increasing counters.
+#: Only the emulator should send the messages of the emulated nodes. Another robot is on the bus if this number of frames
+#: of such a message is received in a row with increasing counters.
 ROBOT_FRAMES: Final = 3
 
 

@@ -29,7 +29,9 @@ class NodeReport:
 
     node: str
     kind: str
-    age_ms: int | None  # time since the last frame of the node's most frequent messages. None if no frame was received.
+    #: Age of the newest frame among the messages of the node with the shortest cycle time. For the HAL, only the SYNC messages
+    #: count. None if no frame was received.
+    age_ms: int | None
     late: bool  # whether the age exceeds the timeout in the DBC
     state: str | None
     dbc_ok: bool | None

@@ -64,7 +64,9 @@ def command(
              atalante conform LEFT_SK -i socketcan -c can0 --torque 1
     """
     if target.embedded and typed("patience"):
-        raise click.UsageError("--patience requires a CAN bus, because no person acts on the emulated node: remove it")
+        raise click.UsageError(
+            "--patience requires a CAN bus, because an emulated node needs no manual action: remove --patience"
+        )
     from datetime import datetime
 
     from atalante_tools.conform.examination import make_safe, requirements_of

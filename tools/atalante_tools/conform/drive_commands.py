@@ -146,9 +146,10 @@ def latches(tester: NodeTester) -> Outcome:
 
 
 def latches_late_commands(tester: NodeTester) -> Outcome:
-    """Test DRIVE-24: commands whose delay grows step by step lead to QUICK STOP ACTIVE.
+    """Test DRIVE-24: several short delays of the commands add up, and then lead to QUICK STOP ACTIVE.
 
-    Each step is a pause of `TOLERATED` cycles. A single pause has no effect.
+    The test pauses the commands three times for `TOLERATED` cycles. The drive tolerates a single pause. After each pause,
+    the alive counter continues with the next value, so the commands fall behind the SYNC by one more pause.
     """
     axis = Axis(tester)
     axis.enable()
@@ -191,7 +192,7 @@ def reports_the_latch(tester: NodeTester) -> Outcome:
 
 
 def latches_without_sync(tester: NodeTester) -> Outcome:
-    """Test DRIVE-16: a SYNC loss of 3 ms has no effect, and a SYNC loss of 20 ms latches the position hold."""
+    """Test DRIVE-16: a SYNC loss of 3 ms has no effect, and a SYNC loss of 20 ms leads to QUICK STOP ACTIVE."""
     axis = Axis(tester)
     axis.enable()
     for _ in range(3):
@@ -200,7 +201,8 @@ def latches_without_sync(tester: NodeTester) -> Outcome:
     for _ in range(20):
         tester.silent_cycle()
     long = axis.run(2 * SHOWN, _C.ENABLE_OPERATION)
-    # This test checks only the drive state. DRIVE-14 tests that the position hold is latched.
+    # This test checks only that the drive enters QUICK STOP ACTIVE. DRIVE-14 tests that the drive stays in this state until
+    # the HAL releases the drive.
     passed = all_in(short, _S.OPERATION_ENABLED) and any(state_of(frame) == _S.QUICK_STOP_ACTIVE for frame in long)
     return Outcome(passed, f"after 3 ms {names_of(short)}, after 20 ms {names_of(long)}")
 

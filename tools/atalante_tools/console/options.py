@@ -175,13 +175,13 @@ class GaitFiles:
         return "".join(f" --{name} {path}" for name, path in (("gait", self.gait), ("network", self.network)) if path)
 
     def require_patient(self, patient: object) -> None:
-        """Raise an error if a network is given without a patient.
+        """Raise an error if the option `--network` (gait network) is given, but no patient.
 
         Args:
             patient: Patient or subject that the user gave, or None.
 
         Raises:
-            click.UsageError: If the patient is missing.
+            click.UsageError: If `--network` is given and `patient` is None.
         """
         if self.network is not None and patient is None:
             raise click.UsageError("--network requires a patient: add --mass and --height")
@@ -203,7 +203,8 @@ def _gait_files(gait: Path | None, network: Path | None) -> GaitFiles:
     for name in ("step_length", "step_duration"):
         if gait is not None and typed(name):
             raise click.UsageError(
-                f"--{name.replace('_', '-')} has no effect with --gait, because the file contains the step: remove it"
+                f"--{name.replace('_', '-')} has no effect with --gait, because the gait file contains length and duration "
+                "of the step: use only one of the two options"
             )
     return GaitFiles(gait, network)
 
@@ -330,7 +331,7 @@ class Target:
 
     @property
     def embedded(self) -> bool:
-        """Return whether the command that drives the robot also emulates this robot, without a CAN bus."""
+        """Return whether the robot is emulated inside the command itself, without a CAN bus."""
         return self.interface == EMBEDDED
 
     def __str__(self) -> str:

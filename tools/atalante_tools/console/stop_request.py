@@ -76,9 +76,10 @@ def check_stop() -> None:
 
 @contextmanager
 def _handled(react: Callable[[StopRequest, int, bool], None]) -> Iterator[StopRequest]:
-    """Record every stop signal that arrives inside the `with` block. The record is the stop request of this process.
+    """Store every stop signal that arrives inside the `with` block in the `StopRequest` of this process.
 
-    Python handles signals in the main thread only. In any other thread the block gets a request that is never set.
+    An inner block uses the `StopRequest` of its outer block. Python handles signals in the main thread only. In any other
+    thread the block gets a request that is never set.
 
     Args:
         react: Function called after each signal, with the request, the signal number, and whether an earlier signal arrived.
@@ -171,7 +172,7 @@ def ended_by(end: Callable[[], None]) -> Iterator[StopRequest]:
 
 @contextmanager
 def deferred() -> Iterator[None]:
-    """Store each SIGINT and SIGTERM inside the block without an exception. Then the next `check_stop` raises `Stopped`.
+    """Store each SIGINT and SIGTERM inside the block, and raise no exception. Only the next `check_stop` raises `Stopped`.
 
     Use this block around compiled code, which may replace `Stopped` by another exception. This block has no effect if no
     other block of this module is active, for example in a worker process, which ignores Ctrl-C.

@@ -87,7 +87,7 @@ class Progress:
         self._width = 0
 
     def due(self) -> bool:
-        """Return whether the next progress line is due."""
+        """Return whether one period has passed since the last progress line."""
         return self._now() >= self._next
 
     def show(self, text: str) -> None:
@@ -101,7 +101,7 @@ class Progress:
             self._stream.write(text + "\n")
 
     def bar(self, done: int, total: int, unit: str) -> None:
-        """Print a bar with the finished share of a task and its estimated remaining time, if the next line is due.
+        """Print a progress bar and the estimated remaining time, if one period has passed since the last progress line.
 
         Args:
             done: Number of finished parts, at least 1.

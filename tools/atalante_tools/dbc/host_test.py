@@ -246,7 +246,11 @@ def _size(build: Build, message: Message) -> int:
 
 
 def _message(build: Build, message: Message, other: Message) -> str:
-    """Return the C test function of a message. The test also expects a CRC error for the Data ID of the message `other`."""
+    """Return the C test function of a message.
+
+    The function also checks each received frame with a wrong Data ID, the one of the message `other`. The result must be a
+    CRC error.
+    """
     body = ""
     if received := build.received(message):
         body += _receive(build, message, received, other)

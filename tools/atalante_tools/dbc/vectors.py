@@ -60,7 +60,10 @@ class Vectors:
         self._order = self._stream_order()
 
     def _stream_order(self) -> npt.NDArray[np.intp]:
-        """Return the index of each byte of an image in the concatenated arrays of `images`."""
+        """Return the index array that puts the bytes of an image into the order of the stream.
+
+        Element k is the source of byte k of the stream: an index into the concatenated `parts` of the method `images`.
+        """
         build, codec = self._build, self._codec
         rows = len(build.messages)
         parts = (FRAME_BYTES * rows, FRAME_BYTES * rows, 8 * codec.size, 8 * codec.size, rows)

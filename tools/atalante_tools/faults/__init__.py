@@ -42,10 +42,10 @@ def command() -> None:
     """
 
 
-@command.command("list", short_help="List all faults with bound, code and proof.")
+@command.command("list", short_help="List all faults with time limit, diagnostic code and tests.")
 @json_option
 def list_(as_json: bool) -> None:
-    """List all faults with the largest accepted reaction time, final state, diagnostic code and proof."""
+    """List all faults: time limit of the reaction, final state, diagnostic code, and proof (tests of the reaction)."""
     from atalante_tools.faults.matrix import load_matrix
 
     rows = load_matrix().values()

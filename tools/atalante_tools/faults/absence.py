@@ -1,4 +1,4 @@
-"""Clock of the HAL that lets the emulated robot move while no SYNC is sent: `delay of the HAL loop -> robot cycles`.
+"""Lock-step clock of the HAL that advances the emulated robot while the HAL loop is late or sends no SYNC.
 
 In lock-step, the emulated robot runs one cycle per SYNC. Without this clock, the robot would stand still while a fault of the
 host suppresses the SYNC or delays the loop, and a robot on the ground would not fall.
@@ -28,7 +28,9 @@ class Absence:
         """
         self._clock, self._emulator = clock, emulator
         self._begun = 0  # number of HAL cycles that have begun
-        self._skipped = 0.0  # sum of the delays of all earlier cycles that began more than one period late [s]
+        # Time that the HAL has lost so far [s]. The HAL does not catch up after a cycle that began more than one period late, so
+        # the delay of each such cycle is added.
+        self._skipped = 0.0
         self._seen = 0  # cycle number of the robot at the end of the last call of `wait`
         self._alone = 0  # number of robot cycles since the last SYNC
 

@@ -1,4 +1,4 @@
-"""All scenarios by fault ID. A row of the fault matrix FAULTS.md has one scenario if its proof is `scenario`."""
+"""All scenarios by fault ID. A fault has a scenario if `scenario` is in the column Proof of FAULTS.md."""
 
 from __future__ import annotations
 

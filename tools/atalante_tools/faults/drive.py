@@ -23,10 +23,11 @@ _S = SupervisorState
 _KNEE: Final = "LEFT_SK"
 _HIP: Final = "LEFT_SH"
 _COMMAND: Final = "COMMAND_LEFT_LEG"
-#: A knee that sinks in LOWER or FAULT is at rest after this time [cycles]. Then its drive can be enabled again.
+#: Time from the end of the fault to START [cycles], if a knee sinks in LOWER or FAULT. After this time the knee is at rest, so
+#: its drive can be enabled again.
 _LOWERED: Final = 4500
-#: Time from the end of the fault to START [cycles], if the HAL has switched off the faulty drive. This drive stays off until
-#: START, so its joint need not be at rest.
+#: Time from the end of the fault to START [cycles], if the HAL has switched off the faulty drive. The joint of this drive may
+#: still sink at START, because START first lets the drive hold the joint.
 _UNTIL_START: Final = 600
 #: Time from HOLD until all joints are at rest [cycles].
 _AT_REST: Final = 60
@@ -291,8 +292,8 @@ SCENARIOS: Final = (
             if joint != "TH"
         ),
     ),
-    # Only FH and SH have a case with a reversed motor. A reversed motor moves any other joint above the velocity limit of the
-    # joint before the HAL can react.
+    # Only FH and SH have a case with a reversed motor. With a reversed motor, TH, SK, SA and HA exceed their velocity limits
+    # before the HAL can react.
     Scenario(
         "F84",
         tuple(
@@ -342,9 +343,10 @@ SCENARIOS: Final = (
             )
         ),
     ),
-    # The drive reports the commanded torque. The torque of HA is less than the dry friction of HA, so the detection takes longer.
-    # There is no case with a reversed motor of SA. The HAL detects this fault within 30 cycles, too, but SA then already moves
-    # faster than the verdict of a case accepts.
+    # A faulty motor is visible only in the motion of its joint, because its drive still reports the commanded torque. HA moves
+    # little, because its commanded torque is less than its dry friction. So the detection takes longer for HA.
+    # A reversed motor of SA is not tested. SA exceeds the velocity that `limit_violations` accepts before the HAL detects the
+    # fault.
     Scenario(
         "F82",
         tuple(

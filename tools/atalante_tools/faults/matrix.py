@@ -1,4 +1,4 @@
-"""Loader of the fault matrix FAULTS.md: time limit, final state, diagnostic code and proof of each fault.
+"""Loader of the fault matrix FAULTS.md: time limit, final state, diagnostic code and tests of each fault.
 
 FAULTS.md -> rows -> verdicts of the scenarios -> report
 """
@@ -16,7 +16,7 @@ from atalante_hal.types import SupervisorState
 
 MATRIX_FILE: Final = Path(__file__).with_name("FAULTS.md")
 COLUMNS: Final = ("ID", "Fault", "Detected by", "Cycles", "Reaction", "State", "DTC", "Proof")
-#: The column Proof contains this text if the proof is the scenario with the ID of the fault.
+#: The column Proof contains this text if a scenario of the catalogue tests the fault. The scenario has the ID of the fault.
 SCENARIO: Final = "scenario"
 _ID = re.compile(r"F\d\d")
 _BOUND = re.compile(r"(\d+)(?: / (\d+))?")
@@ -37,8 +37,8 @@ class Row:
     behaviour: str  # reaction in words
     state: SupervisorState  # final state of the HAL
     dtc: str  # diagnostic code; empty means no code
-    #: Proofs of the row. A proof is SCENARIO or the name of a test in tests/, such as `faults/test_frames.py::test_f08_*`.
-    #: An * at the end of the name stands for any text.
+    #: Proofs that the HAL reacts as the row states. Each proof is SCENARIO or the name of a test in tests/, such as
+    #: `faults/test_frames.py::test_f08_*`. An * at the end of the name stands for any text.
     proof: tuple[str, ...]
 
     @property

@@ -85,7 +85,8 @@ class Schedule:
     """Times of a run, in HAL cycles."""
 
     begins: int  # first faulty cycle
-    starts: tuple[int, ...]  # cycles in which the operator presses START, except the two presses after the observation
+    #: cycles in which the operator presses START; the two presses that `_observe` adds after the fault are not included
+    starts: tuple[int, ...]
     stop: int | None = None  # cycle in which the operator presses STOP
 
 
@@ -148,7 +149,7 @@ class MomentTask:
     engine: str = PYBULLET
 
     def __call__(self) -> MomentVerdict:
-        """Run the cases, and check what must be true for every fault at every moment."""
+        """Run the cases together in one run. Check the rules that apply to any fault at any moment, see the module docstring."""
         chosen = [SCENARIOS[id_].cases[index] for id_, index in self.cases]
         names = tuple(f"{id_} {case.name}" for (id_, _), case in zip(self.cases, chosen, strict=True))
         stimuli = tuple(shifted(s, d) for case, d in zip(chosen, self.delays, strict=True) for s in case.stimuli)
@@ -156,7 +157,7 @@ class MomentTask:
         plan = schedule(self.moment, self.engine)
         try:
             run = _observe(case, plan)
-        except Exception as error:  # noqa: BLE001 - any exception of the stack is a finding
+        except Exception as error:  # noqa: BLE001 - any exception of the driver software is a failed check
             return MomentVerdict(self.moment, names, "-", False, None, (exception_sentence(error),))
         extremes, before = _extremes(run, plan.starts), run.last_before_start
         kinds = [stimulus.kind for stimulus in stimuli]
@@ -166,7 +167,8 @@ class MomentTask:
         starts = [cycle for cycle in presses if cycle >= min(begins, default=math.inf)]
         unlimited = [range(cycle, cycle + FOUND) for cycle in (*begins, *starts)]
         failures = [*limit_violations(run, unlimited, _strength(stimuli)), *_premature(run, plan.starts[0])]
-        # At the other moments, a START of the schedule may cause a less severe state after the fault begins.
+        # At the other moments, the operator presses START just before or after the fault begins. This START may cause a less
+        # severe state, so improvements of the state are not checked.
         if self.moment in (Moment.WALKING, Moment.HOLD):
             failures += automatic_improvements(run, before)
         most = max((SAG_OF.get(kind, SAG_MAX) for kind in kinds), default=SAG_MAX)
@@ -212,7 +214,7 @@ def random_pairs(count: int, seed: int, engine: str) -> list[MomentTask]:
 
 
 def _observe(case: Case, plan: Schedule) -> Observation:
-    """Run a case with a schedule, then press START twice. Return the observation."""
+    """Run a case with a schedule, and press START twice after the fault. Return the record of the run."""
     ends = _LONGEST if case.ends is None else min(case.ends, _LONGEST)
     restart = max(plan.begins + ends, *plan.starts) + _REST
     case_run = CaseRun(case, plan.begins, starts=False)
@@ -251,7 +253,8 @@ def _extremes(run: Observation, starts: Sequence[int]) -> Extremes:
 
     Args:
         run: observation of the run.
-        starts: cycles in which the operator pressed START, except the two presses after the observation of the fault.
+        starts: cycles in which the operator pressed START. The two presses that `_observe` adds after the fault are not
+            included.
     """
     count = len(JOINTS)
     sag, lost, held = np.zeros(count), np.zeros(count), None

@@ -60,7 +60,10 @@ class Observation:
 
     @property
     def last_before_start(self) -> int:
-        """Return the cycle before the operator's START after the fault, or the last cycle if there is no such START."""
+        """Return the last cycle before the operator presses START after the fault.
+
+        If START is not pressed after the fault, return the last cycle of the run.
+        """
         return (self.pressed or self.last + 1) - 1
 
     @property

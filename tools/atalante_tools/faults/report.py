@@ -170,7 +170,11 @@ class Summary:
 
 
 def _moment_row(runs: Sequence[MomentVerdict]) -> list[str]:
-    """Return the cells of a row: numbers of runs, failed runs and restarted runs, then each largest value with its joint."""
+    """Return the cells of a table row for a group of runs.
+
+    The row starts with the numbers of all runs, failed runs and restarted runs. The four measured values of `Extremes` follow:
+    each cell contains the largest value of all runs, and its joint.
+    """
     extremes = [run.extremes for run in runs if run.extremes is not None]
     counts = [len(runs), sum(bool(run.failures) for run in runs), sum(run.restarted for run in runs)]
     worst = [

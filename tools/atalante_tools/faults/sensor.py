@@ -279,8 +279,8 @@ SCENARIOS: Final = (
                 recovers=False,
                 checks=(start_is_rejected,),
             ),
-            # The controller moves the joint to compensate the drift, until the joint reaches its mechanical limit.
-            # The reported position leaves its range only at the mechanical limit, so the detection takes up to 400 cycles.
+            # The controller moves the joint against the drift, so the reported position stays in its range. When the joint has
+            # reached its mechanical limit, the reported position drifts out of its range. This takes up to 400 cycles.
             # The mechanical limit stops the joint against the torque of its motor. This looks like a motor without torque (F82).
             Case(
                 "RIGHT_SA at 2 rad/s",

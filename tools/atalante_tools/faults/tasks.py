@@ -128,7 +128,7 @@ class PairTask:
         first, second = (f"{id_} {name}" for id_, name in (self.first, self.second))
         try:
             run = observe(Case(f"{first} and {second}", stimuli, engine=self.engine), bound, recovery=False)
-        except Exception as error:  # noqa: BLE001 - any exception of the stack is a finding
+        except Exception as error:  # noqa: BLE001 - any exception of the driver software is a failed check
             return PairVerdict(first, second, "-", (exception_sentence(error),))
         failures = [*limit_violations(run), *automatic_improvements(run, run.last)]
         state, worst = run.state(run.last), max(one.state for one in expected)
@@ -154,7 +154,7 @@ def run_case(id_: str, case: Case) -> Verdict:
     expected = Expectation.of(case, row)
     try:
         run = observe(case, expected.reacted, recovery=not expected.walk_continues)
-    except Exception as error:  # noqa: BLE001 - any exception of the stack is a finding
+    except Exception as error:  # noqa: BLE001 - any exception of the driver software is a failed check
         return Verdict(id_, case.name, "-", None, expected.reacted, "", (exception_sentence(error),))
     return evaluate(row, case, run)
 

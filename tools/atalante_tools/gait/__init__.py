@@ -121,8 +121,8 @@ command.add_command(solve)
     "--size",
     type=int,
     metavar="N",
-    help="Number of gaits: the corners of the grid, and points that fill the grid evenly. A larger number keeps "
-    "the gaits of a smaller number, and adds further gaits.  [default: 1000]",
+    help="Number of gaits: the corners of the grid, and points that fill the grid evenly. If N is "
+    "increased, the existing gaits are kept and further gaits are added.  [default: 1000]",
 )
 @json_option
 def library(out: Path, jobs: int, machine_code: bool, cluster: str | None, as_json: bool, **grid_options: Any) -> None:

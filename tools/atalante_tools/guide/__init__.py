@@ -52,17 +52,17 @@ class CheckOptions:
     patients: bool  # whether to check the network gaits of several patients, too
     conditions: tuple[str, ...]  # names of conditions; empty means all
     push: tuple[float, float] | None  # largest push at hip and knee [Nm]; None means the certified torques
-    steps: int | None  # number of steps on the plant per guide; None means the number of `QUICK` or `COMPLETE`
-    robot_steps: int | None  # number of steps on the emulated robot per guide; None means as in `QUICK` or `COMPLETE`
+    steps: int | None  # steps on the ideal plant per guide; None means the preset number of the search effort
+    robot_steps: int | None  # steps on the emulated robot per guide; None means the preset number of the search effort
     seed: int  # seed of the search and of the noise
-    quick: bool  # whether to search with the effort `QUICK` instead of `COMPLETE`
+    quick: bool  # whether the search effort is `QUICK` instead of `COMPLETE`
     plot: Path | None  # picture file; None means no picture
     table: Path | None  # Markdown file for the table; None means no file
     results: Path | None  # file of the results; an interrupted check is resumed from this file; None means no file
     law: Law  # control law of the assisted joints
 
     def effort(self) -> Effort:
-        """Return the numbers of steps for each guide, and whether to search for the smallest push that moves a joint out."""
+        """Return the search effort for each guide: `QUICK` or `COMPLETE`, with the numbers of steps that the user gave."""
         from atalante_tools.guide.promise_check import COMPLETE, QUICK
 
         effort = QUICK if self.quick else COMPLETE
@@ -104,7 +104,8 @@ _CHECK_OPTIONS = [
     click.option("--quick", is_flag=True,
                  help="Run a short search: only on the ideal plant, and only pushes up to the certified torques."),
     click.option("--plot", type=OutputFile(".png", ".svg", ".pdf"), metavar="FILE",
-                 help="Draw the last guide: its bounds, the safe errors (safe backward image) and the worst step."),
+                 help="Draw the last guide: its bounds, the worst step, and the safe backward image (tracking errors from which "
+                      "the backup policy keeps the joints inside the guide)."),
     click.option("--table", type=OutputFile(".md"), metavar="FILE", help="Write the results as a Markdown table."),
     click.option("--results", type=OutputFile(".jsonl"), metavar="FILE",
                  help="Append each result to this file. Guides that the file already contains are not checked again, so the same "
@@ -312,6 +313,6 @@ def random_command(count: int, first: int, steps: int, seed: int, as_json: bool)
     if left:
         worst = max(left, key=lambda v: v.worst_ratio or 0.0)
         raise Failed(
-            f"no joint may leave a certified guide, but a joint left {len(left)} of them; worst: {worst.shape} at "
-            f"Xi {worst.xi:.3f} with |e| / q_bound {worst.worst_ratio:.3f}"
+            f"no joint may leave a certified guide, but in {len(left)} certified guides a joint moved out; worst: "
+            f"{worst.shape} at Xi {worst.xi:.3f} with |e| / q_bound {worst.worst_ratio:.3f}"
         )

@@ -50,10 +50,14 @@ RATE = 0.5
 
 
 class Push(NamedTuple):
-    """Push during one step. Each joint always gets its largest push, with the sign of `signs + feedback @ features`."""
+    """Push at hip and knee during one step: always the largest torque, with the sign of `signs + feedback @ features`.
 
-    signs: Vector  # constant part of the sum for hip and knee in each cycle, shape (cycles + 1, 2)
-    feedback: Vector  # weights of the features for hip and knee, shape (2, FEATURES)
+    The features are e / q_bound and e' / `RATE` of hip and knee in the current cycle. e is the tracking error.
+    """
+
+    #: offset of hip and knee in each cycle, which does not depend on the motion of the leg, shape (cycles + 1, 2)
+    signs: Vector
+    feedback: Vector  # weight of each feature for hip (row 0) and knee (row 1), shape (2, FEATURES)
 
 
 class Start(NamedTuple):
@@ -61,8 +65,10 @@ class Start(NamedTuple):
 
     deviation: Pair  # q - q_nom of SH and SK [rad]
     rate: Pair  # q' - q_nom' of SH and SK [rad/s]
-    carried: Pair  # torque before the stance change minus the torque for the nominal acceleration q_nom'' [Nm]
-    ahead: Pair  # true minus measured speed of SH and SK [rad/s], due to the lag of the velocity filter
+    #: torque left over from the previous step [Nm]: last torque before the stance change, minus the torque that the nominal
+    #: acceleration q_nom'' needs after the change
+    carried: Pair
+    ahead: Pair  # true minus measured speed of SH and SK [rad/s]; the measured speed lags, because it is filtered
 
 
 class Goal(NamedTuple):
@@ -175,17 +181,18 @@ class IdealLeg:
         return Walked(float(ratio), int(cycle), int(joint), log)
 
     def image(self, start: Start) -> Vector:
-        """Return the largest e and the largest -e of each joint in the safe backward image. e is the tracking error.
+        """Return the largest safe tracking errors of each joint, in positive and in negative direction.
 
-        The safe backward image is the set of states with h >= 0, from which the backup policy can keep both joints inside the
-        guide. The angle of the other joint and the speeds of both joints are equal to the desired motion.
+        An error is safe (h >= 0) if the backup policy can keep both joints inside the guide after this error. Only the angle of
+        one joint deviates from the desired motion. The angle of the second joint and both speeds do not deviate. The set of safe
+        states is called the safe backward image.
 
         Args:
             start: state at the stance change.
 
         Returns:
-            Largest e and largest -e [rad], shape (2, cycles + 1, 2). The axes are joint, cycle, and sign of e (+, -). The value
-            is NaN in the cycles between two samples.
+            Sizes of the largest errors [rad], shape (2, cycles + 1, 2). The axes are joint, cycle, and sign of the error (+, -).
+            Only every tenth cycle has values. The other cycles are NaN.
         """
         goal, controller = self.goal(start), self._controller
         self._change_step(goal.q[0], goal.qd[0], np.zeros(2))
@@ -301,13 +308,15 @@ def walk_step(
 
 
 def safe_errors(goal: Goal, row: Vector, image: Vector, measured: Measured, guide: GuideTables, parts: Parts) -> None:
-    """Find the largest safe tracking errors (h >= 0) at every tenth cycle by bisection; see `IdealLeg.image`.
+    """Find the largest safe tracking errors of each joint at every tenth cycle, by bisection.
+
+    An error is safe if the controller returns h >= 0. Then the backup policy can keep both joints inside the guide.
 
     Args:
         goal: desired motion and guide.
         row: angles [rad], then speeds [rad/s] of all joints, shape (24,); the values of hip and knee are ignored.
-        image: largest safe e and largest safe -e [rad], written at every tenth cycle, shape (2, cycles + 1, 2). The axes are
-            joint, cycle, and sign of e (+, -).
+        image: sizes of the largest safe errors [rad], written at every tenth cycle, shape (2, cycles + 1, 2). The axes are
+            joint, cycle, and sign of the error (+, -).
         measured: inputs of the controller, overwritten.
         guide: tables of the guide.
         parts: parts of the controller.

@@ -169,7 +169,7 @@ def inverse_dynamics(constants: Plant, q: Vector, qd: Vector, qdd: Vector) -> Ve
 def dynamics(
     constants: Plant, hip: float, knee: float, hip_rate: float, knee_rate: float
 ) -> tuple[float, float, float, float, float]:
-    """Return M11, M12, M22 [kg m2], and for hip and knee the sum of velocity, gravity and friction torque [Nm].
+    """Return the mass matrix of hip and knee, and for each joint the torque that does not depend on the acceleration.
 
     Args:
         constants: constants of the plant.
@@ -177,6 +177,10 @@ def dynamics(
         knee: angle of SK [rad].
         hip_rate: speed of SH [rad/s].
         knee_rate: speed of SK [rad/s].
+
+    Returns:
+        Entries M11, M12 and M22 of the mass matrix [kg m2], then one torque of the hip and one of the knee [Nm]. Each torque is
+        the sum of Coriolis, centrifugal, gravity and friction torques.
     """
     a, w = constants.mass, constants.weight
     c, s = math.cos(knee), math.sin(knee)

@@ -217,7 +217,10 @@ def check(setup: Setup, controller: AirwalkController, xi: float, task: Task) ->
 
 
 def _on_robot(robot: PushedRobot, box: Pair, found: Sequence[Tried], task: Task) -> RobotWalk:
-    """Let the robot walk in all conditions under the worst pushes from the plant and the pushes of `_robot_pushes`."""
+    """Push the emulated robot with the worst pushes of the search, and with the pushes of `_robot_pushes`.
+
+    The robot walks once in each condition. `found` contains the worst pushes on the ideal plant, the worst first.
+    """
     conditions, seed = task.conditions, task.seed
     cycles = len(found[0].push.signs)
     pushes = [one.push for one in found[:6]] + _robot_pushes(cycles, np.random.default_rng(seed))

@@ -1,4 +1,4 @@
-"""Random guide shapes: smooth, notched and piecewise constant. `seed, number -> GuideShape, assistance factor`."""
+"""Random guide shapes: smooth, notched and piecewise constant. `seed, index -> GuideShape, assistance factor`."""
 
 from __future__ import annotations
 
@@ -12,8 +12,8 @@ from atalante_control.guide.shapes import GuideShape
 from atalante_hal.types import Vector
 
 KINDS: Final = ("smooth", "notched", "piecewise")
-#: Range of the random widths above and below the desired trajectory, as fractions of `half_width(xi)`.
-#: In a notch, the width is at least `_NARROW` times the width outside the notch.
+#: Smallest and largest random width above or below the desired trajectory, as fractions of `half_width(xi)`.
+#: In a notch, `_NARROW` has another meaning: smallest width in the notch, divided by the width beside the notch.
 _NARROW, _WIDE = 0.15, 1.0
 #: Largest assistance factor of a random guide.
 _LARGEST_FACTOR: Final = 0.95
@@ -27,11 +27,12 @@ class RandomGuide(NamedTuple):
 
 
 def random_guide(seed: int, number: int) -> RandomGuide:
-    """Return a random guide shape and an assistance factor. Consecutive numbers give the three kinds of shapes in turn.
+    """Return the random guide shape with a given index, and an assistance factor. Consecutive shapes differ in kind.
 
     Args:
-        seed: seed of all guides.
-        number: number of the guide, 0 or larger. It selects the kind and the random numbers.
+        seed: seed that all guides share.
+        number: index of the guide, 0 or larger. The index selects the kind of the shape, and the random numbers together with
+            the seed.
     """
     generator, kind = np.random.default_rng([seed, number]), KINDS[number % len(KINDS)]
     make: Callable[[np.random.Generator], Callable[[Vector], Vector]] = {

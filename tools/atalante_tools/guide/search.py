@@ -95,13 +95,13 @@ class Adversary:
         return self.tried[0]
 
     def leaving_factor(self, box: Pair, largest: float, budget: int) -> float | None:
-        """Find the smallest multiple of `box` at which a push moves a joint out of the guide. The accuracy is 5 %.
+        """Find the smallest factor by which the largest push must grow, so that a push moves a joint out of the guide.
 
-        Return None if no such push was found up to the multiple `largest`.
+        The result is accurate to 5 %. Return None if the search finds no such push up to the factor `largest`.
 
         Args:
-            box: push at hip and knee [Nm].
-            largest: largest factor tried.
+            box: largest push at hip and knee for the factor 1 [Nm].
+            largest: largest factor to try.
             budget: number of steps per factor.
         """
         inside, outside = 1.0, None
@@ -122,9 +122,9 @@ class Adversary:
         return outside
 
     def _leaves(self, box: Pair, factor: float, budget: int) -> bool:
-        """Search for a push of at most `factor` times `box` that moves a joint out of the guide. Return whether one was found.
+        """Return whether a search finds a push that moves a joint out of the guide.
 
-        The worst pushes so far are tried first.
+        The largest push at hip and knee is `factor * box`. The search begins with the worst pushes so far.
         """
         larger, known, end = (factor * box[0], factor * box[1]), self.tried, self.steps + budget
         self.tried = []
@@ -280,7 +280,7 @@ class Adversary:
         elif feedback.any() and change < 0.7:
             feedback += 0.3 * generator.standard_normal(feedback.shape)
         else:
-            if feedback.any():  # replace the feedback by the signs of the push that the feedback produced
+            if feedback.any():  # repeat the signs of the push that the parent step recorded, without feedback
                 signs, feedback = np.where(parent.walked.log[:, 4:6] >= 0.0, 1.0, -1.0), _no_feedback()
             begin, length = int(generator.integers(cycles)), int(1 + generator.exponential(30.0))
             joints = [[0], [1], [0, 1]][int(generator.integers(3))]

@@ -275,7 +275,8 @@ def _controllers(
     config = options.law.config()
     exoskeleton, gait, source = gait_in_the_air(options.files, options.subject, robot)
     controllers = {name: AirwalkController(robot, gait, shape, config, exoskeleton) for name, shape in shapes.items()}
-    if source:  # printed only now, because the controllers have checked the gait; empty for the default gait
+    # `source` is printed only after the controllers have accepted the gait. For the default gait, `source` is empty.
+    if source:
         print_message(f"{source}; the exoskeleton is empty")
     return exoskeleton, gait, controllers
 

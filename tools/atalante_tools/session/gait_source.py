@@ -105,7 +105,9 @@ def gaits_of_file(path: Path, patient: Patient | None, robot: Robot) -> tuple[Pa
     if not isinstance(loaded, Gait):
         return patient, loaded
     if "step_length" not in gait.parameters:
-        raise GaitError(f"{path}: the parameters must contain step_length, because start step and stop step are solved")
+        raise GaitError(
+            f"{path}: the parameters must contain step_length, which is needed to compute the start step and the stop step"
+        )
     try:
         subject = Subject(patient, gait.parameters["step_length"], gait.duration)
     except ValueError as error:

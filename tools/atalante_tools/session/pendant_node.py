@@ -138,7 +138,8 @@ class PendantNode:
             self._copy_signals()
         if self._takeover.silent and not was_silent:
             self._release_start()
-        if self._reader.gaps > gaps or synced > 1:  # only the last of several SYNCs is answered
+        # If several SYNCs arrive together, only the last one is answered. Like a lost SYNC, this interrupts the row of answers.
+        if self._reader.gaps > gaps or synced > 1:
             self.answered_in_row = 0
         if not synced:
             return False

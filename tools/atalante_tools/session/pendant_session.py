@@ -63,13 +63,15 @@ class Session:
             losses: Function that returns how often the link to the bus was lost so far.
         """
         self.node, self.stop = node, stop
-        #: Whether to press START as soon as the HAL is in READY or HOLD.
+        #: Whether to press START as soon as the HAL is in READY or HOLD, without a typed command.
         self.start_wanted = False
-        self._start_typed = False  # the operator typed start; START is pressed when the HAL accepts requests
+        # Whether the operator typed start. START is then pressed in any state of the HAL, as soon as the HAL trusts this pendant.
+        self._start_typed = False
         self._target, self._keyboard, self._now = target, keyboard, now
         self._begun = self._synced_at = now()
         self._hal_present, self._hal_found = True, False
-        self._absent = 0.0  # time without a HAL since the first SYNC [s]
+        # Sum of all times without a HAL since the first SYNC [s]. A time is added when the HAL sends SYNC again.
+        self._absent = 0.0
         self._hal: object = None
         self._pressed_at: int | None = None
         self._losses, self._lost_before = losses, 0

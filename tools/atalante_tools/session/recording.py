@@ -136,7 +136,7 @@ def require_complete(recording: Recording | None) -> None:
         return
     files = ", ".join(recording.files)
     if not files:
-        raise Failed("the recording must have a file, got none")
+        raise Failed("the recording must be in a file, but no file was written")
     if recording.missing_cycles:
         raise Failed(f"the recording is incomplete: {recording.missing_cycles} cycles are missing in {files}")
     if len(recording.files) > 1:

@@ -153,7 +153,8 @@ def open_hal(
         Failed: If the physics engine of the embedded robot is not installed.
         Stopped: If a signal arrived before or during the start.
     """
-    check_stop()  # imports before this call may have discarded the exception that a stop signal raised
+    # A stop signal during an import raises an exception, which the imported code may discard. So check the signal again.
+    check_stop()
     network = network or atalante_dbc.load()
     robot = robot or load_robot()
     with ExitStack() as stack:

@@ -21,19 +21,19 @@ from atalante_hal.wire.e2e import COUNTER_BYTE, MAX_DELTA, Check
 from atalante_hal.wire.frame import Frames
 from atalante_hal.wire.process_image import ReceiveImage
 
-#: A new pendant sends for at least this time [cycles], in which the older pendant stops sending. If the older pendant continues,
-#: the new pendant may stop after this time.
+#: A new pendant sends for at least this time [cycles], so that the older pendant has time to fall silent. If the older pendant
+#: still sends after this time, the new pendant may fall silent instead.
 TAKEOVER_CYCLES: Final = 50
 #: After a pendant has resumed sending, it must send for at least this time before it may stop again [cycles].
 RETRY_CYCLES: Final = 8
 #: Upper limit of the random time that is added to `TAKEOVER_CYCLES` or `RETRY_CYCLES` [cycles].
 DRAW_CYCLES: Final = 50
-#: A pendant stops sending after this number of consecutive frames of another pendant.
+#: A sending pendant falls silent and listens after this number of consecutive frames of another pendant.
 #: The HAL tolerates two senders for three cycles.
 PRESENT_FRAMES: Final = 2
-#: A pendant that has stopped sending gives up after this number of consecutive frames of another pendant.
+#: A silent pendant gives up, and never sends again, after this number of further consecutive frames of another pendant.
 LOST_FRAMES: Final = 3
-#: A silent pendant starts to send again if no frame of another pendant arrives for this time [cycles].
+#: A silent pendant resumes sending if no frame of another pendant arrives for this time [cycles].
 #: The HAL reports a timeout after 5 cycles without a frame.
 QUIET_CYCLES: Final = 3
 #: E2E check results of a frame with a valid CRC, whether or not its counter is as expected.
@@ -60,7 +60,7 @@ class Takeover:
         self._quiet, self._random = quiet, Random(seed)
         self._sending = self.established = established
         self.silent = self.lost = False
-        self._tag = -1  # alive counter of an answer to the last SYNC; -1 before the first SYNC
+        self._tag = -1  # counter value that every answer to the last SYNC contains; -1 before the first SYNC
         self._cycle = 0  # number of SYNCs
         self._free_from = 0  # first cycle in which this pendant may stop sending
         self._quiet_from = 0  # cycle from which the time without frames of other pendants is counted

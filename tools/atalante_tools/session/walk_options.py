@@ -121,7 +121,7 @@ def sections_of(options: WalkOptions, robot: Robot) -> list[Section]:
 
 @cache
 def solved_gaits(subject: Subject, network: Path | None = None) -> WalkGaits:
-    """Return the gaits of a subject with the default limits of the joints. The gaits are solved once per process.
+    """Return the gaits of a subject with the default limits of the joints. The gaits are computed once per process.
 
     Args:
         subject: Patient and step.
@@ -134,17 +134,20 @@ def solved_gaits(subject: Subject, network: Path | None = None) -> WalkGaits:
     from atalante_tools.console.stop_request import check_stop
 
     gaits = gaits_of_subject(subject, load_robot(), network)
-    check_stop()  # the optimiser discards the exception of a stop signal
+    check_stop()  # the optimiser discards the exception that a stop signal raises, so check the signal again
     return gaits
 
 
 def gaits_of_subject(subject: Subject, robot: Robot, network: Path | None = None) -> WalkGaits:
-    """Return the gaits of a subject: from the default walk file, or from the network and the gait solver.
+    """Return start step, periodic step and stop step of a subject.
+
+    The gaits of the default subject are read from the default walk file, unless `network` is given. For any other subject, the
+    gait network (a neural network) computes the periodic step. The gait optimisation then computes start step and stop step.
 
     Args:
         subject: Patient and step.
         robot: Limits of the joints.
-        network: Network file; None means the network of the package, or the default walk file for the default subject.
+        network: File of the gait network; None means the network of the package.
 
     Raises:
         GaitError: If there is no start step or no stop step for the gait, or if a step fails a check on the ground.

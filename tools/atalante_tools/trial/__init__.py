@@ -195,7 +195,7 @@ def faults(ids: tuple[str, ...], running: Running, as_json: bool) -> None:
     trials = fault_trials(chosen, running.quick, running.seed, running.engine)
     if without := [id_ for id_ in chosen if id_ not in {trial.id for trial in trials}]:
         raise click.UsageError(
-            f"a fault must have a case during a walk, got {without[0]}, whose cases begin at power-on"
+            f"a fault must be one that can begin during a walk, got {without[0]}, which is injected only at power-on"
         )
     _conduct("faults", trials, fault_findings, running, as_json)
 

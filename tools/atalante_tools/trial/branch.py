@@ -18,13 +18,13 @@ from typing import Any
 
 
 class Branch:
-    """Connection from the process of the run to a branch of this run."""
+    """Pipe from the run to a branch: a forked process that waits at one moment of the run and can continue from there."""
 
     def __init__(self, channel: Connection) -> None:
         self._channel = channel
 
     def ask(self, request: Any) -> Any:
-        """Continue the run from the moment of the branch, in a new process. Return the answer of the new process.
+        """Continue the run in a new process, from the moment at which the branch waits. Return the answer of the new process.
 
         Args:
             request: object that describes how the run continues.
@@ -42,7 +42,7 @@ class Branch:
 
 
 class Continuation:
-    """Continued run, inside its own process. This process must end with `finish` or `abandon`.
+    """Copy of a run that continues from a branch, in a new process. The new process must end with `finish` or `abandon`.
 
     Attributes:
         request: how the run continues.
@@ -75,7 +75,7 @@ class _NoAnswer:
 
 
 def branch() -> Branch | Continuation:
-    """Branch off at this point of the run. In the calling process, return the branch and let the run continue.
+    """Fork a process that waits at this moment of the run. In the calling process, return a `Branch`; the run goes on.
 
     For each request to the branch, this function returns once more: in a new process, with a `Continuation`.
     """

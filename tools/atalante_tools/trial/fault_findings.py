@@ -15,10 +15,10 @@ from atalante_tools.trial.findings import Finding, Result
 #: The cases are lost, late and doubled frames; errors on the bus; a failed IMU, foot or force cell; an exception of the
 #: controller. The robot must also not fall after a few late cycles, STOP, the release of the dead-man switch, or the loss of the
 #: pendant.
-#: A loop that stays much slower than 1 kHz is left out. Joints then move too far in a cycle. The HAL takes this for a wrong
-#: velocity, and the drives hold.
-#: A drive without data for ten cycles is left out, because its joint must not be moved.
-#: The button HOLD is left out: the drives then hold at once, so the robot may fall.
+#: The table does not contain three kinds of cases, because the drives then hold at once and the robot may fall:
+#: - A loop stays much slower than 1 kHz. The joints then move far in one cycle, and the HAL reports a wrong velocity.
+#: - A drive sends no data for ten cycles. The HAL does not move a joint without data.
+#: - The operator presses HOLD.
 NO_FALL: Final = {
     **dict.fromkeys(("F01", "F02", "F03", "F05", "F20", "F24", "F30", "F31", "F32", "F33"), ""),
     "F04": "LEFT|RIGHT",
@@ -93,7 +93,10 @@ def _moments(falls: Sequence[dict[str, Any]]) -> str:
 
 
 def _longest(result: Result) -> str:
-    """Return text: the longest fault duration without a fall at the worst moment, and the name of this moment."""
+    """Return text: the fault duration that the robot survives at every moment, and the name of the worst moment.
+
+    Each moment has a longest duration without a fall. The text states the shortest of these durations, and its moment.
+    """
     limited = [
         (cycles, run["moment"])
         for cycles, run in zip(result["longest"], result["runs"], strict=True)

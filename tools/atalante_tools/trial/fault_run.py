@@ -1,7 +1,8 @@
-"""Run the trials of the experiment `faults`: `trial -> a walk for each start of the fault -> outcomes, diagnostics, durations`.
+"""Run the trials of the experiment `faults`: `trial -> walks with the fault -> outcomes, diagnostics, durations`.
 
-A first walk without a fault gives the cycle of each moment. All walks with the same seed are equal until a fault begins. So a
-second walk makes a branch shortly before each moment, and every walk with a fault continues from one of these branches.
+In each walk of a trial, the fault begins at another moment. A first walk without a fault gives the cycle of each moment. All
+walks with the same seed are equal until a fault begins. So a second walk forks a waiting copy of its process (a branch)
+shortly before each moment. Every walk with a fault continues from one of these branches.
 """
 
 from __future__ import annotations
@@ -45,8 +46,8 @@ from atalante_tools.trial.plan import STEP
 if TYPE_CHECKING:
     from atalante_hal.safety.events import Event
 
-#: Number of cycles from a branch of the walk to the moment of the fault. The first faulty frames are computed one cycle
-#: before this moment.
+#: A copy of the walk (a branch) is forked this number of cycles before the fault begins. The first faulty frames are computed
+#: one cycle before the fault begins.
 _LEAD: Final = 5
 #: Number of cycles for which the HAL is observed after a fall.
 _FALLEN: Final = 300
@@ -55,14 +56,14 @@ _LONGEST: Final = 20_000
 #: The robot is at rest if its pelvis and its joints have been slower than `_STILL` [m/s, rad/s] for `_RESTED` cycles, and
 #: each foot carries a load of at least `_LOADED` [N].
 _STILL, _RESTED, _LOADED = 0.01, 500, 50.0
-#: After the end of a fault, the landings of the feet are counted. The outcome is "walked" if the robot still walks `_WALKED`
-#: cycles after the landing with the number `_LANDINGS`.
+#: A walk has the outcome "walked" if a foot lands `_LANDINGS` times after the end of the fault, and the robot then still walks
+#: for `_WALKED` cycles.
 _WALKED: Final = 400
 _LANDINGS: Final = 2
 #: Phases of the walk that begin with the landing of a foot.
 _LANDED: Final = frozenset({Phase.STEP, Phase.STOP, Phase.BACK})
 _PELVIS: Final = IMUS.index("pelvis")
-#: Largest error of the bisection for the longest fault duration without a fall [cycles].
+#: A bisection finds the longest fault duration without a fall. The result is too short by at most this number of cycles.
 RESOLUTION: Final = 10
 
 
@@ -83,7 +84,7 @@ class FaultRun:
 
 
 class _Request(NamedTuple):
-    """Faults and actions to inject into a walk that continues from a branch."""
+    """Request to a branch (a waiting copy of the walk): continue the walk with these faults and actions."""
 
     stimuli: tuple[Stimulus, ...]  # faults and actions of the operator
     begins: int  # HAL cycle in which the case begins
@@ -91,7 +92,7 @@ class _Request(NamedTuple):
 
 
 class _Answer(NamedTuple):
-    """Result of a walk that continued from a branch."""
+    """Result of a walk that continued from a branch (a waiting copy of an earlier walk)."""
 
     outcome: str
     state: SupervisorState
@@ -117,7 +118,8 @@ def run_fault(trial: FaultTrial) -> dict[str, Any]:
         "outcome": "computed",
         "fell": sum(one.outcome == "fell" for one in runs),
         "runs": [asdict(one) for one in runs],
-        "longest": longest,  # longest fault duration without a fall [cycles]; None: no fall with the permanent fault
+        # one per moment: longest fault duration without a fall [cycles]; None: no fall with the permanent fault
+        "longest": longest,
     }
 
 
@@ -150,7 +152,7 @@ def longest_without(falls: Callable[[int], bool], horizon: int, resolution: int)
     Args:
         falls: function that returns whether the robot falls with a fault of the given duration [cycles].
         horizon: longest duration [cycles].
-        resolution: largest accepted error of the result [cycles].
+        resolution: the result may be too short by this number of cycles.
     """
     if not falls(horizon):
         return horizon
@@ -162,7 +164,7 @@ def longest_without(falls: Callable[[int], bool], horizon: int, resolution: int)
 
 
 def _run(trial: FaultTrial, case: Case, moment: str) -> FaultRun:
-    """Walk with a fault that begins at a moment."""
+    """Run one walk in which the fault of `case` begins at the moment named `moment`, and return its result."""
     check_stop()
     begins, walk = _branches(trial.mass, trial.height, trial.seed, trial.engine)[moment]
     answer: _Answer = walk.ask(_Request(case.stimuli, begins, case.ends))
@@ -193,7 +195,9 @@ def diagnosed(events: Sequence[Event], expected: str, first: int) -> tuple[tuple
 
 @cache
 def _branches(mass: float, height: float, seed: int, engine: str) -> dict[str, tuple[int, Branch]]:
-    """Return for each moment the cycle in which the fault begins, and a branch of the walk shortly before this cycle.
+    """Return for each moment the cycle in which the fault begins, and a branch that waits shortly before this cycle.
+
+    A branch is a forked copy of a walk without a fault. The walks with a fault continue from the branches.
 
     Args:
         mass: mass of the wearer [kg].
@@ -207,7 +211,9 @@ def _branches(mass: float, height: float, seed: int, engine: str) -> dict[str, t
     walk = _Walk(())
     walk.execute(mass, height, seed, engine)
     if walk.outcome != "walked":
-        raise RuntimeError(f"a robot without fault must walk to the end, got {walk.outcome}: {walk.reason}")
+        raise RuntimeError(
+            f"the walk without a fault must reach its end, got the outcome {walk.outcome}: {walk.reason}"
+        )
     begins = {
         name: walk.begins[Phase[moment.phase], moment.step] + round(moment.share * STEP[1] / PERIOD)
         for name, moment in (MOMENTS | FURTHER_MOMENTS).items()
@@ -222,7 +228,7 @@ class _Walk:
 
     Attributes:
         begins: (phase, number of steps before the phase) -> first cycle of the phase.
-        branches: cycle -> branch of the walk at the end of this cycle.
+        branches: cycle -> branch, a forked copy of the walk that waits at the end of this cycle.
         outcome: how the walk ended, as in `FaultRun`.
         reason: reason of the last state.
     """
@@ -231,8 +237,8 @@ class _Walk:
         """Prepare the walk.
 
         Args:
-            forks: cycles at whose end the walk branches off. If there are any, the walk ends after the last of
-                these cycles.
+            forks: cycles at whose end a copy of the walk is forked. The walk ends after the last of these cycles.
+                Without such cycles, the walk ends when its outcome is known.
         """
         self._forks = set(forks)
         self.begins: dict[tuple[Phase, int], int] = {}
@@ -327,9 +333,10 @@ class _Walk:
             run(hal, DisturbedController(walk, host_faults), clock, until=over, record=record)
 
     def _branch_off(self, cycle: int, emulator: Emulator) -> bool:
-        """Branch off, and return whether the walk ends here because no further branch follows.
+        """Fork a copy of the walk at this cycle. Return whether the copy is the last one, so that the walk can end.
 
-        In a continued walk, inject the case of the request.
+        The copy waits for requests. For each request, a new process continues the walk: there, inject the requested faults and
+        return False.
 
         Args:
             cycle: number of the last cycle.

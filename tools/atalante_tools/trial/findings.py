@@ -26,8 +26,9 @@ _PHASES: Final = np.linspace(0.1, 0.8, 29)
 SAME: Final = 0.02
 STANDING: Final = 1.44  # metabolic rate of quiet standing [W/kg]
 #: A quantity has a falling trend if its rank correlation with the assistance factor is between -1 and -`TREND`.
-#: `ASYMMETRY` is the largest accepted influence of the order of the trials: the mean of |v[k] - v[-1 - k]| over all k and days,
-#: divided by the range of all values. v[k] is the value of the k-th walk of a day; walks k and -1 - k have the same factor.
+#: In a day of the sweep, the assistance factor falls and then rises, so each factor except the lowest occurs in two walks.
+#: The order of the walks must hardly influence a value. Therefore the mean difference between the two walks with the same factor,
+#: divided by the range of all values, must be at most `ASYMMETRY`.
 TREND, ASYMMETRY = 0.8, 0.25
 #: Largest coefficient of variation of the baseline metabolic rates of a sweep.
 VARIATION: Final = 0.05
@@ -138,9 +139,10 @@ def sweep_findings(results: Sequence[Result]) -> list[Finding]:
 
 
 def protocol_findings(results: Sequence[Result]) -> list[Finding]:
-    """Return the findings of `protocol`.
+    """Return the findings of the experiment `protocol`: walks with full assistance, a transition, and the factor of the trial.
 
-    The claims are: the walks end standing, inside the guide and near the line; the guides are certified; no fault is reported.
+    The claims are: each walk ends standing, inside the guide and near the line; the guides are certified; no fault is reported;
+    the estimated vertical is accurate.
 
     Args:
         results: results of `walk` trials.
@@ -367,7 +369,11 @@ def _trend(id_: str, claim: str, walks: Sequence[Result], value: Callable[[Resul
 
 
 def _symmetry(id_: str, claim: str, walks: Sequence[Result], value: Callable[[Result], float]) -> Finding:
-    """Return the finding that the values are nearly equal while the assistance factor falls and while it rises."""
+    """Return the finding that the order of the walks hardly influences a value.
+
+    In each day of the sweep, the assistance factor falls from 1 to 0 and then rises to 1. The two values at a factor, one on
+    the way down and one on the way up, must be nearly equal.
+    """
     days: dict[str, list[Result]] = {}
     for walk in walks:
         days.setdefault(walk["trial"]["order"].split("-")[0], []).append(walk)

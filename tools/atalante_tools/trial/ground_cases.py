@@ -17,8 +17,9 @@ def _no_load(*feet: str) -> tuple[Fault, ...]:
     return tuple(Fault("value", f"{foot}_STATE", 0, None, **{f"{cell}_ForceZ": 0.0 for cell in CELLS}) for foot in feet)
 
 
-#: Fault ID -> cases that are possible only in a walk on the ground. In F41 the HAL is killed. The case of F41 pauses the HAL for
-#: 6 s instead. After the pause the HAL is in HOLD, so its frames do not move the drives.
+#: Fault ID -> cases that are possible only in a walk on the ground.
+#: Fault F41 is a killed HAL. As a substitute, the case of F41 pauses the HAL for 6 s. After the pause the HAL is in HOLD, so the
+#: frames of the HAL do not move the drives.
 _GROUND_CASES: Final = {
     "F34": (
         Case("both feet report no load", _no_load(*FOOT_NODES)),

@@ -50,8 +50,8 @@ MASS_SHARE: Final = (0.9, 1.1)
 #: Range of the random coefficient of friction between soles and floor in `robustness`.
 FRICTION: Final = (0.25, 0.8)
 #: Number of parts of the control loop that can be one cycle late in `robustness`: state messages, command messages, motors.
-#: Messages that are one cycle late time out after four lost frames in a row. With a longer delay, messages would time out after
-#: fewer lost frames than the fault matrix intends.
+#: The delay is not longer than one cycle. A delayed message then times out after four consecutive lost frames. With a longer
+#: delay, fewer lost frames would cause the timeout, and the fault matrix does not intend this.
 LATE_PARTS: Final = 3
 #: Probability of a lost frame in `robustness`.
 LOSS: Final = 0.01
@@ -73,7 +73,7 @@ _PACKAGES: Final = ("numpy", "numba", "pin", "casadi", "pybullet", "mujoco-core"
 
 @dataclass(frozen=True)
 class ShapeTrial:
-    """Empty exoskeleton in the air, inside one guide shape, without feedforward."""
+    """Walk of the empty exoskeleton in the air. The swing leg moves inside one guide shape, and the feedforward is off."""
 
     kind: ClassVar[str] = "shape"
     shape: str

@@ -1,7 +1,7 @@
 """Find the largest push that the walking robot withstands: `trial -> walks with rising force, in lock-step -> result`.
 
-All walks with the same patient, seed and engine are equal until the push. So one walk branches off shortly before the pushed
-step, and each push continues from this branch.
+All walks with the same patient, seed and engine are equal until the push. So one walk forks a waiting copy of its process (a
+branch) shortly before the pushed step. The walk with each push continues from this branch.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ from atalante_tools.trial.plan import STEP, PushTrial
 _PUSHED: Final = 3
 #: Number of periodic steps after the pushed step.
 _AFTER: Final = 4
-#: The walk branches off at this phase of the step that precedes the pushed step.
+#: Phase at which the process of the walk is forked, in the step before the pushed step. Each push continues from this fork.
 _LEAD: Final = 0.875
 
 
@@ -57,7 +57,7 @@ def largest_push(trial: PushTrial) -> dict[str, Any]:
 
 @cache
 def _branch(mass: float, height: float, seed: int, engine: str) -> Branch:
-    """Walk to the moment shortly before the pushed step, and return a branch of the walk at this moment.
+    """Walk until shortly before the pushed step, and return a branch: a forked copy of the walk that waits at this moment.
 
     Args:
         mass: mass of the wearer [kg].
@@ -90,17 +90,17 @@ def _branch(mass: float, height: float, seed: int, engine: str) -> Branch:
             if walk.continuation is not None:
                 walk.finish(walk.continuation)
     if walk.branch is None:
-        raise RuntimeError(f"a robot without a push must walk to the pushed step, got {walk.ending.outcome}")
+        raise RuntimeError(f"the walk must reach the step to be pushed, got the outcome {walk.ending.outcome}")
     return walk.branch
 
 
 class _Walk:
-    """End condition of a walk that branches off before the pushed step.
+    """End condition for the loop of the HAL, see `over`. Shortly before the pushed step, `over` also forks the process.
 
     Attributes:
-        ending: end condition of the walk; without a push before the branch, with the push after the branch.
-        branch: branch of the walk; None until the branch.
-        continuation: continued walk with a push; None in the process of the walk without a push.
+        ending: general end condition of a trial; created again with the push in the process of a continued walk.
+        branch: forked copy of the walk that waits before the pushed step; None before the fork.
+        continuation: copy of the walk that continues with a push; None in the process of the walk without a push.
     """
 
     def __init__(self, rig: Rig, controller: WalkController) -> None:
@@ -115,7 +115,8 @@ class _Walk:
     def over(self, state: State) -> bool:
         """Return whether the walk is over.
 
-        The walk without a push ends at the branch. A walk that continues from the branch has a push, and ends as `ending` states.
+        The walk without a push ends at the fork. A walk that continues from the fork has a push. This walk ends when `ending`
+        returns True.
 
         Args:
             state: state of the HAL after the cycle.

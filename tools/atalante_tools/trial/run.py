@@ -62,7 +62,7 @@ _SAMPLING = 20  # cycles between two samples of the motion
 _CURVES: Final = 15
 #: Edges of the histogram of e / q_bound.
 EDGES: Final = tuple(round(-1.0 + 0.05 * k, 2) for k in range(41))
-#: Names of the three parts of the protocol.
+#: Names of the three parts of a walk: full assistance, transition, and assistance factor of the trial.
 SEGMENTS: Final = ("full", "transition", "target")
 
 

@@ -39,13 +39,14 @@ class ChannelMap:
         self._channel_of_row = np.full(len(plan.layouts) + len(plan.refused), UNKNOWN, np.int16)
 
     def update(self, chunk: Chunk, rows: Rows, names: list[str]) -> None:
-        """Assign buses to the channels, and expected channels to the messages that a chunk contains for the first time.
+        """Assign a bus to each new channel, and an expected channel to each new message.
 
-        For a channel without the name of a bus, the bus is derived from the first chunk with known frames of the channel.
+        A channel is new until a chunk contains a known frame on the channel. A message is new until a chunk contains a frame of
+        the message. If a channel does not have the name of a bus, the bus is derived from the known frames of that first chunk.
 
         Args:
             chunk: next frames of the log.
-            rows: index of the message of each frame in the plan, shape (n,).
+            rows: for each frame, index of the message in the plan, shape (n,).
             names: channels of the log so far.
         """
         known = (rows >= 0) & (rows < len(self._plan.layouts))

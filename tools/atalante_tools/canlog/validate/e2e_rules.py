@@ -35,8 +35,8 @@ class CrcRules:
     def __init__(self, plan: Plan, findings: Findings) -> None:
         self._plan, self._findings = plan, findings
         lengths = np.where(plan.protected, plan.lengths, 0)
-        #: One range of message indices for each payload length of the messages with a CRC.
-        #: The range contains all messages of this length, with and without a CRC.
+        #: Ranges of message indices, one range for each payload length that a message with a CRC has.
+        #: Each range contains all messages with the payload length, with and without a CRC.
         self._spans = [
             range(int(r[0]), int(r[-1]) + 1) for n in np.unique(lengths[lengths > 0]) for r in [_at(plan, n)]
         ]
@@ -79,8 +79,8 @@ class CrcRules:
         If a CRC matches the Data ID of another message, the report says that the identifier of the frame is wrong.
 
         Args:
-            of: index of the message of each frame in the plan, shape (k,).
-            stamps: stamp of each frame [ns], shape (k,).
+            of: for each frame, index of the message in the plan, shape (k,).
+            stamps: time stamp of each frame [ns], shape (k,).
             differences: result of `crc_differences`, shape (k,).
             length: payload length of the frames, bytes.
         """

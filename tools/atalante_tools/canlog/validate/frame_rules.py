@@ -33,9 +33,9 @@ _RECORDER = 0.99
 class Sorted:
     """Result of the header check: frames that can be decoded, and rejected frames."""
 
-    good: Indices | None  # indices of the frames that can be decoded; None means all frames
-    rejected_rows: Rows  # message index of each rejected frame in the plan; shape (k,)
-    rejected_indices: Indices  # index of each rejected frame in the chunk; shape (k,)
+    good: Indices | None  # indices in the chunk of the frames that can be decoded; None means all frames
+    rejected_rows: Rows  # for each rejected frame, index of the message in the plan; shape (k,)
+    rejected_indices: Indices  # for each rejected frame, index of the frame in the chunk; shape (k,)
 
 
 class FrameRules:

@@ -42,7 +42,12 @@ class Silence:
     reason: str
 
     def covers(self, rule: str, message: str) -> bool:
-        """Return whether this table silences a rule for a message."""
+        """Return whether this [[silence]] table of the rules file silences a rule for a message.
+
+        Args:
+            rule: name of the rule.
+            message: name of the message.
+        """
         return rule == self.rule and fnmatch.fnmatchcase(message, self.message)
 
 

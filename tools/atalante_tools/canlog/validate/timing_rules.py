@@ -198,14 +198,14 @@ class TimingRules:
         """Add the intervals to the statistics, except timeouts and intervals with lost, repeated or rejected frames."""
         bins = np.minimum(np.maximum(share * BINS_A_CYCLE, 0.0), float(BINS - 1)).astype(np.int64)
         bins += (np.arange(len(stream.present)) * BINS).repeat(stream.stops - stream.starts)
-        # Exclude from the statistics the intervals with lost, repeated or rejected frames, and those after repeated frames.
-        # Keep the intervals of messages without an alive counter (`NO_STEP`), because a loss is not detectable.
+        # Intervals with lost, repeated or rejected frames are excluded from the statistics.
+        # Without an alive counter (`NO_STEP`), it is unknown which intervals contain a lost frame, so all intervals are kept.
         incomplete = (
             odd[steps[odd] >= REPEATED]
             if rejected_before is None
             else odd[(steps[odd] >= REPEATED) | (rejected_before[odd] > 0)]
         )
-        # The interval that follows a repeated frame does not begin at a new frame.
+        # An interval that starts at a repeated frame, and not at a new frame, is also excluded.
         after_repeated = np.flatnonzero(stream.before(steps, self._last_steps) == REPEATED)
         left_out = np.unique(np.concatenate([incomplete, timed_out, np.flatnonzero(np.isinf(share)), after_repeated]))
         dump = len(stream.present) * BINS

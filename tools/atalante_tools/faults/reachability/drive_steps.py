@@ -21,7 +21,8 @@ from atalante_tools.faults.reachability.search import Exploration, Transition, e
 
 #: Controlword that CiA 402 does not define.
 UNKNOWN_WORD: Final = 0x55
-#: Errors that the search injects: error code, and whether the cause of the error persists. Each `FaultReaction` occurs.
+#: Errors that the search injects. Each entry has the error code, and whether the cause of the error persists. Together, the
+#: errors trigger every `FaultReaction` of a drive.
 _ERRORS: Final = (
     (emergency.CURRENT, False),
     (emergency.OVER_TEMPERATURE, True),
@@ -49,7 +50,10 @@ class Drive(NamedTuple):
 
 
 class DriveObserver(NamedTuple):
-    """Values with which the search checks the properties. The search computes these values independently of the drive."""
+    """Values that the search tracks itself, without the code of the drive.
+
+    `_violation` checks the safety properties of the drive with these values.
+    """
 
     command_age: int = WATCHDOG  # number of cycles since the last valid command was sent
     sync_age: int = 0  # number of cycles since the last SYNC
@@ -69,7 +73,7 @@ class DriveCycle(NamedTuple):
 
 
 class DriveStep(NamedTuple):
-    """State of the search: state of the drive, and the values with which the search checks the properties."""
+    """State of the search: state of the drive, and the values that the search tracks itself."""
 
     drive: Drive
     observer: DriveObserver = DriveObserver()

@@ -2,7 +2,7 @@
 
 There are two searches, and both visit all states of pendant reception and safety monitor. The search `stops` also counts the
 cycles since the operator released the dead-man switch or pressed STOP or HOLD. The search `moves` also counts the presses of
-START that have not changed the state yet. A single search with both counts would visit more states and prove nothing more.
+START that have not begun a start yet. A single search with both counts would visit more states and prove nothing more.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ from atalante_tools.faults.reachability.search import Exploration, Transition, e
 _S = SupervisorState
 #: Stop actions of the operator: no stop action, dead-man switch released, STOP pressed, HOLD pressed.
 NOTHING, RELEASED, STOPPED, HELD = range(4)
-#: Value of `Inputs.stop` if the HAL has received HOLD.
+#: Value of `Inputs.stop` after the HAL has received HOLD. The stop actions above have other numbers than `Inputs.stop`.
 RECEIVED_HOLD: Final = 2
 #: If no new pendant frame arrives after a stop action, the HAL may still enable a drive for this number of cycles.
 SILENT_PENDANT: Final = LOST - 1
@@ -60,10 +60,10 @@ class Operator(NamedTuple):
 
 
 class Presses(NamedTuple):
-    """Memory of the search `moves`: number of START presses without a state change so far, and whether a START is in progress."""
+    """Presses of START that the search `moves` remembers."""
 
-    received: int = 0  # number of presses of START; 2 means two or more
-    started: bool = False
+    received: int = 0  # number of received presses that have not begun a start yet; 2 means two or more
+    started: bool = False  # whether a start is in progress that has not changed the supervisor state yet
 
 
 class StopState(NamedTuple):
@@ -75,7 +75,7 @@ class StopState(NamedTuple):
 
 
 class MoveState(NamedTuple):
-    """State of the search `moves`, which looks for a change to a better supervisor state that no press of START caused."""
+    """State of the search `moves`, which looks for a supervisor state that improves without a press of START."""
 
     reception: Reception
     supervision: Supervision
@@ -90,8 +90,9 @@ class Cycle(NamedTuple):
     operator: Operator = Operator()
 
 
-#: Result of receiving pendant frames -> frames that cause this result. A result has three elements: state of the reception,
-#: inputs of the operator, and whether a press of START was received from the pendant.
+#: Dictionary of the possible results of receiving pendant frames. The key is a result, and the value is a tuple of frames that
+#: causes the result. A result has three elements: state of the reception, inputs of the operator, and whether the HAL received
+#: a press of START from the genuine pendant.
 _Receptions = dict[tuple[Reception, Inputs, bool], tuple[PendantFrame, ...]]
 
 
@@ -125,11 +126,14 @@ class OperatorPath:
         self._decided, self._commanded = cache(self._decide), cache(self._command)
 
     def stops(self) -> Exploration[StopState, Cycle]:
-        """Search for a torque command that the HAL sends too long after a stop action of the operator."""
+        """Search for a case in which the HAL still enables a drive too long after a stop action of the operator.
+
+        The time limit is `SILENT_PENDANT` cycles.
+        """
         return explore([StopState(*state) for state in _INITIAL], self._stop_successors)
 
     def moves(self) -> Exploration[MoveState, Cycle]:
-        """Search for a change to a better supervisor state that no press of START caused."""
+        """Search for a supervisor state that improves, or a motion that starts, without a press of START (see `is_move`)."""
         return explore([MoveState(*state) for state in _INITIAL], self._move_successors)
 
     def _stop_successors(self, state: StopState) -> Iterator[Transition[StopState, Cycle]]:
@@ -209,7 +213,10 @@ class OperatorPath:
 
 
 def is_move(before: SupervisorState, after: SupervisorState) -> bool:
-    """Return whether a state change starts motion, or improves a state that is worse than ACTIVE."""
+    """Return whether a state change starts motion, or leads from a state worse than ACTIVE to a better state.
+
+    The numbers of `SupervisorState` increase from the best to the worst state.
+    """
     return (after in MOVING and before not in MOVING) or (after < before and before > _S.ACTIVE)
 
 
@@ -251,7 +258,7 @@ def arrivals(before: Reception, operator: Operator) -> Iterator[tuple[PendantFra
         yield frame, frame
         yield (frame._replace(sender="damaged"),)
         if frame.pressed:
-            continue  # a second sender is combined only with frames that report no press
+            continue  # a second sender sends only if the pendant itself reports no press
         for request, pressed in ((Request.START, True), (before.own_request, False), (Request.STOP, True)):
             rogue = PendantFrame(0, True, request, pressed, "rogue")
             yield frame, rogue

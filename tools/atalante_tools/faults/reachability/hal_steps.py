@@ -40,15 +40,18 @@ _TAG: Final = _CYCLE & 0xFF
 _PRESSES, _ROGUE_PRESSES = 10, 12
 #: Cycles in which the HAL may still process a START: none, only this cycle, or this cycle and further cycles.
 NO_START, LAST_START, START = 0, 1, 2
-#: Value of `start_wanted` in the safety monitor for `NO_START`, `LAST_START` and `START` [cycles].
+#: Value of `SafetyMonitor.start_wanted` for each of these three cases: number of cycles in which a START can still change the
+#: state.
 START_CYCLES: Final = {NO_START: 0, LAST_START: 1, START: 100}
 #: Whether the HAL trusts the pendant -> values of `Qualification` that the search tries in this case.
 QUALIFICATIONS: Final = {
     False: (Qualification(0, 0, False), Qualification(0, REQUALIFY - 1, False)),
     True: (SETTLED, Qualification(FULL - 4, REQUALIFY, True)),
 }
-#: Frame from which `Pendant.evaluate` read the last RequestCounter: none yet, last accepted frame, older frame, second sender.
+#: Source of the RequestCounter that `Pendant.evaluate` read last. `_NONE`: no frame yet. `_LATEST`: last accepted frame.
+#: `_OLDER`: earlier frame. `_ROGUE`: frame of a second sender.
 _NONE, _LATEST, _OLDER, _ROGUE = range(4)
+#: Source of the RequestCounter -> value of the RequestCounter.
 _EVALUATED: Final = {_NONE: None, _LATEST: _PRESSES, _OLDER: _PRESSES - 1, _ROGUE: _ROGUE_PRESSES}
 
 
@@ -58,11 +61,12 @@ class Reception(NamedTuple):
     age: int = 0  # age of the last accepted frame [cycles]; `LOST` after the timeout
     dead_man: bool = True  # whether the dead-man switch is pressed in the last accepted frame
     request: int = Request.START  # `Request` of the last accepted frame
-    evaluated: int = _LATEST  # frame of the RequestCounter that `Pendant.evaluate` read last: `_NONE`, `_LATEST`, ...
+    evaluated: int = _LATEST  # source of the RequestCounter that `Pendant.evaluate` read last: `_NONE`, `_LATEST`, ...
     rogue: bool = False  # whether the last accepted frame has the RequestCounter of a second sender
     stored: bool = False  # whether a START is stored until the pendant is trusted
     trusted: bool = True
-    own_request: int = Request.START  # `Request` of the last intact frame of the pendant itself
+    #: `Request` in the last intact frame of the genuine pendant, not of a second sender
+    own_request: int = Request.START
 
 
 #: Reception after the pendant has timed out. The content of its last frame then has no effect.
@@ -127,7 +131,7 @@ class _ScriptedPendant(Pendant):
         """
 
     def clear_press(self) -> None:
-        """Do nothing, because the search drops a stored START itself."""
+        """Do nothing. The search deletes a stored press of START in `HalSteps._without_press`."""
 
 
 class HalSteps:
@@ -173,7 +177,7 @@ class HalSteps:
         )
 
     def _process(self, before: Reception, frames: tuple[PendantFrame, ...]) -> tuple[tuple[Reception, Inputs], ...]:
-        """Return the possible results of the HAL. The field `own_request` of each result is 0.
+        """Return the possible results of the HAL. The field `own_request` is 0 in each result, and the caller sets this field.
 
         Some counters of the HAL are not part of a search state. For these counters, every value that leads to another
         result is tried. The tests check the choice of the values.
@@ -356,11 +360,11 @@ class HalSteps:
 
 
 def _own_request(before: Reception, own: list[int], after: Reception) -> int:
-    """Return the `Request` of the last intact frame of the pendant itself.
+    """Return the `Request` in the last intact frame of the genuine pendant. Frames of a second sender do not count.
 
     Args:
         before: state before the cycle.
-        own: requests of the frames that the pendant itself sent in this cycle.
+        own: requests of the frames that the genuine pendant sent in this cycle.
         after: state after the cycle. Its last accepted frame has not timed out.
     """
     return (before.own_request, *own)[-1] if after.rogue else after.request

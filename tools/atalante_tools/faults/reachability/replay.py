@@ -61,14 +61,16 @@ def drive_case_of(trace: Sequence[tuple[DriveCycle, DriveStep]]) -> Case:
         trace: inputs and state of each cycle.
 
     Raises:
-        NotReplayable: If an input is not the loss of a command.
+        NotReplayable: If a cycle after the drive was enabled contains anything other than the loss of the command.
     """
     states = [step.drive.state for _, step in trace]
     enabled = states.index(DriveState.OPERATION_ENABLED)
     lost = trace[enabled + 1 :]
     for cycle, _ in lost:
         if cycle != DriveCycle():
-            raise NotReplayable(f"each input must be a lost command, got {cycle}")
+            raise NotReplayable(
+                f"the counterexample cannot be replayed: each cycle must only lose the command, got {cycle}"
+            )
     return Case("counterexample", (Fault("drop", "COMMAND_LEFT_LEG", 0, len(lost)),), observed=OBSERVED)
 
 

@@ -166,7 +166,9 @@ def robot_process_wanted(target: Target, others: int, chosen: bool | None = None
 
 
 def cores_are_idle(others: int, load: Path = _LOAD) -> bool:
-    """Return whether enough processor cores are idle: one core for the robot, and one core for each other process.
+    """Return whether the computer has enough idle processor cores for all processes of the run.
+
+    This process already uses one core for the HAL. The robot needs one idle core, and each further process needs one, too.
 
     On a busy computer two processes that wait for each other are slower than one process, because the scheduler runs other
     programs in between.
