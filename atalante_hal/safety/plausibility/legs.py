@@ -21,8 +21,8 @@ the motion of the joint. The check uses this change, so that a stuck encoder is 
 another axis. If the readings of SH and SK are both constant, both are reported. Unlike the module `stillness`, the
 standstill check needs no torque, so it also covers a joint that other joints move.
 
-*Exchange.* If the encoders of a joint are exchanged between the legs, each encoder reports the angle of the other leg. So the errors
-of both legs are opposite, and their size is the difference between the two readings. The joint is reported when the difference
+*Exchange.* If the encoders of a joint are exchanged between the legs, each encoder reports the angle of the other leg. So the
+errors of both legs are opposite, and their size is the difference between the two readings. The joint is reported when the difference
 exceeds `_APART` in `EXCHANGE_SAMPLES` consecutive samples. Exchanged tibia IMUs have the same effect, about all axes.
 
 *Age.* Values from earlier cycles are extrapolated to this cycle with the velocity that the same message contains. The
@@ -105,7 +105,7 @@ class Legs:
         self._stuck: list[tuple[Finding, ...]] = [() for _ in SIDES]
         #: For each of the first four joints of a leg: number of consecutive samples whose errors agree with an exchange.
         self._exchanges = [0] * len(_AXIS_OF)
-        #: Findings about exchanged encoders, by index of the joint in a leg. A finding remains until a drive of the joint restarts.
+        #: Findings about exchanged encoders, by index of the joint in a leg. They remain until a drive of the joint restarts.
         self._exchanged: dict[int, tuple[Finding, ...]] = {}
 
     def reference(self, joint: int) -> None:

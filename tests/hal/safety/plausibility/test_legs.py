@@ -286,7 +286,9 @@ class TestExchange:
     APART = math.radians(1.2)
 
     @staticmethod
-    def legs(angles: tuple[Sequence[float], Sequence[float]], readings: tuple[Sequence[float], Sequence[float]]) -> OneLeg:
+    def legs(
+        angles: tuple[Sequence[float], Sequence[float]], readings: tuple[Sequence[float], Sequence[float]]
+    ) -> OneLeg:
         """Return checks with the given true angles and encoder readings FH, TH, SH, SK of both legs [rad]."""
         legs = OneLeg(0)
         for leg, side in enumerate(("left", "right")):
