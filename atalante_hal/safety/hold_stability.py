@@ -1,7 +1,7 @@
 """Check that each drive that holds its position really holds its joint: `position, velocity, torque, drive state -> findings`.
 
 A drive that holds its position controls the joint by itself, and the HAL does not limit its torque. The HAL can only switch off a
-drive that moves the joint, or presses the joint onto an end stop. Two motions show that the drive does not hold the joint:
+drive that moves the joint, or presses the joint onto an end stop. Three motions show that the drive does not hold the joint:
 
 *Oscillation.* The position control of the drive does not suit the joint. Causes are a wrong parameter, a loose gear, or a late
 motor. A joint counts as oscillating if its velocity reverses `REVERSALS` times in a row. A joint that is stopped in motion,
@@ -10,8 +10,11 @@ pushed or carried reverses less often.
 *Overload.* For `OVERLOADED` cycles, a joint is at least `AWAY` from the position in which the hold began, and the drive reports
 about its torque limit (`SATURATED`), but the joint neither moves back nor slows down. Causes are a motor that turns in the
 wrong direction, a motor without torque, exchanged encoders, and a load that exceeds the torque limit. When a drive stops a
-moving joint, its torque may reach the limit for a longer time, but the joint slows down. A joint that seems to move although
-its drive reports hardly any torque is not reported: its encoder may be wrong, and then the drive holds the joint.
+moving joint, its torque may reach the limit for a longer time, but the joint slows down.
+
+*Motor without torque.* For `OVERLOADED` cycles, a joint is at least `SUNK` from the position in which the hold began and does not
+move back, but the drive reports hardly any torque (`POWERLESS`). The IMUs of the leg must confirm the encoder (`ENCODER_ERROR`),
+because a joint with a wrong encoder may not have moved. No IMU is below SA and HA, so this check omits SA and HA.
 """
 
 from __future__ import annotations
@@ -42,6 +45,12 @@ OVERLOADED: Final = 20
 #: A drive can be overloaded only if its joint is at least this far from the position in which the hold began [rad].
 #: A drive that only reports a wrong torque keeps its joint closer than this distance.
 AWAY: Final = math.radians(1.0)
+#: The position control of a working drive reaches its torque limit if its joint is that far from its position [rad].
+SUNK: Final = math.radians(3.0)
+#: A drive without torque reports less than this share of its torque limit.
+POWERLESS: Final = 0.1
+#: The encoder of a joint is confirmed if it differs from the IMUs of its leg by at most this angle [rad].
+ENCODER_ERROR: Final = math.radians(1.0)
 #: Speed threshold of the overload count [rad/s]. The noise of the velocities is smaller than this threshold.
 #: The count restarts if the joint moves back towards the position in which the hold began, faster than this threshold.
 #: The count also restarts if the motion away from this position has slowed by more than this threshold since the count began.
@@ -58,6 +67,7 @@ class Measured(NamedTuple):
     torque: Vector  # torques that the drives report [Nm]
     drive_state: Vector  # states of the drives
     age: Vector  # age of these values [cycles]
+    encoder_error: Vector  # encoder angle minus angle from the IMUs [rad]; infinite if there is no such angle
 
 
 class Swings(NamedTuple):
@@ -69,11 +79,11 @@ class Swings(NamedTuple):
 
 
 class Loads(NamedTuple):
-    """Record of the overload of all joints, shape (12,) each."""
+    """Record of the overload and of the motors without torque, shape (12,) each."""
 
     start: Vector  # position in which the hold began [rad]; NaN if the drive does not hold its position
     speed: Vector  # speed away from `start` when the count in `cycles` began [rad/s]
-    cycles: Vector  # number of consecutive cycles with overload
+    cycles: Vector  # number of consecutive cycles with overload, or with a motor without torque
 
 
 def _follow(velocity: Vector, drive_state: Vector, swings: Swings, driven: tuple[float, float]) -> bool:
@@ -99,7 +109,7 @@ def _follow(velocity: Vector, drive_state: Vector, swings: Swings, driven: tuple
 
 
 def _watch_load(joints: Measured, limit: Vector, driven: tuple[float, float], loads: Loads) -> bool:
-    """Update the overload of all joints by one cycle, and return whether a drive is overloaded.
+    """Update the overload of all joints by one cycle, and return whether a drive is overloaded or has no torque.
 
     Args:
         joints: measurements of the cycle.
@@ -119,7 +129,9 @@ def _watch_load(joints: Measured, limit: Vector, driven: tuple[float, float], lo
         speed = math.copysign(1.0, away) * joints.velocity[i]
         torque, most = abs(joints.torque[i]), limit[i]
         saturated = SATURATED[0] * most <= torque <= SATURATED[1] * most
-        if not (abs(away) >= AWAY and saturated) or speed < -SLOWER:
+        confirmed = abs(joints.encoder_error[i]) <= ENCODER_ERROR
+        powerless = abs(away) >= SUNK and torque < POWERLESS * most and confirmed
+        if not ((abs(away) >= AWAY and saturated) or powerless) or speed < -SLOWER:
             loads.cycles[i] = 0.0
         elif loads.cycles[i] == 0.0 or speed < loads.speed[i] - SLOWER:
             loads.cycles[i], loads.speed[i] = 1.0, speed
@@ -141,7 +153,7 @@ class HoldStability:
         self._swings = Swings(*np.zeros((3, joints), np.int64))
         self._loads = Loads(*np.zeros((3, joints)))
         self._driven = (float(DriveState.QUICK_STOP_ACTIVE), float(DriveState.OPERATION_ENABLED))
-        at_rest = Measured(*np.zeros((5, joints)))
+        at_rest = Measured(*np.zeros((6, joints)))
         self._follow = specialised(_follow, at_rest.velocity, at_rest.drive_state, self._swings, self._driven)
         self._watch_load = specialised(_watch_load, at_rest, at_rest.torque, self._driven, self._loads)
         self.restart()
@@ -174,7 +186,7 @@ class HoldStability:
             (
                 joint,
                 int(count),
-                f"does not move back although its drive holds it with {abs(joints.torque[joint]):.0f} Nm",
+                f"does not move back although its drive holds it and reports {abs(joints.torque[joint]):.0f} Nm",
             )
             for joint, count in enumerate(cycles)
             if count >= OVERLOADED and reversals[joint] < REVERSALS

@@ -126,7 +126,14 @@ class SafetyMonitor:
         self._states_at_start = b""  # during a start: drive states in the previous cycle
         self.lowered: set[str] = set()
         self._hold_stability = HoldStability()
-        self._held = Measured(state.position, state.velocity, state.torque, state.drive_state, np.zeros(len(JOINTS)))
+        self._held = Measured(
+            state.position,
+            state.velocity,
+            state.torque,
+            state.drive_state,
+            np.zeros(len(JOINTS)),
+            plausibility.encoder_error,
+        )
         self._joint_rows = np.array(rows_of(image.codec, JOINT_MESSAGES))
         self.torque_tracking = TorqueTracking(robot.breakaway)
         self.torque_motion: TorqueMotion | None = None

@@ -22,8 +22,8 @@ another axis. If the readings of SH and SK are both constant, both are reported.
 standstill check needs no torque, so it also covers a joint that other joints move.
 
 *Exchange.* If the encoders of a joint are exchanged between the legs, each encoder reports the angle of the other leg. So the
-errors of both legs are opposite, and their size is the difference between the two readings. The joint is reported when the difference
-exceeds `_APART` in `EXCHANGE_SAMPLES` consecutive samples. Exchanged tibia IMUs have the same effect, about all axes.
+errors of both legs are opposite, and their size is the difference between the two readings. The joint is reported when the
+difference is above `_APART` in `EXCHANGE_SAMPLES` consecutive samples. Exchanged tibia IMUs have the same effect, about all axes.
 
 *Age.* Values from earlier cycles are extrapolated to this cycle with the velocity that the same message contains. The
 thresholds are extended by `velocity_error` times the age of the values.
@@ -80,6 +80,10 @@ class _Comparison(NamedTuple):
 class Legs:
     """Checks of both legs.
 
+    Attributes:
+        encoder_error: encoder angle of each joint minus its angle from the IMUs in the last sample of its leg, shape (12,) [rad].
+            SH and SK both have the error of their sum. The error is infinite if a value is too old, and always for SA and HA.
+
     Args:
         robot: sensor thresholds of the robot.
         now: signals decoded in this cycle.
@@ -95,6 +99,7 @@ class Legs:
         self._attitude_change, self._misalignment = robot.sensors.attitude_change, robot.sensors.misalignment
         #: Estimated heading drift between the IMUs of each leg [rad]. It is subtracted from the error of TH.
         self._heading = [0.0 for _ in SIDES]
+        self.encoder_error: Vector = np.full(len(JOINTS), math.inf)
         self._contradicts = [[0] * len(_AXES) for _ in SIDES]
         self._constant_samples = [constant_samples[hip : hip + len(_AXIS_OF)] for hip in _HIPS]
         #: For each joint: comparison of encoders and IMUs when the encoder reading of this joint last changed.
@@ -142,6 +147,7 @@ class Legs:
 
     def _check(self, leg: int, ages: Ages | None) -> bool:
         comparison = self._compare(leg, ages)
+        self._record_errors(leg, comparison)
         if comparison is not None:
             self._check_drift(leg, comparison)
             self._check_standstill(leg, comparison)
@@ -172,6 +178,11 @@ class Legs:
         turn = 2.0 * math.pi
         errors = math.remainder(fh - x, turn), math.remainder(th - z, turn), math.remainder(sh + sk - y, turn)
         return _Comparison((x, z, y), errors, (fh, th, sh, sk), uncertainty)
+
+    def _record_errors(self, leg: int, comparison: _Comparison | None) -> None:
+        errors = None if comparison is None else self._without_heading(leg, comparison)
+        for index, axis in enumerate(_AXIS_OF):
+            self.encoder_error[_HIPS[leg] + index] = math.inf if errors is None else errors[axis]
 
     def _check_drift(self, leg: int, comparison: _Comparison) -> None:
         drifts = []

@@ -64,6 +64,7 @@ class Plausibility:
 
     Attributes:
         findings: current findings; the tuple is replaced only when the findings change.
+        encoder_error: encoder angle of each joint minus its angle from the IMUs, shape (12,) [rad], see `Legs`.
     """
 
     def __init__(self, robot: Robot, image: ReceiveImage, period: float) -> None:
@@ -75,6 +76,7 @@ class Plausibility:
         self._imus = Imus(robot, codec, now)
         self._stillness = Stillness(robot, image, now, before, SLOW, period)
         self._legs = Legs(robot, now, self._stillness.constant_samples, period)
+        self.encoder_error = self._legs.encoder_error
         self._feet = FootChecks(robot, now, FEET)
         self._support = Support(robot, now, _PERIOD)
         self._soles = Soles(robot, now)

@@ -10,12 +10,15 @@ from atalante_hal.safety.diagnostics import Dtc, Finding
 from atalante_hal.safety.hold_stability import (
     AGE,
     AWAY,
+    ENCODER_ERROR,
     INTERVAL,
     OVERLOADED,
+    POWERLESS,
     REVERSALS,
     SATURATED,
     SLOWER,
     SPEED,
+    SUNK,
     HoldStability,
     Measured,
     _follow,
@@ -33,7 +36,7 @@ FAR, FULL = 1.01 * AWAY, -LIMIT[KNEE]
 def measured(state: DriveState = DriveState.QUICK_STOP_ACTIVE) -> Measured:
     """Return the measurements of a robot at rest whose drives are all in one state."""
     position, velocity, torque, age = np.zeros((4, len(JOINTS)))
-    return Measured(position, velocity, torque, np.full(len(JOINTS), float(state)), age)
+    return Measured(position, velocity, torque, np.full(len(JOINTS), float(state)), age, np.full(len(JOINTS), np.inf))
 
 
 def oscillate(
@@ -144,6 +147,7 @@ def overload(
     torque: float | None = None,
     state: DriveState = DriveState.QUICK_STOP_ACTIVE,
     age: int = 0,
+    encoder_error: float = np.inf,
 ) -> tuple[Finding, ...]:
     """Begin a hold, then return the findings after a number of equal cycles with a joint away from its position."""
     joints, found = measured(state), tuple[Finding, ...]()
@@ -151,6 +155,7 @@ def overload(
     check.check(joints, LIMIT)
     joints.position[joint], joints.velocity[joint], joints.age[joint] = 0.5 + away, speed, age
     joints.torque[joint] = -LIMIT[joint] if torque is None else torque
+    joints.encoder_error[joint] = encoder_error
     for _ in range(cycles):
         found = check.check(joints, LIMIT)
     return found
@@ -173,7 +178,7 @@ def test_overloaded_joint_is_found_in_the_last_cycle(joint: int) -> None:
         JOINTS[joint].upper(),
         OVERLOADED,
         True,
-        f"{JOINTS[joint]} does not move back although its drive holds it with {LIMIT[joint]:.0f} Nm; its drive is switched off",
+        f"{JOINTS[joint]} does not move back although its drive holds it and reports {LIMIT[joint]:.0f} Nm; its drive is switched off",
     )
 
 
@@ -203,6 +208,41 @@ def test_overloaded_joint_is_found_in_the_last_cycle(joint: int) -> None:
 )
 def test_limits_of_an_overload(motion: dict[str, float], found: bool) -> None:
     assert bool(overload(HoldStability(), OVERLOADED, **motion)) is found  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize(
+    ("motion", "found"),
+    [
+        ({}, True),
+        ({"away": -1.0001 * SUNK, "speed": -0.5}, True),
+        ({"away": 0.9999 * SUNK}, False),
+        ({"away": -0.9999 * SUNK}, False),
+        ({"torque": np.nextafter(POWERLESS * FULL, 0.0)}, True),
+        ({"torque": POWERLESS * FULL}, False),
+        ({"torque": -POWERLESS * FULL}, False),
+        ({"encoder_error": ENCODER_ERROR}, True),
+        ({"encoder_error": -ENCODER_ERROR}, True),
+        ({"encoder_error": np.nextafter(ENCODER_ERROR, 1.0)}, False),
+        ({"encoder_error": np.nextafter(-ENCODER_ERROR, -1.0)}, False),
+        ({"encoder_error": np.inf}, False),
+        ({"speed": 2.0}, True),
+        ({"speed": np.nextafter(-SLOWER, -1.0)}, False),
+        ({"state": DriveState.OPERATION_ENABLED}, False),
+        ({"state": DriveState.SWITCH_ON_DISABLED}, False),
+    ],
+)
+def test_limits_of_a_motor_without_torque(motion: dict[str, float], found: bool) -> None:
+    sunk = {"away": 1.0001 * SUNK, "torque": 0.0, "encoder_error": 0.0} | motion
+    assert overload(HoldStability(), OVERLOADED - 1, **sunk) == ()  # type: ignore[arg-type]
+    assert bool(overload(HoldStability(), OVERLOADED, **sunk)) is found  # type: ignore[arg-type]
+
+
+def test_distance_of_a_motor_without_torque_is_at_least_its_bound() -> None:
+    check, joints = HoldStability(), measured()
+    joints.encoder_error[:] = 0.0
+    check.check(joints, LIMIT)
+    joints.position[KNEE] = SUNK
+    assert [len(check.check(joints, LIMIT)) for _ in range(OVERLOADED)] == [0] * (OVERLOADED - 1) + [1]
 
 
 def test_distance_from_the_start_of_the_hold_is_at_least_its_bound() -> None:

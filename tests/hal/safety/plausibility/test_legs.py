@@ -280,6 +280,26 @@ class TestDrift:
         robot.until_found(Dtc.ENC_DRIFT, 1000, drift)
 
 
+class TestEncoderError:
+    @pytest.mark.parametrize("leg", [0, 1])
+    def test_each_sample_writes_the_errors_of_its_leg(self, leg: int):
+        one_leg = OneLeg(leg)
+        one_leg.legs._heading[leg] = 0.01
+        one_leg.show((0.1, 0.2, 0.3), (0.02, -0.03, 0.04))
+        one_leg.compare()
+        hip, expected = 6 * leg, np.full(12, math.inf)
+        expected[hip : hip + 4] = 0.02, -0.04, 0.04, 0.04
+        assert one_leg.legs.encoder_error == pytest.approx(expected, abs=1e-9)
+
+    def test_error_is_infinite_if_a_value_is_too_old(self):
+        one_leg = OneLeg(0)
+        one_leg.compare()
+        ages = Ages(np.zeros(12, np.int64), np.zeros(4, np.int64), np.zeros(2, np.int64))
+        ages.joint[1] = NEVER
+        one_leg.compare(1, ages)
+        assert np.isinf(one_leg.legs.encoder_error).all()
+
+
 class TestExchange:
     """The encoders of a joint are exchanged between the legs, so each leg has the reading of the other leg."""
 
