@@ -148,6 +148,26 @@ def test_sweep_findings_pass_and_fail() -> None:
     assert tired["sweep-error-symmetry"] is False
 
 
+@pytest.mark.parametrize("positions", [(5,), (1, 9), (9,), (2, 3, 4, 5, 6, 7, 8, 9)])
+def test_symmetry_has_no_verdict_if_the_only_day_has_a_missing_trial(positions: tuple[int, ...]) -> None:
+    results = sweep()
+    for position in positions:
+        results[position]["outcome"] = "fell"  # results[0] is the treadmill
+    found = verdicts(sweep_findings(results))
+    assert found["sweep-metabolic-symmetry"] is found["sweep-error-symmetry"] is None
+
+
+def test_symmetry_leaves_out_a_day_with_a_missing_trial() -> None:
+    complete, incomplete = sweep(), sweep(drift=0.05)
+    for result in incomplete:
+        result["trial"]["order"] = result["trial"]["order"].replace("day1", "day2")
+    del incomplete[5]  # the trial with Xi = 0
+    found = {finding.id: finding for finding in sweep_findings([*complete, *incomplete])}
+    expected = {finding.id: finding for finding in sweep_findings(complete)}
+    for id_ in ("sweep-metabolic-symmetry", "sweep-error-symmetry"):
+        assert found[id_] == expected[id_]
+
+
 def test_changing_baseline_fails_its_finding() -> None:
     results = sweep()
     results[1]["metabolic_w_kg"]["full"] = 2.0

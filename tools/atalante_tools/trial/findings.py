@@ -372,17 +372,20 @@ def _symmetry(id_: str, claim: str, walks: Sequence[Result], value: Callable[[Re
     """Return the finding that the order of the walks hardly influences a value.
 
     In each day of the sweep, the assistance factor falls from 1 to 0 and then rises to 1. The two values at a factor, one on
-    the way down and one on the way up, must be nearly equal.
+    the way down and one on the way up, must be nearly equal. Days with a missing trial are left out.
     """
     days: dict[str, list[Result]] = {}
+    count = 0  # number of trials in a complete day
     for walk in walks:
-        days.setdefault(walk["trial"]["order"].split("-")[0], []).append(walk)
+        day, position = walk["trial"]["order"].split("-")
+        days.setdefault(day, []).append(walk)
+        count = max(count, int(position))
     pairs, values = list[float](), list[float]()
-    for day in days.values():
-        factors = [r["trial"]["xi"] for r in day]
-        if factors == factors[::-1]:  # a day without this symmetry has a missing trial, and is left out
-            values += [value(r) for r in day]
-            pairs += [abs(value(day[k]) - value(day[-1 - k])) for k in range(len(day) // 2)]
+    for trials in days.values():
+        factors = [r["trial"]["xi"] for r in trials]
+        if len(trials) == count and factors == factors[::-1]:
+            values += [value(r) for r in trials]
+            pairs += [abs(value(trials[k]) - value(trials[-1 - k])) for k in range(count // 2)]
     if not pairs:
         return Finding(id_, claim, "no results", None)
     span = max(values) - min(values)
