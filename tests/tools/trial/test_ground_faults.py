@@ -14,9 +14,19 @@ from atalante_hal.safety.events import Event
 from atalante_tools.cli import cli
 from atalante_tools.faults.catalogue import SCENARIOS
 from atalante_tools.faults.matrix import load_matrix
+from atalante_tools.trial import command as trial_command
 from atalante_tools.trial.fault_findings import NO_FALL, NO_FALL_IN_DOUBLE_SUPPORT, fault_findings
-from atalante_tools.trial.fault_plan import DOUBLE_SUPPORT, PERMANENT, fault_trials
+from atalante_tools.trial.fault_plan import (
+    DOUBLE_SUPPORT,
+    FURTHER_MOMENTS,
+    MOMENTS,
+    NO_FRAMES,
+    PERMANENT,
+    QUICK_MOMENTS,
+    fault_trials,
+)
 from atalante_tools.trial.fault_run import diagnosed, longest_without, run_fault
+from atalante_tools.trial.report import EXPERIMENTS
 
 #: Fault whose cases all begin at power-on.
 POWER_ON = "F53"
@@ -135,6 +145,17 @@ def test_cases_for_a_suspended_robot_are_left_out() -> None:
     assert suspended
     assert not cases & suspended
     assert "FOOT_LEFT reports no load" in cases
+
+
+def test_help_and_report_state_the_number_of_moments() -> None:
+    _, explanation = EXPERIMENTS["faults"]
+    for text in (trial_command.commands["faults"].help or "", explanation):
+        words = " ".join(text.split())
+        assert (len(MOMENTS), len(MOMENTS | FURTHER_MOMENTS), len(QUICK_MOMENTS)) == (10, 13, 2)
+        assert "begins at ten moments" in words
+        ids = f"{', '.join(sorted(NO_FRAMES)[:-1])} and {max(NO_FRAMES)}"
+        assert f"{ids}, after which the HAL sends no more frames, begin at 13 moments" in words
+        assert "With --quick, there are two moments" in words
 
 
 def test_command_injects_a_fault_and_writes_the_report(tmp_path: Path) -> None:

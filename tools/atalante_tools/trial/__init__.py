@@ -181,8 +181,9 @@ def faults(ids: tuple[str, ...], running: Running, as_json: bool) -> None:
     """Inject each fault, or the faults with the given IDs, into walks on the ground with a passive wearer.
 
     Each case of the fault matrix begins at ten moments: at eight phases of a step, and in double support before and after the
-    steps. The report states which walks end in a fall, and why. For permanent faults, it states the longest duration without
-    a fall.
+    steps. The faults F15, F16 and F41, after which the HAL sends no more frames, begin at 13 moments: also while the robot
+    stands, at the start of the first step, and at the landing of the stop step. With --quick, there are two moments. The
+    report states which walks end in a fall, and why. For permanent faults, it states the longest duration without a fall.
     """
     from atalante_tools.console.names import find
     from atalante_tools.trial.fault_findings import fault_findings

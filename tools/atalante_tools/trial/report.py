@@ -38,7 +38,9 @@ EXPERIMENTS: Final = {
     "faults": (
         "Faults during walks on the ground",
         "Each case of the fault matrix begins at ten moments of a walk with a passive wearer: at eight phases of the second "
-        "step, and in the weight shifts (both feet carry load) before and after the steps. A robot has fallen if its "
+        "step, and in the weight shifts (both feet carry load) before and after the steps. The faults F15, F16 and F41, after "
+        "which the HAL sends no more frames, begin at 13 moments: also while the robot stands, at the start of the first step, "
+        "and at the landing of the stop step. With --quick, there are two moments. A robot has fallen if its "
         "pelvis leans by more than 35 degrees. The longest duration of a permanent fault without a fall is found by bisection.",
     ),
     "protocol": (
