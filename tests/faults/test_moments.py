@@ -152,6 +152,21 @@ def test_a_wrong_motor_may_move_a_joint_during_a_start(
     assert len(patched(monkeypatch, sag, task).failures) == failures
 
 
+@pytest.mark.parametrize("moment", [Moment.START, Moment.RESTART])
+def test_state_that_improves_after_the_start_by_itself_fails(monkeypatch: pytest.MonkeyPatch, moment: Moment) -> None:
+    begins = schedule(moment, ENGINE).begins
+
+    def improve(run: Observation) -> None:
+        states = list(run.states)
+        states[begins + 9 : begins + 29] = [S.FAULT] * 20
+        states[begins + 29 :] = [S.HOLD] * (len(states) - begins - 29)
+        object.__setattr__(run, "states", tuple(states))
+
+    assert patched(monkeypatch, improve, MomentTask(moment, NO_EFFECT.cases)).failures == (
+        f"the state must not improve without the operator, but it became HOLD in cycle {begins + 30}",
+    )
+
+
 def test_motion_that_is_not_a_number_fails(monkeypatch: pytest.MonkeyPatch) -> None:
     def lose(run: Observation) -> None:
         run.velocity[100, 3] = np.nan

@@ -11,6 +11,7 @@ import pytest
 from atalante_dbc import Network
 from atalante_hal.robot import JOINTS, Robot
 from atalante_hal.safety.events import Event
+from atalante_hal.safety.start import ENABLE_CYCLES
 from atalante_hal.types import SupervisorState
 from atalante_hal.wire.cia402 import Controlword
 from atalante_hal.wire.process_image import TransmitImage
@@ -18,7 +19,7 @@ from atalante_tools.faults.command_check import Commands, SentFrames
 from atalante_tools.faults.matrix import Row
 from atalante_tools.faults.observation import RESTARTED, Observation
 from atalante_tools.faults.scenario import Case
-from atalante_tools.faults.verdict import Expectation, Verdict, evaluate
+from atalante_tools.faults.verdict import Expectation, Verdict, automatic_improvements, evaluate
 
 S = SupervisorState
 FIRST, PRESSED = 11, 41
@@ -69,6 +70,27 @@ def test_expected_reaction_passes(make_observation: Any) -> None:
 
 def test_reaction_time_is_measured_to_the_first_hold_frame(make_observation: Any) -> None:
     assert verdict(make_observation(held=12)).cycles == 2
+
+
+@pytest.mark.parametrize(
+    ("states", "improved"),
+    [
+        ([S.HOLD] * 20 + [S.ACTIVE] * 20, None),
+        ([S.FAULT] * 9 + [S.HOLD] * 20, None),  # in the cycle of START
+        ([S.HOLD] * (9 + ENABLE_CYCLES) + [S.ACTIVE] * 20, None),
+        ([S.HOLD] * (10 + ENABLE_CYCLES) + [S.ACTIVE] * 20, ("ACTIVE", 11 + ENABLE_CYCLES)),
+        ([S.HOLD] * 20 + [S.ACTIVE] * 5 + [S.FULL_ASSIST] * 5 + [S.ACTIVE] * 5, ("ACTIVE", 31)),
+        ([S.HOLD] * 20 + [S.LOWER] * 5 + [S.HOLD] * 5, ("HOLD", 26)),
+        ([S.FAULT] * 9 + [S.HOLD] * 5 + [S.ACTIVE] * 5, ("ACTIVE", 15)),
+        ([S.READY] * 20 + [S.OFF] * 5 + [S.READY] * 5, None),
+    ],
+)
+def test_a_start_may_improve_the_state_only_once_and_in_time(
+    make_observation: Any, states: list[S], improved: tuple[str, int] | None
+) -> None:
+    run = make_observation(states)
+    expected = [] if improved is None else [IMPROVED.replace("ACTIVE in cycle 31", "{} in cycle {}".format(*improved))]
+    assert automatic_improvements(run, run.last, (FIRST - 1,)) == expected
 
 
 @pytest.mark.parametrize(

@@ -8,7 +8,7 @@ pairs. The runs check what must be true for every fault at every moment:
 - No torque, position, velocity or torque rate exceeds its limit. Exception: for `FOUND` cycles, a faulty motor may move a joint
   above its velocity limit, because the HAL cannot limit the speed while the drive holds its position.
 - No command lets a drive produce torque before the operator has pressed START.
-- After the robot has walked, only the operator can cause a change to a less severe state.
+- If the fault begins after START, only the operator can cause a change to a less severe state, and each START only one.
 - During a start, no joint moves by more than `SAG_MAX`. A wrong motor, a wrong encoder or a push moves its joint, so these
   faults have other limits (`SAG_OF`).
 - The run raises no exception.
@@ -167,10 +167,9 @@ class MomentTask:
         starts = [cycle for cycle in presses if cycle >= min(begins, default=math.inf)]
         unlimited = [range(cycle, cycle + FOUND) for cycle in (*begins, *starts)]
         failures = [*limit_violations(run, unlimited, _strength(stimuli)), *_premature(run, plan.starts[0])]
-        # At the other moments, the operator presses START just before or after the fault begins. This START may cause a less
-        # severe state, so improvements of the state are not checked.
-        if self.moment in (Moment.WALKING, Moment.HOLD):
-            failures += automatic_improvements(run, before)
+        # At the other moments, the fault may delay the START of the schedule.
+        if self.moment not in (Moment.BOOT, Moment.READY):
+            failures += automatic_improvements(run, before, plan.starts)
         most = max((SAG_OF.get(kind, SAG_MAX) for kind in kinds), default=SAG_MAX)
         if extremes.sag.value > most:
             sag = f"{extremes.sag.value:.2f} deg of {extremes.sag.joint}"

@@ -19,6 +19,7 @@ import numpy as np
 
 from atalante_hal.robot import JOINTS
 from atalante_hal.safety.events import Event
+from atalante_hal.safety.start import ENABLE_CYCLES
 from atalante_hal.types import SupervisorState, Vector
 from atalante_hal.wire.cia402 import Controlword
 from atalante_tools.faults.matrix import Row
@@ -162,18 +163,27 @@ def limit_violations(run: Observation, unlimited: Sequence[range] = (), strength
     return found
 
 
-def automatic_improvements(run: Observation, until: int) -> list[str]:
+def automatic_improvements(run: Observation, until: int, starts: Sequence[int] = ()) -> list[str]:
     """Return a sentence if the HAL changed to a less severe state by itself after the first faulty cycle.
+
+    Each START may change the state only once, and within `ENABLE_CYCLES` cycles. READY to OFF is always accepted, because
+    nothing moves.
 
     Args:
         run: observation of the run.
-        until: last cycle to check. The operator must not act before this cycle.
+        until: last cycle to check.
+        starts: cycles before `until` in which the operator pressed START. The HAL must have received each START before the
+            first faulty cycle.
     """
     for cycle in range(run.first + 1, until + 1):
-        if run.state(cycle) < run.state(cycle - 1):
-            return [
-                f"the state must not improve without the operator, but it became {run.state(cycle).name} in cycle {cycle}"
-            ]
+        now, last = run.state(cycle), run.state(cycle - 1)
+        if now >= last or last is _S.READY:
+            continue
+        if not any(
+            start <= cycle <= start + ENABLE_CYCLES and set(run.states[start - 2 : cycle - 1]) == {last}
+            for start in starts
+        ):
+            return [f"the state must not improve without the operator, but it became {now.name} in cycle {cycle}"]
     return []
 
 
