@@ -38,8 +38,9 @@ class LinkRecord:
     lever: Annotated[Vector, 3]  # m, position of the centre of mass
     rotation: Annotated[Vector, (3, 3)]  # rotation matrix from link to parent
     down: Annotated[Vector, 3]  # m/s2, gravitational acceleration
-    force: Annotated[Vector, 3]  # N, force that holds the link and its descendants
-    moment: Annotated[Vector, 3]  # Nm, moment that holds the link and its descendants, about the joint
+    # Force [N] and moment about the joint [Nm] that hold the link and its descendants; for the pelvis, only its descendants.
+    force: Annotated[Vector, 3]
+    moment: Annotated[Vector, 3]
 
 
 class Gravity:
@@ -101,7 +102,10 @@ def hold(links: Records[LinkRecord], position: Vector, pelvis: Attitude, torque:
         torque: u_g, shape (12,) [Nm], overwritten.
     """
     w, x, y, z = pelvis
-    down = links[0].down
+    base = links[0]
+    for j in range(3):
+        base.force[j], base.moment[j] = 0.0, 0.0  # the inward pass adds the forces and moments of the legs
+    down = base.down
     down[0], down[1] = -GRAVITY * 2.0 * (x * z - w * y), -GRAVITY * 2.0 * (y * z + w * x)
     down[2] = -GRAVITY * (1.0 - 2.0 * (x * x + y * y))
     for i in range(1, len(links)):

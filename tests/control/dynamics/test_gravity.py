@@ -54,3 +54,11 @@ def test_gravity_does_not_change_its_model():
     gravity = Gravity(MODEL)
     gravity.torque(np.zeros(12), (math.sqrt(0.5), math.sqrt(0.5), 0.0, 0.0))
     np.testing.assert_allclose(MODEL.model.gravity.linear, [0.0, 0.0, -9.81])
+
+
+def test_repeated_calls_do_not_add_up_the_force_on_the_pelvis():
+    gravity, q = Gravity(MODEL), np.random.default_rng(9).uniform(ROBOT.position_min, ROBOT.position_max)
+    for _ in range(3):
+        gravity.torque(q, LEVEL)
+    legs = sum(inertia.mass for inertia in MODEL.model.inertias[1:])
+    np.testing.assert_allclose(gravity.links[0].force, [0.0, 0.0, 9.81 * legs], atol=1e-9)
