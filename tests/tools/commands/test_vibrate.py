@@ -5,12 +5,14 @@ from __future__ import annotations
 import json
 from collections.abc import Iterator
 from contextlib import contextmanager
+from functools import partial
 from typing import Any
 
 import numpy as np
 import pytest
 from click.testing import CliRunner, Result
 
+from atalante_emulator.faults import Fault
 from atalante_hal.robot import MOTORS
 from atalante_tools.cli import cli
 from atalante_tools.session import rig as rig_module
@@ -53,6 +55,26 @@ def test_the_output_contains_commanded_and_measured_level() -> None:
     assert result.exit_code == 0
     assert result.stdout == "left_thigh_front: commanded 0.50, measured at most 0.50, for 0.4 s\n"
     assert result.stderr.endswith("the robot is in HOLD\n")
+
+
+@pytest.mark.parametrize(
+    ("fault", "seconds", "code"),
+    [
+        (Fault("value", "HAPTICS_STATE", LeftThighFront_Amplitude=0.2), "0.4", 1),
+        (Fault("value", "HAPTICS_STATE", LeftThighFront_Amplitude=0.3), "0.4", 0),
+        (Fault("value", "HAPTICS_STATE", LeftThighFront_Amplitude=0.0), "0.05", 0),  # too short to check
+        (Fault("drop", "HAPTICS_STATE"), "0.4", 1),
+        (Fault("drop", "HAPTICS_COMMAND"), "0.4", 1),
+    ],
+)
+def test_motor_that_does_not_reach_half_of_its_level_ends_with_1(
+    monkeypatch: pytest.MonkeyPatch, fault: Fault, seconds: str, code: int
+) -> None:
+    monkeypatch.setattr(rig_module, "open_hal", partial(rig_module.open_hal, faults=[fault]))
+    result = vibrate("left_thigh_front", "0.5", "--for", seconds)
+    assert result.exit_code == code, result.stderr
+    assert ("left_thigh_front must reach half of the commanded level 0.5, but at most" in result.stderr) == bool(code)
+    assert "the robot is in HOLD\n" in result.stderr
 
 
 @pytest.mark.parametrize(

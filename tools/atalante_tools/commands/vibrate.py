@@ -2,17 +2,24 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Final
 
 import click
 
 from atalante_tools.console.names import find
 from atalante_tools.console.options import Between, Target, json_option, target_options
+from atalante_tools.console.outcome import Failed
 from atalante_tools.console.stop_request import stop_requested
 from atalante_tools.console.terminal import print_message, show_json
 
 if TYPE_CHECKING:
     from atalante_hal.types import State
+
+#: Shortest vibration whose measured level is checked [s]. A motor with a time constant of 0.06 s, the largest that `atalante
+#: conform` accepts, then reaches 80 % of the level.
+_CHECKED: Final = 0.1
+#: Share of the commanded level that the motor must reach.
+_REACHED: Final = 0.5
 
 
 @click.command()
@@ -35,7 +42,7 @@ def command(motor: str, level: float, seconds: float, target: Target, as_json: b
     MOTOR is left_ or right_, then thigh_ or shank_, then front or back. Example: left_thigh_front.
 
     The motor runs after the operator presses START (`atalante pendant start`). With -i embedded, an emulated operator
-    presses START. The robot ends in HOLD.
+    presses START. The robot ends in HOLD. The exit code is 1 if the motor does not reach half of LEVEL within 0.1 s or more.
 
     \b
     Example: atalante vibrate left_thigh_front 0.5 --for 2
@@ -78,3 +85,8 @@ def command(motor: str, level: float, seconds: float, target: Target, as_json: b
     else:
         click.echo(f"{MOTORS[index]}: commanded {level:.2f}, measured at most {strongest:.2f}, for {seconds:g} s")
     print_message("the robot is in HOLD")
+    if controller.elapsed >= _CHECKED and strongest < _REACHED * level:
+        raise Failed(
+            f"{MOTORS[index]} must reach half of the commanded level {level:g}, but at most {strongest:.3f} was measured: "
+            "check the motor and the node HAPTICS"
+        )
