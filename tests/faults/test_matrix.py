@@ -9,12 +9,15 @@ from fnmatch import fnmatchcase
 from functools import cache
 from pathlib import Path
 
+import numpy as np
 import pytest
 
+from atalante_hal.robot import LEG_JOINTS, load_robot
 from atalante_hal.safety.diagnostics import Dtc
-from atalante_hal.types import SupervisorState
+from atalante_hal.safety.plausibility.encoders import JUMPS_TO_CONFIRM
+from atalante_hal.types import PERIOD, SupervisorState
 from atalante_tools.faults.catalogue import SCENARIOS
-from atalante_tools.faults.matrix import COLUMNS, SCENARIO, MatrixError, load_matrix
+from atalante_tools.faults.matrix import COLUMNS, MATRIX_FILE, SCENARIO, MatrixError, load_matrix
 from atalante_tools.faults.tasks import REPRESENTATIVES
 from atalante_tools.faults.verdict import Expectation
 
@@ -76,6 +79,16 @@ def test_representatives_are_existing_cases_of_at_least_twelve_faults() -> None:
     assert len({id_ for id_, _ in REPRESENTATIVES}) == len(REPRESENTATIVES) >= 12
     for id_, name in REPRESENTATIVES:
         assert name in [case.name for case in SCENARIOS[id_].cases]
+
+
+def test_the_largest_jump_that_is_used_as_a_motion_is_the_one_of_the_robot() -> None:
+    reach = JUMPS_TO_CONFIRM * PERIOD * load_robot().top_speed[: len(LEG_JOINTS)]
+    reach_of = dict(zip(LEG_JOINTS, reach.tolist(), strict=True))
+    ankle = reach_of.pop("SA")
+    (other,) = set(reach_of.values())
+    text = " ".join(MATRIX_FILE.read_text("utf-8").split())
+    assert f"motion possible in five cycles ({1e3 * other:g} mrad; SA: {1e3 * ankle:g})" in text
+    assert f"jump, of up to {np.degrees(other):.2f} deg (SA: {np.degrees(ankle):.2f})" in text
 
 
 def test_invalid_matrix_is_rejected_with_line_and_value(tmp_path) -> None:
