@@ -137,9 +137,8 @@ class SafetyMonitor:
         self._joint_rows = np.array(rows_of(image.codec, JOINT_MESSAGES))
         self.torque_tracking = TorqueTracking(robot.breakaway)
         self.torque_motion: TorqueMotion | None = None
-        #: DBC names of the drives that stay off until the direction test of a start is passed, see `proof`: drives that were off
-        #: before the START, drives with a wrong torque, drives that did not hold their joints, and drives whose joints failed
-        #: the test.
+        #: DBC names of the drives that stay off until a start passes its direction test, see `proof`. They were off before a START
+        #: in READY, had a wrong torque, did not hold their joints, or failed the test.
         self._kept_off: set[str] = set()
         #: False if `evaluate` must evaluate the next cycle. If True, `evaluate` skips a normal cycle: fresh data, no fault, and
         #: unchanged values of pendant and drives.
@@ -395,9 +394,11 @@ class SafetyMonitor:
             self._acknowledged = True
             if not self.start_wanted:  # another press of START during a start does not restart the direction test
                 self._proof_begun = False
-                # If the start ends before the test is passed, the drives that are off now are switched off again.
-                on = powered(state.drive_state).tolist()
-                self._kept_off.update(node for node, is_on in zip(DRIVE_NODES, on, strict=True) if not is_on)
+                if state.supervisor is _S.READY:
+                    # No joint has passed the test yet. If the start ends before the test is passed, the drives that are off
+                    # now are switched off again. In HOLD they hold, because the robot has moved with them before.
+                    on = powered(state.drive_state).tolist()
+                    self._kept_off.update(node for node, is_on in zip(DRIVE_NODES, on, strict=True) if not is_on)
             self.start_wanted = ENABLE_CYCLES if state.supervisor in _STARTABLE else 0
         elif self.start_wanted:
             self.start_wanted -= 1

@@ -178,7 +178,8 @@ def test_overloaded_joint_is_found_in_the_last_cycle(joint: int) -> None:
         JOINTS[joint].upper(),
         OVERLOADED,
         True,
-        f"{JOINTS[joint]} does not move back although its drive holds it and reports {LIMIT[joint]:.0f} Nm; its drive is switched off",
+        f"{JOINTS[joint]} does not move back although its drive holds it and reports {LIMIT[joint]:.0f} Nm; "
+        "its drive is switched off",
     )
 
 

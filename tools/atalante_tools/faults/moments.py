@@ -28,6 +28,7 @@ import numpy as np
 from atalante_emulator.faults import Fault
 from atalante_hal.robot import JOINTS
 from atalante_hal.safety.safety_monitor import DRIVE_NODES
+from atalante_hal.safety.start import ENABLE_CYCLES
 from atalante_hal.types import SupervisorState, Vector
 from atalante_tools.console.options import PYBULLET
 from atalante_tools.faults.catalogue import SCENARIOS
@@ -37,10 +38,10 @@ from atalante_tools.faults.scenario import MID_SWING, Case, Stimulus, shifted
 from atalante_tools.faults.verdict import WALKING, automatic_improvements, exception_sentence, limit_violations
 
 _S = SupervisorState
-#: Largest accepted motion of a joint during a start [deg]. The motion is measured from START to ACTIVE, for at most `_SETTLED`
-#: cycles. Then the drives are enabled, but the test of the joint directions, which takes about 75 cycles, is not over.
+#: Largest accepted motion of a joint during a start [deg]. A start lasts from START to ACTIVE, or until the HAL ends the start.
 SAG_MAX: Final = 1.0
-_SETTLED: Final = 40
+#: Events with which the HAL ends a start before ACTIVE.
+_ENDS_OF_START: Final = ("START_FAILED", "START_REFUSED")
 #: Kind of a fault that moves a joint during a start -> largest accepted motion of the joints of its leg [deg]. A wrong motor or
 #: encoder moves the joint until the test of the joint directions finds the fault (F72). A push may exceed the torque that holds
 #: the joint.
@@ -283,9 +284,11 @@ def _sag(run: Observation, starts: Sequence[int]) -> Vector:
         starts: cycles in which the operator pressed START, except the two presses after the observation of the fault.
     """
     sag = np.zeros(len(JOINTS))
+    ends = [event.cycle for event in run.events if event.code in _ENDS_OF_START]
     for start in starts:
-        for cycle in range(start, min(start + _SETTLED, run.last) + 1):
-            if run.state(cycle) in WALKING:
+        last = min((end for end in ends if end > start), default=run.last)
+        for cycle in range(start, min(start + ENABLE_CYCLES, last, run.last) + 1):
+            if run.state(cycle) is not run.state(start):
                 break
             np.maximum(sag, np.abs(run.position[cycle - 1] - run.position[start - 1]), out=sag)
     return np.degrees(sag)
