@@ -137,8 +137,8 @@ class SafetyMonitor:
         self._joint_rows = np.array(rows_of(image.codec, JOINT_MESSAGES))
         self.torque_tracking = TorqueTracking(robot.breakaway)
         self.torque_motion: TorqueMotion | None = None
-        #: DBC names of the drives that stay off until a start passes its direction test, see `proof`. They were off before a START
-        #: in READY, had a wrong torque, did not hold their joints, or failed the test.
+        #: DBC names of the drives that stay off until a start passes its direction test, see `proof`. They were off before a
+        #: START in READY, had a wrong torque, did not hold their joints, or failed the test.
         self._kept_off: set[str] = set()
         #: False if `evaluate` must evaluate the next cycle. If True, `evaluate` skips a normal cycle: fresh data, no fault, and
         #: unchanged values of pendant and drives.
