@@ -25,7 +25,7 @@ POLLING_PERIOD: Final = 100e-6
 class Share(NamedTuple):
     """Frames of a batch that are sent on one channel."""
 
-    link: Bus
+    channel: int  # index of the channel
     indices: list[int]  # indices of the channel's frames in the batch
     #: send buffer for the channel's frames; always the same array object, because a bus caches memory views of each array
     frames: Frames
@@ -67,7 +67,7 @@ class JoinedBus:
         self._turn = 0
         self._closed = False
         self._failure: BusError | None = None  # error that a channel raised in the current call of `receive`
-        self._down: dict[int, str] = {}  # error message of each lost channel, by `id()` of its bus object
+        self._down: dict[int, str] = {}  # error message of each lost channel, by index of the channel
         files = [_file_of(link) for link in self._links]
         self._files = [file for file in files if file is not None]
         self._all_have_files = len(self._files) == len(files)
@@ -101,17 +101,17 @@ class JoinedBus:
             raise BusDown(f"{self.name} is closed")
         _, headers = self._batches.to_send(frames)
         words = as_words(frames)
-        failures: dict[int, BusError] = {}  # error of each channel that raised one, by `id()` of its bus object
+        failures: dict[int, BusError] = {}  # error of each channel that raised one, by index of the channel
         shares = self._shares.get(headers) or self._divide(headers, frames)
         for share in shares:
             as_words(share.frames)[:] = words[share.indices]
             try:
-                share.link.send(share.frames)
+                self._links[share.channel].send(share.frames)
             except BusError as error:
-                failures[id(share.link)] = error
-                self._lost(share.link, error)
+                failures[share.channel] = error
+                self._lost(share.channel, error)
             else:
-                self._down.pop(id(share.link), None)
+                self._down.pop(share.channel, None)
         if failures:
             raise _combined(shares, failures)
 
@@ -151,27 +151,29 @@ class JoinedBus:
         for link in self._links:
             link.close()
 
-    def _lost(self, link: Bus, error: BusError) -> None:
+    def _lost(self, channel: int, error: BusError) -> None:
         if isinstance(error, BusDown):
-            self._down[id(link)] = str(error)
+            self._down[channel] = str(error)
 
     def _gather(self, tails: list[Frames]) -> int:
         size = len(tails[0])
         room = min(size, self._capacity)
         count = 0
-        links, first = self._links, self._turn
-        self._turn = (first + 1) % len(links)
-        for link in links[first:] + links[:first]:
+        channels, first = len(self._links), self._turn
+        self._turn = (first + 1) % channels
+        for turn in range(first, first + channels):
             if count == room:
                 break
+            channel = turn % channels
+            link = self._links[channel]
             try:
                 got = link.receive(tails[count] if room == size else tails[count][: room - count])
             except BusError as error:
                 self._failure = error
-                self._lost(link, error)
+                self._lost(channel, error)
                 continue
             if got:
-                self._down.pop(id(link), None)
+                self._down.pop(channel, None)
                 self.stamps[count : count + got] = link.stamps[:got]
                 count += got
         return count
@@ -197,7 +199,7 @@ class JoinedBus:
                     f"frame {index} (id 0x{frame_id:X}) is not a message of the network, so it has no channel"
                 )
             rows.setdefault(link, []).append(index)
-        shares = [Share(self._links[link], found, new_frames(len(found))) for link, found in rows.items()]
+        shares = [Share(link, found, new_frames(len(found))) for link, found in rows.items()]
         if len(self._shares) >= REMEMBERED:
             self._shares.clear()
         self._shares[headers] = shares
@@ -211,10 +213,10 @@ def _combined(shares: list[Share], failures: dict[int, BusError]) -> BusError:
 
     Args:
         shares: Frames of each channel.
-        failures: Error of each channel that raised one, by `id()` of its bus object.
+        failures: Error of each channel that raised one, by index of the channel.
     """
     accepted = [
-        share.frames if (error := failures.get(id(share.link))) is None else error.accepted_of(share.frames)
+        share.frames if (error := failures.get(share.channel)) is None else error.accepted_of(share.frames)
         for share in shares
     ]
     frames = joined(accepted)
