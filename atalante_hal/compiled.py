@@ -35,8 +35,8 @@ Function = TypeVar("Function", bound=Callable[..., Any])
 P = ParamSpec("P")
 R = TypeVar("R")
 
-#: Name of a marker file in the cache folder of a function. The file means: this function creates arrays.
-#: numba can compile a function that creates arrays only with reference counts.
+#: Name of a marker file in the cache folder of a function. If the file exists, the function creates arrays.
+#: `specialised` compiles such a function with numba's reference counting, and any other function without it.
 _MARK = "creates-arrays"
 #: Function given to `specialised` -> whether this function creates arrays.
 _CREATES_ARRAYS: dict[Callable[..., Any], bool] = {}
@@ -124,7 +124,12 @@ def _numba() -> Any:
 
 @cache
 def _compiled(function: FunctionType, counted: bool) -> Any:
-    """Return the dispatcher of a function, with or without reference counts."""
+    """Return a function wrapped by `numba.njit`. The wrapper compiles the function at its first call.
+
+    Args:
+        function: Function to compile.
+        counted: Whether the machine code counts the references to arrays. Must be True if the function creates arrays.
+    """
     numba = _numba()
     config: Any = numba.config
     config.CPU_NAME, config.CPU_FEATURES = "generic", ""
@@ -136,14 +141,14 @@ def _compiled(function: FunctionType, counted: bool) -> Any:
 
 
 def _mark(function: Callable[..., Any]) -> None:
-    """Create the marker file of a function that creates arrays, see `_MARK`."""
+    """Record in the cache folder that a function creates arrays, see `_MARK`."""
     folder = _folder(cast(FunctionType, function), False)
     if folder is not None:
         (folder / _MARK).touch()
 
 
 def _is_marked(function: Callable[..., Any]) -> bool:
-    """Return whether the cache folder of a function contains the marker file of functions that create arrays."""
+    """Return whether the cache folder records that a function creates arrays, see `_MARK`."""
     folder = _folder(cast(FunctionType, function), False)
     return folder is not None and (folder / _MARK).exists()
 

@@ -230,8 +230,8 @@ class Hal:
         if safety_monitor.start_wanted and (
             state.supervisor in (_S.LOWER, _S.FAULT) or (state.supervisor is _S.HOLD and safety_monitor.start_prevented)
         ):
-            # The operator acknowledged the faults, so reset the drives in FAULT. All other drives continue to hold. In HOLD, the
-            # emergency of a drive in FAULT prevents the start until the drive is reset.
+            # The operator acknowledged the faults with START. So each drive in FAULT is reset; the other drives continue to hold.
+            # HOLD is included: until a drive in FAULT is reset, its emergency message remains active and prevents the start.
             control[state.drive_state == DriveState.FAULT] = Controlword.FAULT_RESET
             safety_monitor.enabling = False
         elif (

@@ -24,8 +24,8 @@ RECEIVE_BUDGET = 128
 PERSISTENT = 5
 #: Time to listen for another HAL before the first SYNC [s].
 LISTEN = 0.2
-#: Longest wait for answers [s] in two doubtful cases: no node has answered within its timeout, or the last SYNC was not sent.
-#: In all other cases, silent nodes shorten the wait, but never to less than this time, see `Transceiver.receive`.
+#: Longest wait for unlikely answers [s]. Answers are unlikely if the last SYNC was not sent, if every node has timed out, or if
+#: the missing nodes have not answered several SYNCs.
 _DOUBTFUL_PATIENCE = 0.1
 #: Class bit of an error frame that reports bus-off (linux/can/error.h).
 ERROR_BUS_OFF = 0x40

@@ -59,7 +59,8 @@ class State:
     joints_valid: bool  # True if all twelve joint states are valid
     imu_rows: tuple[int, ...] = ()  # indices of the IMU messages in `valid` and `age`; empty if unknown
     foot_rows: tuple[int, ...] = ()  # indices of the foot messages in `valid` and `age`; empty if unknown
-    #: (12,) Nm, last output of the limiter; None if unknown. While the drives hold, 0 is sent to them instead.
+    #: (12,) Nm, last output of the torque limiter; None if unknown. While the controller drives the joints, this is the torque
+    #: command of the drives. While the drives hold their positions, their torque command is 0 instead.
     torque_sent: Vector | None = None
     #: Additional delay [cycles] from a torque command to its effect because of late messages or motors; 0 if all are punctual.
     #: Measured at START, see `safety.direction`.

@@ -207,9 +207,11 @@ class JoinedBus:
 
 
 def _combined(shares: list[Share], failures: dict[int, BusError]) -> BusError:
-    """Return the first error that is not `BusFull`, with the first `BusFull` as its attribute `full`.
+    """Choose the error that `send` raises if at least one channel failed.
 
-    If each error is `BusFull`, return the first one. The errors contain the frames that all channels together accepted.
+    A lost channel is worse than a full transmit queue. So the first error other than `BusFull` is chosen, and its attribute
+    `full` is set to the first `BusFull`. If all errors are `BusFull`, the first one is chosen. `accepted` of the chosen
+    error contains the accepted frames of all channels.
 
     Args:
         shares: Frames of each channel.

@@ -155,7 +155,7 @@ def _open(path: Path) -> can.io.generic.MessageReader:
         )
     if kind not in can.io.player.MESSAGE_READERS:
         raise LogUnreadable(
-            f"{path}: the log format must be one of python-can, such as .log (candump -L), .asc or .blf, "
+            f"{path}: the log format must be one that python-can can read, such as .log (candump -L), .asc or .blf, "
             f"got {kind or 'no suffix'!r}"
         )
     try:

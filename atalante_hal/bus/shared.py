@@ -90,7 +90,7 @@ class SharedBus:
         self._sent = self._received = 0
         self._waits_without_polling = 0  # number of further waits in which this end does not poll
         self._closed = False
-        self._close_reason = ""  # reason for closing that the other end has sent
+        self._close_reason = ""  # text that the other end sent when it closed; empty if it sent none
         self._stamps: Stamps = np.zeros(size // FRAME_BYTES, np.int64)
         self._received_at = 0
         self._batches = Batches()
@@ -314,7 +314,8 @@ class SharedBus:
             except BlockingIOError:
                 return
             except ConnectionResetError:
-                continue  # the other end closed without reading all wake-ups; the next `recv` returns its reason for closing
+                # The other end closed before it had read all wake-ups. Its last message can still be read from the socket.
+                continue
             if not received:
                 raise BusDown(f"{self.name}: {self._close_reason or 'the other end is closed'}")
             if received != _WAKE_UP:

@@ -50,8 +50,8 @@ _SHORT = min(duration for _, duration in GROUPS)
 #: Delay [cycles] from a torque command to the first position that shows its effect, if no frame and no motor is late.
 LATENCY = 2
 #: Delays that the test tries [cycles]. States, commands and motors may be late by three cycles in total.
-#: Longer delays are not tried: the inverted pulse of 16 cycles resembles a pulse that comes 4 to 5 cycles later.
-#: So a motor with a wrong sign would look like a late motor.
+#: A motor with a wrong sign moves its joint almost like a correct motor that is 4 to 5 cycles late (pulse of 16 cycles).
+#: Therefore the longest delay that the test tries is `LATENCY + 3`.
 LATENCIES = tuple(range(LATENCY, LATENCY + 4))
 #: Peak of the pulse as a multiple of `Robot.breakaway`, in the order of LEG_JOINTS.
 #: The peaks of FH and SH are larger, because these joints move a whole leg.
@@ -84,7 +84,9 @@ MOBILITY = (0.045, 0.23, 0.075, 0.56, 4.6, 6.8)
 
 
 def pulse(cycle: int, duration: int) -> float:
-    """Return the torque pulse relative to its peak, from -1 to 0.5625; 0 outside the pulse.
+    """Return the shape of the torque pulse at one time: -1 in the middle of the pulse, 0 outside the pulse.
+
+    Before and after the middle, the shape has a positive lobe with a height of 0.5625.
 
     Args:
         cycle: time since the pulse began [cycles].
@@ -172,8 +174,8 @@ class DirectionProof:
         #: Tests still to be done: joints of the test, and duration of its pulse [cycles].
         self._tests: list[tuple[list[int], int]] = []
         self._trials = [0] * len(JOINTS)
-        # A test of one or two joints uses the delay `late` from earlier tests with more joints. If such a test chose its own
-        # delay, a reversed motor might look like a late motor.
+        # A test of one or two joints does not estimate the delay, but uses `late`. If the delay were fitted to so few joints,
+        # a motor with a wrong sign might look like a late motor.
         self.late = 0
         #: Quality of the fit with each delay in `LATENCIES`: the share of a joint's motion that its torque explains.
         #: The shares of all joints that passed a test with a short pulse are added.

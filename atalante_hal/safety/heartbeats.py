@@ -78,9 +78,9 @@ class Heartbeats:
         #: active emergencies, the entry is the newest of the emergencies with the most severe reaction.
         self.emergencies: dict[str, tuple[Dtc, int]] = {}
         self._cleared: set[str] = set()  # nodes whose emergency was cleared in this cycle
-        #: Emergencies that the next `evaluate` only reports as pending. Each entry is (node, diagnostic, error code).
-        #: Such an emergency has the reaction INFO, or a more severe emergency of the same node is already active.
-        #: `_notices` also contains an entry with error code 0 for each frame of an error passive node.
+        #: Events that the next `evaluate` raises only as pending diagnostics. Each entry is (node, diagnostic, error code).
+        #: One kind of event is a mild emergency: its reaction is INFO, or a more severe emergency of the node is already active.
+        #: The other kind is a frame from an error passive node. There is no emergency in this case, so the error code is 0.
         self._notices: list[tuple[str, Dtc, int]] = []
         #: Nodes that were reset: they reported a state other than OPERATIONAL at least once since the last `evaluate`.
         #: The first status message of a node does not count.

@@ -38,22 +38,25 @@ INTERVAL: Final = 100
 #: A joint is regarded as oscillating after this number of consecutive reversals.
 REVERSALS: Final = 6
 #: Lowest and highest reported torque that count as overload, as shares of the drive's torque limit.
-#: A drive cannot exceed its torque limit that far, so a higher reported torque is wrong.
+#: A drive cannot produce more than 105 % of its torque limit. A higher reported torque is a wrong value, not an overload.
 SATURATED: Final = (0.9, 1.05)
 #: A drive is regarded as overloaded after this number of consecutive cycles with overload.
 OVERLOADED: Final = 20
 #: A drive can be overloaded only if its joint is at least this far from the position in which the hold began [rad].
 #: A drive that only reports a wrong torque keeps its joint closer than this distance.
 AWAY: Final = math.radians(1.0)
-#: The position control of a working drive reaches its torque limit if its joint is that far from its position [rad].
+#: A drive without torque is reported only if its joint is at least this far from the position in which the hold began [rad].
+#: At this distance, the position control of a working drive demands the full torque.
 SUNK: Final = math.radians(3.0)
 #: A drive without torque reports less than this share of its torque limit.
 POWERLESS: Final = 0.1
 #: The encoder of a joint is confirmed if it differs from the IMUs of its leg by at most this angle [rad].
 ENCODER_ERROR: Final = math.radians(1.0)
-#: Speed threshold of the overload count [rad/s]. The noise of the velocities is smaller than this threshold.
-#: The count restarts if the joint moves back towards the position in which the hold began, faster than this threshold.
-#: The count also restarts if the motion away from this position has slowed by more than this threshold since the count began.
+#: Speed threshold of the overload count [rad/s]. It is larger than the noise of the velocities.
+#: A drive that stops its joint or moves its joint back is not overloaded. Therefore the count restarts in two cases:
+#: - The joint moves back faster than this threshold.
+#: - The outward speed of the joint has dropped by more than this threshold since the count began.
+#: Outward means away from the position in which the hold began.
 SLOWER: Final = 0.05
 #: The overload check skips a joint in each cycle in which the values of the joint are older than this [cycles].
 AGE: Final = 4

@@ -144,9 +144,10 @@ def _count(history: History, sensor: int, changed: bool) -> None:
 
 
 def compute(leg: int, model: LegModel, late: int, history: History, torques: Torques) -> bool:
-    """Compute the mean sent torques of a leg, and the torques that its motors produced according to the motion.
+    """Average the sent torques of a leg over time, and compute its motor torques from the measured motion.
 
-    The sent torques are shifted by `DELAY + late` cycles, so that both results belong to the same motion.
+    The motor torques are the result of the inverse dynamics plus the friction. A sent torque moves the leg after
+    `DELAY + late` cycles. Therefore the average is over sent torques that are older than the motion by this delay.
 
     Args:
         leg: index in `SIDES`.

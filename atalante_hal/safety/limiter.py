@@ -90,8 +90,8 @@ class JointLimits(NamedTuple):
     position_max: Vector  # (12,) highest position [rad]
     velocity_max: Vector  # (12,) highest velocity [rad/s]
     look_ahead: float  # prediction time of the position [s], at constant velocity
-    position_margin: float  # distance outside a position limit at which the limit of the outward torque is zero [rad]
-    velocity_margin: float  # excess over `velocity_max` at which the limit of the accelerating torque is zero [rad/s]
+    position_margin: float  # distance beyond a position limit [rad]; at this distance, no outward torque is allowed
+    velocity_margin: float  # excess over `velocity_max` [rad/s]; at this excess, no accelerating torque is allowed
     inertia: Vector  # (12,) smallest effective inertia of each joint [kg m2]
     period: float  # duration of a cycle [s]
     filter_lag: float  # delay of the low-pass of the reported velocity [s]
@@ -257,9 +257,9 @@ def highest_torque(room: float, acceleration: float, oldest: float, inertia: flo
     known = max(oldest, 0.0)
     if acceleration * (delay + known * fall) > room:  # the velocity gets too high even if the torque does not increase
         return max((room / acceleration - delay) / fall, 0.0)
-    # Above `known`, U solves the inequality of the module docstring with equality. Multiplied by the inertia, the equation is
-    #     fall * U^2 + (delay + free * fall) * U + free * delay - inertia * room = 0.
-    # U is the positive solution.
+    # With the torque U, the predicted growth of the velocity (acceleration times time) is equal to `room`:
+    #     (free + U) / inertia * (delay + fall * U) = room
+    # U is the larger solution of this quadratic equation.
     free = inertia * acceleration - oldest  # torque that does not come from the motor [Nm]
     root = math.sqrt((delay - free * fall) ** 2 + 4.0 * fall * inertia * room)
     return max((root - delay - free * fall) / (2.0 * fall), known)

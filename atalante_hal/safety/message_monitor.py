@@ -83,8 +83,8 @@ class Tolerance(NamedTuple):
 
     #: Indices of the legs in SIDES. A brief timeout in these legs leads to FINISH_STEP instead of HOLD.
     legs: Collection[int] = ()
-    #: Number of cycles by which the timeouts of the joints in these legs exceed the DBC timeouts.
-    #: A joint has the longer timeout only while no new frame of this joint is accepted.
+    #: Number of cycles that is added to the DBC timeouts of the joints in these legs while their frames are missing.
+    #: As soon as a frame of a joint is accepted, its DBC timeout applies to the age of the values in this frame.
     longer: int = 0
 
 
@@ -121,8 +121,8 @@ class MessageMonitor:
         #: True for each row with new, intact, trusted and plausible data, shape (rows,).
         self.valid: npt.NDArray[np.bool_] = np.zeros(len(messages), np.bool_)
         self.joints_valid = False
-        #: True if all rows have new data and are trusted, and all counters and leaky buckets are 0. Then a further cycle with
-        #: new data in all rows changes nothing.
+        #: True if all rows have new data and are trusted, and all counters and leaky buckets are 0. If all rows have new data
+        #: again in the next cycle, `evaluate` would not change any attribute of this object, so the call may be omitted.
         self.settled = False
 
     @property
@@ -224,8 +224,8 @@ class MessageMonitor:
         sender, two_senders = self._senders[row], self._check_senders(cycle, memory, row, rival)
         tolerated, timeout = self._legs[row] in tolerance.legs, self._timeouts[row]
         fresh = check <= Check.SOME_LOST
-        # The longer timeout holds only while no new frame is accepted. If a frame is accepted, its age must be below the DBC
-        # timeout, because the plausibility checks do not use older values.
+        # `tolerance.longer` extends the timeout only while frames are missing. The values of an accepted frame must be
+        # younger than the DBC timeout, because the plausibility checks ignore older values.
         late = age >= timeout + tolerance.longer * (tolerated and not fresh)
         # Impossible signal values do not reduce the trust, because the frame was transmitted correctly.
         good = (fresh or check >= Check.RANGE) and not rival

@@ -140,8 +140,8 @@ class SafetyMonitor:
         #: DBC names of the drives that stay off until a start passes its direction test, see `proof`. They were off before a
         #: START in READY, had a wrong torque, did not hold their joints, or failed the test.
         self._kept_off: set[str] = set()
-        #: False if `evaluate` must evaluate the next cycle. If True, `evaluate` skips a normal cycle: fresh data, no fault, and
-        #: unchanged values of pendant and drives.
+        #: True if `evaluate` may skip the next cycle. The cycle is skipped only if all data are fresh, there is no fault, and
+        #: the values of pendant and drives are unchanged.
         self._steady = False
         self._reports: list[Finding] = []  # faults that loop and controller reported since the last `evaluate`
         self._acknowledged = False  # True if START was pressed in this cycle
@@ -501,7 +501,8 @@ class SafetyMonitor:
         elif before is not _S.FINISH_STEP:  # the HOLD after FINISH_STEP keeps the reason of FINISH_STEP
             self.reason = entry_text(after, self.missing(), self._pendant.stop_requested)
         if after is _S.ACTIVE and before not in MOVING:
-            # End all counting windows of events, so that the reason for the next HOLD is logged as a new event.
+            # The fault memory merges equal events within a short time into one event. Stop merging here, so that the reason for
+            # the next HOLD gets its own event even if it equals the reason for the last HOLD.
             memory.log_repeats(state.cycle, final=True)
         if after is _S.ACTIVE and before not in MOVING and not self.enabling:
             self._limiter.restart(state.torque)

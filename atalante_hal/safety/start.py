@@ -32,7 +32,7 @@ STALLED_CYCLES = 10
 AT_REST = 0.3
 #: Prefix of the event text for a refused START.
 REFUSED = "START refused: "
-#: Last words of the reason for FINISH_STEP and for the HOLD after it, if the operator ends a walk on the ground.
+#: Suffix of the reason text of FINISH_STEP if the operator ends a walk on the ground. The next HOLD keeps this text.
 WALK_ENDS = ", so the walk ends on both feet"
 _S = SupervisorState
 #: States in which START only acknowledges faults. An acknowledged fault may stay active for some cycles.

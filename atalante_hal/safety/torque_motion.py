@@ -44,8 +44,9 @@ INTERVAL: Final = 4
 #: Ranges of the share s of a faulty motor (produced torque = s times sent torque). The first range covers reversed, dead and weak
 #: motors. The second range covers motors that are too strong.
 SHARES: Final = ((-1.5, 0.6), (1.4, 2.2))
-#: A check suspects the motor if E > `RATIO` * (F + `Robot.torque_error`^2). E is the mean square error of the explanation
-#: by an external torque. F is the mean square error of the explanation by a faulty motor.
+#: Two models are fitted to the produced torque: external torque (e = t + p) and faulty motor (e = s t), see the module docstring.
+#: E and F are their mean square errors. The motor is suspected if the first model fits clearly worse, that is, if
+#: E > `RATIO` * (F + `Robot.torque_error`^2).
 RATIO: Final = 2.5
 #: Number of consecutive checks that must suspect the motor before the drive is reported.
 CONFIRM: Final = 2
@@ -60,7 +61,8 @@ _OTHER_SHARE: Final = 0.25
 #: Each check multiplies the two sums in `Deviations.sums` by these factors before it adds the torques of the check. A joint is
 #: checked every `INTERVAL` cycles, so the sums cover about the last 20 and the last 100 cycles.
 DECAY: Final = (0.8, 0.96)
-#: The first `LEFT_OUT` checks of a deviation add no torques to `Deviations.sums`.
+#: When the produced torque begins to deviate, this number of checks is not added to `Deviations.sums`. The torques of these
+#: checks are averages that also contain cycles before the deviation.
 LEFT_OUT: Final = 2
 #: A deviation ends if more than this number of consecutive checks find no deviation.
 PAUSE: Final = 5
@@ -68,8 +70,8 @@ PAUSE: Final = 5
 #: The stored largest size is multiplied by `_FORGET` in each check.
 _FALLEN: Final = 0.8
 _FORGET: Final = 0.97
-#: `Deviations.sums` is evaluated only if its first element, the decayed number of added checks, is at least this number. So at
-#: least three checks are needed.
+#: Least count of checks in `Deviations.sums` that suffices to suspect a motor. An older check counts less, see `DECAY`. Three
+#: checks suffice: they count at least 1 + 0.8 + 0.8^2 = 2.44. Two checks count at most 1 + 0.96 = 1.96.
 _ENOUGH: Final = 2.4
 #: A joint closer to its position limit than this angle [rad] is at its end stop.
 _AT_STOP: Final = 0.005
@@ -214,7 +216,9 @@ def _compare(joint: int, sent: float, produced: float, tolerances: Tolerances, d
 
 
 class TorqueMotion:
-    """Check of all drives while the HAL sends the torques of the controller.
+    """Check that the motion of each joint agrees with the torque that the HAL sends.
+
+    The check runs only while the controller drives the joints.
 
     Args:
         robot: position limits and errors of the produced torques.

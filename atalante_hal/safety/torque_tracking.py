@@ -67,7 +67,9 @@ def _compare(sent: Vector, limit: Vector, reported: Vector, tolerance: Vector, t
 
 
 class TorqueTracking:
-    """Check of all drives while the HAL sends the torques of the controller.
+    """Check that each drive reports the torque that the HAL sends.
+
+    The check runs only while the controller drives the joints.
 
     Attributes:
         tolerance: largest distance of a reported torque from the range of the sent torques, shape (12,) [Nm].

@@ -106,8 +106,8 @@ class Service:
 
     def step(self) -> bool:
         """Process all new records and events of the rings, and return whether there were any."""
-        # The control loop writes the note of a run first, and the events of this run later. So once an event was read, the note
-        # of the same run is in the ring. The events must therefore be read before the notes.
+        # Read the events before the notes. The control loop writes the note of a run before the events of this run, so the notes
+        # that are read afterwards include the run of every event.
         events = [unpack(bytes(event)) for event in self._events.read()]
         records = self._records.read()
         first = self._records.position - len(records)

@@ -43,8 +43,8 @@ class SignalTable(NamedTuple):
     arrays. Only `codes` changes: every decoding and encoding overwrites it.
     """
 
-    plan: Words  # (7, size) decoding plan, with the rows WORD to INVALID
-    scales: Vector  # (3, size) scales, with the rows BASE to OFFSET
+    plan: Words  # (7, size) decoding plan; rows WORD, SHIFT, MASK, LARGEST, LOW, HIGH, INVALID
+    scales: Vector  # (3, size) scales; rows BASE, FACTOR, OFFSET
     codes: Words  # (size,) raw codes of the last decoding or encoding
     words: Words  # (n,) indices of the 64-bit words that contain a signal
     by_row: Words  # (size,) signal indices, sorted by row
@@ -93,8 +93,8 @@ class Codec:
             mask, largest = (1 << s.length) - 1, (1 << s.length - s.signed) - 1
             invalid = NO_CODE if s.invalid_raw is None else s.invalid_raw
             plan.append((row * WORDS + 1 + s.start // 64, s.start % 64, mask, largest, low, high, invalid))
-            # If the offset is a multiple of the factor, the integer offset / factor is added to the raw code before the
-            # multiplication, because a sum of integers is exact. Any other offset is added after the multiplication.
+            # Example: offset -40 and factor 0.5. The quotient -80 is an integer, so it is added to the raw code before the
+            # multiplication: (raw - 80) * 0.5. This sum is exact. Without an integer quotient: raw * factor + offset.
             code = s.offset / s.factor
             exact = code == round(code) and round(code) * s.factor == s.offset
             scales.append((code, s.factor, 0.0) if exact else (0.0, s.factor, s.offset))

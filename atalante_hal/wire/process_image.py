@@ -67,8 +67,8 @@ _FOREIGN = -1
 NEVER = 1 << 30
 #: Lowest age at which an answer to a SYNC is rejected as replayed [cycles].
 LATEST = 16
-#: Half a counter period. A frame is old if its counter is at least this far ahead of the last accepted counter.
-#: After a gap of this number of cycles, a counter does not show whether a frame is old.
+#: Half the period of the 8-bit alive counter. A frame is old if (its counter - last accepted counter) mod 256 is at least 128.
+#: Example: counter 250 after counter 5 gives 245, so the frame is old. After a gap of 128 cycles, this test is ambiguous.
 _HALF_TURN = 128
 
 
@@ -142,7 +142,7 @@ class ReceiveImage:
         #: Values before the last `accept`, shape (codec.size,).
         self.values_before = self.values.copy()
         self._age_before: npt.NDArray[np.int64] = self.age.copy()
-        #: True if every row was committed with the expected frame in the last `accept` (a perfect cycle).
+        #: True if the last `accept` found the expected frame of every message, without an error (a perfect cycle).
         self.all_fresh = self._was_fresh = False
         #: Frames given to the last `accept_each`, with the row and `Check` of each frame. None after a perfect cycle.
         self._offered: tuple[Frames, Words] | None = None
@@ -213,7 +213,7 @@ class ReceiveImage:
         self.all_fresh = False
 
     def begins(self, frames: Frames, count: int) -> bool:
-        """Return whether the buffer begins with one frame of every row, in row order, so that the cycle is complete.
+        """Return whether the buffer begins with one frame of each message, in the order of `messages`. Then no frame is missing.
 
         Args:
             frames: receive buffer.
@@ -300,7 +300,7 @@ class ReceiveImage:
         return foreign
 
     def decode_further_frames(self, row: int) -> list[Vector]:
-        """Decode the intact frames of one message in this cycle, except the frame that was committed last.
+        """Decode the intact frames of one message in this cycle, except the frame whose signals are in `values`.
 
         Repetitions of an accepted frame are left out. Call this method before the receive buffer is used again.
 

@@ -32,7 +32,8 @@ from atalante_hal.wire.cia402 import AUTOMATIC, Controlword, DriveState, next_st
 
 #: Timeout of the commands and of SYNC [cycles]. At a timeout, an enabled drive starts its local hold.
 WATCHDOG: Final = 5
-#: Once per this time [cycles], the drives update their temperatures and check whether lowered joints are at rest.
+#: Interval of the slow tasks of the drives [cycles]: update of temperatures and warnings, and after a fault the check whether
+#: the joint is at rest.
 SLOW_CYCLES: Final = 100
 #: Names of the drive nodes, in the order of JOINTS.
 NODES: Final = tuple(joint.upper() for joint in JOINTS)

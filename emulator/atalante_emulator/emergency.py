@@ -26,8 +26,9 @@ COMMAND_TIMEOUT: Final = 0x8250  # command timed out
 _REGISTER: Final = {0x2: 0x03, 0x3: 0x05, 0x4: 0x09, 0x7: 0x21, 0x8: 0x11}
 _GENERIC: Final = 0x01
 
-# Age of a warning: number of calls of `Errors.advance` since `Errors.warn` has reported or renewed the warning.
-# The warning ends at the age `_ENDED`. `Errors.warn` reports the same warning again only from the age `_REPEATABLE` on.
+# The age of a warning is the number of calls of `Errors.advance` since `Errors.warn` reported or renewed the warning.
+# Age 0 and 1: the warning is active, and `warn` renews it. Age 2 (`_ENDED`): the warning has ended, and `warn` does nothing.
+# Age 3 (`_REPEATABLE`): the warning is forgotten, and `warn` reports it again.
 _ENDED, _REPEATABLE = 2, 3
 
 

@@ -184,8 +184,8 @@ class Emulator:
         self._whole = [self._tx.frames]
         #: For each leg: index of its SYNC message in the list of SYNC messages.
         self._leg_syncs = [[m.name for m in syncs].index(f"SYNC_{side.upper()}_LEG") for side in SIDES]
-        #: For each SYNC: copy of the frames with which the nodes answered in the last imperfect cycle. In an imperfect cycle, a
-        #: frame of the HAL is missing, rejected or late. If a SYNC arrives after its cycle was run, the nodes send the copy.
+        #: A cycle also runs if one of its SYNCs is late. When the late SYNC arrives, the nodes answer with the frames of the
+        #: cycle that has already run. Each element is a copy of these frames for one SYNC.
         self._answered = self._shares
         batch = new_frames(_BATCH)
         self._batch = batch.view(np.uint8).data

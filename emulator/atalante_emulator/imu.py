@@ -98,7 +98,7 @@ class AttitudeError:
             self.apply(0.0, np.tile([1.0, 0.0, 0.0, 0.0], (count, 1)))
 
     def draw(self) -> None:
-        """Draw new attitude errors. They apply at the end of the interval that begins now."""
+        """Draw new attitude errors. `apply` changes the errors linearly from the old to the new values during the interval."""
         self._slow = self._keep * self._slow + self._new * self._generator.standard_normal(self._slow.shape)
         self._heading += self._rate * self._interval
         self._last, self._next = self._next, self._slow.copy()

@@ -101,7 +101,8 @@ class EncoderChecks:
         self._speed = np.zeros(len(JOINTS))  # mean velocity of each encoder between its last two good positions [rad/s]
         self._earlier = np.zeros(len(JOINTS))  # `_deviation` at the last velocity check [rad/s]
         self._no_age = np.zeros(len(JOINTS), np.int64)
-        self._earlier_age: Cycles = np.full(len(JOINTS), NEVER)  # age of the values at the last velocity check [cycles]
+        # For each joint, the age that its values had in the last velocity check [cycles].
+        self._earlier_age: Cycles = np.full(len(JOINTS), NEVER)
         self._twice_allowed = 2.0 * robot.sensors.velocity_error * robot.gear
         self._wrong = [0] * len(JOINTS)
         self._wrong_findings: tuple[Finding, ...] = ()

@@ -26,7 +26,7 @@ from atalante_hal.safety.plausibility.finding import FOOT_NODES, Signals
 
 #: A cell is reported as faulty after it has contradicted the other cells for this time [cycles].
 CELL_CYCLES = 256
-#: After both feet have carried load together for this time [cycles], a swing of both feet is implausible.
+#: After both feet have carried load together for this time [cycles], it is a fault if both feet swing for too long.
 STANDING_CYCLES = 500
 #: Longest plausible time in which both feet swing [cycles]. If a foot lands late in a walk, both feet swing for 30 cycles.
 SWING_CYCLES = 60
@@ -53,7 +53,8 @@ class FootChecks:
         self.swing: int | None = None
         self._swinging = LIFTED_CYCLES  # time since a foot was last on the ground [cycles]
         self._standing = 0  # time for which both feet have been on the ground [cycles]
-        self._armed = False  # True while a swing of both feet would be implausible
+        # True from the time when the robot stood on both feet until it is lifted. Only then is a long swing of both feet a fault.
+        self._armed = False
         # Time for which the cells of each foot have contradicted each other [cycles].
         self._contradicts = [0] * len(FEET)
         #: Foot -> difference of the forces on its two diagonals [N], and index of the faulty cell (None if it is unknown).

@@ -72,14 +72,14 @@ class Imus:
         return usable
 
     def tolerated(self, imu: int) -> Dtc | None:
-        """Return the diagnostic of the rejected values of an IMU while this diagnostic is pending.
+        """Return why the values of an IMU were rejected, unless the fault is already confirmed.
 
         Args:
             imu: index of the IMU in IMUS.
 
         Returns:
-            The pending diagnostic. None if the diagnostic is confirmed, or if the values were rejected only because the readings
-            do not change.
+            The pending diagnostic: `IMU_SATURATED` or `IMU_INVALID` (wrong norm of the quaternion). None if the diagnostic is
+            confirmed, or if the values were rejected only because the readings do not change.
         """
         if self._confirmed[imu]:
             return None

@@ -67,7 +67,7 @@ class Readings(NamedTuple):
 
 
 class Record(NamedTuple):
-    """Last sample of each IMU, means of each IMU, and means of the comparison of torso and pelvis."""
+    """Last sample of each IMU, and running means of the errors that the checks compare with limits."""
 
     quaternion: Vector  # (4, 4) attitude in the last sample
     gyro: Vector  # (4, 3) angular velocity in the last sample [rad/s]
@@ -87,7 +87,7 @@ class Excess(NamedTuple):
     """Values that exceed their limits. A value within its limit is replaced by 0."""
 
     force: Vector  # (4,) mean difference between specific force and gravity [m/s2]
-    rate: Vector  # (5,) largest root mean square of each row of `Record.rate_error` [rad/s]
+    rate: Vector  # (5,) rms error of the angular velocity about the worst axis [rad/s]; rows as in `Record.rate_error`
     tilt: Vector  # (1,) angle between the upward directions of torso and pelvis [rad]
 
 
@@ -233,18 +233,28 @@ def compare(now: Readings, record: Record) -> None:
 
 
 def count(record: Record, row: int) -> float:
-    """Count one sample in an element of `Record.samples`, and return the share of this sample in the means.
+    """Count one more sample, and return the weight of this sample in a running mean.
+
+    The weight is 1 / number of samples. The number of samples is limited to `SAMPLES`.
 
     Args:
-        record: means. Updated here.
-        row: index of the element.
+        record: means and numbers of samples. Updated here.
+        row: index of the number of samples in `Record.samples`.
     """
     record.samples[row] = min(record.samples[row] + 1.0, SAMPLES)
     return float(1.0 / record.samples[row])
 
 
 def add_rates(record: Record, row: int, axis: int, share: float, rates: tuple[float, float]) -> None:
-    """Add two measurements of the same angular velocity about one axis [rad/s] to the means of a row."""
+    """Update the running means `Record.rate_error` and `Record.rate` with two measurements of one angular velocity.
+
+    Args:
+        record: means. Updated here.
+        row: row of both means.
+        axis: axis of the angular velocity, 0 to 2.
+        share: weight of the new sample, see `count`.
+        rates: the two measurements [rad/s]. `Record.rate` is the mean square of the first measurement.
+    """
     first, second = rates
     record.rate_error[row, axis] += share * ((first - second) ** 2 - record.rate_error[row, axis])
     record.rate[row, axis] += share * (first**2 - record.rate[row, axis])
@@ -279,7 +289,12 @@ def beyond(value: float, limit: float) -> float:
 
 
 def wrong_rate(record: Record, row: int) -> float:
-    """Return the largest root mean square in a row of `Record.rate_error` [rad/s]; 0 if no axis exceeds its limit."""
+    """Return the rms error of an angular velocity about the worst axis [rad/s]; 0 if no axis exceeds its limit.
+
+    Args:
+        record: means.
+        row: row of `Record.rate_error`.
+    """
     largest = 0.0
     for axis in range(3):
         error = record.rate_error[row, axis]

@@ -39,7 +39,7 @@ PELVIS_IMU = (-0.164, -0.015, 0.191)
 #: Position y of joint FH of the left leg in the pelvis frame [m]. Its x and z are 0.
 FRONTAL_HIP = 0.089
 #: Position (x, y) of joint TH of the left leg relative to joint FH, in the axes of the frontal hip [m].
-#: Joint SH has the position (-x, 0) relative to joint TH, in the axes of the transverse hip.
+#: Relative to joint TH, joint SH is at (0.135, 0) in the axes of the transverse hip: opposite x, no y.
 TRANSVERSE_HIP = (-0.135, 0.169)
 #: Position (x, y, z) of the left tibia IMU in the axes of the tibia [m].
 #: Each coordinate has its own origin: x is relative to joint SK, y to joint SH, and z to joint SA.
@@ -50,14 +50,15 @@ _FILTER_TIME = 0.15
 _MEAN_TIME = 0.75
 #: Time that the filters need to settle after the start [s]. `Filters.moments` is updated only after this time.
 _SETTLING_TIME = 2.0
-#: The error of a knee angle is computed only if the root mean square of the filtered lever exceeds this value [m].
+# A wrong segment length shifts the computed position of the tibia IMU, as a wrong knee angle does. Therefore a regression first
+# removes the effect of the segment length from the lever and from the position difference.
+# `_LEAST_LEVER` and `_SHARE` are applied after this regression.
+#: The error of a knee angle is computed only if the root mean square of the lever exceeds this value [m].
 #: The lever is the derivative of the tibia IMU's position with respect to the knee angle SK.
-#: The component of the lever that looks like a wrong segment length is subtracted first.
-#: In a walk, the root mean square is about 0.012 m.
+#: In a walk, the root mean square of the lever is about 0.012 m.
 _LEAST_LEVER = 0.007
 #: An error of a knee angle is reported only if it explains more than this share of the squared position difference.
 #: The position difference is the measured minus the computed position of the tibia IMU.
-#: The component of the difference that looks like a wrong segment length is subtracted first.
 _SHARE = 0.25
 #: Number of filters of each leg and axis.
 _FILTERS = 11
@@ -195,9 +196,10 @@ def knee_error(moments: Vector, limit: float, before: float) -> float:
         before: last result, which is returned if the thigh does not turn [rad].
     """
     ss, sg, gg, sd, gd, dd = moments[0], moments[1], moments[2], moments[3], moments[4], moments[5]
-    # Subtract from s (lever) and d (position difference) the component that looks like a wrong segment length: a multiple of g.
-    # `lever` is the mean square of the rest of s, and `difference` the mean square of the rest of d.
-    # `product` is the mean product of both rests. All three values are multiplied by gg.
+    # Fit a multiple of g (effect of the segment length) to s (lever) and to d (position difference). The residuals are
+    #     u = s - g * sg / gg, v = d - g * gd / gg.
+    # The next line computes the mean products of the residuals, multiplied by gg to avoid divisions:
+    #     lever = gg * mean(u * u), product = gg * mean(u * v), difference = gg * mean(v * v).
     lever, product, difference = ss * gg - sg * sg, sd * gg - sg * gd, dd * gg - gd * gd
     if lever <= _LEAST_LEVER**2 * gg:
         return before
@@ -224,8 +226,8 @@ def motion(leg: int, now: Readings) -> tuple[Vector3, Vector3, Vector3, Vector3]
     x, y = TRANSVERSE_HIP[0] * (1.0 - math.cos(th)), side * TRANSVERSE_HIP[1] - TRANSVERSE_HIP[0] * math.sin(th)
     y, z = y * math.cos(fh) + side * FRONTAL_HIP, y * math.sin(fh)
     hip = x - PELVIS_IMU[0], y - PELVIS_IMU[1], z - PELVIS_IMU[2]
-    # `thigh` is the vector from joint SH to the tibia IMU, in the axes of the tibia. In these axes, the thigh is rotated by -SK.
-    # (x, z) is the unit vector from hip to knee plus the unit vector from knee to ankle.
+    # `thigh` is the vector from joint SH to the tibia IMU, in the axes of the tibia. In these axes, the unit vector from hip to
+    # knee is (sine, -cosine), and the unit vector from knee to ankle is (0, -1). (x, z) is the sum of both.
     sine, cosine = math.sin(sk), math.cos(sk)
     x, z = sine, -1.0 - cosine
     thigh = SEGMENT * x + TIBIA_IMU[0], side * TIBIA_IMU[1], SEGMENT * z + TIBIA_IMU[2]

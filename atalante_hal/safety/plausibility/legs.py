@@ -49,9 +49,10 @@ DRIFT_SAMPLES = 4
 STANDSTILL_SAMPLES = 2
 #: Number of consecutive samples after which exchanged encoders are reported. Both legs are compared in every sample.
 EXCHANGE_SAMPLES = 2
-#: Encoders are compared with those of the other leg if their readings differ by more than this [rad].
+#: The encoders of a joint can be recognised as exchanged only if the left and the right reading differ by more than this [rad].
 _APART = math.radians(1.2)
-#: The error of a leg agrees with an exchange if it differs from the expected error by at most this share of the expected error.
+#: Exchanged encoders cause an error (encoder angle minus IMU angle) as large as the difference of left and right reading.
+#: Encoders count as exchanged if the errors of both legs deviate from this value by at most 35 %.
 _AGREEMENT = 0.35
 #: The standstill check tolerates this drift of the IMUs per sample [rad]. Intact IMUs drift less than a tenth as much.
 _IMU_DRIFT = 2e-5
@@ -108,13 +109,16 @@ class Legs:
         self._turned: dict[int, int] = {}
         self._drifts: list[tuple[Finding, ...]] = [() for _ in SIDES]
         self._stuck: list[tuple[Finding, ...]] = [() for _ in SIDES]
-        #: For each of the first four joints of a leg: number of consecutive samples whose errors agree with an exchange.
+        #: For each of FH, TH, SH and SK: number of consecutive samples in which left and right encoder seemed exchanged.
         self._exchanges = [0] * len(_AXIS_OF)
-        #: Findings about exchanged encoders, by index of the joint in a leg. They remain until a drive of the joint restarts.
+        #: Findings that the left and the right encoder of a joint are exchanged, by index of the joint in a leg.
+        #: The findings of a joint remain until its left or its right drive restarts.
         self._exchanged: dict[int, tuple[Finding, ...]] = {}
 
     def reference(self, joint: int) -> None:
-        """Discard the finding about exchanged encoders of a joint whose drive has referenced its encoder.
+        """Discard the findings that the left and the right encoder of a joint are exchanged.
+
+        Call it when the drive of the joint has restarted and referenced its encoder.
 
         Args:
             joint: index of the joint in JOINTS.
@@ -122,7 +126,10 @@ class Legs:
         self._exchanged.pop(joint % len(LEG_JOINTS), None)
 
     def check_left(self, ages: Ages | None) -> bool:
-        """Check the left leg. If a right encoder has a constant reading, also run the standstill check of the right leg.
+        """Check the left leg.
+
+        If an encoder of the right leg has a constant reading, the standstill check of the right leg also runs. So a stuck encoder
+        is detected earlier.
 
         Args:
             ages: ages of the sensor values; a leg with values that are too old is not compared. None if all values are of this
@@ -134,15 +141,7 @@ class Legs:
         return self._check(0, ages)
 
     def check_right(self, ages: Ages | None) -> bool:
-        """Check the right leg. If a left encoder has a constant reading, also run the standstill check of the left leg.
-
-        Args:
-            ages: ages of the sensor values; a leg with values that are too old is not compared. None if all values are of this
-                cycle.
-
-        Returns:
-            Whether there is a finding for any leg.
-        """
+        """Check the right leg in the same way as `check_left` checks the left leg."""
         return self._check(1, ages)
 
     def _check(self, leg: int, ages: Ages | None) -> bool:

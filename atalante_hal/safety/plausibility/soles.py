@@ -21,12 +21,13 @@ from atalante_hal.safety.diagnostics import Dtc, Finding
 from atalante_hal.safety.plausibility.finding import JOINT_NODES, Ages, Signals
 from atalante_hal.wire.process_image import NEVER
 
-#: Number of consecutive samples of a flat foot after which a tilted sole is reported. A foot is sampled every 32 cycles.
+#: A fault is reported after this number of consecutive samples in which the forces show that the foot is flat, but the ankle
+#: encoders and the tibia IMU show that its sole is tilted. A foot is sampled every 32 cycles.
 SOLE_SAMPLES = 4
 #: A foot counts as flat on the floor only if its load exceeds this multiple of `cell_free`.
 _LOAD = 4.0
-#: A foot counts as flat only if its centre of pressure is within these distances from the middle of its cells: along the foot,
-#: across the foot. Unit: distance of a cell from the middle. The outermost contact points of the sole are at 1.1 and 2.0.
+#: Largest distance of the centre of pressure from the middle of a flat foot: along the foot, across the foot.
+#: 1 is the distance of a force cell from the middle. The sole is larger: it ends at 1.1 along and at 2.0 across the foot.
 _CENTRE = (0.8, 1.4)
 #: Outward rotation of the foot about the vertical axis of the tibia [rad].
 TOE_OUT = math.radians(8.0)

@@ -2,7 +2,7 @@
 
 All signals are sampled every few cycles, and consecutive samples with exactly the same value are counted. A sample
 skips each signal that has no new value since the last sample. In addition, each cycle updates a record of each joint
-(`Drive`): the range of its torque since its encoder reading last changed, and the motion that a free joint would have made.
+(`Drive`): the range of its torque since its encoder reading last changed, and a simulated motion under this torque.
 
 *Torque.* The reading of an encoder may be constant because the joint is at rest. So an encoder is reported as stuck only under
 two conditions. First, the torque of the drive has varied by at least `breakaway` since the reading last changed. `breakaway` is
@@ -79,17 +79,19 @@ class Readings(NamedTuple):
 
 
 class Drive(NamedTuple):
-    """Torque of each joint while its encoder reading is constant, and the motion of a free joint. Shape (12,) each.
+    """Torque of each joint since its encoder reading last changed, and a simulated motion. Shape (12,) each.
 
-    A free joint has the inertia `_INERTIA`. The change of the torque beyond `breakaway` moves the free joint.
+    The simulated joint starts at rest. It moves only if the torque changes by more than `breakaway`. Its inertia `_INERTIA` is an
+    upper bound, so a real joint turns further.
     """
 
     cycles: Vector  # number of cycles since the encoder reading last changed
     rest: Vector  # balanced torque [Nm]: torque in the third cycle (`_AT_REST`) after the encoder reading last changed
     low: Vector  # lowest torque since the encoder reading last changed [Nm]
     high: Vector  # highest torque since the encoder reading last changed [Nm]
-    momentum: Vector  # angular momentum of a free joint [Nm s]: time integral of abs(torque - `rest`) - `breakaway`
-    turn: Vector  # angle by which a free joint would have turned [rad]
+    #: simulated angular momentum [Nm s], at least 0; each cycle adds (abs(torque - `rest`) - `breakaway`) * cycle time
+    momentum: Vector
+    turn: Vector  # simulated angle since the encoder reading last changed [rad]
 
 
 class Stillness:
@@ -111,7 +113,7 @@ class Stillness:
         where = measured(codec)
         self._values, self._now, self._age = image.values[where], now, image.age
         self._every = every
-        #: Age of the last sample of each row [cycles], shape (rows,).
+        #: For each row: age of the values that were sampled last [cycles]. If `_age` is lower, newer values have arrived.
         self._sampled_age: Cycles = np.full(len(image.age), 2 * NEVER)
         self._row_of = codec.row_of[where]
         size = len(self._values)
@@ -293,7 +295,7 @@ def follow_one(joint: int, readings: Readings, drive: Drive, breakaway: float, l
     """Update the `Drive` record of one joint.
 
     If the encoder reading has changed, or if the ground holds the joint, the record is cleared. Otherwise the torque of this
-    cycle extends the torque range, and the motion is integrated over the time since the last values.
+    cycle extends the torque range, and the simulated motion continues by the time since the last values.
 
     Args:
         joint: index of the joint in JOINTS.

@@ -62,7 +62,9 @@ class Support:
     def __init__(self, robot: Robot, now: Signals, every: int) -> None:
         self._now, self._every, self._free = now, every, robot.sensors.cell_free
         self._to_joint = (robot.polarity / robot.gear)[_KNEES].tolist()
-        self._too_high = [0 for _ in FEET]  # time for which each foot has carried load although it is too high [cycles]
+        #: For each foot: time for which only this foot has reported load [cycles], although it is more than `_HEIGHT` above the
+        #: other foot.
+        self._too_high = [0 for _ in FEET]
         self._wrong_leg = 0  # time for which the load has been on the wrong leg [cycles]
         self._found: tuple[Finding, ...] = ()
 
@@ -118,7 +120,7 @@ def posture_of(pelvis: Sequence[float], tibiae: Sequence[Sequence[float]], knees
         knees: angles of the left and the right knee [rad].
     """
     w, x, y, z = pelvis
-    # Horizontal part of the pelvis axis to the left.
+    # World components x and y of the pelvis axis y, which points to the left.
     left_x, left_y = 2.0 * (x * y - w * z), 1.0 - 2.0 * (x * x + z * z)
     length = math.hypot(left_x, left_y)
     drops, lean = [], 0.0

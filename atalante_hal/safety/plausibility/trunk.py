@@ -48,15 +48,16 @@ class Filters(NamedTuple):
     """Values of the filters. Element 0 is for the acceleration along x, element 1 for the acceleration along y.
 
     The rate of element 0 is the angular velocity about y. The rate of element 1 is minus the angular velocity about x.
-    Two high-passes in series filter the rate. Each high-pass subtracts a low-pass from its input.
+    The filtered rate is rate - `slow_rate` - `slower_rate`. The filtered speed is `speed` - `slow_speed`.
     """
 
     speed: Vector  # (2,) leaky integral of the torso acceleration minus the pelvis acceleration [m/s]
     slow_speed: Vector  # (2,) low-pass of `speed` [m/s]
     slow_rate: Vector  # (2,) low-pass of the rate [rad/s]
-    slower_rate: Vector  # (2,) low-pass of the rate after the first high-pass, which is rate - `slow_rate` [rad/s]
+    slower_rate: Vector  # (2,) low-pass of (rate - `slow_rate`) [rad/s]
     time: Vector  # (1,) time since the start, up to `_SETTLING_TIME` [s]
-    moments: Vector  # (2,) mean product of speed and rate [m/s2], and mean square of the rate [rad2/s2]
+    #: (2,) sums over both axes: mean of filtered speed * filtered rate [m/s2], mean square of the filtered rate [rad2/s2]
+    moments: Vector
 
 
 class Trunk:

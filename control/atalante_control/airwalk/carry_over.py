@@ -30,12 +30,12 @@ class CarryOver:
 
     Attributes:
         records: record that `add_carried` reads and updates, shape (1,).
-        blend: fraction of the torque jump that is still compensated, one value per cycle since the stance change, shape (n,).
-            The fraction falls from 1 towards 0.
+        blend: fade-out of the compensation, shape (n,). Element i is the share of the torque jump that is compensated in
+            cycle i after the stance change. The share falls from 1 towards 0.
     """
 
     def __init__(self, duration: float) -> None:
-        """Compute the compensated fractions (`blend`), and create the record of the state.
+        """Compute the fade-out `blend`, and create the record of the state.
 
         Args:
             duration: time in which the compensation of the torque jump fades out [s]. With 0, the jump is not compensated.
@@ -59,7 +59,7 @@ class CarryOver:
         carry.before[:], carry.pending = before, True
 
     def cancel(self) -> None:
-        """Cancel the carry-over of the torque if its torque jump has not been computed yet."""
+        """Cancel a carry-over that was started but not applied yet. A fade-out that has begun does not change."""
         self.records[0].pending = False
 
 

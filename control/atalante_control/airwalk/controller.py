@@ -189,7 +189,10 @@ class AirwalkController:
 
     @property
     def blend(self) -> Vector:
-        """Return the fraction of the torque jump that is still compensated in each cycle after a stance change, shape (n,)."""
+        """Return how the torque jump at a stance change fades out, shape (n,).
+
+        Element i is the share of the torque jump that is compensated in cycle i after the stance change.
+        """
         return self._carry.blend
 
     def certificate(self, xi: float) -> Certificate:

@@ -58,8 +58,8 @@ class GaitReference:
         self._basis[0, :, :_N], self._basis[0, :, _N:] = c0[:end, None], c0d[:end, None]
         self._basis[1, :, :_N], self._basis[1, :, _N:] = c1[:end, None], c1d[:end, None]
         self._added = np.zeros_like(self._basis)
-        # Measured deviations by which the elements of `_basis` are multiplied: `_angles` has s(0) of the 12 joints, `_rates` has
-        # s'(0). Both the columns s and the columns s' are multiplied, so each array contains its 12 deviations twice.
+        # Measured deviations of the 12 joints: s(0) in `_angles`, s'(0) in `_rates`. Each array contains its 12 values twice:
+        # first as factors for the columns s of `_basis`, then as factors for the columns s'.
         self._angles, self._rates = np.zeros(2 * _N), np.zeros(2 * _N)
 
     def start_step(self, stance: int, position: Vector, velocity: Vector) -> Deviation:

@@ -35,11 +35,11 @@ LEG_SEGMENTS = ("thigh", "shank")  # body segments whose length is an input
 OUTPUTS = len(JOINTS) * (DEGREE + 1)
 LAYERS_MAX = 4
 WIDTH_MAX = 128  # largest number of neurons of a layer
-#: Largest accepted angle jump at the stance change [rad]. The last layer computes a gait as a weighted sum of gaits: the rows of
-#: the weight matrix, and the bias. The jump of each of these gaits is checked. Rounding errors cause small jumps.
+#: Largest angle jump at the stance change [rad] that is accepted as a rounding error.
 _PERIODICITY_DEFECT = 1e-9
 _ANGLE_MAX = 2.0 * np.pi  # rad, largest accepted absolute value of a control point
-_ROUNDING = 1e-9  # relative tolerance of the range limits, because a ratio of lengths has rounding errors
+#: Relative tolerance of the range check of the inputs. The inputs `thigh` and `shank` are quotients with rounding errors.
+_ROUNDING = 1e-9
 
 
 class NetworkError(ValueError):
@@ -286,6 +286,8 @@ def _network(arrays: Mapping[str, npt.NDArray[Any]]) -> GaitNetwork:
         width = columns
     if width != OUTPUTS:
         raise ArrayFileError(f"the last layer must have {OUTPUTS} columns, got {width}")
+    # A gait is a weighted sum of the rows of the last weight matrix, plus the bias. If neither a row nor the bias has an angle
+    # jump at the stance change, no gait has one.
     defect = np.abs(periodicity()[: len(JOINTS)] @ np.vstack([layers[-1].weights, layers[-1].bias]).T).max()
     if not defect <= _PERIODICITY_DEFECT:
         raise ArrayFileError(

@@ -61,9 +61,9 @@ class StanceDynamics:
         self._foot, self._swing_foot = (self._fixed.model.getFrameId(name) for name in (STANCE_FOOT, SWING_FOOT))
         pinocchio.forwardKinematics(self._fixed.model, self._data[1], pinocchio.neutral(self._fixed.model))
         pinocchio.updateFramePlacement(self._fixed.model, self._data[1], self._foot)
-        #: Rotation matrix from the stance foot to the pelvis at the zero pose, a rotation by the toe-out angle.
-        #: `forces` takes this matrix as the rotation from the stance foot to the world in every pose. At the zero pose, pelvis
-        #: and world therefore have the same axes, and the pelvis faces the walking direction.
+        #: Rotation matrix from the stance foot to the world, a rotation by the toe-out angle. The stance foot does not turn
+        #: during a step, so the matrix is constant. At the zero pose, pelvis and world have the same axes (x forward). The
+        #: matrix is therefore the rotation from the foot to the pelvis at the zero pose.
         self._toe_out = self._data[1].oMf[self._foot].rotation.copy()
 
     def forces(self, position: Vector, velocity: Vector, acceleration: Vector) -> GroundForces:

@@ -83,7 +83,7 @@ def read_arrays(path: Path, allowed: Collection[str], size_max: int) -> dict[str
 
 
 def _checked_directory(archive: zipfile.ZipFile, allowed: Collection[str], size_max: int) -> dict[str, zipfile.ZipInfo]:
-    """Check names, compression and declared sizes of the members, and return the dictionary array name -> member."""
+    """Check names, compression and declared sizes of the zip members. Return a dict that maps each array name to its member."""
     members: dict[str, zipfile.ZipInfo] = {}
     for member in archive.infolist():
         name = member.filename.removesuffix(_SUFFIX)

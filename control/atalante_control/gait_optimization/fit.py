@@ -38,8 +38,8 @@ RESOLUTION = math.radians(0.003)  # rad, largest rms error caused by the omitted
 JUMP_KEPT = 0.4  # before the fit, the speed jump of each gait at the stance change is reduced to this fraction
 END_WEIGHT = 40.0  # weight of the squared angle errors at start and end of a step; the weight is 1 at the other samples
 ACCELERATION_WEIGHT = 5e-2  # s2, weight of an acceleration error [rad/s2] relative to an angle error [rad]
-#: The learnt coordinates are scaled to this root mean square. L-BFGS stops if an iteration reduces the squared error by less than
-#: 2e-9, and this limit does not scale with the coordinates. With a root mean square of 1, L-BFGS would stop too early.
+#: L-BFGS stops if an iteration reduces the training loss by less than 2e-9. With small training targets the loss is small, so
+#: L-BFGS would stop too early. The target vectors are therefore scaled. This value is the rms length of the scaled vectors.
 TARGET_SIZE = 10.0
 ALPHA = 1e-5  # penalty on the squared weights of the network; the penalty smooths the gaits between the grid points
 SEED = 1  # seed of the initial weights

@@ -92,7 +92,7 @@ def fan_out(
                 raise TimeoutError(f"no parallel call finished within {patience:g} s") from error
             except BrokenProcessPool as error:
                 if on_lost is None:
-                    raise LostProcessError(f"{_lost(len(pending))}: {_REMEDY}") from error
+                    raise LostProcessError(f"{_lost(len(pending))}; {_REMEDY}") from error
                 losses += 1
                 if alone:
                     del pending[calls[0][0]]
@@ -105,10 +105,11 @@ def fan_out(
                         warnings.simplefilter("ignore", UserWarning)  # joblib warns about results that are not used
                         results.close()
         if without_result:
-            raise LostProcessError(f"{_lost(without_result)}: {_REMEDY}")
+            raise LostProcessError(f"{_lost(without_result)}; {_REMEDY}")
 
 
 def _lost(calls: int) -> str:
+    """Return the start of a message: a process ended unexpectedly, and `calls` calls have no result."""
     return f"a process ended unexpectedly, for example for lack of memory; calls without a result: {calls}"
 
 

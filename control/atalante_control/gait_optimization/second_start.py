@@ -1,8 +1,8 @@
-"""Second start of the optimiser after a failure: `subject, attempt -> gait`.
+"""Second optimisation of a gait from another initial guess, if the first optimisation fails.
 
-The initial guess of the second start is a solved gait of the same patient, with the step length and duration in `MODERATE`.
-The result therefore depends only on the parameters of the subject, as it does without a second start. If the second start
-fails, too, the result states the reasons of both failures.
+The second initial guess is a solved gait of the same patient, with the step length and duration in `MODERATE`. The result depends
+only on the parameters of the subject, and not on gaits that were solved before. If the second optimisation fails, too, the result
+states the reasons of both failures.
 """
 
 from __future__ import annotations

@@ -270,8 +270,9 @@ class StepProblem:
         if around is not None:
             end, next_one = (-1, -2) if self.kind == "start" else (0, 1)
             pose, other = around.coefficients[:, end], around.coefficients[:, next_one]
-            # s is the phase, time / step duration. Where two steps meet, the joint speed is the same in both steps, so dq/ds
-            # is proportional to the step duration. The distance between the two control points is proportional to dq/ds.
+            # Where two steps meet, both steps must have the same joint speed. The joint speed at the end of a step is
+            # DEGREE * (difference of the two control points at this end) / (step duration). A start or stop step lasts
+            # `TRANSITION` seconds, so the difference in the periodic step is multiplied by TRANSITION / around.duration.
             points = {"gait pose": pose, "gait speed": pose + (other - pose) * TRANSITION / around.duration}
             for group in self.program.groups:
                 if group.name in points:

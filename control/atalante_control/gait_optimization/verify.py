@@ -231,7 +231,7 @@ class Verifier:
         """Return the checks of a periodic step: landing pose, periodicity, impact map."""
         after, impulse, leaving = self.impact(motion.q[-1], motion.qd[-1])
         mirrored_q, mirrored_qd = SIGN * motion.q[0][SWAP], SIGN * motion.qd[0][SWAP]
-        # The impulse of a soft landing is small, so a small impulse above the friction limit is accepted.
+        # Horizontal impulse minus the largest impulse that friction can transmit (coefficient 0.5). `_SLIDING` Ns are accepted.
         sliding = math.hypot(impulse[0], impulse[1]) - 0.5 * impulse[2]
         sinking = -min(leaving[2] + np.cross(leaving[3:], corner)[2] for corner in self._corners())
         return [

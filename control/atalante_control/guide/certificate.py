@@ -68,8 +68,8 @@ class JointTorque:
 class Limit(NamedTuple):
     """Condition that limits the disturbance torques for which a guide can be certified."""
 
-    #: Largest factor on the requested disturbance torques at which the guide meets the condition. The factor is negative if the
-    #: guide does not meet the condition even without disturbance torques.
+    #: Largest disturbance torques with which the guide meets the condition, as a fraction of the requested torques. Example: 0.8
+    #: means 24 Nm if 30 Nm are requested. The fraction is negative if the model errors alone violate the condition.
     scale: float
     what: str  # condition in words, for a message
 
@@ -182,13 +182,16 @@ def _pair(torque: Vector) -> JointTorque | None:
 
 
 def _limit(room: Vector, reach: Vector, steps: int, what: str) -> Limit:
-    """Return the largest multiple of the requested torques for which the whole effect is at most `room`.
+    """Return the condition that a quantity stays below its limit in each cycle of a step.
+
+    The quantity is the tracking error, the torque, the speed or the torque change of SH and SK. `Limit.scale` is the smallest
+    (room - effect of the model errors) / (effect of the requested disturbance torques) of all cycles and joints.
 
     Args:
-        room: largest permitted effect on SH and SK in each cycle, shape (n, 2).
-        reach: shape (n, 4). Columns 0 and 1: effect of the model errors on SH and SK. Columns 2 and 3: effect of the
-            requested torques on SH and SK. The whole effect is columns 0 and 1 plus the multiple of columns 2 and 3.
-        steps: number of cycles of a step. All of them are checked.
+        room: limit minus the value of the quantity without disturbances, for SH and SK in each cycle, shape (n, 2).
+        reach: largest change of the quantity in each cycle, shape (n, 4). Columns 0 and 1: SH and SK, due to the model errors.
+            Columns 2 and 3: SH and SK, due to the requested disturbance torques.
+        steps: number of cycles of a step.
         what: start of the message; joint and phase are appended.
     """
     budget, promise = reach[1 : steps + 1, :2], reach[1 : steps + 1, 2:]
@@ -198,11 +201,11 @@ def _limit(room: Vector, reach: Vector, steps: int, what: str) -> Limit:
 
 
 class _Horizon:
-    """Condition on the motion after the prediction: one cycle after the last predicted cycle, the error must be within the guide.
+    """Condition for the cycle after the last predicted cycle: in this cycle, the error must still be inside the guide.
 
-    At the end of the horizon, fast motions have decayed. The error one cycle beyond the horizon is therefore the error at the
-    end of the horizon times a factor, plus a remainder. The remainder is a linear combination of the errors in any two
-    earlier cycles. Each of these errors is at most the width minus the effect of the disturbances.
+    At the end of the prediction, fast motions have decayed. The error in the next cycle is therefore a factor times the error in
+    the last predicted cycle, plus a small remainder. The errors in two earlier predicted cycles determine the remainder.
+    The largest possible remainder follows, because all predicted errors are inside the guide.
 
     Attributes:
         cycles: number of predicted cycles.
@@ -213,12 +216,12 @@ class _Horizon:
         self.cycles, self._step = len(prediction.ahead) - 1, guide.cycles
         rows = prediction.ahead @ prediction.compress * SIZES
         beyond = prediction.beyond * SIZES
+        # Error one cycle after the prediction = factor * error in the last predicted cycle + remainder.
         self._factor = (beyond * rows[-1]).sum(axis=1) / (rows[-1] ** 2).sum(axis=1)
         remainder = beyond - self._factor[:, None] * rows[-1]
-        #: Each element (lags, weights) bounds the remainder by the errors in two predicted cycles.
-        #: `lags` are these two cycles, counted from the start of the prediction. The bound is |remainder| <= |errors| @ weights.
-        #: The four errors are hip and knee in the first cycle, then hip and knee in the second cycle.
-        #: `weights` has the shape (4, 2). Rows: the four errors. Columns: remainder of the hip, remainder of the knee.
+        #: Three upper bounds of the remainder, each an element (lags, weights): |remainder| <= |errors| @ weights.
+        #: `errors` has four elements: hip and knee in predicted cycle lags[0], then hip and knee in predicted cycle lags[1].
+        #: `weights` has one row for each element of `errors`, and two columns: remainder of the hip, remainder of the knee.
         self._pairs: list[tuple[tuple[int, int], Vector]] = []
         for near, far in ((0.1, 0.3), (0.25, 0.5), (0.4, 0.7)):
             lags = round(near * self.cycles), round(far * self.cycles)
@@ -228,7 +231,7 @@ class _Horizon:
         self._reach = prediction.reach[self._starts // START_CYCLES]
 
     def limit(self, width: Vector, narrowest: Vector) -> Limit:
-        """Return the largest factor on the requested disturbance torques at which the guide meets the condition.
+        """Return the condition that the error one cycle after the last predicted cycle is inside the guide.
 
         Args:
             width: distance from q_des to the nearer bound of the guide in each cycle, shape (n, 2) [rad].
@@ -236,7 +239,10 @@ class _Horizon:
         """
 
         def room(lag: int) -> tuple[Vector, Vector]:
-            """Return (width minus effect of model errors, effect of the requested torques), `lag` cycles ahead."""
+            """Return two arrays of errors in the predicted cycle `lag`, each of shape (starts, 2) [rad].
+
+            Array 1: guide width minus the effect of the model errors. Array 2: effect of the requested disturbance torques.
+            """
             added = self._reach[:, min(lag, self.cycles)]
             rooms = narrowest if lag == self.cycles else width
             return rooms[self._starts + lag] - added[:, :2], added[:, 2:]
@@ -245,12 +251,14 @@ class _Horizon:
         found = []
         for lags, weights in self._pairs:
             rooms, promises = (np.hstack(parts) for parts in zip(*map(room, lags), strict=True))
-            # In each cycle, the error may be at most room - scale * promise. A room is the guide width minus the effect of model
-            # errors. A promise is the effect of the requested disturbance torques on the error.
-            # `last` is the room in the last predicted cycle, `end` is the room one cycle later, and `rooms` are the rooms in the
-            # two earlier cycles. The left side of the inequality is the largest possible error one cycle after the prediction.
-            # Find the largest scale at which this largest error still fits into the guide:
-            # factor * (last - scale * last_promise) + (rooms - scale * promises) @ weights <= end - scale * end_promise.
+            # `scale` is the fraction of the requested disturbance torques. The largest error that a cycle permits falls with
+            # `scale`, because the disturbances need a part of the guide width:
+            # - last predicted cycle: last - scale * last_promise,
+            # - the two earlier cycles `lags`: rooms - scale * promises,
+            # - one cycle after the prediction: end - scale * end_promise.
+            # If the predicted errors have the largest permitted values, the error one cycle after the prediction is
+            # factor * (last - scale * last_promise) + (rooms - scale * promises) @ weights.
+            # This error must be at most end - scale * end_promise. Solved for `scale`: scale * need <= have.
             have = end - self._factor * last - rooms @ weights
             need = end_promise - self._factor * last_promise - promises @ weights
             with np.errstate(divide="ignore"):

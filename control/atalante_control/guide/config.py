@@ -32,7 +32,7 @@ class StepGuideConfig:
     torque_reserve: float = 14.0
     #: rad/s, smallest allowed distance of a predicted speed from the velocity limit of the robot
     speed_reserve: float = 0.2
-    zeta: float = 0.01  # s, gain of lambda_d, which increases the weight of the backup torque while h decreases
+    zeta: float = 0.01  # s, gain on -dh/dt; while the safety value h falls, the weight of the backup torque rises
     idealization: float = 1.0  # intensity of the joint idealization u_i in [0, 1] while the backup torque has weight 0
     feedforward: float = 1.0  # intensity of the feedforward u_f in [0, 1] while the backup torque has weight 0
     #: Counter value above which the controller reports that the leg has left a certified guide.

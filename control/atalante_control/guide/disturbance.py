@@ -176,12 +176,14 @@ _SPEED_MARGIN = 1.0
 class Effect(NamedTuple):
     """Effect of a disturbance on two outputs, one per joint (hip, knee). An output is an error, a torque or a speed."""
 
-    #: (n, 2, 2) response to an acceleration that lasts one cycle. Axis 0: number of cycles after the acceleration.
+    #: (n, 2, 2) pushed[i] @ a is the response to an acceleration a that lasts one cycle, i cycles after the acceleration.
     pushed: Vector
-    #: (n, 2, 2) response to an acceleration just before a prediction starts; (0, 2, 2) if this response is left out.
-    #: The measured velocity does not yet contain the effect of this acceleration, so the prediction starts at a wrong velocity.
+    #: (n, 2, 2) response to a wrong start velocity; (0, 2, 2) to ignore this response. The measured velocity lags behind the true
+    #: velocity. While a disturbance accelerates the joints by a, a prediction therefore starts with a wrong velocity.
+    #: hidden[i] @ a is the response to this velocity error, i cycles after the prediction starts.
     hidden: Vector
-    #: (n, 2, 2) matrix for each cycle of the step. The response is multiplied by this matrix from the left to get the output.
+    #: (n, 2, 2) conversion from response to output in each cycle k of the step: output = left[k] @ response. For example, the
+    #: mass matrix left[k] converts an acceleration to a torque.
     left: Vector
 
 
@@ -218,9 +220,9 @@ def spread(effect: Effect, mobilities: Vector, bounds: Vector, grid: Grid, ahead
         The worst-case change in each cycle due to the disturbances since cycle 0, without the response `hidden`, shape (n, 4).
     """
     count, postures = len(bounds), mobilities.shape[1]
+    # In the loop, total[k] is the change in cycle k due to the disturbances in the cycles k - lag to k.
+    # added[k] is the change in cycle k + lag, if a prediction starts in cycle k with a wrong velocity (`Effect.hidden`).
     total, added = np.zeros((count, 4)), np.zeros((grid.starts, 4))
-    # Element 0: response `pushed`, `lag` cycles after the disturbance.
-    # Element 1: response `hidden`, `lag` cycles after the prediction starts.
     both = np.zeros((2, 2, 2))
     column = 0
     for lag in range(count):

@@ -271,13 +271,16 @@ def _guards(config: GuideConfig, prediction: Prediction) -> Records[Guard]:
 
 
 def _reference(prediction: Prediction) -> tuple[list[Vector], Vector]:
-    """Return the reference of the step without re-centring, and the change of the reference by the re-centring.
+    """Compute the two parts of the desired motion of a step: nominal motion and re-centring offset.
+
+    The re-centring adds an offset s(t) to the nominal motion. The offset is linear in the deviations s(0) and s'(0) at the
+    stance change, so `start_step` multiplies the offset array by these deviations.
 
     Returns:
-        The reference consists of four arrays of shape (n, 2): acceleration (ahead by the command lag), velocity after
-            the low-pass of the drives, velocity, torque. The change is one array of shape (2, 4, n, 1). Axis 0: change
-            for s(0) = 1 rad, change for s'(0) = 1 rad/s. Axis 1: acceleration (ahead by the command lag), velocity
-            after the low-pass, velocity, acceleration. Axis 2: cycles.
+        Nominal motion: four arrays of shape (n, 2). They are the acceleration (ahead by the command lag), the velocity after the
+            low-pass of the drives, the velocity, and the torque.
+        Offset: array of shape (2, 4, n, 1). Axis 0: offset for s(0) = 1 rad, offset for s'(0) = 1 rad/s. Axis 1: acceleration
+            (ahead by the command lag), velocity after the low-pass, velocity, acceleration. Axis 2: cycles.
     """
     leg, loop = prediction.leg, prediction.assumptions.loop
     time, lag = leg.time, loop.command_lag

@@ -56,8 +56,8 @@ class Guard:
     motor: Annotated[Vector, 2]  # Nm, estimated torques of the motors of hip and knee
     lag: Annotated[Vector, 2]  # rad/s, estimated error of the measured velocities of hip and knee: true minus measured
     state: Annotated[Vector, STATES]  # state of the last cycle, see `backup_policy`
-    #: Sizes of the state elements, for the effect of model errors. Elements 2 and 3: |true e' - measured e'| of hip and knee,
-    #: where e' is the error rate. All other elements: absolute value of the same element of `state`.
+    #: Absolute values of the state elements. `Block.slack` and `Few.slack` are multiplied by them.
+    #: Exception: elements 2 and 3 are |true minus measured error rate e'| of hip and knee.
     magnitude: Annotated[Vector, STATES]
     compression: Annotated[Vector, (COMPRESSED, STATES)]  # matrix from the state to the compressed state
     compressed: Annotated[Vector, COMPRESSED]  # compressed state of the last cycle
@@ -72,35 +72,36 @@ class Guard:
 
 
 class Lag:
-    """Prediction of the tracking errors for one number of cycles ahead. The fixed array shapes make the compiled loops fast."""
+    """Matrix that predicts the tracking errors a fixed number of cycles ahead: `GuideTables.lags[i]` predicts i cycles ahead.
 
-    #: Matrix for the predicted errors e of sagittal hip and knee [rad]: e = compressed state @ `ahead`.
+    A record has arrays of fixed shape, so the compiled loops are fast.
+    """
+
+    #: Compressed state @ `ahead` gives the predicted tracking errors of sagittal hip and knee [rad].
     ahead: Annotated[Vector, (COMPRESSED, 2)]
 
 
 class Block:
-    """Bounds of the predicted tracking errors over a block: `SLACK_CYCLES` consecutive cycles ahead."""
+    """Bounds of the tracking errors in a group of `SLACK_CYCLES` consecutive predicted cycles, for example cycles 20 to 29.
 
-    #: Matrix for the effect of model errors. `Guard.magnitude` @ `slack` is the largest effect on the predicted tracking errors
-    #: of hip and knee [rad].
+    In each cycle of the block, each element of the matrix `Lag.ahead` is between `middle` - `spread` and `middle` + `spread`.
+    """
+
+    #: `Guard.magnitude` @ `slack` is the largest change of the tracking errors of hip and knee due to model errors [rad].
     slack: Annotated[Vector, (STATES, 2)]
-    #: `Lag.ahead` differs between the cycles of the block. For each matrix element: middle between the smallest and the largest
-    #: value.
-    middle: Annotated[Vector, (COMPRESSED, 2)]
-    #: For each matrix element of `Lag.ahead`: half the difference between the largest and the smallest value in the block.
-    spread: Annotated[Vector, (COMPRESSED, 2)]
+    middle: Annotated[Vector, (COMPRESSED, 2)]  # (largest + smallest `Lag.ahead` in the block) / 2, for each element
+    spread: Annotated[Vector, (COMPRESSED, 2)]  # (largest - smallest `Lag.ahead` in the block) / 2, for each element
     ratio: float  # upper bound of predicted error / guide width in the block, computed in the last control cycle
 
 
 class Few:
-    """Prediction of torque and speed for one number of cycles ahead, see `prediction.FEW`."""
+    """Prediction of torque and speed `lag` cycles ahead, see `prediction.FEW`."""
 
     lag: int  # number of cycles ahead
-    #: Matrix for four predictions: state @ `ahead`. Columns 0 and 1: feedback -Kv e - Dv e' of hip and knee [rad/s2].
-    #: Columns 2 and 3: error rate e' of hip and knee [rad/s].
+    #: State @ `ahead` gives four predicted values. Values 0 and 1: feedback acceleration -Kv e - Dv e' of hip and knee [rad/s2].
+    #: Values 2 and 3: error rate e' of hip and knee [rad/s].
     ahead: Annotated[Vector, (STATES, 4)]
-    #: Matrix for the effect of model errors. `Guard.magnitude` @ `slack` is the largest effect on the predicted error rate e' of
-    #: hip and knee [rad/s].
+    #: `Guard.magnitude` @ `slack` is the largest change of the error rate e' of hip and knee due to model errors [rad/s].
     slack: Annotated[Vector, (STATES, 2)]
 
 
@@ -109,23 +110,22 @@ class GuideTables(NamedTuple):
 
     guards: Records[Guard]  # (1,) constants, state and results of the filter
     laws: Records[Law]  # (1,) mass matrix and friction
-    lags: Records[Lag]  # (lags,) predictions of the tracking errors, one for each number of cycles ahead
+    lags: Records[Lag]  # (lags,) predictions of the tracking errors; the index is the number of cycles ahead
     blocks: Records[Block]  # (blocks,) bounds of the predicted tracking errors
-    #: (rows,) predictions of torque and speed. Each record is one number of cycles ahead, `Few.lag`, in ascending order.
-    few: Records[Few]
-    #: (starts, lags, 4) rad, largest tracking errors of sagittal hip and knee.
+    few: Records[Few]  # (rows,) predictions of torque and speed, in ascending order of `Few.lag`
+    #: (starts, lags, 4) rad, largest tracking errors that disturbances can cause.
     #: Axis 0: blocks of `START_CYCLES` cycles in which a prediction starts. Axis 1: number of cycles ahead.
-    #: Columns 0 and 1 of axis 2: due to model errors. Columns 2 and 3: due to the requested disturbances.
+    #: Axis 2: hip and knee due to model errors, then hip and knee due to the disturbance torques `Assumptions.promise`.
     reach: Vector
     highest: Vector  # (starts, blocks, 4) maximum of `reach` over each block of cycles ahead [rad]
     #: (starts, rows, 12) largest effects on the torques [Nm] and speeds [rad/s] of sagittal hip and knee (SH, SK).
     #: Axis 0: blocks of `START_CYCLES` cycles in which a prediction starts. Axis 1: records of `few`.
     #: Columns 0 to 7 are computed with the inertia and the delay of the model:
     #: Columns 0 to 3: torque of SH, torque of SK, speed of SH, speed of SK, due to torque errors of the model.
-    #: Columns 4 to 7: torque of SH, torque of SK, speed of SH, speed of SK, due to the requested disturbances.
+    #: Columns 4 to 7: torque of SH, torque of SK, speed of SH, speed of SK, due to the disturbance torques `Assumptions.promise`.
     #: Columns 8 to 11 are computed with the worst inertia and the worst delay instead:
     #: Columns 8 and 9: speeds of SH and SK due to torque errors of the model.
-    #: Columns 10 and 11: speeds of SH and SK due to the requested disturbances.
+    #: Columns 10 and 11: speeds of SH and SK due to the disturbance torques `Assumptions.promise`.
     few_reach: Vector
     #: (n, COLUMNS) values of each cycle of the step and of the overlap with the next step. The columns are defined below.
     step: Vector
@@ -146,7 +146,8 @@ TAIL = 16
 #: Columns 20 to 23 of `step`: maximum of columns 0 to 3 over `SLACK_CYCLES` cycles from this cycle on [1/rad].
 NEAR = 20
 COLUMNS = 24
-#: Number of cycles after the last predicted cycle. The last predicted error must fit into the narrowest guide of these cycles.
+#: The guide can become narrower after the prediction ends. The error in the last predicted cycle must therefore also fit into
+#: the guide of this number of later cycles.
 TAIL_CYCLES = 60
 
 

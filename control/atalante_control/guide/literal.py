@@ -172,7 +172,11 @@ def _guide_torque(tables: LiteralTables, cycle: int, joint: int, e: float, rate:
 
 
 def _largest_ratio(tables: LiteralTables, cycle: int, joint: int, e: float, rate: float, side: float) -> float:
-    """Return the largest |e| / q_bound from this cycle to the end of the step, under u_b and a constant u_ext = `side * push`."""
+    """Simulate the rest of the step under a constant push. Return the largest ratio of tracking error to guide width.
+
+    The torque on the joint is the sum of the feedforward torque, the backup torque (PD feedback) and the push. The push is
+    the largest external torque `Letter.push` in the direction `side` (1 or -1).
+    """
     letter, step = tables.letters[0], tables.step
     kp, kd, inertia = letter.kp[joint], letter.kd[joint], letter.inertia[joint]
     push, worst = side * letter.push[joint], 0.0

@@ -28,13 +28,13 @@ SIZES = np.repeat([0.07, 1.0, 1.0, 140.0, 140.0], 2)
 
 @dataclass(frozen=True)
 class Assumptions:
-    """Assumptions of a certificate: disturbance torques, time behaviour of the drives, model errors, start deviations."""
+    """Largest disturbances and model errors with which the joints must stay inside the guide, and lengths of the tables."""
 
-    #: Nm, requested disturbance: largest torques at sagittal hip and knee under which the joints must stay inside the guide
+    #: Nm, requested disturbance torques: these torques at sagittal hip and knee must not move a joint out of the guide
     promise: Pair = (30.0, 18.0)
-    loop: SampledLoop = field(default_factory=SampledLoop)
-    mismatch: Mismatch = field(default_factory=Mismatch)
-    hand_over: HandOver = field(default_factory=HandOver)
+    loop: SampledLoop = field(default_factory=SampledLoop)  # lags of motor torque and measured velocity
+    mismatch: Mismatch = field(default_factory=Mismatch)  # largest errors of friction and inertia
+    hand_over: HandOver = field(default_factory=HandOver)  # largest deviations when a step starts
     #: Smallest and largest number of cycles between a measurement and the torque that is computed from it.
     delays: tuple[int, int] = (1, 2)
     horizon: int = 300  # number of predicted cycles
@@ -138,9 +138,11 @@ class Prediction:
         # the largest effect of disturbances over all members. For example, a joint moves faster if the leg is lighter than in the
         # model, or if the command arrives later.
         self.reach = np.zeros((blocks, len(whole.lags), 4))
-        # Largest effects of disturbances on torque and speed, `FEW` cycles ahead. `self.few_reach` follows from this array.
-        # Axis 0: torque, speed, speed with the worst inertia and delay. Axis 1: block of start cycles. Axis 2: element of `FEW`.
-        # Columns 0 and 1 of axis 3: hip and knee, due to model errors. Columns 2 and 3: due to the requested disturbances.
+        # Largest effects of disturbances on torque and speed.
+        # Axis 0: torque, speed, speed with the worst inertia and delay.
+        # Axis 1: block of start cycles.
+        # Axis 2: prediction length. Element i is for a prediction of FEW[i] cycles.
+        # Axis 3: hip and knee due to model errors, then hip and knee due to the disturbance torques `Assumptions.promise`.
         few_ahead = np.zeros((3, blocks, len(FEW), 4))
         lag = assumptions.loop.velocity_lag
         first, first_rates = [], []
@@ -154,7 +156,7 @@ class Prediction:
         first_torque = run(torque, mobilities, bounds, few, few_ahead[0])
         first_speed = run(speed, mobilities, bounds, few, few_ahead[1])
         # Axes of `by_bound`: block of start cycles, element of `FEW`, cause, output, joint.
-        # Causes: model errors, requested disturbances. Outputs: torque, speed. Joints: sagittal hip, sagittal knee.
+        # Causes: model errors, disturbance torques. Outputs: torque, speed. Joints: sagittal hip, sagittal knee.
         by_bound = few_ahead[:2].reshape(2, blocks, len(FEW), 2, 2).transpose(1, 2, 3, 0, 4)
         self.few_reach: Vector = np.concatenate([by_bound.reshape(blocks, len(FEW), 8), few_ahead[2]], axis=2)
         self.few_ahead: Vector = np.concatenate([nominal.feedback[FEW], nominal.rate[FEW]], axis=1)
@@ -197,10 +199,13 @@ def prediction_of(policy: BackupPolicy, leg: Leg, assumptions: Assumptions, blen
 
 
 def _separated(rows: Vector) -> Vector:
-    """Convert matrices of a prediction: in the state, (true e' - measured e') replaces the true error rate e'.
+    """Convert prediction matrices for a state in which the elements 2 and 3 are (true - measured) error rate.
 
-    The prediction does not change: a * true + b * measured = a * (true - measured) + (a + b) * measured. The state is defined at
-    `STATES`.
+    In the state of the given matrices, the elements 2 and 3 are the true error rate, and the elements 4 and 5 are the measured
+    error rate. The predicted values stay the same: a * true + b * measured = a * (true - measured) + (a + b) * measured.
+
+    Args:
+        rows: prediction matrices. The last axis are the coefficients of the state elements.
     """
     result = rows.copy()
     result[..., 4:6] += rows[..., 2:4]

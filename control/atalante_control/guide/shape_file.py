@@ -97,10 +97,7 @@ def _shape(document: Mapping[str, Any]) -> GuideShape:
 
 
 def _eased(phase: Vector, knots: Vector) -> Vector:
-    """Warp phases for half-cosine interpolation between the knots.
-
-    Linear interpolation at a warped phase gives the value of the half-cosine interpolation at the original phase.
-    """
+    """Convert phases: `np.interp` at a converted phase gives the half-cosine interpolation at the original phase."""
     at = np.clip(np.searchsorted(knots, phase, side="right") - 1, 0, len(knots) - 2)
     length = knots[at + 1] - knots[at]
     return np.asarray(knots[at] + length * (0.5 - 0.5 * np.cos(math.pi * (phase - knots[at]) / length)))

@@ -30,7 +30,8 @@ _ASSISTED = [LEG_JOINTS.index("SH"), LEG_JOINTS.index("SK")]
 _WIDEST = math.radians(7.5)
 #: If no filter can be certified for the requested disturbance torques, a filter is certified for smaller torques. The smaller
 #: torques are this fraction of the largest torques for which the filter can be certified.
-#: The fraction 1 would leave no margin, so the backup torque would have weight 1 even without a disturbance.
+#: With the fraction 1, the error, torque or speed predicted for these torques would already reach its limit without a real
+#: disturbance. The filter would then apply the full backup torque without need.
 _USED = 0.95
 #: Number of decimal digits to which the assistance factor is rounded; the CAN signal has the same resolution.
 _DIGITS = 4

@@ -118,7 +118,7 @@ class AssistedInertia:
         return m11, m12, m22
 
     def velocity_torques(self, knee: float, hip_rate: float, knee_rate: float) -> Pair:
-        """Return the velocity torques (centrifugal, Coriolis) of sagittal hip and knee [Nm], see `velocity_torques`.
+        """Return the velocity torques (centrifugal, Coriolis) of sagittal hip and knee [Nm].
 
         Args:
             knee: angle of SK [rad].

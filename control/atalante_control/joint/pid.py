@@ -98,7 +98,7 @@ class Pid:
         stance, swing = gains.stance, gains.swing
         # stance leg -> gains of the left leg, gains of the right leg
         roles = {LEFT: (stance, swing), RIGHT: (swing, stance)}
-        #: Stance leg -> Kp, Kd, and Ki times the cycle time of the twelve joints, shape (3, 12).
+        #: Stance leg -> gains, shape (3, 12). The rows are Kp, Kd and Ki * PERIOD, with one column for each joint.
         self._gains_of = {
             s: np.array([(*left.kp, *right.kp), (*left.kd, *right.kd), (*left.ki, *right.ki)])
             * [[1.0], [1.0], [PERIOD]]

@@ -1,5 +1,6 @@
-"""Patient as a set of rigid segments: `mass, height (, thigh, shank) -> Winter's table -> mass properties of a segment`.
+"""Patient as a set of rigid segments. Winter's table gives mass, centre of mass and inertia of each segment.
 
+The inputs are body mass and body height. The lengths of thigh and shank are optional.
 `exoskeleton.links` fuses these segments into the links of the exoskeleton.
 """
 

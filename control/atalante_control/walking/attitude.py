@@ -65,7 +65,7 @@ class AttitudeObserver:
         self.reset((1.0, 0.0, 0.0, 0.0))
 
     def reset(self, quaternion: Sequence[float]) -> None:
-        """Set the attitude to a measured attitude with a heading of zero. Set the velocity to zero.
+        """Take roll and pitch from a measured attitude. Set the heading and the velocity to zero.
 
         Args:
             quaternion: attitude of the pelvis IMU, unit quaternion wxyz, pelvis to world.

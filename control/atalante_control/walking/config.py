@@ -71,7 +71,7 @@ class WalkConfig:
     #: the motion earlier.
     reach_time: float = 0.2
     #: rad/s, largest speed of sagittal hip and knee while a late swing foot moves down.
-    #: With an almost straight leg, `reach_rate` makes the foot slower than `reach_speed`.
+    #: With an almost straight leg, even a slow foot needs high joint speeds. The foot is then slower than `reach_speed`.
     reach_rate: float = 2.5
     reach_knee: float = 0.05  # rad, smallest knee angle while a late swing foot moves down
     #: Steering by an offset of the transverse hip: gain on the heading error [rad/rad], gain on the sideways deviation
@@ -97,7 +97,7 @@ class WalkConfig:
     rest: float = 0.3  # s, wait after each weight shift
     guide: StepGuideConfig = WALK_GUIDE
     #: End of the re-centring of sagittal hip and knee in a guided step, as a fraction of the step duration.
-    #: With the smaller value `alpha`, the re-centring of the heavy leg would need more torque than the drives have.
+    #: With the smaller fraction `alpha`, these joints would need more torque than the drives have, because the leg is heavy.
     #: All other joints use `alpha`, because the robot would fall if they were re-centred as slowly as sagittal hip and knee.
     guided_alpha: float = 0.5
     #: s, duration of a ramp from 1 to 0 at the start of a guided step. The weight of the backup torque is never below the ramp.

@@ -143,7 +143,7 @@ class WalkController:
         #: `State` object of the last `_bind`. The tuples in `_measured_by` contain the arrays of this object.
         self._state: State | None = None
         self._measured = Measured(np.zeros(_N), np.zeros(_N), np.zeros(3), np.zeros(3), np.zeros(3), force, self._sent)
-        #: Index of an IMU -> measurements of the kernels with this IMU.
+        #: Index of the IMU in use (pelvis or torso) -> sensor arrays that the kernels read.
         self._measured_by = {_PELVIS: self._measured, _TORSO: self._measured}
         stages: Records[Stage] = zeros(Stage, 1)
         sensed: Records[Sensed] = zeros(Sensed, 1)
@@ -458,7 +458,13 @@ class WalkController:
         record.assistance_factor, stage.intensity = xi, intensity(xi)
 
     def _watch_guide(self, cycle: int) -> None:
-        """Add a guided cycle to the statistics, and report to the HAL if the leg leaves the guide now or in the prediction."""
+        """Update the statistics of the guide, and report h < 0 to the HAL.
+
+        At h < 0, the swing leg is outside the guide, or the guide filter predicts that the leg will leave the guide.
+
+        Args:
+            cycle: cycles since the start of the step.
+        """
         command, guide = self._command, self.config.guide
         guided = self._assisted and cycle < len(self._section.assistance.unmodelled)
         command.hand_over_exceeded = guided and cycle == 0 and self._exceeded

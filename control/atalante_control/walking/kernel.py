@@ -177,7 +177,7 @@ def sense(measured: Measured, table: PhaseTable, constants: Constants, stabilise
     rotation = parts.attitudes[0].rotation
 
     for side in range(len(SIDES)):
-        # The heading of a foot is the heading of its x axis in world axes.
+        # The x axis of a foot points outwards by the toe-out. The toe-out is subtracted from the heading of the x axis.
         foot = soles[side].rotation
         ahead = rotated(rotation, (foot[0, 0], foot[1, 0], foot[2, 0]))
         toe_out = -stabiliser.toe_out if side else stabiliser.toe_out

@@ -7,12 +7,12 @@ moment of inertia J of the rotating parts about the hip, the natural frequency w
 counts most, because a DCM error grows with exp(w t). The trunk therefore leans fast and returns slowly. The lean is an offset
 of the frontal hip (FH) of the stance leg.
 
-A push to the side of the stance foot makes the trunk lean over the stance foot, if the DCM is outwards of the middle of the
-stance sole or at most `inside` inwards of it. A push to the side of the swing foot makes the trunk lean a little to the side of
-the swing foot. This lean also lowers the swing foot.
+A push to the side of the stance foot makes the trunk lean over the stance foot. This lean begins when the distance from the
+DCM to the middle of the stance sole falls below `inside`. A push to the side of the swing foot makes the trunk lean a little
+to the side of the swing foot. This lean also lowers the swing foot.
 
-If the DCM is more than `leg_zone` outwards of the middle of the stance sole, the swing foot also moves away from the stance foot.
-The swing leg then turns in the same direction as the trunk, and its mass moves away from the DCM.
+If the push moves the DCM beyond the middle of the stance sole by more than `leg_zone`, the swing foot moves away from the
+stance foot. The swing leg then turns in the same direction as the trunk, and its mass moves away from the DCM.
 """
 
 from __future__ import annotations
@@ -27,18 +27,18 @@ class LeanConfig(NamedTuple):
 
     gain: float = 6.0  # rad/m, lean per DCM error beyond the dead zone; 0: no lean
     dead_zone: float = 0.02  # m, sideways DCM error up to which the trunk does not lean
-    #: m, the trunk leans over the stance foot only if the DCM is less than this distance inwards of the middle of the stance
-    #: sole, or outwards of the middle. Inwards is the direction to the swing foot.
+    #: m, distance of the DCM from the middle of the stance sole, positive towards the swing foot.
+    #: Above this distance, the trunk does not lean over the stance foot.
     inside: float = 0.015
     outward: float = 0.22  # rad, largest lean over the stance foot
     inward: float = 0.08  # rad, largest lean to the side of the swing foot
     rise: float = 14.0  # rad/s, natural frequency of the critically damped filter while the lean grows
     fall: float = 5.0  # rad/s, natural frequency of the filter while the lean decreases
     acceleration: float = 25.0  # rad/s2, largest acceleration of the lean
-    #: m/m, shift of the swing foot away from the stance foot, per distance of the DCM beyond `leg_zone`; 0: no shift
+    #: Shift of the swing foot [m] = `leg_gain` * (distance of the DCM - `leg_zone`). See `leg_zone` for this distance.
     leg_gain: float = 8.0
-    #: m, the swing foot is shifted only if the DCM is more than this distance outwards of the middle of the stance sole. Outwards
-    #: is the direction away from the swing foot.
+    #: m, distance of the DCM from the middle of the stance sole, positive away from the swing foot.
+    #: Above this distance, the swing foot is shifted away from the stance foot.
     leg_zone: float = 0.02
     leg: float = 0.15  # m, largest shift of the swing foot away from the stance foot
 

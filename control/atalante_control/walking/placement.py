@@ -1,4 +1,4 @@
-"""Foot placement and step timing against pushes: `DCM error -> offset of the landing, phase rate -> shifted swing foot`.
+"""Foot placement and step timing against pushes: a DCM error changes the landing position and the speed of a step.
 
 DCM is the divergent component of motion (`walking.dcm`). Let e be the DCM error, w the natural frequency, k the gain of
 the ankle stabiliser and L the largest shift of the centre of pressure by the ankle. With the ankle stabiliser, e obeys
@@ -10,10 +10,10 @@ The predicted error beyond a dead zone is removed in two ways, see `landing`:
 - Foot placement. The landing is shifted by the error of the DCM at the landing. The DCM is then at its nominal position relative
   to the new stance foot.
 - Step timing. The error depends on the time of the landing, because the DCM moves outwards during a step. The phase
-  rate with the lowest cost is used. The cost consists of the shift of the landing, the shift that the limits do not
-  permit, and the change of the step duration. (After M. Khadiv et al., Walking control based on step timing adaptation,
-  IEEE Transactions on Robotics 36, 2020. The authors solve a quadratic program. Here the phase rate is the only unknown,
-  so no solver is needed.)
+  rate is the speed of the step relative to the gait. The phase rate with the lowest cost is used. The cost consists of
+  the shift of the landing, the shift that the limits do not permit, and the change of the step duration. (After
+  M. Khadiv et al., Walking control based on step timing adaptation, IEEE Transactions on Robotics 36, 2020. The authors
+  solve a quadratic program. Here the phase rate is the only unknown, so no solver is needed.)
 
 A push also moves and tilts the pelvis. With the joint angles of the gait, the swing foot would move with the pelvis:
 sideways, forwards and away from the floor. From the first reaction until the landing, the ankle of the swing leg is
@@ -74,7 +74,9 @@ class PlacementConfig(NamedTuple):
     #: weight of the missing landing offset in the cost, see `_cost`; the missing offset is the needed minus the permitted offset
     missed: float = 30.0
     timing: float = 0.03  # m, weight of a change of the landing time in the cost, see `_cost`
-    hold: float = 0.1  # s, time in which the reference of the swing foot changes from the pelvis to the stance foot
+    #: After a push, the swing foot changes from the joint angles of the gait to a held position relative to the stance foot.
+    #: `hold` is the duration of this change [s].
+    hold: float = 0.1
     slew: float = 15.0  # 1/s, largest change of the phase rate per second
 
 
@@ -83,7 +85,8 @@ class Placement:
 
     clock: float  # cycles, current row of the phase table, not rounded to an integer
     pace: float  # phase rate: progress of the step in one cycle, in nominal cycles
-    #: reference of the swing foot: 0 for the joint angles of the gait, 1 for the position relative to the stance foot
+    #: 0: the swing foot follows the joint angles of the gait. 1: the position relative to the stance foot is held.
+    #: Between 0 and 1: mixture of both positions.
     held: float
     target: Annotated[Vector, 2]  # m, requested offset of the landing in the walking frame
     offset: Annotated[Vector, 2]  # m, current offset of the swing foot in the walking frame
@@ -187,7 +190,7 @@ def _needed(config: PlacementConfig, gain: float, motion: Motion, rate: float) -
 
 
 def _permitted(config: PlacementConfig, side: float, x: float, y: float) -> Pair:
-    """Return an offset of the landing within its limits [m]."""
+    """Clip a landing offset (x forwards, y to the left) to the permitted range, and return it [m]."""
     return (
         min(max(x, -config.forward), config.forward),
         side * min(max(side * y, -config.inward), config.outward),
@@ -240,9 +243,10 @@ def follow(config: PlacementConfig, placement: Placement, rate: float) -> None:
 def shift_foot(
     placement: Placement, links: Records[Link], first: int, desired: Vector, leg: int, goal: Vector3
 ) -> None:
-    """Move the desired position of the swing ankle towards a goal by one Newton step for frontal hip, sagittal hip and knee.
+    """Move the desired swing ankle towards a goal position, with one Newton step of the inverse kinematics.
 
-    The attitude of the foot is not considered, because the ankle holds the sole level.
+    The Newton step changes the angles of frontal hip, sagittal hip and knee (FH, SH, SK). The attitude of the foot is not
+    considered, because the ankle holds the sole level.
 
     Args:
         placement: state; `change` is updated.
@@ -261,7 +265,8 @@ def shift_foot(
     determinant = a[0] * bc[0] + a[1] * bc[1] + a[2] * bc[2]
     if abs(determinant) < _SINGULAR:
         return
-    # If a joint reaches its limit, the next joints move the rest of the shift (least squares).
+    # The joints move in the order FH, SK, SH. If FH reaches a limit, SK and SH reduce the remaining error (least squares).
+    # If SK reaches a limit, SH reduces the remaining error.
     moved = _step(placement, desired, leg, 0, dot(bc, missing) / determinant)
     missing = missing[0] - moved * a[0], missing[1] - moved * a[1], missing[2] - moved * a[2]
     bb, bd, dd = dot(b, b), dot(b, c), dot(c, c)

@@ -47,10 +47,10 @@ class PhaseTable(NamedTuple):
     guided: Vector
     reach: Vector  # (2,) rad/s, speeds of SH and SK of the swing leg that move a late swing foot down
     lowering: float  # m/s, downward speed of a late swing foot at the joint speeds `reach`
-    reach_cycles: int  # cycles after the end of the table for which SH and SK move with the speeds `reach`
-    #: cycles after the end of the table for which foot placement lowers a late swing foot. The knee angle can shorten
-    #: `reach_cycles`, but not `lowering_cycles`.
-    lowering_cycles: int
+    #: SH and SK move with the speeds `reach` for this number of cycles after the end of the table. The number is smaller if the
+    #: knee would become too straight.
+    reach_cycles: int
+    lowering_cycles: int  # foot placement lowers a late swing foot for this number of cycles after the end of the table
 
 
 class Reach(NamedTuple):

@@ -81,8 +81,9 @@ class Steering:
         """Return the offset of the transverse hip (TH) of the swing leg for the next step, positive to the left [rad]."""
         per_yaw, per_metre, largest = self._gains
         limit = largest + abs(self._turn)
-        # The line has just turned by the angle `_turn`. In a steady turn, the heading of the stance sole now lags the heading of
-        # the line by `_turn`. The heading of the swing sole lags by 2 `_turn`, so the mean lag of both soles is 1.5 `_turn`.
+        # In a steady turn, each foot lands with the heading of the line, and the line turns by `_turn` before each step.
+        # Since the landing of the stance foot, the line has turned once. Since the last landing of the swing foot, the line
+        # has turned twice. So the mean heading of both soles is 1.5 `_turn` behind the line.
         error = self.yaw + 1.5 * self._turn
         return -min(max(per_yaw * error + per_metre * self.lateral - self._turn, -limit), limit)
 

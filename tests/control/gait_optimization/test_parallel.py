@@ -88,7 +88,7 @@ def killed(_: int) -> None:
 
 def test_end_of_a_process_gives_one_sentence() -> None:
     with pytest.raises(
-        LostProcessError, match=r"^a process ended unexpectedly.*; calls without a result: 3: repeat the command"
+        LostProcessError, match=r"^a process ended unexpectedly.*; calls without a result: 3; repeat the command"
     ):
         list(fan_out(killed, range(3), jobs=2))
 

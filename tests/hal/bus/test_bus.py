@@ -512,7 +512,7 @@ def broken_logs(folder: Path) -> dict[str, tuple[Path, str]]:
         "folder": (folder, "the log format must be"),
         "suffix": (
             folder / "run.pcap",
-            "the log format must be one of python-can, such as .log .*, got '.pcap'",
+            "the log format must be one that python-can can read, such as .log .*, got '.pcap'",
         ),
         "no suffix": (folder / "run", "the log format must be"),
         "csv": (folder / "run.csv", "cannot store CAN FD frames completely; record the log as .log, .asc or .blf"),

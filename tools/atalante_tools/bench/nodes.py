@@ -49,7 +49,7 @@ _E2E = Struct("<HB")
 
 @dataclass(frozen=True)
 class Walk:
-    """Network, robot, gait and guide filter for the recording."""
+    """Data from which `Recording` computes the frames of a walking robot."""
 
     network: Network
     robot: Robot

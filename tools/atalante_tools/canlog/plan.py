@@ -135,10 +135,13 @@ class Plan:
         return rows
 
     def rows_in_other_format(self, can_ids: npt.NDArray[np.uint32]) -> Rows:
-        """Search the number of each identifier in the other identifier format, and return the message indices. Shape (n,).
+        """Return the index of the message with the same number in the other identifier format (11 or 29 bits). Shape (n,).
 
-        The number of an 11-bit identifier is searched among the 29-bit identifiers of the DBC, and vice versa.
-        The message index is `UNKNOWN` if the DBC has no such message.
+        Example: the 11-bit identifier 0x123 gives the message with the 29-bit identifier 0x00000123, and vice versa.
+        The index is `UNKNOWN` if the DBC has no such message.
+
+        Args:
+            can_ids: identifiers with SocketCAN flags, shape (n,).
         """
         numbers = can_ids & np.uint32(_ALL_BITS)
         short = self._standard[np.where(numbers < _STANDARD, numbers, 0)]

@@ -57,7 +57,11 @@ class Stream:
         carried[self.present] = column[self.stops - 1]
 
     def span(self, rows: range) -> slice:
-        """Return the slice that selects the frames of a range of message indices."""
+        """Return the slice of the stream that contains all frames of several messages.
+
+        Args:
+            rows: indices of the messages in the plan. Their frames are contiguous, because the stream is sorted by message.
+        """
         first, end = self.present.searchsorted((rows.start, rows.stop)).tolist()
         if first == end:
             return slice(0, 0)

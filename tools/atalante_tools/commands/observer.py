@@ -29,8 +29,8 @@ class NodeReport:
 
     node: str
     kind: str
-    #: Age of the newest frame among the messages of the node with the shortest cycle time. For the HAL, only the SYNC messages
-    #: count. None if no frame was received.
+    #: Age of the newest frame from the node. Slow messages are ignored: only the messages with the shortest cycle time of this
+    #: node count. For the HAL, only the SYNC messages count. None if no frame was received.
     age_ms: int | None
     late: bool  # whether the age exceeds the timeout in the DBC
     state: str | None

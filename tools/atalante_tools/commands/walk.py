@@ -255,7 +255,7 @@ def _require_speed_changes(law: Law, files: GaitFiles) -> None:
 
 
 def _subject(patient: Patient | None, step_length: float, step_duration: float) -> Subject | None:
-    """Return patient, step length and step duration as a subject. Return None for the default step without a patient."""
+    """Return patient, step length and step duration as a subject; None if `patient` is None and the step is the default."""
     if patient is None and (step_length, step_duration) == DEFAULT_STEP:
         return None
     return _walking_with(patient, step_length, step_duration)

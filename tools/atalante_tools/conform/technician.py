@@ -31,7 +31,8 @@ class Technician(Protocol):
     """Person or program that carries out manual actions on the node."""
 
     patience: float  # longest wait for the effect of an action [s]
-    fresh: bool  # whether the node was switched on at the start of the examination
+    #: True if the node was powered on just before the tests, so that its boot-up can be tested without a power cycle
+    fresh: bool
     certain: bool  # whether every requested action is carried out; a person may ignore a request
 
     def request(self, action: Action, node: str) -> None:
@@ -65,7 +66,7 @@ class EmulatorTechnician:
         operator = self._operator
         match action:
             case Action.POWER_UP:
-                pass  # the emulated node was switched on at the start of the examination
+                pass  # not needed, because the emulated node was just powered on
             case Action.OVERHEAT | Action.COOL:
                 drive = [joint.upper() for joint in JOINTS].index(node)
                 self._emulator.drives.heat(drive, 150.0 if action is Action.OVERHEAT else 25.0)

@@ -27,7 +27,7 @@ _COMMAND: Final = "COMMAND_LEFT_LEG"
 #: its drive can be enabled again.
 _LOWERED: Final = 4500
 #: Time from the end of the fault to START [cycles], if the HAL has switched off the faulty drive. The joint of this drive may
-#: still sink at START, because START first lets the drive hold the joint.
+#: still be sinking when START is pressed. START enables the drive, and the drive then holds the joint.
 _UNTIL_START: Final = 600
 #: Time from HOLD until all joints are at rest [cycles].
 _AT_REST: Final = 60
@@ -345,8 +345,8 @@ SCENARIOS: Final = (
     ),
     # A faulty motor is visible only in the motion of its joint, because its drive still reports the commanded torque. HA moves
     # little, because its commanded torque is less than its dry friction. So the detection takes longer for HA.
-    # A reversed motor of SA is not tested. SA exceeds the velocity that `limit_violations` accepts before the HAL detects the
-    # fault.
+    # There is no case with a reversed motor of SA, because this case would fail: SA exceeds the velocity limit of the test
+    # (`limit_violations`) sooner than the HAL can detect the fault.
     Scenario(
         "F82",
         tuple(

@@ -86,8 +86,8 @@ SCENARIOS: Final = (
         "F04",
         (
             *(_lost(drive, f"{drive}_STATE", 5, node=drive) for drive in _DRIVES),
-            # Injected forces simulate that the right foot is on the ground. Therefore the left leg finishes its step after 5 lost
-            # frames. The tenth lost frame in a row leads to HOLD at once.
+            # Frames of a swing leg are lost. Injected forces load the right foot, so the HAL treats the left leg as swing leg.
+            # After 5 lost frames in a row, the swing leg finishes its step (FINISH_STEP). The tenth lost frame leads to HOLD.
             *(
                 Case(
                     f"{frames or 'all'} frames of the swing leg",

@@ -37,8 +37,8 @@ class Row:
     behaviour: str  # reaction in words
     state: SupervisorState  # final state of the HAL
     dtc: str  # diagnostic code; empty means no code
-    #: Proofs that the HAL reacts as the row states. Each proof is SCENARIO or the name of a test in tests/, such as
-    #: `faults/test_frames.py::test_f08_*`. An * at the end of the name stands for any text.
+    #: Tests of the fault. Each entry is SCENARIO or the name of a test in tests/, such as `faults/test_frames.py::test_f08_*`.
+    #: The character * at the end of a name stands for any text.
     proof: tuple[str, ...]
 
     @property
@@ -61,7 +61,7 @@ class Row:
 
     @property
     def tests(self) -> tuple[str, ...]:
-        """Return the tests that prove the row."""
+        """Return the names of the tests in `proof`, without the entry SCENARIO."""
         return tuple(entry for entry in self.proof if entry != SCENARIO)
 
 

@@ -87,12 +87,13 @@ class Case:
     reacted: int | None = None  # time limit for the reaction [cycles]; None means as in the fault matrix
     node: str | None = None  # node that the diagnostic must name; None means any node
     recovers: bool = True  # True: START after the fault must lead to ACTIVE; False: START must not lead to ACTIVE
-    #: cycles from the end of the fault to START; for a permanent fault: from the time limit of the reaction to START
+    #: START is pressed this number of cycles after the fault has ended and the time limit `reacted` has passed. A permanent fault
+    #: does not end, so only the time limit counts.
     observed: int = 60
     seed: int = 0  # seed of the random numbers in the emulator
     checks: tuple[ObservationCheck, ...] = ()  # additional checks of the run
     engine: str = PYBULLET  # physics engine of the emulated robot
-    #: True for a case that replaces the measured forces on a foot; such a case is only for a suspended robot
+    #: True: run the case only with a suspended robot, because the case replaces the measured foot forces
     suspended: bool = False
 
     @property
@@ -104,7 +105,7 @@ class Case:
 
 @dataclass(frozen=True)
 class Scenario:
-    """All test cases that prove one row of the fault matrix."""
+    """All test cases of one fault, which is one row of the fault matrix."""
 
     id: str
     cases: tuple[Case, ...]

@@ -109,13 +109,13 @@ command.add_command(solve)
     "--thigh",
     type=levels_of,
     metavar="X,...",
-    help="Thigh lengths of the grid, relative to Winter's table (0.94,1,1.06).",
+    help="Thigh lengths of the grid, as multiples of the length in Winter's table, such as 0.94,1,1.06.",
 )
 @click.option(
     "--shank",
     type=levels_of,
     metavar="X,...",
-    help="Shank lengths of the grid, relative to Winter's table (0.94,1,1.06).",
+    help="Shank lengths of the grid, as multiples of the length in Winter's table, such as 0.94,1,1.06.",
 )
 @click.option(
     "--size",

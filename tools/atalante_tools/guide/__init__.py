@@ -89,7 +89,7 @@ _CHECK_OPTIONS = [
                  help="Assistance factor Xi. Repeat the option for several factors.  "
                       f"[default: {', '.join(f'{xi:g}' for xi in FACTORS)}]"),
     click.option("--patients", is_flag=True,
-                 help="Also check the network gaits of twelve patients of 58 to 91 kg."),
+                 help="Also check gaits that the neural gait network computes for twelve patients of 58 to 91 kg."),
     click.option("--condition", "conditions", type=click.Choice(CONDITION_NAMES), multiple=True,
                  help="Deviation of plant and robot from the model: none (model), friction +-20 %, mass +-10 %, friction and "
                       "mass (both), encoder noise, 1 % frame loss, 1 ms more delay. Repeat the option for several conditions.  "

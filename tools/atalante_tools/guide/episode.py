@@ -43,20 +43,21 @@ LOG = (
     "rate_hip",
     "rate_knee",
 )
-#: Number of features that the direction of a push can depend on: e / q_bound of hip and knee, then e' / `RATE` of hip and knee.
+#: Number of features, the inputs of `Push.feedback`: e / q_bound of hip and knee, then e' / `RATE` of hip and knee. e is the
+#: tracking error.
 FEATURES = 4
-#: The features contain the rates e' divided by this speed [rad/s].
+#: Error rate e' for which a feature has the value 1 [rad/s].
 RATE = 0.5
 
 
 class Push(NamedTuple):
-    """Push at hip and knee during one step: always the largest torque, with the sign of `signs + feedback @ features`.
+    """Push at hip and knee during one step: always the largest torque, with the sign of `signs[cycle] + feedback @ features`.
 
-    The features are e / q_bound and e' / `RATE` of hip and knee in the current cycle. e is the tracking error.
+    The features are e / q_bound and e' / `RATE` of hip and knee in the current cycle. e is the tracking error. A push with zero
+    `feedback` does not depend on the motion of the leg.
     """
 
-    #: offset of hip and knee in each cycle, which does not depend on the motion of the leg, shape (cycles + 1, 2)
-    signs: Vector
+    signs: Vector  # first term of the sum for each cycle (row), at hip and knee (columns), shape (cycles + 1, 2)
     feedback: Vector  # weight of each feature for hip (row 0) and knee (row 1), shape (2, FEATURES)
 
 

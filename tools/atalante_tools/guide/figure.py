@@ -1,4 +1,4 @@
-"""Figure of a check: guide, safe backward image and worst step. `Checked -> picture`."""
+"""Figure of a checked guide: bounds, states from which the backup policy keeps the joints inside, and worst step."""
 
 from __future__ import annotations
 

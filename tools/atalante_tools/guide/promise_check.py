@@ -34,7 +34,8 @@ from atalante_tools.guide.search import DIRECTIONS, Adversary, Tried
 
 Pair = tuple[float, float]
 
-#: Name of a condition -> condition of the plant and of the robot.
+#: Name for the option --condition -> deviations of plant and robot from the model that the search tries. For example, the name
+#: "friction" stands for 80 % and 120 % of the modelled friction.
 CONDITIONS: Final = {
     "model": (Condition(),),
     "friction": (Condition(friction=0.8), Condition(friction=1.2)),
@@ -44,7 +45,8 @@ CONDITIONS: Final = {
     "loss": (Condition(loss=0.01),),
     "delay": (Condition(delay=1),),
 }
-#: Patients whose network gaits are checked: mass [kg], height [m], step length [m], step duration [s].
+#: Patients of the option --patients, for whom the neural gait network computes gaits. An entry has the mass [kg], height [m],
+#: step length [m] and step duration [s].
 PATIENTS: Final = (
     (58.0, 1.62, 0.10, 0.9), (58.0, 1.65, 0.15, 0.9), (61.0, 1.65, 0.15, 0.8), (64.0, 1.70, 0.12, 1.0),
     (67.0, 1.68, 0.18, 0.9), (70.0, 1.75, 0.15, 0.9), (73.0, 1.70, 0.10, 0.8), (76.0, 1.80, 0.15, 1.0),

@@ -280,7 +280,7 @@ class Adversary:
         elif feedback.any() and change < 0.7:
             feedback += 0.3 * generator.standard_normal(feedback.shape)
         else:
-            if feedback.any():  # repeat the signs of the push that the parent step recorded, without feedback
+            if feedback.any():  # replace the feedback by a fixed sequence: the signs of the push in the parent step
                 signs, feedback = np.where(parent.walked.log[:, 4:6] >= 0.0, 1.0, -1.0), _no_feedback()
             begin, length = int(generator.integers(cycles)), int(1 + generator.exponential(30.0))
             joints = [[0], [1], [0, 1]][int(generator.integers(3))]

@@ -41,9 +41,9 @@ if TYPE_CHECKING:
     from atalante_emulator.mechanics import Mechanics
     from atalante_emulator.pendant import Operator
 
-#: Timeout of the answers to a SYNC on the wall clock: half a cycle [s].
+#: Longest wait for the answers to a SYNC in real time: half a cycle [s].
 PATIENCE: Final = 0.5e-3
-#: Timeout of the answers to a SYNC in lock-step [s], long because the other process may run on a slow computer.
+#: Longest wait for the answers to a SYNC in lock-step [s]. This wait is long, because the computer of the robot may be slow.
 LOCKSTEP_PATIENCE: Final = 2.0
 
 
@@ -241,7 +241,7 @@ class Watch:
 
     A run ends when `done(state)` returns True while the robot is ACTIVE, when a signal arrives, or when the robot is in FAULT. If
     the robot leaves ACTIVE for another state, the run ends, too. With `resumes`, the run waits for START of the operator instead.
-    After the run, `conclude` raises an error unless `done` ended the run.
+    After the run, `conclude` raises an error if the run ended before `done` returned True.
     """
 
     def __init__(
@@ -298,7 +298,7 @@ class Watch:
         return over
 
     def conclude(self) -> None:
-        """End the command with an error unless `done` ended the run.
+        """Raise an error if the run ended before the function `done` returned True.
 
         Raises:
             SystemExit: If a signal ended the run, with its exit code.

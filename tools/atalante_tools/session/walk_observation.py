@@ -1,4 +1,4 @@
-"""Observer of a walk on the ground: `true or estimated motion of the robot -> has fallen, deviation from the start line`."""
+"""Observer of a walk on the ground: detects a fall, and measures how far the robot deviates from the start line."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""End condition of a walk on the ground: `state after each cycle -> progress line, end and outcome of the walk`."""
+"""End condition of a walk on the ground: decides after each cycle whether the walk is over, and with which outcome."""
 
 from __future__ import annotations
 

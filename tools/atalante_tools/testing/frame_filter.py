@@ -176,7 +176,8 @@ class FrameFilter(WrappedBus):
         try:
             self.bus.send(frames)
         except BusError as error:
-            error.accepted = accepted = error.accepted_of(frames)  # the caller does not know the changed batch
+            # The faults may have removed or changed frames. So the caller cannot compute the accepted frames from its own batch.
+            error.accepted = accepted = error.accepted_of(frames)
             if self.tap is not None and error.sent:
                 self.tap.sent(accepted)
             raise

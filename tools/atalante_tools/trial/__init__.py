@@ -53,7 +53,7 @@ class Walking:
     shape: str  # guide shape
     idealization: float
     feedforward: float
-    network: Path | None  # network file of the gaits; None means the network of the package
+    network: Path | None  # file of the neural gait network; None means the network of the package
     haptics: bool  # whether active subjects respond to the vibration motors
 
 

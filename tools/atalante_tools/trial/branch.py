@@ -30,7 +30,7 @@ class Branch:
             request: object that describes how the run continues.
 
         Raises:
-            RuntimeError: If the process of the continued run ended without an answer.
+            RuntimeError: If the new process ended without an answer.
         """
         self._channel.send(request)
         answer = self._channel.recv()
@@ -68,7 +68,7 @@ class Continuation:
 
 
 class _NoAnswer:
-    """Substitute for an answer if the process of the continued run ended without an answer."""
+    """Message of a branch to the run: the new process has ended without an answer."""
 
     def __init__(self, status: int) -> None:
         self.status = status

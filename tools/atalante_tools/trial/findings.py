@@ -139,7 +139,9 @@ def sweep_findings(results: Sequence[Result]) -> list[Finding]:
 
 
 def protocol_findings(results: Sequence[Result]) -> list[Finding]:
-    """Return the findings of the experiment `protocol`: walks with full assistance, a transition, and the factor of the trial.
+    """Return the findings of the experiment `protocol`.
+
+    Each walk begins with full assistance, continues with a transition, and ends with the assistance factor of the trial.
 
     The claims are: each walk ends standing, inside the guide and near the line; the guides are certified; no fault is reported;
     the estimated vertical is accurate.
@@ -166,7 +168,7 @@ def protocol_findings(results: Sequence[Result]) -> list[Finding]:
 
 
 def _line(results: Sequence[Result]) -> Finding:
-    """Return the finding that the robot walks along a line. Robots that fell are left out."""
+    """Test whether the robot walks along a line, and return the finding. Robots that fell are left out."""
     reference = any(r["trial"]["heading_reference"] for r in results)
     limit = SIDEWAYS_WITH_REFERENCE if reference else SIDEWAYS
     deviations = [abs(r["true_lateral_m"]) for r in results if r["true_lateral_m"] is not None]
@@ -178,7 +180,7 @@ def _line(results: Sequence[Result]) -> Finding:
 
 
 def _attitude(results: Sequence[Result]) -> Finding:
-    """Return the finding that the error of the estimated vertical is below `ATTITUDE` in every walk."""
+    """Test whether the error of the estimated vertical is below `ATTITUDE` in every walk, and return the finding."""
     errors = [r["attitude_rms_deg"] for r in results if r["attitude_rms_deg"] is not None]
     claim = "the attitude of the pelvis is known"
     if not errors:
@@ -369,10 +371,10 @@ def _trend(id_: str, claim: str, walks: Sequence[Result], value: Callable[[Resul
 
 
 def _symmetry(id_: str, claim: str, walks: Sequence[Result], value: Callable[[Result], float]) -> Finding:
-    """Return the finding that the order of the walks hardly influences a value.
+    """Test whether a value is nearly the same while the assistance factor falls and while it rises, and return the finding.
 
-    In each day of the sweep, the assistance factor falls from 1 to 0 and then rises to 1. The two values at a factor, one on
-    the way down and one on the way up, must be nearly equal. Days with a missing trial are left out.
+    On each day of the sweep, the assistance factor falls from 1 to 0 and then rises to 1. Each factor above 0 therefore has two
+    values. Days with a missing trial are left out.
     """
     days: dict[str, list[Result]] = {}
     count = 0  # number of trials in a complete day

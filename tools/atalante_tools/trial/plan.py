@@ -110,7 +110,7 @@ class WalkTrial:
     order: str = ""  # day of the sweep, and position of the trial in this day; empty outside the sweep
     literal: bool = False  # whether the control law follows the paper literally
     heading_reference: bool = False  # whether the IMUs have a heading reference and the controller follows it
-    #: path and SHA-256 of the network file of the gaits; empty for the network of the package
+    #: path and SHA-256 of the file of the neural gait network; empty for the network of the package
     network: tuple[str, ...] = ()
     haptics: bool = False  # whether an active subject responds to the vibration motors
 

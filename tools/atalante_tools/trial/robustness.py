@@ -1,4 +1,4 @@
-"""Walk with lost frames and pushes. The robot differs from its model: `trial -> rig in lock-step -> result`.
+"""Trial of the experiment `robustness`: a walk with model errors, lost frames and pushes.
 
 The controller uses a model with the nominal patient. The emulated robot carries a patient with another mass and stands on a floor
 with random friction. Messages and motors of this robot are late, its buses lose frames, and the robot is pushed at the pelvis.

@@ -31,7 +31,10 @@ def path_of(trial: Trial, folder: Path) -> Path:
 
 
 def stored(trial: Trial, folder: Path) -> Result | None:
-    """Return the stored result of a trial; None if there is none, or if the trial or a version has changed.
+    """Return the stored result of a trial; None if the trial must be run.
+
+    The file name contains a hash of the parameters of the trial and of all software versions. So the trial must also be run again
+    after a change of a parameter or a version.
 
     Args:
         trial: trial of the result.

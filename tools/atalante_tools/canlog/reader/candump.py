@@ -258,7 +258,17 @@ def _parse_digits(word: npt.NDArray[np.uint64]) -> tuple[npt.NDArray[np.uint64],
 
 
 def _channels(lines: _Lines, numbers: npt.NDArray[np.uint8], channels: Channels) -> npt.NDArray[np.bool_]:
-    """Parse the channel of each line into `numbers`; return the mask of lines with a regular name. Shape (lines,)."""
+    """Find the channel number of each line by the name of the channel.
+
+    Args:
+        lines: lines of the log.
+        numbers: channel number of each line, shape (lines,), overwritten for the lines with a found channel.
+        channels: names of the channels; new names are appended.
+
+    Returns:
+        Mask of the lines with a found channel, shape (lines,). False if the name is empty, longer than `_NAME_BYTES`, or
+        contains a space or tab.
+    """
     stops = lines.id_starts - 1
     length = stops - lines.closes - 2
     regular: npt.NDArray[np.bool_] = (length > 0) & (length <= _NAME_BYTES)

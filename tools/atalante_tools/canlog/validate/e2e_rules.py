@@ -35,8 +35,8 @@ class CrcRules:
     def __init__(self, plan: Plan, findings: Findings) -> None:
         self._plan, self._findings = plan, findings
         lengths = np.where(plan.protected, plan.lengths, 0)
-        #: Ranges of message indices, one range for each payload length that a message with a CRC has.
-        #: Each range contains all messages with the payload length, with and without a CRC.
+        #: One range of message indices for each payload length. The range contains all messages of this length, with and
+        #: without a CRC. A range exists only if at least one of its messages has a CRC.
         self._spans = [
             range(int(r[0]), int(r[-1]) + 1) for n in np.unique(lengths[lengths > 0]) for r in [_at(plan, n)]
         ]

@@ -31,9 +31,9 @@ class _Bus:
     cycle_of: dict[int, int] = field(default_factory=dict)  # cycle number of the last state frame, by message index
     #: number of cycles between the last two state frames, by message index
     jump_of: dict[int, int] = field(default_factory=dict)
-    #: Second state frames of a cycle at the end of the last chunk, to be checked with the next chunk: message index -> time
-    #: stamp [ns]. If the next cycle has no frame of the same message, the second frame arrived before the SYNC of the next
-    #: cycle. Otherwise, the second frame is surplus.
+    #: State frames that perhaps arrived one cycle too early, by message index: time stamp [ns]. Such a frame is the second
+    #: frame of its message in one cycle, and the last one in its chunk. If the next chunk shows that the next cycle has no
+    #: frame of this message, the frame was too early and is reported.
     doubtful: dict[int, int] = field(default_factory=dict)
 
 

@@ -198,14 +198,13 @@ class TimingRules:
         """Add the intervals to the statistics, except timeouts and intervals with lost, repeated or rejected frames."""
         bins = np.minimum(np.maximum(share * BINS_A_CYCLE, 0.0), float(BINS - 1)).astype(np.int64)
         bins += (np.arange(len(stream.present)) * BINS).repeat(stream.stops - stream.starts)
-        # Intervals with lost, repeated or rejected frames are excluded from the statistics.
+        # Excluded are intervals with lost or rejected frames, and intervals that begin or end at a repeated frame.
         # Without an alive counter (`NO_STEP`), it is unknown which intervals contain a lost frame, so all intervals are kept.
         incomplete = (
             odd[steps[odd] >= REPEATED]
             if rejected_before is None
             else odd[(steps[odd] >= REPEATED) | (rejected_before[odd] > 0)]
         )
-        # An interval that starts at a repeated frame, and not at a new frame, is also excluded.
         after_repeated = np.flatnonzero(stream.before(steps, self._last_steps) == REPEATED)
         left_out = np.unique(np.concatenate([incomplete, timed_out, np.flatnonzero(np.isinf(share)), after_repeated]))
         dump = len(stream.present) * BINS

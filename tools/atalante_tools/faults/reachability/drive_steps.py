@@ -80,7 +80,7 @@ class DriveStep(NamedTuple):
 
 
 class DriveSteps:
-    """Transition function of the left frontal hip drive. All drives of the leg receive the same frames."""
+    """Transition function of one drive, the left frontal hip. All drives of a leg receive the same frames, so one is enough."""
 
     def __init__(self) -> None:
         count = len(JOINTS)

@@ -67,7 +67,10 @@ class Presses(NamedTuple):
 
 
 class StopState(NamedTuple):
-    """State of the search `stops`, which looks for torque commands after a stop action of the operator."""
+    """State in the search `stops`: state of the HAL, and stop action of the operator.
+
+    The search looks for torque commands after the stop action.
+    """
 
     reception: Reception
     supervision: Supervision
@@ -75,7 +78,10 @@ class StopState(NamedTuple):
 
 
 class MoveState(NamedTuple):
-    """State of the search `moves`, which looks for a supervisor state that improves without a press of START."""
+    """State in the search `moves`: state of the HAL, and presses of START.
+
+    The search looks for a change to a better supervisor state without a press of START.
+    """
 
     reception: Reception
     supervision: Supervision
@@ -113,7 +119,7 @@ class OperatorPath:
     """Combined transition function of pendant, link and HAL."""
 
     def __init__(self, receives_like: OperatorPath | None = None) -> None:
-        """Prepare the steps of the HAL.
+        """Create the HAL that computes the transitions.
 
         Args:
             receives_like: path with stored results of the reception. The new path uses these results, because reception takes
@@ -133,7 +139,7 @@ class OperatorPath:
         return explore([StopState(*state) for state in _INITIAL], self._stop_successors)
 
     def moves(self) -> Exploration[MoveState, Cycle]:
-        """Search for a supervisor state that improves, or a motion that starts, without a press of START (see `is_move`)."""
+        """Search for a motion, or a change to a better supervisor state, without a press of START (see `is_move`)."""
         return explore([MoveState(*state) for state in _INITIAL], self._move_successors)
 
     def _stop_successors(self, state: StopState) -> Iterator[Transition[StopState, Cycle]]:
@@ -258,7 +264,7 @@ def arrivals(before: Reception, operator: Operator) -> Iterator[tuple[PendantFra
         yield frame, frame
         yield (frame._replace(sender="damaged"),)
         if frame.pressed:
-            continue  # a second sender sends only if the pendant itself reports no press
+            continue  # the search combines a second sender only with a pendant frame without a press
         for request, pressed in ((Request.START, True), (before.own_request, False), (Request.STOP, True)):
             rogue = PendantFrame(0, True, request, pressed, "rogue")
             yield frame, rogue

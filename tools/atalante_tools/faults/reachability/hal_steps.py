@@ -141,7 +141,8 @@ class HalSteps:
         network, robot = atalante_dbc.load(), load_robot()
         self._hal = Hal(network, robot, NoBus())
         self._monitor = self._hal._safety_monitor
-        # Omit the test of the joint directions. The HAL sends the same controlwords during this test and while it enables drives.
+        # Leave out the direction test, which follows after all drives are enabled. During this test, the HAL sends the same
+        # controlwords as while it enables the drives, so the search misses no case.
         self._monitor.proof = DirectionProof(robot, ())
         self._image = self._hal._image
         self._pendant = self._monitor._pendant
@@ -237,10 +238,13 @@ class HalSteps:
         return after, Inputs(pendant.dead_man, stop, pendant.started)
 
     def _without_press(self, state: Reception) -> Reception:
-        """Return the state of the reception after a change of the supervisor state. The change drops a stored START.
+        """Delete a stored press of START, as the HAL does at each change of the supervisor state.
 
         Args:
-            state: state before the change.
+            state: data received from the pendant, before the change.
+
+        Returns:
+            The same data without the press.
         """
         pendant = self._pendant
         pendant._press, pendant._pressed = _EVALUATED[state.evaluated], state.stored
@@ -321,8 +325,8 @@ class HalSteps:
         monitor._reports.clear()
         monitor.start_wanted, monitor.enabling, monitor.moving, monitor.walking = 0, False, False, False
         monitor.recalled = -RECALL_CYCLES  # skip the wait after QUICK_STOP, so that the search includes more STARTs
-        # `_stalled` only decides in which cycle a START ends. The search lets a START end in every cycle (`LAST_START`), so the
-        # value of `_stalled` can be constant.
+        # `_stalled` counts cycles in which no drive changes its state. A high count ends a start. The search needs no count: in
+        # each cycle, it tries both that the start ends (`LAST_START`) and that the start continues (`START`).
         monitor._stalled = 0
         monitor._ending = monitor._duplicate_found = monitor._ramping = monitor._proof_begun = False
         monitor.lowered.clear()

@@ -20,7 +20,7 @@ OBSERVED: Final = 20
 
 
 class NotReplayable(ValueError):  # noqa: N818
-    """Raised if neither an operator action nor a fault can cause an input of a counterexample."""
+    """Raised if a counterexample has an input that cannot be replayed, for example a frame of a second sender."""
 
 
 def case_of(cycles: Sequence[Cycle]) -> Case:
@@ -30,7 +30,7 @@ def case_of(cycles: Sequence[Cycle]) -> Case:
         cycles: inputs of each cycle.
 
     Raises:
-        NotReplayable: If neither an operator action nor a fault can cause an input.
+        NotReplayable: If an input cannot be replayed, for example a frame of a second sender.
     """
     stimuli: list[Stimulus] = []
     dead_man = True
