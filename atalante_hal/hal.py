@@ -227,7 +227,7 @@ class Hal:
         state, control, safety_monitor = self.state, self._commands.control, self._safety_monitor
         if safety_monitor.lowered:
             control[[node in safety_monitor.lowered for node in DRIVE_NODES]] = Controlword.DISABLE_VOLTAGE
-        if safety_monitor.start_wanted and (
+        if safety_monitor.start_cycles_left and (
             state.supervisor in (_S.LOWER, _S.FAULT) or (state.supervisor is _S.HOLD and safety_monitor.start_prevented)
         ):
             # The operator acknowledged the faults with START. So each drive in FAULT is reset; the other drives continue to hold.
@@ -235,7 +235,7 @@ class Hal:
             control[state.drive_state == DriveState.FAULT] = Controlword.FAULT_RESET
             safety_monitor.enabling = False
         elif (
-            safety_monitor.start_wanted
+            safety_monitor.start_cycles_left
             and state.supervisor in (_S.READY, _S.HOLD)
             and not safety_monitor.start_prevented
         ):

@@ -73,7 +73,7 @@ class SafetyMonitor:
         moving: True if the controller's torques are sent to the drives.
         step: number of the walking step, reported by the controller; None if the controller does not walk.
         walking: True while the robot walks on the ground, reported by the controller.
-        start_wanted: number of cycles in which a pressed START can still change the state; 0 if no START is being
+        start_cycles_left: number of cycles in which a pressed START can still change the state; 0 if no START is being
             processed.
         enabling: True while drives are being enabled. In this time, the limiter follows the torques that the drives report.
         recalled: cycle in which QUICK_STOP was last sent to a drive in OPERATION ENABLED.
@@ -117,7 +117,7 @@ class SafetyMonitor:
         self.moving = False
         self.step: int | None = None
         self.walking = False
-        self.start_wanted = 0
+        self.start_cycles_left = 0
         self.enabling = False
         self.recalled = -RECALL_CYCLES
         self.proof = DirectionProof(robot)
@@ -296,7 +296,7 @@ class SafetyMonitor:
             and (state.supervisor is _S.FULL_ASSIST or (self._proof_begun and not self.proof.running)),
             dead_man=pendant.dead_man,
             stop_requested=(pendant.stop_requested and not walk_end_requested) or self._ending,
-            start_wanted=self.start_wanted > 0,
+            start_wanted=self.start_cycles_left > 0,
             step_finished=self.step is None or self.step != self._finish[0] or cycle >= self._finish[1],
             walk_end_requested=walk_end_requested,
             walk_ends=memory.walk_ends(DRIVE_NODES) if self.walking else frozenset(),
@@ -317,7 +317,7 @@ class SafetyMonitor:
             and not (
                 memory.active
                 or self._weak
-                or self.start_wanted
+                or self.start_cycles_left
                 or self._ramping
                 or after is _S.FINISH_STEP
                 or self._ending
@@ -392,16 +392,16 @@ class SafetyMonitor:
             }
             self._heartbeats.acknowledge(faulty)
             self._acknowledged = True
-            if not self.start_wanted:  # another press of START during a start does not restart the direction test
+            if not self.start_cycles_left:  # another press of START during a start does not restart the direction test
                 self._proof_begun = False
                 if state.supervisor is _S.READY:
                     # No joint has passed the test yet. If the start ends before the test is passed, the drives that are off
                     # now are switched off again. In HOLD they hold, because the robot has moved with them before.
                     on = powered(state.drive_state).tolist()
                     self._kept_off.update(node for node, is_on in zip(DRIVE_NODES, on, strict=True) if not is_on)
-            self.start_wanted = ENABLE_CYCLES if state.supervisor in _STARTABLE else 0
-        elif self.start_wanted:
-            self.start_wanted -= 1
+            self.start_cycles_left = ENABLE_CYCLES if state.supervisor in _STARTABLE else 0
+        elif self.start_cycles_left:
+            self.start_cycles_left -= 1
         else:
             return
         states = state.drive_state.tobytes()
@@ -423,7 +423,7 @@ class SafetyMonitor:
             Refusal that ends the start if a joint failed; None if the start may continue.
         """
         state, proof = self._state, self.proof
-        if not self._all_enabled() or not self.start_wanted or state.supervisor not in (_S.READY, _S.HOLD):
+        if not self._all_enabled() or not self.start_cycles_left or state.supervisor not in (_S.READY, _S.HOLD):
             self._proof_begun = proof.running = False
             return None
         self._stalled = 0
@@ -460,7 +460,7 @@ class SafetyMonitor:
         return StartRequest(
             supervisor=state.supervisor,
             pressed=self._acknowledged,
-            cycles_left=self.start_wanted,
+            cycles_left=self.start_cycles_left,
             stalled=self._stalled,
             ending=self._ending,
             stop_requested=pendant.stop_requested,
@@ -474,7 +474,7 @@ class SafetyMonitor:
         )
 
     def _end_start(self, ended: Refusal) -> None:
-        self.start_wanted = 0
+        self.start_cycles_left = 0
         self.proof.running = False
         # Each START of the operator gets its own event; events of several STARTs within one second are not merged.
         self.memory.events.append(Event(self._state.cycle, ended.code, ended.text, ended.severity))
@@ -484,7 +484,7 @@ class SafetyMonitor:
         state, memory = self._state, self.memory
         state.supervisor = after
         # Remove the START request, because one START may change the state only once.
-        self.start_wanted = 0
+        self.start_cycles_left = 0
         self._pendant.clear_press()
         self.moving = after in MOVING
         if before in MOVING and not self.moving:

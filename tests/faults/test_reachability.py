@@ -103,9 +103,9 @@ def test_second_move_of_a_start_is_found(path: OperatorPath, monkeypatch: pytest
     enter = SafetyMonitor._enter
 
     def keeps(self, before, after, reasons):
-        wanted = self.start_wanted
+        wanted = self.start_cycles_left
         enter(self, before, after, reasons)
-        self.start_wanted = wanted
+        self.start_cycles_left = wanted
 
     monkeypatch.setattr(SafetyMonitor, "_enter", keeps)
     assert OperatorPath(path).moves().broken in (MOVE_PROPERTY, RESTART_PROPERTY)

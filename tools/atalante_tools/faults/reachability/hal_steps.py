@@ -40,7 +40,7 @@ _TAG: Final = _CYCLE & 0xFF
 _PRESSES, _ROGUE_PRESSES = 10, 12
 #: Cycles in which the HAL may still process a START: none, only this cycle, or this cycle and further cycles.
 NO_START, LAST_START, START = 0, 1, 2
-#: Value of `SafetyMonitor.start_wanted` for each of these three cases: number of cycles in which a START can still change the
+#: Value of `SafetyMonitor.start_cycles_left` for each of these three cases: number of cycles in which a START can still change the
 #: state.
 START_CYCLES: Final = {NO_START: 0, LAST_START: 1, START: 100}
 #: Whether the HAL trusts the pendant -> values of `Qualification` that the search tries in this case.
@@ -287,7 +287,7 @@ class HalSteps:
             Finding(self._dtc[environment.reaction], DRIVE_NODES[0 if environment.mine else 1], 0.0, True, "input")
         ]
         monitor._evaluate(findings)
-        left = monitor.start_wanted
+        left = monitor.start_cycles_left
         lowered = DRIVE_NODES[0] in monitor.lowered
         for start in {NO_START} if not left else {LAST_START, START} if before.start == START else {min(left, START)}:
             after = Supervision(hal.state.supervisor, start, monitor.enabling, lowered)
@@ -323,7 +323,7 @@ class HalSteps:
         hal.state.cycle = _CYCLE
         monitor.memory = FaultMemory()
         monitor._reports.clear()
-        monitor.start_wanted, monitor.enabling, monitor.moving, monitor.walking = 0, False, False, False
+        monitor.start_cycles_left, monitor.enabling, monitor.moving, monitor.walking = 0, False, False, False
         monitor.recalled = -RECALL_CYCLES  # skip the wait after QUICK_STOP, so that the search includes more STARTs
         # `_stalled` counts cycles in which no drive changes its state. A high count ends a start. The search needs no count: in
         # each cycle, it tries both that the start ends (`LAST_START`) and that the start continues (`START`).
@@ -356,7 +356,7 @@ class HalSteps:
         monitor = self._monitor
         self._hal.state.supervisor = state.supervisor
         monitor.moving = state.supervisor in MOVING
-        monitor.start_wanted, monitor.enabling = START_CYCLES[state.start], state.enabling
+        monitor.start_cycles_left, monitor.enabling = START_CYCLES[state.start], state.enabling
         if state.lowered:
             monitor.lowered.add(DRIVE_NODES[0])
             if state.supervisor not in (SupervisorState.LOWER, SupervisorState.FAULT):
