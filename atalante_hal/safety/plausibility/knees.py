@@ -226,8 +226,8 @@ def motion(leg: int, now: Readings) -> tuple[Vector3, Vector3, Vector3, Vector3]
     x, y = TRANSVERSE_HIP[0] * (1.0 - math.cos(th)), side * TRANSVERSE_HIP[1] - TRANSVERSE_HIP[0] * math.sin(th)
     y, z = y * math.cos(fh) + side * FRONTAL_HIP, y * math.sin(fh)
     hip = x - PELVIS_IMU[0], y - PELVIS_IMU[1], z - PELVIS_IMU[2]
-    # `hip_to_imu` is the vector from joint SH to the tibia IMU, in the axes of the tibia. In these axes, the unit vector from hip to
-    # knee is (sine, -cosine), and the unit vector from knee to ankle is (0, -1). (x, z) is the sum of both.
+    # `hip_to_imu` is the vector from joint SH to the tibia IMU, in the axes of the tibia. In these axes, the unit vector from hip
+    # to knee is (sine, -cosine), and the unit vector from knee to ankle is (0, -1). (x, z) is the sum of both.
     sine, cosine = math.sin(sk), math.cos(sk)
     x, z = sine, -1.0 - cosine
     hip_to_imu = SEGMENT * x + TIBIA_IMU[0], side * TIBIA_IMU[1], SEGMENT * z + TIBIA_IMU[2]

@@ -35,7 +35,7 @@ Pair = tuple[float, float]
 _ASSISTED = [LEG_JOINTS.index("SH"), LEG_JOINTS.index("SK")]
 
 
-class Letter:
+class LiteralRecord:
     """Constants and state of the control law that follows the paper literally. Each array has values for hip and knee."""
 
     kp: Annotated[Vector, 2]  # Nm/rad, proportional gain of the backup torque u_b
@@ -47,16 +47,15 @@ class Letter:
     #: s, gain on -dh/dt; while the safety value h falls, the backup torque u_b gets more weight; while h rises, less weight
     zeta: float
     idealization: float  # factor in [0, 1] on the torque u_i, which cancels friction and gravity (joint idealization)
-    feedforward: float  # factor in [0, 1] on the feedforward torque u_f
     xi: float  # assistance factor of the step, from 0 (widest guide) to 1 (narrowest guide)
     fresh: bool  # True until the first cycle of a step is computed
     h: Annotated[Vector, 2]  # safety value of the last cycle; below 0, u_ext can push the joint out of the guide
 
 
 class LiteralTables(NamedTuple):
-    """Tables of the control law that follows the paper literally. Of these tables, `assistive_torque` changes only `letters`."""
+    """Tables of the control law that follows the paper literally. Of these tables, `assistive_torque` changes only `records`."""
 
-    letters: Records[Letter]  # (1,) record with the constants and the state of the control law
+    records: Records[LiteralRecord]  # (1,) record with the constants and the state of the control law
     step: Vector  # (cycles + 1, 8) values of each cycle of the step; the columns are defined below
 
 
@@ -97,15 +96,15 @@ class LiteralGuide:
         self._shape, self._phase = shape, np.arange(count) / (count - 1)
         self._nominal: Vector = leg.qdd[:count]
         self._basis = leg.deadbeat.basis(leg.time[:count])[2][:, :, None]
-        self.tables = LiteralTables(zeros(Letter, 1), np.zeros((count, 8)))
+        self.tables = LiteralTables(zeros(LiteralRecord, 1), np.zeros((count, 8)))
         self.tables.step[:, FEEDFORWARD:] = config.feedforward * feedforward
-        letter, gains, friction = self.tables.letters[0], config.gains, leg.friction
-        letter.kp[:], letter.kd[:] = ([row[i] for i in _ASSISTED] for row in (gains.kp, gains.kd))
-        letter.coulomb[:], letter.viscous[:] = (
+        record, gains, friction = self.tables.records[0], config.gains, leg.friction
+        record.kp[:], record.kd[:] = ([row[i] for i in _ASSISTED] for row in (gains.kp, gains.kd))
+        record.coulomb[:], record.viscous[:] = (
             [row[i] for i in _ASSISTED] for row in (friction.coulomb, friction.viscous)
         )
-        letter.inertia[:], letter.push[:], letter.zeta = leg.inertia.inertias, config.push, config.zeta
-        letter.idealization = config.idealization
+        record.inertia[:], record.push[:], record.zeta = leg.inertia.inertias, config.push, config.zeta
+        record.idealization = config.idealization
         self.start_step(0.0, (0.0, 0.0), (0.0, 0.0))
 
     def start_step(self, xi: float, deviation: Pair, rate: Pair) -> None:
@@ -116,11 +115,11 @@ class LiteralGuide:
             deviation: measured minus nominal angles of SH and SK at the stance change [rad].
             rate: measured minus nominal speeds of SH and SK at the stance change [rad/s].
         """
-        letter, step = self.tables.letters[0], self.tables.step
+        record, step = self.tables.records[0], self.tables.step
         step[:, BOUND : BOUND + 4] = self._shape.bounds(self._phase, xi).transpose(1, 0, 2).reshape(-1, 4)
         moved = self._basis[0] * np.array(deviation) + self._basis[1] * np.array(rate)
         step[:, REFERENCE : REFERENCE + 2] = self._nominal + moved
-        letter.xi, letter.fresh = xi, True
+        record.xi, record.fresh = xi, True
 
 
 def no_promise(shape: str, xi: float) -> Certificate:
@@ -145,41 +144,41 @@ def assistive_torque(tables: LiteralTables, guard: Guard, cycle: int, leg: LegSt
         leg: measurements of the swing leg.
         rates: q_des' of SH and SK [rad/s].
     """
-    letter, step = tables.letters[0], tables.step
+    record, step = tables.records[0], tables.step
     now = step[min(cycle, len(step) - 1)]
     hip_h, hip_gate, hip = _guide_torque(tables, cycle, 0, leg.hip - leg.hip_desired, leg.hip_rate - rates[0])
     knee_h, knee_gate, knee = _guide_torque(tables, cycle, 1, leg.knee - leg.knee_desired, leg.knee_rate - rates[1])
-    letter.fresh = False
+    record.fresh = False
     guard.h, guard.gate = min(hip_h, knee_h), max(hip_gate, knee_gate)
     for side in range(4):
         guard.bounds[side] = now[BOUND + side]
     return (
-        hip + now[FEEDFORWARD] + letter.idealization * (_friction(letter, 0, leg.hip_rate) + leg.hip_gravity),
-        knee + now[FEEDFORWARD + 1] + letter.idealization * (_friction(letter, 1, leg.knee_rate) + leg.knee_gravity),
+        hip + now[FEEDFORWARD] + record.idealization * (_friction(record, 0, leg.hip_rate) + leg.hip_gravity),
+        knee + now[FEEDFORWARD + 1] + record.idealization * (_friction(record, 1, leg.knee_rate) + leg.knee_gravity),
     )
 
 
 def _guide_torque(tables: LiteralTables, cycle: int, joint: int, e: float, rate: float) -> tuple[float, float, float]:
     """Return three values of a joint: h; the gate, which is the factor of the backup torque u_b; the guide torque u_v [Nm]."""
-    letter = tables.letters[0]
+    record = tables.records[0]
     ratio = max(_largest_ratio(tables, cycle, joint, e, rate, 1.0), _largest_ratio(tables, cycle, joint, e, rate, -1.0))
     h = 1.0 - ratio * ratio
-    slope = 0.0 if letter.fresh else (h - letter.h[joint]) / PERIOD
-    letter.h[joint] = h
-    weight = (1.0 + (letter.xi**10 - 1.0) * max(h, 0.0)) ** 3
-    gate = weight + (1.0 - weight) * -letter.zeta * slope
-    return h, gate, gate * (-letter.kp[joint] * e - letter.kd[joint] * rate)
+    slope = 0.0 if record.fresh else (h - record.h[joint]) / PERIOD
+    record.h[joint] = h
+    weight = (1.0 + (record.xi**10 - 1.0) * max(h, 0.0)) ** 3
+    gate = weight + (1.0 - weight) * -record.zeta * slope
+    return h, gate, gate * (-record.kp[joint] * e - record.kd[joint] * rate)
 
 
 def _largest_ratio(tables: LiteralTables, cycle: int, joint: int, e: float, rate: float, side: float) -> float:
     """Simulate the rest of the step under a constant push. Return the largest ratio of tracking error to guide width.
 
     The torque on the joint is the sum of the feedforward torque, the backup torque (PD feedback) and the push. The push is
-    the largest external torque `Letter.push` in the direction `side` (1 or -1).
+    the largest external torque `LiteralRecord.push` in the direction `side` (1 or -1).
     """
-    letter, step = tables.letters[0], tables.step
-    kp, kd, inertia = letter.kp[joint], letter.kd[joint], letter.inertia[joint]
-    push, worst = side * letter.push[joint], 0.0
+    record, step = tables.records[0], tables.step
+    kp, kd, inertia = record.kp[joint], record.kd[joint], record.inertia[joint]
+    push, worst = side * record.push[joint], 0.0
     for at in range(min(cycle, len(step) - 1), len(step)):
         now = step[at]
         worst = max(worst, e / now[BOUND + 2 * joint], -e / now[BOUND + 2 * joint + 1])
@@ -189,7 +188,7 @@ def _largest_ratio(tables: LiteralTables, cycle: int, joint: int, e: float, rate
     return worst
 
 
-def _friction(letter: Letter, joint: int, rate: float) -> float:
+def _friction(record: LiteralRecord, joint: int, rate: float) -> float:
     """Return the friction torque k_d sign(q') + k_v q' [Nm]."""
     sign = math.copysign(1.0, rate) if rate != 0.0 else 0.0
-    return float(letter.coulomb[joint] * sign + letter.viscous[joint] * rate)
+    return float(record.coulomb[joint] * sign + record.viscous[joint] * rate)

@@ -37,8 +37,8 @@ def torque(one: LiteralGuide, e: np.ndarray, rate: np.ndarray, speed: tuple[floa
 
 def h_of(one: LiteralGuide, joint: int, e: float, rate: float) -> float:
     """Return the smallest h of the two predictions, one for each extreme of u_ext, integrated independently of the law."""
-    step, push = one.tables.step, one.tables.letters[0].push[joint]
-    inertia, worst = one.tables.letters[0].inertia[joint], 0.0
+    step, push = one.tables.step, one.tables.records[0].push[joint]
+    inertia, worst = one.tables.records[0].inertia[joint], 0.0
     for side in (1.0, -1.0):
         x, v = e, rate
         for now in step[CYCLE:]:

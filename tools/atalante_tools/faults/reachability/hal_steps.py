@@ -40,8 +40,8 @@ _TAG: Final = _CYCLE & 0xFF
 _PRESSES, _ROGUE_PRESSES = 10, 12
 #: Cycles in which the HAL may still process a START: none, only this cycle, or this cycle and further cycles.
 NO_START, LAST_START, START = 0, 1, 2
-#: Value of `SafetyMonitor.start_cycles_left` for each of these three cases: number of cycles in which a START can still change the
-#: state.
+#: Value of `SafetyMonitor.start_cycles_left` for each of these three cases: number of cycles in which a START can still change
+#: the state.
 START_CYCLES: Final = {NO_START: 0, LAST_START: 1, START: 100}
 #: Whether the HAL trusts the pendant -> values of `Qualification` that the search tries in this case.
 QUALIFICATIONS: Final = {
