@@ -7,6 +7,7 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
+from atalante_hal.safety.events import Event
 from atalante_hal.types import SupervisorState
 from atalante_hal.wire.cia402 import Controlword
 from atalante_tools.faults import moments
@@ -94,10 +95,32 @@ def patched(
 
 def test_sag_during_the_start_fails(monkeypatch: pytest.MonkeyPatch) -> None:
     def sag(run: Observation) -> None:
-        run.position[schedule(Moment.READY, ENGINE).starts[0] + 3, 4] += np.radians(1.2)
+        run.position[schedule(Moment.READY, ENGINE).starts[0] + 20, 4] += np.radians(1.2)
 
     (failure,) = patched(monkeypatch, sag).failures
     assert failure.startswith("left_SA must not move by more than 1 deg during a start, got 1.2")
+
+
+def test_motion_before_the_first_drive_is_on_or_after_the_start_does_not_count(monkeypatch: pytest.MonkeyPatch) -> None:
+    start = schedule(Moment.READY, ENGINE).starts[0]
+
+    def sag(run: Observation) -> None:
+        run.position[: start + 1, 4] += np.radians(1.2)
+        active = run.states.index(S.ACTIVE)
+        run.position[active:, 5] += np.radians(1.2)
+
+    assert patched(monkeypatch, sag).failures == ()
+
+
+@pytest.mark.parametrize("code", ["START_FAILED", "START_REFUSED"])
+def test_motion_after_a_failed_start_does_not_count(monkeypatch: pytest.MonkeyPatch, code: str) -> None:
+    start = schedule(Moment.READY, ENGINE).starts[0]
+
+    def sag(run: Observation) -> None:
+        object.__setattr__(run, "events", (*run.events, Event(start + 15, code, "the start ends")))
+        run.position[start + 20, 4] += np.radians(1.2)
+
+    assert patched(monkeypatch, sag).failures == ()
 
 
 def test_fast_joint_fails(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -169,7 +192,7 @@ def test_only_the_leg_of_the_fault_has_a_wider_limit_of_motion(id_: str, name: s
 
 def test_a_motor_fault_in_one_leg_does_not_excuse_the_other_leg(monkeypatch: pytest.MonkeyPatch) -> None:
     def sag(run: Observation) -> None:
-        run.position[schedule(Moment.READY, ENGINE).starts[0] + 3, 10] += np.radians(1.2)
+        run.position[schedule(Moment.READY, ENGINE).starts[0] + 20, 10] += np.radians(1.2)
 
     task = MomentTask(Moment.READY, (index("F72", "LEFT_SK dead"),))
     (failure,) = patched(monkeypatch, sag, task).failures

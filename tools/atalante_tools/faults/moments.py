@@ -28,7 +28,7 @@ import numpy as np
 from atalante_emulator.faults import Fault
 from atalante_hal.robot import JOINTS
 from atalante_hal.safety.safety_monitor import DRIVE_NODES
-from atalante_hal.safety.start import ENABLE_CYCLES
+from atalante_hal.safety.start import ENABLE_CYCLES, powered
 from atalante_hal.types import SupervisorState, Vector
 from atalante_tools.console.options import PYBULLET
 from atalante_tools.faults.catalogue import SCENARIOS
@@ -38,7 +38,8 @@ from atalante_tools.faults.scenario import MID_SWING, Case, Stimulus, shifted
 from atalante_tools.faults.verdict import WALKING, automatic_improvements, exception_sentence, limit_violations
 
 _S = SupervisorState
-#: Largest accepted motion of a joint during a start [deg]. A start lasts from START to ACTIVE, or until the HAL ends the start.
+#: Largest accepted motion of a joint during a start [deg]. The motion is measured from the first cycle in which a drive is on, to
+#: ACTIVE or to the end of a start that fails.
 SAG_MAX: Final = 1.0
 #: Events with which the HAL ends a start before ACTIVE.
 _ENDS_OF_START: Final = ("START_FAILED", "START_REFUSED")
@@ -49,7 +50,8 @@ SAG_OF: Final = {
     "torque_wrong": 5.0,
     "torque_weak": 5.0,
     "encoder_swapped": 5.0,
-    "encoder_drift": 5.0,
+    "encoder_stuck": 5.0,
+    "encoder_drift": 10.0,  # an ankle moves until its encoder reads a position outside the range of the joint
     "value": 5.0,
     "push": math.inf,
 }
@@ -286,11 +288,17 @@ def _sag(run: Observation, starts: Sequence[int]) -> Vector:
     sag = np.zeros(len(JOINTS))
     ends = [event.cycle for event in run.events if event.code in _ENDS_OF_START]
     for start in starts:
-        last = min((end for end in ends if end > start), default=run.last)
+        before, enabled = run.position[start - 1], False
+        last = min((end for end in ends if end >= start), default=run.last)
         for cycle in range(start, min(start + ENABLE_CYCLES, last, run.last) + 1):
-            if run.state(cycle) is not run.state(start):
+            on = bool(powered(run.drive_state[cycle - 1]).any())
+            if run.state(cycle) is not run.state(start) or (enabled and not on):
                 break
-            np.maximum(sag, np.abs(run.position[cycle - 1] - run.position[start - 1]), out=sag)
+            enabled |= on
+            if enabled:
+                np.maximum(sag, np.abs(run.position[cycle - 1] - before), out=sag)
+            else:
+                before = run.position[cycle - 1]
     return np.degrees(sag)
 
 
