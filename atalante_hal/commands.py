@@ -117,7 +117,7 @@ class Commands:
         self._image.seal_prepared(self._prepared_hold)
         self._transceiver.send(self._commands)
         self.hold()
-        self._seal(cycle + 1, self._image.counter)  # Like `send`, also encode the SYNC of the next cycle.
+        self._seal(cycle + 1, self._image.counter)  # encode the SYNC frames of the next cycle in advance
         return self._record()
 
     def _seal(self, next_cycle: int, counter: int | None) -> None:

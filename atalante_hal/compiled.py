@@ -93,7 +93,7 @@ def _machine_code(function: Callable[..., Any], args: tuple[Any, ...], counted: 
     """Compile a function, call it once, and return its machine code for the types of the arguments."""
     dispatcher = _compiled(function, counted)
     dispatcher(*args)
-    if len(dispatcher.overloads) == 1:  # the search by argument types below is slower
+    if len(dispatcher.overloads) == 1:  # only one version is compiled, so no search by types is needed
         (only,) = dispatcher.overloads.values()
         return only.entry_point
     return dispatcher.get_overload(tuple(dispatcher.typeof_pyval(arg) for arg in args))

@@ -21,9 +21,9 @@ from atalante_hal.types import PERIOD, Controller, State
 OVERRUNS_TO_HOLD = 3
 #: Lateness of a cycle above which the robot goes to HOLD [s]. The watchdog of the drives has the same timeout.
 GAP_TO_HOLD = 5e-3
-#: The robot goes to HOLD if the loop loses more than this time [s] within `DRIFT_CYCLES` cycles.
+#: The robot goes to HOLD if the loop falls behind the clock by more than this time [s] within `DRIFT_CYCLES` cycles.
 DRIFT_TO_HOLD = 5e-3
-#: Length of the window in which the time lost by the loop is measured [cycles].
+#: Number of cycles to which the limit `DRIFT_TO_HOLD` applies.
 DRIFT_CYCLES = 50
 #: Number of bins of the histogram of computing times. Each bin is 1 us wide.
 COST_BINS = 10_000
@@ -84,21 +84,24 @@ class WallClock:
 
 
 class Drift:
-    """Measurement of the time that the loop lost against the clock within the last `DRIFT_CYCLES` cycles."""
+    """Measurement of how much further the loop fell behind the clock within the last `DRIFT_CYCLES` cycles.
+
+    Example: the loop was 2 ms behind the clock 50 cycles ago, and is 6 ms behind now. Then the drift is 4 ms.
+    """
 
     def __init__(self) -> None:
         self._lost = 0.0
         self._behind = deque([0.0] * DRIFT_CYCLES, maxlen=DRIFT_CYCLES)
 
     def add(self, late: float) -> float:
-        """Add the lateness of one cycle, and return the time that the loop lost within the last `DRIFT_CYCLES` cycles.
+        """Add the lateness of one cycle, and return how much further the loop fell behind within `DRIFT_CYCLES` cycles.
 
         Args:
             late: Lateness of the cycle [s], as `Clock.wait` returns it. A lateness above `GAP_TO_HOLD` is not added,
                 because another diagnostic reports it.
 
         Returns:
-            Increase of the delay [s] within the window.
+            Delay of the loop now, minus its delay `DRIFT_CYCLES` cycles ago [s].
         """
         if PERIOD < late <= GAP_TO_HOLD:
             self._lost += late

@@ -259,7 +259,7 @@ class Transceiver:
             self._find(Dtc.BUS_ERROR, not self._errors.trusted, self.error_frames, text)
 
     def _report_rejected(self, error: BusError) -> None:
-        """Report that `send` of the bus raised an error. One channel may be full while another one is down."""
+        """Report an error of `send`: a full transmit queue, a bus that is down, or both if the bus has several channels."""
         full = error if isinstance(error, BusFull) else error.full
         if full is not None:
             self._full_this_cycle = True

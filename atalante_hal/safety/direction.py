@@ -50,8 +50,8 @@ _SHORT = min(duration for _, duration in GROUPS)
 #: Delay [cycles] from a torque command to the first position that shows its effect, if no frame and no motor is late.
 LATENCY = 2
 #: Delays that the test tries [cycles]. States, commands and motors may be late by three cycles in total.
-#: A motor with a wrong sign moves its joint almost like a correct motor that is 4 to 5 cycles late (pulse of 16 cycles).
-#: Therefore the longest delay that the test tries is `LATENCY + 3`.
+#: Longer delays are not tried, because they would hide a motor with a wrong sign. After a pulse of 16 cycles, a motor with a
+#: wrong sign moves its joint almost like a correct motor that is 4 to 5 cycles late.
 LATENCIES = tuple(range(LATENCY, LATENCY + 4))
 #: Peak of the pulse as a multiple of `Robot.breakaway`, in the order of LEG_JOINTS.
 #: The peaks of FH and SH are larger, because these joints move a whole leg.
@@ -68,9 +68,8 @@ TRAVEL = math.radians(1.5)
 #: A foot is loaded if its mean force during a test exceeds `LOAD * cell_free`.
 #: This threshold `LOAD * cell_free` is four times the noise of the mean force.
 LOAD = 1.0 / 3.0
-#: A foot hit the floor if the sum of its forces in two consecutive cycles exceeds `HIT * cell_free`.
-#: This threshold `HIT * cell_free` is four times the noise of the sum.
-#: If an impact stops an ankle, the sum is at least 1.5 times the threshold.
+#: The forces on a foot in two consecutive cycles are added. If the sum exceeds `HIT * cell_free`, the foot hit the floor.
+#: This threshold is four times the noise of the sum. An impact that stops an ankle causes at least 1.5 times the threshold.
 HIT = 2.0
 #: If a joint near its end stop is tested a second time, its torque pulse is multiplied by this factor, because the leg weight may
 #: press the joint onto the end stop.
@@ -177,8 +176,8 @@ class DirectionProof:
         # A test of one or two joints does not estimate the delay, but uses `late`. If the delay were fitted to so few joints,
         # a motor with a wrong sign might look like a late motor.
         self.late = 0
-        #: Quality of the fit with each delay in `LATENCIES`: the share of a joint's motion that its torque explains.
-        #: The shares of all joints that passed a test with a short pulse are added.
+        #: For each delay in `LATENCIES`: the share of a joint's motion that its torque explains with this delay, summed over
+        #: all joints that passed a test with a short pulse.
         self._explained = np.zeros(len(LATENCIES))
         self._position: list[Vector] = []  # joint positions in each cycle of the current test
         self._force: list[Vector] = []  # vertical force of each foot in each cycle of the current test
@@ -245,8 +244,8 @@ class DirectionProof:
         travel = np.abs(position - self._anchor)
         if not travel.max() <= TRAVEL:
             far = np.flatnonzero(travel > 0.5 * TRAVEL)
-            # A faulty joint also moves its lighter neighbours.
-            # The leg weight moves the same joint of both legs equally far, so a difference between the legs shows the fault.
+            # Gravity makes both legs sag equally far. Therefore a difference between left and right joint shows the fault.
+            # A faulty joint also moves its lighter neighbours. The weight `_kp` is small for these light joints.
             excess = self._kp * np.abs(travel - np.roll(travel, len(LEG_JOINTS)))
             joint = int(far[np.argmax(excess[far])])
             self._fail(far.tolist())

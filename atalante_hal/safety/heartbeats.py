@@ -78,9 +78,10 @@ class Heartbeats:
         #: active emergencies, the entry is the newest of the emergencies with the most severe reaction.
         self.emergencies: dict[str, tuple[Dtc, int]] = {}
         self._cleared: set[str] = set()  # nodes whose emergency was cleared in this cycle
-        #: Events that the next `evaluate` raises only as pending diagnostics. Each entry is (node, diagnostic, error code).
-        #: One kind of event is a mild emergency: its reaction is INFO, or a more severe emergency of the node is already active.
-        #: The other kind is a frame from an error passive node. There is no emergency in this case, so the error code is 0.
+        #: Events that the next `evaluate` raises only as pending diagnostics, each as (node, diagnostic, error code):
+        #: - An emergency with the reaction INFO.
+        #: - An emergency of a node that already has an active emergency with a more severe reaction.
+        #: - A frame from an error passive node; the error code is 0.
         self._notices: list[tuple[str, Dtc, int]] = []
         #: Nodes that were reset: they reported a state other than OPERATIONAL at least once since the last `evaluate`.
         #: The first status message of a node does not count.

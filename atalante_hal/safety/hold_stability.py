@@ -42,8 +42,8 @@ REVERSALS: Final = 6
 SATURATED: Final = (0.9, 1.05)
 #: A drive is regarded as overloaded after this number of consecutive cycles with overload.
 OVERLOADED: Final = 20
-#: A drive can be overloaded only if its joint is at least this far from the position in which the hold began [rad].
-#: A drive that only reports a wrong torque keeps its joint closer than this distance.
+#: Overload is counted only while a joint is at least this far from the position in which the hold began [rad].
+#: If a drive holds its joint but reports a wrong torque, the joint stays closer, so no overload is counted.
 AWAY: Final = math.radians(1.0)
 #: A drive without torque is reported only if its joint is at least this far from the position in which the hold began [rad].
 #: At this distance, the position control of a working drive demands the full torque.
@@ -52,11 +52,10 @@ SUNK: Final = math.radians(3.0)
 POWERLESS: Final = 0.1
 #: The encoder of a joint is confirmed if it differs from the IMUs of its leg by at most this angle [rad].
 ENCODER_ERROR: Final = math.radians(1.0)
-#: Speed threshold of the overload count [rad/s]. It is larger than the noise of the velocities.
-#: A drive that stops its joint or moves its joint back is not overloaded. Therefore the count restarts in two cases:
-#: - The joint moves back faster than this threshold.
-#: - The outward speed of the joint has dropped by more than this threshold since the count began.
-#: Outward means away from the position in which the hold began.
+#: Speed threshold for two motions that show a working drive [rad/s]. After such a motion, the count of faulty cycles restarts.
+#: - The joint returns to the position in which the hold began, and is faster than this threshold.
+#: - The joint still moves away, but its speed has dropped by more than this threshold since the count began.
+#: The threshold is larger than the noise of the velocities.
 SLOWER: Final = 0.05
 #: The overload check skips a joint in each cycle in which the values of the joint are older than this [cycles].
 AGE: Final = 4
@@ -74,7 +73,7 @@ class Measured(NamedTuple):
 
 
 class Swings(NamedTuple):
-    """Record of the reversals of all joints, shape (12,) each."""
+    """Record of the velocity reversals of all joints, shape (12,) each."""
 
     direction: npt.NDArray[np.int64]  # sign of the last velocity above `SPEED`; 0 if there is none
     age: npt.NDArray[np.int64]  # number of cycles since the joint first exceeded `SPEED` in its current direction
@@ -82,15 +81,15 @@ class Swings(NamedTuple):
 
 
 class Loads(NamedTuple):
-    """Record of the overload and of the motors without torque, shape (12,) each."""
+    """Record with which `_watch_load` detects overloaded drives and motors without torque, shape (12,) each."""
 
-    start: Vector  # position in which the hold began [rad]; NaN if the drive does not hold its position
-    speed: Vector  # speed away from `start` when the count in `cycles` began [rad/s]
-    cycles: Vector  # number of consecutive cycles with overload, or with a motor without torque
+    start: Vector  # position of the joint when the hold began [rad]; NaN if the drive does not hold its position
+    speed: Vector  # speed in the first faulty cycle [rad/s], positive away from the position in which the hold began
+    cycles: Vector  # number of consecutive faulty cycles: the drive is overloaded, or its motor has no torque
 
 
 def _follow(velocity: Vector, drive_state: Vector, swings: Swings, driven: tuple[float, float]) -> bool:
-    """Update the reversals of all joints by one cycle, and return whether a joint oscillates.
+    """Count the velocity reversals of each joint in one more cycle, and return whether a joint oscillates.
 
     Args:
         velocity: joint velocities, shape (12,) [rad/s].
@@ -112,7 +111,9 @@ def _follow(velocity: Vector, drive_state: Vector, swings: Swings, driven: tuple
 
 
 def _watch_load(joints: Measured, limit: Vector, driven: tuple[float, float], loads: Loads) -> bool:
-    """Update the overload of all joints by one cycle, and return whether a drive is overloaded or has no torque.
+    """Count the faulty cycles of each drive, and return whether a drive was faulty for `OVERLOADED` cycles.
+
+    A cycle is faulty if the drive is overloaded or its motor has no torque, see the module docstring.
 
     Args:
         joints: measurements of the cycle.

@@ -66,10 +66,11 @@ class History(NamedTuple):
     accel: Vector  # (SPAN, 3) m/s2, specific force at the pelvis IMU
     gyro: Vector  # (SPAN, 3) rad/s, angular velocity of the pelvis IMU
     force: Vector  # (SPAN, 2, 4, 3) N, force on each cell of each foot
-    #: (3,) number of consecutive cycles without a change of the specific force at the pelvis IMU, of the forces on the left foot,
-    #: and of the forces on the right foot
+    #: (3,) number of consecutive cycles in which the values of a sensor did not change.
+    #: Elements: specific force at the pelvis IMU, forces on the left foot, forces on the right foot.
     repeats: Cycles
-    #: (3,) number of consecutive cycles in which `repeats` was at most `REPEATED`, in the same order
+    #: (3,) number of consecutive cycles in which a sensor was not stuck: pelvis IMU, left foot, right foot.
+    #: A sensor is stuck if its values have not changed for more than `REPEATED` cycles.
     good: Cycles
 
 

@@ -64,8 +64,7 @@ _COUNT = len(JOINTS)
 #: Number of cycles after which a change of the commanded torque is visible in the measured acceleration.
 DELAY: Final = 3
 #: Smallest effective inertia [kg m2] of each joint in LEG_JOINTS while all other joints are free to move.
-#: `SMALLEST_INERTIA` is a lower bound over all poses of the empty exoskeleton, suspended or floating.
-#: The bound does not depend on the gait.
+#: Each value is a lower bound for the empty exoskeleton in all poses, with a fixed pelvis and with a free pelvis.
 SMALLEST_INERTIA: Final = (0.12, 0.14, 0.17, 0.11, 0.038, 0.038)
 #: Results of `limit`: all torques are unchanged, at least one torque was reduced, an input is not finite.
 _UNCHANGED, _CUT, _NOT_FINITE = range(3)
@@ -245,6 +244,14 @@ def limit(
 def highest_torque(room: float, acceleration: float, oldest: float, inertia: float, delay: float, fall: float) -> float:
     """Return U [Nm], the largest torque in one direction that keeps the predicted velocity within its limit.
 
+    With the torque U, the predicted growth of the velocity is acceleration times time:
+
+    - Acceleration: `acceleration` + (U - `oldest`) / `inertia`. The measured acceleration belongs to the torque `oldest`.
+    - Time: `delay` + `fall` * U. After the delay, the torque falls from U to 0. The mean torque in the fall is U / 2, so half of
+      the duration of the fall counts.
+
+    U is the larger solution of the quadratic equation growth = `room`.
+
     Args:
         room: difference between the velocity limit and the velocity [rad/s].
         acceleration: measured acceleration [rad/s2].
@@ -257,9 +264,7 @@ def highest_torque(room: float, acceleration: float, oldest: float, inertia: flo
     known = max(oldest, 0.0)
     if acceleration * (delay + known * fall) > room:  # the velocity gets too high even if the torque does not increase
         return max((room / acceleration - delay) / fall, 0.0)
-    # With the torque U, the predicted growth of the velocity (acceleration times time) is equal to `room`:
-    #     (free + U) / inertia * (delay + fall * U) = room
-    # U is the larger solution of this quadratic equation.
+    # Solve the quadratic equation in the docstring for U.
     free = inertia * acceleration - oldest  # torque that does not come from the motor [Nm]
     root = math.sqrt((delay - free * fall) ** 2 + 4.0 * fall * inertia * room)
     return max((root - delay - free * fall) / (2.0 * fall), known)

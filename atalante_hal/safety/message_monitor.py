@@ -83,8 +83,8 @@ class Tolerance(NamedTuple):
 
     #: Indices of the legs in SIDES. A brief timeout in these legs leads to FINISH_STEP instead of HOLD.
     legs: Collection[int] = ()
-    #: Number of cycles that is added to the DBC timeouts of the joints in these legs while their frames are missing.
-    #: As soon as a frame of a joint is accepted, its DBC timeout applies to the age of the values in this frame.
+    #: Number of cycles that is added to the DBC timeout of a joint in these legs if the cycle has no accepted frame of the joint.
+    #: In a cycle with an accepted frame, the data of this frame must be younger than the DBC timeout.
     longer: int = 0
 
 
@@ -224,8 +224,8 @@ class MessageMonitor:
         sender, two_senders = self._senders[row], self._check_senders(cycle, memory, row, rival)
         tolerated, timeout = self._legs[row] in tolerance.legs, self._timeouts[row]
         fresh = check <= Check.SOME_LOST
-        # `tolerance.longer` extends the timeout only while frames are missing. The values of an accepted frame must be
-        # younger than the DBC timeout, because the plausibility checks ignore older values.
+        # The timeout is longer only in cycles without an accepted frame. An accepted frame with data older than the DBC timeout
+        # is late, because the plausibility checks ignore such data.
         late = age >= timeout + tolerance.longer * (tolerated and not fresh)
         # Impossible signal values do not reduce the trust, because the frame was transmitted correctly.
         good = (fresh or check >= Check.RANGE) and not rival
@@ -254,14 +254,14 @@ class MessageMonitor:
 def rivals_of(refused: Sequence[tuple[int, Check]], checks: Sequence[int]) -> frozenset[int]:
     """Return the rows whose frames in this cycle cannot all be from one sender.
 
-    Each of these rows has at least two intact frames in this cycle. The check result of at least one rejected frame is
-    CONFLICT or WRONG_SEQUENCE.
+    Each of these rows has at least two intact frames in this cycle: frames with correct format and CRC, accepted or rejected.
+    The check result of at least one rejected frame is CONFLICT or WRONG_SEQUENCE.
 
     Args:
         refused: row and check result of each rejected frame.
         checks: `Check` of each row, shape (rows,).
     """
-    # Number of intact frames of each row: rejected frames, plus 1 if the row also has an accepted frame.
+    # Count the intact frames of each row: first the rejected ones, then the accepted one.
     intact = Counter(row for row, result in refused if result in _INTACT)
     for row in intact:
         intact[row] += checks[row] <= _FRESH or checks[row] == Check.IMPLAUSIBLE

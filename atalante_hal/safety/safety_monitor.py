@@ -137,8 +137,8 @@ class SafetyMonitor:
         self._joint_rows = np.array(rows_of(image.codec, JOINT_MESSAGES))
         self.torque_tracking = TorqueTracking(robot.breakaway)
         self.torque_motion: TorqueMotion | None = None
-        #: DBC names of the drives that stay off until a start passes its direction test, see `proof`. They were off before a
-        #: START in READY, had a wrong torque, did not hold their joints, or failed the test.
+        #: DBC names of the drives that are kept off until a start passes its direction test, see `proof`.
+        #: A start enables these drives for the test. If the start fails, the drives are switched off again.
         self._kept_off: set[str] = set()
         #: True if `evaluate` may skip the next cycle. The cycle is skipped only if all data are fresh, there is no fault, and
         #: the values of pendant and drives are unchanged.
@@ -381,6 +381,10 @@ class SafetyMonitor:
     def _process_start(self, nodes_ready: bool) -> None:
         """Process a START until the state changes, the start is refused, or `ENABLE_CYCLES` cycles have passed.
 
+        If a start in READY fails, the drives that were off before the start are switched off again, because their directions are
+        not tested yet. If a start in HOLD fails, only the drives in `_kept_off` are switched off again, because the other drives
+        have already moved the robot.
+
         Args:
             nodes_ready: True if every required node is trusted and has sent a status message.
         """
@@ -395,8 +399,7 @@ class SafetyMonitor:
             if not self.start_cycles_left:  # another press of START during a start does not restart the direction test
                 self._proof_begun = False
                 if state.supervisor is _S.READY:
-                    # No joint has passed the test yet. If the start ends before the test is passed, the drives that are off
-                    # now are switched off again. In HOLD they hold, because the robot has moved with them before.
+                    # These drives are off and not tested yet. If the start fails, they are switched off again.
                     on = powered(state.drive_state).tolist()
                     self._kept_off.update(node for node, is_on in zip(DRIVE_NODES, on, strict=True) if not is_on)
             self.start_cycles_left = ENABLE_CYCLES if state.supervisor in _STARTABLE else 0

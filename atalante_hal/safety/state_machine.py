@@ -19,7 +19,8 @@ class Conditions:
 
     diagnostics: frozenset[Dtc] = frozenset()
     nodes_ready: bool = False  # every required node is trusted and has sent its status
-    #: All twelve drives are in OPERATION ENABLED. In a start from READY or HOLD, the test of the joint directions is also over.
+    #: True if all twelve drives are in OPERATION ENABLED and the direction test of the joints has ended.
+    #: In FULL_ASSIST, which has no direction test, OPERATION ENABLED is sufficient.
     drives_enabled: bool = False
     dead_man: bool = False  # the pendant has not timed out and its dead-man switch is pressed
     #: True if HOLD is requested, if STOP is requested outside a walk on the ground, or if the program is ending.

@@ -11,8 +11,11 @@ explanations:
     external torque:  e = t + p with a constant p
     faulty motor:     e = s t   with a share s in `SHARES`
 
-A drive is reported if the first explanation has a clearly larger mean square error than the second explanation, see `RATIO`. So
-the check needs a torque that changes. After a fault, the controller changes the torque of the joint within a few cycles.
+Each explanation is fitted to the torques of the last checks. E is the mean square error of the first fit, F of the second fit.
+A motor is suspected if E > `RATIO` * (F + error^2), where error is the error of the produced torque, `Robot.torque_error`. A
+drive is reported after `CONFIRM` such checks in a row.
+
+The comparison needs a torque that changes. After a fault, the controller changes the torque of the joint within a few cycles.
 An external torque that opposes each change of the torque, such as an obstacle that stops the joint, looks like a dead motor.
 
 *Changes.* Sent and computed torques are averages over `leg_torques.SPAN` cycles. At the start of a deviation, these averages also
@@ -44,9 +47,8 @@ INTERVAL: Final = 4
 #: Ranges of the share s of a faulty motor (produced torque = s times sent torque). The first range covers reversed, dead and weak
 #: motors. The second range covers motors that are too strong.
 SHARES: Final = ((-1.5, 0.6), (1.4, 2.2))
-#: Two models are fitted to the produced torque: external torque (e = t + p) and faulty motor (e = s t), see the module docstring.
-#: E and F are their mean square errors. The motor is suspected if the first model fits clearly worse, that is, if
-#: E > `RATIO` * (F + `Robot.torque_error`^2).
+#: Ratio of two mean square errors: of the explanation by an external torque, and of the explanation by a faulty motor.
+#: If this ratio is exceeded, the motor is suspected. The module docstring states the exact condition.
 RATIO: Final = 2.5
 #: Number of consecutive checks that must suspect the motor before the drive is reported.
 CONFIRM: Final = 2
@@ -66,13 +68,13 @@ DECAY: Final = (0.8, 0.96)
 LEFT_OUT: Final = 2
 #: A deviation ends if more than this number of consecutive checks find no deviation.
 PAUSE: Final = 5
-#: A deviation smaller than `_FALLEN` times its largest size is not added to `Deviations.sums`.
-#: The stored largest size is multiplied by `_FORGET` in each check.
-_FALLEN: Final = 0.8
-_FORGET: Final = 0.97
-#: Least count of checks in `Deviations.sums` that suffices to suspect a motor. An older check counts less, see `DECAY`. Three
-#: checks suffice: they count at least 1 + 0.8 + 0.8^2 = 2.44. Two checks count at most 1 + 0.96 = 1.96.
-_ENOUGH: Final = 2.4
+#: A check is left out if the deviation has fallen below this fraction of its peak, because an external torque may be ending.
+_PEAK_SHARE: Final = 0.8
+#: In each check with a deviation, the stored peak of the deviation is multiplied by this factor.
+_PEAK_DECAY: Final = 0.97
+#: A motor can be suspected only if the weights of its added checks sum to at least this value. This takes three checks.
+#: With the weights of `DECAY`, three checks reach at least 1 + 0.8 + 0.8^2 = 2.44, and two checks at most 1 + 0.96 = 1.96.
+_LEAST_WEIGHT: Final = 2.4
 #: A joint closer to its position limit than this angle [rad] is at its end stop.
 _AT_STOP: Final = 0.005
 _LEG: Final = len(LEG_JOINTS)
@@ -94,7 +96,7 @@ class Deviations(NamedTuple):
     sums: Vector
     length: npt.NDArray[np.int64]  # (12,) number of checks that found the current deviation
     pause: npt.NDArray[np.int64]  # (12,) number of checks since the last check with a deviation
-    largest: Vector  # (12,) Nm, largest size of the current deviation, reduced by `_FORGET` in each check
+    peak: Vector  # (12,) Nm, decaying maximum of |produced torque - sent torque| in the current deviation
     found: npt.NDArray[np.int64]  # (12,) number of consecutive checks that suspected the motor
     share: Vector  # (12,) share s = produced torque / sent torque, from the last check that suspected the motor
 
@@ -176,11 +178,15 @@ def _forget(joint: int, deviations: Deviations) -> None:
     """
     deviations.sums[:, joint] = 0.0
     deviations.length[joint] = deviations.pause[joint] = deviations.found[joint] = 0
-    deviations.largest[joint] = 0.0
+    deviations.peak[joint] = 0.0
 
 
 def _compare(joint: int, sent: float, produced: float, tolerances: Tolerances, deviations: Deviations) -> bool:
-    """Add a deviation to the sums of a joint, and return whether a faulty motor explains the sums.
+    """Evaluate one check in which a joint deviates, and return whether its motor is faulty.
+
+    The torques of the check are added to the sums of the joint. From these sums, the two explanations of the module docstring
+    are fitted: external torque and faulty motor. At the start of a deviation, and while a deviation decreases, the check is left
+    out.
 
     Args:
         joint: index in `JOINTS`.
@@ -188,12 +194,15 @@ def _compare(joint: int, sent: float, produced: float, tolerances: Tolerances, d
         produced: produced torque e [Nm].
         tolerances: properties of the joints.
         deviations: state of the check. Updated here.
+
+    Returns:
+        True if the last `CONFIRM` added checks suspect the motor. False if this check is left out.
     """
     size = abs(produced - sent)
     deviations.length[joint] += 1
     deviations.pause[joint] = 0
-    deviations.largest[joint] = max(size, _FORGET * deviations.largest[joint])
-    if deviations.length[joint] <= LEFT_OUT or size < _FALLEN * deviations.largest[joint]:
+    deviations.peak[joint] = max(size, _PEAK_DECAY * deviations.peak[joint])
+    if deviations.length[joint] <= LEFT_OUT or size < _PEAK_SHARE * deviations.peak[joint]:
         return False
     faulty = False
     for window in range(len(DECAY)):
@@ -201,7 +210,7 @@ def _compare(joint: int, sent: float, produced: float, tolerances: Tolerances, d
         for k, value in enumerate((1.0, sent, produced, sent * sent, sent * produced, produced * produced)):
             sums[k] = keep * sums[k] + value
         count, t, e, tt, et, ee = sums
-        if count < _ENOUGH:
+        if count < _LEAST_WEIGHT:
             continue
         external = ee - 2.0 * et + tt - (e - t) ** 2 / count
         share, best = et / max(tt, 1e-9), math.inf

@@ -27,7 +27,8 @@ from atalante_hal.types import Vector
 
 #: Largest time from sending a torque to its report by the drive [cycles]: 4 lost commands, 4 late cycles, 4 for the answer.
 SPAN: Final = 12
-#: Largest distance of a reported torque from the range of the sent torques, relative to the breakaway torque of the joint.
+#: A reported torque may lie outside the range of the last sent torques (smallest to largest) by this tolerance.
+#: The tolerance is a fraction of the breakaway torque of the joint.
 TOLERANCE: Final = 0.2
 #: A drive is reported after this number of consecutive cycles with a wrong torque.
 CONFIRM: Final = 5
@@ -48,8 +49,8 @@ def _compare(sent: Vector, limit: Vector, reported: Vector, tolerance: Vector, t
         sent: torques sent in the last cycle, shape (12,) [Nm].
         limit: torque limits of the drives, shape (12,) [Nm].
         reported: reported torques, shape (12,) [Nm].
-        tolerance: largest distance of a reported torque from the range of the sent torques, shape (12,) [Nm].
-        tracking: memory to update.
+        tolerance: torque by which a reported torque may lie outside the range of the sent torques, shape (12,) [Nm].
+        tracking: state of the check. Updated here.
     """
     row = tracking.cycles[0] % SPAN
     tracking.cycles[0] += 1
@@ -72,7 +73,7 @@ class TorqueTracking:
     The check runs only while the controller drives the joints.
 
     Attributes:
-        tolerance: largest distance of a reported torque from the range of the sent torques, shape (12,) [Nm].
+        tolerance: torque by which a reported torque may lie outside the range of the sent torques, shape (12,) [Nm].
 
     Args:
         breakaway: breakaway torques of the joints, shape (12,) [Nm].

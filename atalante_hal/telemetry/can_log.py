@@ -92,7 +92,7 @@ class CanLog(Closing):
         """
         foreign = self._channels[FOREIGN]
         if self._relative and len(stamps):
-            # python-can does not convert a time before the first frame to a relative time: it would write about 1.7e9 s.
+            # For a frame older than the first frame, python-can would write the absolute Unix time instead of a relative time.
             self._first_ns = int(stamps[0]) if self._first_ns is None else self._first_ns
             stamps = np.maximum(stamps, self._first_ns)
         columns = (frames[name].tolist() for name in ("can_id", "len", "flags"))

@@ -186,7 +186,7 @@ class TelemetryProcess(Closing):
         self._early = child  # subprocess that was started before the first call of `start`; None if there is none
         self._child: TelemetryChild | None = None
         self._restarts = 0
-        self._abandoned = False  # True after a fault that causes no further restart
+        self._abandoned = False  # True if the subprocess failed again after its last allowed restart
         self._faults: list[str] = []  # one sentence for each fault of a subprocess
         self._recordings: list[str] = []  # names of the recording files begun so far
         self._last_endpoint: str | None = None  # last endpoint in use; None before the first endpoint was opened

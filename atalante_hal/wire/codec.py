@@ -25,8 +25,8 @@ Words = npt.NDArray[np.int64]
 WORD, SHIFT, MASK, LARGEST, LOW, HIGH, INVALID = range(7)
 #: Row indices of the scales in the formula  physical value = (raw code + base) * factor + offset.
 BASE, FACTOR, OFFSET = range(3)
-#: In the decoding plan: signal i has no invalid code if `plan[INVALID, i]` has this value.
-#: As the result of `encode`: all values were encoded. Any other result is the index of a signal that could not be encoded.
+#: The element `plan[INVALID, i]` is `NO_CODE` if signal i has no invalid code.
+#: The function `encode` returns `NO_CODE` if it encoded all values, otherwise the index of a signal that it could not encode.
 NO_CODE = -1
 # Results of `read_row`. INSIDE: all signals are in range. OUTSIDE: a signal is out of range, and none has its invalid code.
 # MARKED_INVALID: a signal is out of range, and at least one signal has its invalid code.

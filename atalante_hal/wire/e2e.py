@@ -181,8 +181,8 @@ GOOD_CYCLE = 1
 FULL = 64
 #: Number of consecutive good cycles after which a message is trusted. Until then the inputs of a pendant are ignored.
 REQUALIFY = 16
-#: Increase of the counter that detects two senders (see `suspect`), in a cycle with frames of two senders.
-#: After four such cycles in a row, the counter reaches `FULL`, and two senders are confirmed.
+#: A cycle with frames of two senders increases the two-sender counter (see `suspect`) by this number.
+#: Four such cycles in a row fill the counter up to `FULL`. Then it is confirmed that the message has two senders.
 RIVAL_CYCLE = 16
 
 

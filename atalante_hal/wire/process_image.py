@@ -65,8 +65,8 @@ _NO_NEW_VALUES = frozenset({Check.CRC, Check.LENGTH, Check.REPEATED})
 _FOREIGN = -1
 #: Age of a message that has never been received [cycles].
 NEVER = 1 << 30
-#: Lowest age at which an answer to a SYNC is rejected as replayed [cycles].
-LATEST = 16
+#: An answer to a SYNC is rejected as a replayed frame if the SYNC was sent this number of cycles ago or earlier.
+_TOO_OLD = 16
 #: Half the period of the 8-bit alive counter. A frame is old if (its counter - last accepted counter) mod 256 is at least 128.
 #: Example: counter 250 after counter 5 gives 245, so the frame is old. After a gap of 128 cycles, this test is ambiguous.
 _HALF_TURN = 128
@@ -359,7 +359,10 @@ def _results(count: int) -> Words:
 def accept_exact(
     words: Words, e2e: E2EState, tag: int, table: SignalTable, values: Vector, values_before: Vector
 ) -> bool:
-    """Commit all rows if every expected message arrived in order and is intact, in sequence, in range and of this cycle.
+    """Commit all rows at once if the frames are in row order and every frame passes all checks; otherwise commit none.
+
+    Frame i must have identifier, length and flags of row i, a correct CRC, the expected counter, and every signal in its range.
+    With a tag, the expected counter must also equal the tag, because each frame must answer the SYNC of this cycle.
 
     Args:
         words: received frames as a flat array of 64-bit words, shape (rows * 9,).
@@ -471,9 +474,9 @@ def classify_frame(words: Words, row: int, offset: int, e2e: E2EState, tag: int,
     if octets[begin] != crc & 0xFF or octets[begin + 1] != crc >> 8:
         return _CRC
     counter = int(octets[begin + COUNTER_BYTE])
-    in_time = tag == _NO_TAG or tag - counter & 0xFF < LATEST
+    in_time = tag == _NO_TAG or tag - counter & 0xFF < _TOO_OLD
     # After a gap of at least half a counter period, the counter does not show whether a frame is new or old.
-    # After such a gap, the counter of a frame is accepted if the frame answers one of the last `LATEST` SYNCs.
+    # After such a gap, the counter of a frame is accepted if the frame answers one of the last `_TOO_OLD` SYNCs.
     back = tag != _NO_TAG and in_time and expected[row] != NOTHING and silent[row] >= _HALF_TURN
     result = classify_counter(expected[row], counter)
     if back and result == _REPEATED:

@@ -115,8 +115,8 @@ class Drives:
         self.encoders = Encoders(robot, parameters.velocity_bandwidth, signals.position, signals.velocity)
         self.motors = Motors(robot, parameters.motor, signals.torque, signals.temperature)
         self._slow_phase = 0
-        #: Controlwords of the last evaluation if this evaluation changed no drive; otherwise empty.
-        #: Received controlwords that are equal to `_steady` are not evaluated.
+        #: Controlwords that have no effect in the present drive states, as bytes; empty if no such controlwords are known.
+        #: If the HAL sends these controlwords again, the drives skip them.
         self._steady = b""
         self._hold_at = np.zeros(len(JOINTS))  # setpoint of the local hold of each drive [rad]
         self._target, self._limit = np.zeros((2, len(JOINTS)))

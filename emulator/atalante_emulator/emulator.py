@@ -184,8 +184,8 @@ class Emulator:
         self._whole = [self._tx.frames]
         #: For each leg: index of its SYNC message in the list of SYNC messages.
         self._leg_syncs = [[m.name for m in syncs].index(f"SYNC_{side.upper()}_LEG") for side in SIDES]
-        #: A cycle also runs if one of its SYNCs is late. When the late SYNC arrives, the nodes answer with the frames of the
-        #: cycle that has already run. Each element is a copy of these frames for one SYNC.
+        #: For each SYNC: answer of the nodes on the bus of this SYNC in the last cycle.
+        #: If a SYNC arrives after its cycle has already run, the nodes send this stored answer.
         self._answered = self._shares
         batch = new_frames(_BATCH)
         self._batch = batch.view(np.uint8).data

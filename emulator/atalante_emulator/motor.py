@@ -35,7 +35,7 @@ MOST_LATE = 20
 
 # Rows 0 to 3 of the motor array: torque setpoint, ratio of true torque to measured torque, dry friction, damping.
 # Rows 4 to 6 of the motor array: external torque, resulting joint torque, torque of the wearer's limb.
-# Row 7 of the motor array: ratio of measured torque to torque setpoint.
+# Row 7 of the motor array: factor on the torque setpoint, see `set_gain`.
 _WANTED, _STRENGTH, _DRY, _DAMPING, _PUSH, _JOINT, _LIMB, _GAIN = range(8)
 
 
@@ -102,11 +102,13 @@ class Motors:
         self._motors[_STRENGTH, motor] = strength
 
     def set_gain(self, motor: int, gain: float) -> None:
-        """Set the ratio of the torque to its setpoint, both for the true and for the measured torque of a motor.
+        """Scale the torque setpoint of a motor. The current loop follows the scaled setpoint.
+
+        The gain therefore changes the true torque and the measured torque alike.
 
         Args:
             motor: index of the motor.
-            gain: ratio; 1 for a motor without fault, 0 for a motor whose power stage is off.
+            gain: factor on the setpoint; 1 for a motor without fault, 0 for a motor whose power stage is off.
         """
         self._motors[_GAIN, motor] = gain
 

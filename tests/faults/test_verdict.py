@@ -177,5 +177,5 @@ def test_detection_time_is_measured_when_the_robot_stays_active(make_observation
 
 
 def test_case_without_any_bound_is_rejected() -> None:
-    with pytest.raises(ValueError, match=r"F99 x: the case must define `detected` and `reacted`, .*, got '1 step'"):
+    with pytest.raises(ValueError, match=r"F99 x: the time limit .* must be a number of cycles, got '1 step'; define"):
         Expectation.of(Case("x", ()), Row("F99", "", "", "1 step", "", S.HOLD, "", ()))

@@ -41,7 +41,7 @@ from atalante_hal.wire.process_image import NEVER
 SAMPLES = 64
 #: For each IMU: number of samples after which its means are first compared with their limits.
 #: A few samples are enough for the trunk, so a faulty IMU of the trunk is found before READY.
-#: The tibiae need more samples, because the drives are off before READY, and bent legs sink.
+#: The tibiae accelerate before READY, because the drives are off and bent legs sink. A mean over more samples tolerates this.
 FIRST_SAMPLES = (4, 4, 16, 16)
 GRAVITY = 9.81  # m/s2
 #: Limit of the mean difference between specific force and gravity [m/s2]. A healthy robot reaches 2.2 m/s2 in walks and falls.
@@ -218,7 +218,7 @@ def add(imu: int, now: Readings, record: Record, time: float) -> None:
 
 
 def compare(now: Readings, record: Record) -> None:
-    """Add a sample to the means with which torso and pelvis are compared.
+    """Update the running means of the differences between torso IMU and pelvis IMU: vertical direction and angular velocity.
 
     Args:
         now: readings of the sample.

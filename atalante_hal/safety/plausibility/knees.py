@@ -39,26 +39,24 @@ PELVIS_IMU = (-0.164, -0.015, 0.191)
 #: Position y of joint FH of the left leg in the pelvis frame [m]. Its x and z are 0.
 FRONTAL_HIP = 0.089
 #: Position (x, y) of joint TH of the left leg relative to joint FH, in the axes of the frontal hip [m].
-#: Relative to joint TH, joint SH is at (0.135, 0) in the axes of the transverse hip: opposite x, no y.
+#: `motion` also uses the distance 0.135 m for joint SH, which is in front of joint TH in the axes of the transverse hip.
 TRANSVERSE_HIP = (-0.135, 0.169)
 #: Position (x, y, z) of the left tibia IMU in the axes of the tibia [m].
 #: Each coordinate has its own origin: x is relative to joint SK, y to joint SH, and z to joint SA.
 TIBIA_IMU = (-0.13, -0.069, 0.018)
-#: Time constant of the integration and of the high-pass [s].
+#: Time constant of the low-passes [s]. Both the integration of the accelerations and the high-passes are built from low-passes.
 _FILTER_TIME = 0.15
 #: Time constant of the mean values `Filters.moments` [s].
 _MEAN_TIME = 0.75
 #: Time that the filters need to settle after the start [s]. `Filters.moments` is updated only after this time.
 _SETTLING_TIME = 2.0
-# A wrong segment length shifts the computed position of the tibia IMU, as a wrong knee angle does. Therefore a regression first
-# removes the effect of the segment length from the lever and from the position difference.
-# `_LEAST_LEVER` and `_SHARE` are applied after this regression.
-#: The error of a knee angle is computed only if the root mean square of the lever exceeds this value [m].
-#: The lever is the derivative of the tibia IMU's position with respect to the knee angle SK.
-#: In a walk, the root mean square of the lever is about 0.012 m.
+#: The error of a knee angle is computed only if the root mean square of the lever exceeds this value [m/rad].
+#: The lever is the derivative of the tibia IMU's position with respect to the knee angle SK, after the correction for the segment
+#: length in `knee_error`. In a walk, the root mean square of the lever is about 0.012 m/rad.
 _LEAST_LEVER = 0.007
 #: An error of a knee angle is reported only if it explains more than this share of the squared position difference.
-#: The position difference is the measured minus the computed position of the tibia IMU.
+#: The position difference is the measured minus the computed position of the tibia IMU, after the correction for the segment
+#: length in `knee_error`.
 _SHARE = 0.25
 #: Number of filters of each leg and axis.
 _FILTERS = 11
@@ -80,16 +78,19 @@ class Readings(NamedTuple):
 
 
 class Filters(NamedTuple):
-    """Values of the filters of both legs."""
+    """Values of the filters of both legs.
+
+    The moments of a leg are the running means of the products ss, sg, gg, sd, gd and dd, each summed over three axes. The factors
+    are filtered values:
+
+    - s is the lever [m/rad]: derivative of the tibia IMU's position with respect to the knee angle SK.
+    - g is the growth [m/m]: derivative of the tibia IMU's position if thigh and shank become longer by the same length.
+    - d is the difference [m]: measured minus computed position of the tibia IMU.
+    """
 
     low: Vector  # (2, 33) outputs of the low-passes: for each leg, three axes with `_FILTERS` low-passes each
     time: Vector  # (1,) time since the start, up to `_SETTLING_TIME` [s]
-    #: (2, 6) for each leg, the running means of six products of the filtered values s, g and d.
-    #: s is the lever: the derivative of the tibia IMU's position with respect to the knee angle SK.
-    #: g is the growth: the derivative of the tibia IMU's position with respect to the length of both segments.
-    #: d is the difference: the measured minus the computed position of the tibia IMU.
-    #: Order of the products: ss, sg, gg, sd, gd, dd.
-    moments: Vector
+    moments: Vector  # (2, 6) for each leg: running means of ss, sg, gg, sd, gd and dd
 
 
 class Knees:
@@ -190,21 +191,28 @@ def follow(now: Readings, filters: Filters, error: Vector, limit: float, period:
 def knee_error(moments: Vector, limit: float, before: float) -> float:
     """Return the error of a knee angle if it exceeds the limit, otherwise 0 [rad].
 
+    An error e of the knee angle causes the position difference d = -e * s, with the lever s (see `Filters`). A wrong segment
+    length causes a position difference proportional to the growth g. Therefore the parts of s and d that are proportional to g
+    are first subtracted (least squares; sg is the mean of s * g):
+
+        u = s - g * sg / gg
+        v = d - g * gd / gg
+
+    Then the error is e = -uv / uu, with the mean uv of u * v and the mean uu of u * u. The error explains the share
+    uv^2 / (uu * vv) of the mean square vv.
+
     Args:
-        moments: mean products, see `Filters`, shape (6,).
+        moments: mean products ss, sg, gg, sd, gd and dd, see `Filters`, shape (6,).
         limit: largest error [rad].
         before: last result, which is returned if the thigh does not turn [rad].
     """
     ss, sg, gg, sd, gd, dd = moments[0], moments[1], moments[2], moments[3], moments[4], moments[5]
-    # Fit a multiple of g (effect of the segment length) to s (lever) and to d (position difference). The residuals are
-    #     u = s - g * sg / gg, v = d - g * gd / gg.
-    # The next line computes the mean products of the residuals, multiplied by gg to avoid divisions:
-    #     lever = gg * mean(u * u), product = gg * mean(u * v), difference = gg * mean(v * v).
-    lever, product, difference = ss * gg - sg * sg, sd * gg - sg * gd, dd * gg - gd * gd
-    if lever <= _LEAST_LEVER**2 * gg:
+    # Mean products of u and v, all multiplied by gg to avoid divisions.
+    uu, uv, vv = ss * gg - sg * sg, sd * gg - sg * gd, dd * gg - gd * gd
+    if uu <= _LEAST_LEVER**2 * gg:
         return before
-    error = -product / lever
-    return float(error) if abs(error) > limit and product**2 > _SHARE * lever * difference else 0.0
+    error = -uv / uu
+    return float(error) if abs(error) > limit and uv**2 > _SHARE * uu * vv else 0.0
 
 
 def motion(leg: int, now: Readings) -> tuple[Vector3, Vector3, Vector3, Vector3]:
@@ -215,8 +223,8 @@ def motion(leg: int, now: Readings) -> tuple[Vector3, Vector3, Vector3, Vector3]
         now: signals of the cycle.
 
     Returns:
-        Position [m], its derivatives with respect to SK [m/rad] and to the length of both segments [m/m], and difference of the
-        specific forces [m/s2].
+        Position [m], lever [m/rad] and growth [m/m] (see `Filters`), and specific force at the tibia IMU minus specific force at
+        the pelvis IMU [m/s2].
     """
     first, side, tibia = len(LEG_JOINTS) * leg, 1.0 - 2.0 * leg, _TIBIA + leg
     fh = now.position[first + _FH] * now.to_joint[first + _FH]

@@ -61,6 +61,7 @@ _IMU_DRIFT = 2e-5
 _HEADING_DRIFT = 1e-5
 _PELVIS = IMUS.index("pelvis")
 _TIBIAE = tuple(IMUS.index(f"{side}_tibia") for side in SIDES)
+#: Angles of a leg that are compared with the IMUs: angle of FH, angle of TH, sum of the angles of SH and SK.
 _AXES = (("FH",), ("TH",), ("SH", "SK"))
 #: Index in `_AXES` of the only axis that a heading drift of the IMUs affects.
 _HEADING = _AXES.index(("TH",))
@@ -235,7 +236,10 @@ class Legs:
                 self._exchanged[index] = tuple(_exchange(_HIPS[side] + index, ours[axis]) for side in range(len(SIDES)))
 
     def _without_heading(self, leg: int, comparison: _Comparison) -> list[float]:
-        """Return the errors of a leg about `_AXES` without the heading drift of the IMUs [rad]."""
+        """Return the encoder angles of a leg minus its IMU angles, corrected for the heading drift of the IMUs [rad].
+
+        The three values belong to FH, TH, and the sum of SH and SK.
+        """
         errors = list(comparison.errors)
         errors[_HEADING] -= self._heading[leg]
         return errors

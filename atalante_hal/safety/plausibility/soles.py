@@ -26,8 +26,8 @@ from atalante_hal.wire.process_image import NEVER
 SOLE_SAMPLES = 4
 #: A foot counts as flat on the floor only if its load exceeds this multiple of `cell_free`.
 _LOAD = 4.0
-#: Largest distance of the centre of pressure from the middle of a flat foot: along the foot, across the foot.
-#: 1 is the distance of a force cell from the middle. The sole is larger: it ends at 1.1 along and at 2.0 across the foot.
+#: A foot counts as flat only if its centre of pressure is at most this far from the middle of the foot: along, across.
+#: The unit is the distance of a force cell from the middle. In this unit, the sole ends at 1.1 along and at 2.0 across the foot.
 _CENTRE = (0.8, 1.4)
 #: Outward rotation of the foot about the vertical axis of the tibia [rad].
 TOE_OUT = math.radians(8.0)
@@ -103,7 +103,9 @@ def stands_flat(cells: Sequence[float], loaded: float) -> bool:
 
 
 def sole_tilt(tibia: Sequence[float], sa: float, ha: float, toe_out: float) -> tuple[float, float]:
-    """Return the components of the upward direction along and across a sole. Both are 0 if the sole is level.
+    """Return the tilt of a sole along and across the foot. Both components are 0 if the sole is level.
+
+    The tilt is the projection of the upward unit vector of the world onto the longitudinal and the lateral axis of the sole.
 
     Args:
         tibia: attitude of the tibia, quaternion wxyz, sensor to world.

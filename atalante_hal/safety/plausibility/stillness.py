@@ -63,8 +63,8 @@ _NEVER = 1 << 30
 _ANKLES = [JOINTS.index(f"{side}_{joint}") for side in SIDES for joint in ("SA", "HA")]
 #: For each ankle joint: index of its foot in FEET.
 _FOOT_OF = [0, 0, 1, 1]
-#: For each joint: index of its foot in FEET if the joint is an ankle, otherwise -1. A foot on the ground holds its ankles.
-_HELD_BY = tuple(_FOOT_OF[_ANKLES.index(joint)] if joint in _ANKLES else -1 for joint in range(len(JOINTS)))
+#: For each joint: index of its foot in FEET if the joint is an ankle, otherwise -1.
+_FOOT_OF_JOINT = tuple(_FOOT_OF[_ANKLES.index(joint)] if joint in _ANKLES else -1 for joint in range(len(JOINTS)))
 #: For each ankle joint: index in IMUS of the IMU at its shank.
 _SHANK_OF = [IMUS.index(f"{side}_tibia") for side in SIDES for _ in ("SA", "HA")]
 
@@ -81,17 +81,16 @@ class Readings(NamedTuple):
 class Drive(NamedTuple):
     """Torque of each joint since its encoder reading last changed, and a simulated motion. Shape (12,) each.
 
-    The simulated joint starts at rest. It moves only if the torque changes by more than `breakaway`. Its inertia `_INERTIA` is an
-    upper bound, so a real joint turns further.
+    The simulated joint starts at rest. If the torque changes by more than `breakaway`, the part of the change above `breakaway`
+    accelerates the joint. The inertia of the simulated joint is `_INERTIA`, an upper bound, so a real joint turns further.
     """
 
     cycles: Vector  # number of cycles since the encoder reading last changed
-    rest: Vector  # balanced torque [Nm]: torque in the third cycle (`_AT_REST`) after the encoder reading last changed
+    rest: Vector  # torque of the joint at rest [Nm]: its torque in the third cycle (`_AT_REST`) with a constant reading
     low: Vector  # lowest torque since the encoder reading last changed [Nm]
     high: Vector  # highest torque since the encoder reading last changed [Nm]
-    #: simulated angular momentum [Nm s], at least 0; each cycle adds (abs(torque - `rest`) - `breakaway`) * cycle time
-    momentum: Vector
-    turn: Vector  # simulated angle since the encoder reading last changed [rad]
+    momentum: Vector  # angular momentum of the simulated joint [Nm s], at least 0
+    turn: Vector  # angle by which the simulated joint has turned since the encoder reading last changed [rad]
 
 
 class Stillness:
@@ -120,8 +119,8 @@ class Stillness:
         self._sampled = np.full(size, np.nan)
         self._same = np.empty(size, np.bool_)
         self._repeats = np.full(size, 0)
-        # Convert the limits from cycles to numbers of samples.
-        # A standstill may begin up to `every` - 1 cycles before its first sample, so each limit is shortened by these cycles.
+        # Convert the limits from cycles to numbers of samples. A reading may already be constant for `every` - 1 cycles when it
+        # is sampled first, so these cycles are subtracted.
         limit = np.full(size, _NEVER)
         limit[codec.slice("Position")] = self._to_stuck = (STUCK_CYCLES - every + 1) // every
         limit[codec.slice("Gyro")] = limit[codec.slice("Force")] = to_freeze = (FROZEN_CYCLES - every + 1) // every
@@ -294,8 +293,8 @@ def follow(readings: Readings, drive: Drive, breakaway: Vector, loaded: float, p
 def follow_one(joint: int, readings: Readings, drive: Drive, breakaway: float, limits: tuple[float, float]) -> None:
     """Update the `Drive` record of one joint.
 
-    If the encoder reading has changed, or if the ground holds the joint, the record is cleared. Otherwise the torque of this
-    cycle extends the torque range, and the simulated motion continues by the time since the last values.
+    The record is cleared if the encoder reading has changed, or if the joint is an ankle whose foot is on the ground. Otherwise
+    the torque of this cycle extends the torque range, and the simulated motion continues by the time since the last values.
 
     Args:
         joint: index of the joint in JOINTS.
@@ -305,11 +304,12 @@ def follow_one(joint: int, readings: Readings, drive: Drive, breakaway: float, l
         limits: vertical force above which a foot is on the ground [N], and time since the last values of the joint [s].
     """
     loaded, time = limits
-    foot, held = _HELD_BY[joint], False
+    foot, on_ground = _FOOT_OF_JOINT[joint], False
     if foot >= 0:
         force = readings.force[foot]
-        held = force[0, 2] + force[1, 2] + force[2, 2] + force[3, 2] > loaded
-    if held or readings.position[joint] != readings.before[joint]:
+        on_ground = force[0, 2] + force[1, 2] + force[2, 2] + force[3, 2] > loaded
+    # The ankles of a foot on the ground may stand still despite a torque, see the module docstring.
+    if on_ground or readings.position[joint] != readings.before[joint]:
         release(drive, joint)
         return
     torque = readings.torque[joint]

@@ -125,9 +125,9 @@ def posture_of(pelvis: Sequence[float], tibiae: Sequence[Sequence[float]], knees
     length = math.hypot(left_x, left_y)
     drops, lean = [], 0.0
     for (w, x, y, z), knee in zip(tibiae, knees, strict=True):
-        # Long axis of the shank in world axes.
+        # Components x, y and z of the long axis of the shank in the world.
         shank_x, shank_y, shank_z = 2.0 * (x * z + w * y), 2.0 * (y * z - w * x), 1.0 - 2.0 * (x * x + y * y)
-        # Upward component of the long axis of the thigh. The thigh points like the shank rotated by minus the knee angle.
+        # Vertical component of the thigh axis, which is the shank axis rotated about the knee axis by -knee.
         thigh_z = math.cos(knee) * shank_z - math.sin(knee) * 2.0 * (x * z - w * y)
         drops.append(SEGMENT * (thigh_z + shank_z))
         lean += (shank_x * left_x + shank_y * left_y) / (length * len(SIDES))

@@ -45,10 +45,12 @@ _TORSO, _PELVIS = IMUS.index("torso"), IMUS.index("pelvis")
 
 
 class Filters(NamedTuple):
-    """Values of the filters. Element 0 is for the acceleration along x, element 1 for the acceleration along y.
+    """Values of the filters.
 
+    The first four arrays have one element for each axis: element 0 for the acceleration along x, element 1 along y.
     The rate of element 0 is the angular velocity about y. The rate of element 1 is minus the angular velocity about x.
     The filtered rate is rate - `slow_rate` - `slower_rate`. The filtered speed is `speed` - `slow_speed`.
+    The height of the torso IMU above the pelvis IMU is `moments[0]` / `moments[1]`.
     """
 
     speed: Vector  # (2,) leaky integral of the torso acceleration minus the pelvis acceleration [m/s]
@@ -56,7 +58,8 @@ class Filters(NamedTuple):
     slow_rate: Vector  # (2,) low-pass of the rate [rad/s]
     slower_rate: Vector  # (2,) low-pass of (rate - `slow_rate`) [rad/s]
     time: Vector  # (1,) time since the start, up to `_SETTLING_TIME` [s]
-    #: (2,) sums over both axes: mean of filtered speed * filtered rate [m/s2], mean square of the filtered rate [rad2/s2]
+    #: (2,) element 0: mean of (filtered speed * filtered rate), x and y added [m/s2];
+    #: element 1: mean of (filtered rate squared), x and y added [rad2/s2]
     moments: Vector
 
 

@@ -19,7 +19,7 @@ class AirwalkConfig(StepGuideConfig):
     """
 
     #: Whether the assisted joints and the baseline controller follow the paper literally, see `guide.literal`.
-    #: If true, no guide is certified for a disturbance torque.
+    #: If true, there is no proof that the joints stay inside the guide when a disturbance torque acts.
     literal_law: bool = False
     gains: PidGains = AIR_GAINS
     alpha: float = 0.4  # end of the re-centring (see `gait.recentering`), as a fraction of the step duration

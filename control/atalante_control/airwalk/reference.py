@@ -58,8 +58,8 @@ class GaitReference:
         self._basis[0, :, :_N], self._basis[0, :, _N:] = c0[:end, None], c0d[:end, None]
         self._basis[1, :, :_N], self._basis[1, :, _N:] = c1[:end, None], c1d[:end, None]
         self._added = np.zeros_like(self._basis)
-        # Measured deviations of the 12 joints: s(0) in `_angles`, s'(0) in `_rates`. Each array contains its 12 values twice:
-        # first as factors for the columns s of `_basis`, then as factors for the columns s'.
+        # `_angles` and `_rates` contain the measured deviations of the 12 joints, s(0) and s'(0).
+        # Each value is stored twice, so that one product with the 24 columns of `_basis` gives both s and s' of the joint.
         self._angles, self._rates = np.zeros(2 * _N), np.zeros(2 * _N)
 
     def start_step(self, stance: int, position: Vector, velocity: Vector) -> Deviation:

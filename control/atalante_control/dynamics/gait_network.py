@@ -286,8 +286,8 @@ def _network(arrays: Mapping[str, npt.NDArray[Any]]) -> GaitNetwork:
         width = columns
     if width != OUTPUTS:
         raise ArrayFileError(f"the last layer must have {OUTPUTS} columns, got {width}")
-    # A gait is a weighted sum of the rows of the last weight matrix, plus the bias. If neither a row nor the bias has an angle
-    # jump at the stance change, no gait has one.
+    # A gait of the network is the bias plus a weighted sum of the rows of the last weights. Bias and rows are themselves gaits.
+    # If the angles of these gaits do not jump at the stance change, the angles of their sums do not jump.
     defect = np.abs(periodicity()[: len(JOINTS)] @ np.vstack([layers[-1].weights, layers[-1].bias]).T).max()
     if not defect <= _PERIODICITY_DEFECT:
         raise ArrayFileError(

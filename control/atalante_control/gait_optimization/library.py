@@ -34,7 +34,7 @@ from atalante_control.gait_optimization.verify import Verifier
 from atalante_hal.robot import Robot, load_robot
 
 FORMAT = "atalante-library/2"
-_ROOT_ITERATIONS = 60  # number of iterations in the computation of the root g, see `Grid.points`
+_ROOT_ITERATIONS = 60  # number of fixed-point iterations that solve the equation g^(d + 1) = g + 1 in `Grid.points`
 LEVELS_MIN = 3  # smallest number of grid levels of a parameter; a network fitted to 2 levels has an error of 10 degrees
 
 Index = tuple[int, ...]

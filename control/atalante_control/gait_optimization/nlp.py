@@ -24,11 +24,11 @@ class Rows(NamedTuple):
     """Named group of constraints: lower <= values <= upper."""
 
     name: str  # readable name of the group, for example "swing clearance"
-    unit: str  # SI unit of `values`
-    size: float  # [unit] scale; the program divides values and bounds by this scale
-    values: Symbol  # SX, constrained expressions, shape (m,) [unit]
-    lower: Vector  # [unit] lower bounds, shape (m,), or (repetitions, m) if they differ between repetitions
-    upper: Vector  # [unit] upper bounds, same shapes as `lower`
+    unit: str  # SI unit of `size`, `values`, `lower` and `upper`
+    size: float  # scale of the group; the solver gets the values and the bounds divided by this scale
+    values: Symbol  # CasADi SX expressions to constrain, shape (m,)
+    lower: Vector  # lower bounds, shape (m,), or (repetitions, m) if they differ between repetitions
+    upper: Vector  # upper bounds, same shapes as `lower`
 
 
 class Group(NamedTuple):
@@ -36,7 +36,7 @@ class Group(NamedTuple):
 
     name: str  # name of the group, as in `Rows`
     unit: str  # SI unit of the constraints, as in `Rows`
-    size: float  # scale of the constraints, as in `Rows`
+    size: float  # scale of the group, as in `Rows`
     rows: Indices  # row indices in g
 
 
@@ -56,9 +56,9 @@ NAMES = ("nlp_f", "nlp_g", "nlp_grad_f", "nlp_jac_g", "nlp_hess_l")
 class _Block(NamedTuple):
     """Expression that is repeated for several groups of unknowns: a cost if it has weights, else a constraint."""
 
-    expression: Symbol  # SX, cost or constraints of one repetition
-    x: Symbol  # SX symbols of the unknowns of one repetition, shape (n,)
-    at: Indices  # indices of the unknowns of each repetition, shape (repetitions, n)
+    expression: Symbol  # CasADi SX expression to repeat: a scalar cost, or a column of constraints
+    x: Symbol  # CasADi SX symbols of the n variables in `expression`, shape (n,)
+    at: Indices  # indices of the unknowns that replace `x` in each repetition, shape (repetitions, n)
     weights: Vector | None  # weight of each repetition in the objective, or None if the expression is a constraint
 
 

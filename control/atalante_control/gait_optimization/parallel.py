@@ -109,7 +109,11 @@ def fan_out(
 
 
 def _lost(calls: int) -> str:
-    """Return the start of a message: a process ended unexpectedly, and `calls` calls have no result."""
+    """Return the first half of an error text, which states that a process ended unexpectedly.
+
+    Args:
+        calls: number of calls that have no result.
+    """
     return f"a process ended unexpectedly, for example for lack of memory; calls without a result: {calls}"
 
 

@@ -263,6 +263,11 @@ class StepProblem:
     def constraint_bounds(self, around: Gait | None = None) -> tuple[Vector, Vector]:
         """Return the lower and upper bounds of the constraint function g.
 
+        A start step ends in the periodic gait, and a stop step begins in the periodic gait. Where the steps meet, both must have
+        the same joint angles and the same joint speeds. At each end of a step, the outermost control point is the joint angle.
+        The joint speed is proportional to (difference to the next control point) / (step duration). A start or stop step lasts
+        `TRANSITION` seconds. So the difference in the periodic step is multiplied by TRANSITION / around.duration.
+
         Args:
             around: periodic gait after a start step or before a stop step; None for a periodic step.
         """
@@ -270,9 +275,7 @@ class StepProblem:
         if around is not None:
             end, next_one = (-1, -2) if self.kind == "start" else (0, 1)
             pose, other = around.coefficients[:, end], around.coefficients[:, next_one]
-            # Where two steps meet, both steps must have the same joint speed. The joint speed at the end of a step is
-            # DEGREE * (difference of the two control points at this end) / (step duration). A start or stop step lasts
-            # `TRANSITION` seconds, so the difference in the periodic step is multiplied by TRANSITION / around.duration.
+            # For equal joint speeds, the difference of two control points is proportional to the duration of the step.
             points = {"gait pose": pose, "gait speed": pose + (other - pose) * TRANSITION / around.duration}
             for group in self.program.groups:
                 if group.name in points:

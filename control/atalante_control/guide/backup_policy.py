@@ -55,7 +55,7 @@ class SampledLoop:
         for name in ("torque_lag", "velocity_bandwidth"):
             value = getattr(self, name)
             if not (math.isfinite(value) and value > 0.0):
-                raise ValueError(f"{name} of the sampled loop must be positive and finite, got {value!r}")
+                raise ValueError(f"{name} of the drives must be positive and finite, got {value!r}")
 
     @property
     def tracking(self) -> float:

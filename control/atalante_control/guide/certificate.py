@@ -68,8 +68,8 @@ class JointTorque:
 class Limit(NamedTuple):
     """Condition that limits the disturbance torques for which a guide can be certified."""
 
-    #: Largest disturbance torques with which the guide meets the condition, as a fraction of the requested torques. Example: 0.8
-    #: means 24 Nm if 30 Nm are requested. The fraction is negative if the model errors alone violate the condition.
+    #: Largest factor on the requested disturbance torques of hip and knee with which the guide meets the condition. Example: 0.8
+    #: means 24 and 14.4 Nm if 30 and 18 Nm are requested. A negative factor means that the model errors alone are too large.
     scale: float
     what: str  # condition in words, for a message
 
@@ -182,10 +182,12 @@ def _pair(torque: Vector) -> JointTorque | None:
 
 
 def _limit(room: Vector, reach: Vector, steps: int, what: str) -> Limit:
-    """Return the condition that a quantity stays below its limit in each cycle of a step.
+    """Compute the largest factor on the requested disturbance torques with which a quantity stays below its limit.
 
-    The quantity is the tracking error, the torque, the speed or the torque change of SH and SK. `Limit.scale` is the smallest
-    (room - effect of the model errors) / (effect of the requested disturbance torques) of all cycles and joints.
+    The quantity is the tracking error, the torque, the speed or the torque change of SH and SK. The model errors use up a part
+    of the room below the limit. The disturbance torques may use the rest. The factor is therefore
+    (room - effect of the model errors) / (effect of the requested torques), in the worst cycle and for the worse joint. The
+    message `Limit.what` names this cycle and this joint.
 
     Args:
         room: limit minus the value of the quantity without disturbances, for SH and SK in each cycle, shape (n, 2).
@@ -207,6 +209,9 @@ class _Horizon:
     the last predicted cycle, plus a small remainder. The errors in two earlier predicted cycles determine the remainder.
     The largest possible remainder follows, because all predicted errors are inside the guide.
 
+    The constructor computes three upper bounds of the remainder. Each bound is a weighted sum of the absolute errors in two
+    earlier cycles. `limit` uses the bound with the best result.
+
     Attributes:
         cycles: number of predicted cycles.
     """
@@ -219,48 +224,55 @@ class _Horizon:
         # Error one cycle after the prediction = factor * error in the last predicted cycle + remainder.
         self._factor = (beyond * rows[-1]).sum(axis=1) / (rows[-1] ** 2).sum(axis=1)
         remainder = beyond - self._factor[:, None] * rows[-1]
-        #: Three upper bounds of the remainder, each an element (lags, weights): |remainder| <= |errors| @ weights.
-        #: `errors` has four elements: hip and knee in predicted cycle lags[0], then hip and knee in predicted cycle lags[1].
-        #: `weights` has one row for each element of `errors`, and two columns: remainder of the hip, remainder of the knee.
-        self._pairs: list[tuple[tuple[int, int], Vector]] = []
+        #: Upper bounds of the remainder. Each element contains the two earlier cycles, and the weights of the errors in these
+        #: cycles. Weight matrix, shape (4, 2): one row per error (hip and knee in the nearer cycle, hip and knee in the farther
+        #: cycle), one column per bound (hip, knee).
+        self._remainders: list[tuple[tuple[int, int], Vector]] = []
         for near, far in ((0.1, 0.3), (0.25, 0.5), (0.4, 0.7)):
             lags = round(near * self.cycles), round(far * self.cycles)
             inverse = np.linalg.pinv(np.concatenate([rows[lag] for lag in lags]), rcond=1e-9)
-            self._pairs.append((lags, np.abs(remainder @ inverse).T))
+            self._remainders.append((lags, np.abs(remainder @ inverse).T))
         self._starts = np.arange(0, max(1, len(prediction.leg.time) - self.cycles - 1), START_CYCLES)
         self._reach = prediction.reach[self._starts // START_CYCLES]
 
     def limit(self, width: Vector, narrowest: Vector) -> Limit:
-        """Return the condition that the error one cycle after the last predicted cycle is inside the guide.
+        """Compute the largest factor on the requested disturbance torques with which the next error is inside the guide.
+
+        The next error is the error one cycle after the last predicted cycle. The factor is called `scale`.
+
+        In each cycle, the error without disturbances may be at most `free - scale * used`. Here, `free` is the guide width minus
+        the effect of the model errors, and `used` is the effect of the requested torques. In the worst case, the error has this
+        largest value in the last predicted cycle and in the two earlier cycles. Then the next error is at most
+
+            factor * (last_free - scale * last_used) + (early_free - scale * early_used) @ weights
+
+        This value must be at most `next_free - scale * next_used`. With `scale` on the left side only, the condition is
+        `scale * need <= have`, where
+
+            have = next_free - factor * last_free - early_free @ weights
+            need = next_used - factor * last_used - early_used @ weights
 
         Args:
             width: distance from q_des to the nearer bound of the guide in each cycle, shape (n, 2) [rad].
             narrowest: largest allowed error if the prediction ends in the cycle, shape (n, 2) [rad], see `filter.tail`.
         """
 
-        def room(lag: int) -> tuple[Vector, Vector]:
-            """Return two arrays of errors in the predicted cycle `lag`, each of shape (starts, 2) [rad].
+        def parts(lag: int) -> tuple[Vector, Vector]:
+            """Return the arrays `free` and `used` in cycle `lag` of each prediction, each of shape (starts, 2) [rad].
 
-            Array 1: guide width minus the effect of the model errors. Array 2: effect of the requested disturbance torques.
+            `free`: guide width minus the tracking error that the model errors can cause.
+            `used`: tracking error that the requested disturbance torques can cause.
             """
             added = self._reach[:, min(lag, self.cycles)]
-            rooms = narrowest if lag == self.cycles else width
-            return rooms[self._starts + lag] - added[:, :2], added[:, 2:]
+            widths = narrowest if lag == self.cycles else width
+            return widths[self._starts + lag] - added[:, :2], added[:, 2:]
 
-        (last, last_promise), (end, end_promise) = room(self.cycles), room(self.cycles + 1)
+        (last_free, last_used), (next_free, next_used) = parts(self.cycles), parts(self.cycles + 1)
         found = []
-        for lags, weights in self._pairs:
-            rooms, promises = (np.hstack(parts) for parts in zip(*map(room, lags), strict=True))
-            # `scale` is the fraction of the requested disturbance torques. The largest error that a cycle permits falls with
-            # `scale`, because the disturbances need a part of the guide width:
-            # - last predicted cycle: last - scale * last_promise,
-            # - the two earlier cycles `lags`: rooms - scale * promises,
-            # - one cycle after the prediction: end - scale * end_promise.
-            # If the predicted errors have the largest permitted values, the error one cycle after the prediction is
-            # factor * (last - scale * last_promise) + (rooms - scale * promises) @ weights.
-            # This error must be at most end - scale * end_promise. Solved for `scale`: scale * need <= have.
-            have = end - self._factor * last - rooms @ weights
-            need = end_promise - self._factor * last_promise - promises @ weights
+        for lags, weights in self._remainders:
+            early_free, early_used = (np.hstack(pair) for pair in zip(*map(parts, lags), strict=True))
+            have = next_free - self._factor * last_free - early_free @ weights
+            need = next_used - self._factor * last_used - early_used @ weights
             with np.errstate(divide="ignore"):
                 scales = np.where(need > 0.0, have / np.maximum(need, 1e-12), np.where(have >= 0.0, np.inf, -1.0))
             found.append(scales.min(axis=1))

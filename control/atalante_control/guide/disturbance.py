@@ -65,7 +65,8 @@ class HandOver:
 
     deviation: float = math.radians(2.7)  # rad, largest angle deviation |s(0)| of sagittal hip and knee
     rate: float = 0.25  # rad/s, largest speed deviation |s'(0)| of sagittal hip and knee
-    #: Nm, largest torques of sagittal hip and knee that the carry-over adds at the start of a step
+    #: Nm, largest torque jump at a stance change, of sagittal hip and knee. In the air, the controller adds a torque that cancels
+    #: the jump, and this torque then fades out.
     torque: Pair = (25.0, 13.0)
     #: rad/s2, largest joint acceleration before the stance change. The acceleration distorts the velocity measured
     #: after the change.
@@ -79,24 +80,23 @@ class HandOver:
             raise ValueError(f"torque of the hand-over must be finite and at least 0 Nm, got {self.torque!r}")
 
     def largest(self, values: Vector) -> Vector:
-        """Return the worst-case size of a re-centring curve, for all start deviations up to `deviation` and `rate`.
+        """Return the largest absolute value that the re-centring offset s(t) can have at each time, shape (n,).
 
-        Re-centring adds an offset s(t) to the nominal trajectory after a stance change. The curve is s, s' or s''.
+        Re-centring adds the offset s(t) to the nominal trajectory, so that a step starts without a tracking error. The offset
+        is linear in the start deviations s(0) and s'(0). The deviations are at most `deviation` and `rate`, with any sign.
 
         Args:
-            values: the curve for s(0) = 1 rad (row 0) and for s'(0) = 1 rad/s (row 1) at n times, shape (2, n).
-
-        Returns:
-            Largest absolute value of the curve at each time, shape (n,). The curve is linear in the deviations, so the
-            largest deviations are the worst case.
+            values: s at n times, shape (2, n). Row 0: for s(0) = 1 rad. Row 1: for s'(0) = 1 rad/s. With the values of s' or s''
+                instead, the result is the largest absolute value of s' or s''.
         """
         return np.asarray(np.abs(values).T @ [self.deviation, self.rate])
 
 
 class Leg(NamedTuple):
-    """Data of the swing leg along its nominal trajectory, in one step and in the first cycles of the next step (overlap).
+    """Data of one leg along its nominal trajectory.
 
-    The rows are cycles; the columns are SH and SK.
+    The leg is the swing leg of a step. In the air, the data also contain the first cycles of the next step, because predictions
+    reach into the next step. In these cycles, the leg is the stance leg. The rows are cycles; the columns are SH and SK.
     """
 
     deadbeat: Deadbeat  # re-centring of the gait
@@ -174,17 +174,23 @@ _SPEED_MARGIN = 1.0
 
 
 class Effect(NamedTuple):
-    """Effect of a disturbance on two outputs, one per joint (hip, knee). An output is an error, a torque or a speed."""
+    """Matrices from a disturbance to its effect on the hip and on the knee. The effect is an error, a torque or a speed.
 
-    #: (n, 2, 2) pushed[i] @ a is the response to an acceleration a that lasts one cycle, i cycles after the acceleration.
+    A disturbance is an acceleration of hip and knee that lasts one cycle. The disturbance has two effects:
+
+    1. The disturbance moves the joints. The matrices `pushed` describe the motion in the following cycles.
+    2. While the joints accelerate, the measured velocity lags behind the true velocity. Therefore a prediction starts with a
+       wrong velocity. The matrices `hidden` describe how the wrong velocity changes the prediction.
+
+    The matrices `left` convert an acceleration to a torque. For an error or a speed, they are unit matrices.
+    """
+
+    #: (n, 2, 2) matrix i converts an acceleration that lasts one cycle to the error, speed or acceleration i cycles later
     pushed: Vector
-    #: (n, 2, 2) response to a wrong start velocity; (0, 2, 2) to ignore this response. The measured velocity lags behind the true
-    #: velocity. While a disturbance accelerates the joints by a, a prediction therefore starts with a wrong velocity.
-    #: hidden[i] @ a is the response to this velocity error, i cycles after the prediction starts.
+    #: (n, 2, 2) matrix i converts an acceleration at the start of a prediction to the change of the prediction i cycles later.
+    #: With an empty array (0, 2, 2), this change is left out.
     hidden: Vector
-    #: (n, 2, 2) conversion from response to output in each cycle k of the step: output = left[k] @ response. For example, the
-    #: mass matrix left[k] converts an acceleration to a torque.
-    left: Vector
+    left: Vector  # (n, 2, 2) mass matrix in each cycle of the step if the effect is a torque, otherwise unit matrices
 
 
 class Grid(NamedTuple):
@@ -197,18 +203,18 @@ class Grid(NamedTuple):
 
 
 def spread(effect: Effect, mobilities: Vector, bounds: Vector, grid: Grid, ahead: Vector) -> Vector:
-    """Compute the worst-case change of two outputs that disturbance torques can cause: one output per joint (hip, knee).
+    """Compute how much disturbance torques can change the error, the torque or the speed of hip and knee in the worst case.
 
-    An output is an error, a torque or a speed, see `Effect`. The function fills `ahead` and returns a second array.
+    `effect` selects the quantity: error, torque or speed. The function fills `ahead` and returns a second array.
     In `ahead`, the disturbances begin when a prediction starts.
     In the returned array, the disturbances begin at the start of the step.
 
-    In both arrays, columns 0 and 1 are the changes of the hip output and the knee output due to the budget (torque errors of the
-    model). Columns 2 and 3 are the changes due to the requested promise (disturbance torques of the certificate).
-    Each change is a sum of absolute values over the cycles.
+    In both arrays, columns 0 and 1 are the changes for hip and knee due to the budget (torque errors of the model). Columns 2 and
+    3 are the changes due to the requested promise (disturbance torques of the certificate). Each change is a sum of absolute
+    values over the cycles. In the code, `total[k]` is the change in cycle k due to the disturbances of the last `lag` cycles.
 
     Args:
-        effect: effect of a disturbance on the outputs.
+        effect: matrices from a disturbance to its effect on the quantity.
         mobilities: inverse mass matrices of each cycle, shape (n, postures, 2, 2).
         bounds: torque bounds of SH and SK (rows), budget and requested promise (columns), in each cycle, shape (n, 2, 2) [Nm].
         grid: start cycles and lengths of the predictions in `ahead`.
@@ -217,12 +223,11 @@ def spread(effect: Effect, mobilities: Vector, bounds: Vector, grid: Grid, ahead
             Predictions past the end of `bounds` are left out.
 
     Returns:
-        The worst-case change in each cycle due to the disturbances since cycle 0, without the response `hidden`, shape (n, 4).
+        The worst-case change in each cycle due to the disturbances since cycle 0, without `Effect.hidden`, shape (n, 4).
     """
     count, postures = len(bounds), mobilities.shape[1]
-    # In the loop, total[k] is the change in cycle k due to the disturbances in the cycles k - lag to k.
-    # added[k] is the change in cycle k + lag, if a prediction starts in cycle k with a wrong velocity (`Effect.hidden`).
-    total, added = np.zeros((count, 4)), np.zeros((grid.starts, 4))
+    # wrong_start[k]: largest effect of a wrong start velocity on a prediction from cycle k to cycle k + lag.
+    total, wrong_start = np.zeros((count, 4)), np.zeros((grid.starts, 4))
     both = np.zeros((2, 2, 2))
     column = 0
     for lag in range(count):
@@ -249,11 +254,11 @@ def spread(effect: Effect, mobilities: Vector, bounds: Vector, grid: Grid, ahead
                         total[end, r] += budget
                         total[end, r + 2] += promise
                     else:
-                        added[start, r], added[start, r + 2] = budget, promise
+                        wrong_start[start, r], wrong_start[start, r + 2] = budget, promise
         for start in range(starts):
             for r in range(4):
-                output = total[start + lag, r] + added[start, r]
-                ahead[start // grid.block, column, r] = max(ahead[start // grid.block, column, r], output)
+                change = total[start + lag, r] + wrong_start[start, r]
+                ahead[start // grid.block, column, r] = max(ahead[start // grid.block, column, r], change)
         if reported:
             column += 1
     return total

@@ -1,8 +1,12 @@
-"""Compiled cycle of the virtual guide filter: measured motion -> h -> gate -> torques of sagittal hip and knee (SH, SK).
+"""Compiled cycle of the virtual guide filter, which computes the torques of sagittal hip and knee (SH, SK).
 
-`GuideFilter` prepares the tables and runs the compiled `tick`. A tick estimates the state of the sampled loop (`_estimate`),
-predicts errors, torques and speeds under the backup policy (`largest_ratio`), and blends the torque of the free motion with the
-backup torque.
+`GuideFilter` prepares the tables and runs the compiled `tick` in each cycle. A tick has four steps:
+
+1. Estimate the state of the leg from the measurements (`_estimate`).
+2. Predict errors, torques and speeds under the backup policy. Their largest ratio to their limits gives the safety value h
+   (`largest_ratio`).
+3. Compute the gate from h. The gate is the weight of the backup torque (`gate`, `damped_gate`).
+4. Return the weighted mean of the torque of the free motion and the backup torque.
 """
 
 from __future__ import annotations
@@ -17,12 +21,11 @@ from atalante_hal.types import Vector
 
 Pair = tuple[float, float]
 
-#: Slope for the ratios of torque and speed. Let x be a predicted torque or speed divided by its limit. The kernel
-#: converts x to 1 - STEEPNESS * (1 - x), which is 1 at x = 1.
-#: Normal walking already uses most of the allowed torque and speed. With a steep slope, the weight of the backup torque rises
-#: only close to the limits.
+#: Normal walking already uses most of the allowed torque and speed. The backup torque must rise only close to these limits.
+#: So a ratio x (torque / limit or speed / limit) is replaced by 1 - STEEPNESS * (1 - x). Example: 0.9 becomes 0.6, 1 stays 1.
 STEEPNESS = 4.0
-#: Number of elements of the compressed state, from which the predicted errors are computed.
+#: Number of elements of the compressed state, a short form of the state of the leg. The tracking errors are predicted from the
+#: compressed state, because this is faster.
 COMPRESSED = 5
 #: Number of consecutive predicted cycles in a `Block`. `Block.slack` bounds the effect of model errors in all these
 #: cycles.
@@ -56,8 +59,8 @@ class Guard:
     motor: Annotated[Vector, 2]  # Nm, estimated torques of the motors of hip and knee
     lag: Annotated[Vector, 2]  # rad/s, estimated error of the measured velocities of hip and knee: true minus measured
     state: Annotated[Vector, STATES]  # state of the last cycle, see `backup_policy`
-    #: Absolute values of the state elements. `Block.slack` and `Few.slack` are multiplied by them.
-    #: Exception: elements 2 and 3 are |true minus measured error rate e'| of hip and knee.
+    #: Absolute values of the elements of `state`. The effect of model errors is proportional to these values.
+    #: Instead of the true error rates, elements 2 and 3 contain abs(true error rate - measured error rate) of hip and knee.
     magnitude: Annotated[Vector, STATES]
     compression: Annotated[Vector, (COMPRESSED, STATES)]  # matrix from the state to the compressed state
     compressed: Annotated[Vector, COMPRESSED]  # compressed state of the last cycle
@@ -65,8 +68,7 @@ class Guard:
     #: safety value 1 - `largest_ratio`^2 of the last cycle; at h >= 0, the backup policy can keep both joints inside the guide
     h: float
     rate: float  # 1/s, dh/dt after the low-pass filter
-    #: weight of the backup torque: the maximum of `damped_gate`, the lower bound in column `FLOOR`, and (last gate - `release`)
-    gate: float
+    gate: float  # weight of the backup torque in the last cycle, in [0, 1]
     #: rad, distances from q_des to the bounds: hip upper, hip lower, knee upper, knee lower
     bounds: Annotated[Vector, 4]
 
@@ -77,7 +79,8 @@ class Lag:
     A record has arrays of fixed shape, so the compiled loops are fast.
     """
 
-    #: Compressed state @ `ahead` gives the predicted tracking errors of sagittal hip and knee [rad].
+    #: Matrix from the five numbers `Guard.compressed` (state of the leg) to the predicted errors of hip and knee [rad]:
+    #: compressed @ ahead.
     ahead: Annotated[Vector, (COMPRESSED, 2)]
 
 
@@ -106,7 +109,15 @@ class Few:
 
 
 class GuideTables(NamedTuple):
-    """Tables of the guide filter. `GuideFilter` owns the tables; `tick` writes to `guards` and to `Block.ratio` only."""
+    """Tables of the guide filter. `GuideFilter` owns the tables; `tick` writes to `guards` and to `Block.ratio` only.
+
+    Columns of `few_reach`:
+
+    - 0 to 3: change of hip torque, knee torque, hip speed and knee speed due to torque errors of the model,
+    - 4 to 7: change of hip torque, knee torque, hip speed and knee speed due to the disturbance torques `Assumptions.promise`,
+    - 8 and 9: as columns 2 and 3 (hip and knee speed, torque errors of the model), but with the worst inertia and delay,
+    - 10 and 11: as columns 6 and 7 (hip and knee speed, `Assumptions.promise`), but with the worst inertia and delay.
+    """
 
     guards: Records[Guard]  # (1,) constants, state and results of the filter
     laws: Records[Law]  # (1,) mass matrix and friction
@@ -114,20 +125,17 @@ class GuideTables(NamedTuple):
     blocks: Records[Block]  # (blocks,) bounds of the predicted tracking errors
     few: Records[Few]  # (rows,) predictions of torque and speed, in ascending order of `Few.lag`
     #: (starts, lags, 4) rad, largest tracking errors that disturbances can cause.
-    #: Axis 0: blocks of `START_CYCLES` cycles in which a prediction starts. Axis 1: number of cycles ahead.
-    #: Axis 2: hip and knee due to model errors, then hip and knee due to the disturbance torques `Assumptions.promise`.
+    #: Example: reach[2, 50] is the error 50 cycles ahead, if the prediction starts in one of the cycles 8 to 11 of the step.
+    #: The 4 columns: hip and knee due to model errors, then hip and knee due to the disturbance torques `Assumptions.promise`.
     reach: Vector
-    highest: Vector  # (starts, blocks, 4) maximum of `reach` over each block of cycles ahead [rad]
-    #: (starts, rows, 12) largest effects on the torques [Nm] and speeds [rad/s] of sagittal hip and knee (SH, SK).
-    #: Axis 0: blocks of `START_CYCLES` cycles in which a prediction starts. Axis 1: records of `few`.
-    #: Columns 0 to 7 are computed with the inertia and the delay of the model:
-    #: Columns 0 to 3: torque of SH, torque of SK, speed of SH, speed of SK, due to torque errors of the model.
-    #: Columns 4 to 7: torque of SH, torque of SK, speed of SH, speed of SK, due to the disturbance torques `Assumptions.promise`.
-    #: Columns 8 to 11 are computed with the worst inertia and the worst delay instead:
-    #: Columns 8 and 9: speeds of SH and SK due to torque errors of the model.
-    #: Columns 10 and 11: speeds of SH and SK due to the disturbance torques `Assumptions.promise`.
+    #: (starts, blocks, 4) rad, maximum of `reach` over all cycles of a `Block`.
+    #: Example: highest[2, 5] is the maximum of reach[2, 50] to reach[2, 59].
+    highest: Vector
+    #: (starts, rows, 12) largest changes of torque [Nm] and speed [rad/s] that disturbances can cause. Columns: see above.
+    #: Example: few_reach[2, 3] is the change few[3].lag cycles ahead, if the prediction starts in one of the cycles 8 to 11.
     few_reach: Vector
-    #: (n, COLUMNS) values of each cycle of the step and of the overlap with the next step. The columns are defined below.
+    #: (n, COLUMNS) values of gait and guide in each cycle of a step. In the air, additional rows after the end of the step
+    #: contain the first cycles of the next step, because predictions reach into the next step.
     step: Vector
 
 
@@ -137,8 +145,8 @@ VELOCITY = 6  # columns 6 and 7 of `step`: velocity of q_des after the low-pass 
 BASE = 8  # columns 8 and 9 of `step`: torque that moves the leg along q_des [Nm]
 MASS = 10  # columns 10 to 12 of `step`: mass matrix M11, M12 and M22 along q_des [kg m2]
 SPEED = 13  # columns 13 and 14 of `step`: velocity of q_des [rad/s]
-#: Column 15 of `step`: lower bound of the gate. The bound is 1 at the start of a step, when the filter takes over the
-#: joints, and falls to 0 with `CarryOver.blend`.
+#: Column 15 of `step`: smallest allowed weight of the backup torque. This minimum falls from 1 to 0 in the first cycles of a
+#: step, while the filter takes over the joints.
 FLOOR = 15
 #: Columns 16 to 19 of `step`: maximum of columns 0 to 3 over this cycle and the next `TAIL_CYCLES` cycles, plus a margin [1/rad].
 #: See `filter.tail`.
@@ -146,8 +154,7 @@ TAIL = 16
 #: Columns 20 to 23 of `step`: maximum of columns 0 to 3 over `SLACK_CYCLES` cycles from this cycle on [1/rad].
 NEAR = 20
 COLUMNS = 24
-#: The guide can become narrower after the prediction ends. The error in the last predicted cycle must therefore also fit into
-#: the guide of this number of later cycles.
+#: Number of cycles after the last predicted cycle in which the guide must still be wider than the last predicted error.
 TAIL_CYCLES = 60
 
 
@@ -196,6 +203,8 @@ def tick(guide: GuideTables, cycle: int, leg: LegState) -> Pair:
     """Compute the torques of sagittal hip and knee for one cycle: (1 - gate) u_free + gate u_B.
 
     u_free is the sum of u_i and u_f, each multiplied by its intensity. u_B is the backup torque, see `backup_policy`.
+    The gate is the result of `damped_gate`, with two lower bounds: the value in column `FLOOR`, and the last gate minus
+    `Guard.release`. The second bound does not apply in the first cycle of a step.
 
     Args:
         guide: tables of the guide filter; the results of the tick are written to `GuideTables.guards`.
@@ -365,7 +374,7 @@ def bound_blocks(guide: GuideTables, cycle: int, blocks: int) -> int:
 
 
 def _few_ratio(guide: GuideTables, cycle: int, least: float) -> float:
-    """Return the largest ratio x of predicted torque or speed to its limit, converted to 1 - STEEPNESS * (1 - x).
+    """Return the largest ratio of a predicted torque or speed to its limit, converted with the slope `STEEPNESS`.
 
     Args:
         guide: tables of the guide filter.
@@ -409,10 +418,12 @@ def _few_ratio(guide: GuideTables, cycle: int, least: float) -> float:
 
 
 def gate(h: float, xi: float) -> float:
-    """Return the gate lambda of the paper: (1 + (Xi^10 - 1) h)^3, clamped to [0, 1]; 1 outside the safe backward image (h < 0).
+    """Return the weight of the backup torque without damping (lambda in the paper): (1 + (Xi^10 - 1) h)^3, limited to [0, 1].
+
+    If h < 0, the backup policy may not be able to keep the joints inside the guide. Then the weight is 1.
 
     Args:
-        h: safe backward image function, at most 1; h is at least 0 inside the safe backward image.
+        h: safety value, at most 1 (in the paper: function of the safe backward image).
         xi: assistance factor in [0, 1].
     """
     if h <= 0.0:

@@ -53,10 +53,10 @@ class LiteralRecord:
 
 
 class LiteralTables(NamedTuple):
-    """Tables of the control law that follows the paper literally. Of these tables, `assistive_torque` changes only `records`."""
+    """Tables of the control law that follows the paper literally."""
 
-    records: Records[LiteralRecord]  # (1,) record with the constants and the state of the control law
-    step: Vector  # (cycles + 1, 8) values of each cycle of the step; the columns are defined below
+    records: Records[LiteralRecord]  # (1,) constants and state of the control law; `assistive_torque` updates the state
+    step: Vector  # (cycles + 1, 8) bounds, reference and feedforward in each cycle of the step; columns: see below
 
 
 BOUND = 0  # columns 0 to 3 of `step`: distances to the upper and lower bound of the hip, then of the knee [rad]
@@ -80,7 +80,7 @@ class LiteralGuide:
     """Control law that follows the paper literally, for one gait and one guide shape. Call `start_step` at each stance change.
 
     Attributes:
-        tables: tables of `assistive_torque`.
+        tables: constants, state and values of each cycle, with which `assistive_torque` computes the torque.
     """
 
     def __init__(self, config: LiteralConfig, shape: GuideShape, leg: Leg, feedforward: Vector) -> None:

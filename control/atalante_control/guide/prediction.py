@@ -119,7 +119,7 @@ class Prediction:
             for sign in (-1.0, 1.0)
         ]
         lightest = family[0]
-        changes = [_separated(one.error[: horizon + 1] - self.ahead @ self.compress) for one in family]
+        changes = [_for_rate_difference(one.error[: horizon + 1] - self.ahead @ self.compress) for one in family]
         self.slack = _blocks(np.abs(changes).max(axis=0), SLACK_CYCLES)
 
         mobilities = leg.mobilities(hand_over, width)
@@ -160,7 +160,7 @@ class Prediction:
         by_bound = few_ahead[:2].reshape(2, blocks, len(FEW), 2, 2).transpose(1, 2, 3, 0, 4)
         self.few_reach: Vector = np.concatenate([by_bound.reshape(blocks, len(FEW), 8), few_ahead[2]], axis=2)
         self.few_ahead: Vector = np.concatenate([nominal.feedback[FEW], nominal.rate[FEW]], axis=1)
-        rates = [_separated(one.rate[FEW] - nominal.rate[FEW]) for one in family]
+        rates = [_for_rate_difference(one.rate[FEW] - nominal.rate[FEW]) for one in family]
         self.few_slack: Vector = np.abs(rates).max(axis=0)
         # The torque that is carried over the stance change fades out slowly. Its change within one cycle is neglected.
         bounds[:, :, 0] = leg.budget(assumptions.mismatch, hand_over, np.zeros(0))
@@ -198,14 +198,15 @@ def prediction_of(policy: BackupPolicy, leg: Leg, assumptions: Assumptions, blen
     return tables
 
 
-def _separated(rows: Vector) -> Vector:
-    """Convert prediction matrices for a state in which the elements 2 and 3 are (true - measured) error rate.
+def _for_rate_difference(rows: Vector) -> Vector:
+    """Convert prediction matrices for a state with (true - measured) error rates instead of true error rates.
 
-    In the state of the given matrices, the elements 2 and 3 are the true error rate, and the elements 4 and 5 are the measured
-    error rate. The predicted values stay the same: a * true + b * measured = a * (true - measured) + (a + b) * measured.
+    The given matrices multiply a state in which elements 2 and 3 are the true error rates of SH and SK. Elements 4 and 5 are the
+    measured error rates. The returned matrices multiply a state in which elements 2 and 3 are the differences true - measured.
+    The predicted values are the same, because a * true + b * measured = a * (true - measured) + (a + b) * measured.
 
     Args:
-        rows: prediction matrices. The last axis are the coefficients of the state elements.
+        rows: prediction matrices. The index of the last axis is the element of the state.
     """
     result = rows.copy()
     result[..., 4:6] += rows[..., 2:4]

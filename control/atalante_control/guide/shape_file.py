@@ -84,9 +84,9 @@ def _shape(document: Mapping[str, Any]) -> GuideShape:
     distances = np.radians([_distances(document[joint], joint, len(phases)) for joint in JOINTS])
 
     def fractions(phase: Vector, width: float) -> tuple[Vector, Vector]:
-        between = _eased(phase, phases) if cosine else phase
+        phase = _warped(phase, phases) if cosine else phase
         upper, lower = (
-            np.stack([np.interp(between, phases, distances[joint, side]) for joint in range(len(JOINTS))])
+            np.stack([np.interp(phase, phases, distances[joint, side]) for joint in range(len(JOINTS))])
             for side in range(len(_SIDES))
         )
         if capped:
@@ -96,8 +96,13 @@ def _shape(document: Mapping[str, Any]) -> GuideShape:
     return GuideShape(name, summary, fractions)
 
 
-def _eased(phase: Vector, knots: Vector) -> Vector:
-    """Convert phases: `np.interp` at a converted phase gives the half-cosine interpolation at the original phase."""
+def _warped(phase: Vector, knots: Vector) -> Vector:
+    """Warp phases so that a linear interpolation at the warped phases is a half-cosine interpolation at the given phases.
+
+    Args:
+        phase: phases of the step, shape (n,).
+        knots: phases of the shape file, ascending from 0 to 1.
+    """
     at = np.clip(np.searchsorted(knots, phase, side="right") - 1, 0, len(knots) - 2)
     length = knots[at + 1] - knots[at]
     return np.asarray(knots[at] + length * (0.5 - 0.5 * np.cos(math.pi * (phase - knots[at]) / length)))

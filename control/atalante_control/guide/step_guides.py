@@ -28,11 +28,10 @@ _MIDDLE = math.radians(30.0)
 _ASSISTED = [LEG_JOINTS.index("SH"), LEG_JOINTS.index("SK")]
 #: Largest half-width of a guide [rad]. This width applies at assistance factor 0, see `half_width`.
 _WIDEST = math.radians(7.5)
-#: If no filter can be certified for the requested disturbance torques, a filter is certified for smaller torques. The smaller
-#: torques are this fraction of the largest torques for which the filter can be certified.
-#: With the fraction 1, the error, torque or speed predicted for these torques would already reach its limit without a real
-#: disturbance. The filter would then apply the full backup torque without need.
-_USED = 0.95
+#: If the requested disturbance torques cannot be certified, the filter is certified for this fraction of the largest certifiable
+#: torques. Every prediction of the filter includes the certified torques. With the fraction 1, a prediction would therefore reach
+#: its limit even if nobody pushes, and the filter would apply the full backup torque without need.
+_MARGIN = 0.95
 #: Number of decimal digits to which the assistance factor is rounded; the CAN signal has the same resolution.
 _DIGITS = 4
 
@@ -45,7 +44,7 @@ class Choice(NamedTuple):
 
 
 class StepGuides:
-    """Guide filters of one gait and one shape.
+    """Guide filters for one gait and one guide shape, one filter for each set of backup gains.
 
     Attributes:
         filters: guide filters in ascending order of their gains.
@@ -85,9 +84,10 @@ class StepGuides:
             self.at(percent / 100)
 
     def at(self, xi: float) -> Choice:
-        """Return the filter with the lowest backup stiffness that is certified for the requested disturbance torques.
+        """Return the softest guide filter that is certified for the requested disturbance torques.
 
-        If no filter is certified for the requested torques, return the filter with the largest certified torques.
+        The softest filter has the lowest stiffness of the backup policy. If no filter can be certified for the requested torques,
+        return the filter with the largest certifiable torques.
 
         Args:
             xi: assistance factor in [0, 1].
@@ -105,7 +105,7 @@ class StepGuides:
                 return Choice(guide, 1.0)
             if scale > most:
                 best, most = guide, scale
-        return Choice(best, min(1.0, max(0.0, _USED * most)))
+        return Choice(best, min(1.0, max(0.0, _MARGIN * most)))
 
     def certificate(self, xi: float) -> Certificate:
         """Return the certificate of the filter used at an assistance factor.

@@ -44,7 +44,7 @@ class ExoskeletonParameters:
     knee_lateral: float = 0.005  # m, lateral offset of joint SK relative to SH, positive outwards
     ankle_lateral: float = -0.169  # m, lateral offset of joint SA relative to SK, positive outwards
     toe_out: float = math.radians(8.0)  # rad, outward rotation of the foot about the vertical
-    ha_axis: Vector3 = (0.788, 0.0, 0.616)  # axis of joint HA in the foot frame; the URDF contains the unit vector
+    ha_axis: Vector3 = (0.788, 0.0, 0.616)  # direction of the HA axis in the foot frame; need not be a unit vector
 
     sole_size: tuple[float, float] = (0.275, 0.119)  # m, length and width of the sole
     sole_centre: tuple[float, float] = (0.06, -0.165)  # m, x and z of the sole centre relative to the ankle

@@ -47,12 +47,12 @@ class WalkConfig:
     """
 
     gains: PidGains = WALK_GAINS
-    #: Fraction by which the derivative gains of hip, knee and ankle (SH, SK, SA) of the stance leg fall for each cycle of
-    #: `State.delay`. With full gains and three cycles of delay, the stance leg of a light patient oscillates with 50 Hz after a
-    #: landing.
+    #: Reduction of the derivative gains of the stance leg (SH, SK, SA) per cycle of loop delay. With 3 cycles, 75 % remain.
+    #: With full gains and 3 cycles of delay, the stance leg of a light patient oscillates with 50 Hz after a landing.
     damping_loss: float = 1.0 / 12.0
     impact: ImpactConfig = field(default_factory=ImpactConfig)
-    alpha: float = 0.3  # end of the re-centring, as a fraction of the step duration
+    #: End of the re-centring (return from the measured to the nominal motion), as a fraction of the step duration.
+    alpha: float = 0.3
     #: True: the periodic steps follow the control law of the paper literally, see `literal`. The guide is then not certified.
     literal_law: bool = False
     #: m/m, gain of the ankle stabiliser: shift of the centre of pressure per error of the divergent component of motion
@@ -97,8 +97,8 @@ class WalkConfig:
     rest: float = 0.3  # s, wait after each weight shift
     guide: StepGuideConfig = WALK_GUIDE
     #: End of the re-centring of sagittal hip and knee in a guided step, as a fraction of the step duration.
-    #: With the smaller fraction `alpha`, these joints would need more torque than the drives have, because the leg is heavy.
-    #: All other joints use `alpha`, because the robot would fall if they were re-centred as slowly as sagittal hip and knee.
+    #: If hip and knee returned to the nominal motion as fast as with `alpha`, their drives would reach the torque limit.
+    #: If all other joints returned as slowly as hip and knee, the robot would fall. Therefore the other joints use `alpha`.
     guided_alpha: float = 0.5
     #: s, duration of a ramp from 1 to 0 at the start of a guided step. The weight of the backup torque is never below the ramp.
     #: The backup torque holds the leg inside the guide.

@@ -328,7 +328,10 @@ class WalkController:
         return self._command
 
     def _bind(self, state: State) -> None:
-        """Use the arrays of a state as the measurements of the kernels. A state has the same array objects in every cycle.
+        """Give the kernels references to the arrays of a state.
+
+        The values of each new cycle are written into the same arrays, so the references remain valid. They must be renewed only
+        for another state object.
 
         Args:
             state: measured state of the robot.
@@ -384,20 +387,19 @@ class WalkController:
         missing = 1.0 - float(self._forces[1 - side, :, 2].sum()) / weight
         return weight * min(1.0, max(0.0, missing - _LOAD_ERROR) / (1.0 - _LOAD_ERROR))
 
-    def _facts(self, cycle: int) -> Facts:
+    def _facts(self, elapsed: int) -> Facts:
         phase, nominal, landed = self.phase, len(self._table.rows) - 1, False
         load = self._load.tolist()
         self._loaded = self._loaded + 1 if min(load) >= self._carrying else 0
         if phase in STEPPING:
-            # `cycle` is the row of the phase table. With a phase rate of 1 (no step timing), this row is the number of
-            # cycles.
-            cycle = int(self._clock[0] + self._pace[0])
+            # Progress of the step = row of the phase table. Step timing advances the row by more or less than 1 per cycle.
+            elapsed = int(self._clock[0] + self._pace[0])
             swing = 1 - self._stance
             contact = contact_force(load[swing], float(self._twist[swing]))
-            landed = self._landed = self._impact.update(contact, cycle / nominal)
+            landed = self._landed = self._impact.update(contact, elapsed / nominal)
         steps = self.statistics.steps + (phase is Phase.STEP)
         loaded, stopping = self._loaded >= self._settled, self._stopping or steps >= self.steps_wanted
-        return Facts(cycle, nominal, self._rest, self._timeout, landed, loaded, stopping)
+        return Facts(elapsed, nominal, self._rest, self._timeout, landed, loaded, stopping)
 
     def _begin(self, phase: Phase, cycle: int, xi: float) -> None:
         """Start a phase: set stance leg and steering, start the re-centring from the measured motion, and start the guide."""

@@ -8,10 +8,13 @@ estimates the bias of the gyro. Its state is
     b   bias of the gyro about the vertical [rad/s], b' = white noise
     o   constant offset of the measured heading [rad], because the measured heading at the start counts as 0 despite its error
 
-The measurement is measured heading - estimated heading = o - d + error of the reference. The error of the reference is correlated
-in time. The filter regards this error as white noise with the same spectral density at low frequencies. After each update, the
-estimated heading is corrected by d. A measurement that differs from its prediction by more than `outlier` standard deviations is
-not used, because iron near a magnetometer can turn the measured heading by many degrees.
+The measurement is measured heading - estimated heading = o - d + error of the reference. The error of the reference changes
+slowly: it has the standard deviation s and the correlation time T. A Kalman filter requires white measurement noise. With the
+update interval t, white noise of the variance 2 s^2 T / t has the same spectral density at low frequencies as the error. The
+filter uses this variance. After each update, the estimated heading is corrected by d.
+
+A measurement that differs from its prediction by more than `outlier` standard deviations is not used, because iron near a
+magnetometer can turn the measured heading by many degrees.
 """
 
 from __future__ import annotations
@@ -48,9 +51,8 @@ class HeadingFilter:
         self._config, time = config, config.interval * PERIOD
         self._transition = np.array([[1.0, time, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]])
         self._process = np.diag([config.gyro_noise**2 * time, config.bias_walk**2 * time, 0.0])
-        #: Variance of the white noise with which the filter replaces the correlated error of the reference [rad2]. Both have the
-        #: same spectral density at low frequencies.
-        self._noise = 2.0 * config.reference**2 * config.reference_time / time
+        #: Variance of the white measurement noise that stands for the slowly changing error of the reference [rad2].
+        self._measurement_noise = 2.0 * config.reference**2 * config.reference_time / time
         self.reset()
 
     def reset(self) -> None:
@@ -78,7 +80,7 @@ class HeadingFilter:
         output = np.array([-1.0, 0.0, 1.0])
         surprise, variance = difference - output @ state, output @ covariance @ output
         if abs(surprise) <= self._config.outlier * math.sqrt(variance + self._config.reference**2):
-            gain = covariance @ output / (variance + self._noise)
+            gain = covariance @ output / (variance + self._measurement_noise)
             state += gain * surprise
             covariance = covariance - np.outer(gain, output @ covariance)
         self._covariance = covariance

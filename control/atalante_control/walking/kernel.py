@@ -113,7 +113,9 @@ class Assistance(NamedTuple):
 
     guide: GuideTables  # `GuideFilter.tables`
     literal: LiteralTables  # `LiteralGuide.tables`, used instead of `guide` if `Stage.literal` is True
-    unmodelled: Vector  # (n + 1, 2) Nm, `SwingLeg.unmodelled`, added to u_g of hip and knee in each cycle of the step
+    #: (n + 1, 2) Nm, torques of hip and knee due to the motion of the pelvis, which the leg model of the guide filter leaves out.
+    #: Row: cycle of the step.
+    unmodelled: Vector
     fade: Vector  # (m,) factor of `Stage.excess` in each cycle after the nominal end of the step; falls from 1 to 0
 
 
@@ -218,7 +220,10 @@ def _velocity(point: Vector, sole: Vector, sole_velocity: Vector, gyro: Vector) 
 
 
 def start(measured: Measured, table: PhaseTable, parts: Parts) -> None:
-    """Store the deviations of the measured motion at the start of a phase. The re-centring starts from these deviations.
+    """Store the deviations of the measured motion at the start of a phase.
+
+    The re-centring fades out these deviations during the phase. If no foot swings, the speed deviations are set to 0. Otherwise
+    the re-centring would continue the downward motion of a foot that has just landed, and press the foot into the floor.
 
     Args:
         measured: measurements of the cycle.
@@ -231,8 +236,6 @@ def start(measured: Measured, table: PhaseTable, parts: Parts) -> None:
     placement.target[:], placement.offset[:], placement.speed[:], placement.change[:] = 0.0, 0.0, 0.0, 0.0
     for joint in range(n):
         stage.deviation[joint] = measured.q[joint] - table.rows[0, joint]
-        # In a phase without a swing foot, the measured speeds are ignored.
-        # A re-centring that started with the measured speeds would press a landed foot down.
         stage.rate[joint] = 0.0 if stage.double else measured.qd[joint] - table.rows[0, n + joint]
     swing = 1 - stage.stance
     attitude, gyro = _tibia(swing, measured, parts)

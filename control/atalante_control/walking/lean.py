@@ -27,18 +27,17 @@ class LeanConfig(NamedTuple):
 
     gain: float = 6.0  # rad/m, lean per DCM error beyond the dead zone; 0: no lean
     dead_zone: float = 0.02  # m, sideways DCM error up to which the trunk does not lean
-    #: m, distance of the DCM from the middle of the stance sole, positive towards the swing foot.
-    #: Above this distance, the trunk does not lean over the stance foot.
+    #: m, limit for the DCM, measured from the middle of the stance sole towards the swing foot.
+    #: If the DCM is on the swing foot's side of this limit, the trunk does not lean over the stance foot.
     inside: float = 0.015
     outward: float = 0.22  # rad, largest lean over the stance foot
     inward: float = 0.08  # rad, largest lean to the side of the swing foot
     rise: float = 14.0  # rad/s, natural frequency of the critically damped filter while the lean grows
     fall: float = 5.0  # rad/s, natural frequency of the filter while the lean decreases
     acceleration: float = 25.0  # rad/s2, largest acceleration of the lean
-    #: Shift of the swing foot [m] = `leg_gain` * (distance of the DCM - `leg_zone`). See `leg_zone` for this distance.
-    leg_gain: float = 8.0
-    #: m, distance of the DCM from the middle of the stance sole, positive away from the swing foot.
-    #: Above this distance, the swing foot is shifted away from the stance foot.
+    leg_gain: float = 8.0  # m/m, outward shift of the swing foot per distance of the DCM beyond `leg_zone`
+    #: m, limit for the DCM, measured from the middle of the stance sole away from the swing foot.
+    #: If a push moves the DCM beyond this limit, the swing foot is shifted away from the stance foot.
     leg_zone: float = 0.02
     leg: float = 0.15  # m, largest shift of the swing foot away from the stance foot
 

@@ -31,10 +31,12 @@ WALKING = STEPPING | {Phase.SHIFT, Phase.BACK}
 
 
 class Facts(NamedTuple):
-    """Times and events that decide whether a phase ends in the current cycle."""
+    """Times and events that decide whether a phase ends in the current cycle.
 
-    #: Cycles since the start of the phase. In a step: current row of the phase table, because step timing makes the step faster
-    #: or slower than one row per cycle.
+    The progress of a step is measured in rows of its table, because step timing can change the number of rows per cycle.
+    """
+
+    #: Progress of the phase. In a step: row of the phase table. In all other phases: cycles since the start of the phase.
     elapsed: int
     nominal: int  # nominal duration of the phase in cycles
     rest: int  # cycles to wait after a weight shift

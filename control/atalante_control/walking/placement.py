@@ -50,7 +50,12 @@ _FASTEST = 3.0  # rad/s, largest desired speed of a joint that shifts the foot
 
 
 class PlacementConfig(NamedTuple):
-    """Parameters of foot placement and step timing."""
+    """Parameters of foot placement and step timing.
+
+    `capacity` differs from the limit of the ankle stabiliser, `WalkConfig.shift_limit` (0.12 m forwards, 0.05 m sideways).
+    Forwards, `capacity` is smaller, because the PIDs of the stance leg act against the stabiliser. Sideways, `capacity` is
+    larger, because the trunk leans in addition.
+    """
 
     #: m, placement and timing react only to a predicted DCM error at the landing above this value; infinity switches both off
     dead_zone: float = 0.015
@@ -64,9 +69,7 @@ class PlacementConfig(NamedTuple):
     #: s, last part of the step before the nominal landing. In this part, the phase rate returns to 1, and `late_landing`
     #: computes the offset of the landing.
     frozen: float = 0.05
-    #: m, DCM error (forward, sideways) above which the ankle and the trunk cannot stop the growth of the error. The forward
-    #: value is below the forward limit of the ankle stabiliser (`WalkConfig.shift_limit`), because the PIDs of the stance leg
-    #: act against the stabiliser. The sideways value is above the sideways limit, because the trunk leans.
+    #: m, largest DCM error (forwards, sideways) that ankle and trunk can stop. A larger error grows until the landing.
     capacity: Pair = (0.10, 0.08)
     bandwidth: float = 25.0  # rad/s, natural frequency of the critically damped filter of the landing offset
     speed: float = 1.2  # m/s, largest rate of change of the landing offset
@@ -74,8 +77,8 @@ class PlacementConfig(NamedTuple):
     #: weight of the missing landing offset in the cost, see `_cost`; the missing offset is the needed minus the permitted offset
     missed: float = 30.0
     timing: float = 0.03  # m, weight of a change of the landing time in the cost, see `_cost`
-    #: After a push, the swing foot changes from the joint angles of the gait to a held position relative to the stance foot.
-    #: `hold` is the duration of this change [s].
+    #: s, duration of a transition after a push: from the joint angles of the gait to a path of the swing foot.
+    #: The path is fixed relative to the stance foot, so a tilt of the pelvis does not move the swing foot.
     hold: float = 0.1
     slew: float = 15.0  # 1/s, largest change of the phase rate per second
 
@@ -85,8 +88,8 @@ class Placement:
 
     clock: float  # cycles, current row of the phase table, not rounded to an integer
     pace: float  # phase rate: progress of the step in one cycle, in nominal cycles
-    #: 0: the swing foot follows the joint angles of the gait. 1: the position relative to the stance foot is held.
-    #: Between 0 and 1: mixture of both positions.
+    #: 0: the swing leg follows the joint angles of the gait. 1: the swing foot follows its path relative to the stance foot.
+    #: Between 0 and 1: the desired position of the swing foot is between these two positions.
     held: float
     target: Annotated[Vector, 2]  # m, requested offset of the landing in the walking frame
     offset: Annotated[Vector, 2]  # m, current offset of the swing foot in the walking frame
@@ -198,7 +201,7 @@ def _permitted(config: PlacementConfig, side: float, x: float, y: float) -> Pair
 
 
 def _cost(config: PlacementConfig, gain: float, motion: Motion, rate: float) -> float:
-    """Return the cost of walking the rest of the step with a candidate phase rate [m2].
+    """Return the cost of a candidate phase rate for the rest of the step. The unit of the cost is m2.
 
     cost = permitted^2 + missed * (needed - permitted)^2 + (timing * w * dt)^2. `needed` is the needed landing offset, and
     `permitted` is the same offset within its limits. `missed` and `timing` are in `PlacementConfig`. w is the natural frequency,

@@ -31,6 +31,10 @@ _SH, _SK = LEG_JOINTS.index("SH"), LEG_JOINTS.index("SK")
 class PhaseTable(NamedTuple):
     """Desired motion of one phase with n cycles. After the last cycle, the last row is held.
 
+    At the start of a phase, the joints deviate from the first row of the table by the angle d and the speed v. The re-centring
+    fades out this deviation: it adds c0 d + c1 v to q_nom, and c0' d + c1' v to q_nom'. c0 and c1 are cubic polynomials of time,
+    c0' and c1' are their time derivatives.
+
     A late swing foot has not landed at the end of the table. The fields from `reach` on define how a late swing foot moves down.
     """
 
@@ -40,11 +44,8 @@ class PhaseTable(NamedTuple):
     #: (n + 1, 3) m, nominal position of the ankle of the swing leg relative to the centre of the stance sole, walking frame
     ankle: Vector
     frequency: float  # rad/s, natural frequency w of the pendulum
-    #: (m, 4) re-centring: polynomials that fade out the deviation at the start of the phase. Row k holds c0, c1, c0', c1' of
-    #: cycle k, see `flat_foot.recentring_rows`. These rows apply to all joints that are not guided in this phase.
-    recentring: Vector
-    #: (m, 4) re-centring of sagittal hip and knee (SH, SK) of the swing leg in a guided step, with the columns of `recentring`
-    guided: Vector
+    recentring: Vector  # (m, 4) c0, c1, c0', c1' of the re-centring in each cycle, for all joints without a guide
+    guided: Vector  # (m, 4) c0, c1, c0', c1' of the re-centring in each cycle, for hip and knee (SH, SK) with a guide
     reach: Vector  # (2,) rad/s, speeds of SH and SK of the swing leg that move a late swing foot down
     lowering: float  # m/s, downward speed of a late swing foot at the joint speeds `reach`
     #: SH and SK move with the speeds `reach` for this number of cycles after the end of the table. The number is smaller if the

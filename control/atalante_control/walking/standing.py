@@ -36,12 +36,14 @@ class Stance(NamedTuple):
 
 
 class Shift(NamedTuple):
-    """Weight shift from the middle between the feet onto one foot, as Bezier control points along the path."""
+    """Weight shift from the middle between the feet onto one foot, as Bezier control points along the path.
+
+    The controller adds the gravity torques u_g of the suspended exoskeleton to `feedforward`. The sum is the static torque on the
+    ground, which also holds the weight of the patient.
+    """
 
     q: Vector  # (12, 8) rad, joint angles
-    #: (12, 8) Nm, torques that hold the pose against weight and ground forces, minus the gravity torques u_g of the suspended
-    #: exoskeleton. The controller adds u_g itself.
-    feedforward: Vector
+    feedforward: Vector  # (12, 8) Nm, static torques of the pose on the ground, minus u_g, which the controller adds
     centre: Vector  # (3, 8) m, centre of mass relative to the middle between the soles, in the walking frame
 
 

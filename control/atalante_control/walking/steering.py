@@ -78,13 +78,16 @@ class Steering:
         self.feet[:] = middle + np.column_stack([c * x + s * y, c * y - s * x])
 
     def offset(self) -> float:
-        """Return the offset of the transverse hip (TH) of the swing leg for the next step, positive to the left [rad]."""
+        """Return the offset of the transverse hip (TH) of the swing leg for the next step, positive to the left [rad].
+
+        In a steady turn, the line turns by the same angle before each step, and each foot lands in the direction of the line. At
+        the start of a step, the stance foot is then one turn behind the line, and the swing foot is two turns behind the line.
+        Their mean heading is 1.5 turns behind the line. This lag is not an error.
+        """
         per_yaw, per_metre, largest = self._gains
         limit = largest + abs(self._turn)
-        # In a steady turn, each foot lands with the heading of the line, and the line turns by `_turn` before each step.
-        # Since the landing of the stance foot, the line has turned once. Since the last landing of the swing foot, the line
-        # has turned twice. So the mean heading of both soles is 1.5 `_turn` behind the line.
-        error = self.yaw + 1.5 * self._turn
+        lag = 1.5 * self._turn  # angle by which the mean heading is behind the line in a steady turn
+        error = self.yaw + lag
         return -min(max(per_yaw * error + per_metre * self.lateral - self._turn, -limit), limit)
 
     def _on_line(self, step: Vector) -> Vector:

@@ -36,7 +36,9 @@ class SwingLeg(NamedTuple):
     """Model of the swing leg in one step, and the torque that this model leaves out."""
 
     leg: Leg  # model of sagittal hip and knee with a fixed pelvis, for the guide filter
-    unmodelled: Vector  # (n + 1, 2) Nm, torque w of sagittal hip and knee, added to the gravity torques u_g
+    #: (n + 1, 2) Nm, torques of sagittal hip and knee due to the motion of the pelvis, which `leg` leaves out.
+    #: Row: cycle of the step.
+    unmodelled: Vector
 
 
 def swing_leg(

@@ -75,7 +75,7 @@ class PyBulletBody:
         Raises:
             ValueError: If the text is not a URDF, or a required joint or link is missing.
         """
-        # Each body has a new physics client. A simulation from a restored PyBullet state would not repeat exactly.
+        # Simulations with a new client repeat exactly. Simulations that start from `pybullet.restoreState` do not.
         self._client = pybullet.connect(pybullet.DIRECT)
         client = {"physicsClientId": self._client}
         pybullet.setPhysicsEngineParameter(

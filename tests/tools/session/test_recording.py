@@ -29,7 +29,12 @@ def test_can_log_and_fast_recording_need_a_core_for_telemetry(outputs: Outputs |
     [
         ((), 3, "the recording must be in a file, but no file was written"),
         (("recording.mcap",), 3, "the recording is incomplete: 3 cycles are missing in recording.mcap"),
-        (("recording.mcap", "recording-1.mcap"), 0, "the recording is split: recording.mcap, recording-1.mcap"),
+        (
+            ("recording.mcap", "recording-1.mcap"),
+            0,
+            "the recording must be one file, but the telemetry process was restarted and wrote several: "
+            "recording.mcap, recording-1.mcap",
+        ),
         (("recording.mcap",), 0, "the recording is incomplete: recording.mcap may have no index"),
     ],
 )

@@ -29,8 +29,7 @@ class NodeReport:
 
     node: str
     kind: str
-    #: Age of the newest frame from the node. Slow messages are ignored: only the messages with the shortest cycle time of this
-    #: node count. For the HAL, only the SYNC messages count. None if no frame was received.
+    #: Age of the newest frame [ms] among the messages that the node sends most often. None if no such frame was received.
     age_ms: int | None
     late: bool  # whether the age exceeds the timeout in the DBC
     state: str | None
@@ -153,9 +152,13 @@ class Observer:
         return report
 
     def _fast(self, node: Node) -> list[Message]:
+        """Return the messages that a node sends most often, that is, with the shortest cycle time.
+
+        For the HAL, return only the SYNC messages. The commands have the same cycle time, but the HAL does not always send them.
+        """
         cyclic = [m for m in self._network.sent_by(node.name) if m.cycle_ms]
         fastest = min(m.cycle_ms for m in cyclic)
-        if node.kind == "master":  # the HAL always sends SYNC, but not always commands
+        if node.kind == "master":
             return [m for m in cyclic if m.name.startswith("SYNC_")]
         return [m for m in cyclic if m.cycle_ms == fastest]
 

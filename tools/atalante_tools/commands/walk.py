@@ -70,7 +70,8 @@ def _protocol(_ctx: click.Context, _param: click.Parameter, text: str | None) ->
     "--protocol",
     callback=_protocol,
     metavar="A,B,C",
-    help="A steps with full assistance, then B steps in which Xi falls to --xi, then C steps with --xi. Replaces --steps.",
+    help="Numbers of steps. 112,38,225 means 112 steps with full assistance, then 38 steps in which Xi falls to --xi, then 225 "
+    "steps with --xi. Replaces --steps.",
 )
 @click.option(
     "--wearer",
@@ -152,8 +153,8 @@ def _protocol(_ctx: click.Context, _param: click.Parameter, text: str | None) ->
     "--robot-process/--no-robot-process",
     default=None,
     help="Run the emulated robot in a process of its own, in parallel with the HAL. With idle processor cores, the walk is then "
-    "faster. The result is the same.  [default: on if enough cores are idle: one core, or two cores if a CAN log is written "
-    "or the rate is above 100 Hz]",
+    "faster. The result is the same.  [default: own process if a processor core is idle; with a CAN log or a recording rate "
+    "above 100 Hz, if two cores are idle]",
 )
 @options_as("recording", RecordingOptions, RECORDING_OPTIONS)
 @target_options(embedded=True)

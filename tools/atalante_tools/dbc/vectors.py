@@ -60,9 +60,10 @@ class Vectors:
         self._order = self._stream_order()
 
     def _stream_order(self) -> npt.NDArray[np.intp]:
-        """Return the index array that puts the bytes of an image into the order of the stream.
+        """Return indices that sort the computed bytes of an image (one payload per message) into the order of the stream.
 
-        Element k is the source of byte k of the stream: an index into the concatenated `parts` of the method `images`.
+        Element k is the index of the computed byte that becomes byte k of the image in the stream. The computed bytes are the
+        concatenated `parts` in the method `images`.
         """
         build, codec = self._build, self._codec
         rows = len(build.messages)
@@ -90,11 +91,15 @@ class Vectors:
         return HEADER.pack(MAGIC, self._build.network.hash32, images)
 
     def images(self, count: int) -> Iterator[bytes]:
-        """Yield images. Image 0 contains the minimum of each signal, image 1 the maximum, and image 2 the invalid code.
+        """Yield images (one payload per message) as bytes of the binary stream.
 
-        All further images contain random values.
+        Image 0 contains the minimum of each signal, image 1 the maximum, and image 2 the invalid code. All further images
+        contain random values.
 
         Call this method only once per instance, because a second call would continue the counters and the random numbers.
+
+        Args:
+            count: number of images.
         """
         for image in range(count):
             encoded = self._next(image)
@@ -102,9 +107,9 @@ class Vectors:
             yield np.concatenate([part.view(np.uint8) for part in parts])[self._order].tobytes()
 
     def examples(self) -> Iterator[dict[str, Any]]:
-        """Yield one JSON object for each message in each of four images.
+        """Yield four test vectors of each message as JSON objects.
 
-        The images contain minimum values, maximum values, invalid codes, and random values.
+        The four vectors contain the minimum of each signal, the maximum, the invalid code, and a random value.
 
         Call this method only once per instance, because a second call would continue the counters and the random numbers.
         """
@@ -124,16 +129,20 @@ class Vectors:
                     "values": values,
                 }
 
-    def _next(self, image: int) -> Vector:
-        """Encode the image with the number `image`, and return its signal values before encoding, shape (signals,)."""
+    def _next(self, number: int) -> Vector:
+        """Encode and decode one payload of each message. Return the signal values before encoding, shape (signals,).
+
+        Args:
+            number: 0 encodes the minimum of each signal, 1 the maximum, 2 the invalid code, and a higher number random values.
+        """
         limits = (self._minimum, self._maximum, self._invalid)
-        encoded = limits[image] if image < len(limits) else self._random.uniform(self._minimum, self._maximum)
+        encoded = limits[number] if number < len(limits) else self._random.uniform(self._minimum, self._maximum)
         self._sender.values[:] = encoded
         self._sender.seal()
-        if image % 2 and image > len(limits):
+        if number % 2 and number > len(limits):
             data = self._received["data"]
             data[:] = self._random.integers(0, 256, data.shape, np.uint8)
-            self._counters.fill(image & 0xFF)
+            self._counters.fill(number & 0xFF)
             self._crcs[:] = [crc(payload, data_id) for payload, data_id in self._protected]
         else:
             self._received[:] = self._sender.frames

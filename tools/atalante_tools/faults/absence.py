@@ -28,8 +28,7 @@ class Absence:
         """
         self._clock, self._emulator = clock, emulator
         self._begun = 0  # number of HAL cycles that have begun
-        # Time that the HAL has lost so far [s]. The HAL does not catch up after a cycle that began more than one period late, so
-        # the delay of each such cycle is added.
+        # Time that the HAL has lost for good [s]: sum of all delays above one period. Later cycles make up for shorter delays.
         self._skipped = 0.0
         self._seen = 0  # cycle number of the robot at the end of the last call of `wait`
         self._alone = 0  # number of robot cycles since the last SYNC

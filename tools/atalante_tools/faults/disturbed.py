@@ -27,7 +27,7 @@ _TOO_MUCH: Final = 1e3
 
 
 class HostFaults:
-    """Host faults of a case, with their timing in HAL cycles."""
+    """Faults of the computer that runs the HAL (such as a late cycle), and the HAL cycles in which each fault is active."""
 
     def __init__(self, faults: Sequence[HostFault], begins: int) -> None:
         self.schedule(faults, begins)

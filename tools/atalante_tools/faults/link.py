@@ -101,7 +101,7 @@ SCENARIOS: Final = (
                     node=_KNEE,
                     reacted=reacted,
                     recovers=False,
-                    observed=40,  # few cycles, because foot forces that stay constant for 100 cycles are a fault
+                    observed=40,  # short, because the HAL reports the constant injected forces as a fault after 100 cycles
                     suspended=True,
                 )
                 for frames, state, dtc, reacted in (

@@ -171,7 +171,7 @@ class MomentTask:
         starts = [cycle for cycle in presses if cycle >= min(begins, default=math.inf)]
         unlimited = [range(cycle, cycle + FOUND) for cycle in (*begins, *starts)]
         failures = [*limit_violations(run, unlimited, _strength(stimuli)), *_premature(run, plan.starts[0])]
-        # At the other moments, the fault may delay the START of the schedule.
+        # No check for a fault at BOOT or READY: the fault begins before the first START, and may delay the effect of this START.
         if self.moment not in (Moment.BOOT, Moment.READY):
             failures += automatic_improvements(run, before, plan.starts)
         failures += _sag_violations(_sag(run, plan.starts), _sag_limits(stimuli))

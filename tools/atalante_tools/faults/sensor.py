@@ -279,9 +279,9 @@ SCENARIOS: Final = (
                 recovers=False,
                 checks=(start_is_rejected,),
             ),
-            # The controller moves the joint against the drift, so the reported position stays in its range. When the joint has
-            # reached its mechanical limit, the reported position drifts out of its range. This takes up to 400 cycles.
-            # The mechanical limit stops the joint against the torque of its motor. This looks like a motor without torque (F82).
+            # The controller corrects the reported position, so the real joint moves against the drift to its end stop. The HAL
+            # then detects one of two effects: the reported position leaves its range (POSITION_RANGE), or the joint does not
+            # follow its torque, like a joint with a dead motor (TORQUE_MOTION). The detection takes up to 400 cycles.
             Case(
                 "RIGHT_SA at 2 rad/s",
                 (Fault("encoder_drift", "RIGHT_SA", rate=2.0),),

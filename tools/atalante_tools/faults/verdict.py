@@ -59,8 +59,8 @@ class Expectation:
         reacted = row.reacted if case.reacted is None else case.reacted
         if detected is None or reacted is None:
             raise ValueError(
-                f"{row.id} {case.name}: the case must define `detected` and `reacted`, because the time limit in the fault "
-                f"matrix is not a number of cycles, got {row.cycles!r}"
+                f"{row.id} {case.name}: the time limit in the fault matrix must be a number of cycles, got {row.cycles!r}; "
+                "define `detected` and `reacted` in the case instead"
             )
         state = row.state if case.state is None else case.state
         return cls(state, row.dtc if case.dtc is None else case.dtc, detected, reacted)

@@ -91,9 +91,9 @@ _CHECK_OPTIONS = [
     click.option("--patients", is_flag=True,
                  help="Also check gaits that the neural gait network computes for twelve patients of 58 to 91 kg."),
     click.option("--condition", "conditions", type=click.Choice(CONDITION_NAMES), multiple=True,
-                 help="Deviation of plant and robot from the model: none (model), friction +-20 %, mass +-10 %, friction and "
-                      "mass (both), encoder noise, 1 % frame loss, 1 ms more delay. Repeat the option for several conditions.  "
-                      "[default: all]"),
+                 help="Deviation of plant and robot from the model. model: no deviation; friction: +-20 %; mass: +-10 %; both: "
+                      "friction and mass; noise: encoder noise; loss: 1 % of the frames is lost; delay: 1 ms more delay. Repeat "
+                      "the option for several conditions.  [default: all]"),
     click.option("--push", type=(Between(0.0, 500.0), Between(0.0, 500.0)), default=None, metavar="HIP KNEE",
                  help="Largest push at hip and knee [Nm].  [default: the certified torques of the guide]"),
     click.option("--steps", type=click.IntRange(1), metavar="N",
@@ -158,7 +158,9 @@ def check(options: CheckOptions, as_json: bool, subject: Subject | None) -> None
 
 
 def _all_checks(options: CheckOptions, subject: Subject | None) -> Iterator[tuple[Verdict, Checked | None]]:
-    """Check all guides of the options one after another, and show the current guide in the progress line.
+    """Check one guide after another, and show the current guide in the progress line.
+
+    The options select gaits, shapes and assistance factors. Each combination is one guide.
 
     Yields:
         Verdict on a guide, and the check with its worst step. The check is None if the verdict is from an earlier run.

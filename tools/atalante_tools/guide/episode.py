@@ -51,14 +51,14 @@ RATE = 0.5
 
 
 class Push(NamedTuple):
-    """Push at hip and knee during one step: always the largest torque, with the sign of `signs[cycle] + feedback @ features`.
+    """Push at hip and knee during one step. The push always has the largest torque, and only its direction changes.
 
-    The features are e / q_bound and e' / `RATE` of hip and knee in the current cycle. e is the tracking error. A push with zero
-    `feedback` does not depend on the motion of the leg.
+    The direction is the sign of the sum `signs[cycle] + feedback @ features`. The features describe the motion of the leg in
+    the current cycle: e / q_bound and e' / `RATE` of hip and knee. e is the tracking error.
     """
 
-    signs: Vector  # first term of the sum for each cycle (row), at hip and knee (columns), shape (cycles + 1, 2)
-    feedback: Vector  # weight of each feature for hip (row 0) and knee (row 1), shape (2, FEATURES)
+    signs: Vector  # part of the sum that ignores the motion; rows: cycles, columns: hip, knee; shape (cycles + 1, 2)
+    feedback: Vector  # weight of each feature in the sum; rows: hip, knee; columns: features; shape (2, FEATURES)
 
 
 class Start(NamedTuple):
@@ -66,8 +66,7 @@ class Start(NamedTuple):
 
     deviation: Pair  # q - q_nom of SH and SK [rad]
     rate: Pair  # q' - q_nom' of SH and SK [rad/s]
-    #: torque left over from the previous step [Nm]: last torque before the stance change, minus the torque that the nominal
-    #: acceleration q_nom'' needs after the change
+    #: surplus torque at the stance change [Nm]: torque just before, minus the torque for the nominal acceleration just after
     carried: Pair
     ahead: Pair  # true minus measured speed of SH and SK [rad/s]; the measured speed lags, because it is filtered
 

@@ -18,13 +18,14 @@ _CENTRE = Start((0.0, 0.0), (0.0, 0.0), (0.0, 0.0), (0.0, 0.0))
 
 
 def draw(checked: Checked, picture: Path) -> None:
-    """Draw the guide, the safe backward image, and the angles and pushes of the worst step over the phase, for hip and knee.
+    """Draw hip and knee over one step: bounds of the guide, safe area inside the bounds, and the worst simulated step.
 
-    From a state in the safe backward image, the backup policy keeps both joints inside the guide. The image is drawn for the
-    speeds of the desired motion.
+    From an angle in the safe area, the backup policy keeps both joints inside the guide. The figure calls this area the safe
+    backward image. The area is computed for the speeds of the desired motion. For the worst step, the figure shows the angles and
+    the pushes.
 
     Args:
-        checked: result of a check. If the guide has no promise, only the guide and the safe backward image are drawn.
+        checked: result of a check. If the guide has no promise, the figure has no worst step.
         picture: file to write.
     """
     leg, worst = checked.leg, checked.worst

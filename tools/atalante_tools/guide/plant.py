@@ -62,9 +62,11 @@ class Condition:
 class Plant(NamedTuple):
     """Constants of the plant for compiled functions. Index 0 is the hip, index 1 the knee."""
 
-    #: Mass matrix [kg m2], shape (3, 3). Rows: M11, M12, M22. Columns: coefficients of 1, cos q_SK, sin q_SK.
+    #: Coefficients a, b, c (columns) of the elements M11, M12, M22 (rows) of the 2x2 mass matrix [kg m2], shape (3, 3).
+    #: Each element is a + b cos(knee angle) + c sin(knee angle).
     mass: Vector
-    #: Gravity torques [Nm], shape (2, 4). Rows: hip, knee. Columns: coefficients of cos and sin of q_SH, then of q_SH + q_SK.
+    #: Coefficients a, b, c, d (columns) of the gravity torques of hip and knee (rows) [Nm], shape (2, 4).
+    #: Each torque is a cos(q_SH) + b sin(q_SH) + c cos(q_SH + q_SK) + d sin(q_SH + q_SK).
     weight: Vector
     coulomb: Vector  # dry friction [Nm], shape (2,)
     viscous: Vector  # viscous friction [Nm s/rad], shape (2,)

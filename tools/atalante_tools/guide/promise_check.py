@@ -56,9 +56,9 @@ PATIENTS: Final = (
 _CORNERS: Final = 64
 #: Lag of the measured velocity of a drive [s], caused by the low-pass filter and by the sampling (half a cycle).
 _VELOCITY_LAG: Final = 2.0e-3
-#: The search for `Verdict.left_at` tries pushes up to this multiple of the certified torques.
+#: The search for the smallest push that moves a joint out of the guide multiplies the push limits by at most this factor.
 LARGEST_FACTOR: Final = 6.0
-#: For each multiple of the certified torques, the search for `Verdict.left_at` simulates this share of `Effort.steps`.
+#: For each factor on the push limits, the search for this smallest push simulates a share of `Effort.steps`: 150 of 1500 steps.
 _SHARE: Final = 0.1
 
 
@@ -104,7 +104,8 @@ class Verdict:
     worst_push: str  # kind of the worst push on the plant
     worst_condition: str  # deviation of the plant from the model in the worst step, for example "friction +20 %"
     stopped: str  # reason why the robot left ACTIVE; empty if the robot stayed in ACTIVE
-    #: smallest multiple of the certified torques that moved a joint out of the guide; None if not searched or not found
+    #: smallest factor on the largest push (`promise_hip_nm`, `promise_knee_nm`) with which a joint left the guide; None if not
+    #: searched or not found
     left_at: float | None
     reason: str  # what limits the certified torques, or why there are none
 
@@ -116,11 +117,11 @@ class Verdict:
 
 @dataclass(frozen=True)
 class Checked:
-    """Verdict with the worst step, for the figure."""
+    """Verdict about a guide, with the data for `figure.draw`: the simulated leg and its worst step."""
 
     verdict: Verdict
-    leg: IdealLeg
-    worst: Tried | None
+    leg: IdealLeg  # simulated leg that swings in the guide
+    worst: Tried | None  # simulated step with the largest |e| / q_bound; None if the guide has no promise
 
 
 def setup_of(subject: Subject | None, robot: Robot, config: AirwalkConfig | None = None) -> Setup:

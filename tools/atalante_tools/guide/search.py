@@ -95,12 +95,13 @@ class Adversary:
         return self.tried[0]
 
     def leaving_factor(self, box: Pair, largest: float, budget: int) -> float | None:
-        """Find the smallest factor by which the largest push must grow, so that a push moves a joint out of the guide.
+        """Return the smallest factor on the push limits with which the search finds a push that moves a joint out of the guide.
 
-        The result is accurate to 5 %. Return None if the search finds no such push up to the factor `largest`.
+        The factor grows until the search finds such a push. A bisection then makes the factor accurate to 5 %. Return None if
+        the limits `largest * box` are too small for such a push.
 
         Args:
-            box: largest push at hip and knee for the factor 1 [Nm].
+            box: push limits at hip and knee for the factor 1 [Nm].
             largest: largest factor to try.
             budget: number of steps per factor.
         """
@@ -122,9 +123,9 @@ class Adversary:
         return outside
 
     def _leaves(self, box: Pair, factor: float, budget: int) -> bool:
-        """Return whether a search finds a push that moves a joint out of the guide.
+        """Return whether the search finds a push within `factor * box` that moves a joint out of the guide.
 
-        The largest push at hip and knee is `factor * box`. The search begins with the worst pushes so far.
+        The search begins with the worst pushes so far.
         """
         larger, known, end = (factor * box[0], factor * box[1]), self.tried, self.steps + budget
         self.tried = []
@@ -170,7 +171,11 @@ class Adversary:
             yield "constant", Push(np.tile(direction, (cycles, 1)), _no_feedback())
 
     def _following(self, cycles: int) -> Iterator[tuple[str, Push]]:
-        """Yield pushes whose sign follows the error, the rate of the error, or a random mixture of all features."""
+        """Yield pushes whose sign depends on the current tracking errors and error rates.
+
+        First, the push follows the tracking error of one joint, its rate, or both. Then, without end, the push follows a random
+        linear combination of the errors and error rates of both joints.
+        """
         for joint, (error, rate) in itertools.product((0, 1), ((0.0, 1.0), (1.0, 0.0), (1.0, 1.0))):
             # The mass matrix couples the joints, so the worst push at the other joint may have either direction.
             for other in (-1.0, 1.0):
@@ -280,7 +285,8 @@ class Adversary:
         elif feedback.any() and change < 0.7:
             feedback += 0.3 * generator.standard_normal(feedback.shape)
         else:
-            if feedback.any():  # replace the feedback by a fixed sequence: the signs of the push in the parent step
+            # The signs that the feedback produced in the parent step become a fixed sequence. The feedback becomes zero.
+            if feedback.any():
                 signs, feedback = np.where(parent.walked.log[:, 4:6] >= 0.0, 1.0, -1.0), _no_feedback()
             begin, length = int(generator.integers(cycles)), int(1 + generator.exponential(30.0))
             joints = [[0], [1], [0, 1]][int(generator.integers(3))]

@@ -318,8 +318,8 @@ def _close(telemetry: TelemetryProcess, walked: Walked) -> None:
 
 def _result(certificate: Certificate, controller: AirwalkController, hal: Hal, statistics: Statistics) -> Result:
     walking = controller.statistics
-    # The statistics start after the first step.
-    # After a run of only one step, the statistics contain a single cycle, so they are not reported.
+    # The statistics begin in the cycle in which the first step ends. A run of one step also ends in this cycle, and statistics of
+    # a single cycle are not reported.
     counted = walking.steps >= 2
     return Result(
         shape=certificate.shape,

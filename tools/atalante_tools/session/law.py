@@ -20,8 +20,12 @@ _Command = TypeVar("_Command", bound=Callable[..., Any])
 class Law:
     """Control law of the assisted joints. The field names are keys of summary.json."""
 
-    idealization: float = 1.0  # intensity of the joint idealization u_i while the guide does not act, 0 to 1
-    feedforward: float = 1.0  # intensity of the feedforward u_f while the guide does not act, 0 to 1
+    #: share of gravity, friction, Coriolis and centrifugal torques that the exoskeleton compensates while the guide does not act,
+    #: 0 to 1 (factor of u_i)
+    idealization: float = 1.0
+    #: The gait needs torques that accelerate the leg. Share of these torques that the exoskeleton produces while the guide does
+    #: not act, 0 to 1 (factor of u_f).
+    feedforward: float = 1.0
     literal: bool = False  # whether the law follows the paper literally; the guides are then not certified
 
     def config(self) -> AirwalkConfig:
@@ -41,16 +45,15 @@ def law_options() -> Callable[[_Command], _Command]:
             default=Law.idealization,
             show_default=True,
             metavar="X",
-            help="Intensity of the joint idealization (gravity, friction, velocity torques) from 0 to 1 while the guide does not "
-            "act. At a lower intensity, the patient must carry more of the weight of the leg.",
+            help="Share of gravity, friction, Coriolis and centrifugal torques of the leg that the exoskeleton compensates while "
+            "the guide does not act, 0 to 1. The patient must produce the rest.",
         ),
         click.option(
             "--feedforward",
             type=Between(0.0, 1.0),
             metavar="X",
-            help="Intensity of the feedforward (inertia of the leg along the gait) from 0 to 1 while the guide does not act. "
-            "At a lower intensity, the patient must produce more of the torque that accelerates the leg.  "
-            "[default: 1; 0 if --literal is given]",
+            help="The gait needs torques that accelerate the leg. Share of these torques that the exoskeleton produces while the "
+            "guide does not act, 0 to 1. The patient must produce the rest.  [default: 1; 0 if --literal is given]",
         ),
         click.option(
             "--literal",

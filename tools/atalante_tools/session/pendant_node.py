@@ -43,8 +43,8 @@ class PendantNode:
     Attributes:
         hal: State of the HAL in the last SYNC. None if no SYNC was received.
         cycles: Number of received SYNCs.
-        answered_in_row: Number of SYNCs answered since the last lost SYNC. After a gap, the HAL ignores requests of the pendant
-            until enough consecutive frames of the pendant were received.
+        answered_in_row: Number of consecutive SYNCs that this node answered. A lost or unanswered SYNC resets the number to zero.
+            The HAL then ignores requests of the pendant until enough consecutive answers were received.
         answered: Number of answered SYNCs.
         found_another: Whether another pendant sent before `start_sending()`.
     """
@@ -138,7 +138,8 @@ class PendantNode:
             self._copy_signals()
         if self._takeover.silent and not was_silent:
             self._release_start()
-        # If several SYNCs arrive together, only the last one is answered. Like a lost SYNC, this interrupts the row of answers.
+        # Only the last of several waiting SYNCs gets an answer. The count of consecutive answers therefore restarts from zero, as
+        # after a lost SYNC.
         if self._reader.gaps > gaps or synced > 1:
             self.answered_in_row = 0
         if not synced:

@@ -140,7 +140,9 @@ def require_complete(recording: Recording | None) -> None:
     if recording.missing_cycles:
         raise Failed(f"the recording is incomplete: {recording.missing_cycles} cycles are missing in {files}")
     if len(recording.files) > 1:
-        raise Failed(f"the recording is split: {files}")
+        raise Failed(
+            f"the recording must be one file, but the telemetry process was restarted and wrote several: {files}"
+        )
     raise Failed(f"the recording is incomplete: {files} may have no index")
 
 
@@ -225,7 +227,7 @@ def close_telemetry(telemetry: TelemetryProcess) -> TelemetrySummary:
 
 
 class EndpointReport:
-    """Printer of the Zenoh endpoint, at the start and after each change of the endpoint."""
+    """Object that prints the Zenoh endpoint of the telemetry: once at the start, and again after a change of the endpoint."""
 
     def __init__(self, telemetry: TelemetryProcess) -> None:
         """Print the notices and the endpoint of the telemetry.

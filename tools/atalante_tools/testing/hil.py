@@ -69,8 +69,9 @@ def open_bus(network: Network, target: Target, *, emulated: bool) -> tuple[Bus, 
     if hal_bus.receive(scratch, _QUIET):
         hal_bus.close()
         raise BusInUse(
-            f"{target} must carry no frames before the emulated robot uses it, got frame {int(scratch['can_id'][0]):#x}: mark "
-            "the tests of the connected robot with @pytest.mark.hil, and run all other tests on another bus"
+            f"{target} must carry no frames before the emulated robot starts, got frame {int(scratch['can_id'][0]):#x}. A real "
+            "robot is probably connected. Run the tests with an emulated robot on another bus, and mark the tests of the real "
+            "robot with @pytest.mark.hil."
         )
     return hal_bus, join(network, open_buses(network, target))
 

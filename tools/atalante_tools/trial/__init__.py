@@ -80,11 +80,11 @@ def _walking() -> Callable[[_Command], _Command]:
         click.option("--shape", type=click.Choice(("constant", "pinched")), default="constant", show_default=True,
                      help="Shape of the guide. The guide of the paper is constant."),
         click.option("--idealization", type=Between(0.0, 1.0), default=1.0, show_default=True, metavar="X",
-                     help="Intensity of the joint idealization. At a lower intensity, the subject must carry more of the weight "
-                          "of the leg."),
+                     help="Share of gravity, friction, Coriolis and centrifugal torques of the leg that the exoskeleton "
+                          "compensates while the guide does not act, 0 to 1. The subject must produce the rest."),
         click.option("--feedforward", type=Between(0.0, 1.0), default=1.0, show_default=True, metavar="X",
-                     help="Intensity of the feedforward. At a lower intensity, the subject must produce more of the torque that "
-                          "accelerates the leg."),
+                     help="The gait needs torques that accelerate the leg. Share of these torques that the exoskeleton "
+                          "produces while the guide does not act, 0 to 1. The subject must produce the rest."),
         network_option,
         click.option("--haptics", is_flag=True,
                      help="Active subjects respond to the vibration motors: while a motor of a joint vibrates, they perceive an "
@@ -164,7 +164,10 @@ def assist(masses: tuple[float, ...], walking: Walking, running: Running, as_jso
 @_walking()
 @_running("sweep")
 def sweep(days: int | None, walking: Walking, running: Running, as_json: bool) -> None:
-    """Walk with one active subject and assistance factors from 1 down to 0 and back to 1. Each walk takes five minutes."""
+    """Run a series of walks of one active subject, of five minutes each. Each walk has one assistance factor.
+
+    From walk to walk, the factor falls from 1 to 0 and then rises to 1.
+    """
     from atalante_tools.trial.findings import sweep_findings
     from atalante_tools.trial.plan import DAYS, PROTOCOL, QUICK_DAYS, QUICK_PROTOCOL, QUICK_SWEEP, SWEEP, sweep_trials
 

@@ -36,7 +36,7 @@ class Branch:
         answer = self._channel.recv()
         if isinstance(answer, _NoAnswer):
             raise RuntimeError(
-                f"the process of the continued run must answer, but it ended with status {answer.status}"
+                f"the new process that continues the run must answer, but it ended with status {answer.status}"
             )
         return answer
 
@@ -68,16 +68,21 @@ class Continuation:
 
 
 class _NoAnswer:
-    """Message of a branch to the run: the new process has ended without an answer."""
+    """Message of the waiting process: a process that continued the run has ended, but has sent no answer.
+
+    Attributes:
+        status: wait status of the ended process, see `os.waitpid`.
+    """
 
     def __init__(self, status: int) -> None:
         self.status = status
 
 
 def branch() -> Branch | Continuation:
-    """Fork a process that waits at this moment of the run. In the calling process, return a `Branch`; the run goes on.
+    """Fork this process. The parent gets a `Branch` and goes on with the run. The child waits at this moment of the run.
 
-    For each request to the branch, this function returns once more: in a new process, with a `Continuation`.
+    For each request that the parent sends through the `Branch`, the waiting child forks a new process. In the new process, this
+    function returns a `Continuation`, and the run continues from this moment.
     """
     ours, theirs = Pipe()
     if _fork():

@@ -11,13 +11,14 @@ from atalante_tools.faults.matrix import load_matrix
 from atalante_tools.trial.fault_plan import DOUBLE_SUPPORT, NO_FRAMES
 from atalante_tools.trial.findings import Finding, Result
 
-#: Fault ID -> regular expression for the names of the cases in which the robot must not fall; empty for all cases.
-#: The cases are lost, late and doubled frames; errors on the bus; a failed IMU, foot or force cell; an exception of the
-#: controller. The robot must also not fall after a few late cycles, STOP, the release of the dead-man switch, or the loss of the
-#: pendant.
-#: The table does not contain three kinds of cases, because the drives then hold at once and the robot may fall:
-#: - A loop stays much slower than 1 kHz. The joints then move far in one cycle, and the HAL reports a wrong velocity.
-#: - A drive sends no data for ten cycles. The HAL does not move a joint without data.
+#: Cases in which the robot must not fall: fault ID -> regular expression for the case name. An empty expression matches all
+#: cases of the fault. The faults are:
+#: - lost, late and doubled frames, and errors on the bus;
+#: - a failed IMU, foot or force cell, and an exception of the controller;
+#: - a few late cycles, STOP, the release of the dead-man switch, and the loss of the pendant.
+#: After three faults, all drives hold at once, so the robot may fall. These faults are not in the table:
+#: - The loop stays much slower than 1 kHz, so that the HAL computes a wrong velocity.
+#: - A drive is silent for ten cycles, so that the HAL does not know the angle of the joint.
 #: - The operator presses HOLD.
 NO_FALL: Final = {
     **dict.fromkeys(("F01", "F02", "F03", "F05", "F20", "F24", "F30", "F31", "F32", "F33"), ""),

@@ -46,8 +46,8 @@ from atalante_tools.trial.plan import STEP
 if TYPE_CHECKING:
     from atalante_hal.safety.events import Event
 
-#: A copy of the walk (a branch) is forked this number of cycles before the fault begins. The first faulty frames are computed
-#: one cycle before the fault begins.
+#: The walk is forked this number of cycles before the fault begins. A fork one cycle before the fault would be too late,
+#: because the emulated robot then already has the frames of the first faulty cycle.
 _LEAD: Final = 5
 #: Number of cycles for which the HAL is observed after a fall.
 _FALLEN: Final = 300
@@ -106,6 +106,11 @@ def run_fault(trial: FaultTrial) -> dict[str, Any]:
 
     Args:
         trial: trial to run.
+
+    Returns:
+        Result for JSON. For a permanent fault, the list `longest` has one element per moment: the longest duration for which the
+        fault may act without a fall [cycles], or None if the robot does not fall at all. Without a permanent fault, `longest` is
+        empty.
     """
     case = ground_cases(trial.id)[trial.index]
     runs: list[FaultRun] = []
@@ -118,7 +123,6 @@ def run_fault(trial: FaultTrial) -> dict[str, Any]:
         "outcome": "computed",
         "fell": sum(one.outcome == "fell" for one in runs),
         "runs": [asdict(one) for one in runs],
-        # one per moment: longest fault duration without a fall [cycles]; None: no fall with the permanent fault
         "longest": longest,
     }
 
@@ -135,7 +139,8 @@ def _longest(trial: FaultTrial, case: Case, permanent: FaultRun) -> int:
     fatal = permanent.fallen
 
     def falls(cycles: int) -> bool:
-        if cycles >= fatal:  # a fault that lasts until the fall acts like the permanent fault
+        # With the permanent fault, the robot falls after `fatal` cycles. A fault of this duration has the same effect.
+        if cycles >= fatal:
             return True
         stimuli = tuple(limited(stimulus, cycles) for stimulus in case.stimuli)
         return _run(trial, replace(case, stimuli=stimuli), permanent.moment).outcome == "fell"
@@ -195,9 +200,9 @@ def diagnosed(events: Sequence[Event], expected: str, first: int) -> tuple[tuple
 
 @cache
 def _branches(mass: float, height: float, seed: int, engine: str) -> dict[str, tuple[int, Branch]]:
-    """Return for each moment the cycle in which the fault begins, and a branch that waits shortly before this cycle.
+    """Return for each moment the cycle in which the fault begins, and a forked process paused shortly before this cycle.
 
-    A branch is a forked copy of a walk without a fault. The walks with a fault continue from the branches.
+    The paused process is a copy of a walk without a fault. Through its `Branch`, walks with a fault continue from this cycle.
 
     Args:
         mass: mass of the wearer [kg].
@@ -333,10 +338,10 @@ class _Walk:
             run(hal, DisturbedController(walk, host_faults), clock, until=over, record=record)
 
     def _branch_off(self, cycle: int, emulator: Emulator) -> bool:
-        """Fork a copy of the walk at this cycle. Return whether the copy is the last one, so that the walk can end.
+        """Fork a waiting copy of the walk at this cycle. Return True if the walk needs no further copies and can end.
 
-        The copy waits for requests. For each request, a new process continues the walk: there, inject the requested faults and
-        return False.
+        For each request to the waiting copy, a new process continues the walk. In the new process, this function injects the
+        requested faults and returns False.
 
         Args:
             cycle: number of the last cycle.

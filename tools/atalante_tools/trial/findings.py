@@ -26,9 +26,8 @@ _PHASES: Final = np.linspace(0.1, 0.8, 29)
 SAME: Final = 0.02
 STANDING: Final = 1.44  # metabolic rate of quiet standing [W/kg]
 #: A quantity has a falling trend if its rank correlation with the assistance factor is between -1 and -`TREND`.
-#: In a day of the sweep, the assistance factor falls and then rises, so each factor except the lowest occurs in two walks.
-#: The order of the walks must hardly influence a value. Therefore the mean difference between the two walks with the same factor,
-#: divided by the range of all values, must be at most `ASYMMETRY`.
+#: On each day of the sweep, the assistance factor falls from 1 to 0 and then rises to 1. The two walks with the same factor must
+#: give nearly the same value. Their mean difference, divided by the range of all values, must be at most `ASYMMETRY`.
 TREND, ASYMMETRY = 0.8, 0.25
 #: Largest coefficient of variation of the baseline metabolic rates of a sweep.
 VARIATION: Final = 0.05
@@ -258,7 +257,10 @@ def condition(result: Result) -> str:
 
 
 def normalised(result: Result) -> float:
-    """Return the metabolic rate of exercise divided by the metabolic rate of the baseline (full assistance) of the same trial.
+    """Return the normalised metabolic rate of a walk.
+
+    A walk begins with full assistance and ends with the assistance factor of the trial. The rate of the last part is divided by
+    the rate of the first part.
 
     Args:
         result: result of a walk.
@@ -292,7 +294,7 @@ def _alarms(results: Sequence[Result]) -> str:
 
 
 def _net(result: Result) -> float:
-    """Return the metabolic rate of the exercise part minus the rate of the baseline part of the same trial [W/kg]."""
+    """Return the metabolic rate with the assistance factor of the trial minus the rate with full assistance [W/kg]."""
     return float(result["metabolic_w_kg"]["target"] - result["metabolic_w_kg"]["full"])
 
 

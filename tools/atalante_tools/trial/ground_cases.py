@@ -18,8 +18,8 @@ def _no_load(*feet: str) -> tuple[Fault, ...]:
 
 
 #: Fault ID -> cases that are possible only in a walk on the ground.
-#: In fault F41, the HAL is killed. A trial cannot kill its own process, so the case of F41 pauses the HAL for 6 s. In both cases
-#: the drives receive no frames, and the HAL does not move the robot any more: after the pause, the HAL is in HOLD.
+#: In fault F41, the HAL is killed. The HAL of a trial runs in the process of the trial, so the HAL pauses for 6 s instead.
+#: A pause has the same effect: the drives receive no frames. After the pause, the HAL is in HOLD and does not move the robot.
 _GROUND_CASES: Final = {
     "F34": (
         Case("both feet report no load", _no_load(*FOOT_NODES)),

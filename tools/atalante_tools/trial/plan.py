@@ -50,8 +50,7 @@ MASS_SHARE: Final = (0.9, 1.1)
 #: Range of the random coefficient of friction between soles and floor in `robustness`.
 FRICTION: Final = (0.25, 0.8)
 #: Number of parts of the control loop that can be one cycle late in `robustness`: state messages, command messages, motors.
-#: The delay is not longer than one cycle. A delayed message then times out after four consecutive lost frames. With a longer
-#: delay, fewer lost frames would cause the timeout, and the fault matrix does not intend this.
+#: Data times out at an age of five cycles. With a delay of one cycle, the timeout needs four consecutive lost frames.
 LATE_PARTS: Final = 3
 #: Probability of a lost frame in `robustness`.
 LOSS: Final = 0.01
@@ -258,11 +257,11 @@ def assist_trials(setting: WalkSetting, masses: Sequence[float] = ()) -> list[Tr
 
 
 def sweep_trials(setting: WalkSetting, factors: Sequence[float], days: int) -> list[Trial]:
-    """Return the trials of the sweep. Each day has a treadmill trial, then one walk of an active subject for each factor.
+    """Return the trials of the sweep. Each day has one treadmill trial, and one walk of an active subject per item of `factors`.
 
     Args:
         setting: settings that all walks share.
-        factors: assistance factors in their order.
+        factors: assistance factors in the order of the walks. The same factor may occur twice, for example 1, 0.5, 0, 0.5, 1.
         days: number of days. Only the seeds differ between the days.
     """
     from atalante_control.model import Patient
@@ -362,7 +361,12 @@ def push_trials(
 
 @cache
 def versions() -> dict[str, str]:
-    """Return the versions of Python, this project and the packages that compute a trial, a source hash, and the machine."""
+    """Describe the software and the machine that compute a trial.
+
+    Returns:
+        Versions of Python, of this project and of the packages in `_PACKAGES`, by name. The key "source" has a hash of the source
+        code, and the key "machine" has the processor architecture and byte order.
+    """
     import atalante_tools.session
 
     folder = Path(__file__).parent

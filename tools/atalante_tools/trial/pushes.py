@@ -95,10 +95,12 @@ def _branch(mass: float, height: float, seed: int, engine: str) -> Branch:
 
 
 class _Walk:
-    """End condition for the loop of the HAL, see `over`. Shortly before the pushed step, `over` also forks the process.
+    """Walk that is forked shortly before the pushed step, so that the steps before the push are computed only once.
+
+    The loop of the HAL calls `over` in each cycle. `over` forks the process and decides when the walk ends.
 
     Attributes:
-        ending: general end condition of a trial; created again with the push in the process of a continued walk.
+        ending: end condition of the walk: all steps walked, fall or stop. A copy of the walk with a push has its own condition.
         branch: forked copy of the walk that waits before the pushed step; None before the fork.
         continuation: copy of the walk that continues with a push; None in the process of the walk without a push.
     """

@@ -139,7 +139,11 @@ class ParquetSink:
 
 
 def _exact(field: Field, values: npt.NDArray[Any]) -> Any:
-    """Return the column `integer`: exact values as decimals, or only nulls if float64 represents all values exactly."""
+    """Return the values of a signal for the column `integer`: decimals if float64 may round a value, otherwise nulls.
+
+    float64 represents integers exactly only up to 2**53. A signal of 64 bits may have larger values. For such a signal,
+    the column `integer` has the exact values, and the column `value` has the rounded values.
+    """
     codes = raw_range(field) if field.kind != "float" else range(0)
     largest = (
         max((abs(code * field.factor + field.offset) for code in (codes[0], codes[-1])), default=0) if codes else 0

@@ -48,7 +48,7 @@ def read(log: LogFile, chunk_frames: int) -> Iterator[Chunk]:
                     kept, line_too_long = 0, True
                 continue
             start = MARGIN
-            if line_too_long:  # leave out the end of this line
+            if line_too_long:  # skip the rest of the line that was too long
                 start += int(np.argmax(text[MARGIN:stop] == ord("\n"))) + 1
                 line_too_long = False
             parsed = candump.parse(text, start, stop, log.channels)

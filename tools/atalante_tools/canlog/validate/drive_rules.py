@@ -234,7 +234,10 @@ def _command_fields(plan: Plan, command: str) -> list[_CommandField]:
 
 
 def _drive(row: int, node: str, commands: Sequence[_CommandField]) -> _Drive:
-    """Create a drive. The controlword of the drive is the first command field for the same node and joint.
+    """Create a drive, and find its controlword in the command fields.
+
+    The node must receive the field. If the field belongs to a joint, the name of the node must end with this joint. For
+    example, `FH_Controlword` is the controlword of the node LEFT_FH. The first matching field is used.
 
     Args:
         row: index of the state message in the plan.

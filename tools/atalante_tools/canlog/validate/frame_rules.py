@@ -47,7 +47,8 @@ class FrameRules:
         #: Expected FDF and BRS flags of each message: 0, 1, or `UNKNOWN` if the DBC does not define the flag.
         fd = [UNKNOWN if m.fd is None else int(m.fd) for m in layouts]
         switch = [UNKNOWN if m.bit_rate_switch is None else int(m.bit_rate_switch) for m in layouts]
-        # The additional last element makes the index 0 valid for a DBC without messages. No message uses this element.
+        # Frames without a known message read element 0. The dummy at the end of each array is this element if the DBC has
+        # no messages.
         self._fd, self._switch = np.array([*fd, UNKNOWN], np.int8), np.array([*switch, UNKNOWN], np.int8)
         self._length, self._sender = np.append(plan.lengths, 0), np.append(plan.sender_of_row, UNKNOWN)
         #: Node that recorded the log; None if not known yet; empty if the node cannot be determined (see `_RECORDER`).

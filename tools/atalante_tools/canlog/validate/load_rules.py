@@ -98,7 +98,7 @@ class LoadRules:
         return float((self._of_row[rows] / (period * 1e-9)).sum())
 
     def check(self, chunk: Chunk, rows: Rows) -> None:
-        """Add the wire times of all frames in a chunk.
+        """Sum the wire times of the frames in a chunk, for each bus and time window. `finish` checks the sums.
 
         Args:
             chunk: n frames of the log.

@@ -31,9 +31,7 @@ class _Bus:
     cycle_of: dict[int, int] = field(default_factory=dict)  # cycle number of the last state frame, by message index
     #: number of cycles between the last two state frames, by message index
     jump_of: dict[int, int] = field(default_factory=dict)
-    #: State frames that perhaps arrived one cycle too early, by message index: time stamp [ns]. Such a frame is the second
-    #: frame of its message in one cycle, and the last one in its chunk. If the next chunk shows that the next cycle has no
-    #: frame of this message, the frame was too early and is reported.
+    #: time stamp [ns] of a state frame that is judged in the next chunk (see `_check_order`), by message index
     doubtful: dict[int, int] = field(default_factory=dict)
 
 
@@ -108,6 +106,9 @@ class OrderRules:
         the second frame was received before its SYNC. If a cycle without a frame precedes a cycle with two frames, the
         first of the two frames was late. If a SYNC is missing in the log, a cycle also has two state frames, but then the
         previous and the next cycle have one state frame each, and nothing is reported.
+
+        The second frame of a cycle may be the last frame of its message in the chunk. Only the next chunk then shows whether
+        the next cycle has no frame. Until then, `bus.doubtful` stores the time stamp of the second frame.
 
         Args:
             bus: bus of the state message.

@@ -50,14 +50,14 @@ class Drive(NamedTuple):
 
 
 class DriveObserver(NamedTuple):
-    """Values that the search tracks itself, without the code of the drive.
+    """Values with which `_violation` checks the safety properties of the drive.
 
-    `_violation` checks the safety properties of the drive with these values.
+    The search counts these values itself. The counters of the drive could be wrong, so they are not used.
     """
 
     command_age: int = WATCHDOG  # number of cycles since the last valid command was sent
     sync_age: int = 0  # number of cycles since the last SYNC
-    unacknowledged: bool = False  # the drive started a local hold, and the HAL has not sent QUICK STOP since then
+    unacknowledged: bool = False  # whether a local hold has begun, and the HAL has not sent QUICK STOP since then
 
 
 class DriveCycle(NamedTuple):
@@ -73,7 +73,7 @@ class DriveCycle(NamedTuple):
 
 
 class DriveStep(NamedTuple):
-    """State of the search: state of the drive, and the values that the search tracks itself."""
+    """State of the search: state of the drive, and the values for the check of the safety properties."""
 
     drive: Drive
     observer: DriveObserver = DriveObserver()

@@ -60,7 +60,10 @@ class Operator(NamedTuple):
 
 
 class Presses(NamedTuple):
-    """Presses of START that the search `moves` remembers."""
+    """Presses of START that have not changed the supervisor state yet.
+
+    The search `moves` checks its properties with these values.
+    """
 
     received: int = 0  # number of received presses that have not begun a start yet; 2 means two or more
     started: bool = False  # whether a start is in progress that has not changed the supervisor state yet
@@ -264,7 +267,7 @@ def arrivals(before: Reception, operator: Operator) -> Iterator[tuple[PendantFra
         yield frame, frame
         yield (frame._replace(sender="damaged"),)
         if frame.pressed:
-            continue  # the search combines a second sender only with a pendant frame without a press
+            continue  # frames of a second sender are tried only in cycles in which no button of the pendant is pressed
         for request, pressed in ((Request.START, True), (before.own_request, False), (Request.STOP, True)):
             rogue = PendantFrame(0, True, request, pressed, "rogue")
             yield frame, rogue

@@ -48,10 +48,10 @@ QUALIFICATIONS: Final = {
     False: (Qualification(0, 0, False), Qualification(0, REQUALIFY - 1, False)),
     True: (SETTLED, Qualification(FULL - 4, REQUALIFY, True)),
 }
-#: Source of the RequestCounter that `Pendant.evaluate` read last. `_NONE`: no frame yet. `_LATEST`: last accepted frame.
-#: `_OLDER`: earlier frame. `_ROGUE`: frame of a second sender.
+#: Frame that `Pendant.evaluate` compares with the next frame, to find a press: no frame, the last accepted frame, an earlier
+#: frame, or a frame of a second sender.
 _NONE, _LATEST, _OLDER, _ROGUE = range(4)
-#: Source of the RequestCounter -> value of the RequestCounter.
+#: RequestCounter (counter of button presses) in each of these four frames.
 _EVALUATED: Final = {_NONE: None, _LATEST: _PRESSES, _OLDER: _PRESSES - 1, _ROGUE: _ROGUE_PRESSES}
 
 
@@ -61,7 +61,7 @@ class Reception(NamedTuple):
     age: int = 0  # age of the last accepted frame [cycles]; `LOST` after the timeout
     dead_man: bool = True  # whether the dead-man switch is pressed in the last accepted frame
     request: int = Request.START  # `Request` of the last accepted frame
-    evaluated: int = _LATEST  # source of the RequestCounter that `Pendant.evaluate` read last: `_NONE`, `_LATEST`, ...
+    evaluated: int = _LATEST  # last frame that the HAL checked for a press: `_NONE`, `_LATEST`, `_OLDER` or `_ROGUE`
     rogue: bool = False  # whether the last accepted frame has the RequestCounter of a second sender
     stored: bool = False  # whether a START is stored until the pendant is trusted
     trusted: bool = True
@@ -92,12 +92,15 @@ class Inputs(NamedTuple):
 
 
 class Supervision(NamedTuple):
-    """Part of the search state that belongs to the safety monitor of the HAL."""
+    """Part of the search state that belongs to the safety monitor of the HAL.
+
+    The search follows only one drive, the left frontal hip.
+    """
 
     supervisor: SupervisorState
     start: int  # `NO_START`, `LAST_START` or `START`
     enabling: bool = False
-    lowered: bool = False  # whether the HAL lowers the joint of the left frontal hip drive
+    lowered: bool = False  # whether the HAL keeps the left frontal hip drive off, so that its joint sinks
 
 
 class Environment(NamedTuple):
@@ -141,8 +144,7 @@ class HalSteps:
         network, robot = atalante_dbc.load(), load_robot()
         self._hal = Hal(network, robot, NoBus())
         self._monitor = self._hal._safety_monitor
-        # Leave out the direction test, which follows after all drives are enabled. During this test, the HAL sends the same
-        # controlwords as while it enables the drives, so the search misses no case.
+        # Leave out the direction test at the end of a start. The test changes no controlword, so the search misses no case.
         self._monitor.proof = DirectionProof(robot, ())
         self._image = self._hal._image
         self._pendant = self._monitor._pendant
@@ -162,10 +164,10 @@ class HalSteps:
     # -- pendant -----------------------------------------------------------------------------------------------------
 
     def _receive(self, before: Reception, frames: tuple[PendantFrame, ...]) -> tuple[tuple[Reception, Inputs], ...]:
-        """Return the possible results of a cycle in which frames of the pendant arrive.
+        """Return all pairs of `Reception` and `Inputs` that are possible after these frames arrive.
 
-        `own_request` belongs to the pendant, not to the HAL. This value is therefore computed here. The HAL then runs
-        only once for states that differ only in `own_request`.
+        The field `own_request` belongs to the pendant, not to the HAL. This field is therefore computed here. The HAL then
+        runs only once for states that differ only in `own_request`.
 
         Args:
             before: state before the cycle.
@@ -178,10 +180,12 @@ class HalSteps:
         )
 
     def _process(self, before: Reception, frames: tuple[PendantFrame, ...]) -> tuple[tuple[Reception, Inputs], ...]:
-        """Return the possible results of the HAL. The field `own_request` is 0 in each result, and the caller sets this field.
+        """Return all pairs of `Reception` and `Inputs` that the HAL may compute from these frames.
 
-        Some counters of the HAL are not part of a search state. For these counters, every value that leads to another
-        result is tried. The tests check the choice of the values.
+        Several pairs are possible, because some counters of the HAL are not part of a search state. For these counters,
+        every value that leads to another pair is tried. The tests check the choice of the values.
+
+        The field `own_request` is 0 in each pair. The method `_receive` sets this field.
 
         Args:
             before: state before the cycle.

@@ -1,4 +1,8 @@
-"""Conversion of a counterexample to a fault scenario: inputs become operator actions or faults of a walk in lock-step."""
+"""Conversion of a counterexample to a test case of a walk: each input becomes an operator action or an injected fault.
+
+A counterexample lists the inputs, cycle by cycle, with which a search has violated a safety property. The test case replays the
+inputs while the emulated robot walks.
+"""
 
 from __future__ import annotations
 
@@ -69,7 +73,7 @@ def drive_case_of(trace: Sequence[tuple[DriveCycle, DriveStep]]) -> Case:
     for cycle, _ in lost:
         if cycle != DriveCycle():
             raise NotReplayable(
-                f"the counterexample cannot be replayed: each cycle must only lose the command, got {cycle}"
+                f"the counterexample cannot be replayed: a lost command must be the only fault in each cycle, got {cycle}"
             )
     return Case("counterexample", (Fault("drop", "COMMAND_LEFT_LEG", 0, len(lost)),), observed=OBSERVED)
 

@@ -113,11 +113,12 @@ class _Shared(NamedTuple):
     program order.
     """
 
-    question: Vector  # `_CYCLE`, `_ATTITUDE` or `_STANCE`, shape (1,)
+    question: Vector  # request to the emulator: `_CYCLE`, `_ATTITUDE` or `_STANCE`, shape (1,)
     dial: Vector  # [number of calls of `assist` so far, last assistance factor (NaN means None)], shape (2,)
-    pushes: Vector  # whether the pelvis is pushed, shape (1,)
+    pushes: Vector  # 1 if the pelvis is pushed, otherwise 0, shape (1,)
     wrench: Vector  # force [N] and moment [Nm] on the pelvis, shape (6,)
-    answer: Vector  # attitude or stance, shape (4,)
+    #: answer to `_ATTITUDE`: quaternion xyzw of the pelvis; answer to `_STANCE`: x [m], y [m], yaw [rad], unused; shape (4,)
+    answer: Vector
 
 
 def access_memory() -> int:
