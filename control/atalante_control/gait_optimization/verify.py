@@ -24,6 +24,8 @@ _LEFT, _RIGHT = (f"{side}_{LEG_LINKS['HA']}" for side in SIDES)
 _SAMPLES = 201  # number of samples of a step
 _LOCAL = pinocchio.ReferenceFrame.LOCAL
 _CLEARANCE = 0.05  # m, intended height of the swing sole at mid-swing
+#: Ground friction coefficient that a verified gait may need at most.
+_FRICTION = 0.5
 _SLIDING = 1.0  # Ns, accepted impact impulse above the friction limit; 1 Ns changes the robot speed by some mm/s
 _SLIDE = 0.04  # m/s, accepted horizontal speed of a corner of the sole at the landing
 _DROP = 0.035  # m/s, accepted downward speed of a corner of the sole at the landing
@@ -186,7 +188,7 @@ class Verifier:
                 "",
             ),
             GaitCheck("unloaded fraction of the weight", float(1.0 - vertical.min() / self.weight), 0.5, ""),
-            GaitCheck("required friction coefficient", float(slip.max()), 0.5, ""),
+            GaitCheck("required friction coefficient", float(slip.max()), _FRICTION, ""),
             GaitCheck(
                 "centre of pressure along the sole",
                 float(np.abs(moment[:, 1] / vertical).max()),
@@ -231,8 +233,8 @@ class Verifier:
         """Return the checks of a periodic step: landing pose, periodicity, impact map."""
         after, impulse, leaving = self.impact(motion.q[-1], motion.qd[-1])
         mirrored_q, mirrored_qd = SIGN * motion.q[0][SWAP], SIGN * motion.qd[0][SWAP]
-        # Horizontal impulse minus the largest impulse that friction can transmit (coefficient 0.5). `_SLIDING` Ns are accepted.
-        sliding = math.hypot(impulse[0], impulse[1]) - 0.5 * impulse[2]
+        # Horizontal impulse minus the largest impulse that friction can transmit. `_SLIDING` Ns are accepted.
+        sliding = math.hypot(impulse[0], impulse[1]) - _FRICTION * impulse[2]
         sinking = -min(leaving[2] + np.cross(leaving[3:], corner)[2] for corner in self._corners())
         return [
             *self._landing(motion.q[-1], tolerances),

@@ -44,7 +44,7 @@ def test_continued_run_that_ends_without_an_answer_is_an_error() -> None:
             one.abandon()
         one.finish("here")
     assert isinstance(one, Branch)
-    with pytest.raises(RuntimeError, match="must answer, but it ended with status"):
+    with pytest.raises(RuntimeError, match="must answer, but it ended with exit code 1"):
         one.ask("abandon")
     assert one.ask("answer") == "here"
 

@@ -36,7 +36,7 @@ class Branch:
         answer = self._channel.recv()
         if isinstance(answer, _NoAnswer):
             raise RuntimeError(
-                f"the new process that continues the run must answer, but it ended with status {answer.status}"
+                f"the new process that continues the run must answer, but it ended with exit code {answer.exit_code}"
             )
         return answer
 
@@ -71,11 +71,11 @@ class _NoAnswer:
     """Message of the waiting process: a process that continued the run has ended, but has sent no answer.
 
     Attributes:
-        status: wait status of the ended process, see `os.waitpid`.
+        exit_code: exit code of the ended process; the negative number of the signal if a signal ended it.
     """
 
-    def __init__(self, status: int) -> None:
-        self.status = status
+    def __init__(self, exit_code: int) -> None:
+        self.exit_code = exit_code
 
 
 def branch() -> Branch | Continuation:
@@ -99,7 +99,7 @@ def branch() -> Branch | Continuation:
                 break
             _, status = os.waitpid(child, 0)
             if status:
-                theirs.send(_NoAnswer(status))
+                theirs.send(_NoAnswer(os.waitstatus_to_exitcode(status)))
     except EOFError:  # the process of the run has closed the branch, or has ended
         os._exit(0)
     except BaseException:  # noqa: BLE001 - in this copy of the process, no error may reach the caller
