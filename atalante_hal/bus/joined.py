@@ -209,9 +209,9 @@ class JoinedBus:
 def _combined(shares: list[Share], failures: dict[int, BusError]) -> BusError:
     """Choose the error that `send` raises if at least one channel failed.
 
-    A lost channel is worse than a full transmit queue. So the first error other than `BusFull` is chosen, and its attribute
-    `full` is set to the first `BusFull`. If all errors are `BusFull`, the first one is chosen. `accepted` of the chosen
-    error contains the accepted frames of all channels.
+    A lost channel is worse than any other error, and a full transmit queue is the mildest one. So the first `BusDown` is
+    chosen, or else the first error other than `BusFull`, and its attribute `full` is set to the first `BusFull`. If all errors
+    are `BusFull`, the first one is chosen. `accepted` of the chosen error contains the accepted frames of all channels.
 
     Args:
         shares: Frames of each channel.
@@ -228,8 +228,9 @@ def _combined(shares: list[Share], failures: dict[int, BusError]) -> BusError:
     others = [error for error in errors if not isinstance(error, BusFull)]
     if not others:
         return errors[0]
-    others[0].full = next((error for error in errors if isinstance(error, BusFull)), None)
-    return others[0]
+    worst = next((error for error in others if isinstance(error, BusDown)), others[0])
+    worst.full = next((error for error in errors if isinstance(error, BusFull)), None)
+    return worst
 
 
 def _file_of(link: Bus) -> int | None:

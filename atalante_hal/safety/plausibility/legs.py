@@ -124,7 +124,10 @@ class Legs:
         Args:
             joint: index of the joint in JOINTS.
         """
-        self._exchanged.pop(joint % len(LEG_JOINTS), None)
+        index = joint % len(LEG_JOINTS)
+        self._exchanged.pop(index, None)
+        if index < len(self._exchanges):
+            self._exchanges[index] = 0
 
     def check_left(self, ages: Ages | None) -> bool:
         """Check the left leg.
@@ -233,7 +236,10 @@ class Legs:
             agrees = abs(ours[axis] - apart) <= allowed and abs(theirs[axis] + apart) <= allowed
             self._exchanges[index] = self._exchanges[index] + 1 if agrees and abs(apart) > _APART else 0
             if self._exchanges[index] >= EXCHANGE_SAMPLES and index not in self._exchanged:
-                self._exchanged[index] = tuple(_exchange(_HIPS[side] + index, ours[axis]) for side in range(len(SIDES)))
+                errors = (ours[axis], theirs[axis]) if leg == 0 else (theirs[axis], ours[axis])
+                self._exchanged[index] = tuple(
+                    _exchange(hip + index, error) for hip, error in zip(_HIPS, errors, strict=True)
+                )
 
     def _without_heading(self, leg: int, comparison: _Comparison) -> list[float]:
         """Return the encoder angles of a leg minus its IMU angles, corrected for the heading drift of the IMUs [rad].

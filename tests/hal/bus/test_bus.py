@@ -770,6 +770,19 @@ def test_joined_bus_with_a_full_and_a_closed_channel_reports_both(network: Netwo
     assert f"{down} is closed" in lossy.down
 
 
+@pytest.mark.parametrize(("other", "down"), [("left_leg", "right_leg"), ("right_leg", "left_leg")])
+def test_joined_bus_raises_the_error_of_the_lost_channel_first(network: Network, other: str, down: str) -> None:
+    class Failing(WrappedBus):
+        def send(self, frames: Frames) -> None:
+            raise BusError("the kernel reports an error")
+
+    channels: dict[str, Bus] = {bus: lockstep_pair(capacity=8, names=(bus, f"{bus} peer"))[0] for bus in BUSES}
+    channels[down].close()
+    channels[other] = Failing(channels[other])
+    with pytest.raises(BusDown, match=f"{down} is closed"):
+        JoinedBus(network, channels).send(frames_of(network, "SYNC_LEFT_LEG", "SYNC_RIGHT_LEG", "SYNC_LEFT_SENSE"))
+
+
 def test_joined_bus_requires_a_channel_for_every_bus(network: Network) -> None:
     with pytest.raises(ValueError, match="; right_leg is missing"):
         JoinedBus(network, {"left_leg": lockstep_pair()[0]})

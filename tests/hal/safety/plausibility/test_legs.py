@@ -345,11 +345,14 @@ class TestExchange:
             joint = JOINTS[index].removeprefix("left_")
             assert self.found(legs) == ([f"LEFT_{joint}", f"RIGHT_{joint}"] if expected else [])
 
-    def test_both_legs_check_the_exchange(self):
+    @pytest.mark.parametrize("last", [0, 1])
+    def test_both_legs_check_the_exchange(self, last: int):
         legs = self.exchanged(0, 0.05)
-        legs.legs.check_left(None)
-        legs.legs.check_right(None)
+        checks = legs.legs.check_left, legs.legs.check_right
+        checks[1 - last](None)
+        checks[last](None)
         assert self.found(legs) == ["LEFT_FH", "RIGHT_FH"]
+        assert [finding.value for finding in legs.legs.findings()] == pytest.approx([0.05, -0.05])
 
     @pytest.mark.parametrize(("share", "expected"), [(0.6, False), (0.7, True), (1.3, True), (1.4, False)])
     def test_errors_must_agree_with_the_readings(self, share: float, expected: bool):
@@ -404,6 +407,23 @@ class TestExchange:
         assert self.found(legs) == ["LEFT_FH", "RIGHT_FH"]
         legs.legs.reference(joint)
         assert self.found(legs) == []
+
+    @pytest.mark.parametrize("joint", [0, 6])
+    def test_restart_of_a_drive_restarts_the_count(self, joint: int):
+        legs = self.exchanged(0, 0.05)
+        legs.compare(2)
+        legs.legs.reference(joint)
+        legs.compare()
+        assert self.found(legs) == []
+        legs.compare()
+        assert self.found(legs) == ["LEFT_FH", "RIGHT_FH"]
+
+    def test_restart_of_an_ankle_drive_changes_nothing(self):
+        legs = self.exchanged(0, 0.05)
+        legs.compare(2)
+        legs.legs.reference(4)
+        legs.legs.reference(11)
+        assert self.found(legs) == ["LEFT_FH", "RIGHT_FH"]
 
     def test_heading_drift_of_the_imus_is_no_exchange(self):
         angles = ([0.0, 0.03, 0.0, 0.0], [0.0, -0.03, 0.0, 0.0])
