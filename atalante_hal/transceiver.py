@@ -25,7 +25,8 @@ PERSISTENT = 5
 #: Time to listen for another HAL before the first SYNC [s].
 LISTEN = 0.2
 #: Longest wait for unlikely answers [s]. Answers are unlikely if the last SYNC was not sent, if every node has timed out, or if
-#: the missing nodes have not answered several SYNCs.
+#: the missing nodes have not answered several SYNCs. Each unanswered SYNC halves the wait, but not below this time, see
+#: `Transceiver.receive`.
 _DOUBTFUL_PATIENCE = 0.1
 #: Class bit of an error frame that reports bus-off (linux/can/error.h).
 ERROR_BUS_OFF = 0x40

@@ -47,7 +47,7 @@ UNREADABLE = (
 class LogUnreadable(BusError):  # noqa: N818
     """Error of a log that cannot be read.
 
-    The log is missing, empty, truncated or not closed, or its format cannot store CAN FD frames.
+    The log is missing, empty, truncated, damaged or not closed, or its format is unknown or cannot store CAN FD frames.
     """
 
 

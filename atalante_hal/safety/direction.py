@@ -50,8 +50,9 @@ _SHORT = min(duration for _, duration in GROUPS)
 #: Delay [cycles] from a torque command to the first position that shows its effect, if no frame and no motor is late.
 LATENCY = 2
 #: Delays that the test tries [cycles]. States, commands and motors may be late by three cycles in total.
-#: Longer delays are not tried, because they would hide a motor with a wrong sign. After a pulse of 16 cycles, a motor with a
-#: wrong sign moves its joint almost like a correct motor that is 4 to 5 cycles late.
+#: Longer delays are not tried, because they would hide a motor with a wrong sign. In a pulse of 16 cycles, the largest and the
+#: smallest torque are 4.6 cycles apart. So a motor with a wrong sign moves its joint almost like a correct motor that is 4 to 5
+#: cycles late.
 LATENCIES = tuple(range(LATENCY, LATENCY + 4))
 #: Peak of the pulse as a multiple of `Robot.breakaway`, in the order of LEG_JOINTS.
 #: The peaks of FH and SH are larger, because these joints move a whole leg.
@@ -120,7 +121,7 @@ def mobilities_of(torque: Vector, position: Vector) -> tuple[Vector, Vector]:
     Returns:
         Two arrays of shape (delays, joints). The first array is the mobility, the inverse of the effective inertia
         [1/(kg m2)]. The mobility is 0 for a joint whose torque did not change. The second array is the share of the measured
-        motion that the torque explains. The share is from 0 to 1 and has the sign of the mobility.
+        motion that the torque explains. The magnitude of the share is from 0 to 1, and its sign is the sign of the mobility.
     """
     count = len(position)
     response = np.zeros((len(LATENCIES), *torque.shape))
@@ -151,8 +152,9 @@ class DirectionProof:
         mobility: last measured mobility of each joint, shape (12,) [1/(kg m2)]; 0 if it was not measured.
         failed: indices in JOINTS of the joints that failed in this start.
         running: True from `begin` until all joints are tested, or one has failed.
-        late: delay of the torques in addition to `LATENCY` [cycles]. It is estimated from all tests with a short pulse and more
-            than two joints: with this delay, the torques explain the motions best. 0 before the first such test.
+        late: delay of the torques in addition to `LATENCY` [cycles]. With this delay, the torques explain the motions best. The
+            motions are those of all joints that passed a test with a short pulse and more than two joints in the last start. A
+            new start keeps the delay until its first such test. 0 before any joint passed such a test.
     """
 
     def __init__(self, robot: Robot, groups: Sequence[tuple[Sequence[str], int]] = GROUPS) -> None:

@@ -168,9 +168,9 @@ class FaultMemory:
     def walk_ends(self, drives: Collection[str]) -> frozenset[Dtc]:
         """Return the confirmed codes that permit a walking robot to finish its walk before HOLD, see `permits_walk_end`.
 
-        With these codes, the robot walks on until it stands on both feet, and then goes to HOLD. With all other codes, the
-        drives hold at once. A code may be confirmed for several nodes. The code is returned only if all these nodes permit the
-        end of the walk.
+        With these codes, the robot walks on until it stands on both feet, and then goes to HOLD. All other codes keep their
+        reaction: a code with the reaction HOLD leads to HOLD at once. A code may be confirmed for several nodes. The code is
+        returned only if all these nodes permit the end of the walk.
 
         Args:
             drives: DBC names of the drives.

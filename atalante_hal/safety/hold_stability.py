@@ -12,9 +12,10 @@ about its torque limit (`SATURATED`), but the joint neither moves back nor slows
 wrong direction, a motor without torque, exchanged encoders, and a load that exceeds the torque limit. When a drive stops a
 moving joint, its torque may reach the limit for a longer time, but the joint slows down.
 
-*Motor without torque.* For `OVERLOADED` cycles, a joint is at least `SUNK` from the position in which the hold began and does not
-move back, but the drive reports hardly any torque (`POWERLESS`). The IMUs of the leg must confirm the encoder (`ENCODER_ERROR`),
-because a joint with a wrong encoder may not have moved. No IMU is below SA and HA, so this check omits SA and HA.
+*Motor without torque.* For `OVERLOADED` cycles, a joint is at least `SUNK` from the position in which the hold began and neither
+moves back nor slows down, but the drive reports hardly any torque (`POWERLESS`). The IMUs of the leg must confirm the encoder
+(`ENCODER_ERROR`), because a joint with a wrong encoder may not have moved. No IMU is below SA and HA, so this check omits SA and
+HA.
 """
 
 from __future__ import annotations
@@ -40,13 +41,13 @@ REVERSALS: Final = 6
 #: Lowest and highest reported torque that count as overload, as shares of the drive's torque limit.
 #: A drive cannot produce more than 105 % of its torque limit. A higher reported torque is a wrong value, not an overload.
 SATURATED: Final = (0.9, 1.05)
-#: A drive is regarded as overloaded after this number of consecutive cycles with overload.
+#: A drive is reported after this number of consecutive faulty cycles: cycles with overload, or with a motor without torque.
 OVERLOADED: Final = 20
 #: Overload is counted only while a joint is at least this far from the position in which the hold began [rad].
 #: If a drive holds its joint but reports a wrong torque, the joint stays closer, so no overload is counted.
 AWAY: Final = math.radians(1.0)
 #: A drive without torque is reported only if its joint is at least this far from the position in which the hold began [rad].
-#: At this distance, the position control of a working drive demands the full torque.
+#: At this distance, the stiffness of a working drive (`Robot.hold_kp`) demands more than half of `Robot.torque_max`.
 SUNK: Final = math.radians(3.0)
 #: A drive without torque reports less than this share of its torque limit.
 POWERLESS: Final = 0.1
@@ -146,7 +147,7 @@ def _watch_load(joints: Measured, limit: Vector, driven: tuple[float, float], lo
 
 
 class HoldStability:
-    """Check that each drive holds its joint without oscillation and without overload.
+    """Check for oscillation, overload and motors without torque, see the module docstring.
 
     The check is used while the HAL sends no torques of the controller.
     """

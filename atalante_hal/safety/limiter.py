@@ -246,11 +246,12 @@ def highest_torque(room: float, acceleration: float, oldest: float, inertia: flo
 
     With the torque U, the predicted growth of the velocity is acceleration times time:
 
-    - Acceleration: `acceleration` + (U - `oldest`) / `inertia`. The measured acceleration belongs to the torque `oldest`.
+    - Acceleration: `acceleration` + max(0, U - `oldest`) / `inertia`. The measured acceleration belongs to the torque `oldest`.
     - Time: `delay` + `fall` * U. After the delay, the torque falls from U to 0. The mean torque in the fall is U / 2, so half of
       the duration of the fall counts.
 
-    U is the larger solution of the quadratic equation growth = `room`.
+    U is the largest torque for which the growth is at most `room`; 0 if there is no such torque above 0. If U is above `oldest`,
+    U is the larger solution of the quadratic equation growth = `room`. Otherwise the equation is linear.
 
     Args:
         room: difference between the velocity limit and the velocity [rad/s].

@@ -224,8 +224,8 @@ class MessageMonitor:
         sender, two_senders = self._senders[row], self._check_senders(cycle, memory, row, rival)
         tolerated, timeout = self._legs[row] in tolerance.legs, self._timeouts[row]
         fresh = check <= Check.SOME_LOST
-        # The timeout is longer only in cycles without an accepted frame. An accepted frame with data older than the DBC timeout
-        # is late, because the plausibility checks ignore such data.
+        # The timeout is longer only in cycles without an accepted frame. If the age of an accepted frame's data is at least the
+        # DBC timeout, the frame is late, because the plausibility checks ignore such data.
         late = age >= timeout + tolerance.longer * (tolerated and not fresh)
         # Impossible signal values do not reduce the trust, because the frame was transmitted correctly.
         good = (fresh or check >= Check.RANGE) and not rival

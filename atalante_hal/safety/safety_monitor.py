@@ -138,6 +138,8 @@ class SafetyMonitor:
         self.torque_tracking = TorqueTracking(robot.breakaway)
         self.torque_motion: TorqueMotion | None = None
         #: DBC names of the drives that are kept off until a start passes its direction test, see `proof`.
+        #: These are drives with a wrong torque, drives that did not hold their joints, drives whose joints failed the test, and
+        #: drives that were off when START was pressed in READY.
         #: A start enables these drives for the test. If the start fails, the drives are switched off again.
         self._kept_off: set[str] = set()
         #: True if `evaluate` may skip the next cycle. The cycle is skipped only if all data are fresh, there is no fault, and

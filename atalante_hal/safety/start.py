@@ -77,7 +77,7 @@ class StartRequest(NamedTuple):
 class Refusal(NamedTuple):
     """Event that is logged when a start is refused or fails."""
 
-    code: str  # START_REFUSED, or START_FAILED if the drives were not enabled in time
+    code: str  # START_REFUSED, or START_FAILED if the drives were not enabled in time, or if a direction test failed
     severity: str  # severity of the event, one of `events.SEVERITIES`
     text: str  # one sentence for the operator
 

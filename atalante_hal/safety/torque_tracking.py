@@ -87,7 +87,7 @@ class TorqueTracking:
         self.restart()
 
     def restart(self) -> None:
-        """Discard all stored torques, because the drives did not follow the controller until now."""
+        """Discard all stored torques. Call this when the controller stops driving the joints."""
         for record in self._tracking:
             record[:] = 0
 

@@ -184,8 +184,8 @@ class Emulator:
         self._whole = [self._tx.frames]
         #: For each leg: index of its SYNC message in the list of SYNC messages.
         self._leg_syncs = [[m.name for m in syncs].index(f"SYNC_{side.upper()}_LEG") for side in SIDES]
-        #: For each SYNC: answer of the nodes on the bus of this SYNC in the last cycle.
-        #: If a SYNC arrives after its cycle has already run, the nodes send this stored answer.
+        #: For each SYNC: copy of the answer of the nodes on its bus in the last imperfect cycle, see `_imperfect_cycle`.
+        #: If a SYNC of that cycle arrives after the cycle has already run, the nodes send this stored answer.
         self._answered = self._shares
         batch = new_frames(_BATCH)
         self._batch = batch.view(np.uint8).data

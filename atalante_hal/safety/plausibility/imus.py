@@ -156,7 +156,7 @@ def largest(readings: Vector) -> float:
 def _end_of_range(codec: Codec, name: str) -> float:
     """Return the saturation threshold of an IMU signal: the maximum of its range minus half of its resolution.
 
-    A reading at or above this threshold counts as saturated.
+    A reading whose absolute value is at or above this threshold counts as saturated.
     """
     signal = next(signal for _, signal in codec.signals if signal.name == name)
     return signal.maximum - 0.5 * signal.factor

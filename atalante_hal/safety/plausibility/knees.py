@@ -51,12 +51,11 @@ _MEAN_TIME = 0.75
 #: Time that the filters need to settle after the start [s]. `Filters.moments` is updated only after this time.
 _SETTLING_TIME = 2.0
 #: The error of a knee angle is computed only if the root mean square of the lever exceeds this value [m/rad].
-#: The lever is the derivative of the tibia IMU's position with respect to the knee angle SK, after the correction for the segment
-#: length in `knee_error`. In a walk, the root mean square of the lever is about 0.012 m/rad.
+#: The lever is the filtered value s of `Filters`, after the correction for the segment length in `knee_error`.
+#: In a walk, the root mean square of this lever is about 0.012 m/rad.
 _LEAST_LEVER = 0.007
-#: An error of a knee angle is reported only if it explains more than this share of the squared position difference.
-#: The position difference is the measured minus the computed position of the tibia IMU, after the correction for the segment
-#: length in `knee_error`.
+#: An error of a knee angle is reported only if it explains more than this share of the mean square of the position difference.
+#: The position difference is the filtered value d of `Filters`, after the correction for the segment length in `knee_error`.
 _SHARE = 0.25
 #: Number of filters of each leg and axis.
 _FILTERS = 11

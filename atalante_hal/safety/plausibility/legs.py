@@ -1,4 +1,4 @@
-"""Leg checks, which compare the encoders of a leg with its IMUs to detect drifting and stuck encoders.
+"""Leg checks, which compare the encoders of a leg with its IMUs to detect drifting, stuck and exchanged encoders.
 
 Four joints of a leg lie between the pelvis IMU and the tibia IMU: frontal, transverse and sagittal hip and sagittal
 knee (FH, TH, SH, SK). At zero angles their axes are x, z, y and y. So the attitude of the tibia relative to the pelvis
@@ -22,8 +22,9 @@ another axis. If the readings of SH and SK are both constant, both are reported.
 standstill check needs no torque, so it also covers a joint that other joints move.
 
 *Exchange.* If the encoders of a joint are exchanged between the legs, each encoder reports the angle of the other leg. So the
-errors of both legs are opposite, and their size is the difference between the two readings. The joint is reported when the
-difference is above `_APART` in `EXCHANGE_SAMPLES` consecutive samples. Exchanged tibia IMUs have the same effect, about all axes.
+errors of both legs are opposite, and their size is the difference between the two readings. The joint is reported when
+the errors agree with the difference within `_AGREEMENT`, and the difference is above `_APART`, in `EXCHANGE_SAMPLES` consecutive
+samples. Exchanged tibia IMUs have the same effect, about all axes.
 
 *Age.* Values from earlier cycles are extrapolated to this cycle with the velocity that the same message contains. The
 thresholds are extended by `velocity_error` times the age of the values.
@@ -51,8 +52,8 @@ STANDSTILL_SAMPLES = 2
 EXCHANGE_SAMPLES = 2
 #: The encoders of a joint can be recognised as exchanged only if the left and the right reading differ by more than this [rad].
 _APART = math.radians(1.2)
-#: Exchanged encoders cause an error (encoder angle minus IMU angle) as large as the difference of left and right reading.
-#: Encoders count as exchanged if the errors of both legs deviate from this value by at most 35 %.
+#: Exchanged encoders cause an error (encoder angle minus IMU angle) in each leg: the reading of this leg minus the reading of the
+#: other leg. Encoders count as exchanged if the errors of both legs deviate from these values by at most 35 %.
 _AGREEMENT = 0.35
 #: The standstill check tolerates this drift of the IMUs per sample [rad]. Intact IMUs drift less than a tenth as much.
 _IMU_DRIFT = 2e-5
@@ -84,7 +85,8 @@ class Legs:
 
     Attributes:
         encoder_error: encoder angle of each joint minus its angle from the IMUs in the last sample of its leg, shape (12,) [rad].
-            SH and SK both have the error of their sum. The error is infinite if a value is too old, and always for SA and HA.
+            The estimated heading drift is subtracted. SH and SK both have the error of their sum. The error is infinite
+            if a value is too old, and always for SA and HA.
 
     Args:
         robot: sensor thresholds of the robot.

@@ -26,8 +26,8 @@ from atalante_hal.wire.process_image import NEVER
 SOLE_SAMPLES = 4
 #: A foot counts as flat on the floor only if its load exceeds this multiple of `cell_free`.
 _LOAD = 4.0
-#: A foot counts as flat only if its centre of pressure is at most this far from the middle of the foot: along, across.
-#: The unit is the distance of a force cell from the middle. In this unit, the sole ends at 1.1 along and at 2.0 across the foot.
+#: A foot counts as flat only if its centre of pressure is at most this far from the middle of its cells: along, across.
+#: The unit is the distance of a force cell from this middle. In this unit, the sole ends at 1.1 along and at 2.0 across the foot.
 _CENTRE = (0.8, 1.4)
 #: Outward rotation of the foot about the vertical axis of the tibia [rad].
 TOE_OUT = math.radians(8.0)

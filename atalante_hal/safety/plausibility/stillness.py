@@ -82,7 +82,8 @@ class Drive(NamedTuple):
     """Torque of each joint since its encoder reading last changed, and a simulated motion. Shape (12,) each.
 
     The simulated joint starts at rest. If the torque changes by more than `breakaway`, the part of the change above `breakaway`
-    accelerates the joint. The inertia of the simulated joint is `_INERTIA`, an upper bound, so a real joint turns further.
+    accelerates the joint. If the torque changes by less, the missing part brakes the joint, at most to rest. The inertia of the
+    simulated joint is `_INERTIA`, an upper bound, so a real joint turns further.
     """
 
     cycles: Vector  # number of cycles since the encoder reading last changed

@@ -51,7 +51,7 @@ class GaitReference:
         time: Vector = np.arange(gait.cycles + 1, dtype=np.float64) * PERIOD
         (c0, c1), (c0d, c1d), _ = deadbeat.basis(time)
         end = self._end = int(np.searchsorted(time, deadbeat.end))
-        #: Offset s from the nominal angles and its rate s' in each cycle, for a deviation of 1 at the stance change.
+        #: Offset s from the nominal angles and its rate s' in each cycle of the re-centring, for a deviation of 1 at its start.
         #: Element 0 is for the angle deviation s(0) = 1 rad, element 1 for the speed deviation s'(0) = 1 rad/s.
         #: Shape (2, cycles, 24): 12 columns s, then 12 columns s'.
         self._basis = np.zeros((2, end, 2 * _N))

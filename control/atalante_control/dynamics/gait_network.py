@@ -35,7 +35,8 @@ LEG_SEGMENTS = ("thigh", "shank")  # body segments whose length is an input
 OUTPUTS = len(JOINTS) * (DEGREE + 1)
 LAYERS_MAX = 4
 WIDTH_MAX = 128  # largest number of neurons of a layer
-#: Largest angle jump at the stance change [rad] that is accepted as a rounding error.
+#: Largest angle jump at the stance change [rad] that is accepted as a rounding error. The limit applies to the bias of the last
+#: layer and to each row of its weights.
 _PERIODICITY_DEFECT = 1e-9
 _ANGLE_MAX = 2.0 * np.pi  # rad, largest accepted absolute value of a control point
 #: Relative tolerance of the range check of the inputs. The inputs `thigh` and `shank` are quotients with rounding errors.

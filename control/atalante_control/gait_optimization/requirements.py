@@ -39,7 +39,8 @@ class Requirements:
         0.025  # m/s, limit of the forward speed and of the lateral speed of each corner of the landing sole
     )
     #: Largest jump of a joint speed at the impact [rad/s].
-    #: It is smaller than the accepted jump `VELOCITY_JUMP`, because the gait network adds a fit error to the jump of the gait.
+    #: A gait of the network keeps the fraction `fit.JUMP_KEPT` of this jump, and the fit error is added. The sum must be at most
+    #: `VELOCITY_JUMP`.
     impact_jump: float = 0.6 * VELOCITY_JUMP
     sinking: float = 0.01  # m/s, largest downward speed of the rear foot after the impact
     # The cost is the sum of (joint torque / 100 Nm)^2 plus three weighted sums of squares. Without the sums for tilt and

@@ -37,14 +37,15 @@ def solve_with_second_start(subject: Subject, attempt: Attempt) -> SolvedGait:
 
     The second initial guess is a solved gait of the same patient, with the step length and duration in `MODERATE`.
     If the patient has no landing pose for the step length, the optimiser does not start, and there is no second start.
+    There is also no second start if the subject itself has the values in `MODERATE`, or if the gait with these values fails.
 
     Args:
         subject: patient and step parameters.
         attempt: function that solves a gait.
 
     Returns:
-        The gait. If the second start fails, too, the gait is the last iterate of the first attempt. The status then
-        states the reasons of both failures, and names the joints that are at a limit in the last iterate.
+        The gait. Without a successful attempt, the gait is the last iterate of the first attempt. The status then states the
+        reason of each failure. If the optimiser started, the status also names the joints that are at a limit in this iterate.
     """
     first = attempt(subject, None)
     if first.solved or first.iterations == 0:

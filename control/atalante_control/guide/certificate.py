@@ -72,7 +72,8 @@ class Limit(NamedTuple):
     """Condition that limits the disturbance torques for which a guide can be certified."""
 
     #: Largest factor on the requested disturbance torques of hip and knee with which the guide meets the condition. Example: 0.8
-    #: means 24 and 14.4 Nm if 30 and 18 Nm are requested. A negative factor means that the model errors alone are too large.
+    #: means 24 and 14.4 Nm if 30 and 18 Nm are requested. A negative factor means that the guide does not meet the condition
+    #: even without disturbance torques.
     scale: float
     what: str  # condition in words, for a message
 
@@ -196,7 +197,7 @@ def _limit(room: Vector, reach: Vector, steps: int, what: str) -> Limit:
         room: limit minus the value of the quantity without disturbances, for SH and SK in each cycle, shape (n, 2).
         reach: largest change of the quantity in each cycle, shape (n, 4). Columns 0 and 1: SH and SK, due to the model errors.
             Columns 2 and 3: SH and SK, due to the requested disturbance torques.
-        steps: number of cycles of a step.
+        steps: number of cycles of a step. The cycles 1 to `steps` are checked.
         what: start of the message; joint and phase are appended.
     """
     budget, promise = reach[1 : steps + 1, :2], reach[1 : steps + 1, 2:]

@@ -66,7 +66,8 @@ class HandOver:
     deviation: float = math.radians(2.7)  # rad, largest angle deviation |s(0)| of sagittal hip and knee
     rate: float = 0.25  # rad/s, largest speed deviation |s'(0)| of sagittal hip and knee
     #: Nm, largest torque jump at a stance change, of sagittal hip and knee. In the air, the controller adds a torque that cancels
-    #: the jump, and this torque then fades out.
+    #: the jump, and this torque then fades out. On the ground, the controller adds no such torque, but the budget includes its
+    #: bound during `WalkConfig.engage`.
     torque: Pair = (25.0, 13.0)
     #: rad/s2, largest joint acceleration before the stance change. The acceleration distorts the velocity measured
     #: after the change.
@@ -174,7 +175,9 @@ _SPEED_MARGIN = 1.0
 
 
 class Effect(NamedTuple):
-    """Matrices from a disturbance to its effect on the hip and on the knee. The effect is an error, a torque or a speed.
+    """Matrices from a disturbance to its effect on the hip and on the knee.
+
+    The effect is an error, a speed, a torque, or the change of a torque within one cycle.
 
     A disturbance is an acceleration of hip and knee that lasts one cycle. The disturbance has two effects:
 
@@ -182,15 +185,18 @@ class Effect(NamedTuple):
     2. While the joints accelerate, the measured velocity lags behind the true velocity. Therefore a prediction starts with a
        wrong velocity. The matrices `hidden` describe how the wrong velocity changes the prediction.
 
-    The matrices `left` convert an acceleration to a torque. For an error or a speed, they are unit matrices.
+    The matrices `left` convert an acceleration to a torque. The change of a torque is converted from the change of an
+    acceleration. For an error or a speed, `left` contains unit matrices.
     """
 
-    #: (n, 2, 2) matrix i converts an acceleration that lasts one cycle to the error, speed or acceleration i cycles later
+    #: (n, 2, 2) matrix i converts an acceleration that lasts one cycle to the error or speed i cycles later. For a torque or
+    #: its change, matrix i gives an acceleration or its change, which `left` then converts.
     pushed: Vector
     #: (n, 2, 2) matrix i converts an acceleration at the start of a prediction to the change of the prediction i cycles later.
     #: With an empty array (0, 2, 2), this change is left out.
     hidden: Vector
-    left: Vector  # (n, 2, 2) mass matrix in each cycle of the step if the effect is a torque, otherwise unit matrices
+    #: (n, 2, 2) mass matrix in each cycle of the step if the effect is a torque or its change, otherwise unit matrices
+    left: Vector
 
 
 class Grid(NamedTuple):
@@ -203,9 +209,10 @@ class Grid(NamedTuple):
 
 
 def spread(effect: Effect, mobilities: Vector, bounds: Vector, grid: Grid, ahead: Vector) -> Vector:
-    """Compute how much disturbance torques can change the error, the torque or the speed of hip and knee in the worst case.
+    """Compute how much disturbance torques can change a quantity of hip and knee in the worst case.
 
-    `effect` selects the quantity: error, torque or speed. The function fills `ahead` and returns a second array.
+    `effect` selects the quantity: error, speed, torque, or change of the torque within one cycle.
+    The function fills `ahead` and returns a second array.
     In `ahead`, the disturbances begin when a prediction starts.
     In the returned array, the disturbances begin at the start of the step.
 

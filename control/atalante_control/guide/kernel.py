@@ -68,7 +68,9 @@ class Guard:
     #: safety value 1 - `largest_ratio`^2 of the last cycle; at h >= 0, the backup policy can keep both joints inside the guide
     h: float
     rate: float  # 1/s, dh/dt after the low-pass filter
-    gate: float  # weight of the backup torque in the last cycle, in [0, 1]
+    #: Weight of the backup torque in the last cycle. `tick` writes a value in [0, 1]. The literal law
+    #: (`literal.assistive_torque`) can write a value outside [0, 1].
+    gate: float
     #: rad, distances from q_des to the bounds: hip upper, hip lower, knee upper, knee lower
     bounds: Annotated[Vector, 4]
 

@@ -47,8 +47,9 @@ class WalkConfig:
     """
 
     gains: PidGains = WALK_GAINS
-    #: Reduction of the derivative gains of the stance leg (SH, SK, SA) per cycle of loop delay. With 3 cycles, 75 % remain.
-    #: With full gains and 3 cycles of delay, the stance leg of a light patient oscillates with 50 Hz after a landing.
+    #: Reduction of the derivative gains of the stance leg (SH, SK, SA) per cycle of additional loop delay (`State.delay`), as a
+    #: fraction of the full gains. With 1/12 and 3 cycles, 75 % remain.
+    #: With full gains and 3 cycles of `State.delay`, the stance leg of a light patient oscillates with 50 Hz after a landing.
     damping_loss: float = 1.0 / 12.0
     impact: ImpactConfig = field(default_factory=ImpactConfig)
     #: End of the re-centring (return from the measured to the nominal motion), as a fraction of the step duration.

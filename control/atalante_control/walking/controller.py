@@ -460,9 +460,10 @@ class WalkController:
         record.assistance_factor, stage.intensity = xi, intensity(xi)
 
     def _watch_guide(self, cycle: int) -> None:
-        """Update the statistics of the guide, and report h < 0 to the HAL.
+        """Update the statistics of the guide, and set the reports to the HAL: `outside`, `guide_left` and `hand_over_exceeded`.
 
-        At h < 0, the swing leg is outside the guide, or the guide filter predicts that the leg will leave the guide.
+        `Command.outside` reports h < 0: the swing leg is outside the guide, or a quantity of the worst-case prediction (error,
+        torque or speed) exceeds its limit.
 
         Args:
             cycle: cycles since the start of the step.

@@ -113,8 +113,8 @@ class Assistance(NamedTuple):
 
     guide: GuideTables  # `GuideFilter.tables`
     literal: LiteralTables  # `LiteralGuide.tables`, used instead of `guide` if `Stage.literal` is True
-    #: (n + 1, 2) Nm, torques of hip and knee due to the motion of the pelvis, which the leg model of the guide filter leaves out.
-    #: Row: cycle of the step.
+    #: (n + 1, 2) Nm, torques of hip and knee due to the pelvis motion and the weight of the patient's leg, see `swing_leg`.
+    #: Row: cycle of the step. `_assist` adds these torques to u_g of hip and knee, except in the literal law.
     unmodelled: Vector
     fade: Vector  # (m,) factor of `Stage.excess` in each cycle after the nominal end of the step; falls from 1 to 0
 
@@ -222,8 +222,9 @@ def _velocity(point: Vector, sole: Vector, sole_velocity: Vector, gyro: Vector) 
 def start(measured: Measured, table: PhaseTable, parts: Parts) -> None:
     """Store the deviations of the measured motion at the start of a phase.
 
-    The re-centring fades out these deviations during the phase. If no foot swings, the speed deviations are set to 0. Otherwise
-    the re-centring would continue the downward motion of a foot that has just landed, and press the foot into the floor.
+    The re-centring fades out these deviations during the phase. If no foot swings, the speed deviations are set to 0. With the
+    measured speeds, the re-centring would continue the downward motion of a foot that has just landed, and press the foot into
+    the floor.
 
     Args:
         measured: measurements of the cycle.
@@ -424,7 +425,7 @@ def _desired(cycle: int, placement: Placement, table: PhaseTable, stage: Stage, 
     """Write q_des and q_des', and return the current row of the phase table.
 
     q_des is the sum of the table, the re-centring (fades out the deviation at the start of the phase), the steering and the
-    lowering of a late swing foot. Afterwards, foot placement and flat foot change q_des further.
+    lowering of a late swing foot. Afterwards, lean, foot placement and flat foot change q_des further.
 
     Args:
         cycle: cycles since the start of the phase.

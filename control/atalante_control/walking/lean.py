@@ -7,12 +7,14 @@ moment of inertia J of the rotating parts about the hip, the natural frequency w
 counts most, because a DCM error grows with exp(w t). The trunk therefore leans fast and returns slowly. The lean is an offset
 of the frontal hip (FH) of the stance leg.
 
-A push to the side of the stance foot makes the trunk lean over the stance foot. This lean begins when the distance from the
-DCM to the middle of the stance sole falls below `inside`. A push to the side of the swing foot makes the trunk lean a little
-to the side of the swing foot. This lean also lowers the swing foot.
+A push to the side of the stance foot makes the trunk lean over the stance foot. This lean requires that the DCM is near the
+middle of the stance sole or beyond it: on the side of the swing foot, the DCM must be less than `inside` from the middle. On the
+other side, the distance is not limited. A push to the side of the swing foot makes the trunk lean a little to the side of the
+swing foot. This lean also lowers the swing foot.
 
-If the push moves the DCM beyond the middle of the stance sole by more than `leg_zone`, the swing foot moves away from the
-stance foot. The swing leg then turns in the same direction as the trunk, and its mass moves away from the DCM.
+If the DCM is beyond the middle of the stance sole by more than `leg_zone`, on the side away from the swing foot, the swing foot
+also moves away from the stance foot. The swing leg then turns in the same direction as the trunk, and its mass moves away from
+the DCM.
 """
 
 from __future__ import annotations
@@ -35,9 +37,9 @@ class LeanConfig(NamedTuple):
     rise: float = 14.0  # rad/s, natural frequency of the critically damped filter while the lean grows
     fall: float = 5.0  # rad/s, natural frequency of the filter while the lean decreases
     acceleration: float = 25.0  # rad/s2, largest acceleration of the lean
-    leg_gain: float = 8.0  # m/m, outward shift of the swing foot per distance of the DCM beyond `leg_zone`
+    leg_gain: float = 8.0  # m/m, outward shift of the swing foot per distance of the DCM beyond `leg_zone`; 0: no shift
     #: m, limit for the DCM, measured from the middle of the stance sole away from the swing foot.
-    #: If a push moves the DCM beyond this limit, the swing foot is shifted away from the stance foot.
+    #: If the DCM is beyond this limit, the swing foot is shifted away from the stance foot.
     leg_zone: float = 0.02
     leg: float = 0.15  # m, largest shift of the swing foot away from the stance foot
 

@@ -51,7 +51,9 @@ class PhaseTable(NamedTuple):
     #: SH and SK move with the speeds `reach` for this number of cycles after the end of the table. The number is smaller if the
     #: knee would become too straight.
     reach_cycles: int
-    lowering_cycles: int  # foot placement lowers a late swing foot for this number of cycles after the end of the table
+    #: Foot placement lowers a late swing foot for this number of cycles after the end of the table. The number does not depend on
+    #: the knee angle.
+    lowering_cycles: int
 
 
 class Reach(NamedTuple):

@@ -2,8 +2,9 @@
 
 The guide filter computes the torques of sagittal hip and knee (SH, SK) with the mass matrix of the swing leg. The mass matrix
 includes the leg of the patient, and is computed for a fixed pelvis. On the ground, the pelvis moves with the stance leg. The
-torque u_g + u_f of the gait includes the effect of the pelvis motion. A torque computed with the mass matrix does not include
-this effect. The filter therefore adds the missing torque w to the gravity torque. w depends on the time t in the step:
+torque u_g + u_f of the gait includes the effect of the pelvis motion and the weight of the patient's leg. The gravity torque u_g
+of the empty exoskeleton and a torque computed with the mass matrix include neither. The filter therefore adds the missing torque
+w to u_g. w depends on the time t in the step:
 
     w(t) = u_f - M(q_nom) q_nom'' - c(q_nom, q_nom')
 
@@ -33,11 +34,11 @@ _SH, _SK = LEG_JOINTS.index("SH"), LEG_JOINTS.index("SK")
 
 
 class SwingLeg(NamedTuple):
-    """Model of the swing leg in one step, and the torque that this model leaves out."""
+    """Model of the swing leg in one step, and the torque w that the mass matrix and u_g leave out."""
 
-    leg: Leg  # model of sagittal hip and knee with a fixed pelvis, for the guide filter
-    #: (n + 1, 2) Nm, torques of sagittal hip and knee due to the motion of the pelvis, which `leg` leaves out.
-    #: Row: cycle of the step.
+    leg: Leg  # model of sagittal hip and knee with a fixed pelvis, for the guide filter; `leg.gravity` is u_g + w
+    #: (n + 1, 2) Nm, torque w of sagittal hip and knee: effect of the pelvis motion, and weight of the patient's leg.
+    #: The controller adds w to u_g of the measured pose. Row: cycle of the step.
     unmodelled: Vector
 
 

@@ -100,7 +100,7 @@ class PyBulletBody:
         pybullet.setJointMotorControlArray(
             self._body, self._joints, pybullet.VELOCITY_CONTROL, forces=[0.0] * len(JOINTS), **client
         )
-        # Contacts are read only if there is a floor, because the links of the robot do not collide with each other.
+        # Only the pads of the soles and the floor can be in contact. So contacts are read only if there is a floor.
         self._touches = ground is not None
         if ground is not None:
             self._add_floor(ground, friction)

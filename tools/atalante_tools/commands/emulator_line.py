@@ -22,8 +22,8 @@ from atalante_tools.session.takeover import PendantReader, Takeover
 #: A silent pendant in another process resumes after `takeover.QUIET_CYCLES`. `PENDANT_QUIET` is longer, so that the pendant in
 #: the other process resumes first.
 PENDANT_QUIET: Final = 12
-#: Only the emulator should send the messages of the emulated nodes. Another robot is on the bus if this number of frames
-#: of such a message is received in a row with increasing counters.
+#: Only the emulator should send the messages of the emulated nodes, except those of the pendant. Another robot is on the bus if
+#: this number of frames of such a message is received in a row with increasing counters.
 ROBOT_FRAMES: Final = 3
 
 

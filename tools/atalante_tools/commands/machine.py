@@ -43,7 +43,7 @@ class Machine(Protocol):
         """Return all CAN interfaces of the kernel."""
 
     def open_channel(self, interface: str, channel: str) -> str | None:
-        """Open a channel and close it again. Return the error message, or None on success.
+        """Open a channel as all commands do, and close it again. Return the error message, or None on success.
 
         Args:
             interface: Name of the interface in python-can.

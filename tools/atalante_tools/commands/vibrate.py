@@ -42,7 +42,8 @@ def command(motor: str, level: float, seconds: float, target: Target, as_json: b
     MOTOR is left_ or right_, then thigh_ or shank_, then front or back. Example: left_thigh_front.
 
     The motor runs after the operator presses START (`atalante pendant start`). With -i embedded, an emulated operator
-    presses START. The robot ends in HOLD. The exit code is 1 if the motor does not reach half of LEVEL within 0.1 s or more.
+    presses START. The robot ends in HOLD. The exit code is 1 if the motor runs for 0.1 s or more and does not reach half of
+    LEVEL.
 
     \b
     Example: atalante vibrate left_thigh_front 0.5 --for 2

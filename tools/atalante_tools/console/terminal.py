@@ -87,7 +87,7 @@ class Progress:
         self._width = 0
 
     def due(self) -> bool:
-        """Return whether one period has passed since the last progress line."""
+        """Return whether one period has passed since the last progress line; before the first line, since `__init__`."""
         return self._now() >= self._next
 
     def show(self, text: str) -> None:

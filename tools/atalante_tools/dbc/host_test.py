@@ -248,8 +248,8 @@ def _size(build: Build, message: Message) -> int:
 def _message(build: Build, message: Message, other: Message) -> str:
     """Return the C test function of a message.
 
-    The function also checks each received frame with a wrong Data ID, the one of the message `other`. The result must be a
-    CRC error.
+    If the node receives the message, the function also checks the payloads of the images 0 and 1 with a wrong Data ID, the one
+    of the message `other`. The result must be a CRC error. If `other` is the same message, this check is left out.
     """
     body = ""
     if received := build.received(message):

@@ -25,7 +25,7 @@ def draw(checked: Checked, picture: Path) -> None:
     the pushes.
 
     Args:
-        checked: result of a check. If the guide has no promise, the figure has no worst step.
+        checked: result of a check. If no push was searched (`Checked.worst` is None), the figure has no worst step.
         picture: file to write.
     """
     leg, worst = checked.leg, checked.worst

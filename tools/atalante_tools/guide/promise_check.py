@@ -121,7 +121,8 @@ class Checked:
 
     verdict: Verdict
     leg: IdealLeg  # simulated leg that swings in the guide
-    worst: Tried | None  # simulated step with the largest |e| / q_bound; None if the guide has no promise
+    #: simulated step with the largest |e| / q_bound; None if the guide has no promise and `Task.push` is None
+    worst: Tried | None
 
 
 def setup_of(subject: Subject | None, robot: Robot, config: AirwalkConfig | None = None) -> Setup:

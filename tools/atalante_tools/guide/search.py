@@ -98,7 +98,7 @@ class Adversary:
         """Return the smallest factor on the push limits with which the search finds a push that moves a joint out of the guide.
 
         The factor grows until the search finds such a push. A bisection then makes the factor accurate to 5 %. Return None if
-        the limits `largest * box` are too small for such a push.
+        the search finds no such push up to the limits `largest * box`.
 
         Args:
             box: push limits at hip and knee for the factor 1 [Nm].

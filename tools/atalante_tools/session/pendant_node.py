@@ -43,8 +43,10 @@ class PendantNode:
     Attributes:
         hal: State of the HAL in the last SYNC. None if no SYNC was received.
         cycles: Number of received SYNCs.
-        answered_in_row: Number of consecutive SYNCs that this node answered. A lost or unanswered SYNC resets the number to zero.
-            The HAL then ignores requests of the pendant until enough consecutive answers were received.
+        answered_in_row: Number of SYNCs that this node answered since the last gap. A gap is a rejected SYNC, see
+            `PendantReader.gaps`, or a `poll` with several waiting SYNCs, of which only the last gets an answer. Silence in a
+            takeover is no gap. After a gap, the HAL may ignore requests of the pendant until enough consecutive answers were
+            received.
         answered: Number of answered SYNCs.
         found_another: Whether another pendant sent before `start_sending()`.
     """
@@ -139,7 +141,7 @@ class PendantNode:
         if self._takeover.silent and not was_silent:
             self._release_start()
         # Only the last of several waiting SYNCs gets an answer. The count of consecutive answers therefore restarts from zero, as
-        # after a lost SYNC.
+        # after a rejected SYNC.
         if self._reader.gaps > gaps or synced > 1:
             self.answered_in_row = 0
         if not synced:

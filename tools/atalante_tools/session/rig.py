@@ -43,7 +43,8 @@ if TYPE_CHECKING:
 
 #: Longest wait for the answers to a SYNC in real time: half a cycle [s].
 PATIENCE: Final = 0.5e-3
-#: Longest wait for the answers to a SYNC in lock-step [s]. This wait is long, because the computer of the robot may be slow.
+#: Longest wait for the answers to a SYNC in lock-step [s]. This wait is long, because the process of the emulated robot may run
+#: on a slow computer.
 LOCKSTEP_PATIENCE: Final = 2.0
 
 

@@ -141,8 +141,8 @@ def solved_gaits(subject: Subject, network: Path | None = None) -> WalkGaits:
 def gaits_of_subject(subject: Subject, robot: Robot, network: Path | None = None) -> WalkGaits:
     """Return start step, periodic step and stop step of a subject.
 
-    The gaits of the default subject are read from the default walk file, unless `network` is given. For any other subject, the
-    gait network (a neural network) computes the periodic step. The gait optimisation then computes start step and stop step.
+    The gaits of the default subject are read from the default walk file, unless `network` is given. In all other cases,
+    the gait network (a neural network) computes the periodic step. The gait optimisation then computes start step and stop step.
 
     Args:
         subject: Patient and step.

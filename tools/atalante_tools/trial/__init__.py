@@ -164,9 +164,10 @@ def assist(masses: tuple[float, ...], walking: Walking, running: Running, as_jso
 @_walking()
 @_running("sweep")
 def sweep(days: int | None, walking: Walking, running: Running, as_json: bool) -> None:
-    """Run a series of walks of one active subject, of five minutes each. Each walk has one assistance factor.
+    """Run a series of walks of one active subject, of five minutes each.
 
-    From walk to walk, the factor falls from 1 to 0 and then rises to 1.
+    Each walk begins with full assistance and ends with the assistance factor of the walk. From walk to walk, this factor falls
+    from 1 to 0 and then rises to 1.
     """
     from atalante_tools.trial.findings import sweep_findings
     from atalante_tools.trial.plan import DAYS, PROTOCOL, QUICK_DAYS, QUICK_PROTOCOL, QUICK_SWEEP, SWEEP, sweep_trials

@@ -16,8 +16,8 @@ from atalante_tools.trial.findings import Finding, Result
 #: - lost, late and doubled frames, and errors on the bus;
 #: - a failed IMU, foot or force cell, and an exception of the controller;
 #: - a few late cycles, STOP, the release of the dead-man switch, and the loss of the pendant.
-#: After three faults, all drives hold at once, so the robot may fall. These faults are not in the table:
-#: - The loop stays much slower than 1 kHz, so that the HAL computes a wrong velocity.
+#: In other cases of these faults, all drives hold at once, so the robot may fall. Such cases are not in the table, for example:
+#: - The loop stays much slower than 1 kHz. The joints then move too far in a cycle, which the HAL takes for a wrong velocity.
 #: - A drive is silent for ten cycles, so that the HAL does not know the angle of the joint.
 #: - The operator presses HOLD.
 NO_FALL: Final = {

@@ -157,7 +157,7 @@ def longest_without(falls: Callable[[int], bool], horizon: int, resolution: int)
     Args:
         falls: function that returns whether the robot falls with a fault of the given duration [cycles].
         horizon: longest duration [cycles].
-        resolution: the result may be too short by this number of cycles.
+        resolution: largest number of cycles by which the result may be too short.
     """
     if not falls(horizon):
         return horizon
@@ -202,7 +202,7 @@ def diagnosed(events: Sequence[Event], expected: str, first: int) -> tuple[tuple
 def _branches(mass: float, height: float, seed: int, engine: str) -> dict[str, tuple[int, Branch]]:
     """Return for each moment the cycle in which the fault begins, and a forked process paused shortly before this cycle.
 
-    The paused process is a copy of a walk without a fault. Through its `Branch`, walks with a fault continue from this cycle.
+    The paused process is a copy of a walk without a fault. Through its `Branch`, walks with a fault continue from this pause.
 
     Args:
         mass: mass of the wearer [kg].

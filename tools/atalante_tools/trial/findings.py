@@ -27,7 +27,8 @@ SAME: Final = 0.02
 STANDING: Final = 1.44  # metabolic rate of quiet standing [W/kg]
 #: A quantity has a falling trend if its rank correlation with the assistance factor is between -1 and -`TREND`.
 #: On each day of the sweep, the assistance factor falls from 1 to 0 and then rises to 1. The two walks with the same factor must
-#: give nearly the same value. Their mean difference, divided by the range of all values, must be at most `ASYMMETRY`.
+#: give nearly the same value. The mean absolute difference of all these pairs, divided by the range of all values, must be at
+#: most `ASYMMETRY`.
 TREND, ASYMMETRY = 0.8, 0.25
 #: Largest coefficient of variation of the baseline metabolic rates of a sweep.
 VARIATION: Final = 0.05

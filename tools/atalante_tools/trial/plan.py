@@ -51,6 +51,7 @@ MASS_SHARE: Final = (0.9, 1.1)
 FRICTION: Final = (0.25, 0.8)
 #: Number of parts of the control loop that can be one cycle late in `robustness`: state messages, command messages, motors.
 #: Data times out at an age of five cycles. With a delay of one cycle, the timeout needs four consecutive lost frames.
+#: With a longer delay, fewer lost frames than the fault matrix intends would cause a timeout.
 LATE_PARTS: Final = 3
 #: Probability of a lost frame in `robustness`.
 LOSS: Final = 0.01

@@ -139,10 +139,10 @@ class ParquetSink:
 
 
 def _exact(field: Field, values: npt.NDArray[Any]) -> Any:
-    """Return the values of a signal for the column `integer`: decimals if float64 may round a value, otherwise nulls.
+    """Return the values of a signal for the column `integer`: decimals if float64 may round an integer value, otherwise nulls.
 
-    float64 represents integers exactly only up to 2**53. A signal of 64 bits may have larger values. For such a signal,
-    the column `integer` has the exact values, and the column `value` has the rounded values.
+    float64 represents all integers only up to 2**53. An integer signal of more than 53 bits may have larger values. For such a
+    signal, the column `integer` has the exact values, and the column `value` has the rounded values.
     """
     codes = raw_range(field) if field.kind != "float" else range(0)
     largest = (

@@ -199,7 +199,8 @@ class TimingRules:
         bins = np.minimum(np.maximum(share * BINS_A_CYCLE, 0.0), float(BINS - 1)).astype(np.int64)
         bins += (np.arange(len(stream.present)) * BINS).repeat(stream.stops - stream.starts)
         # Excluded are intervals with lost or rejected frames, and intervals that begin or end at a repeated frame.
-        # Without an alive counter (`NO_STEP`), it is unknown which intervals contain a lost frame, so all intervals are kept.
+        # Without an alive counter (`NO_STEP`), it is unknown which intervals contain a lost frame. So no interval is excluded for
+        # a lost frame.
         incomplete = (
             odd[steps[odd] >= REPEATED]
             if rejected_before is None
