@@ -78,7 +78,8 @@ class Command:
     vibration: Vector  # (8,) level, 0 to 1
     step: int | None = None  # number of the walking step; None for a controller that does not walk
     walking: bool = False  # True while the robot walks on the ground; STOP then ends the walk before HOLD
-    #: True if the guide value h is below 0: a joint is, or soon may be, outside the virtual guide. Raises a pending diagnostic.
+    #: True if the guide value h is below 0: a joint is outside the virtual guide, or the guide filter predicts that a joint
+    #: leaves the guide, or exceeds a torque or speed limit. Raises a pending diagnostic.
     outside: bool = False
     #: True if a joint was outside a certified guide for too many cycles. FULL_ASSIST follows if `outside` is also True.
     guide_left: bool = False

@@ -58,7 +58,7 @@ ENCODER_ERROR: Final = math.radians(1.0)
 #: - The joint still moves away, but its speed has dropped by more than this threshold since the count began.
 #: The threshold is larger than the noise of the velocities.
 SLOWER: Final = 0.05
-#: The overload check skips a joint in each cycle in which the values of the joint are older than this [cycles].
+#: `_watch_load` skips a joint in each cycle in which the values of the joint are older than this [cycles].
 AGE: Final = 4
 
 

@@ -76,8 +76,8 @@ class _Comparison(NamedTuple):
 
     angles: tuple[float, float, float]  # leg angles from the IMUs: FH, TH and the sum SH + SK [rad]
     errors: tuple[float, float, float]  # encoder angles minus IMU angles [rad]
-    encoders: tuple[float, ...] = ()  # encoder angles of FH, TH, SH and SK [rad]
-    uncertainty: float = 0.0  # largest error [rad] that arises if encoder and IMU values are from different cycles
+    encoders: tuple[float, float, float, float]  # encoder angles of FH, TH, SH and SK [rad]
+    uncertainty: float  # largest error [rad] that arises if encoder and IMU values are from different cycles
 
 
 class Legs:
@@ -156,9 +156,8 @@ class Legs:
         if comparison is not None:
             self._check_drift(leg, comparison)
             self._check_standstill(leg, comparison)
-        other = 1 - leg
-        if comparison is not None:
             self._check_exchange(leg, comparison, ages)
+        other = 1 - leg
         if self._stuck[other] or self._constant_samples[other].any():
             comparison = self._compare(other, ages)
             if comparison is not None:

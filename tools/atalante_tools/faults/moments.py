@@ -5,12 +5,13 @@
 The fault matrix states the reaction to a fault during a walk. The matrix prescribes no reaction for other moments or for
 pairs. The runs check what must be true for every fault at every moment:
 
-- No torque, position, velocity or torque rate exceeds its limit. Exception: for `FOUND` cycles, a faulty motor may move a joint
-  above its velocity limit, because the HAL cannot limit the speed while the drive holds its position.
+- No torque, position, velocity or torque rate exceeds its limit. There are two exceptions. For `FOUND` cycles, a faulty motor may
+  move a joint above its velocity limit, because the HAL cannot limit the speed while the drive holds its position. A motor
+  that is too strong may exceed its torque limit by the same share.
 - No command lets a drive produce torque before the operator has pressed START.
 - If the fault begins after START, only the operator can cause a change to a less severe state, and each START only one.
-- During a start, no joint moves by more than `SAG_MAX`. A wrong motor, a wrong encoder or a push moves its joint, and the
-  inertia of this joint moves the other joints of the leg. So these faults have other limits in their leg (`SAG_OF`).
+- During a start of the schedule, no joint moves by more than `SAG_MAX`. A wrong motor, a wrong encoder or a push moves its joint,
+  and the inertia of this joint moves the other joints of the leg. So these faults have other limits in their leg (`SAG_OF`).
 - The run raises no exception.
 """
 
