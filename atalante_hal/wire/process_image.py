@@ -48,16 +48,18 @@ from atalante_hal.wire.frame import (
     WORDS,
     Frames,
     as_words,
+    header_word,
     new_frames,
 )
 
-#: Flags of a CAN FD frame whose sender is error passive.
-_PASSIVE = FLAG_ESI | FLAG_FDF
+#: Flags of a CAN FD frame whose sender is error passive, and the flag ESI alone, in the header word of a frame.
+_PASSIVE, _ESI = header_word(0, 0, FLAG_ESI | FLAG_FDF), header_word(0, 0, FLAG_ESI)
 #: Value of the argument `tag` for nodes whose alive counter counts their own frames, not the cycles.
 _NO_TAG = -1
 #: Values of `Check` as plain integers. A value of at most `_FRESH` means new, usable data.
 _FRESH = _SOME_LOST = int(Check.SOME_LOST)
 _REPEATED, _CONFLICT, _WRONG_SEQUENCE = int(Check.REPEATED), int(Check.CONFLICT), int(Check.WRONG_SEQUENCE)
+_NO_DATA = int(Check.NO_DATA)
 _CRC, _LENGTH, _RANGE, _INVALID = int(Check.CRC), int(Check.LENGTH), int(Check.RANGE), int(Check.INVALID)
 #: Check results of frames that contain no new values: damaged frames and repeats of the accepted frame.
 _NO_NEW_VALUES = frozenset({Check.CRC, Check.LENGTH, Check.REPEATED})
@@ -156,6 +158,7 @@ class ReceiveImage:
         self._accept_frames = specialised(
             accept_frames, words, _results(0), self._e2e, _NO_TAG, restarts, table, self.values, self._status
         )
+        self._begin_cycle = specialised(begin_cycle, self._e2e, self._status, 0)
 
     def new_cycle(self, elapsed: int = 1) -> None:
         """Begin a new cycle: increase the age of every row, and set the check result of every row to NO_DATA.
@@ -164,9 +167,7 @@ class ReceiveImage:
             elapsed: number of cycles since the last call.
         """
         self.all_fresh = False
-        self.age += elapsed
-        np.add(self._e2e.silent, elapsed, out=self._e2e.silent)
-        self.check.fill(Check.NO_DATA)
+        self._begin_cycle(self._e2e, self._status, elapsed)
         self.refused, self.error_passive = [], []
 
     def accept(self, frames: Frames, count: int, tag: int | None = None) -> Sequence[int]:
@@ -272,12 +273,6 @@ class ReceiveImage:
             Indices in `frames` of the frames that are not messages of this process image.
         """
         self.values_before[:] = self.values
-        flags = frames["flags"][:count]
-        passive = [index for index, flag in enumerate(flags.tolist()) if flag & _PASSIVE == _PASSIVE]
-        if passive:
-            flags[passive] ^= FLAG_ESI
-            senders = (self.frame_ids.get(can_id) for can_id in frames["can_id"][passive].tolist())
-            self.error_passive = [row for row in senders if row is not None]
         found = _results(count)
         self._accept_frames(
             _words_of(frames),
@@ -291,10 +286,13 @@ class ReceiveImage:
         )
         self._offered = frames, found
         foreign = []
-        for index, (row, check) in enumerate(found.tolist()):
+        for index, (row, check, passive) in enumerate(found.tolist()):
             if row == _FOREIGN:
                 foreign.append(index)
-            elif check > _FRESH:
+                continue
+            if passive:
+                self.error_passive.append(row)
+            if check > _FRESH:
                 self.refused.append((row, Check(check)))
                 self.crc_errors += check == _CRC
         return foreign
@@ -314,7 +312,7 @@ class ReceiveImage:
         if self._offered is None:
             return []
         frames, found = self._offered
-        mine = [(index, check) for index, (of, check) in enumerate(found.tolist()) if of == row]
+        mine = [(index, check) for index, (of, check, _) in enumerate(found.tolist()) if of == row]
         committed = max((index for index, check in mine if check <= _FRESH), default=None)
         return [
             self._decoded(frames, index, row)
@@ -352,8 +350,8 @@ def _words_of(frames: Frames) -> Words:
 
 
 def _results(count: int) -> Words:
-    """Return an uninitialized array for the results of `accept_frames`, shape (count, 2)."""
-    return np.empty((count, 2), np.int64)
+    """Return an uninitialized array for the results of `accept_frames`, shape (count, 3)."""
+    return np.empty((count, 3), np.int64)
 
 
 def accept_exact(
@@ -389,6 +387,20 @@ def accept_exact(
     return True
 
 
+def begin_cycle(e2e: E2EState, status: RowStatus, elapsed: int) -> None:
+    """Increase the age of every row, and set the check result of every row to NO_DATA.
+
+    Args:
+        e2e: `silent` of each row is increased.
+        status: age and check result of each row; overwritten.
+        elapsed: number of cycles since the last call.
+    """
+    for row in range(len(status.age)):
+        status.age[row] += elapsed
+        e2e.silent[row] += elapsed
+        status.check[row] = _NO_DATA
+
+
 def accept_frames(
     words: Words,
     found: Words,
@@ -401,9 +413,12 @@ def accept_frames(
 ) -> None:
     """Check frames one by one in order of arrival, and commit the good frames.
 
+    The flag ESI of a frame from an error passive sender is removed first.
+
     Args:
         words: received frames as a flat array of 64-bit words, shape (at least count * 9,).
-        found: output, shape (count, 2): row and `Check` of each frame. Both are `_FOREIGN` if the frame has no row.
+        found: output, shape (count, 3): row and `Check` of each frame, and 1 if its sender is error passive, otherwise 0. Row and
+            check are `_FOREIGN` if the frame has no row.
         e2e: expected format and counter of each row; the counters are updated with each accepted frame.
         tag: expected counter of all frames in this cycle, or `_NO_TAG`.
         restarts: True if a sender may restart at any counter.
@@ -414,6 +429,10 @@ def accept_frames(
     octets, age, check = words.view(np.uint8), status.age, status.check
     for index in range(len(found)):
         first = index * WORDS
+        passive = words[first] & _PASSIVE == _PASSIVE
+        if passive:
+            words[first] ^= _ESI
+        found[index, 2] = passive
         row = row_of(words[first], e2e.headers)
         found[index, 0], found[index, 1] = row, _FOREIGN
         if row == _FOREIGN:

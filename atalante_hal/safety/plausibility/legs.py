@@ -152,11 +152,14 @@ class Legs:
 
     def _check(self, leg: int, ages: Ages | None) -> bool:
         comparison = self._compare(leg, ages)
-        self._record_errors(leg, comparison)
-        if comparison is not None:
-            self._check_drift(leg, comparison)
+        if comparison is None:
+            self._record_errors(leg, [math.inf] * len(_AXES))
+        else:
+            errors = self._without_heading(leg, comparison)
+            self._record_errors(leg, errors)
+            self._check_drift(leg, errors, comparison.uncertainty)
             self._check_standstill(leg, comparison)
-            self._check_exchange(leg, comparison, ages)
+            self._check_exchange(leg, errors, comparison.encoders, ages)
         other = 1 - leg
         if self._stuck[other] or self._constant_samples[other].any():
             comparison = self._compare(other, ages)
@@ -183,15 +186,13 @@ class Legs:
         errors = math.remainder(fh - x, turn), math.remainder(th - z, turn), math.remainder(sh + sk - y, turn)
         return _Comparison((x, z, y), errors, (fh, th, sh, sk), uncertainty)
 
-    def _record_errors(self, leg: int, comparison: _Comparison | None) -> None:
-        errors = None if comparison is None else self._without_heading(leg, comparison)
-        for index, axis in enumerate(_AXIS_OF):
-            self.encoder_error[_HIPS[leg] + index] = math.inf if errors is None else errors[axis]
+    def _record_errors(self, leg: int, errors: list[float]) -> None:
+        first = _HIPS[leg]
+        self.encoder_error[first : first + len(_AXIS_OF)] = [errors[axis] for axis in _AXIS_OF]
 
-    def _check_drift(self, leg: int, comparison: _Comparison) -> None:
+    def _check_drift(self, leg: int, errors: list[float], uncertainty: float) -> None:
         drifts = []
-        counts = self._contradicts[leg]
-        errors, allowed = self._without_heading(leg, comparison), self._attitude_error + comparison.uncertainty
+        counts, allowed = self._contradicts[leg], self._attitude_error + uncertainty
         for axis, error in enumerate(errors):
             counts[axis] = counts[axis] + 1 if abs(error) > allowed else 0
             if counts[axis] >= DRIFT_SAMPLES:
@@ -222,8 +223,7 @@ class Legs:
                 stuck.append(_stuck(joint, change))
         self._stuck[leg] = tuple(stuck)
 
-    def _check_exchange(self, leg: int, comparison: _Comparison, ages: Ages | None) -> None:
-        ours = self._without_heading(leg, comparison)
+    def _check_exchange(self, leg: int, ours: list[float], encoders: tuple[float, ...], ages: Ages | None) -> None:
         if max(map(abs, ours)) <= (1.0 - _AGREEMENT) * _APART:
             self._exchanges = [0] * len(_AXIS_OF)
             return
@@ -232,7 +232,7 @@ class Legs:
             return
         theirs = self._without_heading(1 - leg, opposite)
         for index, axis in enumerate(_AXIS_OF):
-            apart = comparison.encoders[index] - opposite.encoders[index]
+            apart = encoders[index] - opposite.encoders[index]
             allowed = _AGREEMENT * abs(apart)
             agrees = abs(ours[axis] - apart) <= allowed and abs(theirs[axis] + apart) <= allowed
             self._exchanges[index] = self._exchanges[index] + 1 if agrees and abs(apart) > _APART else 0

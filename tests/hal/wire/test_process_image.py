@@ -70,7 +70,7 @@ def test_each_call_has_the_argument_types_of_the_compilation(monkeypatch):
     buffer[:ROWS] = tx.seal_prepared(tx.prepare())
     rx.accept(buffer[:ROWS], ROWS, 2)
     rx.accept(buffer, 1, 3)
-    assert called == {"accept_exact", "accept_frames", "seal", "protect"}
+    assert called == {"begin_cycle", "accept_exact", "accept_frames", "seal", "protect"}
 
 
 def test_cycle_without_frames_leaves_all_rows_without_data():
