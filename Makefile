@@ -45,7 +45,7 @@ coverage: .venv/installed-dev ## check that the tests of the safety core cover a
 	$(BIN)/python tests/mutation/cover.py
 
 mutation: .venv/installed-mutation ## mutation testing of the safety core: tests must detect 95 % of the mutants
-	$(BIN)/python tests/mutation/mutate.py $(if $(WITHOUT),--without $(WITHOUT))
+	$(BIN)/python tests/mutation/mutate.py $(if $(WITHOUT),--without $(WITHOUT)) $(if $(THIRD),--third $(THIRD))
 
 lint: .venv/installed-dev ## check style, formatting, types, import layers and spelling
 	$(BIN)/ruff check .

@@ -1,15 +1,16 @@
 """Mutation testing of the safety core with mutmut.
 
-    python tests/mutation/mutate.py [PART...] [--without PART...]
+    python tests/mutation/mutate.py [PART...] [--without PART...] [--third {1,2,3}]
 
 or `make mutation`. PART is a part of the safety core, such as limiter. The default is the whole safety core.
 
 mutmut makes small changes (mutants) in the source code. A mutant is killed if a test fails, otherwise it survives. The file
 SURVIVORS.md lists the accepted survivors with reasons. Each part is tested by its own tests only, in a copy of the project in
 .mutation/. A killed mutant is not tested again until its function changes. A surviving mutant is tested in every run. Delete
-.mutation/ to test all mutants.
+.mutation/ to test all mutants. With --third, a third of the mutants is tested, always again.
 
-The exit code is 1 if fewer than 95 % of the mutants are killed, if a survivor is not listed, or if a listed mutant is killed.
+The exit code is 1 if fewer than 95 % of the tested mutants are killed, if a survivor is not listed, or if a listed mutant is
+killed. The last condition is checked only without --third.
 """
 
 from __future__ import annotations
@@ -23,6 +24,7 @@ import sys
 import time
 from collections import Counter
 from collections.abc import Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import chdir
 from pathlib import Path
 
@@ -34,6 +36,10 @@ HERE = Path(__file__).resolve().parent
 ROOT = HERE.parents[1]
 WORK = ROOT / ".mutation"
 REQUIRED = 0.95
+#: Number of parts that are tested at the same time. The preparation of a part uses only one core.
+PARALLEL = 2
+#: Last digits of the numbers of the mutants in each third.
+THIRDS = {1: "0369", 2: "147", 3: "258"}
 
 PACKAGES = ("atalante_hal", "dbc/atalante_dbc", "control/atalante_control", "emulator/atalante_emulator")
 #: Exit codes of mutmut for a survivor: 0 if all tests passed, 33 if no test reaches the mutant.
@@ -64,13 +70,19 @@ timeout_multiplier = 3.0
 
 
 class PartTest:
-    """Mutation test of one part of the safety core. It works in its own directory."""
+    """Mutation test of one part of the safety core. It works in its own directory.
 
-    def __init__(self, part: str) -> None:
-        self._part, (self._files, self._tests) = part, CORE[part]
+    Args:
+        part: name of the part.
+        third: third of the mutants to test; None means all mutants.
+    """
+
+    def __init__(self, part: str, third: int | None) -> None:
+        self.part, (self._files, self._tests) = part, CORE[part]
+        self._digits = THIRDS[third] if third else None
         self._work = WORK / part
 
-    def prepare(self) -> None:
+    def _prepare(self) -> None:
         """Copy the project. Results of mutants in unchanged functions are kept."""
         self._work.mkdir(parents=True, exist_ok=True)
         before = self._sources()
@@ -102,12 +114,17 @@ class PartTest:
         paths = [self._work / name for name in (*self._files, *(f"tests/{test}" for test in self._tests))]
         return {path.name: path.read_bytes() for path in paths if path.exists()}
 
-    def run(self, children: int) -> None:
-        """Test all mutants that were not killed before. On a terminal, mutmut shows its progress.
+    def run(self, children: int) -> float:
+        """Test the mutants; without a third, only those that were not killed before.
+
+        Returns:
+            Duration [s].
 
         Raises:
             SystemExit: If mutmut fails.
         """
+        start = time.monotonic()
+        self._prepare()
         for file in self._files:
             meta = self._meta(file)
             if meta.exists():
@@ -122,21 +139,30 @@ class PartTest:
             "HYPOTHESIS_STORAGE_DIRECTORY": str(self._work / ".hypothesis"),
         }
         command = [sys.executable, "-m", "mutmut", "run", "--max-children", str(children)]
-        output = None if sys.stdout.isatty() else subprocess.PIPE
+        if self._digits:
+            command.append(f"*__mutmut_*[{self._digits}]")
         done = subprocess.run(
-            command, cwd=self._work, env=environment, stdout=output, stderr=subprocess.STDOUT, text=True, check=False
+            command,
+            cwd=self._work,
+            env=environment,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.STDOUT,
+            text=True,
+            check=False,
         )
         if done.returncode:
-            sys.exit(f"{done.stdout or ''}\nmutmut failed in part {self._part} (exit code {done.returncode})")
+            sys.exit(f"{done.stdout}\nmutmut failed in part {self.part} (exit code {done.returncode})")
+        return time.monotonic() - start
 
     def results(self) -> Iterator[tuple[str, int, list[Mutant]]]:
-        """Yield the name, the number of mutants and the survivors of each module.
+        """Yield the name, the number of tested mutants and the survivors of each module.
 
         Raises:
             SystemExit: If a mutant was not tested.
         """
         for file in self._files:
-            codes: dict[str, int | None] = json.loads(self._meta(file).read_text())["exit_code_by_key"]
+            recorded: dict[str, int | None] = json.loads(self._meta(file).read_text())["exit_code_by_key"]
+            codes = {name: code for name, code in recorded.items() if not self._digits or name[-1] in self._digits}
             for name, code in codes.items():
                 if code in NOT_TESTED:
                     sys.exit(f"the mutant {name} was not tested (exit code {code}): run the command again")
@@ -168,6 +194,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
         "--without", nargs="+", choices=CORE, default=[], metavar="PART", help="parts that are not tested"
     )
     parser.add_argument(
+        "--third", type=int, choices=THIRDS, help="test only this third of the mutants; default: all mutants"
+    )
+    parser.add_argument(
         "--children", type=int, default=os.cpu_count() or 1, help="mutants tested in parallel; default: number of cores"
     )
     options = parser.parse_args(arguments)
@@ -178,18 +207,22 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parts = [part for part in options.part or CORE if part not in options.without]
     if not parts:
         parser.error("--without must leave at least one part, got all parts")
-    for part in parts:
-        part_test, start = PartTest(part), time.monotonic()
-        part_test.prepare()
-        part_test.run(options.children)
-        for module, count, alive in part_test.results():
-            modules.append(module)
-            survivors += alive
-            total += count
-            print(f"{module}: {count - len(alive)} of {count} mutants killed", flush=True)
-        print(f"{part}: {time.monotonic() - start:.0f} s", flush=True)
+    tests = [PartTest(part, options.third) for part in parts]
+    with ThreadPoolExecutor(PARALLEL) as pool:
+        try:
+            for test, seconds in zip(tests, pool.map(lambda test: test.run(options.children), tests), strict=True):
+                for module, count, alive in test.results():
+                    modules.append(module)
+                    survivors += alive
+                    total += count
+                    print(f"{module}: {count - len(alive)} of {count} mutants killed", flush=True)
+                print(f"{test.part}: {seconds:.0f} s", flush=True)
+        except BaseException:
+            pool.shutdown(wait=False, cancel_futures=True)
+            raise
     expected = Counter(m for m in known if any(m.function.startswith(f"{module}.") for module in modules))
-    unlisted, killed = Counter(survivors) - expected, expected - Counter(survivors)
+    unlisted = Counter(survivors) - expected
+    killed = Counter[Mutant]() if options.third else expected - Counter(survivors)
     for survivor in unlisted.elements():
         print(
             f"\nsurvived, but is not in SURVIVORS.md: add a test that kills it, or list it with a reason:\n\n{survivor}"
@@ -199,6 +232,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     for part in options.without:
         print(f"\n{part} was not tested")
     score = 1.0 - len(survivors) / total
+    if options.third:
+        print(f"\nonly third {options.third} of the mutants was tested")
     print(f"\n{score:.1%} of {total} mutants killed, at least {REQUIRED:.0%} are required")
     return int(score < REQUIRED or bool(unlisted) or bool(killed))
 
