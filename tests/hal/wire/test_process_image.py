@@ -780,6 +780,16 @@ class TestErrorPassiveSender:
         assert list(rx.accept(buffer, 1)) == [0]
         assert rx.error_passive == []
 
+    def test_frames_after_an_unknown_frame_are_reported(self):
+        tx, rx, buffer = pair()
+        buffer["can_id"][0], buffer["flags"][0] = 0x7FF, FLAG_FDF | FLAG_BRS
+        buffer[1 : 1 + ROWS] = tx.seal()
+        buffer["flags"][2] |= FLAG_ESI
+        buffer["data"][3, 5] ^= 1
+        assert list(rx.accept(buffer, 1 + ROWS)) == [0]
+        assert rx.error_passive == [1]
+        assert rx.refused == [(2, Check.CRC)]
+
     def test_error_passive_flag_outside_the_received_frames_is_ignored(self):
         tx, rx, buffer = pair()
         buffer[:ROWS] = tx.seal()
