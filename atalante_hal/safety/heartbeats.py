@@ -136,6 +136,8 @@ class Heartbeats:
     def evaluate(self, cycle: int, memory: FaultMemory) -> None:
         """Report the diagnostics of all nodes to the fault memory."""
         self._age(cycle)
+        if self.quiet and not self.overdue(cycle):
+            return
         messages = self.image.codec.messages
         for row, why in self.image.refused:
             dtc = _REFUSED.get(why, Dtc.SIGNAL_RANGE)

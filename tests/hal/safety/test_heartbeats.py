@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import random
+
 import numpy as np
 import pytest
 
@@ -390,3 +392,54 @@ def test_status_that_is_received_twice_in_a_cycle_is_reported(running: Nodes):
     assert running.heartbeats.quiet is False
     assert running.evaluate() == {("E2E_REPEATED", "LEFT_SK"): False}
     assert running.heartbeats.quiet
+
+
+#: Signals of the status messages and emergencies of a random history: some are fault-free, the others have one fault.
+HISTORY = [
+    ("STATUS", {"NodeState": 5, "DbcHash": NETWORK.hash32, "SupplyVoltage": 48.0}),
+    ("STATUS", {"NodeState": 5, "DbcHash": NETWORK.hash32, "SupplyVoltage": LOW - 0.1}),
+    ("STATUS", {"NodeState": 5, "DbcHash": NETWORK.hash32, "SupplyVoltage": UNDER - 0.1}),
+    ("STATUS", {"NodeState": BOOT_UP, "DbcHash": NETWORK.hash32, "SupplyVoltage": 48.0}),
+    ("STATUS", {"NodeState": 5, "DbcHash": NETWORK.hash32 ^ 1, "SupplyVoltage": 48.0}),
+    ("EMCY", {"ErrorCode": 0x4310}),
+    ("EMCY", {"ErrorCode": 0x8120}),
+    ("EMCY", {"ErrorCode": 0}),
+]
+
+
+@pytest.mark.parametrize("seed", range(10))
+def test_quiet_never_hides_a_fault(nodes: Nodes, seed: int):
+    """A second monitor gets the same frames, but has to look for faults in every cycle."""
+    rng = random.Random(seed)
+    full, memory = Heartbeats(NETWORK, THRESHOLDS), FaultMemory()
+    some, good = ("LEFT_SK", "RIGHT_HA", "LEFT_FH"), HISTORY[0][1]
+    outcomes = set()
+    for step in range(300):
+        if step % 15 == 0:  # the end of all faults
+            frames = [nodes.frame(node, **good) for node in [*NODES, "PENDANT"] if node not in some]
+            frames += [
+                nodes.frame(node, kind, **signals) for node in some for kind, signals in (HISTORY[0], HISTORY[-1])
+            ]
+        else:
+            chosen = rng.choices(HISTORY, weights=[8, *[1] * 7], k=rng.choice((0, 0, 0, 1, 2)))
+            frames = [nodes.frame(rng.choice(some), kind, **signals) for kind, signals in chosen]
+        if frames and rng.random() < 0.1:
+            frames[0]["data"][0, 6] ^= 1
+        if frames and rng.random() < 0.1:
+            frames.append(frames[0])
+        nodes.now += rng.choice((1, 1, 1, 20, 60))
+        if frames:
+            full.accept(np.concatenate(frames), nodes.now, np.zeros(8))
+            nodes.receive(*frames, cycle=nodes.now)
+        quiet = full.quiet
+        assert nodes.heartbeats.quiet is quiet
+        full.quiet = False
+        full.evaluate(nodes.now, memory)
+        memory.close_cycle(nodes.now)
+        found = nodes.evaluate()
+        assert {(dtc.value, node): entry.confirmed for (dtc, node), entry in memory.active.items()} == found
+        assert [str(e) for e in memory.events] == [str(e) for e in nodes.memory.events]
+        assert nodes.heartbeats.quiet is full.quiet
+        assert nodes.heartbeats.booted == full.booted
+        outcomes.add((quiet, bool(found)))
+    assert {(True, False), (False, True)} <= outcomes
