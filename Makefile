@@ -44,7 +44,7 @@ fuzz: .venv/installed-dev ## send 10 million random and mutated frames to the HA
 coverage: .venv/installed-dev ## check that the tests of the safety core cover all its lines and branches
 	$(BIN)/python tests/mutation/cover.py
 
-mutation: .venv/installed-mutation ## mutation testing of the safety core: tests must detect 95 % of the mutants
+mutation: .venv/installed-mutation ## mutation testing of the safety core: tests must detect 95 % of the mutants (THIRD=1, 2 or 3: of one third)
 	$(BIN)/python tests/mutation/mutate.py $(if $(WITHOUT),--without $(WITHOUT)) $(if $(THIRD),--third $(THIRD))
 
 lint: .venv/installed-dev ## check style, formatting, types, import layers and spelling
