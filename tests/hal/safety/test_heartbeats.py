@@ -165,6 +165,17 @@ def test_low_supply_of_another_node_is_ignored(running: Nodes, node: str):
     assert running.evaluate() == {}
 
 
+@pytest.mark.parametrize("node", ["PENDANT", "IMU_TORSO", "FOOT_LEFT", "HAPTICS"])
+def test_low_supply_of_another_node_is_ignored_beside_a_fault(running: Nodes, node: str):
+    running.receive(running.frame(node, SupplyVoltage=0.0), running.frame("LEFT_SK", SupplyVoltage=UNDER - 0.1))
+    assert running.evaluate() == {("UNDER_VOLTAGE", "LEFT_SK"): True}
+
+
+def test_node_without_any_frame_is_not_lost_beside_a_fault(nodes: Nodes):
+    nodes.receive(nodes.frame("LEFT_SK", SupplyVoltage=UNDER - 0.1), cycle=0)
+    assert nodes.evaluate() == {("UNDER_VOLTAGE", "LEFT_SK"): True}
+
+
 def test_emergency_lasts_until_the_node_clears_it(running: Nodes):
     running.receive(running.frame("LEFT_SK", "EMCY", ErrorCode=0x4310))
     assert running.heartbeats.quiet is False
