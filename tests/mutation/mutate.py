@@ -7,7 +7,7 @@ or `make mutation`. PART is a part of the safety core, such as limiter. The defa
 mutmut makes small changes (mutants) in the source code. A mutant is killed if a test fails, otherwise it survives. The file
 SURVIVORS.md lists the accepted survivors with reasons. Each part is tested by its own tests only, in a copy of the project in
 .mutation/. A killed mutant is not tested again until its function changes. A surviving mutant is tested in every run. Delete
-.mutation/ to test all mutants. With --third, a third of the mutants is tested, always again.
+.mutation/ to test all mutants. With --third, a third of the mutants is tested, also those that were killed before.
 
 The exit code is 1 if fewer than 95 % of the tested mutants are killed, if a survivor is not listed, or if a listed mutant is
 killed. The last condition is checked only without --third.

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import signal
 import sys
 import time
@@ -46,6 +47,13 @@ class Terminal:
         wait_until(
             lambda: any(each in self.text()[since:] for each in wanted),
             lambda: f"{self.arguments} must print {' or '.join(wanted)}: {self.text()}",
+        )
+
+    def wait_for_pattern(self, pattern: str, since: int) -> None:
+        """Wait until a part of the output after the position `since` matches a regular expression."""
+        wait_until(
+            lambda: re.search(pattern, self.text()[since:]) is not None,
+            lambda: f"{self.arguments} must print {pattern!r}: {self.text()}",
         )
 
     def end(self, number: int = signal.SIGTERM) -> int:
