@@ -2,14 +2,24 @@
 
 from __future__ import annotations
 
+import ctypes
 import signal
 import subprocess
 import sys
 import threading
+from collections.abc import Callable
+from contextlib import suppress
 
 import pytest
 
-from atalante_tools.console.stop_request import Stopped, check_stop, deferred, ended_by, stop_requested
+from atalante_tools.console.stop_request import (
+    Stopped,
+    check_stop,
+    deferred,
+    ended_by,
+    interruptible,
+    stop_requested,
+)
 
 
 @pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
@@ -115,3 +125,45 @@ def test_without_a_stop_request_deferred_keeps_the_signal_handlers() -> None:
             check_stop()
     finally:
         signal.signal(signal.SIGINT, before)
+
+
+class HalfBuilt:
+    """Object whose destructor fails if `interrupt`, called in `__init__`, raises an exception."""
+
+    def __init__(self, interrupt: Callable[[], None]) -> None:
+        interrupt()
+        self.handle = 1
+
+    def __del__(self) -> None:
+        assert self.handle
+
+
+def fail() -> None:
+    raise ZeroDivisionError
+
+
+@pytest.fixture
+def reported(monkeypatch: pytest.MonkeyPatch) -> list[type[BaseException]]:
+    """Return the exceptions that Python ignored and reported outside of `interruptible`."""
+    types: list[type[BaseException]] = []
+    monkeypatch.setattr(sys, "unraisablehook", lambda lost: types.append(lost.exc_type))
+    return types
+
+
+def test_after_a_signal_the_destructor_of_a_half_built_object_is_silent(reported: list[type[BaseException]]) -> None:
+    with interruptible(), suppress(Stopped):
+        HalfBuilt(lambda: signal.raise_signal(signal.SIGINT))
+    assert reported == []
+
+
+def test_without_a_signal_a_failed_destructor_is_reported(reported: list[type[BaseException]]) -> None:
+    with interruptible(), pytest.raises(ZeroDivisionError):
+        HalfBuilt(fail)
+    assert reported == [AttributeError]
+
+
+def test_after_a_signal_other_ignored_exceptions_are_reported(reported: list[type[BaseException]]) -> None:
+    with interruptible() as stop:
+        stop.ask(signal.SIGTERM)
+        ctypes.CFUNCTYPE(None)(fail)()
+    assert reported == [ZeroDivisionError]

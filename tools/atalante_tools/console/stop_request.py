@@ -112,7 +112,9 @@ def interruptible() -> Iterator[StopRequest]:
     """Raise `Stopped` at each SIGINT and SIGTERM inside the block. Use this block once, around the whole program.
 
     Python prints a warning if it ignores an exception, for example in `__del__`. Inside the block this warning is suppressed for
-    `Stopped`, because the request is stored. After the block, a signal ends the process with the default action of the system.
+    `Stopped`, because the request is stored. After a signal it is also suppressed for every exception in `__del__`, because
+    `Stopped` may have ended the `__init__` of the object before all attributes were set. After the block, a signal ends the
+    process with the default action of the system.
     """
 
     def stop(request: StopRequest, _number: int, _repeated: bool) -> None:
@@ -121,7 +123,9 @@ def interruptible() -> Iterator[StopRequest]:
     report = sys.unraisablehook
 
     def report_others(lost: sys.UnraisableHookArgs) -> None:
-        if not issubclass(lost.exc_type, Stopped):
+        stopped = _request is not None and _request.wanted
+        in_destructor = getattr(lost.object, "__name__", None) == "__del__"
+        if not (issubclass(lost.exc_type, Stopped) or (stopped and in_destructor)):
             report(lost)
 
     for number in _SIGNALS:
