@@ -32,8 +32,8 @@ _WIDEST = math.radians(7.5)
 #: torques. Every prediction of the filter includes the certified torques. With the fraction 1, a prediction would therefore reach
 #: its limit even if nobody pushes, and the filter would apply the full backup torque without need.
 _MARGIN = 0.95
-#: Number of decimal digits to which the assistance factor is rounded; the CAN signal has the same resolution.
-_DIGITS = 4
+#: Filters are chosen for this many assistance factors from 0 to 1, without 0: 0.01, 0.02 and so on.
+_FACTORS = 100
 
 
 class Choice(NamedTuple):
@@ -72,16 +72,16 @@ class StepGuides:
             for policy in policies(config, leg.inertia)
         ]
         self._limits = [PromiseLimits(guide) for guide in self.filters]
-        self._choices: dict[float, Choice] = {}
+        self._choices: dict[int, Choice] = {}
 
     def prepare(self) -> None:
-        """Choose and store the filter and its certified torques for every assistance factor from 0 to 1, in steps of 0.01.
+        """Choose and store the filter and its certified torques for every assistance factor that `at` uses.
 
         The computation for one assistance factor takes longer than a cycle. In real time, `prepare` must therefore be called
-        before a walk.
+        before a walk. After `prepare`, `at` computes nothing for any assistance factor.
         """
-        for percent in range(101):
-            self.at(percent / 100)
+        for number in range(_FACTORS + 1):
+            self.at(number / _FACTORS)
 
     def at(self, xi: float) -> Choice:
         """Return the softest guide filter that is certified for the requested disturbance torques.
@@ -89,13 +89,16 @@ class StepGuides:
         The softest filter has the lowest stiffness of the backup policy. If no filter can be certified for the requested torques,
         return the filter with the largest certifiable torques.
 
+        The filter is chosen for the assistance factor rounded up to 0.01. A larger factor reduces the certifiable torques, so
+        the certified torques of the choice are also certified for the exact factor.
+
         Args:
             xi: assistance factor in [0, 1].
         """
-        key = round(xi, _DIGITS)
-        if key not in self._choices:
-            self._choices[key] = self._choose(key)
-        return self._choices[key]
+        number = math.ceil(round(xi * _FACTORS, 6))  # rounded first, because 0.07 * 100 is above 7
+        if number not in self._choices:
+            self._choices[number] = self._choose(number / _FACTORS)
+        return self._choices[number]
 
     def _choose(self, xi: float) -> Choice:
         best, most = self.filters[0], -math.inf

@@ -13,7 +13,7 @@ from atalante_control.airwalk.swing_leg import OVERLAP, swing_leg
 from atalante_control.dynamics.gravity import Gravity
 from atalante_control.gait.gait import AIRWALK_GAIT, load_gait
 from atalante_control.guide.certificate import PromiseLimits
-from atalante_control.guide.shapes import CONSTANT
+from atalante_control.guide.shapes import CONSTANT, SHAPES
 from atalante_control.guide.step_guides import StepGuides, filter_config, policies
 from atalante_control.joint.idealization import AssistedInertia
 from atalante_control.model import ExoskeletonParameters, pinocchio_model, urdf
@@ -61,11 +61,23 @@ def test_filter_of_a_step_gets_stiffer_with_the_assistance_factor():
     assert "only the baseline" in guides.certificate(1.0).reason
 
 
-def test_prepared_guides_need_no_computation_when_the_assistance_factor_changes(monkeypatch: pytest.MonkeyPatch):
-    guides = StepGuides(CONFIG, ROBOT, CONSTANT, LEG, np.linspace(1.0, 0.0, 20), OVERLAP)
+@pytest.mark.parametrize("shape", SHAPES)
+def test_prepared_guides_need_no_computation_when_the_assistance_factor_changes(
+    shape: str, monkeypatch: pytest.MonkeyPatch
+):
+    guides = StepGuides(CONFIG, ROBOT, SHAPES[shape], LEG, np.linspace(1.0, 0.0, 20), OVERLAP)
     exact = guides.at(0.37)
     guides.prepare()
     monkeypatch.setattr(PromiseLimits, "at", lambda *_: pytest.fail("a promise was computed in the loop"))
-    for percent in range(101):
-        assert guides.at(percent * 100 * 0.0001).guide in guides.filters  # decoded as on the bus
-    assert guides.at(0.37) == exact
+    for raw in range(10001):
+        assert guides.at(raw * 0.0001).guide in guides.filters  # decoded as on the bus
+    assert guides.at(0.37) == guides.at(37 * 100 * 0.0001) == exact
+
+
+@pytest.mark.parametrize("shape", SHAPES)
+def test_guide_of_any_assistance_factor_is_certified_like_that_of_the_next_hundredth(shape: str):
+    guides = StepGuides(CONFIG, ROBOT, SHAPES[shape], LEG, np.linspace(1.0, 0.0, 20), OVERLAP)
+    for xi in (0.0001, 0.4951, 0.735, 0.9312, 0.9899, 0.98999999, 0.9901):
+        rounded = math.ceil(xi * 100) / 100
+        assert guides.at(xi) == guides.at(rounded)
+        assert guides.certificate(xi).certified >= guides.certificate(rounded).certified
