@@ -71,11 +71,15 @@ class ResilientBus(WrappedBus):
         Returns:
             Number of received frames.
         """
+        if self.down:
+            timeout = min(timeout, RETRY_PERIOD)
+        begin = time.monotonic()
         try:
             count = super().receive(frames, timeout)
         except BusDown as error:
             self._lost(str(error))
-            time.sleep(min(timeout, RETRY_PERIOD))
+            waited = time.monotonic() - begin  # a `JoinedBus` waits before it raises the error
+            time.sleep(max(min(timeout, RETRY_PERIOD) - waited, 0.0))
             return 0
         self._update_down(proven=count > 0)
         return count

@@ -125,6 +125,23 @@ def test_lost_link_is_tried_again_after_the_retry_period(clock: Clock) -> None:
     assert clock.slept == [RETRY_PERIOD]
 
 
+def test_bus_that_waits_before_it_raises_an_error_is_not_waited_for_twice(clock: Clock) -> None:
+    class LateLink(Link):
+        def receive(self, frames: Frames, timeout: float = 0.0) -> int:
+            clock.sleep(timeout)
+            return super().receive(frames, timeout)
+
+    near, _ = lockstep_pair()
+    link = LateLink(near)
+    link.error = BusDown("can0 is down")
+    bus = ResilientBus(link)
+    start = clock.now
+    assert bus.receive(new_frames(4), 0.05) == 0
+    assert clock.now - start == pytest.approx(0.05)
+    assert bus.receive(new_frames(4), 60.0) == 0
+    assert clock.now - start == pytest.approx(0.05 + RETRY_PERIOD)
+
+
 def test_other_errors_of_the_bus_are_raised() -> None:
     near, _ = lockstep_pair()
     link = Link(near)
