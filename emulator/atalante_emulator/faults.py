@@ -13,6 +13,7 @@ from dataclasses import dataclass, field
 from typing import Any, Final
 
 from atalante_dbc import Message, Network
+from atalante_emulator.motor import MOST_LATE
 from atalante_hal.robot import CELLS
 from atalante_hal.wire.cia402 import DriveState
 from atalante_hal.wire.frame import FD_LENGTHS
@@ -171,7 +172,7 @@ NODE_KINDS: Final[Mapping[str, Kind]] = {
         "drive",
         {"share": _number(-2.0, 2.0)},
     ),
-    "torque_late": Kind("a motor produces its torque `by` cycles late", "drive", {"by": _whole(1, 20)}),
+    "torque_late": Kind("a motor produces its torque `by` cycles late", "drive", {"by": _whole(1, MOST_LATE)}),
     "over_temperature": Kind("a drive has a given temperature", "drive", {"degrees": _number(-40.0, 214.0, "degC")}),
     "heat_ramp": Kind(
         "the temperature of a drive rises at a given rate up to a limit",

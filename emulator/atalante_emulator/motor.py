@@ -30,7 +30,7 @@ class MotorParameters:
 
 
 _MOTORS = np.arange(len(JOINTS))
-#: Largest delay of a motor torque that the emulator supports [cycles].
+#: Largest additional delay of a motor torque that a fault can cause [cycles], see `Motors.delay`.
 MOST_LATE = 20
 
 # Rows 0 to 3 of the motor array: torque setpoint, ratio of true torque to measured torque, dry friction, damping.
@@ -70,7 +70,7 @@ class Motors:
         #: Time until a new setpoint reaches the current loop of each motor [cycles].
         self._dead_time = np.full(len(JOINTS), parameters.dead_time)
         self._late = parameters.dead_time > 0  # whether any setpoint is delayed
-        self._setpoints = np.zeros((MOST_LATE + 1, len(JOINTS)))
+        self._setpoints = np.zeros((parameters.dead_time + MOST_LATE + 1, len(JOINTS)))
         self._cycle = 0
         #: Torques of the wearer's limbs on the joints, shape (12,) [Nm]. The emulator writes into this array.
         self.limb = self._motors[_LIMB]
@@ -117,7 +117,7 @@ class Motors:
 
         Args:
             motor: index of the motor.
-            cycles: additional time [cycles]. Additional time plus dead time must be at most `MOST_LATE`.
+            cycles: additional time [cycles], from 0 to `MOST_LATE`.
         """
         self._dead_time[motor] = self._parameters.dead_time + cycles
         self._late = bool(self._dead_time.any())

@@ -1,11 +1,12 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from atalante_emulator.motor import MotorParameters, Motors
+from atalante_emulator.motor import MOST_LATE, MotorParameters, Motors
 from atalante_hal.robot import Robot
 from atalante_hal.types import PERIOD
 
@@ -64,6 +65,18 @@ def test_weak_motor_makes_less_torque_than_it_measures(robot: Robot) -> None:
     np.testing.assert_allclose(measured, 40.0, rtol=1e-6)
     motors.set_strength(2, 1.0)
     np.testing.assert_allclose(settle(motors), 40.0, rtol=1e-6)
+
+
+@pytest.mark.parametrize("dead_time", [0, 1, 3])
+def test_torque_is_late_by_its_dead_time_and_its_additional_delay(robot: Robot, dead_time: int) -> None:
+    motors = Motors(robot, replace(SMOOTH, dead_time=dead_time), *np.zeros((2, 12)))
+    motors.power(POWERED)
+    motors.delay(4, MOST_LATE)
+    for cycle in range(30):
+        motors.wanted[:] = 10.0 * (cycle + 1)
+        torque = np.array(motors.advance(AT_REST))
+        assert bool(torque[3]) == (cycle >= dead_time)
+        assert bool(torque[4]) == (cycle >= dead_time + MOST_LATE)
 
 
 def test_push_acts_on_the_joint_and_is_not_measured(robot: Robot) -> None:
