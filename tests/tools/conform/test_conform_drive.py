@@ -259,6 +259,7 @@ BROKEN: dict[str, tuple[Callable[[MakeSetup, Patch], NodeSetup], dict[str, Verdi
 }
 
 
+@pytest.mark.sample(6)
 @pytest.mark.parametrize("name", BROKEN)
 def test_defective_drive_fails_only_its_requirement(name: str, make_setup: MakeSetup, monkeypatch: Patch):
     broken, expected = BROKEN[name]

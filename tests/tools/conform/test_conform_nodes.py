@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import itertools
 import math
 from collections import deque
 from collections.abc import Callable
@@ -414,6 +415,7 @@ BROKEN: dict[str, tuple[Break, str]] = {
 _REST = ("NODE-03", "NODE-04", "NODE-07", "NODE-08", "NODE-09", "NODE-10")
 
 
+@pytest.mark.sample(6)
 @pytest.mark.parametrize("name", BROKEN)
 def test_defective_node_fails_only_its_requirement(name: str, make_setup: MakeSetup, monkeypatch: Patch):
     broken, expected = BROKEN[name]
@@ -447,6 +449,34 @@ def test_unexpected_frame_is_named(flag: int, kind: str, make_setup: MakeSetup):
     (result,) = examine(setup.tester, [r for r in requirements_of(setup.tester) if r.id == "NODE-13"])
     assert result.verdict is Verdict.FAILED
     assert f"1 of 1 frames: {kind} with the identifier of {IMU}_STATUS in cycle 1" in result.measured
+
+
+def test_imu_that_changes_the_sign_of_its_quaternion_passes(make_setup: MakeSetup, monkeypatch: Patch):
+    """A quaternion and its negative are the same attitude."""
+
+    def change(at: Callable[[str], int], cycle: int, values: np.ndarray) -> None:
+        values[[at(f"Quaternion{axis}") for axis in "WXYZ"]] *= (-1.0) ** cycle
+
+    assert not_passed(_measures(change)(make_setup, monkeypatch).examine(_REST)) == {}
+
+
+@pytest.mark.parametrize(("gyro", "verdict"), [(1.0, Verdict.PASSED), (1.1, Verdict.FAILED)])
+def test_rate_of_a_turning_imu_is_compared_although_frames_are_lost(
+    gyro: float, verdict: Verdict, make_setup: MakeSetup, monkeypatch: Patch
+):
+    def turn(at: Callable[[str], int], cycle: int, values: np.ndarray) -> None:
+        half = 0.5 * 1e-3 * cycle  # 1 rad/s about y
+        sign = (-1.0) ** cycle
+        values[[at(f"Quaternion{axis}") for axis in "WXYZ"]] = sign * math.cos(half), 0.0, sign * math.sin(half), 0.0
+        values[[at(f"Gyro{axis}") for axis in "XYZ"]] = 0.0, gyro, 0.0
+
+    setup = _measures(turn)(make_setup, monkeypatch)
+    state, count = setup.message("STATE").frame_id, itertools.count()
+    setup.wire.from_node = lambda frame: (
+        wire.NO_FRAME if int(frame["can_id"][0]) == state and next(count) % 3 else frame
+    )
+    (result,) = examine(setup.tester, [r for r in requirements_of(setup.tester) if r.id == "IMU-04"])
+    assert result.verdict is verdict, result.measured
 
 
 # -- bounds: the requirement passes at half of its bound and fails at twice its bound ------------------------------------

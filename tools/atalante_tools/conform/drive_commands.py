@@ -49,7 +49,7 @@ def ignores_unknown_controlwords(tester: NodeTester) -> Outcome:
         for code in UNKNOWN:
             received = [*axis.send(axis.command(stay, raw={"Controlword": code})), *axis.run(2 * SHOWN, stay)]
             if not all_in(received, state):
-                wrong.append(f"{code} in {state.name}: {names_of(received)}")
+                wrong.append(f"0x{code:02X} in {state.name}: {names_of(received)}")
     return Outcome(not wrong, f"acted on {'; '.join(wrong)}" if wrong else "all ignored")
 
 

@@ -9,6 +9,7 @@ from typing import Final
 import numpy as np
 
 from atalante_hal.types import PERIOD, Vector
+from atalante_tools.conform.frames import ReceivedFrame
 from atalante_tools.conform.node_tester import NodeTester, NotTested
 from atalante_tools.conform.requirement import Outcome, Requirement
 
@@ -108,14 +109,12 @@ def measures_gravity(tester: NodeTester) -> Outcome:
 
 def agrees_with_gravity(tester: NodeTester) -> Outcome:
     """Test IMU-03: the mean acceleration is vertical after rotation by the measured attitude."""
-    measured = _signals(
-        tester, [f"Quaternion{axis}" for axis in ("W", *_VECTOR)] + [f"Accel{axis}" for axis in _VECTOR]
-    )
-    mean = measured.mean(axis=0)
-    w, x, y, z = mean[:4] / np.linalg.norm(mean[:4])
+    _, quaternions, acceleration = _attitudes(tester, "Accel")
+    mean, force = quaternions.mean(axis=0), acceleration.mean(axis=0)
+    w, x, y, z = mean / np.linalg.norm(mean)
     # `up` is the world z axis in the sensor frame.
     up = np.array([2.0 * (x * z - w * y), 2.0 * (y * z + w * x), 1.0 - 2.0 * (x * x + y * y)])
-    cosine = float(up @ mean[4:] / np.linalg.norm(mean[4:]))
+    cosine = float(up @ force / np.linalg.norm(force))
     tilt = math.acos(max(-1.0, min(1.0, cosine)))
     return Outcome(tilt <= TILT, f"{math.degrees(tilt):.2f} degrees between gravity and vertical")
 
@@ -125,12 +124,13 @@ def agrees_with_attitude(tester: NodeTester) -> Outcome:
 
     An emulated robot without power sinks slowly, so the expected gyro rate is not zero.
     """
-    measured = _signals(tester, [f"Quaternion{axis}" for axis in ("W", *_VECTOR)] + [f"Gyro{axis}" for axis in _VECTOR])
-    (w0, *v0), (w1, *v1) = measured[0, :4].tolist(), measured[-1, :4].tolist()
+    cycles, quaternions, rate = _attitudes(tester, "Gyro")
+    (w0, *v0), (w1, *v1) = quaternions[0].tolist(), quaternions[-1].tolist()
     first, last = np.array(v0), np.array(v1)
     # For small angles, the vector part of conj(q0) q1 is half the rotation vector in the sensor frame.
     turned = 2.0 * (w0 * last - w1 * first - np.cross(first, last))
-    deviation = np.abs(measured[:, 4:].mean(axis=0) - turned / max(1, len(measured) - 1) / PERIOD).max()
+    duration = max(1, cycles[-1] - cycles[0]) * PERIOD
+    deviation = np.abs(rate.mean(axis=0) - turned / duration).max()
     return Outcome(bool(deviation <= RATE), f"deviation at most {deviation:.4f} rad/s")
 
 
@@ -169,13 +169,36 @@ def _is_unloaded(cells: Sequence[str]) -> Callable[[NodeTester], Outcome]:
     return test
 
 
+def _attitudes(tester: NodeTester, vector: str) -> tuple[list[int], Vector, Vector]:
+    """Run `_MEASURED` cycles and return the values of all n received state frames.
+
+    A quaternion and its negative are the same attitude. So all quaternions are returned with the sign of the first one.
+
+    Returns:
+        Numbers of the cycles in which the frames arrived, quaternions wxyz, shape (n, 4), and the named vectors, shape (n, 3).
+    """
+    frames = _frames(tester)
+    quaternions = _values(frames, [f"Quaternion{axis}" for axis in ("W", *_VECTOR)])
+    signs = np.where(quaternions @ quaternions[0] < 0.0, -1.0, 1.0)
+    values = _values(frames, [f"{vector}{axis}" for axis in _VECTOR])
+    return [frame.cycle for frame in frames], signs[:, np.newaxis] * quaternions, values
+
+
 def _vectors(tester: NodeTester, vector: str, axes: Sequence[str]) -> Vector:
     return _signals(tester, [f"{vector}{axis}" for axis in axes])
 
 
 def _signals(tester: NodeTester, names: Sequence[str]) -> Vector:
     """Run `_MEASURED` cycles and return the named signals of all received state frames. Shape (frames, names)."""
+    return _values(_frames(tester), names)
+
+
+def _frames(tester: NodeTester) -> list[ReceivedFrame]:
     received = tester.states(tester.idle(_MEASURED))
     if not received:
         raise NotTested("no state frame received")
-    return np.array([[frame.values[name] for name in names] for frame in received])
+    return received
+
+
+def _values(frames: Sequence[ReceivedFrame], names: Sequence[str]) -> Vector:
+    return np.array([[frame.values[name] for name in names] for frame in frames])
