@@ -122,6 +122,7 @@ def test_fault_at_power_on_is_refused(tmp_path: Path) -> None:
     )
 
 
+@pytest.mark.long
 def test_f41_robot_with_both_feet_on_the_ground_stands_when_the_hal_is_killed() -> None:
     (trial,) = fault_trials(("F41",), False, 0, "mujoco")
     moments = tuple(moment for moment in trial.moments if moment in DOUBLE_SUPPORT)

@@ -138,6 +138,7 @@ def test_source_hash_changes_with_every_file_that_computes(tmp_path: Path) -> No
     assert source_hash([tmp_path], [report]) != before
 
 
+@pytest.mark.long
 def test_results_contain_what_the_findings_need(reference: Path) -> None:
     active, passive = (stored(trial, reference) for trial in TINY)
     assert active is not None
@@ -412,3 +413,10 @@ def test_largest_push_is_the_last_one_before_the_robot_falls(monkeypatch: pytest
 def test_robot_withstands_a_push_at_the_landing_that_moves_the_dcm_over_the_new_stance_foot() -> None:
     trial = PushTrial(90.0, 0.875, (200.0,), 75.0, 1.75, 0, "mujoco")
     assert largest_push(trial)["end"] == "stood"
+
+
+def test_figure_of_the_sweep_has_its_trials_in_time() -> None:
+    from atalante_tools.trial.figures import time_of
+
+    orders = [trial.order for trial in sweep_trials(SETTING, SWEEP, 11)]  # type: ignore[union-attr]
+    assert sorted(orders, key=time_of) == orders

@@ -174,15 +174,23 @@ def scenario(result: Result) -> bytes:
     return _png(figure)
 
 
+def time_of(order: str) -> tuple[int, int]:
+    """Return day and position of a trial of the sweep, which sort the trials in time. The position of a treadmill trial is 0.
+
+    Args:
+        order: field `order` of the trial, for example "day2-03", or "day2" of a treadmill trial.
+    """
+    day, _, position = order.partition("-")
+    return int(day.removeprefix("day")), int(position or 0)
+
+
 def sweep_in_time(results: Sequence[Result]) -> bytes:
     """Draw metabolic rates and tracking errors in the order of the trials (figure "up and down" of the paper).
 
     Args:
         results: results of the sweep trials that ended, including the treadmill trials.
     """
-    ordered = sorted(
-        results, key=lambda r: (r["trial"]["order"].split("-")[0], r["trial"]["kind"] == "walk", r["trial"]["order"])
-    )
+    ordered = sorted(results, key=lambda r: time_of(r["trial"]["order"]))
     figure, (upper, lower) = plt.subplots(2, 1, figsize=(11.0, 5.6), sharex=True)
     names = []
     for i, result in enumerate(ordered):
