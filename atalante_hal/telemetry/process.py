@@ -131,7 +131,9 @@ class Recording:
 
     files: tuple[str, ...]  # file names in order; each restart of the subprocess begins a new file
     complete: bool  # True if there is one file, with an index and with all cycles
-    missing_cycles: int  # number of cycles that are not recorded in the files
+    missing_cycles: (
+        int  # number of cycles that are not in the files; after a killed subprocess at most one MCAP chunk too high
+    )
 
 
 @dataclass(frozen=True)
