@@ -103,6 +103,18 @@ def pytest_configure(config: pytest.Config) -> None:
         gc.disable()  # until `pytest_collection_finish`, because the collection of the tests creates many objects and no garbage
 
 
+@pytest.hookimpl(tryfirst=True)
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Mark the cases of a test with the mark `sample(n)` as long, except the cases 0, n, 2n and so on."""
+    cases: Counter[str] = Counter()
+    for item in items:
+        if (sample := item.get_closest_marker("sample")) is not None:
+            test = item.nodeid.partition("[")[0]
+            if cases[test] % sample.args[0]:
+                item.add_marker("long")
+            cases[test] += 1
+
+
 def pytest_collection_finish() -> None:
     """Exclude the half million objects of modules and tests from garbage collection, so that a collection takes less time.
 

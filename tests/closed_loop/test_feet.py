@@ -87,6 +87,7 @@ def test_f76_wrong_sign_of_cells_is_found_when_the_robot_is_set_down(robot, cell
     assert len(wrong) - wrong.index(True) <= 270  # the load sways about its limit while the crane lowers the robot
 
 
+@pytest.mark.long
 def test_f78_exchanged_feet_are_found_before_the_first_step(robot) -> None:
     controller = WalkController(robot, PATIENT, gaits_of_subject(Subject(PATIENT, *STEP), robot), 4)
     fault = Fault("sensor_swapped", "FOOT_LEFT", other="FOOT_RIGHT")

@@ -112,6 +112,7 @@ def programs(network: Network, robot: Robot, urdf_text: str) -> Iterator[Program
     made.close()
 
 
+@pytest.mark.sample(6)
 @pytest.mark.parametrize("order", list(itertools.permutations((ROBOT, CONTROLLER, PENDANT))), ids="-".join)
 def test_every_order_of_the_three_programs_becomes_active_within_two_seconds(
     programs: Programs, order: tuple[str, ...]

@@ -16,6 +16,7 @@ def test_walks_cover_the_requested_cycles_in_the_air_and_on_the_ground() -> None
     assert [task.number for task in quiet_tasks(150_000, "mujoco")] == [0, 1, 2]
 
 
+@pytest.mark.sample(2)
 @pytest.mark.parametrize(
     ("number", "name"),
     # The gaits of the patient of 75 kg are in a file. Gaits of another patient would be solved first, which takes 10 s.

@@ -52,6 +52,7 @@ def test_fault_begins_in_the_state_of_its_moment(moment: Moment, state: S) -> No
     assert run.states[-1] is state
 
 
+@pytest.mark.sample(3)
 @pytest.mark.parametrize("moment", Moment)
 def test_silent_drive_at_any_moment_breaks_no_limit(moment: Moment) -> None:
     verdict = MomentTask(moment, (index("F04", "LEFT_SK"),))()
@@ -150,6 +151,7 @@ def test_wrong_motors_are_found_within_the_bound_of_the_fault_matrix() -> None:
         assert case.detected == case.stimuli[1].start + moments.FOUND
 
 
+@pytest.mark.sample(2)
 @pytest.mark.parametrize(("cycle", "failures"), [(0, 0), (moments.FOUND - 1, 0), (-1, 1), (moments.FOUND, 1)])
 def test_a_wrong_motor_may_move_a_joint_fast_until_it_is_found(
     monkeypatch: pytest.MonkeyPatch, cycle: int, failures: int

@@ -99,6 +99,7 @@ def test_ignored_dead_man_is_found_and_its_scenario_shows_it(path: OperatorPath,
     assert (run.drive_state[-1] == DriveState.OPERATION_ENABLED).all()
 
 
+@pytest.mark.long
 def test_second_move_of_a_start_is_found(path: OperatorPath, monkeypatch: pytest.MonkeyPatch):
     enter = SafetyMonitor._enter
 

@@ -246,6 +246,7 @@ def mutant(rng: random.Random) -> str:
     return "".join(lines)
 
 
+@pytest.mark.sample(4)
 @pytest.mark.parametrize("seed", range(60))
 def test_f52_mutated_dbc_is_rejected_with_its_path_or_loads_completely(seed: int, tmp_path: Path) -> None:
     path = tmp_path / "mutant.dbc"

@@ -86,6 +86,7 @@ def test_assistance_factor_out_of_range_is_rejected(factor, network, robot, rig)
         Hal(network, robot, rig.bus, assistance_factor=factor)
 
 
+@pytest.mark.sample(4)
 @pytest.mark.parametrize("joint", JOINTS)
 def test_silent_drive_leads_to_hold_after_exactly_five_lost_frames(rig, joint, network):
     message = network.message(f"{joint.upper()}_STATE")

@@ -57,7 +57,7 @@ PYPROJECT = """
 testpaths = ["tests"]
 pythonpath = ["tests/fuzz", "tests/witness", "tests/hal/safety/plausibility"]
 addopts = "-q --strict-markers --import-mode=importlib --hypothesis-profile=mutation -m 'not exhaustive' {plugins}"
-markers = ["exhaustive"]
+markers = ["exhaustive", "long", "sample(n)"]
 
 [tool.mutmut]
 source_paths = {packages}

@@ -234,6 +234,7 @@ class SteppedTime:
             self.emulator.run_without_sync()
 
 
+@pytest.mark.sample(3)
 @pytest.mark.parametrize("milliseconds", [3, 20, 2000])
 def test_f42_stopped_hal_sends_no_burst_and_holds_after_five_milliseconds(
     milliseconds: int, robot: Robot, urdf_text: str

@@ -139,6 +139,7 @@ def assert_never_started(run: Run, number: int) -> list[Cycle]:
     return cycles
 
 
+@pytest.mark.sample(4)
 @pytest.mark.parametrize(
     ("point", "number"),
     [
@@ -178,6 +179,7 @@ def test_signal_before_ready_ends_the_command(number: signal.Signals, tmp_path: 
     assert {cycle.supervisor for cycle in cycles} == {"OFF"}
 
 
+@pytest.mark.sample(3)
 @pytest.mark.parametrize(
     "command",
     [
@@ -196,6 +198,7 @@ def test_signal_lost_in_a_callback_ends_every_driving_command(
     assert not (tmp_path / "run").exists()
 
 
+@pytest.mark.sample(5)
 @pytest.mark.parametrize("seed", range(10))
 def test_no_cycle_is_active_after_a_signal_at_a_random_time(seed: int, tmp_path: Path) -> None:
     rng = random.Random(seed)

@@ -43,6 +43,7 @@ def test_own_bus_example_counts_frames_in_both_directions():
     assert "SYNC_LEFT_LEG" in line
 
 
+@pytest.mark.long
 def test_own_guide_shape_example_is_certified_and_stays_in_its_guide():
     certificate, walk = run("own_guide_shape.py").splitlines()
     assert certificate.startswith("certified - ")

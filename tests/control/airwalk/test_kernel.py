@@ -42,6 +42,7 @@ def states(xi: float) -> list[State]:
     return result
 
 
+@pytest.mark.sample(5)
 @pytest.mark.parametrize(
     ("xi", "config"),
     [

@@ -42,6 +42,7 @@ def test_suspended_gait_keeps_its_trajectories() -> None:
     np.testing.assert_array_equal(suspended_gait(gait, EXOSKELETON, ROBOT).coefficients, gait.coefficients)
 
 
+@pytest.mark.sample(9)
 @pytest.mark.parametrize("mass_height", [(58.0, 1.62), (75.0, 1.75), (91.0, 1.93)])
 @pytest.mark.parametrize("step", [(0.1, 1.1), (0.15, 0.9), (0.2, 0.75)])
 def test_guides_are_certified_with_the_gaits_of_the_network(

@@ -63,6 +63,7 @@ def gaits() -> list[Gait]:
     return [synthetic(GRID.subject(index)).gait for index in GRID.points()]
 
 
+@pytest.mark.long
 def test_fit_generalizes_to_subjects_off_the_grid(gaits: list[Gait]) -> None:
     fitted = fit(gaits, GRID, hidden=(16,), iterations=1500)
     assert fitted.directions <= len(DIRECTIONS) + 1
@@ -155,6 +156,7 @@ class TestCommand:
     def run(*arguments: str) -> Any:
         return CliRunner().invoke(cli, ["gait", *arguments])
 
+    @pytest.mark.long
     def test_library_fit_and_check_run_in_sequence(self, monkeypatch: pytest.MonkeyPatch, tmp_path: Any) -> None:
         monkeypatch.setattr(library_module, "solve_subject", synthetic)
         monkeypatch.setattr(fit_module, "fit", partial(fit, hidden=(8,), iterations=800))

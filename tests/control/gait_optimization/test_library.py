@@ -240,6 +240,7 @@ DAMAGES: dict[str, tuple[Callable[[Path], Any], str]] = {
 }  # fmt: skip
 
 
+@pytest.mark.sample(6)
 @pytest.mark.parametrize("damage", DAMAGES)
 def test_damaged_gait_file_is_rejected_with_a_reason_and_solved_again(solved_library: Library, damage: str) -> None:
     library, index = solved_library, CORNER
@@ -310,6 +311,7 @@ def test_gaits_of_a_killed_process_are_solved_again(tmp_path: Path) -> None:
     assert messages[0].endswith("they are repeated in new processes")
 
 
+@pytest.mark.long
 def test_gait_that_always_ends_its_process_is_recorded_as_failed(tmp_path: Path) -> None:
     messages: list[str] = []
     library = Library(tmp_path, GRID)

@@ -8,6 +8,7 @@ from itertools import product
 from pathlib import Path
 
 import numpy as np
+import pytest
 from click.testing import CliRunner
 
 from atalante_control.dynamics.gait_network import Layer, load_network, save_network, subject_of
@@ -21,6 +22,7 @@ SHIPPED = load_network()
 LARGER_CHANGE = 0.03  # rad, change of a control point that lifts the landing foot from the ground
 
 
+@pytest.mark.long
 def test_gaits_of_the_shipped_network_pass_every_check() -> None:
     corners = map(list, product(*zip(SHIPPED.low.tolist(), SHIPPED.high.tolist(), strict=True)))
     subjects = [*random_subjects(SHIPPED.low, SHIPPED.high, 30, seed=4), *map(subject_of, corners)]

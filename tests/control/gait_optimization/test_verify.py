@@ -32,6 +32,7 @@ def gait() -> Gait:
     return solve(SUBJECT).gait
 
 
+@pytest.mark.sample(3)
 @pytest.mark.parametrize("kind", KINDS)
 def test_solved_steps_pass_the_verification(verifier: Verifier, kind: Kind) -> None:
     failed = [check for check in verifier.verify(solve(SUBJECT, kind=kind).gait, kind) if not check.holds]

@@ -68,6 +68,7 @@ def test_reset_removes_the_heading_only() -> None:
     np.testing.assert_allclose(observer.rotation, rotation_of(tilt), atol=1e-12)
 
 
+@pytest.mark.sample(4)
 @pytest.mark.parametrize("start", [0.0, 3.0])
 @pytest.mark.parametrize("drift", [-1e-4, 1e-4])
 def test_a_heading_reference_stops_the_drift_of_the_heading(start: float, drift: float) -> None:

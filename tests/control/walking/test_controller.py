@@ -141,6 +141,7 @@ def pushed(
         body.close()
 
 
+@pytest.mark.sample(2)
 @pytest.mark.parametrize(("direction", "force"), [(90.0, 210.0), (270.0, 180.0)], ids=["left", "right"])
 def test_robot_withstands_a_push_only_with_foot_placement_step_timing_and_lean(direction: float, force: float) -> None:
     assert pushed(PlacementConfig().dead_zone, direction, force)
@@ -163,6 +164,7 @@ def test_ankle_of_a_pushed_robot_keeps_the_centre_of_pressure_within_the_sole() 
     assert heel + edge - 0.01 <= min(arms) < heel + edge
 
 
+@pytest.mark.sample(2)
 @pytest.mark.parametrize("foot", [0, 1])
 def test_robot_makes_a_stop_step_without_the_data_of_a_foot(foot: int) -> None:
     controller, phases = walked("mujoco", 100, finish_after=1, lost_foot=foot)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 
 import numpy as np
+import pytest
 
 from atalante_control.gait.gait import PERIOD
 from atalante_control.walking.heading import HeadingConfig, HeadingFilter
@@ -28,6 +29,7 @@ def heading_errors(generator: np.random.Generator, followed: bool) -> tuple[floa
     return error, total
 
 
+@pytest.mark.long
 def test_the_heading_is_more_exact_than_gyro_and_reference_alone() -> None:
     """The position error of a walk is the integral of the heading error times the speed."""
     follow, drift = (

@@ -50,6 +50,7 @@ def test_speed_changes_within_a_walk(first: tuple[float, float], second: tuple[f
     assert guide.hand_overs_exceeded == 0
 
 
+@pytest.mark.long
 def test_stop_before_the_speed_change_is_the_stop_step_of_the_first_gait() -> None:
     distances = []
     for then in ([], [Section(gaits(SHORT), 5)]):
@@ -60,6 +61,7 @@ def test_stop_before_the_speed_change_is_the_stop_step_of_the_first_gait() -> No
     assert distances[0] == distances[1]
 
 
+@pytest.mark.long
 def test_second_walk_begins_with_the_first_gait_again() -> None:
     controller = changing(SHORT, LONG, steps=1)
     distances = []

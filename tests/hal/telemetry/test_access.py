@@ -316,6 +316,7 @@ class TestTelemetryFile:
 class TestCommand:
     """The command `atalante airwalk --telemetry FILE`, with each combination of keys that the README shows."""
 
+    @pytest.mark.sample(4)
     @pytest.mark.parametrize(
         "keys",
         [

@@ -363,6 +363,7 @@ def test_garbage_in_every_cycle_does_not_stop_a_pendant(world: World) -> None:
     assert node.answered == world.hal.state.cycle
 
 
+@pytest.mark.sample(8)
 @pytest.mark.parametrize("older", [False, True])
 @pytest.mark.parametrize("offset", [0, 1, 2, 5, 30, 49, 77, 120])
 def test_one_pendant_is_left_and_motion_requires_its_dead_man(world: World, offset: int, older: bool) -> None:
@@ -420,6 +421,7 @@ def test_start_pressed_before_a_silence_has_no_effect_again(world: World) -> Non
 # -- two robots ------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.sample(4)
 @pytest.mark.parametrize(("seed", "head_start"), [(0, 0), (1, 0), (0, 120), (1, 120)])
 def test_the_hal_never_starts_while_two_emulators_answer(
     make_world: Callable[..., World], urdf_text: str, robot: Robot, seed: int, head_start: int
@@ -478,6 +480,7 @@ def started_once(world: World, capsys: pytest.CaptureFixture[str]) -> None:
     assert printed.count("START pressed") == 1
 
 
+@pytest.mark.sample(8)
 @pytest.mark.parametrize("cycles", HEAD_STARTS)
 def test_a_hal_started_after_the_pendant_becomes_active(
     world: World, cycles: int, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
@@ -493,6 +496,7 @@ def test_a_hal_started_after_the_pendant_becomes_active(
     started_once(world, capsys)
 
 
+@pytest.mark.sample(8)
 @pytest.mark.parametrize("cycles", HEAD_STARTS)
 def test_a_hal_started_before_the_pendant_becomes_active(
     world: World, cycles: int, capsys: pytest.CaptureFixture[str]
@@ -501,6 +505,7 @@ def test_a_hal_started_before_the_pendant_becomes_active(
     started_once(world, capsys)
 
 
+@pytest.mark.sample(8)
 @pytest.mark.parametrize("cycles", HEAD_STARTS)
 @pytest.mark.parametrize("state", [READY, HOLD])
 def test_a_start_of_a_late_pendant_makes_the_hal_active(
@@ -516,6 +521,7 @@ def test_a_start_of_a_late_pendant_makes_the_hal_active(
     started_once(world, capsys)
 
 
+@pytest.mark.sample(8)
 @pytest.mark.parametrize("frames", HEAD_STARTS)
 @pytest.mark.parametrize("state", [READY, HOLD])
 def test_press_of_a_late_pendant_is_accepted_from_its_second_frame(

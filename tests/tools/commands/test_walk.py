@@ -19,6 +19,7 @@ def run(*arguments: str) -> tuple[int, str, str]:
     return result.exit_code, result.stdout, result.stderr
 
 
+@pytest.mark.sample(2)
 @pytest.mark.parametrize("engine", ["pybullet", "mujoco"])
 def test_patient_walks_three_steps_and_stands(engine: str) -> None:
     code, out, errors = run("--steps", "3", "--engine", engine, "--json")
@@ -36,6 +37,7 @@ def test_walk_with_a_heading_reference_stands() -> None:
     assert result["yaw_deg"] == pytest.approx(result["true_yaw_deg"], abs=1.0)
 
 
+@pytest.mark.sample(2)
 @pytest.mark.parametrize(("turn", "xi"), [(3.0, 1.0), (-3.0, 0.5)])
 def test_line_turns_before_each_step(turn: float, xi: float) -> None:
     code, out, errors = run("--steps", "8", "--turn", str(turn), "--xi", str(xi), "--engine", "mujoco", "--json")

@@ -48,6 +48,7 @@ def test_c_and_python_agree_on_random_images_of_the_whole_network(whole):
     assert run_host_test(build, program, IMAGES, seed=1) == 2 * IMAGES * len(build.messages)
 
 
+@pytest.mark.long
 def test_host_test_passes_on_the_vector_file(whole):
     _, folder, program = whole
     done = subprocess.run([program, folder / "vectors.bin"], capture_output=True, text=True, check=False)

@@ -75,6 +75,7 @@ def test_controller_loads_the_written_gait(result: tuple[Result, Path]) -> None:
     assert gait.feedforward is not None
 
 
+@pytest.mark.long
 def test_plot_and_animation_are_written(result: tuple[Result, Path], tmp_path: Path) -> None:
     from atalante_control.model import Patient
 

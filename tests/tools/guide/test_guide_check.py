@@ -50,6 +50,7 @@ def test_names_in_the_help_are_those_of_the_check():
     assert tuple(CONDITIONS) == CONDITION_NAMES
 
 
+@pytest.mark.long
 def test_step_without_a_push_stays_in_the_guide_and_is_repeatable():
     leg, start = IdealLeg(setup(), controller("constant"), 0.5), starts_of(setup().config, 0)[0]
     push, numbers = (
@@ -115,6 +116,7 @@ def test_guide_that_is_never_certified_has_no_promise():
     assert verdict.steps == 0
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("condition", [Condition(), Condition(1.2, 1.1, noise=1e-5, loss=0.01, delay=1)], ids=str)
 def test_robot_walks_under_pushes_in_every_condition(condition: Condition):
     push = Push(np.ones((setup().gait.cycles + 1, 2)), NONE)
@@ -156,6 +158,7 @@ def test_effort_of_a_check_adds_robot_steps_and_tightness():
 # -- command ---------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.long
 def test_command_prints_the_promise_beside_the_worst_ratio(tmp_path: Path):
     picture = tmp_path / "worst.png"
     arguments = [

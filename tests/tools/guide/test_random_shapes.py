@@ -36,6 +36,7 @@ def test_notches_are_short_and_pieces_are_constant():
     assert len(np.unique(piecewise)) <= 12
 
 
+@pytest.mark.long
 def test_command_repeats_the_check_of_one_shape():
     arguments = ["guide", "random", "--first", "3", "--count", "1", "--steps", "1", "--json"]
     first, second = (CliRunner().invoke(cli, arguments).stdout for _ in range(2))

@@ -298,6 +298,7 @@ def kill_and_take_the_port(telemetry: TelemetryProcess) -> socket.socket:
     return squatter
 
 
+@pytest.mark.long
 def test_a_recording_with_a_gap_fails_the_run_and_is_counted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     tend, calls, endpoints = TelemetryProcess.tend, [0], []
 
@@ -368,6 +369,7 @@ def test_a_run_starts_without_the_telemetry_process(tmp_path: Path, monkeypatch:
     assert recording == {"recording": {"files": ["recording.mcap"], "complete": True, "missing_cycles": 0}}
 
 
+@pytest.mark.long
 def test_every_event_is_recorded_when_the_event_log_holds_one(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     monkeypatch.setattr(fault_memory, "EventLog", functools.partial(fault_memory.EventLog, 1))
     done = CliRunner().invoke(cli, ["airwalk", "--steps", "1", "--out", str(tmp_path)])
@@ -380,6 +382,7 @@ def test_every_event_is_recorded_when_the_event_log_holds_one(tmp_path: Path, mo
     assert [code for code in events if code in SupervisorState.__members__] == ["READY", "ACTIVE", "HOLD"]
 
 
+@pytest.mark.sample(2)
 @pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
 def test_a_signal_ends_in_hold_and_keeps_recording_and_summary(number, code, tmp_path: Path):
     command = [ATALANTE, "airwalk", "--steps", "1000", "--out", str(tmp_path)]
@@ -401,6 +404,7 @@ def test_a_signal_ends_in_hold_and_keeps_recording_and_summary(number, code, tmp
     assert json.loads((tmp_path / "summary.json").read_text())["shapes"][0]["shape"] == "constant"
 
 
+@pytest.mark.long
 def test_a_patient_s_gait_of_the_network_is_walked_inside_a_certified_guide(tmp_path: Path):
     done = atalante("demo", "--shape", "pinched", "--steps", "2", "--mass", "75", "--height", "175", "--step-length", "0.16",
                     "--step-duration", "0.8", "--thigh", "0.44", "--shank", "0.42", "--out", str(tmp_path), "--json")  # fmt: skip

@@ -96,6 +96,7 @@ def test_walk_in_the_air_to_the_end_with_the_given_gait(folder: Path, command: s
     assert given[options[0].removeprefix("--")] == options[1]
 
 
+@pytest.mark.long
 def test_gait_file_adjusts_the_exoskeleton_to_its_patient(folder: Path) -> None:
     for name in ("walk.json", "periodic.json"):
         files = GaitFiles(gait=folder / name)
@@ -145,6 +146,7 @@ def network_as_gait(folder: Path) -> Path:
     return DEFAULT_NETWORK
 
 
+@pytest.mark.sample(5)
 @pytest.mark.parametrize("command", COMMANDS)
 @pytest.mark.parametrize(
     ("make", "message"),
@@ -166,6 +168,7 @@ def test_wrong_gait_file_is_rejected_before_the_robot_moves(
     assert done.stderr.count("\n") == 1
 
 
+@pytest.mark.sample(4)
 @pytest.mark.parametrize("command", COMMANDS)
 @pytest.mark.parametrize(
     ("options", "message"),

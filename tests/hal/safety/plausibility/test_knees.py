@@ -283,6 +283,7 @@ class TestInTheCycle:
     def test_drift_is_found(self):
         assert self.found()
 
+    @pytest.mark.sample(5)
     @pytest.mark.parametrize("sensor", ["left_FH", "left_TH", "right_SK", "IMU_pelvis", "IMU_right_tibia"])
     def test_late_values_are_used_and_old_values_are_not(self, sensor: str):
         assert self.found(late={row(sensor): 4})

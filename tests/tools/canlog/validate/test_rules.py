@@ -538,6 +538,7 @@ def test_unchecked_signals_are_listed(recording: Recording, network: Plan, tmp_p
         assert seen not in unseen
 
 
+@pytest.mark.sample(3)
 @pytest.mark.parametrize("rule", RULE_OF)
 def test_mutation_violates_only_its_rule(
     rule: str, recording: Recording, network: Plan, extended_network: Plan, tmp_path: Path
