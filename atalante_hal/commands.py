@@ -49,7 +49,8 @@ class Commands:
         self._sent_torque, self._sent_level = record.torque_command, record.level_command
         self._no_level = np.zeros_like(self._level)
         self.hold()
-        #: HOLD frames (quick stop, zero torque, vibration motors off), encoded in advance, so that no later fault prevents HOLD.
+        #: Encoded HOLD frames: quick stop, zero torque, vibration motors off.
+        #: HOLD frames are encoded now, so that HOLD can be sent even if later command values are invalid (NaN).
         self._prepared_hold = self._image.prepare()
         self._sealed = False  # True: the SYNC of the next cycle is already encoded
 

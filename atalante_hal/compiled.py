@@ -35,10 +35,10 @@ Function = TypeVar("Function", bound=Callable[..., Any])
 P = ParamSpec("P")
 R = TypeVar("R")
 
-#: Name of a marker file in the cache folder of a function. If the file exists, the function creates arrays.
-#: `specialised` compiles such a function with numba's reference counting, and any other function without it.
+#: Name of an empty file, which is stored in the cache folder of each function that creates arrays.
+#: `specialised` compiles a function that creates arrays with numba's reference counting, and any other function without it.
 _MARK = "creates-arrays"
-#: Function given to `specialised` -> whether this function creates arrays.
+#: Function given to `specialised` -> True if the function creates arrays, so that numba must count references to arrays.
 _CREATES_ARRAYS: dict[Callable[..., Any], bool] = {}
 
 

@@ -30,10 +30,10 @@ from atalante_hal.types import PERIOD, Command, State, SupervisorState, Vector
 from atalante_hal.wire.cia402 import Controlword, DriveState
 from atalante_hal.wire.process_image import NEVER, ReceiveImage
 
-#: Number of consecutive cycles with a limited torque after which TORQUE_SATURATED is confirmed.
+#: If the limiter reduces a torque in more than this number of consecutive cycles, the reaction of TORQUE_SATURATED follows.
 SATURATED_CYCLES = 200
-#: A robot on the ground continues to walk after at most this number of consecutive exceptions of the controller.
-#: A drive tolerates the same number of lost commands.
+#: While the robot walks on the ground, up to this number of consecutive controller exceptions only repeat the last torques.
+#: The next consecutive exception leads to HOLD. A drive bridges at most 4 lost commands in the same way.
 BRIDGED_ERRORS = 4
 #: Longest total wait for the nodes' answers while `Hal.stop` puts the robot into HOLD [s].
 STOP_PATIENCE = 1.0
@@ -231,7 +231,7 @@ class Hal:
             state.supervisor in (_S.LOWER, _S.FAULT) or (state.supervisor is _S.HOLD and safety_monitor.start_prevented)
         ):
             # The operator acknowledged the faults with START. So each drive in FAULT is reset; the other drives continue to hold.
-            # HOLD is included: until a drive in FAULT is reset, its emergency message remains active and prevents the start.
+            # In HOLD, a drive in FAULT needs the reset, too: until then, its emergency message is active and prevents the start.
             control[state.drive_state == DriveState.FAULT] = Controlword.FAULT_RESET
             safety_monitor.enabling = False
         elif (
@@ -381,7 +381,7 @@ class Hal:
         return bool((self._image.age >= NEVER).all())
 
     def missing(self) -> list[str]:
-        """Return the names of the nodes that prevent READY.
+        """Return the names of the nodes for which the HAL still waits before the robot becomes READY.
 
         Such a node timed out, is not qualified yet, has sent no status, or uses another DBC.
         """

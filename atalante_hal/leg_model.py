@@ -19,14 +19,14 @@ class LegModel(NamedTuple):
     """
 
     offset: Vector  # (2, 6, 3) m, position of the joint in the frame of the parent link
-    #: (2, 6, 3, 3, 3) three matrices T for each joint, shape (3, 3) each. At the joint angle q, the rotation matrix from link to
-    #: parent is T[0] + sin(q) T[1] + (1 - cos(q)) T[2].
+    #: (2, 6, 3, 3, 3) three matrices T[0], T[1], T[2] of shape (3, 3) for each joint.
+    #: At the joint angle q, the rotation matrix from link to parent is T[0] + sin(q) T[1] + (1 - cos(q)) T[2].
     turn: Vector
     axis: Vector  # (2, 6, 3) unit vector of the joint axis in the frame of the link
-    mass: Vector  # (2, 6) kg
+    mass: Vector  # (2, 6) kg, mass of each link
     centre: Vector  # (2, 6, 3) m, position of the centre of mass in the frame of the link
     inertia: Vector  # (2, 6, 3, 3) kg m2, inertia about the origin of the link frame
-    cell: Vector  # (2, 4, 3) m, positions of the force cells in the frame of the last link
+    cell: Vector  # (2, 4, 3) m, position of each force cell in the frame of the foot, which is the last link
     dry: Vector  # (2, 6) Nm, dry friction of the joints
     viscous: Vector  # (2, 6) Nm s/rad, viscous friction of the joints
-    friction_speed: float  # rad/s, joint speed at which dry friction reaches 76 % of its full value
+    friction_speed: float  # rad/s, at this joint speed, the dry friction is tanh(1) = 76 % of its full value

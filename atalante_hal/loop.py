@@ -17,13 +17,13 @@ from atalante_hal.hal import Hal
 from atalante_hal.safety.diagnostics import Dtc
 from atalante_hal.types import PERIOD, Controller, State
 
-#: Number of consecutive late cycles after which the robot goes to HOLD.
+#: The robot goes to HOLD if this number of consecutive cycles begin more than one period late.
 OVERRUNS_TO_HOLD = 3
-#: Lateness of a cycle above which the robot goes to HOLD [s]. The watchdog of the drives has the same timeout.
+#: The robot goes to HOLD if one cycle begins more than this time [s] late. The watchdog of the drives has the same timeout.
 GAP_TO_HOLD = 5e-3
-#: The robot goes to HOLD if the loop falls behind the clock by more than this time [s] within `DRIFT_CYCLES` cycles.
+#: The robot goes to HOLD if the loop's delay against the clock grows by more than this time [s] within `DRIFT_CYCLES` cycles.
 DRIFT_TO_HOLD = 5e-3
-#: Number of cycles to which the limit `DRIFT_TO_HOLD` applies.
+#: Number of cycles over which the growth of the loop's delay is measured, for the comparison with `DRIFT_TO_HOLD`.
 DRIFT_CYCLES = 50
 #: Number of bins of the histogram of computing times. Each bin is 1 us wide.
 COST_BINS = 10_000
@@ -84,9 +84,9 @@ class WallClock:
 
 
 class Drift:
-    """Measurement of how much further the loop fell behind the clock within the last `DRIFT_CYCLES` cycles.
+    """Drift of the loop: the growth of its delay against the clock within the last `DRIFT_CYCLES` cycles.
 
-    Example: the loop was 2 ms behind the clock 50 cycles ago, and is 6 ms behind now. Then the drift is 4 ms.
+    Example: 50 cycles ago, the delay was 2 ms. Now the delay is 6 ms, so the drift is 4 ms.
     """
 
     def __init__(self) -> None:
@@ -94,7 +94,7 @@ class Drift:
         self._behind = deque([0.0] * DRIFT_CYCLES, maxlen=DRIFT_CYCLES)
 
     def add(self, late: float) -> float:
-        """Add the lateness of one cycle, and return how much further the loop fell behind within `DRIFT_CYCLES` cycles.
+        """Add the lateness of one cycle, and return the drift of the loop [s].
 
         Args:
             late: Lateness of the cycle [s], as `Clock.wait` returns it. A lateness above `GAP_TO_HOLD` is not added,

@@ -71,7 +71,8 @@ class Pendant:
         self._slice = slice(indices[0], indices[-1] + 1)
         #: Signal values as received, a view of the process image.
         self.signals = image.values[self._slice]
-        #: Bytes of `signals` at the last call of `evaluate`. If `signals` has changed since then, call `evaluate` again.
+        #: Copy of `signals` as bytes, made by the last `evaluate`; empty while the pendant is absent.
+        #: If this copy differs from `signals`, the pendant has sent new inputs, and `evaluate` must be called.
         self.evaluated = b""
         self.dead_man = False
         self.stop_requested = False

@@ -103,7 +103,7 @@ def _fields(codec: Codec, controller_fields: Sequence[tuple[str, int]]) -> list[
     ]
 
 
-#: Field names for signal groups of the DBC whose names would be ambiguous in a record.
+#: Quantity in the DBC's signal names -> name of its record field. The field name adds the device that measures the quantity.
 _FIELD_NAMES = {
     "Position": "motor_position",
     "Velocity": "motor_velocity",

@@ -64,18 +64,21 @@ class Derating:
 class Sensors:
     """Tolerances that sensors without a fault meet, and load thresholds of the force cells, see `plausibility`."""
 
-    #: Largest mean difference [rad/s at the joint] between the reported velocity and the filtered encoder velocity.
+    #: Largest mean difference [rad/s at the joint] between a drive's reported velocity and the velocity of its encoder positions.
+    #: The velocity of the encoder positions is filtered with the same low-pass as the reported velocity.
     velocity_error: float
-    velocity_bandwidth: float  # Hz, cut-off frequency of the low-pass of the reported velocity
+    velocity_bandwidth: float  # Hz, cut-off frequency of the low-pass with which a drive filters its reported velocity
     #: Largest difference [rad] about each axis between the tibia attitude from the encoders and the tibia attitude from the IMUs.
     attitude_error: float
-    #: Largest change [rad] of the difference between encoder angle and IMU angle while the encoder reading is constant.
+    #: While an encoder reading is constant, encoder angle minus IMU angle may change by at most this angle [rad].
+    #: A larger change of this difference of angles is a sign that the joint moves although its encoder is stuck.
     attitude_change: float
-    #: The limit `attitude_change` grows by this angle [rad] for each radian of leg rotation, because an IMU may be mounted askew.
+    #: An IMU may be mounted askew. So this factor times the leg rotation [rad] is added to the limit `attitude_change`.
+    #: Example: with a factor of 0.02, a leg rotation of 0.5 rad increases the limit by 0.01 rad.
     misalignment: float
     quaternion_error: float  # largest difference between the squared norm of a quaternion and 1
     cell_free: float  # N, largest vertical force at which a cell is regarded as unloaded
-    cell_twist: float  # N, largest difference between the vertical forces on the two diagonals of a foot's cells
+    cell_twist: float  # N, largest difference between the vertical forces FL + RR and FR + RL of a foot's cells
     sole_tilt: float  # rad, largest tilt of a sole on the floor, computed from the ankle encoders and the tibia IMU
 
 
@@ -85,15 +88,16 @@ class Thresholds:
 
     supply_low: float  # V at a drive; below this voltage the battery is nearly empty
     supply_under: float  # V at a drive; below this voltage the drives may soon fail to hold
-    #: Walking is permitted while the torque limit of a hot drive is at least this share of the torque limit of the same drive in
-    #: the other leg.
+    #: Walking is permitted while the torque limit of a hot drive is at least this share of its twin's torque limit.
+    #: The twin is the drive of the same joint in the other leg. Example: 0.5 of a twin's limit of 200 Nm is 100 Nm.
     derated_imbalance: float
     full_assist_ramp: float  # s, time for the ramp of the assistance factor from 0 to 1 in FULL_ASSIST
     #: Largest accepted angle [rad] outside a position limit. A joint beyond this angle is out of range.
     position_tolerance: float
-    #: Largest torque that a drive may report while it is off [Nm]. A drive that is on may exceed `torque_max` by this torque.
+    #: Largest plausible torque [Nm] that a drive reports while it is off.
+    #: While a drive is on, a reported torque of up to `torque_max` plus this value is plausible.
     idle_torque: float
-    surplus_frames: float  # largest number of frames in a cycle in addition to one frame of each cyclic message
+    surplus_frames: float  # largest number of frames in a cycle beyond one of each cyclic message; more are a BUS_FLOOD
 
 
 @dataclass(frozen=True)
@@ -113,7 +117,7 @@ class Robot:
     hold_kp: Vector  # Nm/rad, stiffness of the position control in the drive
     hold_kd: Vector  # Nm s/rad, damping of the position control in the drive
     encoder_noise: Vector  # rad rms
-    breakaway: Vector  # Nm, change of the drive torque that is sufficient to overcome the dry friction of the joint
+    breakaway: Vector  # Nm, change of the drive torque that moves a joint at rest despite its dry friction
     torque_error: Vector  # Nm rms, error of the torque that is computed from the motion of the leg
     envelope: Envelope
     derating: Derating
@@ -165,7 +169,7 @@ _KEYS = {
     "breakaway": _Key(1, 0.01, 400.0, "Nm"),
     "torque_error": _Key(1, 0.01, 100.0, "Nm"),
 }
-#: Keys of all tables of the robot file except [joints].
+#: Table of the robot file -> key -> rule for the value of the key. The table [joints] is missing, because `_KEYS` has its keys.
 _TABLES = {
     "envelope": {
         "look_ahead": _Key(1, 1e-3, 1.0, "s"),

@@ -18,15 +18,14 @@ from atalante_hal.wire.e2e import SETTLED, qualify
 from atalante_hal.wire.frame import FLAG_BRS, FLAG_FDF, ID_ERROR, Frames, as_words, header_word, new_frames
 from atalante_hal.wire.process_image import ReceiveImage
 
-#: Largest number of frames received in one cycle. About 20 of these frames are cyclic.
+#: Largest number of frames that are received in one cycle. In each cycle, the nodes send about 20 cyclic frames.
 RECEIVE_BUDGET = 128
-#: Number of consecutive cycles after which a fault is confirmed: too many received frames, or a full transmit queue.
+#: A fault is confirmed after this number of cycles in a row with too many received frames, or with a full transmit queue.
 PERSISTENT = 5
 #: Time to listen for another HAL before the first SYNC [s].
 LISTEN = 0.2
-#: Longest wait for unlikely answers [s]. Answers are unlikely if the last SYNC was not sent, if every node has timed out, or if
-#: the missing nodes have not answered several SYNCs. Each unanswered SYNC halves the wait, but not below this time, see
-#: `Transceiver.receive`.
+#: Shortened wait [s] for nodes that will probably not answer, for example because the last SYNC was not sent.
+#: The argument `patience` of `Transceiver.receive` describes all cases.
 _DOUBTFUL_PATIENCE = 0.1
 #: Class bit of an error frame that reports bus-off (linux/can/error.h).
 ERROR_BUS_OFF = 0x40
@@ -60,7 +59,9 @@ class FrameTap(Protocol):
 
 
 class Outgoing:
-    """Batch of frames that this node may send, with a copy of the checked headers.
+    """Batch of frames that this node may send.
+
+    `granted` is a copy of the headers that `Transceiver.grant` checked. So `send` detects a header that was changed later.
 
     Args:
         frames: Frames, shape (n,); always the same array.
@@ -101,10 +102,10 @@ class Transceiver:
         self._asked = True  # True if the last batch was sent completely
         self._floods = 0  # number of consecutive cycles with too many received frames
         self._error_frames = 0  # number of error frames since the last call of `faults`
-        self._errors = SETTLED  # leaky bucket that counts cycles with error frames
+        self._errors = SETTLED  # error counter: +4 in a cycle with error frames, otherwise -1, see `e2e.qualify`
         #: Number of error frames since the start, except frames that report bus-off.
         self.error_frames = 0
-        self._bus_off = 0  # error class of the last bus-off frame; 0 after the operator's acknowledgement
+        self._bus_off = 0  # error bits of the last frame that reported bus-off; 0 before it or after `acknowledge`
         #: True if the bus has no fault, so that `faults` need not be called.
         self.quiet = True
 
@@ -159,10 +160,10 @@ class Transceiver:
         Args:
             count: Number of frames already in `scratch`.
             cycle: Process image of the expected messages. With None, the call does not wait for messages.
-            patience: Longest wait for the expected messages [s]. If the last batch, which contains the SYNC, was not sent, the
-                call waits at most 0.1 s. If none of the missing nodes answered the previous n SYNCs, the call waits at
-                most `patience` / 2^n, or 0.1 s if this is longer. So in lock-step, a dead node does not cause the full
-                wait in every cycle before it times out.
+            patience: Longest wait for the expected messages [s]. If the last batch, which contains the SYNC, was not sent, or
+                if every node has timed out, the call waits at most 0.1 s. If none of the missing nodes answered the previous
+                n SYNCs, the call waits at most `patience` / 2^n, or 0.1 s if this is longer. So in lock-step, a dead node does
+                not cause the full wait in every cycle before it times out.
 
         Returns:
             Number of frames now in `scratch`.
@@ -232,11 +233,18 @@ class Transceiver:
             self._find(Dtc.BUS_DOWN, True, 0.0, f"the bus {self.bus.name} cannot receive: {error}")
 
     def acknowledge(self) -> None:
-        """End the report of a bus-off that the operator has acknowledged. A new bus-off starts a new report."""
+        """Forget a bus-off that the operator has acknowledged, so that `faults` no longer returns it.
+
+        A later bus-off is returned again.
+        """
         self._bus_off = 0
 
     def faults(self) -> list[Finding]:
-        """Return the faults since the last call. Return a bus-off in each call until it is acknowledged. Call once per cycle."""
+        """Return the bus faults found since the last call.
+
+        Call this method once per cycle, because it counts for how many cycles a fault lasts. A bus-off is returned in every
+        call until `acknowledge` is called.
+        """
         self._refused = self._refused + 1 if self._full_this_cycle else 0
         self._full_this_cycle = False
         self._floods = self._floods + 1 if any(finding.dtc is Dtc.BUS_FLOOD for finding in self._found) else 0
@@ -248,7 +256,10 @@ class Transceiver:
         return found
 
     def _check_error_frames(self) -> None:
-        """Count the error frames of this cycle. Confirm the fault if more than a fifth of the cycles have error frames."""
+        """Count the error frames of this cycle, and report them as BUS_ERROR.
+
+        BUS_ERROR is confirmed if more than a fifth of the cycles have error frames.
+        """
         count, self._error_frames = self._error_frames, 0
         self.error_frames += count
         if count or self._errors is not SETTLED:
@@ -276,8 +287,8 @@ class Transceiver:
         """Wait until every expected message of `cycle` has arrived in `scratch[first:]`, at most `patience` [s]."""
         missing = cycle.expected_ages()
         shortest = min(patience, _DOUBTFUL_PATIENCE)
-        # While no node has answered within its timeout, no message is expected. In this case, receive until the bus is silent, so
-        # that late answers are not taken for answers of the next cycle.
+        # If every node has timed out, `missing` is empty. In this case, receive frames until the bus is silent.
+        # Otherwise a late answer to this SYNC would be taken for an answer to the next SYNC.
         until_silent = not missing
         begun = time.monotonic()
         while count < RECEIVE_BUDGET:

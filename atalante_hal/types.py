@@ -34,7 +34,10 @@ class SupervisorState(IntEnum):
 
 @dataclass(slots=True)
 class State:
-    """Measured state of the robot in one cycle: SI units, joint side of the gears, joints in the order of `robot.JOINTS`.
+    """Measured state of the robot in one cycle.
+
+    The values have SI units. Position, velocity and torque are those of the joints, not of the motors before the gears. Arrays of
+    twelve elements are in the order of `robot.JOINTS`.
 
     The arrays are views of the HAL's memory and valid until the next `Hal.read()`. Copy values that are needed longer.
     Do not write into the arrays.
@@ -43,7 +46,7 @@ class State:
     cycle: int  # SYNC counter
     time: float  # s, `cycle` times the period
     supervisor: SupervisorState
-    assistance_factor: float  # factor Xi in [0, 1], set by the operator; ramped to 1 in FULL_ASSIST and FINISH_STEP
+    assistance_factor: float  # Xi, 0 to 1 (full); set by the operator, ramped to 1 in FULL_ASSIST and FINISH_STEP
     position: Vector  # (12,) rad
     velocity: Vector  # (12,) rad/s
     torque: Vector  # (12,) Nm, measured by the drive
@@ -54,22 +57,24 @@ class State:
     imu_accel: Vector  # (4, 3) m/s2, specific force
     foot_force: Vector  # (2, 4, 3) N, force on the foot at each force cell, in the foot frame
     vibration: Vector  # (8,) measured level, 0 to 1
-    valid: npt.NDArray[np.bool_]  # (messages,) True if the data is new, plausible and from a trusted sender, see `e2e`
-    age: npt.NDArray[np.int64]  # (messages,) age of the data [cycles], counted from the SYNC that the message answers
+    #: One element per cyclic message: True if the data is new and plausible, and the sender is trusted (see `e2e.qualify`).
+    valid: npt.NDArray[np.bool_]
+    #: One element per cyclic message: age of the data [cycles], counted from the SYNC that the message answers.
+    age: npt.NDArray[np.int64]
     joints_valid: bool  # True if all twelve joint states are valid
     imu_rows: tuple[int, ...] = ()  # indices of the IMU messages in `valid` and `age`; empty if unknown
     foot_rows: tuple[int, ...] = ()  # indices of the foot messages in `valid` and `age`; empty if unknown
-    #: (12,) Nm, last output of the torque limiter; None if unknown. While the controller drives the joints, this is the torque
-    #: command of the drives. While the drives hold their positions, their torque command is 0 instead.
+    #: (12,) Nm, last output of the torque limiter; None if unknown. Drives that follow the controller receive these torques.
+    #: Drives that hold their positions receive the torque 0, not the output of the limiter.
     torque_sent: Vector | None = None
-    #: Additional delay [cycles] from a torque command to its effect because of late messages or motors; 0 if all are punctual.
-    #: Measured at START, see `safety.direction`.
+    #: Number of cycles by which torques act late; 0 if every torque acts after the normal delay (`safety.direction.LATENCY`).
+    #: The test of the motors at START measures this number, see `safety.direction`.
     delay: int = 0
 
 
 @dataclass(slots=True)
 class Command:
-    """Command of a controller for one cycle, before the limiter.
+    """Command of a controller for one cycle, before the HAL limits the torques.
 
     A torque that is not finite raises no exception. The limiter detects it and the robot goes to HOLD.
     """
@@ -78,12 +83,14 @@ class Command:
     vibration: Vector  # (8,) level, 0 to 1
     step: int | None = None  # number of the walking step; None for a controller that does not walk
     walking: bool = False  # True while the robot walks on the ground; STOP then ends the walk before HOLD
-    #: True if the guide value h is below 0: a joint is outside the virtual guide, or the guide filter predicts that a joint
-    #: leaves the guide, or exceeds a torque or speed limit. Raises a pending diagnostic.
+    #: True if a joint is outside the virtual guide, or is predicted to leave it or to exceed its torque or speed limit (h < 0).
+    #: The HAL reports GUIDE_OUTSIDE. This diagnostic is pending (the robot does not react) unless `guide_left` is True.
     outside: bool = False
-    #: True if a joint was outside a certified guide for too many cycles. FULL_ASSIST follows if `outside` is also True.
+    #: True if `outside` was True in too many cycles, although the guide is certified (calculated to keep the joints inside).
+    #: While `outside` and `guide_left` are True, GUIDE_OUTSIDE is confirmed, and the state FULL_ASSIST follows.
     guide_left: bool = False
-    #: True if a step starts with a larger deviation than the guide certificate assumes; raises a pending diagnostic.
+    #: True if a step starts with a larger deviation (angle or speed) than the certificate of the guide was calculated for.
+    #: The HAL then reports GUIDE_OUTSIDE as a pending diagnostic, to which the robot does not react.
     hand_over_exceeded: bool = False
 
 

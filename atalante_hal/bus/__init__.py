@@ -1,4 +1,4 @@
-"""CAN transports: the first and the last stage of each control cycle.
+"""CAN transports: classes that send and receive the CAN frames of the HAL or the emulator.
 
 Several transports implement the interface `Bus`. The HAL and the emulator run on each transport without change:
 
@@ -74,7 +74,11 @@ class Bus(Protocol):
 
     @property
     def stamps(self) -> Stamps:
-        """Return the receive time of each frame of the last `receive()`. Shape (capacity,), int64 [ns]."""
+        """Return the receive times of the frames that the last `receive()` returned, int64 [ns].
+
+        Element i is the receive time of frame i. The shape is (capacity,), where capacity is the largest number of frames that
+        one `receive()` returns. If n frames were returned, only the first n elements have a meaning.
+        """
         ...
 
     @property

@@ -1,4 +1,4 @@
-"""Table of the interfaces of python-can: CAN FD support, driver, channel, bit timing, and tests with this project.
+"""Table of the CAN interfaces that python-can supports, with the driver and the settings that each interface requires.
 
     name of an interface -> `Adapter` -> `refusal()`
 
@@ -271,7 +271,7 @@ def refusal(interface: str, *, one_process: bool = False) -> str:
 
 
 def reports_can_fd(interface: str) -> bool:
-    """Return whether a CAN FD bus on this interface reports CAN FD in its attribute `protocol`.
+    """Return whether the backend of an interface sets `can.BusABC.protocol` to CAN FD after it opened a CAN FD bus.
 
     Args:
         interface: Name of the interface in python-can.

@@ -1,8 +1,10 @@
 """Byte views of frame arrays, cached for each array that is passed to `Bus.send()` or `Bus.receive()`.
 
-Creating a byte view of an array takes longer than copying the frames of a cycle, so the views are cached. The header
-words of each valid batch are cached, too. In most cycles the next batch has the same header words, and a batch with
-cached header words needs no check.
+Creating a byte view of an array takes longer than copying the frames of a cycle, so the views are cached.
+
+The first 8 bytes of a frame are its header: identifier, length and flags. The header alone decides whether a frame is valid.
+So the headers of each valid batch are cached, too. In most cycles the next batch has the same headers, and a batch with
+cached headers needs no check.
 """
 
 from __future__ import annotations
@@ -23,18 +25,18 @@ from atalante_hal.wire.frame import (
     as_words,
 )
 
-#: Largest number of cached arrays. Also the largest number of batches whose header words are cached.
-#: A HAL or an emulator uses about five arrays and five batches.
+#: Largest number of entries in a cache. A full cache is emptied.
+#: One entry is an array or a batch of frames; a HAL or an emulator uses about five arrays and five batches.
 REMEMBERED = 64
 CLASSIC_LENGTHS = tuple(range(9))
 
 
 class Batch(NamedTuple):
-    """Array of frames, with a view of its bytes and a view of its header words."""
+    """Array of frames, with one view of all its bytes and one view of its headers (identifier, length, flags)."""
 
     frames: Frames
     memory: memoryview  # bytes of the array of n frames, 72 bytes per frame
-    headers: npt.NDArray[np.uint64]  # identifier, length and flags of each frame, shape (n,)
+    headers: npt.NDArray[np.uint64]  # header of each frame (identifier, length, flags), shape (n,)
 
 
 class Batches:
@@ -59,13 +61,13 @@ class Batches:
         return self._batch_of(frames).memory
 
     def to_send(self, frames: Frames) -> tuple[memoryview, bytes]:
-        """Check a batch of frames to send, and return its bytes and header words.
+        """Check a batch of frames to send, and return its bytes and its headers (identifier, length, flags).
 
         Args:
             frames: Frames to send, shape (n,).
 
         Returns:
-            Bytes of the array, length 72 n, and bytes of its header words, length 8 n.
+            All bytes of the array, length 72 n, and only the headers of its frames as bytes, length 8 n.
 
         Raises:
             ValueError: If a frame is not a valid CAN frame; the message names the first one.

@@ -61,7 +61,8 @@ class JoinedBus:
         self._capacity = capacity
         self._batches = Batches()
         self._shares: dict[bytes, list[Share]] = {}
-        #: lists of the slices `frames[i:]`, one list for each receive buffer that was used so far
+        #: one list for each receive buffer `frames` that was used so far: `frames`, `frames[1:]`, `frames[2:]`, ...
+        #: after i frames were received on some channels, the next channel writes into the slice `frames[i:]`
         self._tails: list[list[Frames]] = []
         #: index of the channel that is read first; it changes in each call, so a busy channel cannot block the others
         self._turn = 0
@@ -179,7 +180,11 @@ class JoinedBus:
         return count
 
     def _tails_of(self, frames: Frames) -> list[Frames]:
-        """Return the slices `frames[i:]` for all i, cached for the next call."""
+        """Return `frames` and its slices `frames[1:]`, `frames[2:]`, ..., cached for the next call.
+
+        After i frames were received on some channels, the next channel writes into the slice `frames[i:]`. The slices are
+        cached, because a bus caches memory views of each array object.
+        """
         for tails in self._tails:
             if tails[0] is frames:
                 return tails

@@ -63,7 +63,10 @@ class PairBus:
 
     @property
     def stamps(self) -> Stamps:
-        """Return the virtual time of the last `receive()`, repeated for each frame. Shape (capacity,), int64 [ns]."""
+        """Return an array of receive times in virtual time, shape (capacity,), int64 [ns].
+
+        All elements are equal: the time of the last `receive()` that returned frames.
+        """
         self._stamps.fill(self._received_at)
         return self._stamps
 

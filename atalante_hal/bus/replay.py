@@ -196,7 +196,13 @@ def _size_defect(path: Path, stated: int, size: int | None) -> str:
 
 
 def _bytes(path: Path, count: int, whence: int) -> bytes:
-    """Return the first `count` bytes of a file; the last `-count` bytes if `count` is negative."""
+    """Return the first or the last bytes of a file.
+
+    Args:
+        path: File to read.
+        count: Number of bytes: 4 returns the first 4 bytes, and -4 returns the last 4 bytes.
+        whence: `os.SEEK_SET` for a positive count, `os.SEEK_END` for a negative count.
+    """
     with path.open("rb") as file:
         file.seek(min(count, 0), whence)
         return file.read(abs(count))

@@ -13,7 +13,7 @@ from atalante_hal.bus.joined import JoinedBus
 from atalante_hal.bus.wrapped import WrappedBus
 from atalante_hal.wire.frame import Frames
 
-#: Longest time for which `receive` waits after an error of a lost link [s]. The next call tries the link again.
+#: If `receive` finds the link lost, it sleeps for at most this time [s]. Its next call tries the link again.
 RETRY_PERIOD = 0.1
 #: An error message of a lost link is reported after its text has stayed the same for this time [s].
 #: A removed interface causes the error "down" and soon afterwards the error "removed". So only "removed" is reported.
@@ -85,10 +85,10 @@ class ResilientBus(WrappedBus):
         return count
 
     def _update_down(self, *, proven: bool) -> None:
-        """Update the error message `down` after a call that raised no error.
+        """Update `down`, the error message of the lost link, after a call that raised no error.
 
         Args:
-            proven: Whether a frame was sent or received.
+            proven: True if a frame was sent or received, which proves that the link works.
         """
         if isinstance(self.bus, JoinedBus) and self.bus.down:
             self._lost(self.bus.down)

@@ -35,12 +35,12 @@ _SENT, _RECEIVED, _REQUESTED, _COMPLETED = range(4)
 #: Indices of the flags of each bus end. `_SERVING` is 1 while the end runs `serve`. `_SLEEPING` is 1 while the end sleeps.
 #: `_CLOSED` is 1 after the end is closed.
 _SERVING, _SLEEPING, _CLOSED = range(4, 7)
-#: Number of 64-bit header words of each bus end: one cache line.
+#: Number of 64-bit words that store the counters and flags of one bus end: one cache line.
 _END_WORDS = 8
 _HEADER_BYTES = mmap.PAGESIZE
-#: A waiting bus end polls for this time [s] before it sleeps. The time is longer than the computing time of a cycle.
+#: A waiting bus end polls for this time [s] before it sleeps. The computing time of one control cycle is shorter.
 _POLL_TIME = 500e-6
-#: If a bus end had to sleep, because polling was not sufficient, it does not poll in this number of further waits.
+#: After a wait that took longer than `_POLL_TIME`, a bus end does not poll in this number of following waits, but sleeps at once.
 _WAITS_WITHOUT_POLLING = 32
 #: Longest sleep of a waiting bus end before it reads the shared memory again [ms].
 #: A sleep must be limited, because a wake-up byte may arrive before the new value in the shared memory is visible.
@@ -88,7 +88,7 @@ class SharedBus:
         self._outgoing, self._incoming = queues[end], queues[1 - end]
         self._size = size
         self._sent = self._received = 0
-        self._waits_without_polling = 0  # number of further waits in which this end does not poll
+        self._waits_without_polling = 0  # number of following waits in which this end sleeps at once, without polling
         self._closed = False
         self._close_reason = ""  # text that the other end sent when it closed; empty if it sent none
         self._stamps: Stamps = np.zeros(size // FRAME_BYTES, np.int64)

@@ -26,7 +26,7 @@ from atalante_hal.wire.frame import FLAG_FDF, FRAME_BYTES, Frames, as_words, new
 CLASSIC_BYTES = 16  # size of a `struct can_frame` [bytes]
 CAN_RAW_ERR_FILTER: Final = 2
 SO_RCVBUFFORCE: Final = 33
-SO_TIMESTAMPNS: Final = 35  # number of the socket option; its control message has the same number
+SO_TIMESTAMPNS: Final = 35  # number of the socket option, and also type of the control message with the time stamp
 SO_RXQ_OVFL: Final = 40
 SIOCGIFFLAGS: Final = 0x8913
 SIOCGIFMTU: Final = 0x8921
@@ -38,13 +38,14 @@ LINK_DOWN: Final = errno.ENETDOWN
 LINK_REMOVED: Final = (errno.ENODEV, errno.ENXIO)
 #: Shortest time [s] between two attempts to open a removed interface again.
 REOPEN_PERIOD: Final = 0.1
-#: When the link is lost, at most this number of batches of queued frames is received and dropped.
+#: When the link is lost, the receive queue is emptied with at most this number of calls of `recvmmsg`.
 DROPPED_BATCHES: Final = 64
 NO_ROOM = (errno.ENOBUFS, errno.EAGAIN)
 
-#: Mask of the used fields in the header word of a received frame. The reserved bytes may contain garbage.
+#: Mask for the first 8 bytes of a received frame: keeps identifier, length and flags, and clears the two reserved bytes.
+#: The reserved bytes may contain garbage.
 HEADER_FIELDS = np.uint64(0x0000_FFFF_FFFF_FFFF)
-#: FDF flag in a header word. Older kernels leave this flag 0 in received CAN FD frames.
+#: FDF flag in the first 8 bytes of a frame. Older kernels leave this flag 0 in received CAN FD frames.
 FDF_IN_HEADER = np.uint64(FLAG_FDF << 40)
 
 IOVEC = np.dtype([("base", "u8"), ("length", "u8")])
@@ -294,8 +295,8 @@ class SocketCanBus:
         if code != LINK_DOWN and code not in LINK_REMOVED:
             return None
         self._drop_queued()
-        # An interface goes down before it is removed. `_drop_queued` may have dropped the error code of the removal.
-        # A removed interface is therefore detected by its socket, which the kernel unbinds.
+        # A removed interface first reports "down" and later "removed", but `_drop_queued` may have dropped the report "removed".
+        # So the socket shows whether the interface was removed: the kernel unbinds the socket of a removed interface.
         if code == LINK_DOWN and self._is_bound():
             return BusDown(f"{self.name} is down: type `ip link set {self.name} up`")
         self._removed = f"{self.name} was removed: plug the adapter in again; the link is opened again when it is up"
@@ -306,7 +307,10 @@ class SocketCanBus:
         return bool(self._socket.getsockname()[0])
 
     def _drop_queued(self) -> None:
-        """Drop the queued frames and the queued error. Otherwise `poll` would report the socket as readable."""
+        """Drop the received frames and the error codes that wait in the socket.
+
+        A waiting frame or error code would make `poll` report the socket as readable, although the link is lost.
+        """
         for _ in range(DROPPED_BATCHES):
             count = self._recvmmsg(self._file, self._rx_address, self._capacity, socket.MSG_DONTWAIT, None)
             if count > 0:

@@ -23,7 +23,7 @@ class WrappedBus:
 
     @property
     def stamps(self) -> Stamps:
-        """Return the receive time of each frame of the last `receive()` of the wrapped bus. Shape (capacity,), int64 [ns]."""
+        """Return the receive times that the wrapped bus recorded, see `Bus.stamps`."""
         return self.bus.stamps
 
     @property

@@ -206,7 +206,7 @@ class Finding:
 
 
 def number_of(bits: int) -> int:
-    """Return the number of the worst code in a bit set. The number fits into one CAN signal.
+    """Return the number of the worst code in a bit set, as HAL_STATUS sends it.
 
     Args:
         bits: bit set of codes, see `Dtc.bit`.

@@ -44,42 +44,41 @@ import numpy.typing as npt
 from atalante_hal.robot import JOINTS, LEG_JOINTS, SIDES, Robot
 from atalante_hal.types import PERIOD, Vector
 
-#: Joints of a leg that are tested at the same time, and duration of their pulse [cycles].
+#: One element for each test: the joints of a leg that are tested at the same time, and the duration of their pulse [cycles].
 GROUPS = ((("FH", "SH"), 32), (("TH", "SA"), 16), (("SK", "HA"), 16))
 _SHORT = min(duration for _, duration in GROUPS)
 #: Delay [cycles] from a torque command to the first position that shows its effect, if no frame and no motor is late.
 LATENCY = 2
-#: Delays that the test tries [cycles]. States, commands and motors may be late by three cycles in total.
-#: Longer delays are not tried, because they would hide a motor with a wrong sign. In a pulse of 16 cycles, the largest and the
-#: smallest torque are 4.6 cycles apart. So a motor with a wrong sign moves its joint almost like a correct motor that is 4 to 5
-#: cycles late.
+#: Delays from torque to motion that the test tries [cycles]: `LATENCY` plus 0 to 3, because frames and motors may be late.
+#: A reversed motor moves its joint almost like a correct motor that is 4 to 5 cycles late. So such long delays are not tried.
+#: The reason is the pulse of 16 cycles: its largest and its smallest torque are 4.6 cycles apart.
 LATENCIES = tuple(range(LATENCY, LATENCY + 4))
-#: Peak of the pulse as a multiple of `Robot.breakaway`, in the order of LEG_JOINTS.
+#: Largest torque of the pulse, as a multiple of the breakaway torque `Robot.breakaway`. One value for each joint in LEG_JOINTS.
 #: The peaks of FH and SH are larger, because these joints move a whole leg.
 PEAK = (6.0, 3.0, 6.0, 3.0, 3.0, 3.0)
-#: Stiffness and damping of the HAL's position control in the test, divided by `Robot.hold_kp` and `Robot.hold_kd` of the drives.
-#: The order is LEG_JOINTS. The position control of the HAL has more delay than the position control of a drive. So the HAL uses
-#: lower gains for light joints.
+#: Gains of the HAL's position control in the test, as multiples of the drives' gains `Robot.hold_kp` and `Robot.hold_kd`.
+#: One value for each joint in LEG_JOINTS. Light joints have low gains, because the HAL controls with more delay than a drive.
 STIFFNESS = (1.0, 1.0, 1.25, 0.5, 0.25, 0.25)
 DAMPING = (0.5, 0.5, 0.6, 0.25, 0.25, 0.25)
 #: Integral time of the HAL's position control, which holds the legs during the test [s].
 INTEGRAL = 0.03
-#: Largest motion of a joint during the test [rad].
+#: A joint that moves farther than this from its initial position ends the start [rad].
 TRAVEL = math.radians(1.5)
 #: A foot is loaded if its mean force during a test exceeds `LOAD * cell_free`.
-#: This threshold `LOAD * cell_free` is four times the noise of the mean force.
+#: `LOAD * cell_free` is about four times the rms noise of the mean force.
 LOAD = 1.0 / 3.0
 #: The forces on a foot in two consecutive cycles are added. If the sum exceeds `HIT * cell_free`, the foot hit the floor.
-#: This threshold is four times the noise of the sum. An impact that stops an ankle causes at least 1.5 times the threshold.
+#: `HIT * cell_free` is about four times the rms noise of the sum.
+#: If the floor stops a moving ankle, the sum is at least 1.5 times `HIT * cell_free`.
 HIT = 2.0
-#: If a joint near its end stop is tested a second time, its torque pulse is multiplied by this factor, because the leg weight may
-#: press the joint onto the end stop.
+#: Factor by which the pulse is larger in the second test of a joint near its end stop.
+#: The leg weight may press the joint onto the end stop, so the normal pulse of the first test may not move the joint.
 BOOST = 6.0
-#: Number of unsuccessful tests of a joint after which the joint has failed.
+#: A joint fails after this number of unsuccessful tests.
 TRIALS = 2
-#: Smallest mobility [1/(kg m2)] that proves that a joint follows its torque, in the order of LEG_JOINTS.
-#: `MOBILITY` is about half of the smallest mobility of each joint in four cases of the suspended robot: straight legs and bent
-#: legs, each without a patient and with a patient of 110 kg.
+#: A joint follows its torque if its mobility (acceleration per torque) is at least this [1/(kg m2)]. Order of LEG_JOINTS.
+#: Each joint of a suspended robot has at least about twice this mobility: with straight legs and with bent legs,
+#: without a patient and with a patient of 110 kg.
 MOBILITY = (0.045, 0.23, 0.075, 0.56, 4.6, 6.8)
 
 
@@ -109,10 +108,10 @@ def pose_gains(robot: Robot) -> tuple[Vector, Vector]:
 
 
 def mobilities_of(torque: Vector, position: Vector) -> tuple[Vector, Vector]:
-    """Fit the motion of each joint to its torque, once for each delay in `LATENCIES`.
+    """Estimate the mobility of each joint from its torques and positions, once for each delay in `LATENCIES`.
 
-    The fit assumes that the torque moves the joint after this delay. A wrong delay makes the mobility of a light joint
-    several times too small.
+    The estimate is a least-squares fit. It assumes that a torque moves the joint after exactly the tried delay. A wrong delay
+    makes the mobility of a light joint several times too small.
 
     Args:
         torque: torque sent in each cycle, shape (n, joints) [Nm].
@@ -128,7 +127,8 @@ def mobilities_of(torque: Vector, position: Vector) -> tuple[Vector, Vector]:
     for row, latency in enumerate(LATENCIES):
         response[row, latency:] = torque[:-latency] - torque[0]
     response = response.cumsum(axis=1).cumsum(axis=1) * PERIOD**2
-    # Remove the cubic trends over time from response and motion, because a joint may also move without a pulse.
+    # `response` is the motion that the torques would cause with a mobility of 1. A joint may also move without a pulse,
+    # roughly like a cubic polynomial of time. So the cubic part is removed from `response` and `motion`.
     free = np.linalg.qr(np.vander(np.linspace(-1.0, 1.0, count), 4))[0]
     response -= free @ (free.T @ response)
     motion = position - position[0]
@@ -145,7 +145,7 @@ class DirectionProof:
 
     Args:
         robot: position limits, hold gains and breakaway torques.
-        groups: joints of a leg that are tested at the same time, and duration of their pulse [cycles]; empty means no test.
+        groups: one element for each test, as in `GROUPS`; empty means no test.
 
     Attributes:
         proven: True for each joint that passed in the last start, shape (12,).
@@ -172,14 +172,15 @@ class DirectionProof:
         self.failed: list[int] = []
         self.running = False
         self._anchor, self._base, self._sign = np.zeros((3, len(JOINTS)))
-        #: Tests still to be done: joints of the test, and duration of its pulse [cycles].
+        #: Tests still to be done: indices in JOINTS of the tested joints, and duration of the pulse [cycles].
         self._tests: list[tuple[list[int], int]] = []
         self._trials = [0] * len(JOINTS)
-        # A test of one or two joints does not estimate the delay, but uses `late`. If the delay were fitted to so few joints,
-        # a motor with a wrong sign might look like a late motor.
+        # A test of one or two joints uses `late`, the extra delay that tests of more joints have measured [cycles].
+        # A delay that is fitted to one or two joints might make a motor with a wrong sign look like a late motor.
         self.late = 0
-        #: For each delay in `LATENCIES`: the share of a joint's motion that its torque explains with this delay, summed over
-        #: all joints that passed a test with a short pulse.
+        #: Score of each delay in `LATENCIES`. The delay with the largest score explains the measured motions best.
+        #: Each joint that passed a test with a short pulse and more than two joints adds a share of 0 to 1:
+        #: the share of its motion that its torque explains with the delay.
         self._explained = np.zeros(len(LATENCIES))
         self._position: list[Vector] = []  # joint positions in each cycle of the current test
         self._force: list[Vector] = []  # vertical force of each foot in each cycle of the current test
@@ -233,21 +234,21 @@ class DirectionProof:
         self._torque.append(torque.copy())
 
     def evaluate(self, position: Vector, force: Vector) -> str:
-        """Record this cycle, evaluate the motion of the tested joints, and return the reason why the start must end.
+        """Record this cycle, and evaluate the motion of the tested joints when their pulse is over.
 
         Args:
             position: joint positions, shape (12,) [rad].
             force: vertical force of each foot, shape (2,) [N].
 
         Returns:
-            Reason why the start must end, as one sentence; empty if it may continue.
+            Reason why the start must end, as one sentence; empty if the start may continue.
         """
         self._force.append(force)
         travel = np.abs(position - self._anchor)
         if not travel.max() <= TRAVEL:
             far = np.flatnonzero(travel > 0.5 * TRAVEL)
-            # Gravity makes both legs sag equally far. Therefore a difference between left and right joint shows the fault.
-            # A faulty joint also moves its lighter neighbours. The weight `_kp` is small for these light joints.
+            # Gravity makes both legs sag equally far, so a faulty joint moves farther than the same joint of the other leg.
+            # A faulty joint also moves its lighter neighbours. Light joints have a small stiffness `_kp`, so they count less.
             excess = self._kp * np.abs(travel - np.roll(travel, len(LEG_JOINTS)))
             joint = int(far[np.argmax(excess[far])])
             self._fail(far.tolist())
@@ -304,7 +305,7 @@ class DirectionProof:
         return supported
 
     def report(self) -> str:
-        """Return the result of the tests as one sentence, with the effective inertia of each joint and the delay."""
+        """Return the result of the tests as one sentence: effective inertias, delay of the torques, untested joints."""
         passed = ", ".join(f"{JOINTS[j]} {1.0 / self.mobility[j]:.2g}" for j in np.flatnonzero(self.proven).tolist())
         text = f"effective inertia [kg m2]: {passed}"
         if self.late:
@@ -313,7 +314,7 @@ class DirectionProof:
         return f"{text}; not tested under load: {', '.join(blocked)}" if blocked else text
 
     def _strength(self, joints: Sequence[int]) -> Vector:
-        """Return the peaks of the pulses of a test, shape (joints,) [Nm]."""
+        """Return the largest torque in the pulse of each tested joint, shape (joints,) [Nm]."""
         pressed = (self._anchor < self._low) | (self._anchor > self._high)
         repeated = np.array(self._trials) > 0
         return np.where(pressed & repeated, BOOST, 1.0)[joints] * self._peak[joints]

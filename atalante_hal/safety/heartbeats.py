@@ -24,7 +24,7 @@ from atalante_hal.wire.process_image import NEVER, ReceiveImage
 
 #: Values of the signal NodeState (CiA 301): 0 after the node has started, 5 in normal operation.
 BOOT_UP, OPERATIONAL = 0, 5
-#: A frame has new data if its `Check` result is at most this value.
+#: A frame has new data if its check result is `Check.OK` (0) or `Check.SOME_LOST` (1), so at most this value.
 #: The constant is an integer, because numpy compares enum members ten times slower.
 _FRESH = int(Check.SOME_LOST)
 
@@ -74,8 +74,8 @@ class Heartbeats:
         self._status_of = {codec.messages[s.row].frame_id: s for s in self._statuses}
         self._amplitude, self._amplitude_row = codec.slice("Amplitude"), codec.rows["HAPTICS_STATE"]
         self._seen = 0  # cycle of the last call of `image.new_cycle`
-        #: Diagnostic and error code of the active emergency of each node. A cleared emergency is removed. If a node has several
-        #: active emergencies, the entry is the newest of the emergencies with the most severe reaction.
+        #: Node -> diagnostic and error code of its active emergency. A cleared emergency is removed.
+        #: A new emergency replaces the entry, unless the new reaction is INFO or less severe than the old reaction.
         self.emergencies: dict[str, tuple[Dtc, int]] = {}
         self._cleared: set[str] = set()  # nodes whose emergency was cleared in this cycle
         #: Events that the next `evaluate` raises only as pending diagnostics, each as (node, diagnostic, error code):
@@ -161,13 +161,18 @@ class Heartbeats:
             self._check_status(cycle, memory, status)
 
     def overdue(self, cycle: int) -> bool:
-        """Return whether a status message timed out. Call this periodically, because a lost message triggers no `evaluate`."""
+        """Return whether a status message timed out.
+
+        Call this function periodically: a received message can trigger `evaluate`, but a missing message cannot.
+        """
         self._age(cycle)
         ages = self.image.age[self._status_rows]
         return bool(((ages >= self._timeouts) & (ages < NEVER)).any())
 
     def acknowledge(self, still_faulty: set[str]) -> None:
-        """Remove the emergencies of all nodes except the drives that are still in FAULT. Call this when START is pressed.
+        """Remove the emergencies of all nodes except the drives that are still in FAULT.
+
+        Call this function when START is pressed.
 
         Args:
             still_faulty: DBC names of the drives that are still in FAULT.
@@ -175,9 +180,10 @@ class Heartbeats:
         self.emergencies = {node: active for node, active in self.emergencies.items() if node in still_faulty}
 
     def has_emergency(self, node: str) -> bool:
-        """Return whether a drive has an active emergency. The drive state FAULT then raises no additional diagnostic.
+        """Return whether a drive has an active emergency.
 
-        The result is also True in the cycle in which the emergency is cleared, because the drive may still report FAULT.
+        While the result is True, the drive state FAULT raises no second diagnostic. The result is also True in the cycle in which
+        the emergency is cleared, because the drive may still report FAULT.
 
         Args:
             node: DBC name of the drive.
@@ -200,7 +206,9 @@ class Heartbeats:
             self._seen = cycle
 
     def _suspect(self, row: int, *, rival: bool) -> None:
-        """Update the counter that detects two senders of one message. Call this for each frame of the message.
+        """Update the counter that detects two senders of one message.
+
+        Call this function for each frame of the message.
 
         A restarted sender can repeat the last alive counter once, so one repeat is no proof of two senders. Two senders of one
         message often send the same alive counter.
@@ -235,7 +243,7 @@ class Heartbeats:
         elif dtc.reaction is Reaction.INFO:
             self._notices.append((node, dtc, code))
         elif node in self.emergencies and dtc.reaction < self.emergencies[node][0].reaction:
-            self._notices.append((node, dtc, code))  # a milder emergency does not end the reaction to the active one
+            self._notices.append((node, dtc, code))  # the active emergency is more severe, so it stays active
         else:
             self.emergencies[node] = dtc, code
 

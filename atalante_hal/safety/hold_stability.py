@@ -44,19 +44,20 @@ SATURATED: Final = (0.9, 1.05)
 #: A drive is reported after this number of consecutive faulty cycles: cycles with overload, or with a motor without torque.
 OVERLOADED: Final = 20
 #: Overload is counted only while a joint is at least this far from the position in which the hold began [rad].
-#: If a drive holds its joint but reports a wrong torque, the joint stays closer, so no overload is counted.
+#: A drive that reports a wrong torque but holds its joint keeps the joint within this distance, so no overload is counted.
 AWAY: Final = math.radians(1.0)
 #: A drive without torque is reported only if its joint is at least this far from the position in which the hold began [rad].
 #: At this distance, the stiffness of a working drive (`Robot.hold_kp`) demands more than half of `Robot.torque_max`.
 SUNK: Final = math.radians(3.0)
 #: A drive without torque reports less than this share of its torque limit.
 POWERLESS: Final = 0.1
-#: The encoder of a joint is confirmed if it differs from the IMUs of its leg by at most this angle [rad].
+#: If encoder and IMUs of a joint differ by more than this angle [rad], the encoder may be wrong.
+#: The drive is then not reported as a drive without torque, because the joint may not have moved.
 ENCODER_ERROR: Final = math.radians(1.0)
-#: Speed threshold for two motions that show a working drive [rad/s]. After such a motion, the count of faulty cycles restarts.
-#: - The joint returns to the position in which the hold began, and is faster than this threshold.
-#: - The joint still moves away, but its speed has dropped by more than this threshold since the count began.
-#: The threshold is larger than the noise of the velocities.
+#: A joint that moves back or slows down by more than this [rad/s] has a working drive. So the count of faulty cycles restarts.
+#: - Moves back: the joint moves faster than this towards the position in which the hold began.
+#: - Slows down: the joint moves away, but its speed is lower than in the first counted cycle by more than this.
+#: The value is larger than the noise of the velocities.
 SLOWER: Final = 0.05
 #: `_watch_load` skips a joint in each cycle in which the values of the joint are older than this [cycles].
 AGE: Final = 4
@@ -76,7 +77,7 @@ class Measured(NamedTuple):
 class Swings(NamedTuple):
     """Record of the velocity reversals of all joints, shape (12,) each."""
 
-    direction: npt.NDArray[np.int64]  # sign of the last velocity above `SPEED`; 0 if there is none
+    direction: npt.NDArray[np.int64]  # direction of the last motion faster than `SPEED`: 1, -1, or 0 if there is none
     age: npt.NDArray[np.int64]  # number of cycles since the joint first exceeded `SPEED` in its current direction
     reversals: npt.NDArray[np.int64]  # number of consecutive reversals
 
@@ -85,7 +86,7 @@ class Loads(NamedTuple):
     """Record with which `_watch_load` detects overloaded drives and motors without torque, shape (12,) each."""
 
     start: Vector  # position of the joint when the hold began [rad]; NaN if the drive does not hold its position
-    speed: Vector  # speed in the first faulty cycle [rad/s], positive away from the position in which the hold began
+    speed: Vector  # speed in the first faulty cycle [rad/s]: > 0 if the joint moved away from `start`, < 0 if it moved back
     cycles: Vector  # number of consecutive faulty cycles: the drive is overloaded, or its motor has no torque
 
 

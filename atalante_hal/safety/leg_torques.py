@@ -31,12 +31,12 @@ HALF: Final = 8
 SPAN: Final = 2 * HALF + 1
 #: A torque in `Sample.sent` of cycle n moves the joints in cycle n + DELAY, if no frame and no motor is late.
 DELAY: Final = 1
-#: Largest delay of the torques in addition to `DELAY` [cycles]: the sum of the delays of states, commands and motors.
+#: A torque may move the joints up to this many cycles later than `DELAY`, because states, commands or motors are late.
 MORE: Final = 3
-#: Largest permitted age of the positions [cycles].
-#: If a node always answers one cycle late, its positions have the age 1 in every cycle.
+#: No torques are computed from a position that is older than this [cycles].
+#: The limit is not 0, because the positions of a node that always answers one cycle late have the age 1.
 LATE: Final = 1
-#: Largest permitted number of consecutive cycles in which the values of the pelvis IMU or of a foot do not change.
+#: No torques are computed from a stuck sensor: the values of the pelvis IMU or of a foot do not change for more cycles than this.
 REPEATED: Final = 2
 _LEG: Final = len(LEG_JOINTS)
 _PELVIS: Final = IMUS.index("pelvis")
@@ -57,7 +57,10 @@ class Sample(NamedTuple):
 
 
 class History(NamedTuple):
-    """Values of the last `SPAN` cycles; for `sent`, of the last `SPAN + MORE` cycles. A new cycle overwrites the oldest row."""
+    """Values of the last `SPAN` cycles, with one row for each cycle.
+
+    `sent` has `SPAN + MORE` rows, because a late torque is older. A new cycle overwrites the oldest row of each array.
+    """
 
     cycles: Cycles  # (1,) number of stored cycles since the restart
     sent: Vector  # (SPAN + MORE, 12) Nm, see `Sample.sent`
@@ -133,7 +136,7 @@ def store(sample: Sample, history: History) -> None:
 
 
 def _count(history: History, sensor: int, changed: bool) -> None:
-    """Count the cycles in which the values of a sensor did not change.
+    """Update the counters `History.repeats` and `History.good` of one sensor by one cycle.
 
     Args:
         history: values of the last cycles. Updated here.
@@ -192,14 +195,17 @@ def compute(leg: int, model: LegModel, late: int, history: History, torques: Tor
 
 
 def _average(leg: int, newest: int, late: int, history: History, torques: Torques) -> tuple[Vector3, Vector3, Vector3]:
-    """Average the sent torques and the loads, and return specific force, angular velocity and acceleration of the pelvis.
+    """Average the sent torques, the foot forces and the motion of the pelvis over time.
 
     Args:
         leg: index in `SIDES`.
         newest: number of the newest stored cycle.
         late: further delay of the torques [cycles].
         history: values of the last cycles.
-        torques: output for the mean sent torques and the mean loads.
+        torques: output for the mean sent torques and the mean foot forces (`load`).
+
+    Returns:
+        Specific force [m/s2], angular velocity [rad/s] and angular acceleration [rad/s2] at the pelvis IMU.
     """
     torques.sent[:], torques.load[:] = 0.0, 0.0
     ax, ay, az = 0.0, 0.0, 0.0
@@ -219,7 +225,7 @@ def _average(leg: int, newest: int, late: int, history: History, torques: Torque
         x, y, z = history.gyro[row]
         share = 0.5 / HALF
         wx, wy, wz = wx + share * x, wy + share * y, wz + share * z
-        # The difference between the means of both halves, divided by their distance in time, is the angular acceleration.
+        # Angular acceleration: mean of the newer `HALF` cycles minus mean of the older `HALF` cycles, divided by HALF * PERIOD.
         share = (1.0 if past < HALF else -1.0) / (HALF * HALF * PERIOD)
         dx, dy, dz = dx + share * x, dy + share * y, dz + share * z
     return (ax, ay, az), (wx, wy, wz), (dx, dy, dz)

@@ -88,7 +88,7 @@ class JointLimits(NamedTuple):
     position_min: Vector  # (12,) lowest position [rad]
     position_max: Vector  # (12,) highest position [rad]
     velocity_max: Vector  # (12,) highest velocity [rad/s]
-    look_ahead: float  # prediction time of the position [s], at constant velocity
+    look_ahead: float  # the envelope uses the position that the joint has after this time at constant velocity [s]
     position_margin: float  # distance beyond a position limit [rad]; at this distance, no outward torque is allowed
     velocity_margin: float  # excess over `velocity_max` [rad/s]; at this excess, no accelerating torque is allowed
     inertia: Vector  # (12,) smallest effective inertia of each joint [kg m2]
@@ -132,7 +132,7 @@ class Limiter:
         # Copies of the inputs, because the compiled code accepts only the array type and layout that it was compiled for.
         self._asked, self._motion = np.zeros(_COUNT), np.zeros((2, _COUNT))
         # First rows of `_past`: torques sent in the last `DELAY` cycles, newest first.
-        # Last two rows of `_past`: last velocity with low-pass, last velocity without low-pass.
+        # Last two rows of `_past`: velocity of the last cycle as reported by the drives, and without their low-pass.
         self._past = np.zeros((DELAY + 2, _COUNT))
         self._apply = specialised(
             limit, self._asked, self._motion, self._limits, self.limit, self.last, self._past, self.cut
@@ -166,7 +166,9 @@ class Limiter:
         np.minimum(limit, self._torque_max, out=self.limit)
 
     def restart(self, torque: Vector) -> None:
-        """Set the start value of the rate limit: the torque that the drives report, clipped to the torque limit.
+        """Start the rate limit again at the torque that the drives report.
+
+        The reported torque is clipped to the torque limit.
 
         Args:
             torque: torque reported by the drives, shape (12,) [Nm]; NaN and infinity are replaced by 0.

@@ -67,8 +67,8 @@ _RIVAL = (Check.CONFLICT, Check.WRONG_SEQUENCE)
 #: Results of the E2E check of a rejected frame whose format and CRC are correct.
 _INTACT = (*_RIVAL, Check.RANGE, Check.INVALID)
 _FRESH = int(Check.SOME_LOST)
-#: E2E check result of a rejected frame -> diagnostic. The diagnostic is raised when its leaky bucket is full.
-#: An INVALID frame of an IMU raises another diagnostic, see `MessageMonitor`.
+#: Check result of a rejected frame -> diagnostic that is confirmed when such frames have filled a leaky bucket.
+#: Exception: INVALID frames of an IMU confirm IMU_INVALID.
 _DISTURBANCES = {
     Check.REPEATED: Dtc.E2E_REPEAT_RATE,
     Check.RANGE: Dtc.SIGNAL_RANGE,
@@ -79,12 +79,15 @@ BRIEF_TIMEOUTS = 2
 
 
 class Tolerance(NamedTuple):
-    """Legs whose joint messages may time out briefly, depending on the motion of the robot."""
+    """Legs in which a brief timeout of a joint message does not lead to HOLD.
+
+    A swing leg is tolerated while the other foot is on the ground. In a walk on the ground, both legs are tolerated.
+    """
 
     #: Indices of the legs in SIDES. A brief timeout in these legs leads to FINISH_STEP instead of HOLD.
     legs: Collection[int] = ()
-    #: Number of cycles that is added to the DBC timeout of a joint in these legs if the cycle has no accepted frame of the joint.
-    #: In a cycle with an accepted frame, the data of this frame must be younger than the DBC timeout.
+    #: Extra time until a joint in these legs times out [cycles]: with 3, a DBC timeout of 5 cycles becomes 8 cycles.
+    #: An accepted frame gets no extra time: the joint times out if the data of this frame is at least as old as the DBC timeout.
     longer: int = 0
 
 
@@ -121,8 +124,8 @@ class MessageMonitor:
         #: True for each row with new, intact, trusted and plausible data, shape (rows,).
         self.valid: npt.NDArray[np.bool_] = np.zeros(len(messages), np.bool_)
         self.joints_valid = False
-        #: True if all rows have new data and are trusted, and all counters and leaky buckets are 0. If all rows have new data
-        #: again in the next cycle, `evaluate` would not change any attribute of this object, so the call may be omitted.
+        #: True if no message is disturbed: all rows have new data and are trusted, and all counters and leaky buckets are 0.
+        #: If `settled` is True and all rows have new data again, `evaluate` has nothing to update, so the call may be omitted.
         self.settled = False
 
     @property
@@ -139,7 +142,9 @@ class MessageMonitor:
         return bool(self._image.age[row] < self._timeouts[row])
 
     def evaluate(self, cycle: int, memory: FaultMemory, tolerance: Tolerance = NO_TOLERANCE) -> None:
-        """Check all rows in one cycle. If `settled` is True and all rows have new data, this call may be omitted.
+        """Check all rows in one cycle.
+
+        If `settled` is True and all rows have new data, this call may be omitted.
 
         Args:
             cycle: number of the current cycle.
@@ -224,8 +229,8 @@ class MessageMonitor:
         sender, two_senders = self._senders[row], self._check_senders(cycle, memory, row, rival)
         tolerated, timeout = self._legs[row] in tolerance.legs, self._timeouts[row]
         fresh = check <= Check.SOME_LOST
-        # The timeout is longer only in cycles without an accepted frame. If the age of an accepted frame's data is at least the
-        # DBC timeout, the frame is late, because the plausibility checks ignore such data.
+        # `tolerance.longer` delays the timeout only in cycles without an accepted frame. An accepted frame gets no extra time,
+        # because the plausibility checks ignore data that is at least as old as the DBC timeout.
         late = age >= timeout + tolerance.longer * (tolerated and not fresh)
         # Impossible signal values do not reduce the trust, because the frame was transmitted correctly.
         good = (fresh or check >= Check.RANGE) and not rival

@@ -54,7 +54,7 @@ class RingTap:
         self._used = 0
 
     def begin_run(self, base_ns: int) -> None:
-        """Set the time base of the stamps. It applies to all following frames.
+        """Set the time that is added to the stamps of all following frames.
 
         Args:
             base_ns: Time of stamp 0 [ns]. On the wall clock this is 0. In virtual time it is the start of the run.

@@ -1,6 +1,8 @@
-"""Encoder of telemetry records as protobuf messages, with one stream for each message type.
+"""Conversion of the record of a control cycle to protobuf messages.
 
 ring -> record -> [streams] -> bytes -> publisher and recorder
+
+A stream is the series of all messages of one type. For example, the stream "imu" consists of `ImuStates` messages.
 """
 
 from __future__ import annotations
@@ -17,9 +19,10 @@ from atalante_hal.robot import CELLS, FEET, IMUS, JOINTS, MOTORS
 from atalante_hal.safety.events import SEVERITIES, Event
 from atalante_hal.telemetry.schema import message_class
 
-#: Assisted joints in left stance and in right stance: sagittal hip and knee of the swing leg.
+#: Joints that the guide assists: sagittal hip (SH) and sagittal knee (SK) of the leg in the air.
+#: Element 0 applies while the robot stands on the left leg, element 1 while the robot stands on the right leg.
 ASSISTED = (("right_SH", "right_SK"), ("left_SH", "left_SK"))
-#: For each field of the message `Guide`: name of the controller's record field that contains its value.
+#: Key: field of the message `Guide`. Value: name of the same quantity in the telemetry of the controller.
 _GUIDE_FIELDS = {"error": "error", "bound": "q_bound", "h": "h", "lambda": "lambda", "desired_position": "q_des"}
 _GUIDE_OTHERS = ("filter_active", "step", "phase", "stance")
 
@@ -28,7 +31,7 @@ _GUIDE_OTHERS = ("filter_active", "step", "phase", "stance")
 class Sample:
     """Record of one control cycle, with its time and the number of its run."""
 
-    values: list[float]  # values of the record, in the order of its layout
+    values: list[float]  # all fields of the record in one list; `record_layout.Layout` has the slice of each field
     cycle: int
     timestamp: int  # log time of the cycle [ns]
     run: int = 0  # number of the run in the session
@@ -37,15 +40,15 @@ class Sample:
 
 @dataclass(frozen=True)
 class Stream:
-    """Key, message type and encoder of one stream."""
+    """Series of messages of one type, which are published and recorded under one key."""
 
-    key: str
-    message: str
-    encode: Callable[[Sample], bytes]
+    key: str  # name of the stream, such as joint_states
+    message: str  # name of the message type, such as JointStates
+    encode: Callable[[Sample], bytes]  # function that returns the message of one cycle
 
 
 class Encoder:
-    """Encoder that converts records with a given layout to the messages of all streams.
+    """Encoder that converts each record to one message per stream.
 
     Args:
         layout: Layout of the records.
@@ -54,7 +57,7 @@ class Encoder:
 
     def __init__(self, layout: Layout, diagnostics: Sequence[str] = ()) -> None:
         self.cycle_at, self.time_at = layout["cycle"].start, layout["time"].start
-        #: Streams that can be encoded, because the layout has all their fields.
+        #: Streams for which the layout has all fields. Without guide fields in the layout, there is no stream "guide".
         self.streams = _streams(layout, diagnostics)
         self.window = LoopWindow(layout)
 

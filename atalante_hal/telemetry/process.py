@@ -42,12 +42,12 @@ HANGS_AFTER = 2.0
 RESTARTS = 3
 #: Time between two attempts of `close` to kill a subprocess that is still starting [s].
 _KILLED = 0.1
-#: The subprocess must end its Zenoh session within this time [s] after it has printed its summary.
+#: After its summary, the subprocess has this time [s] to end its Zenoh session. Then `close` kills the subprocess.
 _SESSION_END = 2.0
-#: A restarted subprocess must be ready within this time [s], see `tend`.
+#: A restarted subprocess that is not ready after this time [s] is ended. Then `tend` restarts the subprocess again.
 _RESTART = 30.0
-#: The first subprocess must be ready within this time [s]. A run may begin before the subprocess is ready.
-#: A subprocess that is not ready in time is ended, and `tend` starts another one.
+#: On the wall clock, the first subprocess is ended if it is not ready after this time [s]. Then `tend` starts a new subprocess.
+#: A run may begin before the subprocess is ready, see `TelemetryProcess.start`.
 _JOIN = 60.0
 
 
@@ -66,14 +66,14 @@ class TelemetryConfig:
     robot: str = "exo"  # name of the robot in the Zenoh keys atalante/<robot>/...
     publish: bool = True  # whether messages are published on Zenoh
     listen: str | None = None  # Zenoh endpoint; None means the first free port from tcp/127.0.0.1:7447 on
-    stream_rate: int = 100  # Hz in robot time, publishing rate of each stream
-    loop_rate: int = 10  # Hz in robot time, rate of the messages with loop statistics
+    stream_rate: int = 100  # Hz, publishing rate of each stream; 100 publishes every tenth cycle
+    loop_rate: int = 10  # Hz, rate of the loop statistics; 10 sends the statistics every hundredth cycle
     recording: Path | None = None  # MCAP file; None if nothing is recorded
-    record_rate: int = 100  # Hz in robot time, recording rate of each stream; at 1000, every cycle is recorded
+    record_rate: int = 100  # Hz, recording rate of each stream; 100 records every tenth cycle, 1000 records every cycle
     can_log: Path | None = None  # log file of all CAN frames; the file suffix determines the format; None for no log
-    lock_step: bool = False  # True for virtual time, in which the loop waits for recorder and CAN log
-    #: Capacity of the ring of cycle records and of the ring of CAN frames [records].
-    #: The ring of cycle records gets one record per cycle. The ring of CAN frames gets fewer records on average.
+    lock_step: bool = False  # True in virtual time (lock-step): the loop waits if recorder or CAN log are too slow
+    #: Number of slots of the ring of cycle records: at one record per cycle, 1024 slots store the last 1023 cycles.
+    #: The ring of CAN frames has as many slots but fills more slowly: one record contains the frames of two or three cycles.
     slots: int = 1024
     patience: float = 5.0  # s, longest wait of the loop for the recorder or the CAN log in lock-step
     certificate: Path | None = None  # TLS certificate, see `access.Access`
@@ -140,7 +140,7 @@ class Recording:
 class TelemetrySummary:
     """Result of a telemetry session."""
 
-    complete: bool = False  # False if a subprocess ended without a summary; the numbers are then incomplete
+    complete: bool = False  # False if a subprocess ended without a summary; then message and frame counts are too low
     published: int = 0  # number of published messages
     recorded: int = 0  # number of recorded messages
     frames_logged: int = 0
@@ -387,7 +387,9 @@ class TelemetryProcess(Closing):
         return self._tap
 
     def begin_run(self, name: str, about: Mapping[str, object] | None = None) -> None:
-        """Begin a run, such as a walk with one guide shape. All following records belong to this run.
+        """Begin a run, to which all following records belong.
+
+        Example: a program that compares three shapes of the guide begins one run for each shape.
 
         The robot time of a run begins at 0. The log time of a run begins at the current time of day. In lock-step the
         log time begins 1 s after the log time of the last record.

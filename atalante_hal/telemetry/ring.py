@@ -35,14 +35,15 @@ from atalante_hal.memory import anonymous_file
 MAGIC = int.from_bytes(b"ATLRING\0", "little")
 VERSION = 1
 
-# Indices of the 64-bit header words: constant words, words of the writer, words of the reader. Each group has its own cache line.
+# Each name is the index of a 64-bit word in the header of a ring. Line 1: constants. Line 2: words that only the writer changes.
+# Line 3: words that only the reader changes. The words of each line are in a cache line of their own.
 _MAGIC, _VERSION, _RECORD_SIZE, _STRIDE, _SLOTS, _META_LENGTH, _NOTES_SIZE, _DATA = range(8)
 _WRITTEN, _CLOSED, _WRITER_PID, _NOTES_LENGTH, _LOSSLESS = range(8, 13)
 _READ, _LOST, _READER_PID, _KEPT = range(16, 20)
 _HEADER_BYTES = 256
 
 _WRITER_BYTE, _READER_BYTE = 0, 1  # offsets of the bytes that writer and reader lock
-#: number of attempts to lock a byte; several are needed, because `_held` of the other end locks the byte for microseconds
+#: Number of attempts to lock a byte. An attempt may fail, because `_held` in the other process locks the byte for microseconds.
 _LOCK_TRIES = 50
 
 _WAIT = 0.0002  # s, polling period
@@ -69,7 +70,7 @@ class _Ring:
 
     @property
     def slots(self) -> int:
-        """Return the number of slots. One slot is reserved for writing."""
+        """Return the number of slots: one more than the number of records that can wait for the reader."""
         return self._header[_SLOTS]
 
     @property
@@ -84,7 +85,7 @@ class _Ring:
 
     @property
     def kept(self) -> int:
-        """Return the number of records that readers have marked as saved so far, see `keep`."""
+        """Return the number of records that all readers together have saved to disk, see `RingReader.keep`."""
         return self._header[_KEPT]
 
     @property
@@ -109,7 +110,10 @@ class _Ring:
         return _HEADER_BYTES + self._header[_META_LENGTH]
 
     def _lock(self, byte: int) -> bool:
-        """Lock one byte of the file. Return False if another process keeps it locked."""
+        """Lock one byte of the ring's memory file. Return False if another process keeps this byte locked.
+
+        The lock shows the other process that this process exists, see `_held`.
+        """
         for _ in range(_LOCK_TRIES):
             try:
                 fcntl.lockf(self.fd, fcntl.LOCK_EX | fcntl.LOCK_NB, 1, byte)
@@ -320,7 +324,7 @@ class RingReader(_Ring, Closing):
         return self._batch[intact - first : count, : self.record_size]
 
     def keep(self, records: int) -> None:
-        """Report that more records were saved. `kept` returns the total number of saved records.
+        """Increase the number of saved records, which `kept` returns.
 
         Args:
             records: Number of records whose content was saved to disk since the last call.

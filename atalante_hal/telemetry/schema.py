@@ -1,6 +1,7 @@
-"""Protobuf messages of `messages.proto`, loaded from the committed descriptor set.
+"""Protobuf messages of `messages.proto`, loaded from the compiled file `messages.binpb`.
 
-Generated `_pb2` modules work only with certain protobuf releases. A descriptor set does not depend on the release.
+The file contains a descriptor set, which every protobuf release can load. Generated `_pb2` modules work only with certain
+protobuf releases.
 """
 
 from __future__ import annotations

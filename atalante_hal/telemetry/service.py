@@ -35,7 +35,10 @@ _DROPPED_EVERY = 1.0  # s, shortest time between two reports of lost cycles
 
 @dataclass(frozen=True)
 class Run:
-    """Run of a session. The control loop describes each run in a note of the ring."""
+    """Run of a session: consecutive cycles with one name and one start time.
+
+    The control loop sends the data of each run as a note in the ring of cycle records.
+    """
 
     number: int
     name: str
@@ -75,9 +78,9 @@ class Service:
         self._runs = [Run(0, "", records.meta["start_ns"], 0)]
         self._cycle, self._timestamp = 0, self._runs[0].start_ns  # cycle number and log time [ns] of the last record
         self._lost, self._lost_reported = 0, -math.inf
-        self._recorder, self._saved = recorder, 0  # recorder, and its number of saved messages at the last check
+        self._recorder, self._saved = recorder, 0  # `_saved`: last seen value of `recorder.saved` (messages on disk)
         self._handled = 0  # number of records whose messages have been passed to all sinks
-        self._kept = 0  # number of records that this service has marked as saved in the ring header
+        self._kept = 0  # number of records that this service has reported as saved with `RingReader.keep`
         self.notices: list[str] = []  # faults, one sentence each
 
     def run(self, stop: Sequence[object]) -> None:
@@ -106,8 +109,8 @@ class Service:
 
     def step(self) -> bool:
         """Process all new records and events of the rings, and return whether there were any."""
-        # Read the events before the notes. The control loop writes the note of a run before the events of this run, so the notes
-        # that are read afterwards include the run of every event.
+        # Read the events before `_begin_runs` reads the notes, because the control loop announces each run in a note before it
+        # writes events of the run. In the opposite order, an event could be read whose run is still unknown.
         events = [unpack(bytes(event)) for event in self._events.read()]
         records = self._records.read()
         first = self._records.position - len(records)
@@ -139,7 +142,9 @@ class Service:
         return next((run for run in reversed(self._runs) if run.first <= record), self._runs[0])
 
     def _handle_records(self, encoder: Encoder, records: npt.NDArray[np.float64], first: int) -> None:
-        """Encode the records that are due at the message rate of a sink, and pass the messages to this sink.
+        """Pass the messages of every n-th cycle to each sink; each sink has its own n.
+
+        Example: a sink with n = 10 gets the messages of the cycles 0, 10, 20 and so on. All sinks also get the loop statistics.
 
         Args:
             encoder: Encoder for the layout of the records.
@@ -194,7 +199,7 @@ class Service:
             self._mark_saved()
 
     def _mark_saved(self) -> None:
-        """Mark all records processed so far as saved, in the header of the ring."""
+        """Report all records processed so far as saved, so that `RingWriter.kept` includes them."""
         self._records.keep(self._handled - self._kept)
         self._kept = self._handled
 

@@ -20,16 +20,16 @@ from atalante_hal.wire.frame import FLAG_BRS, FLAG_FDF, WORDS, Frames, new_frame
 
 Words = npt.NDArray[np.int64]
 
-# Row indices of the decoding plan. WORD, SHIFT and MASK locate the bits of a signal. LARGEST is the largest code of these bits.
-# LOW and HIGH are the limits of the signal's range in the DBC. INVALID is the code that marks an invalid value.
+# Rows of `SignalTable.plan`. WORD, SHIFT, MASK: position of the bits of a signal. LARGEST: largest code that these bits can have.
+# LOW, HIGH: smallest and largest code in the DBC range of a signal. INVALID: code by which a sender marks a value as invalid.
 WORD, SHIFT, MASK, LARGEST, LOW, HIGH, INVALID = range(7)
-#: Row indices of the scales in the formula  physical value = (raw code + base) * factor + offset.
+#: Rows of `SignalTable.scales`: physical value = (raw code + BASE) * FACTOR + OFFSET.
 BASE, FACTOR, OFFSET = range(3)
-#: The element `plan[INVALID, i]` is `NO_CODE` if signal i has no invalid code.
-#: The function `encode` returns `NO_CODE` if it encoded all values, otherwise the index of a signal that it could not encode.
+#: In `plan[INVALID, i]`, this number means that the DBC defines no invalid code for signal i.
+#: As result of `encode`, this number means that all values were encoded. Another result is the index of a failed signal.
 NO_CODE = -1
-# Results of `read_row`. INSIDE: all signals are in range. OUTSIDE: a signal is out of range, and none has its invalid code.
-# MARKED_INVALID: a signal is out of range, and at least one signal has its invalid code.
+# Results of `read_row`. INSIDE: all signals are in range. OUTSIDE: a signal is out of range, and no signal is marked as invalid.
+# MARKED_INVALID: a signal is out of range, and the sender marked at least one signal as invalid (with its invalid code).
 INSIDE, OUTSIDE, MARKED_INVALID = range(3)
 #: Adding and then subtracting this number rounds a float64 to an integer.
 _ROUND = 1.5 * 2.0**52
@@ -46,9 +46,9 @@ class SignalTable(NamedTuple):
     plan: Words  # (7, size) decoding plan; rows WORD, SHIFT, MASK, LARGEST, LOW, HIGH, INVALID
     scales: Vector  # (3, size) scales; rows BASE, FACTOR, OFFSET
     codes: Words  # (size,) raw codes of the last decoding or encoding
-    words: Words  # (n,) indices of the 64-bit words that contain a signal
-    by_row: Words  # (size,) signal indices, sorted by row
-    row_begins: Words  # (rows + 1,) index in `by_row` of the first signal of each row; the last element is `size`
+    words: Words  # (n,) indices of all 64-bit words of the frame array that contain a signal
+    by_row: Words  # (size,) indices of all signals, sorted by the row of the frame that contains the signal
+    row_begins: Words  # (rows + 1,) the signals of row r are by_row[row_begins[r] : row_begins[r + 1]]
 
 
 @lru_cache(maxsize=4096)
@@ -93,8 +93,8 @@ class Codec:
             mask, largest = (1 << s.length) - 1, (1 << s.length - s.signed) - 1
             invalid = NO_CODE if s.invalid_raw is None else s.invalid_raw
             plan.append((row * WORDS + 1 + s.start // 64, s.start % 64, mask, largest, low, high, invalid))
-            # Example: offset -40 and factor 0.5. The quotient -80 is an integer, so it is added to the raw code before the
-            # multiplication: (raw - 80) * 0.5. This sum is exact. Without an integer quotient: raw * factor + offset.
+            # If offset / factor is an integer, it is added to the raw code: offset -40 and factor 0.5 give (raw - 80) * 0.5.
+            # The sum raw - 80 has no rounding error. If offset / factor is not an integer, the formula is raw * factor + offset.
             code = s.offset / s.factor
             exact = code == round(code) and round(code) * s.factor == s.offset
             scales.append((code, s.factor, 0.0) if exact else (0.0, s.factor, s.offset))

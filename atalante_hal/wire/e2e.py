@@ -66,7 +66,7 @@ def crc(protected: bytes | memoryview, data_id: bytes) -> int:
     return crc_hqx(data_id, crc_hqx(protected, CRC_START))
 
 
-#: Lookup table of the CRC: remainder of each byte value.
+#: Lookup table: element i is the CRC of the single byte i with the initial value 0.
 _TABLE = np.array([crc_hqx(bytes([octet]), 0) for octet in range(256)], np.int64)
 
 
@@ -179,10 +179,11 @@ BAD_CYCLE = 4
 GOOD_CYCLE = 1
 #: Limit of the error counter. At this value the message is no longer trusted.
 FULL = 64
-#: Number of consecutive good cycles after which a message is trusted. Until then the inputs of a pendant are ignored.
+#: A message is trusted after this number of good cycles in a row.
+#: Until then, its values are not used: for example, the inputs of a pendant (remote control) are ignored.
 REQUALIFY = 16
-#: A cycle with frames of two senders increases the two-sender counter (see `suspect`) by this number.
-#: Four such cycles in a row fill the counter up to `FULL`. Then it is confirmed that the message has two senders.
+#: Increase of the counter in `suspect` in a cycle in which two senders sent the same message.
+#: After 64 / 16 = 4 cycles with two senders in a row, the counter reaches `FULL`. Then two senders are confirmed.
 RIVAL_CYCLE = 16
 
 

@@ -52,9 +52,9 @@ from atalante_hal.wire.frame import (
     new_frames,
 )
 
-#: Flags of a CAN FD frame whose sender is error passive, and the flag ESI alone, in the header word of a frame.
+#: Bits in the header word of a frame. `_ESI`: the sender is error passive. `_PASSIVE`: `_ESI` and the bit of a CAN FD frame.
 _PASSIVE, _ESI = header_word(0, 0, FLAG_ESI | FLAG_FDF), header_word(0, 0, FLAG_ESI)
-#: Value of the argument `tag` for nodes whose alive counter counts their own frames, not the cycles.
+#: Value of the argument `tag` (expected alive counter in this cycle) if each node counts only its own frames.
 _NO_TAG = -1
 #: Values of `Check` as plain integers. A value of at most `_FRESH` means new, usable data.
 _FRESH = _SOME_LOST = int(Check.SOME_LOST)
@@ -70,7 +70,7 @@ NEVER = 1 << 30
 #: An answer to a SYNC is rejected as a replayed frame if the SYNC was sent this number of cycles ago or earlier.
 _TOO_OLD = 16
 #: Half the period of the 8-bit alive counter. A frame is old if (its counter - last accepted counter) mod 256 is at least 128.
-#: Example: counter 250 after counter 5 gives 245, so the frame is old. After a gap of 128 cycles, this test is ambiguous.
+#: Example: (250 - 5) mod 256 is 245, so counter 250 is older than 5. After 128 cycles without a frame, this comparison may err.
 _HALF_TURN = 128
 
 
@@ -78,7 +78,7 @@ class E2EState(NamedTuple):
     """State of the E2E check: expected format, expected counter and last frame of each row of a process image.
 
     The `ReceiveImage` owns the arrays. The arrays `headers` and `spans` are constant. The other arrays change with
-    every accepted frame.
+    every accepted frame. In addition, `silent` grows in cycles without an accepted frame.
     """
 
     headers: Words  # (rows,) header word of the message: identifier, length and flags
@@ -126,7 +126,7 @@ class ReceiveImage:
         self.crc_errors = 0
         #: Row and `Check` of each frame that was rejected in this cycle.
         self.refused: list[tuple[int, Check]] = []
-        #: Rows whose sender is error passive according to a frame of this cycle. The frame may be damaged.
+        #: Row of each frame of this cycle in which the sender set the flag ESI (error passive). Damaged frames are included.
         self.error_passive: list[int] = []
         self._restarts = restarts
         #: For each row, the last frame with correct format and CRC whose counter was accepted, see `classify_frame`.
@@ -214,7 +214,9 @@ class ReceiveImage:
         self.all_fresh = False
 
     def begins(self, frames: Frames, count: int) -> bool:
-        """Return whether the buffer begins with one frame of each message, in the order of `messages`. Then no frame is missing.
+        """Return whether the buffer begins with one frame of each message, in the order of `messages`.
+
+        In this case no message is missing. Only the headers are compared: identifier, length and flags.
 
         Args:
             frames: receive buffer.
@@ -298,7 +300,7 @@ class ReceiveImage:
         return foreign
 
     def decode_further_frames(self, row: int) -> list[Vector]:
-        """Decode the intact frames of one message in this cycle, except the frame whose signals are in `values`.
+        """Decode the intact frames of one message that arrived in this cycle but are not stored in `values`.
 
         Repetitions of an accepted frame are left out. Call this method before the receive buffer is used again.
 
@@ -494,8 +496,8 @@ def classify_frame(words: Words, row: int, offset: int, e2e: E2EState, tag: int,
         return _CRC
     counter = int(octets[begin + COUNTER_BYTE])
     in_time = tag == _NO_TAG or tag - counter & 0xFF < _TOO_OLD
-    # After a gap of at least half a counter period, the counter does not show whether a frame is new or old.
-    # After such a gap, the counter of a frame is accepted if the frame answers one of the last `_TOO_OLD` SYNCs.
+    # `back`: the last accepted frame is at least 128 cycles old, and this frame answers one of the last 16 SYNCs (`_TOO_OLD`).
+    # Then every counter is accepted, because after 128 cycles the last counter does not show whether this frame is new or old.
     back = tag != _NO_TAG and in_time and expected[row] != NOTHING and silent[row] >= _HALF_TURN
     result = classify_counter(expected[row], counter)
     if back and result == _REPEATED:
@@ -564,7 +566,7 @@ class TransmitImage:
         rows = len(self.codec.messages)
         self._counters: Words = np.zeros(rows, np.int64)
         self._singles = [self.frames[row : row + 1] for row in range(rows)]
-        # `specialised` calls each function once. The calls leave every alive counter at 0xFF, so the first counter sent is 0.
+        # `specialised` runs `seal` once with the counter 0xFF. So the first frame that is sent has the counter 0.
         self._protect = specialised(protect, self._octets, self._spans, self._counters)
         self._seal = specialised(seal, self.values, self.codec.table, self._words, self._spans, self._counters, 0xFF)
 
@@ -589,7 +591,7 @@ class TransmitImage:
 
     @property
     def counter(self) -> int:
-        """Return the alive counter of the first row in the last `seal`."""
+        """Return the last alive counter of the first row."""
         return int(self._counters[0])
 
     def prepare(self) -> bytes:
@@ -614,7 +616,9 @@ class TransmitImage:
         return self.frames
 
     def seal_row(self, row: int) -> Frames:
-        """Encode and protect one row; the counters of the other rows do not change.
+        """Return the frame of one row for sending, with the last counter of the row plus 1.
+
+        The counters of the other rows do not change.
 
         Args:
             row: row of the message.

@@ -1,4 +1,4 @@
-"""Check of the attribute values in a DBC text. It runs before cantools parses the text: `text -> attributes -> parser`.
+"""Check of the attribute values in a DBC text, before cantools parses the text.
 
 cantools does not check whether a value has the type that its attribute requires. Without this check, an invalid value causes
 an error later or remains undetected.
@@ -21,7 +21,7 @@ _RAW = re.compile(r"(0[xX][0-9a-fA-F]{1,16}|\d{1,20})?")
 
 
 def wrong_values(text: str) -> Iterator[tuple[int, str]]:
-    """Yield (line number, problem) for each invalid value and for each value without an earlier definition."""
+    """Yield (line number, problem) for each attribute value that is invalid or has no definition above its line."""
     definitions: dict[str, tuple[str, str]] = {}
     for number, line in enumerate(text.splitlines(), start=1):
         if match := _DEFINITION.match(line):

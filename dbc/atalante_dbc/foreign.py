@@ -32,9 +32,9 @@ _FLOAT_BITS = (16, 32, 64)
 _E2E_HEADER = {"Crc": (0, 16), "Counter": (16, 8)}
 #: Values of GenMsgSendType for cyclic messages, in lower case. The empty text stands for a missing GenMsgSendType.
 _CYCLIC = ("", "cyclic", "cyclicx", "periodic", "fixedperiodic", "fixed_periodic")
-# Masks of the parameter group in a J1939 identifier.
-# `_PGN_PEER` applies if the PDU format is below `_PDU2`. Such an identifier also contains a destination address.
-# `_PGN_BROADCAST` applies to all other identifiers.
+# Masks of the parameter group in a J1939 identifier. The PDU format (bits 16 to 23) selects the mask.
+# `_PGN_PEER`: PDU format below `_PDU2`. The identifier also contains a destination address.
+# `_PGN_BROADCAST`: PDU format of at least `_PDU2`. The identifier contains no destination address.
 _PGN_PEER, _PGN_BROADCAST, _PDU2 = 0x03FF0000, 0x03FFFF00, 240
 _QUOTED = re.compile(r'"[^"]*"')
 _WRITTEN = re.compile(r"\bBO_\s+(\d+)\s+(\w+)\s*:|\bSG_\s+(\w+)\s+(M|m\d+M?)?\s*:")
@@ -62,7 +62,7 @@ class Field:
 
     @property
     def first_bit(self) -> int:
-        """Return the position of the start bit, counted in the byte order of the signal.
+        """Return the number of payload bits before the start bit, counted in the byte order of the signal.
 
         The count starts at the least significant bit of byte 0 (Intel) or at the most significant bit of byte 0 (Motorola).
         """
@@ -93,10 +93,10 @@ class Layout:
     timeout_ms: float | None
     inhibit_ms: float | None  # minimum time between two frames of an event message [ms]
     data_id: int | None  # Data ID of AUTOSAR E2E Profile 5; None if the message is not protected
-    #: Mask of the identifier bits that identify the message. For J1939 these are the bits of the parameter group.
-    #: For all other messages these are all bits.
+    #: Mask of the identifier bits that identify the message. The parameter group identifies a J1939 message.
+    #: The complete identifier identifies a message that is not J1939.
     pgn_mask: int
-    #: Name of each multiplexer -> raw values for which the DBC defines a layout.
+    #: Known raw values of each multiplexer: values that select a signal, and values with a name. Key: name of the multiplexer.
     multiplexers: Mapping[str, frozenset[int]]
 
     def field(self, name: str) -> Field:
@@ -255,7 +255,10 @@ def _first_bit(signal: RawSignal) -> int:
 
 
 def _selectors(message: RawMessage) -> dict[str, tuple[tuple[str, frozenset[int]], ...]]:
-    """Return the multiplexers of each signal, outermost first, with the raw values that select the signal."""
+    """Return the multiplexers of each signal, with the raw values that select the signal.
+
+    Multiplexers can be nested. The outermost multiplexer is the first element.
+    """
     by_name = {s.name: s for s in message.signals}
 
     def of(signal: RawSignal, depth: int = 0) -> tuple[tuple[str, frozenset[int]], ...]:

@@ -70,7 +70,7 @@ def _parse(path: Path) -> Network:
 
 
 def _key(path: Path) -> bytes:
-    """Return the digest of everything that determines the parsed network.
+    """Return a digest that changes if the DBC, the parser, Python or cantools changes.
 
     Args:
         path: DBC file.

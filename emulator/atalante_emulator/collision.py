@@ -1,5 +1,6 @@
-"""Detection of two senders of the same message, by the alive counters of the received frames.
+"""Detection of two nodes that send the same message.
 
+Each sender numbers its frames by an alive counter. Numbers that do not fit together show that there are two senders.
 A sender increments its counter by one with each frame. CAN may lose or repeat a frame, but CAN keeps the order of the frames. So
 two different frames with the same counter, one directly after the other, come from two senders. Two successive frames of one
 cycle also come from two senders if their counters are not consecutive.
@@ -24,7 +25,7 @@ class Senders:
         self._last_cycle = -1
 
     def are_two(self, frames: Frames, cycle: int) -> bool:
-        """Return whether two senders sent the message in this cycle.
+        """Return whether frames received in a cycle show two senders of the message.
 
         Args:
             frames: all frames received in the cycle, in the order of reception, shape (n,). Other messages are ignored.

@@ -1,4 +1,6 @@
-"""Crane of an emulated robot: suspends the robot above the floor, and lowers it onto its feet after the time `DELAY` in ACTIVE.
+"""Crane of an emulated robot: suspends the robot above the floor, and lowers the robot onto its feet.
+
+The crane lowers the robot after the HAL was in the state ACTIVE or FULL_ASSIST for the time `DELAY`, or at a call of `lower`.
 
 The sling is a spring between the hook and the pelvis. The sling pulls upwards only. While the sling is under tension, the crane
 also keeps the pelvis upright and holds its horizontal position and heading constant. These forces and moments grow in
@@ -16,28 +18,29 @@ from atalante_hal.types import PERIOD, SupervisorState, Vector
 
 #: Speed of the hook [m/s].
 SPEED: Final = 0.1
-#: Time in ACTIVE or FULL_ASSIST after which the crane lowers the robot [s]. In this time, the walking controller moves the legs
-#: to the standing pose. If the feet stood on the floor during this motion, friction would keep the wrong distance between the
-#: feet.
+#: The crane lowers the robot after the HAL was in the state ACTIVE or FULL_ASSIST for this time [s].
+#: The robot hangs during this time, because the walking controller moves the legs to the standing pose.
+#: Feet that already stood on the floor could not slide to the positions of the standing pose.
 DELAY: Final = 2.0
-#: Stiffness and damping of the sling, both per kg of the robot. The weight of the robot stretches the sling by 25 mm.
+#: Stiffness and damping of the sling. The crane multiplies both by the mass of the robot [kg], so every robot stretches the
+#: sling by the same length: 9.81 / 400 m = 25 mm.
 STIFFNESS: Final = 400.0  # N/m per kg
 DAMPING: Final = 28.0  # N s/m per kg
-#: The sling turns the pelvis upright with this rotational stiffness and damping, both per kg of the robot.
-#: Both values apply while the sling carries the full weight.
+#: Rotational stiffness and damping with which the crane turns the pelvis upright, for each kg of the robot.
+#: The moment on the pelvis is smaller while the feet carry a part of the weight.
 RIGHTING: Final = 100.0  # Nm/rad per kg
 ATTITUDE_DAMPING: Final = 1.5  # Nm s/rad per kg
-#: Slack of the sling at which lowering ends [m]. After that, the sling exerts no force until a call of `lift`.
-#: The slack exceeds the vertical motion of the pelvis of a walking robot.
+#: The crane lowers the hook until the sling is loose by this length [m], and then exerts no force until a call of `lift`.
+#: The pelvis of a walking robot moves up and down by less than this length, so the sling stays loose.
 SLACK: Final = 0.15
 _ACTIVE: Final = (SupervisorState.ACTIVE, SupervisorState.FULL_ASSIST)
 
 
 class Crane:
-    """Crane of a robot with a free pelvis. Each call advances the crane by one `PERIOD` and returns the wrench on the pelvis.
+    """Crane of a robot with a free pelvis. The emulator calls the crane once in each time step.
 
     Attributes:
-        lowered: Whether the sling is slack and the robot stands alone.
+        lowered: True after the crane has lowered the robot: the sling is loose, and the robot stands alone.
     """
 
     def __init__(self, body: Body, *, automatic: bool = True) -> None:
@@ -70,10 +73,13 @@ class Crane:
         self._goal, self.lowered = self._top, False
 
     def __call__(self, hal_state: int) -> Vector:
-        """Advance the crane by one `PERIOD` and return force [N] and moment [Nm] on the pelvis, in world axes, shape (6,).
+        """Move the hook for one time step of 1 ms (`PERIOD`), and return the force and moment on the pelvis.
 
         Args:
             hal_state: state of the HAL, a value of `SupervisorState`.
+
+        Returns:
+            Force [N] and moment [Nm] in world axes, shape (6,).
         """
         if self._automatic and hal_state in _ACTIVE:
             self._waited += 1
@@ -101,7 +107,7 @@ class Crane:
         return wrench
 
     def _hold(self, motion: Motion) -> None:
-        """Hold the horizontal position and the heading of the pelvis from now on."""
+        """Store horizontal position and heading of the pelvis as setpoints. The crane holds the pelvis there from now on."""
         x, y, _ = motion.position.tolist()
         self._at, half = (x, y), 0.5 * _yaw(motion.attitude)
         self._half_heading = float(np.sin(half)), float(np.cos(half))
@@ -113,9 +119,9 @@ def _yaw(attitude: Vector) -> float:
 
 
 def _turn_to_upright(attitude: Vector, half_heading: tuple[float, float]) -> tuple[float, float, float]:
-    """Return the rotation from an attitude to the upright attitude with a given heading, in world axes [rad].
+    """Return the rotation that turns a pelvis upright and into a given heading, as a vector in world axes [rad].
 
-    The result is 2 sin(angle / 2) along the axis of rotation. For a small angle it is the rotation vector.
+    The vector has the length 2 sin(angle / 2) along the axis of rotation. For a small angle, 2 sin(angle / 2) is the angle.
 
     Args:
         attitude: quaternion xyzw, shape (4,).
@@ -123,6 +129,6 @@ def _turn_to_upright(attitude: Vector, half_heading: tuple[float, float]) -> tup
     """
     s, c = half_heading
     x, y, z, w = attitude.tolist()
-    # Product of the quaternion (0, 0, s, c) and the conjugate of the attitude.
+    # The result is twice the vector part of the quaternion product "(0, 0, s, c) times conjugate of `attitude`".
     twice = 2.0 if c * w + s * z >= 0.0 else -2.0
     return twice * (-c * x + s * y), twice * (-s * x - c * y), twice * (s * w - c * z)

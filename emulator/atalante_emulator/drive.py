@@ -30,10 +30,10 @@ from atalante_hal.robot import JOINTS, LEG_JOINTS, SIDES, Robot
 from atalante_hal.types import PERIOD, Vector
 from atalante_hal.wire.cia402 import AUTOMATIC, Controlword, DriveState, next_state
 
-#: Timeout of the commands and of SYNC [cycles]. At a timeout, an enabled drive starts its local hold.
+#: An enabled drive holds its joint by itself (local hold) after this time without a valid command or without SYNC [cycles].
 WATCHDOG: Final = 5
-#: Interval of the slow tasks of the drives [cycles]: update of temperatures and warnings, and after a fault the check whether
-#: the joint is at rest.
+#: Interval of the slow tasks of the drives [cycles]. The slow tasks update temperatures and warnings.
+#: After a fault, they also check whether the joint has stopped.
 SLOW_CYCLES: Final = 100
 #: Names of the drive nodes, in the order of JOINTS.
 NODES: Final = tuple(joint.upper() for joint in JOINTS)
@@ -49,28 +49,32 @@ class DriveParameters:
     motor: MotorParameters = field(default_factory=MotorParameters)
     velocity_bandwidth: float = 80.0  # cut-off frequency of the velocity low-pass [Hz]
     torque_noise: float = 0.05  # noise of the torque measurement [Nm rms]
-    trip_temperature: float = 120.0  # winding temperature that switches the power stage off [degC]
-    cool_enough: float = 100.0  # highest winding temperature at which an over-temperature error can end [degC]
+    trip_temperature: float = 120.0  # a drive switches its power stage off at this winding temperature [degC]
+    #: The HAL can acknowledge an over-temperature error at this winding temperature or below [degC].
+    cool_enough: float = 100.0
     supply: float = 48.0  # nominal supply voltage [V]
-    hold_below: float = 40.0  # supply voltage below which a drive starts its local hold [V]
-    #: Joint speed, computed from two encoder samples, above which the local hold assumes that the encoder jumped [rad/s].
+    hold_below: float = 40.0  # a drive with less supply voltage stops following commands and holds its joint [V]
+    #: If two successive encoder samples show a higher joint speed [rad/s], a drive that holds its joint assumes an encoder jump.
     jump_speed: float = 20.0
     off_below: float = 20.0  # lowest supply voltage at which the power stage works [V]
-    rest_speed: float = 0.05  # joint speed below which the lowering of a joint ends [rad/s]
+    rest_speed: float = 0.05  # a joint that sinks against its brake counts as stopped below this joint speed [rad/s]
 
 
 class DriveSignals(NamedTuple):
-    """Signals in the state frames of the twelve drives, shape (12,) each. `Drives` updates the signals."""
+    """Values that the twelve drives report to the HAL in their state frames. Element i of each array belongs to joint i."""
 
-    position: Vector  # position of the motor [rad]
-    velocity: Vector  # velocity of the motor [rad/s]
-    torque: Vector  # measured torque at the joint [Nm]
-    temperature: Vector  # temperature of the winding [degC]
-    state: Vector  # value of `DriveState`
+    position: Vector  # angle of the motor shaft, before the gear, shape (12,) [rad]
+    velocity: Vector  # velocity of the motor shaft, before the gear, shape (12,) [rad/s]
+    torque: Vector  # measured motor torque, given as torque at the joint, shape (12,) [Nm]
+    temperature: Vector  # temperature of the motor winding, shape (12,) [degC]
+    state: Vector  # state of the drive as a value of `DriveState`, shape (12,)
 
 
 def _within(target: Vector, limit: Vector, own_limit: Vector, wanted: Vector) -> None:
-    """Clip the target torque to the limits of HAL and drive, and write it to `wanted`. All arrays have shape (12,) [Nm]."""
+    """Clip the target torques, and write the results to `wanted`.
+
+    All arrays have shape (12,) [Nm]. The smaller of two limits applies: `limit` from the HAL and `own_limit` of the drive.
+    """
     for i in range(len(wanted)):
         most = min(limit[i], own_limit[i])
         wanted[i] = max(-most, min(target[i], most))
@@ -97,32 +101,33 @@ class Drives:
         self.parameters = parameters
         self.signals = signals
         self.state = [DriveState.SWITCH_ON_DISABLED] * len(JOINTS)
-        #: For each drive: True after the drive has left OPERATION ENABLED without a command, for example for a local hold.
-        #: A latched drive ignores ENABLE_OPERATION until the HAL sends QUICK_STOP or a controlword that changes the state.
+        #: latched[i] is True if drive i left OPERATION ENABLED by itself, for example because it holds its joint.
+        #: A latched drive ignores ENABLE_OPERATION. The HAL unlatches the drive by a controlword that changes its state,
+        #: or by QUICK_STOP after the cause of the error is gone.
         self.latched = [False] * len(JOINTS)
-        #: Delay of each drive from the command ENABLE_OPERATION to the state OPERATION ENABLED [cycles].
+        #: enable_delay[i]: number of ENABLE_OPERATION commands that drive i ignores before it enters OPERATION ENABLED.
         self.enable_delay = [0] * len(JOINTS)
-        #: For each drive: number of consecutive ENABLE_OPERATION commands that the drive has delayed, see `enable_delay`.
+        #: _enabling[i]: number of ENABLE_OPERATION commands in a row that drive i has ignored because of `enable_delay`.
         self._enabling = [0] * len(JOINTS)
         self.emergencies = [] if outbox is None else outbox
         self.errors = Errors(NODES, self.emergencies)
         #: Supply voltage of each drive [V].
         self.voltage = [parameters.supply] * len(JOINTS)
-        #: Age of the last valid command, per leg [cycles].
+        #: missed[leg]: age of the last valid command that the drives of the leg received [cycles].
         self.missed = [0] * len(SIDES)
-        self._unsynced = [0] * len(SIDES)  # number of consecutive cycles without SYNC, per leg
-        self._unsynced_at = [-1] * len(SIDES)  # number of the last cycle without SYNC, per leg
+        self._unsynced = [0] * len(SIDES)  # _unsynced[leg]: number of cycles in a row in which the leg received no SYNC
+        self._unsynced_at = [-1] * len(SIDES)  # _unsynced_at[leg]: last cycle in which the leg received no SYNC
         self.encoders = Encoders(robot, parameters.velocity_bandwidth, signals.position, signals.velocity)
         self.motors = Motors(robot, parameters.motor, signals.torque, signals.temperature)
         self._slow_phase = 0
-        #: Controlwords that have no effect in the present drive states, as bytes; empty if no such controlwords are known.
-        #: If the HAL sends these controlwords again, the drives skip them.
+        #: The last controlwords of all drives, as bytes, if they changed no drive state and no error. Otherwise empty.
+        #: When the HAL sends the same bytes again, the drives need not evaluate them.
         self._steady = b""
-        self._hold_at = np.zeros(len(JOINTS))  # setpoint of the local hold of each drive [rad]
+        self._hold_at = np.zeros(len(JOINTS))  # joint position at which each drive holds its joint [rad]
         self._target, self._limit = np.zeros((2, len(JOINTS)))
         self._own_limit = robot.torque_max.copy()  # torque limit of each drive at the current winding temperature [Nm]
         self._within = compiled(_within)
-        # Compile the kernel now, because compilation takes longer than a cycle.
+        # Compile `_within` now. A compilation in the first cycle would delay this cycle by more than 1 ms.
         self._within(self._target, self._limit, self._own_limit, self.motors.wanted)
         self._states_changed()
 
@@ -144,9 +149,9 @@ class Drives:
         limit: Vector,
         delay: tuple[int, int] = (0, 0),
     ) -> None:
-        """Latch the last valid command and run the watchdog and the state machines.
+        """Pass the commands of the HAL to the drives, and update watchdog and drive states.
 
-        Until the next command, every call of `drive` reads the arrays `target` and `limit`.
+        The drives keep the arrays `target` and `limit`. Each call of `drive` reads them until the next call of this method.
 
         Args:
             fresh: per leg, whether a valid new command arrived since the last cycle.
@@ -170,7 +175,7 @@ class Drives:
         self._target, self._limit = target, limit
 
     def drive(self, velocity: Vector) -> list[float]:
-        """Return the joint torques of the next `PERIOD`.
+        """Return the joint torques for the next time step of 1 ms (`PERIOD`).
 
         Args:
             velocity: true joint velocities, shape (12,) [rad/s]. The friction depends on these velocities.
@@ -197,25 +202,29 @@ class Drives:
         np.multiply(generator.standard_normal(out.shape), self.parameters.torque_noise, out=out)
 
     def _without_command(self, wanted: Vector) -> None:
-        """Set the torque of drives in a state other than OPERATION ENABLED: hold torque in QUICK STOP ACTIVE, otherwise zero."""
+        """Overwrite the torque of each drive that does not follow commands.
+
+        A drive in QUICK STOP ACTIVE holds its joint with a spring and damper torque. A drive in OPERATION ENABLED keeps its
+        commanded torque. A drive in any other state has zero torque.
+        """
         robot, limit = self._robot, self._own_limit
-        # The local hold uses the unfiltered encoder velocity, because the filtered velocity has too much delay.
+        # Use the encoder velocity without low-pass: the delay of a low-pass would reduce the damping of the hold.
         speed = self.encoders.speed
         jumped = np.abs(speed) > self.parameters.jump_speed
-        if jumped.any():  # the encoder jumped: shift the setpoint by the jump, so that the joint does not move
+        if jumped.any():  # the encoder jumped, not the joint: move the hold position with it, so that the torque stays
             self._hold_at[jumped] += speed[jumped] * PERIOD
             speed[jumped] = 0.0
         hold = robot.hold_kp * (self._hold_at - self.encoders.angle) - robot.hold_kd * speed
         np.clip(hold, -limit, limit, out=hold)
         unknown = np.isnan(hold)
-        if unknown.any():  # the hold began before the first sample of the encoder
+        if unknown.any():  # NaN: the hold began before the first encoder sample, so the hold position is still unknown
             self._hold_at[unknown], hold[unknown] = self.encoders.angle[unknown], 0.0
         wanted[:] = np.where(self._is_enabled, wanted, np.where(self._is_holding, hold, 0.0))
 
     # -- errors and local reactions ----------------------------------------------------------------------------------
 
     def hold(self, leg: int, code: int) -> None:
-        """Start a latched local hold in every enabled drive of a leg.
+        """Make every enabled drive of a leg hold its joint until the HAL acknowledges the error.
 
         Args:
             leg: index of the leg, 0 is left.
@@ -226,7 +235,9 @@ class Drives:
                 self.fail(drive, code)
 
     def miss_sync(self, leg: int, cycle: int) -> None:
-        """Count a cycle without SYNC on the bus of a leg. After `WATCHDOG` such cycles in a row, start the local hold.
+        """Count a cycle in which the drives of a leg received no SYNC.
+
+        After `WATCHDOG` cycles in a row without SYNC, the enabled drives of the leg hold their joints.
 
         Args:
             leg: index of the leg, 0 is left.
@@ -239,7 +250,7 @@ class Drives:
             self.hold(leg, emergency.LIFE_GUARD)
 
     def restart_sync_watchdog(self, leg: int) -> None:
-        """Restart the SYNC watchdog of a leg after a SYNC that arrived late in its cycle.
+        """Reset the number of cycles without SYNC of a leg to 0. The emulator calls this when a SYNC arrives late.
 
         Args:
             leg: index of the leg, 0 is left.
@@ -247,9 +258,9 @@ class Drives:
         self._unsynced[leg] = 0
 
     def warn(self, leg: int, code: int) -> None:
-        """Report a warning from each drive of a leg, because the command of the leg has an error.
+        """Make each drive of a leg report that the command for this leg was wrong or lost.
 
-        The drives do not react to a warning.
+        The report is a warning: the drives do not react to it.
 
         Args:
             leg: index of the leg, 0 is left.
@@ -259,7 +270,7 @@ class Drives:
             self.errors.warn(drive, code)
 
     def fail(self, drive: int, code: int, *, persists: bool = False) -> None:
-        """Report an error of a drive and start its local reaction.
+        """Report an error of a drive to the HAL, and make the drive react: hold the joint, lower the joint, or continue.
 
         Args:
             drive: index of the drive.
@@ -279,7 +290,9 @@ class Drives:
         self._states_changed()
 
     def recover(self, drive: int, code: int) -> None:
-        """Mark the cause of an error as gone. The reaction to the error continues until the HAL acknowledges the error.
+        """Record that the cause of an error no longer exists, so that the HAL can acknowledge the error.
+
+        The drive continues its reaction, for example the hold of its joint, until the HAL acknowledges the error.
 
         Args:
             drive: index of the drive.
@@ -288,11 +301,11 @@ class Drives:
         self.errors.end(drive, code)
         if not self.latched[drive] and self.state[drive] not in _FAULTY:
             self.errors.acknowledge(drive)
-        # Evaluate the next controlwords even if they are unchanged, because they may now acknowledge the error.
+        # Forget the stored controlwords: the same controlwords had no effect before, but can now acknowledge the error.
         self._steady = b""
 
     def leave(self, drive: int, state: DriveState) -> None:
-        """Change the state of a drive without a command, for example because its power stage is locked for a moment.
+        """Change the state of a drive without a controlword of the HAL.
 
         Args:
             drive: index of the drive.
@@ -354,14 +367,17 @@ class Drives:
             self._steady = words
 
     def _apply_controlword(self, drive: int, word: int) -> bool:
-        """Apply a controlword to a drive. Return whether the word changed the drive state or acknowledged an error."""
+        """Apply a controlword to a drive, and return whether it had an effect.
+
+        An effect is a new drive state, the acknowledgement of an error, or an ENABLE_OPERATION counted for `enable_delay`.
+        """
         state, latched = self.state[drive], self.latched[drive]
         after = next_state(state, word, latched=latched)
         if self.errors.any_persists(drive) and (state is DriveState.FAULT or after is DriveState.OPERATION_ENABLED):
             return False  # the cause of an error persists, so the HAL cannot acknowledge the error
         if after is DriveState.OPERATION_ENABLED is not state and self._enabling[drive] < self.enable_delay[drive]:
             self._enabling[drive] += 1
-            return True  # evaluate the next controlwords even if they are unchanged
+            return True  # counting is an effect: the caller must evaluate the same controlword again in the next cycle
         self._enabling[drive] = 0
         acknowledged = after is not state and state is DriveState.FAULT
         if latched and (after is not state or word == Controlword.QUICK_STOP):
@@ -400,7 +416,7 @@ class Drives:
     def _check_temperature(self) -> None:
         """Reduce the torque limit of hot drives and switch off drives above the trip temperature."""
         temperature, parameters = self.motors.temperature, self.parameters
-        # The temperature is rounded as in the state frame, so that drive and HAL compute the same limit.
+        # Round to whole degrees: the HAL gets the temperature in whole degrees, and must compute the same torque limit.
         self._own_limit[:] = self._robot.torque_limit(np.rint(temperature))
         for drive, degrees in enumerate(temperature.tolist()):
             if degrees >= parameters.trip_temperature:
@@ -409,7 +425,7 @@ class Drives:
                 self.recover(drive, emergency.OVER_TEMPERATURE)
 
     def _check_rest(self) -> None:
-        """Change each drive from FAULT REACTION ACTIVE to FAULT when its joint is at rest."""
+        """Put each drive with a stopped joint from FAULT REACTION ACTIVE into FAULT."""
         speed = np.abs(self.encoders.speed)
         for drive in np.flatnonzero(speed < self.parameters.rest_speed).tolist():
             if self.state[drive] is DriveState.FAULT_REACTION_ACTIVE:

@@ -12,8 +12,8 @@ from typing import Final, NamedTuple
 
 ERROR_RESET: Final = 0x0000
 CURRENT: Final = 0x2310  # continuous over-current
-UNDER_VOLTAGE: Final = 0x3220  # DC link voltage too low for normal operation
-NO_VOLTAGE: Final = 0x3222  # DC link voltage too low for the power stage
+UNDER_VOLTAGE: Final = 0x3220  # supply voltage too low to follow commands; the drive can still hold its joint
+NO_VOLTAGE: Final = 0x3222  # supply voltage too low for the power stage, so the motor has no torque
 OVER_TEMPERATURE: Final = 0x4310  # drive too hot
 ENCODER: Final = 0x7305  # incremental sensor 1
 COMMAND_LOST: Final = 0x8110  # CAN overrun: objects lost
@@ -22,13 +22,15 @@ TWO_SENDERS: Final = 0x8150  # identifier collision: two nodes send the same com
 COMMAND_REJECTED: Final = 0x8200  # protocol error: command with wrong CRC, length or value range
 COMMAND_TIMEOUT: Final = 0x8250  # command timed out
 
-#: First hex digit of an error code -> value of the CiA 301 error register: generic bit plus bit of the error class.
+#: First hex digit of an error code (its class) -> error register of CiA 301. Bit 0 means "any error".
+#: One more bit names the class: 1 current, 2 voltage, 3 temperature, 4 communication (0x8), 5 device profile (0x7).
 _REGISTER: Final = {0x2: 0x03, 0x3: 0x05, 0x4: 0x09, 0x7: 0x21, 0x8: 0x11}
 _GENERIC: Final = 0x01
 
-# The age of a warning is the number of calls of `Errors.advance` since `Errors.warn` reported or renewed the warning.
-# Age 0 and 1: the warning is active, and `warn` renews it. Age 2 (`_ENDED`): the warning has ended, and `warn` does nothing.
-# Age 3 (`_REPEATABLE`): the warning is forgotten, and `warn` reports it again.
+# A warning has an age. `Errors.warn` starts a new warning at age 0, and `Errors.advance` adds 1 to the ages of all warnings.
+# At age 0 or 1, a warning is active: the next `Errors.warn` with its code only sets its age back to 0.
+# At age 2 (`_ENDED`), a warning ends: `Errors.advance` reports the end, and `Errors.warn` with its code does nothing.
+# At age 3 (`_REPEATABLE`), a warning is deleted: `Errors.warn` with its code starts and reports a new warning.
 _ENDED, _REPEATABLE = 2, 3
 
 
@@ -85,8 +87,9 @@ class Errors:
 
     def __init__(self, nodes: Sequence[str], outbox: list[Emergency]) -> None:
         self._nodes, self._outbox = nodes, outbox
-        self._active: list[dict[int, bool]] = [{} for _ in nodes]  # error code -> whether the cause persists
-        self._warnings: dict[tuple[int, int], int] = {}  # (node, error code) -> age of the warning [calls of `advance`]
+        #: _active[node]: error code of each active error -> whether the cause of the error still exists.
+        self._active: list[dict[int, bool]] = [{} for _ in nodes]
+        self._warnings: dict[tuple[int, int], int] = {}  # (node index, error code) -> age of the warning, see `_ENDED`
 
     def begin(self, node: int, code: int, *, persists: bool = False) -> None:
         """Begin an error, and report it unless it is already active.
@@ -103,7 +106,7 @@ class Errors:
             self._report(node, code)
 
     def end(self, node: int, code: int) -> None:
-        """Mark the cause of an error as gone. The error stays active until it is acknowledged.
+        """Record that the cause of an error no longer exists. The error stays active until a call of `acknowledge`.
 
         Args:
             node: index of the node.
@@ -113,7 +116,9 @@ class Errors:
             self._active[node][code] = False
 
     def acknowledge(self, node: int) -> None:
-        """Remove all errors whose cause is gone. Report code 0 if no error is left.
+        """Remove the errors of a node whose cause no longer exists.
+
+        If the node then has no active error or warning left, report this by an emergency with code 0.
 
         Args:
             node: index of the node.
@@ -124,7 +129,7 @@ class Errors:
             self._report(node, ERROR_RESET)
 
     def any_persists(self, node: int) -> bool:
-        """Return whether the cause of any error of a node persists.
+        """Return whether a node has an error whose cause still exists.
 
         Args:
             node: index of the node.
@@ -132,7 +137,7 @@ class Errors:
         return any(self._active[node].values())
 
     def has(self, node: int, code: int) -> bool:
-        """Return whether an error is active and its cause persists.
+        """Return whether a node has a given error, and the cause of the error still exists.
 
         Args:
             node: index of the node.
@@ -150,7 +155,9 @@ class Errors:
         self._warnings = {warning: age for warning, age in self._warnings.items() if warning[0] != node}
 
     def warn(self, node: int, code: int) -> None:
-        """Report a warning, unless the same warning was reported a short time ago. A warning is an error without a reaction.
+        """Report a warning, which is an error without a reaction of the node.
+
+        While a warning with the same code is in the list of warnings, the new warning is not reported, see `_ENDED`.
 
         Args:
             node: index of the node.
@@ -164,7 +171,10 @@ class Errors:
             self._warnings[node, code] = 0
 
     def advance(self) -> None:
-        """Advance the age of all warnings by one, and report code 0 when a warning ends."""
+        """Add 1 to the age of all warnings, and report the end of warnings by emergencies with code 0.
+
+        A node that still has an active error or another active warning does not report the end.
+        """
         if not self._warnings:
             return
         self._warnings = {warning: age + 1 for warning, age in self._warnings.items() if age + 1 < _REPEATABLE}

@@ -1,4 +1,4 @@
-"""Emulator of the robot: runs all nodes except the HAL, and answers each SYNC of the HAL.
+"""Emulator of the robot: runs all nodes of the CAN network except the HAL, and sends their frames after each SYNC.
 
     bus -> process image -> E2E + validity -> nodes -> body -> nodes -> process image -> bus
 
@@ -48,11 +48,11 @@ from atalante_hal.wire.process_image import ReceiveImage, TransmitImage
 _RECEIVE_BUDGET = 128
 #: Capacity of the transmit buffer [frames]. The nodes send 19 cyclic frames per cycle, slow messages and emergencies.
 _BATCH = 128
-#: The nodes reject a command frame if the result of its E2E check is one of these values.
+#: The nodes reject a command frame if `ReceiveImage` found one of these errors in the frame.
 _REJECTED = (Check.CRC, Check.LENGTH, Check.RANGE, Check.INVALID)
-#: Half the period of the alive counter [cycles].
+#: Half of the 256 values of the alive counter. The difference of two counters is known only in the range -128 to 127.
 _HALF_TURN = 128
-#: After the first SYNC of a cycle, the emulator waits at most this time for the SYNCs on the other buses [s].
+#: The HAL sends one SYNC on each bus. After the first SYNC, the emulator waits at most this time for all other SYNCs [s].
 _SYNC_SKEW = 200e-6
 
 
@@ -67,7 +67,7 @@ class EmulatorParameters:
 
 
 class Emulator:
-    """All nodes of the network except the HAL, connected to one body.
+    """All nodes of the network except the HAL. The nodes sense and move one emulated robot, the `body`.
 
     `before_send` is a list of callables `(cycle, values)`. Each callable is called after the SYNC of a cycle and may change
     `values`, the signal values that the nodes then send. The values are in the order of `signals`.
@@ -114,11 +114,12 @@ class Emulator:
         self.before_send: list[Callable[[int, Vector], None]] = []
         self.pelvis_forces: list[Callable[[int], Vector]] = []
         self._pushing = False  # whether a wrench acted on the pelvis in the last time step
-        #: Crane that lowers the robot to the ground; None without crane. The same object is also in `pelvis_forces`.
+        #: Crane that lowers the robot to the ground, or None. If set, the crane is also in the list `pelvis_forces`.
         self.crane: Crane | None = None
-        #: Emulated operator who steadies the robot on the ground, or None. The same object is also in `pelvis_forces`.
+        #: Emulated operator who steadies the robot on the ground, or None. If set, it is also in the list `pelvis_forces`.
         self.virtual_operator: VirtualOperator | None = None
-        self.wearer: PassiveWearer | ActivePatient | None = None  # wearer whose limbs act on the joints
+        #: Emulated wearer whose legs act on the joints of the robot, or None.
+        self.wearer: PassiveWearer | ActivePatient | None = None
         self._build_images()
         self._bind_commands()
         self._build_nodes(robot, parameters)
@@ -127,7 +128,7 @@ class Emulator:
         self._sample_next()
 
     def inject(self, faults: Sequence[Fault]) -> None:
-        """Add faults to an emulator that has no faults yet.
+        """Plan the faults of a run. Call this at most once, and only if the constructor got no faults.
 
         Args:
             faults: faults to inject; each must begin at least two cycles later, because the next frames are already computed.
@@ -146,7 +147,7 @@ class Emulator:
 
     @property
     def signals(self) -> Codec:
-        """Codec of the 1 ms messages of the nodes. The codec defines the order of the signals."""
+        """Codec of the 1 ms messages of the nodes, with the index of each signal in `values` of a `before_send` callable."""
         return self._tx.codec
 
     # -- construction ------------------------------------------------------------------------------------------------
@@ -158,8 +159,8 @@ class Emulator:
         sent = [m for m in network.messages if m.sender in ours]
         cyclic = [m for bus in network.buses for m in sent if m.bus == bus and m.cycle_ms == 1]
         self._tx = TransmitImage(cyclic)
-        self._sealed = False  # whether the next frames already have counter and CRC
-        self._tag = 0  # alive counter of the next frames: low byte of the cycle number
+        self._sealed = False  # True if `_tx` already contains the finished frames for the next SYNC
+        self._tag = 0  # alive counter in the frames for the next SYNC: low byte of the expected cycle number
         self._haptics_tx = TransmitImage([network.message("HAPTICS_STATE")])
         self._heartbeats = Heartbeats(network, [m for m in sent if m.name.endswith("_STATUS")])
         self._emergencies: list[Emergency] = []  # emergencies to send in this cycle
@@ -167,25 +168,25 @@ class Emulator:
 
         received = [m for m in network.sent_by("HAL") if m.cycle_ms == 1]
         syncs = [m for m in received if m.name.startswith("SYNC_")]
-        # The rows are in the order in which an embedded bus delivers the frames: commands of the previous cycle, then SYNC.
+        # List the commands before the SYNCs: a HAL in the same process delivers its frames in this order.
         self._rx = ReceiveImage([m for m in received if m not in syncs] + syncs)
-        self._rx.values.fill(0.0)  # values until the first command: zero torque, zero vibration, HAL state OFF
+        self._rx.values.fill(0.0)  # before the first command, 0 means no torque, no vibration and HAL state OFF
         self._scratch = new_frames(_RECEIVE_BUDGET)
         self._scratch_from = [self._scratch[offset:] for offset in range(_RECEIVE_BUDGET)]
-        #: Number of frames that arrived before the SYNC of their cycle. The scratch buffer keeps these frames for the next poll.
+        #: Number of frames at the start of `_scratch` that arrived before a SYNC. The next `poll` processes these frames.
         self._waiting = 0
 
         self._sync_rows = [self._rx.codec.rows[m.name] for m in syncs]
         self._sync_ids = {m.frame_id for m in syncs}
-        self._shares: list[Frames] = []  # for each SYNC: frames with which the nodes on the bus of this SYNC answer
+        self._shares: list[Frames] = []  # _shares[i]: frames that the nodes send after SYNC i, on the bus of SYNC i
         for sync in syncs:
             rows = [row for row, m in enumerate(cyclic) if m.bus == sync.bus]
             self._shares.append(self._tx.frames[rows[0] : rows[-1] + 1])
         self._whole = [self._tx.frames]
-        #: For each leg: index of its SYNC message in the list of SYNC messages.
+        #: _leg_syncs[leg]: index i of the SYNC that the drives of the leg receive.
         self._leg_syncs = [[m.name for m in syncs].index(f"SYNC_{side.upper()}_LEG") for side in SIDES]
-        #: For each SYNC: copy of the answer of the nodes on its bus in the last imperfect cycle, see `_imperfect_cycle`.
-        #: If a SYNC of that cycle arrives after the cycle has already run, the nodes send this stored answer.
+        #: _answered[i]: copy of `_shares[i]` from the last cycle that `_imperfect_cycle` ran.
+        #: If SYNC i arrives only after this cycle has run, the nodes on the bus of SYNC i send this copy.
         self._answered = self._shares
         batch = new_frames(_BATCH)
         self._batch = batch.view(np.uint8).data
@@ -201,15 +202,15 @@ class Emulator:
         self._sync_cycles = values[codec.slice("Cycle")]
         self._command_rows = [codec.rows[f"COMMAND_{side.upper()}_LEG"] for side in SIDES]
         self._senders = [Senders(self._rx.codec.messages[row]) for row in self._command_rows]
-        #: For each leg: rows of its SYNC message and of its command message in the process image.
+        #: _leg_rows[leg]: row of the SYNC and row of the command of the leg in the receive buffer `_rx`.
         self._leg_rows = [
             (self._sync_rows[sync], row) for sync, row in zip(self._leg_syncs, self._command_rows, strict=True)
         ]
-        #: Alive counter of the last frame of each row, a view of the process image.
+        #: _counters[row]: alive counter of the last frame received for this row of `_rx` (one row for each message of the HAL).
         self._counters = self._rx.frames["data"][:, COUNTER_BYTE]
         self._level_row = codec.rows["HAPTICS_COMMAND"]
         self._commanded = [False] * len(SIDES)
-        self._delay = [0] * len(SIDES)  # delay of the last valid command of each leg [cycles]
+        self._delay = [0] * len(SIDES)  # _delay[leg]: number of cycles by which the last valid command arrived late
         self._last_sync: int | None = None
 
     def _build_nodes(self, robot: Robot, parameters: EmulatorParameters) -> None:
@@ -243,7 +244,7 @@ class Emulator:
             for message in codec.messages:
                 if message.name.startswith(f"{kind}_"):
                     truth[codec.index(message.name, "Temperature")] = temperature
-        #: amplitudes of the vibration motors in the order of MOTORS, shape (8,), 0 to 1
+        #: Vibration of each motor as a share of its largest vibration, 0 to 1, in the order of MOTORS, shape (8,).
         self.vibration: Vector = self._haptics_tx.values[self._haptics_tx.codec.slice("Amplitude")]
         self._haptics = Haptics(parameters.haptics, self.vibration)
         self._haptics_cycles = self._haptics_tx.codec.messages[0].cycle_ms
@@ -302,10 +303,15 @@ class Emulator:
         return count
 
     def _imperfect_cycle(self, count: int) -> bool:
-        """Process the frames of a cycle in which a frame is missing, rejected or late. Return whether a cycle was run.
+        """Process received frames when not all frames of the HAL are valid and on time.
+
+        If a SYNC is among them, run one cycle, unless the emulator already ran this cycle.
 
         Args:
             count: number of frames in the scratch buffer.
+
+        Returns:
+            Whether a cycle was run.
         """
         self._check_delays()
         checks = self._rx.check.tolist()
@@ -314,7 +320,7 @@ class Emulator:
         if not synced:
             return self._cycle_without_sync()
         number = int(max(self._sync_cycles[synced]))
-        if number == self._last_sync:  # late SYNC of a cycle that already ran
+        if number == self._last_sync:  # another SYNC of this cycle arrived earlier, and the cycle has already run
             for leg, sync in enumerate(self._leg_syncs):
                 if sync in synced:
                     self.drives.restart_sync_watchdog(leg)
@@ -333,13 +339,17 @@ class Emulator:
         return True
 
     def _commands_in_step(self) -> bool:
-        """Return whether all commands are on time. A command and the SYNC of the next cycle have the same alive counter."""
+        """Return whether the commands of both legs are on time.
+
+        The HAL sends a command and the SYNC of the next cycle with the same alive counter. So a command is on time if
+        its counter equals the counter of the SYNC.
+        """
         counters = self._counters.tobytes()
         (left_sync, left), (right_sync, right) = self._leg_rows
         return counters[left_sync] == counters[left] and counters[right_sync] == counters[right]
 
     def _check_delays(self) -> None:
-        """Measure the delay of each valid new command, and reject commands that are late by `WATCHDOG` cycles or more.
+        """Store by how many cycles each valid command is late, and reject a command that is late by `WATCHDOG` cycles or more.
 
         The HAL sends a command and the SYNC of the next cycle with the same alive counter. So the delay of a command
         is SYNC counter minus command counter [cycles]. The delay is negative if the SYNC is missing.
@@ -364,7 +374,7 @@ class Emulator:
         for leg, row in enumerate(self._command_rows):
             check = checks[row]
             self._commanded[leg] |= check <= Check.SOME_LOST
-            # in this process image, IMPLAUSIBLE marks a command that is too late
+            # `_check_delays` gives a command that is too late the check result IMPLAUSIBLE.
             if check in (Check.SOME_LOST, Check.IMPLAUSIBLE):
                 self.drives.warn(leg, COMMAND_LOST)
             elif check in _REJECTED:
@@ -373,7 +383,11 @@ class Emulator:
                 self.drives.hold(leg, TWO_SENDERS)
 
     def _cycle_without_sync(self) -> bool:
-        """If an injected fault removed the SYNC, run a cycle in which no node answers. Return whether a cycle was run."""
+        """Run a cycle without answers if an injected fault removed the SYNC of the HAL. Otherwise, do nothing.
+
+        Returns:
+            Whether a cycle was run.
+        """
         lost = self._link is not None and self._link.synced
         if lost:
             for leg in range(len(SIDES)):
@@ -382,7 +396,7 @@ class Emulator:
         return lost
 
     def _send(self, parts: Sequence[Frames]) -> None:
-        """Send all frames of a cycle in one call of the bus."""
+        """Send all frames of a cycle in one call of `bus.send`."""
         frames = parts[0] if len(parts) == 1 else self._gather(parts)
         try:
             self.bus.send(frames)
@@ -397,7 +411,7 @@ class Emulator:
     # -- steps of one cycle ------------------------------------------------------------------------------------------
 
     def _sample_next(self) -> None:
-        """Sample the sensors for the next cycle, and encode the next frames in advance if possible.
+        """Sample the sensors, and encode the frames that the nodes will send after the next SYNC.
 
         A callable in `before_send` may change the values after the next SYNC. With such a callable, the frames are encoded after
         that SYNC.
@@ -422,7 +436,10 @@ class Emulator:
         self._sealed = True
 
     def _complete_answer(self, number: int) -> None:
-        """Encode the answer to a SYNC, unless the answer is already encoded for this cycle number and no signal has changed.
+        """Make sure that `_tx` contains the frames with which the nodes answer a SYNC.
+
+        `_sample_next` has already encoded these frames for the expected cycle number. Encode them again if SYNC contains another
+        number, if the pendant signals changed, or if `before_send` contains a callable.
 
         Args:
             number: cycle number received in SYNC.
@@ -435,7 +452,7 @@ class Emulator:
         self._sealed = False
 
     def _cycle(self, fresh: tuple[bool, bool], answer: list[Frames], delay: tuple[int, int] = (0, 0)) -> None:
-        """Latch the command, send the answer, step the body and sample the sensors.
+        """Run one cycle: pass the command to the drives, send the answer, move the body and sample the sensors.
 
         The command of cycle k-1 acts from the start of cycle k to the start of cycle k+1.
 
@@ -469,7 +486,7 @@ class Emulator:
         self._sample_next()
 
     def _with_slow(self, parts: list[Frames]) -> list[Frames]:
-        """Return `parts` plus the slow messages and the emergencies that are due in this cycle."""
+        """Return `parts` plus the status messages, the haptics message and the emergencies that are due in this cycle."""
         if self.cycle % self._haptics_cycles == 0:
             self._haptics.advance(self._level, int(self._rx.age[self._level_row]), self._haptics_cycles)
             parts = [*parts, self._haptics_tx.seal()]
@@ -514,14 +531,14 @@ class Emulator:
     def idle(self) -> None:
         """Run one millisecond without a HAL. Enabled drives start their local hold.
 
-        The nodes send only slow messages and emergencies.
+        The nodes send only status, haptics and emergency messages.
         """
         for leg in range(len(SIDES)):
             self.drives.hold(leg, LIFE_GUARD)
         self.run_without_sync()
 
     def run_without_sync(self) -> None:
-        """Run one millisecond without SYNC. The nodes send only slow messages and emergencies."""
+        """Run one millisecond without SYNC. The nodes send only status, haptics and emergency messages."""
         drives = self.drives
         self._rx.new_cycle()
         drives.command((False, False), self._controlword, self._target, self._limit)

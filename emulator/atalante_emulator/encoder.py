@@ -43,10 +43,10 @@ def _sample(
 
 
 class Encoders:
-    """Encoders of all joints. `sample` updates the arrays of motor position and motor velocity."""
+    """Encoders of the twelve motors. `sample` writes motor positions and velocities to the arrays given to the constructor."""
 
     def __init__(self, robot: Robot, bandwidth: float, position: Vector, velocity: Vector) -> None:
-        """Connect the encoders to the arrays of the position and velocity signals.
+        """Store the arrays to which `sample` writes.
 
         Args:
             robot: gear ratio and polarity of each joint.
@@ -59,11 +59,12 @@ class Encoders:
         self._counts, self._before = np.zeros((2, len(JOINTS)))
         self._position, self._velocity = position, velocity
         self._sample = compiled(_sample)
-        self.sample(np.zeros(len(JOINTS)))  # compiles the kernel; the compilation takes longer than a cycle
+        # Compile `_sample` now. A compilation in the first cycle would delay this cycle by more than 1 ms.
+        self.sample(np.zeros(len(JOINTS)))
         self._counts.fill(math.nan)  # no sample yet
 
     def sample(self, position: Vector) -> None:
-        """Sample all encoders. Call this once per `PERIOD`.
+        """Sample all encoders. The caller must call this method once in each cycle of 1 ms (`PERIOD`).
 
         Args:
             position: joint positions, shape (12,) [rad]. An injected encoder fault is already included.
@@ -80,6 +81,6 @@ class Encoders:
 
     @property
     def speed(self) -> Vector:
-        """Joint velocities for the local hold, shape (12,) [rad/s], computed from the last two counts without a low-pass."""
+        """Joint velocities computed from the last two samples, without a low-pass, shape (12,) [rad/s]."""
         speed: Vector = (self._counts - self._before) / (self._counts_per_rad * PERIOD)
         return speed

@@ -1,6 +1,7 @@
-"""Rigid-body dynamics of a URDF, computed by PyBullet. The results are a reference for the Pinocchio model of the gaits.
+"""Rigid-body dynamics of a robot, computed by PyBullet from a URDF.
 
-`URDF -> mass matrix, gravity, inverse dynamics, centre of mass`. The emulator does not use this module.
+The module computes mass matrix, gravity torques, inverse dynamics and centre of mass. The results are a reference for the
+model that the gaits use, which the library Pinocchio computes. The emulator does not use this module.
 """
 
 from __future__ import annotations
@@ -16,7 +17,7 @@ from atalante_hal.closing import Closing
 from atalante_hal.robot import JOINTS
 from atalante_hal.types import Vector
 
-Pose = tuple[Sequence[float], Sequence[float]]  # position [m], quaternion xyzw
+Pose = tuple[Sequence[float], Sequence[float]]  # pose of a frame in PyBullet: position (3) [m] and quaternion xyzw (4)
 
 
 class EngineDynamics(Closing):
@@ -37,7 +38,7 @@ class EngineDynamics(Closing):
         self._client = pybullet.connect(pybullet.DIRECT)
         try:
             self._body = load_urdf(urdf, self._client)
-            # The link masses are read from a body with a free base, because PyBullet sets the mass of a fixed base to 0.
+            # Load the robot a second time, with a free pelvis: PyBullet reports mass 0 for a fixed pelvis.
             self._free = load_urdf(urdf, self._client, fixed=False)
         except ValueError:
             self.close()
@@ -51,8 +52,10 @@ class EngineDynamics(Closing):
         if missing := [name for name in JOINTS if name not in moving]:
             self.close()
             raise ValueError(f"the URDF must contain the joints {', '.join(JOINTS)}, got no joint {missing[0]}")
-        self._order = [moving.index(name) for name in JOINTS]  # indices into PyBullet's joint vectors
-        self._rows = [[info[1].decode() for info in infos].index(name) for name in JOINTS]  # PyBullet joint numbers
+        #: _order[i]: index of joint i in PyBullet's lists of joint positions, velocities and torques (movable joints only).
+        self._order = [moving.index(name) for name in JOINTS]
+        #: _rows[i]: number of joint i in PyBullet, which also counts fixed joints.
+        self._rows = [[info[1].decode() for info in infos].index(name) for name in JOINTS]
         self._links = range(len(infos))
         dynamics = [
             pybullet.getDynamicsInfo(self._free, row, physicsClientId=self._client) for row in (-1, *self._links)
@@ -87,7 +90,7 @@ class EngineDynamics(Closing):
         return np.array(torque)[self._order]
 
     def gravity(self, q: Vector) -> Vector:
-        """Return the joint torques that keep a pose at rest.
+        """Return the joint torques that hold the robot motionless against gravity.
 
         Args:
             q: joint positions, shape (12,) [rad].
@@ -127,7 +130,8 @@ class EngineDynamics(Closing):
         states = pybullet.getLinkStates(self._free, self._links, 0, 1, physicsClientId=self._client)
         masses = np.array(list(self.masses.values()))
         centre = masses @ np.array([root[0], *(state[0] for state in states)]) / masses.sum()
-        # PyBullet returns the pose of the base's inertial frame. The result must be in the link frame of the base.
+        # `root` is the pose of a frame at the centre of mass of the pelvis (inertial frame). So the centre of mass of the robot
+        # is computed in the inertial frame first, and then in the URDF link frame of the pelvis.
         unturned = [0.0, 0.0, 0.0, 1.0]
         in_root = pybullet.multiplyTransforms(*pybullet.invertTransform(*root), centre.tolist(), unturned)[0]
         return np.array(pybullet.multiplyTransforms(*self._base_from_inertial, in_root, unturned)[0])

@@ -31,17 +31,17 @@ class Parameter:
 
     valid: str  # description of the valid values, for error messages
     holds: Callable[[Any], bool]  # function that returns whether a value is valid
-    default: Value | None = None  # None if the parameter is required
+    default: Value | None = None  # value of the parameter if a fault does not set it; None if each fault must set it
 
 
 @dataclass(frozen=True)
 class Kind:
     """Definition of a kind of fault: its effect, its valid targets and its parameters."""
 
-    does: str  # description of the effect in one line
-    targets: str  # valid types of the target: message, node, bus, or a kind of node such as drive
-    parameters: Mapping[str, Parameter] = field(default_factory=dict)  # name -> definition
-    #: True: parameters may also have the names of signals of the target message, for example Position=0.3
+    does: str  # effect of the fault as text of one line
+    targets: str  # what the fault can affect, for example "message, node or bus", or kinds of nodes: "imu or foot"
+    parameters: Mapping[str, Parameter] = field(default_factory=dict)  # name of each parameter -> definition
+    #: Whether a fault of this kind can set signals of the target message by parameters such as Position=0.3.
     signals: bool = False
 
 
@@ -74,7 +74,7 @@ def _choice(names: Sequence[str], *, default: str | None = None) -> Parameter:
 _P = _number(0.0, 1.0, default=1.0)
 _MESSAGE = Parameter("the name of a message", lambda value: isinstance(value, str))
 _OTHER = Parameter("the name of another node of the same kind", lambda value: isinstance(value, str))
-#: Parameter value that selects all force cells of a foot.
+#: Value of the fault parameter `cell` that selects all force cells of a foot.
 ALL_CELLS: Final = "all"
 _CELL: Final = (*CELLS, ALL_CELLS)
 _AXES: Final = ("X", "Y", "Z")
@@ -83,7 +83,8 @@ BATTERY: Final = "battery"
 _SUPPLIED: Final = f"drive or {BATTERY}"
 _ANY_TARGET: Final = "message, node or bus"
 
-#: Kinds of communication faults. The parameter `p` is the probability that the fault affects a frame.
+#: Kinds of communication faults: name of the kind -> definition. The parameter `p` of a fault is the probability [0 to 1] that
+#: the fault affects a frame of its target.
 LINK_KINDS: Final[Mapping[str, Kind]] = {
     "drop": Kind("frames are lost", _ANY_TARGET, {"p": _P}),
     "duplicate": Kind("frames are repeated", _ANY_TARGET, {"p": _P, "copies": _whole(1, 16, default=1)}),
@@ -143,7 +144,7 @@ LINK_KINDS: Final[Mapping[str, Kind]] = {
     ),
 }
 
-#: Kinds of faults inside the nodes.
+#: Kinds of faults inside the nodes: name of the kind -> definition.
 NODE_KINDS: Final[Mapping[str, Kind]] = {
     "reset": LINK_KINDS["reset"],
     "emergency": Kind(
@@ -196,7 +197,7 @@ NODE_KINDS: Final[Mapping[str, Kind]] = {
     ),
 }
 
-#: Kinds of sensor faults. A sensor fault changes signal values of a node after the noise was added.
+#: Kinds of sensor faults: name of the kind -> definition. A sensor fault changes signal values that already contain noise.
 SENSOR_KINDS: Final[Mapping[str, Kind]] = {
     "imu_invalid": Kind("an IMU sends the invalid code in all measured signals", "imu"),
     "imu_saturated": Kind("gyroscope and accelerometer report the end of their range", "imu"),
@@ -246,7 +247,7 @@ class Fault:
     parameters: tuple[tuple[str, Value], ...]  # (name, value), with defaults
 
     def __init__(self, kind: str, target: str, start: int = 0, cycles: int | None = None, **parameters: Value) -> None:
-        """Check and store the definition of the fault.
+        """Create a fault, and check its kind, time and parameters.
 
         Args:
             kind: name of the kind, a key of `KINDS`.
@@ -305,7 +306,7 @@ class Fault:
 
 
 def _checked(kind: str, given: Mapping[str, Value]) -> tuple[tuple[str, Value], ...]:
-    """Check the parameters of a fault, and return them together with the defaults of the omitted parameters."""
+    """Check the given parameters of a fault. Return all its parameters as (name, value), where omitted ones have defaults."""
     rule = KINDS[kind]
     known = rule.parameters
     for name, value in given.items():

@@ -16,12 +16,12 @@ from atalante_hal.types import Vector
 class FootParameters:
     """Noise and temperature of the emulated force cells. The sample rate is 1 kHz."""
 
-    noise: tuple[float, float, float] = (3.0, 3.0, 10.0)  # noise of a cell along x, y, z [N rms]
-    temperature: float = 28.0  # constant temperature of all cells [degC]
+    noise: tuple[float, float, float] = (3.0, 3.0, 10.0)  # noise of each force cell along x, y, z [N rms]
+    temperature: float = 28.0  # constant temperature of all force cells [degC]
 
 
 def _share(plate: Vector, sole_force: Vector, force: Vector) -> None:
-    """Compute the forces of the cells of both feet from the forces on the corners of the soles.
+    """Compute the force on each force cell from the forces of the floor on the sole corners.
 
     Args:
         plate: matrix for each foot: cell forces = matrix times corner forces, shape (2, 12, 12).
@@ -38,7 +38,10 @@ def _share(plate: Vector, sole_force: Vector, force: Vector) -> None:
 
 
 class Feet:
-    """Force cells of two feet, four cells per foot. `sample` updates the array of forces, shape (2, 4, 3) [N]."""
+    """Force cells of both feet. `sample` writes the force on each cell to the array given to the constructor.
+
+    The array has the shape (2, 4, 3) [N]. Its indices count the foot, the cell and the axis.
+    """
 
     def __init__(self, parameters: FootParameters, soles: Soles, force: Vector) -> None:
         self._force = force
@@ -50,7 +53,7 @@ class Feet:
         self._loaded = True
 
     def sample(self, sole_force: Vector, touching: bool) -> None:
-        """Sample all force cells. Call this once per `PERIOD`.
+        """Sample all force cells. The caller must call this method once in each cycle of 1 ms (`PERIOD`).
 
         Args:
             sole_force: forces on the corners of the soles in the last time step, in foot axes, shape (2, 4, 3) [N].

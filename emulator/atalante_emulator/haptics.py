@@ -7,15 +7,16 @@ from dataclasses import dataclass
 
 from atalante_hal.types import PERIOD, Vector
 
-#: Timeout of the vibration command [cycles]. At this age of the last command, the commanded level becomes 0.
+#: Timeout of the vibration command [cycles]. If the last command is this old, the node sets the commanded levels to 0.
 WATCHDOG = 50
 
 
 @dataclass(frozen=True)
 class HapticsParameters:
-    """Time response of the emulated vibration motors to a change of the level."""
+    """Speed at which the emulated vibration motors follow their commanded level."""
 
-    rise_time: float = 0.04  # time constant of a small eccentric-mass motor [s]
+    #: Time constant of a small eccentric-mass motor [s]. After this time, the motor has made 63 % of a change of the level.
+    rise_time: float = 0.04
 
 
 class Haptics:

@@ -20,11 +20,11 @@ _SUPPLY_VOLTAGE: Final = 48.0  # supply voltage in the status messages [V]
 
 @dataclass
 class _Status:
-    """Status message of one node."""
+    """Status message of one node, and the time at which the node started."""
 
-    tx: TransmitImage
-    at: dict[str, int]  # signal name -> index in `tx.values`
-    booted: int = 0  # number of the cycle in which the node started
+    tx: TransmitImage  # encoder of the status message: `tx.values` contains its signal values
+    at: dict[str, int]  # name of each signal -> index of its value in `tx.values`
+    booted: int = 0  # cycle number at the last start of the node, the zero of the signal Uptime
 
 
 class Heartbeats:
@@ -32,7 +32,8 @@ class Heartbeats:
 
     def __init__(self, network: Network, messages: Sequence[Message]) -> None:
         self._period = max(m.cycle_ms for m in messages)
-        # The status messages of two consecutive nodes are due `gap` cycles apart, so that no cycle contains two of them.
+        # Distribute the status messages over the period: node i sends its message `gap` cycles after node i - 1.
+        # So each cycle contains at most one regular status message.
         gap = self._period // len(messages)
         self._due: dict[int, _Status] = {}
         self._of: dict[str, _Status] = {}
@@ -58,11 +59,13 @@ class Heartbeats:
         status.tx.values[status.at[signal]] = value
 
     def boot(self, node: str, cycle: int) -> None:
-        """Restart a node. The node sends BOOTUP in this cycle. Its uptime and the counter of its status message restart at 0.
+        """Restart a node, so that its next status message reports BOOTUP.
+
+        The next call of `due` returns this message. Uptime and alive counter of the status message restart at 0.
 
         Args:
             node: name of the node.
-            cycle: number of this cycle.
+            cycle: number of the current cycle.
         """
         status = self._of[node]
         status.booted = cycle
@@ -72,7 +75,9 @@ class Heartbeats:
         self._booting.append(status)
 
     def due(self, cycle: int) -> Sequence[Frames]:
-        """Return the status frames to send in a cycle, shape (1,) each. Most cycles have no status frame.
+        """Return the status frames to send in a cycle, as one array of shape (1,) for each frame.
+
+        Most cycles have no status frame.
 
         Args:
             cycle: number of the cycle.

@@ -19,24 +19,28 @@ from atalante_hal.types import PERIOD, Vector
 
 @dataclass(frozen=True)
 class ImuParameters:
-    """Noise, bias and temperature of the emulated IMUs. Noise and bias are given per axis. The sample rate is 1 kHz."""
+    """Noise, bias, attitude errors and temperature of the emulated IMUs.
 
-    gyro_noise: float = 3.9e-3  # noise [rad/s rms]: density 0.01 deg/s/sqrt(Hz) times the square root of 500 Hz
-    gyro_bias: float = 5.2e-5  # standard deviation of the constant bias of a device [rad/s] (0.003 deg/s)
-    accel_noise: float = 0.05  # noise [m/s2 rms]
-    accel_bias: float = 0.02  # standard deviation of the constant bias of a device [m/s2]
-    attitude_error: float = 0.0  # slowly changing attitude error about each world axis [rad rms]
-    attitude_time: float = 10.0  # time constant of the attitude error [s]
-    heading_drift: float = 0.0  # standard deviation of the constant heading drift of a device [rad/s]
+    The sample rate is 1 kHz. Noise and bias apply to each axis. Each IMU has its own random bias and its own random heading
+    drift. Both stay constant during a run.
+    """
+
+    gyro_noise: float = 3.9e-3  # gyroscope noise [rad/s rms]: 0.01 deg/s/sqrt(Hz) over a bandwidth of 500 Hz
+    gyro_bias: float = 5.2e-5  # standard deviation of the gyroscope bias [rad/s]; equals 0.003 deg/s
+    accel_noise: float = 0.05  # accelerometer noise [m/s2 rms]
+    accel_bias: float = 0.02  # standard deviation of the accelerometer bias [m/s2]
+    attitude_error: float = 0.0  # random error of the reported attitude about each world axis [rad rms]
+    attitude_time: float = 10.0  # time constant with which the random attitude error changes [s]
+    heading_drift: float = 0.0  # standard deviation of the speed at which the heading error of an IMU grows [rad/s]
     temperature: float = 32.0  # constant temperature of all IMUs [degC]
 
 
 class ImuSignals(NamedTuple):
-    """Signals in the state frames of the IMUs. `Imus.sample` updates the signals."""
+    """Values that the four IMUs report to the HAL in their state frames. Row i of each array belongs to IMU i."""
 
-    quaternion: Vector  # attitudes as quaternions wxyz from sensor to world frame, w >= 0, shape (4, 4)
-    gyro: Vector  # angular rate in the sensor frame, shape (4, 3) [rad/s]
-    accel: Vector  # specific force in the sensor frame, upwards at rest, shape (4, 3) [m/s2]
+    quaternion: Vector  # quaternion wxyz that turns a vector from sensor axes into world axes, w >= 0, shape (4, 4)
+    gyro: Vector  # angular velocity in sensor axes, shape (4, 3) [rad/s]
+    accel: Vector  # acceleration plus 9.81 m/s2 upwards (specific force), in sensor axes, shape (4, 3) [m/s2]
 
 
 def _sample(links: Vector, before: Vector, quaternion: Vector, gyro: Vector, accel: Vector) -> None:
@@ -55,7 +59,7 @@ def _sample(links: Vector, before: Vector, quaternion: Vector, gyro: Vector, acc
             before[i] = vx, vy, vz
         ax, ay, az = (vx - before[i, 0]) / PERIOD, (vy - before[i, 1]) / PERIOD, (vz - before[i, 2]) / PERIOD + GRAVITY
         before[i] = vx, vy, vz
-        # r00 to r22 are the rotation matrix from world axes to the sensor frame.
+        # r00 to r22 are the elements of the rotation matrix that turns a vector from world axes into sensor axes.
         x2, y2, z2 = x + x, y + y, z + z
         xx, yy, zz, xy, xz, yz = x * x2, y * y2, z * z2, x * y2, x * z2, y * z2
         xw, yw, zw = w * x2, w * y2, w * z2
@@ -69,14 +73,17 @@ def _sample(links: Vector, before: Vector, quaternion: Vector, gyro: Vector, acc
 
 
 class AttitudeError:
-    """Rotations from the true to the estimated attitudes of the IMUs, as small rotation vectors in world axes.
+    """Errors of the attitudes that the IMUs report.
 
+    The error of an IMU is a small rotation vector in world axes, from the true attitude to the reported attitude.
     Each component is a Gauss-Markov process of first order. The heading also drifts at a constant rate, because no sensor of an
     IMU measures the heading.
     """
 
     def __init__(self, parameters: ImuParameters, count: int, interval: float, generator: np.random.Generator) -> None:
-        """Draw the initial errors and the drift rates of the heading. The accumulated drift starts at zero.
+        """Draw the initial attitude error of each IMU, and the speed at which its heading drifts.
+
+        The drift starts at zero.
 
         Args:
             parameters: size and time constant of the errors.
@@ -94,11 +101,14 @@ class AttitudeError:
         self._next = self._slow.copy()
         self._last = self._next
         self._turn = compiled(_turn)
-        if self.active:  # compile the kernel now, because compilation takes longer than a cycle
+        if self.active:  # compile `_turn` now: a compilation in the first cycle would delay it by more than 1 ms
             self.apply(0.0, np.tile([1.0, 0.0, 0.0, 0.0], (count, 1)))
 
     def draw(self) -> None:
-        """Draw new attitude errors. `apply` changes the errors linearly from the old to the new values during the interval."""
+        """Start an interval: draw the attitude errors that the IMUs have at its end.
+
+        During the interval, `apply` interpolates linearly between the errors at its start and at its end.
+        """
         self._slow = self._keep * self._slow + self._new * self._generator.standard_normal(self._slow.shape)
         self._heading += self._rate * self._interval
         self._last, self._next = self._next, self._slow.copy()
@@ -115,7 +125,9 @@ class AttitudeError:
 
 
 def _turn(share: float, last: Vector, following: Vector, quaternion: Vector) -> None:
-    """Turn each attitude by a small rotation. The rotation is interpolated linearly between two rotation vectors.
+    """Turn each attitude by a small rotation vector.
+
+    The rotation vector is `last` at the start of an interval and `following` at its end, with linear interpolation between.
 
     Args:
         share: elapsed share of the interval, 0 to 1.
@@ -143,12 +155,12 @@ class Imus:
         self._count = len(signals.quaternion)
         self._before = np.zeros((self._count, 3))
         self._sample = compiled(_sample)
-        # Compile the kernel now, because compilation takes longer than a cycle.
+        # Compile `_sample` now. A compilation in the first cycle would delay this cycle by more than 1 ms.
         self.sample(np.zeros((self._count, LINK_STATE)))
         self._before.fill(math.nan)
 
     def sample(self, links: Vector) -> None:
-        """Sample all IMUs. Call this once per `PERIOD`.
+        """Sample all IMUs. The caller must call this method once in each cycle of 1 ms (`PERIOD`).
 
         Args:
             links: attitude and velocities of each IMU after the last time step, as in `Body.imu`, shape (4, 10).
@@ -179,7 +191,7 @@ class Imus:
     def draw_noise(
         self, generator: np.random.Generator, bias: tuple[Vector, Vector], gyro: Vector, accel: Vector
     ) -> None:
-        """Draw the noise of the IMUs for many cycles, and add their bias.
+        """Draw the noise of gyroscopes and accelerometers for many cycles, and add the constant bias of each axis.
 
         Args:
             generator: source of the random numbers.

@@ -22,33 +22,33 @@ from atalante_hal.bus.wrapped import WrappedBus
 from atalante_hal.wire.e2e import COUNTER_BYTE, CRC_BYTES, crc, data_id_bytes
 from atalante_hal.wire.frame import FLAG_BRS, FLAG_FDF, ID_ERROR, ID_EXTENDED, Frames, joined, new_frames
 
-#: Bit for bus-off in the identifier of a CAN error frame (CAN_ERR_BUSOFF of linux/can/error.h).
+#: Bit of a CAN error frame that reports bus-off. The bit is in the identifier (CAN_ERR_BUSOFF of linux/can/error.h).
 BUS_OFF: Final = 0x40
 _HIGHEST_STANDARD: Final = 0x7FF
 _CLASSIC_LENGTH: Final = 8
 
 
 class _Late(NamedTuple):
-    """Delayed frame, and the number of the cycle in which this frame is sent."""
+    """Frame that a fault delays."""
 
-    due: int
-    frame: Frames
+    due: int  # number of the cycle in which the delayed frame is sent
+    frame: Frames  # delayed frame, shape (1,)
 
 
 class _Disturbance:
-    """State of one communication fault during a run, and its effect on the frames."""
+    """One communication fault during a run. Its methods change, delay and add frames."""
 
     def __init__(self, fault: Fault, network: Network, seed: str) -> None:
         self.fault = fault
-        # The fault `inject` begins one cycle early, because it needs a received frame to copy.
+        # A fault of kind `inject` sends copies of the last real frame. So it stores frames from one cycle before its start.
         self.from_cycle = fault.start - (fault.kind == "inject")
         self.messages = {message.frame_id: message for message in messages_of(fault, network)}
         self.random = random.Random(seed)
         self.late: list[_Late] = []
         self._network = network
-        self._counters: dict[int, int] = {}  # identifier -> frozen counter
-        self._held: dict[int, Frames] = {}  # identifier -> frame kept back by `reorder` until the next frame
-        self._last: Frames | None = None  # last received frame, which `inject` copies
+        self._counters: dict[int, int] = {}  # for kind `freeze_counter`: frame identifier -> alive counter that stays
+        self._held: dict[int, Frames] = {}  # for kind `reorder`: frame identifier -> frame to send after the next frame
+        self._last: Frames | None = None  # for kind `inject`: last real frame of the target message
         self._effect = _EFFECTS[fault.kind]
         self.babble: Babble | None = None
         if fault.kind == "flood":
@@ -56,7 +56,7 @@ class _Disturbance:
         self._chance = float(dict(fault.parameters).get("p", 1.0))
 
     def frames(self, frame: Frames, cycle: int) -> Sequence[Frames]:
-        """Apply the fault to a frame. Return the frames that replace this frame on the bus, each of shape (1,).
+        """Apply the fault to a frame, if a random draw says so. Return the frames to send instead, each of shape (1,).
 
         Args:
             frame: frame of a target message of the fault, shape (1,). The function may change this frame.
@@ -69,7 +69,7 @@ class _Disturbance:
         return self.random.random() < self._chance
 
     def changed(self, frame: Frames, cycle: int) -> Sequence[Frames]:
-        """Return the frames that replace an affected frame on the bus, each of shape (1,).
+        """Apply the fault to a frame. Return the frames to send instead, each of shape (1,).
 
         Args:
             frame: frame that the fault affects, shape (1,). The function may change this frame.
@@ -78,7 +78,7 @@ class _Disturbance:
         return self._effect(self, frame, self.messages[_id(frame)], cycle)
 
     def due(self, cycle: int) -> list[Frames]:
-        """Return the delayed frames that are due, each of shape (1,), and remove them from `late`.
+        """Return the delayed frames to send in a cycle, each of shape (1,), and remove them from `late`.
 
         Args:
             cycle: number of the cycle.
@@ -126,7 +126,7 @@ class _Disturbance:
         earlier = self._held.pop(message.frame_id, None)
         if earlier is not None:
             return frame, earlier
-        # Send this frame after the next frame, but only if the fault is still active in the next cycle.
+        # Keep `frame` until the next frame of the message arrives. In the last cycle of the fault, send `frame` at once.
         if cycle + 1 < self.fault.end:
             self._held[message.frame_id] = frame
             return ()
@@ -236,7 +236,7 @@ class FaultyBus(WrappedBus):
             FaultError: If the target or a signal of a fault is not in the network.
         """
         super().__init__(bus)
-        #: Whether a SYNC of the HAL arrived in the last `receive`. True even if an injected fault removed this SYNC.
+        #: Whether a SYNC of the HAL arrived in the last `receive`. A fault may then have removed this SYNC for the nodes.
         self.synced = False
         self._clock, self._cycle, self._begun = clock, -1, -1
         self._all = [
@@ -245,11 +245,11 @@ class FaultyBus(WrappedBus):
             if fault.kind in LINK_KINDS
         ]
         self._active: list[_Disturbance] = []
-        self._acting: dict[int, list[_Disturbance]] = {}  # identifier -> active faults of this message
+        self._acting: dict[int, list[_Disturbance]] = {}  # frame identifier -> active faults that affect such frames
         self._syncs = {m.frame_id for m in network.messages if m.name.startswith("SYNC_")}
         self._from_hal = {m.frame_id for m in network.sent_by("HAL")}
-        self._for_nodes: list[Frames] = []  # frames of the HAL that the nodes have not received yet
-        #: Arbitration of the frames on each bus, computed only during a flood.
+        self._for_nodes: list[Frames] = []  # frames that the next `receive` returns to the nodes
+        #: Model of the bus time: during a fault `flood`, it decides which frames are sent in a cycle and which must wait.
         self.wire = Wire(network)
 
     def send(self, frames: Frames) -> None:
@@ -283,7 +283,7 @@ class FaultyBus(WrappedBus):
         self.synced = not self._syncs.isdisjoint(frames["can_id"][:count].tolist())
         if self.synced:
             self._begin_cycle()
-        # Faults also apply to frames received without SYNC, because commands may arrive before the SYNC of their cycle.
+        # Apply the faults even if no SYNC has arrived yet: a command can arrive before the SYNC of its cycle.
         if self._now() or not self.wire.idle:
             self._for_nodes += self._passed(frames[:count], from_hal=True)
         elif self._for_nodes:
@@ -312,7 +312,7 @@ class FaultyBus(WrappedBus):
     def _passed(self, frames: Frames, *, from_hal: bool) -> list[Frames]:
         """Apply all active faults to each frame. Return the frames that are sent in this cycle."""
         passing: list[Frames] = []
-        unchanged = 0  # first row that is not in `passing` yet; the frames from here up to `row - 1` pass unchanged
+        unchanged = 0  # index of the first frame that is not yet handled; frames from here to `row - 1` have no fault
         for row, can_id in enumerate(frames["can_id"].tolist()):
             acting = self._acting.get(can_id, ())
             for number, disturbance in enumerate(acting, 1):
@@ -332,7 +332,10 @@ class FaultyBus(WrappedBus):
         return self.wire.carry(single, from_hal=from_hal)
 
     def _begin_cycle(self) -> None:
-        """Send delayed frames that are due, and frames that faults add. Only the first call in a cycle has an effect."""
+        """Send the frames that the faults delayed until this cycle, and the frames that the faults add in this cycle.
+
+        A second call in the same cycle does nothing.
+        """
         self._now()
         if self._begun == self._cycle:
             return
@@ -356,7 +359,9 @@ def _cut(frame: Frames, length: int) -> None:
 
 
 def _sealed(frame: Frames, message: Message, *, counter: int | None = None) -> Frames:
-    """Compute the CRC of a frame with the Data ID of its message, write the CRC into the frame, and return the frame.
+    """Write a valid CRC into a frame, and return the frame.
+
+    The CRC also covers the Data ID, a number that the DBC gives to `message` and that is not in the frame.
 
     If `counter` is given, the function also writes this alive counter. A frame that is too short for an alive counter stays
     unchanged.

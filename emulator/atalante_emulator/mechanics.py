@@ -19,9 +19,10 @@ from atalante_emulator.virtual_operator import VirtualOperator
 from atalante_emulator.wearer import LimbParameters, PassiveWearer
 from atalante_hal.robot import JOINTS
 
-#: Parameters of the nodes of a robot on the ground. The IMUs have attitude errors, because these errors affect a walk.
+#: Parameters of the nodes if the robot stands on the ground. The IMUs have attitude errors: a walking controller must tolerate
+#: these errors.
 GROUND_PARAMETERS: Final = EmulatorParameters(imu=ImuParameters(attitude_error=0.004, heading_drift=5.2e-5))
-#: `GROUND_PARAMETERS` for IMUs with a heading reference, such as a magnetometer. The headings of these IMUs do not drift.
+#: Like `GROUND_PARAMETERS`, but each IMU also measures its heading, for example by a magnetometer. So no heading drifts.
 HEADING_REFERENCE_PARAMETERS: Final = replace(GROUND_PARAMETERS, imu=replace(GROUND_PARAMETERS.imu, heading_drift=0.0))
 
 
@@ -30,7 +31,7 @@ class Ground:
     """Floor, crane and virtual operator of a robot with a free pelvis. The height of the floor is 0."""
 
     friction: float = FRICTION  # coefficient of friction between soles and floor
-    clearance: float = 0.03  # height of the lowest sole corner above the floor while the robot is suspended [m]
+    clearance: float = 0.03  # height of the lowest sole corner above the floor at the start, when the robot hangs [m]
     operator_force: float = 0.0  # largest force of the virtual operator [N]; 0 if there is no virtual operator
 
 
@@ -38,21 +39,21 @@ class Ground:
 class Mechanics:
     """Mechanics of an emulated robot."""
 
-    urdf: str  # text of the URDF, with the wearer's segments if the robot is worn
+    urdf: str  # text of the URDF; if a person wears the robot, the URDF also contains the body of the person
     engine: str = ENGINES[0]  # physics engine, one of `ENGINES`
-    ground: Ground | None = None  # with None, the pelvis is fixed, and there is no floor
-    #: Impedance of a passive wearer. With None, a wearer in the URDF affects the joints only by the masses of the limbs.
+    ground: Ground | None = None  # floor below a robot with a free pelvis; None: no floor and a fixed pelvis
+    #: Stiffness and damping of the wearer's passive legs. With None, a wearer in the URDF acts on the joints only by mass.
     limbs: LimbParameters | None = None
-    active: ActiveTask | None = None  # task of an active patient on the ground; None: the patient uses no muscles
-    parameters: EmulatorParameters | None = None  # parameters of the nodes; None: the default in `node_parameters`
+    active: ActiveTask | None = None  # task of a wearer who moves the legs by muscle; None: the wearer uses no muscles
+    parameters: EmulatorParameters | None = None  # parameters of the nodes; None: see `node_parameters`
 
     @property
     def node_parameters(self) -> EmulatorParameters:
-        """Return the true parameters of the nodes. The default depends on whether there is a floor."""
+        """Return `parameters`. If they are None, return GROUND_PARAMETERS for a robot with a floor, otherwise the defaults."""
         return self.parameters or (GROUND_PARAMETERS if self.ground else EmulatorParameters())
 
     def make_body(self, pose: Sequence[float] | None = None) -> Body:
-        """Create the body. The caller must close it.
+        """Create the body of the emulated robot. The caller must call `close` of the body at the end.
 
         If there is a floor, the body is suspended, with the soles at the height `ground.clearance` above the floor.
 
@@ -79,7 +80,10 @@ class Mechanics:
         return body
 
     def complete(self, emulator: Emulator) -> None:
-        """Add wearer, crane and virtual operator to the emulator, as far as the fields of this object describe them.
+        """Add wearer, crane and virtual operator to the emulator.
+
+        The wearer is added if `active` or `limbs` is set, the crane if `ground` is set, and the virtual operator if
+        `ground.operator_force` is not 0.
 
         Args:
             emulator: emulator with the body of `make_body`.

@@ -21,7 +21,8 @@ import numpy as np
 
 from atalante_hal.types import Vector
 
-#: Energy per litre of oxygen and of carbon dioxide [J/l], without the term of urinary nitrogen.
+#: Factors of the metabolic rate M [J/l]: M = OXYGEN * oxygen uptake + CARBON_DIOXIDE * carbon dioxide output, both in l/s.
+#: Brockway also subtracts the energy of the nitrogen in the urine, which is omitted here.
 #: Source: Brockway, "Derivation of formulae used to calculate energy expenditure in man", Hum. Nutr. Clin. Nutr. 41C, 1987.
 OXYGEN: Final = 16_580.0
 CARBON_DIOXIDE: Final = 4_510.0
@@ -36,15 +37,18 @@ class MetabolismParameters:
     #: Metabolic rate of quiet standing [W/kg].
     #: Source: walking equation of Looney et al., Med. Sci. Sports Exerc. 51, 2019.
     standing: float = 1.44
-    positive: float = 0.25  # efficiency of positive muscle work (Margaria, Int. Z. Angew. Physiol. 25, 1968)
-    negative: float = 1.20  # magnitude of the efficiency of negative muscle work (Margaria 1968)
-    #: Metabolic rate per muscle torque without motion [W/Nm]: 0.054 times the largest joint speed, assumed to be 10 rad/s.
-    #: Source: Minetti, Alexander, J. Theor. Biol. 186, 1997.
+    #: Work of a shortening muscle per metabolic energy: 1 J of work takes 4 J (Margaria, Int. Z. Angew. Physiol. 25, 1968).
+    positive: float = 0.25
+    #: Work absorbed by a lengthening muscle per metabolic energy: to absorb 1.2 J takes 1 J (Margaria 1968).
+    negative: float = 1.20
+    #: Metabolic rate of a muscle that holds a torque of 1 Nm without motion [W/Nm]: 0.054 * 10 rad/s.
+    #: The speed 10 rad/s is an assumption: the fastest possible motion of the joint.
+    #: Source of 0.054: Minetti, Alexander, J. Theor. Biol. 186, 1997.
     activation: float = 0.54
     quotient: float = 0.85  # respiratory exchange ratio, litres of CO2 per litre of O2
     oxygen_time: float = 30.0  # time constant of oxygen uptake after a change of the metabolic rate [s]
     carbon_dioxide_time: float = 60.0  # time constant of CO2 output [s], longer because body tissue stores CO2
-    noise: float = 0.05  # standard deviation of a sample of the respirometer, as a fraction of the sample
+    noise: float = 0.05  # standard deviation of each gas measurement, as a fraction of the true value
 
 
 def metabolic_rate(

@@ -22,10 +22,10 @@ class MotorParameters:
     friction_speed: float = 0.05  # joint speed at which dry friction reaches 76 % of its full value [rad/s]
     # While the power stage is off, a relay shorts the windings. The motor then brakes the joint with this additional damping.
     brake: tuple[float, ...] = (150.0, 40.0, 125.0, 80.0, 20.0, 8.0)  # Nm s/rad
-    current_loop: float = 0.5e-3  # time constant of the torque [s]
-    dead_time: int = 0  # number of cycles until a new setpoint reaches the current loop
+    current_loop: float = 0.5e-3  # time constant with which the motor torque follows the torque setpoint [s]
+    dead_time: int = 0  # number of cycles until a new torque setpoint reaches the current loop
     ambient: float = 25.0  # ambient temperature [degC]
-    heating: float = 70.0  # steady temperature rise at half the torque limit [K]
+    heating: float = 70.0  # steady temperature rise of the winding above `ambient` at half the torque limit [K]
     thermal_time: float = 300.0  # time constant of the winding temperature [s]
 
 
@@ -42,13 +42,13 @@ _WANTED, _STRENGTH, _DRY, _DAMPING, _PUSH, _JOINT, _LIMB, _GAIN = range(8)
 def _advance(
     velocity: Vector, setpoint: Vector, motors: Vector, tracking: float, friction_speed: float, torque: Vector
 ) -> None:
-    """Advance all motors by one `PERIOD`.
+    """Advance all motors by one control cycle (`PERIOD`, 1 ms).
 
     Args:
         velocity: true joint velocities, shape (12,) [rad/s].
         setpoint: motor torque setpoints that now reach the current loops, shape (12,) [Nm].
         motors: motor array, shape (8, 12). Its joint torques are updated.
-        tracking: share of the torque deviation that the current loop removes per `PERIOD`.
+        tracking: share of the torque deviation that the current loop removes in one cycle.
         friction_speed: joint speed at which dry friction reaches 76 % of its full value [rad/s].
         torque: measured motor torques, shape (12,) [Nm]. Updated here.
     """
@@ -82,7 +82,8 @@ class Motors:
         self._heat = parameters.heating / (0.5 * robot.torque_max) ** 2
         temperature.fill(parameters.ambient)
         self._advance = compiled(_advance)
-        self.advance(np.zeros(len(JOINTS)))  # compiles the kernel now; the compilation takes longer than a cycle
+        # Compile `_advance` now. In the first control cycle, the compilation would take too long.
+        self.advance(np.zeros(len(JOINTS)))
 
     def power(self, powered: npt.NDArray[np.bool_]) -> None:
         """Switch the power stage of each motor on or off. A motor whose power stage is off brakes its joint.
@@ -132,7 +133,7 @@ class Motors:
         self._motors[_PUSH, joint] = torque
 
     def advance(self, velocity: Vector) -> list[float]:
-        """Advance the motors by one `PERIOD` and return the torques on the joints.
+        """Advance the motors by one control cycle (`PERIOD`, 1 ms) and return the torques on the joints.
 
         The measured motor torque follows the setpoint `wanted`. The joint torque is the true motor torque (see `set_strength`)
         minus friction and brake torque, plus the external torque and the torque of the wearer's limb.

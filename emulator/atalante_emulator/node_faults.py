@@ -66,7 +66,7 @@ class NodeFaults:
         self._hold_up: dict[Fault, HoldUp] = {}
 
     def begin(self, cycle: int, position: Vector) -> Vector:
-        """Apply the node faults that are active in this cycle, and end the faults whose duration is over.
+        """Apply the active node faults, and end each fault in the cycle `fault.end`.
 
         Args:
             cycle: number of the cycle.

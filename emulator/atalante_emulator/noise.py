@@ -17,7 +17,7 @@ NOISE_CYCLES: Final = 128
 
 
 class SensorNoise:
-    """Noise of all signals for `NOISE_CYCLES` cycles, in the signal order of the codec."""
+    """Table of sensor noise: one row per cycle for `NOISE_CYCLES` cycles, one column per signal of the codec."""
 
     def __init__(self, seed: int, codec: Codec, drives: Drives, imus: Imus, feet: Feet) -> None:
         noise = np.zeros((NOISE_CYCLES, codec.size))
@@ -33,7 +33,8 @@ class SensorNoise:
         self._bias = imus.draw_bias(self._of_imus)
         self._attitude = imus.attitude_error(NOISE_CYCLES * PERIOD, of_attitude)
         self._quaternion = codec.slice("Quaternion")
-        self._values: Vector | None = None  # output array of the last `add`; `_attitudes` is a view of this array
+        self._values: Vector | None = None  # array that the last call of `add` filled
+        #: View of the IMU quaternions in `_values`, shape (IMUs, 4). If `add` gets another array, `add` renews the view.
         self._attitudes = np.zeros((0, 4))
 
     def add(self, cycle: int, truth: Vector, values: Vector) -> None:

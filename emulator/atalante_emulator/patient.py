@@ -1,4 +1,6 @@
-"""Active patient in the emulated robot: muscles at the sagittal hip (SH) and sagittal knee (SK) track the gait of the swing leg.
+"""Active patient in the emulated robot: muscles make hip and knee of the swing leg follow the nominal step.
+
+The muscles act at the sagittal hip (SH) and the sagittal knee (SK).
 
     joint angles, landings -> perceived error -> feedback with a delay + learned torque -> muscles -> torque, work
 
@@ -32,7 +34,8 @@ _SH, _SK, _LEG = LEG_JOINTS.index("SH"), LEG_JOINTS.index("SK"), len(LEG_JOINTS)
 #: exceeds `_STANDING`. During the walk, a foot is in the air when its load is below `_AIR`, and lands when its load exceeds
 #: `_LANDED`.
 _STANDING, _AIR, _LANDED = 0.25, 0.02, 0.1
-#: Indices in MOTORS of the motors on the front and the back of thigh and shank, per leg.
+#: `_MOTORS[leg][segment]` contains the indices of two vibration motors in MOTORS: front and back of the segment.
+#: The legs are left and right. The segments are thigh and shank.
 _MOTORS = [
     [
         [MOTORS.index(f"{side.lower()}_{segment}_{where}") for where in ("front", "back")]
@@ -52,10 +55,10 @@ class ActiveParameters:
         ValueError: If a parameter is out of range.
     """
 
-    #: feedback torque per perceived error [Nm/rad]: the stiffness of a person who resists a motion
+    #: Feedback torque per perceived error [Nm/rad]: the stiffness of a person who resists a motion.
     gain: Pair = (150.0, 80.0)
-    damping: Pair = (15.0, 8.0)  # feedback torque per rate of the error [Nm s/rad]
-    #: time from an error to the voluntary reaction [s] (kinaesthetic reaction times are 0.12 to 0.18 s)
+    damping: Pair = (15.0, 8.0)  # feedback torque per rate of the joint angle error [Nm s/rad]
+    #: Time from a joint angle error to the voluntary reaction [s]. Kinaesthetic reaction times are 0.12 to 0.18 s.
     delay: float = 0.15
     #: Largest joint angle error that the patient does not perceive [rad].
     #: The threshold at hip and knee is one to two degrees (Domingo, Lam, J. NeuroEng. Rehabil. 11, 2014).
@@ -64,13 +67,15 @@ class ActiveParameters:
     learning: float = 0.1
     forgetting: float = 0.95  # fraction of the learned torque that remains in the next step of the same leg
     noise: float = 0.1  # standard deviation of the noise torque, as a fraction of the torque (signal-dependent noise)
-    noise_time: float = 0.1  # correlation time of the noise [s]
-    activation: float = 0.05  # time constant from excitation to torque [s] (Zajac, Crit. Rev. Biomed. Eng. 17, 1989)
+    noise_time: float = 0.1  # correlation time of the noise torque [s]
+    #: Time constant with which the muscle torque follows the torque that the patient wants [s].
+    #: Source: Zajac, Crit. Rev. Biomed. Eng. 17, 1989.
+    activation: float = 0.05
     #: Largest voluntary flexion torque of each joint, divided by mass * gravity * height. Flexion is the weaker direction.
     #: Source: Anderson, Madigan, Nussbaum, J. Biomech. 40, 2007.
     strength: Pair = (0.113, 0.087)
     fraction: float = 1.0  # strength of this patient as a fraction of the strength of an able-bodied person
-    #: Amplitude from which the patient feels a vibration motor, 0 to 1. With infinity, the patient feels no motor.
+    #: Smallest amplitude (0 to 1) at which the patient feels a vibration motor. With infinity, the patient feels no motor.
     #: While the patient feels a motor of the thigh, the patient perceives every error of the hip angle, however small.
     #: While the patient feels a motor of the shank, the patient perceives every error of the knee angle.
     vibration: float = math.inf
@@ -95,7 +100,8 @@ class ActiveTask:
 
     mass: float  # mass of the patient [kg]
     height: float  # height of the patient [m]
-    #: nominal hip and knee angles of the swing leg, shape (n + 1, 2) [rad]: one row per cycle, row 0 and row n are at landings
+    #: Hip and knee angles that the swing leg must track, shape (n + 1, 2) [rad]. Row k is for cycle k of the step.
+    #: In row 0 the other foot has just landed. In row n the foot of the swing leg lands.
     swing: Sequence[Pair]
     seed: int = 0
     parameters: ActiveParameters = ActiveParameters()
@@ -137,14 +143,17 @@ class ActivePatient:
         cycles = len(self._nominal)
         self._delay = round(parameters.delay / PERIOD)
         self._lag = PERIOD / (parameters.activation + PERIOD)
-        self._learned = np.zeros((len(SIDES), cycles, 2))
-        self._plan = np.zeros((cycles, 2))  # learned torque of the current step, without noise
-        self._wobble = np.ones((cycles, 2))  # noise factor of the torque in the current step
+        # In the following arrays, index k of the dimension `cycles` is cycle k of a step. The last dimension is hip, knee.
+        self._learned = np.zeros((len(SIDES), cycles, 2))  # learned torque of each leg [Nm]
+        self._plan = np.zeros((cycles, 2))  # learned torque of the current swing leg [Nm]
+        self._wobble = np.ones((cycles, 2))  # factor with mean 1 on the wanted torque: 1 + noise
+        #: Nominal minus true joint angle [rad], and the rate of this error [rad/s].
         self._error, self._slope = np.zeros((cycles, 2)), np.zeros((cycles, 2))
-        #: Threshold of perception in each cycle of the step.
+        #: Largest joint angle error that the patient does not perceive in each cycle [rad].
         self._threshold = np.full((cycles, 2), parameters.threshold)
         self._amplitude = np.zeros(len(MOTORS)) if amplitude is None else amplitude
-        self._swing, self._cycle, self._ready = -1, 0, 0  # `_swing` is -1 before the first landing: no muscle acts
+        # `_swing` is the swing leg (0 left, 1 right), or -1 before the first landing. With -1, no muscle acts.
+        self._swing, self._cycle, self._ready = -1, 0, 0
         self._air = [False] * len(SIDES)
         self._weight = body.mass * GRAVITY
         self.muscle = np.zeros(len(SIDES) * _LEG)
@@ -199,7 +208,11 @@ class ActivePatient:
         self._wobble = 1.0 + self._p.noise * self._noise(len(self._nominal))
 
     def _learn(self, cycles: int) -> None:
-        """Update the learned torque of the last swing leg from the errors in the first `cycles` cycles of its step."""
+        """Update the learned torque of the leg `_swing` from the joint angle errors of its completed step.
+
+        Args:
+            cycles: number of cycles of the step for which errors were recorded.
+        """
         felt = np.zeros_like(self._error)
         felt[:cycles] = _perceived(self._error[:cycles], self._threshold[:cycles])
         self._learned[self._swing] *= self._p.forgetting
@@ -215,7 +228,10 @@ class ActivePatient:
         return np.column_stack([np.convolve(white[:, k], kernel, "valid") for k in range(2)])
 
     def _excite(self, position: Vector, velocity: Vector) -> Pair:
-        """Return the excitation of sagittal hip and knee of the swing leg as torques [Nm], and advance the step by one cycle."""
+        """Return the torques that the patient wants at hip and knee of the swing leg [Nm].
+
+        Advance the step by one cycle. The muscles follow the wanted torques with a lag.
+        """
         cycle = self._cycle
         if self._swing < 0 or cycle >= len(self._nominal):
             return 0.0, 0.0

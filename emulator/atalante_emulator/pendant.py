@@ -25,7 +25,7 @@ class Request(IntEnum):
 
 
 class PendantSignals(NamedTuple):
-    """Signals of the message `PENDANT_STATE`. If `assistance_factor` is None, the HAL keeps its own factor."""
+    """Signals of the message `PENDANT_STATE`. If `assistance_factor` is None, the factor of the HAL stays unchanged."""
 
     dead_man: bool = True
     request: Request = Request.NONE
@@ -46,7 +46,7 @@ class Operator:
         """Press the dead-man switch and set the dial.
 
         Args:
-            assistance_factor: assistance factor Xi on the dial, 0 to 1. With None, the HAL keeps its own factor.
+            assistance_factor: assistance factor Xi on the dial, 0 to 1. With None, the factor of the HAL stays unchanged.
             starts: whether the operator presses START when the HAL is in READY.
 
         Raises:
@@ -54,7 +54,7 @@ class Operator:
         """
         self._starts = starts
         self._ready_for = 0
-        #: Signals that the node sends. Every change creates a new object.
+        #: Signals that the pendant node sends. A change replaces the whole object, so the node finds a change with `is`.
         self.signals = PendantSignals()
         self.assist(assistance_factor)
 
@@ -62,7 +62,7 @@ class Operator:
         """Turn the assistance dial.
 
         Args:
-            factor: assistance factor Xi, 0 to 1. With None, the HAL keeps its own factor.
+            factor: assistance factor Xi, 0 to 1. With None, the factor of the HAL stays unchanged.
 
         Raises:
             ValueError: If the factor is outside [0, 1].

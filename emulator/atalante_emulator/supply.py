@@ -31,7 +31,9 @@ class HoldUp:
         self._energy = 0.5 * capacity * voltage**2
 
     def draw(self, torque: Vector, speed: Vector) -> float:
-        """Take the energy of one `PERIOD` out of the DC link, and return its voltage [V]. Braking motors return no energy.
+        """Take the energy of one control cycle (`PERIOD`, 1 ms) out of the DC link, and return the voltage of the DC link [V].
+
+        Braking motors return no energy.
 
         Args:
             torque: motor torques, shape (12,) [Nm at the joint].

@@ -36,7 +36,7 @@ class Intervention:
 
 
 class VirtualOperator:
-    """Person who steadies the pelvis. Each call advances the operator by one `PERIOD` and returns the wrench on the pelvis."""
+    """Person who steadies the pelvis. Each call is one control cycle (1 ms) and returns force and moment on the pelvis."""
 
     def __init__(self, body: Body, most: float) -> None:
         """Connect the operator to a body.

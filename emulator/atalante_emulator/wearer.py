@@ -55,7 +55,7 @@ class PassiveWearer:
         self._damping = np.array(parameters.damping * both)
         self._offset = self._stiffness * np.array(parameters.rest * both)
         self._impedance = compiled(_impedance)
-        # Compile the kernel now, because compilation takes longer than a cycle.
+        # Compile `_impedance` now. In the first control cycle, the compilation would take too long.
         self.act(*np.zeros((3, len(JOINTS))))
 
     def act(self, position: Vector, velocity: Vector, torque: Vector) -> None:

@@ -85,7 +85,7 @@ def test_lowest_corner_of_a_tilted_sole_is_at_its_low_edge() -> None:
 @pytest.mark.parametrize(
     ("reference", "sentence"),
     [
-        ("child link=", "must be the child link of a joint with an origin, got no such joint"),
+        ("child link=", "must be attached by a joint with an origin, got no such joint"),
         ("link name=", "must be a link with a collision sphere, got no such link"),
     ],
 )

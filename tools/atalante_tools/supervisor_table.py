@@ -17,7 +17,7 @@ from atalante_hal.types import SupervisorState
 
 #: Conditions of normal operation: no fault, the dead-man switch is pressed, and the operator requests no change.
 WELL: Final = Conditions(nodes_ready=True, drives_enabled=True, dead_man=True)
-#: Rows of the first table: description, and conditions of the state machine. No diagnostic is active.
+#: Rows of the first table, each as (text for the reader, inputs of the state machine). The inputs contain no diagnostic.
 FACTS: Final = (
     ("nothing", WELL),
     ("a node is missing or not trusted", replace(WELL, nodes_ready=False)),

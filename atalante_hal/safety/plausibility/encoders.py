@@ -41,7 +41,8 @@ from atalante_hal.wire.process_image import NEVER
 
 #: Number of consecutive rejected positions of an encoder after which ENC_JUMP is confirmed.
 JUMPS_TO_CONFIRM = 5
-#: Overspeed is confirmed after this number of consecutive values above the top speed. A single such value may be a small jump.
+#: Overspeed is confirmed after this number of consecutive velocities above the top speed.
+#: A single velocity above the top speed may come from a small jump of the encoder.
 OVERSPEED_TO_CONFIRM = 2
 #: Number of consecutive wrong velocities of a drive after which ENC_VELOCITY is raised.
 VELOCITY_SAMPLES = 3
@@ -96,7 +97,8 @@ class EncoderChecks:
         self._polarity = robot.polarity.tolist()
         self._period, self._every = period, every
         self._keep = math.exp(-2.0 * math.pi * robot.sensors.velocity_bandwidth * period)
-        #: Encoder velocities after the low-pass, and reported velocities minus these encoder velocities [rad/s].
+        #: `_filtered`: velocity of each encoder, computed from its positions, after the low-pass [rad/s].
+        #: `_deviation`: velocity reported by each drive minus `_filtered` [rad/s].
         self._filtered, self._deviation = np.zeros((2, len(JOINTS)))
         self._speed = np.zeros(len(JOINTS))  # mean velocity of each encoder between its last two good positions [rad/s]
         self._earlier = np.zeros(len(JOINTS))  # `_deviation` at the last velocity check [rad/s]

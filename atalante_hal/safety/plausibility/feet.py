@@ -26,9 +26,9 @@ from atalante_hal.safety.plausibility.finding import FOOT_NODES, Signals
 
 #: A cell is reported as faulty after it has contradicted the other cells for this time [cycles].
 CELL_CYCLES = 256
-#: After both feet have carried load together for this time [cycles], it is a fault if both feet swing for too long.
+#: The check for two swinging feet begins when both feet have carried load together for this time [cycles].
 STANDING_CYCLES = 500
-#: Longest plausible time in which both feet swing [cycles]. If a foot lands late in a walk, both feet swing for 30 cycles.
+#: It is a fault if both feet swing for this time [cycles]. If a foot lands late in a walk, both feet swing for 30 cycles.
 SWING_CYCLES = 60
 #: After this time without ground contact [cycles], the robot is regarded as lifted on purpose.
 LIFTED_CYCLES = 140
@@ -51,16 +51,16 @@ class FootChecks:
         self._free_squared = self._free**2
         #: Index of the swing leg in FEET; None unless exactly one foot is on the ground.
         self.swing: int | None = None
-        self._swinging = LIFTED_CYCLES  # time since a foot was last on the ground [cycles]
+        self._swinging = LIFTED_CYCLES  # time for which no foot has been on the ground [cycles]
         self._standing = 0  # time for which both feet have been on the ground [cycles]
-        # True from the time when the robot stood on both feet until it is lifted. Only then is a long swing of both feet a fault.
+        # True if the check for two swinging feet is active: after the robot stood on both feet, until the robot is lifted.
         self._armed = False
         # Time for which the cells of each foot have contradicted each other [cycles].
         self._contradicts = [0] * len(FEET)
-        #: Foot -> difference of the forces on its two diagonals [N], and index of the faulty cell (None if it is unknown).
+        #: Foot with contradicting cells -> force FL + RR - FR - RL [N], and index of the faulty cell (None if it is unknown).
         self._twisted: dict[int, tuple[float, int | None]] = {}
-        self._pulls = [0] * len(FEET)  # time for which the floor has seemed to pull each foot [cycles]
-        self._pulled: dict[int, float] = {}  # foot -> sum of its vertical forces [N], if the floor seems to pull it
+        self._pulls = [0] * len(FEET)  # time for which each foot has reported an impossible pull of the floor [cycles]
+        self._pulled: dict[int, float] = {}  # foot that reports a pull for too long -> sum of its vertical forces [N]
 
     def evaluate(self, updated: tuple[bool, bool]) -> bool:
         """Check the vertical forces of both feet.

@@ -40,8 +40,8 @@ from atalante_hal.wire.process_image import NEVER
 #: Number of samples in each mean. Before this number is reached, a mean is over all samples since the start.
 SAMPLES = 64
 #: For each IMU: number of samples after which its means are first compared with their limits.
-#: A few samples are enough for the trunk, so a faulty IMU of the trunk is found before READY.
-#: The tibiae accelerate before READY, because the drives are off and bent legs sink. A mean over more samples tolerates this.
+#: Torso and pelvis need only 4 samples, so their faults are found before READY.
+#: The tibiae need more samples, because they accelerate before READY: the drives are off, and bent legs sink.
 FIRST_SAMPLES = (4, 4, 16, 16)
 GRAVITY = 9.81  # m/s2
 #: Limit of the mean difference between specific force and gravity [m/s2]. A healthy robot reaches 2.2 m/s2 in walks and falls.
@@ -51,9 +51,10 @@ _FORCE_CLIP = 5.0
 #: If an IMU turns faster than this [rad/s], its specific force is not compared with gravity.
 #: Fast motions cause large accelerations, for example when the drives are switched off and the legs fall to their end stops.
 _MOVING_RATE = 0.5
-#: Largest root mean square of the difference between two measurements of one angular velocity, if the IMU does not turn [rad/s].
+#: Gyroscope and change of attitude must show the same angular velocity: at rest, with an rms difference of at most this [rad/s].
+#: The same limit applies to the gyroscopes of torso and pelvis.
 _RATE_ERROR = 0.1
-#: If the IMU turns, the limit of the mean square difference is _RATE_ERROR^2 + _RATE_SHARE * mean square angular velocity.
+#: While an IMU turns, its rms difference may be larger: the limit is sqrt(_RATE_ERROR^2 + _RATE_SHARE * mean square of its rate).
 _RATE_SHARE = 0.25
 _TORSO, _PELVIS = IMUS.index("torso"), IMUS.index("pelvis")
 
@@ -73,21 +74,21 @@ class Record(NamedTuple):
     gyro: Vector  # (4, 3) angular velocity in the last sample [rad/s]
     age: Cycles  # (4,) age of the last sample [cycles]; `NEVER` if it must not be used
     #: Number of samples in each mean, at most `SAMPLES`, shape (9,).
-    #: Elements: angular velocity of each IMU (4), comparison of torso and pelvis (1), specific force of each IMU (4).
+    #: Elements 0 to 3: gyroscope checks of the IMUs; 4: check of torso against pelvis; 5 to 8: accelerometer checks of the IMUs.
     samples: Vector
     force: Vector  # (4, 3) mean difference between specific force and gravity, in world axes [m/s2]
-    #: Mean square of the difference of two measurements of one angular velocity, shape (5, 3) [rad2/s2].
-    #: Rows: gyroscope against change of attitude of each IMU (4), gyroscope of the torso against gyroscope of the pelvis (1).
+    #: Mean square difference between two angular velocities that must be equal, about three axes, shape (5, 3) [rad2/s2].
+    #: Rows 0 to 3: gyroscope minus change of attitude of each IMU; row 4: gyroscope of the torso minus gyroscope of the pelvis.
     rate_error: Vector
-    rate: Vector  # (5, 3) mean square of the angular velocity [rad2/s2], with the rows of `rate_error`
-    tilt: Vector  # (3,) mean difference of the upward directions of torso and pelvis
+    rate: Vector  # (5, 3) mean square of the angular velocity [rad2/s2]; rows and columns as in `rate_error`
+    tilt: Vector  # (3,) mean of the unit vector upwards in torso axes minus the same vector in pelvis axes
 
 
 class Excess(NamedTuple):
     """Values that exceed their limits. A value within its limit is replaced by 0."""
 
-    force: Vector  # (4,) mean difference between specific force and gravity [m/s2]
-    rate: Vector  # (5,) rms error of the angular velocity about the worst axis [rad/s]; rows as in `Record.rate_error`
+    force: Vector  # (4,) magnitude of the mean difference between specific force and gravity [m/s2]
+    rate: Vector  # (5,) largest rms difference in each row of `Record.rate_error` [rad/s]
     tilt: Vector  # (1,) angle between the upward directions of torso and pelvis [rad]
 
 
@@ -114,7 +115,7 @@ class Inertial:
         )  # fmt: skip
         self._intervals = itertools.cycle(intervals)
         self._interval = 0  # time since the last call of `evaluate` [cycles]
-        #: Arguments of the function `follow` besides the ages and the interval. The array objects are the same in every call.
+        #: Arguments of the function `follow` after the ages and the interval. The array objects are the same in every call.
         self._readings = (
             Readings(now.quaternion, now.gyro, now.accel), record, self._excess, limits,
             period, 2.0 * robot.sensors.attitude_error,
@@ -218,7 +219,7 @@ def add(imu: int, now: Readings, record: Record, time: float) -> None:
 
 
 def compare(now: Readings, record: Record) -> None:
-    """Update the running means of the differences between torso IMU and pelvis IMU: vertical direction and angular velocity.
+    """Add a sample to the means that compare torso and pelvis: vertical direction and angular velocity.
 
     Args:
         now: readings of the sample.
@@ -289,7 +290,9 @@ def beyond(value: float, limit: float) -> float:
 
 
 def wrong_rate(record: Record, row: int) -> float:
-    """Return the rms error of an angular velocity about the worst axis [rad/s]; 0 if no axis exceeds its limit.
+    """Return the largest rms difference in one row of `Record.rate_error` [rad/s].
+
+    Only axes above their limit count. The result is 0 if no axis is above its limit.
 
     Args:
         record: means.
@@ -327,7 +330,9 @@ def to_world(quaternion: Vector, vector: Vector | tuple[float, float, float]) ->
 
 
 def turn_rate(first: Vector, last: Vector, time: float) -> tuple[float, float, float]:
-    """Return the mean angular velocity between two attitudes, in the sensor frame, to first order [rad/s].
+    """Return the mean angular velocity between two attitudes, in the sensor frame [rad/s].
+
+    For a turn by the angle t, the magnitude is 2 sin(t / 2) / time, which is exact only for small angles.
 
     Args:
         first: first attitude, quaternion wxyz, sensor to world, shape (4,).
@@ -336,7 +341,8 @@ def turn_rate(first: Vector, last: Vector, time: float) -> tuple[float, float, f
     """
     a, b, c, d = first[0], first[1], first[2], first[3]
     e, f, g, h = last[0], last[1], last[2], last[3]
-    # Attitude of the last sample relative to the first one: conj(first) * last. Both signs of a quaternion are the same attitude.
+    # (x, y, z) is the vector part of the quaternion conj(first) * last, the turn between the attitudes. `factor` has the sign of
+    # the scalar part, because a quaternion and its negative are the same attitude.
     factor = math.copysign(2.0 / time, a * e + b * f + c * g + d * h)
     x = a * f - b * e - c * h + d * g
     y = a * g + b * h - c * e - d * f

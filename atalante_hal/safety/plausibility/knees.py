@@ -34,30 +34,30 @@ from atalante_hal.safety.plausibility.support import SEGMENT
 from atalante_hal.types import Vector
 from atalante_hal.vectors import Vector3
 
-#: Pelvis IMU in the pelvis frame [m].
+#: Position (x, y, z) of the pelvis IMU in the pelvis frame [m].
 PELVIS_IMU = (-0.164, -0.015, 0.191)
 #: Position y of joint FH of the left leg in the pelvis frame [m]. Its x and z are 0.
 FRONTAL_HIP = 0.089
 #: Position (x, y) of joint TH of the left leg relative to joint FH, in the axes of the frontal hip [m].
-#: `motion` also uses the distance 0.135 m for joint SH, which is in front of joint TH in the axes of the transverse hip.
+#: Joint SH is 0.135 m in front of joint TH in the axes of the transverse hip, so `motion` uses -x as this distance.
 TRANSVERSE_HIP = (-0.135, 0.169)
 #: Position (x, y, z) of the left tibia IMU in the axes of the tibia [m].
 #: Each coordinate has its own origin: x is relative to joint SK, y to joint SH, and z to joint SA.
 TIBIA_IMU = (-0.13, -0.069, 0.018)
-#: Time constant of the low-passes [s]. Both the integration of the accelerations and the high-passes are built from low-passes.
+#: Time constant of the low-passes [s]. Two low-passes in a row replace the double integration of an acceleration.
+#: A high-pass is the input minus a low-pass.
 _FILTER_TIME = 0.15
 #: Time constant of the mean values `Filters.moments` [s].
 _MEAN_TIME = 0.75
 #: Time that the filters need to settle after the start [s]. `Filters.moments` is updated only after this time.
 _SETTLING_TIME = 2.0
-#: The error of a knee angle is computed only if the root mean square of the lever exceeds this value [m/rad].
-#: The lever is the filtered value s of `Filters`, after the correction for the segment length in `knee_error`.
-#: In a walk, the root mean square of this lever is about 0.012 m/rad.
+#: While the thigh hardly turns, no error of a knee angle is computed: the rms of u must exceed this [m/rad].
+#: u in `knee_error` is the filtered motion of the tibia IMU per radian of knee error. In a walk, its rms is about 0.012 m/rad.
 _LEAST_LEVER = 0.007
-#: An error of a knee angle is reported only if it explains more than this share of the mean square of the position difference.
-#: The position difference is the filtered value d of `Filters`, after the correction for the segment length in `knee_error`.
+#: An error of a knee angle is reported only if it explains more than this share of the mean square of v.
+#: v in `knee_error` is the filtered position of the tibia IMU, measured minus computed, without the effect of segment lengths.
 _SHARE = 0.25
-#: Number of filters of each leg and axis.
+#: Number of low-passes for each axis of a leg.
 _FILTERS = 11
 _PELVIS = IMUS.index("pelvis")
 _TIBIA = IMUS.index("left_tibia")
@@ -115,12 +115,14 @@ class Knees:
         self._found: dict[int, Finding] = {}
 
     def restart(self) -> None:
-        """Restart the filters, because signals of the check were too old."""
+        """Restart the filters."""
         for values in self._filters:
             values.fill(0.0)
 
     def reference(self, leg: int) -> None:
-        """Forget the finding of a leg, because the encoder of its SH or SK has been referenced.
+        """Forget the finding of a leg, after the drive of joint SH or SK has restarted.
+
+        A restarted drive references its encoder again, so the old finding no longer applies.
 
         Args:
             leg: index of the leg in SIDES.
@@ -206,7 +208,7 @@ def knee_error(moments: Vector, limit: float, before: float) -> float:
         before: last result, which is returned if the thigh does not turn [rad].
     """
     ss, sg, gg, sd, gd, dd = moments[0], moments[1], moments[2], moments[3], moments[4], moments[5]
-    # Mean products of u and v, all multiplied by gg to avoid divisions.
+    # Means of u * u, u * v and v * v (see the docstring), each multiplied by gg to avoid divisions.
     uu, uv, vv = ss * gg - sg * sg, sd * gg - sg * gd, dd * gg - gd * gd
     if uu <= _LEAST_LEVER**2 * gg:
         return before
@@ -233,8 +235,8 @@ def motion(leg: int, now: Readings) -> tuple[Vector3, Vector3, Vector3, Vector3]
     x, y = TRANSVERSE_HIP[0] * (1.0 - math.cos(th)), side * TRANSVERSE_HIP[1] - TRANSVERSE_HIP[0] * math.sin(th)
     y, z = y * math.cos(fh) + side * FRONTAL_HIP, y * math.sin(fh)
     hip = x - PELVIS_IMU[0], y - PELVIS_IMU[1], z - PELVIS_IMU[2]
-    # `hip_to_imu` is the vector from joint SH to the tibia IMU, in the axes of the tibia. In these axes, the unit vector from hip
-    # to knee is (sine, -cosine), and the unit vector from knee to ankle is (0, -1). (x, z) is the sum of both.
+    # `hip_to_imu` is the vector from joint SH to the tibia IMU, in the axes of the tibia.
+    # (x, z) is the direction from hip to knee, (sine, -cosine), plus the direction from knee to ankle, (0, -1).
     sine, cosine = math.sin(sk), math.cos(sk)
     x, z = sine, -1.0 - cosine
     hip_to_imu = SEGMENT * x + TIBIA_IMU[0], side * TIBIA_IMU[1], SEGMENT * z + TIBIA_IMU[2]
@@ -261,12 +263,12 @@ def low_pass(low: Vector, index: int, share: float, value: float) -> float:
 
 
 def high_pass(low: Vector, index: int, share: float, value: float) -> float:
-    """Update a high-pass of first order, which is the input minus a low-pass, and return its output. See `low_pass`."""
+    """Update a high-pass of first order, and return its output: the input minus the output of `low_pass`."""
     return value - low_pass(low, index, share, value)
 
 
 def high_pass_3(low: Vector, index: int, share: float, value: float) -> float:
-    """Update a high-pass of third order with three low-passes, and return its output. See `low_pass`."""
+    """Update a high-pass of third order, which is three times `high_pass` in a row, and return its output."""
     return high_pass(low, index, share, high_pass(low, index + 1, share, high_pass(low, index + 2, share, value)))
 
 

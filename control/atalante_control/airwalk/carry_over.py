@@ -1,6 +1,9 @@
-"""Carry-over of the torque at a stance change: the torque jump is compensated, and the compensation fades out.
+"""Carry-over: a torque added to the command after a stance change, so that the command does not jump.
 
 `torque before the stance change, torque of the new control law -> continuous torque`
+
+Example: the torque is 10 Nm before the stance change, and the new control law computes 14 Nm. The controller adds -4 Nm in the
+first cycle. The added torque then fades out to 0 Nm.
 """
 
 from __future__ import annotations
@@ -17,28 +20,28 @@ from atalante_hal.types import Vector
 
 
 class Carry:
-    """State of the carry-over of the torque: torque before the stance change, and torque jump to compensate."""
+    """State of the carry-over: torque before the stance change, and torque to add after the stance change."""
 
     pending: bool  # true until the first torque after the stance change is computed
     before: Annotated[Vector, len(JOINTS)]  # Nm, torque before the stance change
-    #: Nm, torque before the stance change minus first torque after the stance change
+    #: Nm, torque to add in the first cycle after the stance change: `before` minus the computed torque of the first cycle
     carried: Annotated[Vector, len(JOINTS)]
 
 
 class CarryOver:
-    """Carry-over of the torque, which keeps the command continuous at a stance change.
+    """Carry-over: adds a torque after a stance change, so that the torque command does not jump.
 
     Attributes:
         records: record that `add_carried` reads and updates, shape (1,).
-        blend: fade-out of the compensation, shape (n,). Element i is the share of the torque jump that is compensated in
-            cycle i after the stance change. The share falls from 1 towards 0.
+        blend: fade-out of the added torque, shape (n,). Element i is the fraction of `Carry.carried` that is added in cycle i
+            after the stance change. The fraction falls from 1 towards 0.
     """
 
     def __init__(self, duration: float) -> None:
         """Compute the fade-out `blend`, and create the record of the state.
 
         Args:
-            duration: time in which the compensation of the torque jump fades out [s]. With 0, the jump is not compensated.
+            duration: time in which the added torque fades out [s]. With 0, no torque is added, and the command can jump.
         """
         cycles = round(duration / PERIOD)
         self.blend: Vector = 0.5 + 0.5 * np.cos(math.pi * np.arange(cycles) / max(1, cycles))
@@ -46,11 +49,11 @@ class CarryOver:
 
     @property
     def pending(self) -> bool:
-        """Return whether a carry-over has started but the first torque after the stance change is not computed yet."""
+        """Return whether the next call of `add_carried` computes a new added torque."""
         return bool(self.records[0].pending)
 
     def start(self, before: Vector) -> None:
-        """Start the carry-over of the torque, at a stance change or at the start of the motion.
+        """Start a carry-over, at a stance change or at the start of the motion.
 
         Args:
             before: torque before the stance change, shape (12,) [Nm]; copied.
@@ -59,14 +62,18 @@ class CarryOver:
         carry.before[:], carry.pending = before, True
 
     def cancel(self) -> None:
-        """Cancel a carry-over that was started but not applied yet. A fade-out that has begun does not change."""
+        """Cancel the last `start`, if `add_carried` has not been called since.
+
+        If the added torque already fades out, it continues to fade out.
+        """
         self.records[0].pending = False
 
 
 def add_carried(carries: Records[Carry], blend: Vector, cycle: int, torque: Vector) -> None:
-    """Add the opposite of the torque jump at the stance change to the torque command, so that the command does not jump.
+    """Add a torque to the torque command, so that the command does not jump at a stance change.
 
-    The first call after a stance change computes the added torque. In later calls, the added torque fades out.
+    The first call after a stance change computes the added torque: torque before the stance change minus `torque`. In later
+    calls, the added torque fades out.
 
     Args:
         carries: `CarryOver.records`; `pending` is set to False.

@@ -18,15 +18,16 @@ class AirwalkConfig(StepGuideConfig):
         ValueError: If a parameter is out of range.
     """
 
-    #: Whether the assisted joints and the baseline controller follow the paper literally, see `guide.literal`.
-    #: If true, there is no proof that the joints stay inside the guide when a disturbance torque acts.
+    #: Whether the assistive torque follows the formulas of the paper (`guide.literal`) and the baseline adds no gravity torque.
+    #: If true, it is not proven that the joints stay inside the guide when a disturbance torque acts.
     literal_law: bool = False
     gains: PidGains = AIR_GAINS
-    alpha: float = 0.4  # end of the re-centring (see `gait.recentering`), as a fraction of the step duration
-    flat_foot: bool = True  # whether the ankle of the swing leg holds the sole level
+    #: fraction of the step duration after which the desired trajectory is the nominal trajectory again, see `gait.recentering`
+    alpha: float = 0.4
+    flat_foot: bool = True  # whether the ankle of the swing leg keeps the sole horizontal
     ankle_offset: float = math.radians(1.0)  # rad, offset added to the desired angles of both sagittal ankles
     startup: float = 2.0  # s, shortest duration of the motion from the measured pose to the first pose of the gait
-    #: s, time in which the compensation of a torque jump fades out (see `carry_over`), or 0 for no compensation
+    #: s, fade-out time of the torque that prevents a jump at a stance change (`carry_over`); with 0, the torque can jump
     blend: float = 0.02
 
     def __post_init__(self) -> None:
@@ -50,6 +51,6 @@ class AirwalkConfig(StepGuideConfig):
             literal_law=True,
             gains=replace(AIR_GAINS, integral_limit=math.inf),
             feedforward=0.0,  # the paper used no feedforward in its experiment in the air
-            gentler=(),  # the guide filter has only the stiffest set of gains
-            blend=0.0,  # torque jumps at stance changes are not compensated
+            gentler=(),  # only the stiffest backup gains are used, no softer ones
+            blend=0.0,  # the torque can jump at a stance change
         )

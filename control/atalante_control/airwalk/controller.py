@@ -178,9 +178,10 @@ class AirwalkController:
             self._guides.prepare()
 
     def choice(self, xi: float) -> Choice:
-        """Return the guide filter that is used at an assistance factor, together with its certified disturbance torques.
+        """Return the guide filter for an assistance factor, and the promise of this filter.
 
-        The certified torques are expressed as a fraction of the requested disturbance torques.
+        The promise is a fraction of the requested disturbance torques (`config.promise`). The guide filter is certified for this
+        fraction.
 
         Args:
             xi: assistance factor in [0, 1].
@@ -189,9 +190,9 @@ class AirwalkController:
 
     @property
     def blend(self) -> Vector:
-        """Return how the torque jump at a stance change fades out, shape (n,).
+        """Return the fade-out of the torque that is added after a stance change (carry-over), shape (n,).
 
-        Element i is the share of the torque jump that is compensated in cycle i after the stance change.
+        Element i is the fraction of this torque that is still added in cycle i after the stance change.
         """
         return self._carry.blend
 

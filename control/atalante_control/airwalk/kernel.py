@@ -43,12 +43,12 @@ class Parts(NamedTuple):
     links: Records[LinkRecord]  # (n,) links of the exoskeleton, see `Gravity.links`
     pids: Records[PidRecord]  # (1,) gains and integral torques of the PIDs, see `Pid.records`
     ankles: Records[Ankle]  # (2,) left and right ankle, see `LevelFeet.ankles`
-    #: (n, 4) c0, c1, c0', c1' in each cycle of a step, see `LevelFeet.cubics`. After a stance change, the cubics c0 and c1 fade
-    #: out the deviations of ankle angle and ankle speed.
+    #: (n, 4) row i: basis cubics c0 and c1 of the re-centring and their derivatives c0' and c1' in cycle i of a step.
+    #: With c0 and c1, the ankle deviations at the stance change fade out, see `LevelFeet.cubics`.
     cubics: Vector
-    literal: LiteralTables  # tables of the literal control law, see `LiteralGuide.tables`
-    carries: Records[Carry]  # (1,) state of the carry-over, see `CarryOver.records`
-    blend: Vector  # (n,) fraction of the torque jump that is still compensated in each cycle after a stance change
+    literal: LiteralTables  # tables of the control law as printed in the paper, see `LiteralGuide.tables`
+    carries: Records[Carry]  # (1,) torque before and torque added after a stance change, see `CarryOver.records`
+    blend: Vector  # (n,) element i: fraction of `Carry.carried` that is added in cycle i after a stance change
     outputs: Records[Outputs]  # (1,) results of the cycle
     telemetry: Records[Telemetry]  # (1,) telemetry of the cycle
 

@@ -1,6 +1,9 @@
-"""Desired trajectories of the airwalk controller: start motion, then q_des = q_nom + s (nominal plus re-centring) in every step.
+"""Desired joint trajectories of the airwalk controller: first a start motion, then one trajectory for each step.
 
 `gait, measured pose at the stance change -> row (q_des, q_des') of each cycle`
+
+In a step, q_des = q_nom + s. q_nom is the nominal trajectory of the gait. The offset s begins with the measured deviation from
+q_nom at the stance change, and then fades out to zero (re-centring).
 """
 
 from __future__ import annotations
@@ -51,15 +54,14 @@ class GaitReference:
         time: Vector = np.arange(gait.cycles + 1, dtype=np.float64) * PERIOD
         (c0, c1), (c0d, c1d), _ = deadbeat.basis(time)
         end = self._end = int(np.searchsorted(time, deadbeat.end))
-        #: Offset s from the nominal angles and its rate s' in each cycle of the re-centring, for a deviation of 1 at its start.
-        #: Element 0 is for the angle deviation s(0) = 1 rad, element 1 for the speed deviation s'(0) = 1 rad/s.
-        #: Shape (2, cycles, 24): 12 columns s, then 12 columns s'.
+        #: (2, cycles, 24) offset s from q_nom (columns 0 to 11) and rate s' (columns 12 to 23) in each cycle of the re-centring.
+        #: Element 0 begins with s(0) = 1 rad and s'(0) = 0, element 1 with s(0) = 0 and s'(0) = 1 rad/s.
         self._basis = np.zeros((2, end, 2 * _N))
         self._basis[0, :, :_N], self._basis[0, :, _N:] = c0[:end, None], c0d[:end, None]
         self._basis[1, :, :_N], self._basis[1, :, _N:] = c1[:end, None], c1d[:end, None]
         self._added = np.zeros_like(self._basis)
-        # `_angles` and `_rates` contain the measured deviations of the 12 joints, s(0) and s'(0).
-        # Each value is stored twice, so that one product with the 24 columns of `_basis` gives both s and s' of the joint.
+        # `_angles` holds the angle deviations s(0) of the 12 joints twice: for the s columns and for the s' columns of `_basis`.
+        # `_rates` holds the speed deviations s'(0) in the same way.
         self._angles, self._rates = np.zeros(2 * _N), np.zeros(2 * _N)
 
     def start_step(self, stance: int, position: Vector, velocity: Vector) -> Deviation:
@@ -98,11 +100,12 @@ class StartMotion:
     """Quintic trajectory from rest at the measured pose to the first pose and speed of the gait.
 
     Attributes:
-        cycles: duration in cycles. If the configured duration is so short that a joint would exceed `SPEED_SHARE` of its velocity
-            limit, the duration is longer than configured.
+        cycles: duration in cycles. If a joint would move too fast in the configured duration, see `SPEED_SHARE`, the duration is
+            longer than configured.
     """
 
-    #: Largest speed with which a joint covers the distance to the first pose, as a share of its velocity limit.
+    #: Largest speed of a joint on the way to the first pose, as a fraction of the velocity limit of the joint.
+    #: The speed that a joint needs in addition to arrive with the speed of the gait is not limited by `SPEED_SHARE`.
     SPEED_SHARE = 0.5
     #: Largest slope of the quintic 10 x^3 - 15 x^4 + 6 x^5 for x from 0 to 1.
     _STEEPEST = 1.875

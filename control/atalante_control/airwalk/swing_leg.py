@@ -13,7 +13,7 @@ from atalante_control.joint.idealization import AssistedInertia
 from atalante_hal.robot import LEG_JOINTS
 
 _SH, _SK = LEG_JOINTS.index("SH"), LEG_JOINTS.index("SK")
-#: Number of cycles of the next step that the predictions of the guides include.
+#: Number of cycles beyond the end of the step for which the guides predict the motion of the leg.
 OVERLAP = 100
 
 

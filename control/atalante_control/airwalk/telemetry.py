@@ -15,13 +15,17 @@ Pair = tuple[float, float]
 
 
 class Telemetry:
-    """Telemetry of one cycle. Each pair except `guide` has values for sagittal hip and knee of the swing leg."""
+    """Telemetry of one control cycle.
+
+    The two elements of an array with two values are for sagittal hip and knee of the swing leg. Only `guide` has two values of
+    the hip.
+    """
 
     q_des: Annotated[Vector, len(JOINTS)]  # rad, desired joint angles
     error: Annotated[Vector, 2]  # rad, q - q_des
-    q_bound: Annotated[Vector, 2]  # rad, distance from q_des to the guide bound on the side of the error
+    q_bound: Annotated[Vector, 2]  # rad, distance from q_des to the guide bound: upper bound if error > 0, else lower
     guide: Annotated[Vector, 2]  # rad, distances from q_des to upper and lower guide bound of the hip
-    #: h of the paper, the same value for both joints. If h >= 0, the backup policy can keep both joints inside the guide.
+    #: safety value h of the guide filter, equal for hip and knee; h >= 0: the backup policy can keep both inside the guide
     h: Annotated[Vector, 2]
     gate: Annotated[Vector, 2]  # weight of the backup torque, the same value for both joints; published as `lambda`
     filter_active: Annotated[Vector, 2]  # 1 while the guide filter is active, else 0; the same for both joints
@@ -47,7 +51,7 @@ class Step:
     xi: float  # assistance factor Xi of the step
     assisted: bool  # True if hip and knee of the swing leg get the assistive torque; False at assistance factor 1
     intensity: float  # factor of the haptic levels
-    literal: bool  # whether the control law follows the paper literally, see `guide.literal`
+    literal: bool  # whether the torques follow the formulas of the paper, see `AirwalkConfig.literal_law`
     active: float  # weight of the backup torque above which the guide filter counts as active
 
 

@@ -29,17 +29,18 @@ from atalante_hal.types import Vector
 
 FORMAT = "atalante-gait-network/3"
 DEFAULT_NETWORK = Path(__file__).parents[1] / "gaits" / "network.npz"
-#: Inputs of the network in their order: name -> unit. `thigh` and `shank` are lengths divided by the lengths in Winter's table.
+#: Inputs of the network in this order: name -> unit. `thigh` and `shank` are ratios: the segment length of the patient divided by
+#: the segment length that Winter's table of body proportions gives for the height of the patient.
 INPUTS = {"mass": "kg", "height": "m", "step_length": "m", "step_duration": "s", "thigh": "", "shank": ""}
 LEG_SEGMENTS = ("thigh", "shank")  # body segments whose length is an input
 OUTPUTS = len(JOINTS) * (DEGREE + 1)
 LAYERS_MAX = 4
 WIDTH_MAX = 128  # largest number of neurons of a layer
-#: Largest angle jump at the stance change [rad] that is accepted as a rounding error. The limit applies to the bias of the last
-#: layer and to each row of its weights.
+#: rad, a network file is rejected if a joint angle jumps by more than this value at the stance change (rounding tolerance).
+#: The check regards the bias and each weight row of the last layer as the control points of one gait.
 _PERIODICITY_DEFECT = 1e-9
 _ANGLE_MAX = 2.0 * np.pi  # rad, largest accepted absolute value of a control point
-#: Relative tolerance of the range check of the inputs. The inputs `thigh` and `shank` are quotients with rounding errors.
+#: An input may be beyond its range by this fraction of the bound, because the ratios `thigh` and `shank` have rounding errors.
 _ROUNDING = 1e-9
 
 
@@ -61,7 +62,7 @@ class GaitNetwork:
     low: Vector  # smallest valid values of INPUTS, shape (6,)
     high: Vector  # largest valid values of INPUTS, shape (6,)
     layers: tuple[Layer, ...]  # layers in order; tanh follows each layer except the last
-    version: str  # version of atalante-hal that fitted the network
+    version: str  # version of the package atalante-hal with which the network was fitted
 
     def coefficients(self, inputs: Vector) -> Vector:
         """Return the Bezier control points of a right-stance step, without a check of the inputs.
@@ -168,15 +169,15 @@ def subject_of(inputs: Sequence[float]) -> Subject:
 
 
 def periodicity() -> Vector:
-    """Return the matrix A of the conditions A c = 0 for continuity at the stance change, shape (24, 96).
+    """Return the matrix A for which A c = 0 means that a gait is continuous at the stance change, shape (24, 96).
 
-    c is the vector of the control points of all joints, shape (96,). The first 12 rows of A are the conditions on the angles, the
-    last 12 rows are the conditions on the slopes.
+    c is the vector of the control points of all joints, shape (96,). The first 12 elements of A c are the jumps of the joint
+    angles [rad]. The last 12 elements are the jumps of the joint speeds, multiplied by T / 7 [rad] (T is the step duration).
     """
     points = np.arange(OUTPUTS).reshape(len(JOINTS), DEGREE + 1)
     rows = np.zeros((2, len(JOINTS), OUTPUTS))
     for joint, (other, sign) in enumerate(zip(SWAP, SIGN, strict=True)):
-        # The angles must satisfy q(T) = S q(0), where S swaps and mirrors the legs. The slopes must satisfy q'(T) = S q'(0).
+        # Continuity at the stance change: angles q(T) = S q(0), speeds q'(T) = S q'(0). S swaps and mirrors the legs.
         rows[0, joint, points[joint, DEGREE]] = 1.0
         rows[0, joint, points[other, 0]] = -sign
         rows[1, joint, points[joint, DEGREE]] = 1.0
@@ -287,8 +288,8 @@ def _network(arrays: Mapping[str, npt.NDArray[Any]]) -> GaitNetwork:
         width = columns
     if width != OUTPUTS:
         raise ArrayFileError(f"the last layer must have {OUTPUTS} columns, got {width}")
-    # A gait of the network is the bias plus a weighted sum of the rows of the last weights. Bias and rows are themselves gaits.
-    # If the angles of these gaits do not jump at the stance change, the angles of their sums do not jump.
+    # The last layer adds multiples of its weight rows to its bias. If the bias and each row, as control points of a gait, give
+    # angles without a jump at the stance change, the angles of every gait of the network are continuous.
     defect = np.abs(periodicity()[: len(JOINTS)] @ np.vstack([layers[-1].weights, layers[-1].bias]).T).max()
     if not defect <= _PERIODICITY_DEFECT:
         raise ArrayFileError(

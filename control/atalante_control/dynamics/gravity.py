@@ -38,7 +38,8 @@ class LinkRecord:
     lever: Annotated[Vector, 3]  # m, position of the centre of mass
     rotation: Annotated[Vector, (3, 3)]  # rotation matrix from link to parent
     down: Annotated[Vector, 3]  # m/s2, gravitational acceleration
-    # Force [N] and moment about the joint [Nm] that hold the link and its descendants; for the pelvis, only its descendants.
+    # Force [N] and moment about the joint [Nm] that hold the link and all links below this link, down to the foot.
+    # In the record of the pelvis, force and moment hold only the legs, not the pelvis.
     force: Annotated[Vector, 3]
     moment: Annotated[Vector, 3]
 
@@ -51,7 +52,7 @@ class Gravity:
     """
 
     def __init__(self, articulated: ArticulatedModel) -> None:
-        """Prepare the tree of links and compile the kernel.
+        """Prepare the tree of links, and compile the function `hold`.
 
         Args:
             articulated: model of the empty exoskeleton with the pelvis fixed.
@@ -104,7 +105,7 @@ def hold(links: Records[LinkRecord], position: Vector, pelvis: Attitude, torque:
     w, x, y, z = pelvis
     base = links[0]
     for j in range(3):
-        base.force[j], base.moment[j] = 0.0, 0.0  # the inward pass adds the forces and moments of the legs
+        base.force[j], base.moment[j] = 0.0, 0.0  # the loop from feet to pelvis adds the forces and moments of the legs
     down = base.down
     down[0], down[1] = -GRAVITY * 2.0 * (x * z - w * y), -GRAVITY * 2.0 * (y * z + w * x)
     down[2] = -GRAVITY * (1.0 - 2.0 * (x * x + y * y))

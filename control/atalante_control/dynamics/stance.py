@@ -34,7 +34,7 @@ _SAMPLES = 33
 
 
 class GroundForces(NamedTuple):
-    """Joint torques and ground wrench of one state, with the attitude of the pelvis."""
+    """Result of `StanceDynamics.forces`: joint torques, ground wrench and attitude of the pelvis."""
 
     torque: Vector  # (12,) Nm, joint torques in the order of JOINTS
     force: Vector  # (3,) N, ground force on the stance foot, in the axes of the foot
@@ -61,9 +61,8 @@ class StanceDynamics:
         self._foot, self._swing_foot = (self._fixed.model.getFrameId(name) for name in (STANCE_FOOT, SWING_FOOT))
         pinocchio.forwardKinematics(self._fixed.model, self._data[1], pinocchio.neutral(self._fixed.model))
         pinocchio.updateFramePlacement(self._fixed.model, self._data[1], self._foot)
-        #: Rotation matrix from the stance foot to the world, a rotation by the toe-out angle. The stance foot does not turn
-        #: during a step, so the matrix is constant. At the zero pose, pelvis and world have the same axes (x forward). The
-        #: matrix is therefore the rotation from the foot to the pelvis at the zero pose.
+        #: Rotation matrix from the stance foot to the world: the foot points outwards by the toe-out angle during the whole step.
+        #: The matrix is computed with all joints at 0 rad, where the pelvis has the axes of the world (x forward).
         self._toe_out = self._data[1].oMf[self._foot].rotation.copy()
 
     def forces(self, position: Vector, velocity: Vector, acceleration: Vector) -> GroundForces:

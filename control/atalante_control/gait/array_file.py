@@ -26,7 +26,7 @@ _FLOAT: Final = np.dtype("<f8")
 
 
 class ArrayFileError(ValueError):
-    """Invalid content of an array file. The message does not state the path, because the caller adds it."""
+    """Invalid content of an array file. The caller must add the path of the file to the message."""
 
 
 def write_arrays(path: Path, arrays: Mapping[str, Array]) -> None:
@@ -108,7 +108,10 @@ def _checked_directory(archive: zipfile.ZipFile, allowed: Collection[str], size_
 
 
 def _member(archive: zipfile.ZipFile, member: zipfile.ZipInfo) -> bytes:
-    """Check that the content of a member has the declared size, and return the content. zipfile checks the CRC-32."""
+    """Return the content of one file in the zip archive, and check that the content has the declared size.
+
+    zipfile checks the CRC-32 of the content.
+    """
     with archive.open(member) as stream:
         # `read()` without a limit would decompress the whole member, even if it is larger than declared.
         content = stream.read(member.file_size + 1)
@@ -135,7 +138,7 @@ def _array(name: str, content: bytes) -> Array:
     for length in shape:
         size *= length
     if len(data) != size:
-        raise ArrayFileError(f"{name} must have the {size} bytes of its shape {shape}, got {len(data)}")
+        raise ArrayFileError(f"{name} with shape {shape} must have {size} bytes, got {len(data)}")
     if dtype.kind == "U":
         data.decode("utf-32")  # invalid text raises an exception here; NumPy would raise it only on use of the text
     array = np.frombuffer(data, dtype).reshape(shape).copy()

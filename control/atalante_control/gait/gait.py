@@ -31,8 +31,10 @@ AIRWALK_GAIT = Path(__file__).parents[1] / "gaits" / "airwalk.json"
 SWAP = np.r_[len(LEG_JOINTS) : len(JOINTS), 0 : len(LEG_JOINTS)]
 SIGN = np.array(MIRROR_SIGN * len(SIDES), dtype=np.float64)
 
-POSITION_JUMP = math.radians(0.1)  # rad, largest accepted jump of a joint angle between two motions
-VELOCITY_JUMP = 0.05  # rad/s, largest accepted jump of a joint speed between two motions
+#: rad, largest accepted jump of a joint angle from the end of one motion to the start of the next motion
+POSITION_JUMP = math.radians(0.1)
+#: rad/s, largest accepted jump of a joint speed from the end of one motion to the start of the next motion
+VELOCITY_JUMP = 0.05
 DURATION_RANGE = (0.3, 3.0)  # s, shortest and longest duration of a step
 ROUNDING = 1e-9  # rad, rad/s or Nm, tolerance for rounding errors in the limit checks
 
@@ -86,7 +88,7 @@ class Gait:
         return zlib.crc32(content)
 
     def mirrored(self) -> Gait:
-        """Return the step of the mirrored robot. Stance leg and swing leg are exchanged."""
+        """Return the step with left and right exchanged: a right-stance step becomes a left-stance step."""
         feedforward = None if self.feedforward is None else _mirror(self.feedforward)
         return replace(self, coefficients=_mirror(self.coefficients), feedforward=feedforward)
 

@@ -43,9 +43,9 @@ WALK_KINDS: tuple[Kind, ...] = ("start", "periodic", "stop")
 class WalkGaits(NamedTuple):
     """Right-stance steps of a walk. The mirrored steps are the left-stance steps."""
 
-    start: Gait  # begins at rest with the weight on the right foot; has the same end as the periodic step
+    start: Gait  # begins at rest with the weight on the right foot; ends with the last angles and speeds of `step`
     step: Gait  # periodic step
-    stop: Gait  # has the same start as the periodic step; ends at rest with the weight on the stance foot
+    stop: Gait  # begins with the first angles and speeds of `step`; ends at rest with the weight on the stance foot
 
     @property
     def hash32(self) -> int:

@@ -1,8 +1,8 @@
-"""Fit of the gait network to a library of gaits: `gaits -> principal directions -> perceptron -> GaitNetwork`.
+"""Fit of the gait network to the gaits of a library, by principal component analysis and a perceptron.
 
-The 96 control points depend on each other, so the perceptron does not learn them directly. The perceptron learns the
-coordinates along the few directions in which the library varies. The last layer includes the linear map from these
-coordinates to the control points.
+`gaits -> principal directions -> perceptron -> GaitNetwork`. The 96 control points depend on each other, so the perceptron does
+not learn them directly. The perceptron learns the coordinates along the few directions in which the library varies (principal
+directions). The last layer includes the linear map from these coordinates to the control points.
 
 1. *Periodic gaits.* The angles are exactly continuous at the stance change, which leaves 84 dimensions. The speeds jump slightly
    at the impact. Before the fit, each gait is changed so that the fraction `JUMP_KEPT` of its speed jump remains. A
@@ -34,14 +34,15 @@ from atalante_hal.types import Vector
 
 HIDDEN = (64, 64)
 ITERATIONS = 1500  # largest number of L-BFGS iterations
-RESOLUTION = math.radians(0.003)  # rad, largest rms error caused by the omitted principal directions
+#: rad, the fit uses the smallest number of principal directions for which the rms error is at most this value
+RESOLUTION = math.radians(0.003)
 JUMP_KEPT = 0.4  # before the fit, the speed jump of each gait at the stance change is reduced to this fraction
 END_WEIGHT = 40.0  # weight of the squared angle errors at start and end of a step; the weight is 1 at the other samples
-ACCELERATION_WEIGHT = 5e-2  # s2, weight of an acceleration error [rad/s2] relative to an angle error [rad]
-#: L-BFGS stops if an iteration reduces the training loss by less than 2e-9. With small training targets the loss is small, so
-#: L-BFGS would stop too early. The target vectors are therefore scaled. This value is the rms length of the scaled vectors.
+ACCELERATION_WEIGHT = 5e-2  # s2, an acceleration error of 1 rad/s2 counts as much as an angle error of 0.05 rad
+#: Rms length to which the target vectors of the training are scaled. With smaller targets, L-BFGS would stop too early:
+#: the training loss would be small, and L-BFGS stops if an iteration reduces the loss by less than 2e-9.
 TARGET_SIZE = 10.0
-ALPHA = 1e-5  # penalty on the squared weights of the network; the penalty smooths the gaits between the grid points
+ALPHA = 1e-5  # penalty on the squared weights; keeps the gaits smooth between the subjects of the library
 SEED = 1  # seed of the initial weights
 _SAMPLES = 41  # number of samples per step in the comparison of two gaits
 

@@ -34,9 +34,10 @@ from atalante_control.gait_optimization.verify import Verifier
 from atalante_hal.robot import Robot, load_robot
 
 FORMAT = "atalante-library/2"
-_ROOT_ITERATIONS = 60  # number of fixed-point iterations that solve the equation g^(d + 1) = g + 1 in `Grid.points`
-LEVELS_MIN = 3  # smallest number of grid levels of a parameter; a network fitted to 2 levels has an error of 10 degrees
+_ROOT_ITERATIONS = 60  # number of iterations that compute the constant g in `Grid.points`
+LEVELS_MIN = 3  # smallest number of levels of a parameter; with 2 levels, the joint angles of the network are wrong by 10 degrees
 
+#: Point of the grid: one number for each parameter, the index of the level of this parameter.
 Index = tuple[int, ...]
 #: Function that solves one gait. It must be defined at module level, because other processes import it.
 Solve = Callable[[Subject], SolvedGait]
@@ -48,11 +49,12 @@ class LibraryError(ValueError):
 
 @dataclass(frozen=True)
 class Grid:
-    """Selected points of a grid of subjects. The default covers the subjects of the paper (58 to 91 kg, 1.62 to 1.93 m).
+    """Grid of subjects, and selection of the subjects for which the library contains a gait.
 
-    The levels of a parameter are listed in ascending order. A grid of six parameters has too many points to solve all of them.
-    Therefore the library contains `size` points: all combinations of smallest and largest levels, and points of a
-    low-discrepancy sequence, which fills the grid evenly. A larger `size` only adds points.
+    Each parameter has a list of values in ascending order, called levels. A point of the grid is one combination of levels.
+    The default levels cover the subjects of the paper (58 to 91 kg, 1.62 to 1.93 m). A grid of six parameters has too many
+    points to solve all of them. Therefore the library contains `size` points: all combinations of smallest and largest levels,
+    and points of a low-discrepancy sequence, which fills the grid evenly. A larger `size` only adds points.
 
     Raises:
         ValueError: If there are fewer than three levels, levels are not ascending, the size is too small, or a subject is out of
@@ -85,7 +87,7 @@ class Grid:
 
     @staticmethod
     def names() -> tuple[str, ...]:
-        """Return the names of the parameters, in the order of an `Index`."""
+        """Return the names of the parameters, in the order of the inputs of the network (INPUTS)."""
         return tuple(INPUTS)
 
     def axes(self) -> tuple[tuple[float, ...], ...]:
@@ -110,8 +112,8 @@ class Grid:
         shape = np.array(self.shape)
         if math.prod(self.shape) <= self.size:
             return list(product(*map(range, self.shape)))
-        # The points are an additive recurrence sequence with the increments g^-1, g^-2, ..., g^-d. Here d is the number of
-        # parameters, and g is the root of g^(d + 1) = g + 1. For d = 1, g is the golden ratio.
+        # Point n of the sequence has the coordinates (0.5 + n g^-i) mod 1 for i = 1 to d (additive recurrence sequence).
+        # d is the number of parameters, and g is the positive root of g^(d + 1) = g + 1. For d = 1, g is the golden ratio.
         root = 2.0
         for _ in range(_ROOT_ITERATIONS):
             root = (1.0 + root) ** (1.0 / (len(shape) + 1))
@@ -136,7 +138,8 @@ class Library:
             grid: required grid, or None to accept the grid that is stored in the folder.
 
         Raises:
-            LibraryError: If the folder has no library and no grid is given, or if the library has another grid.
+            LibraryError: If the folder has no library and no grid is given, if the library has another grid, or if the file
+                `grid.json` cannot be read or is invalid.
         """
         self.folder = folder
         path = folder / "grid.json"
@@ -187,7 +190,7 @@ class Library:
         return gait
 
     def gaits(self, robot: Robot) -> dict[Index, Gait]:
-        """Return all solved gaits of the library. Files that do not count as solved are left out, see `rejected`.
+        """Return all solved gaits of the library. Rejected files are left out, see `rejected`.
 
         Args:
             robot: limits of the joints.
@@ -201,7 +204,10 @@ class Library:
         return gaits
 
     def rejected(self) -> dict[Index, str]:
-        """Return the rejected gait files as grid point -> reason of the rejection. `generate` solves these gaits again."""
+        """Return why gait files are rejected, for each grid point with a rejected file.
+
+        `generate` solves the gaits of these grid points again.
+        """
         return self._read()[1]
 
     def failures(self) -> dict[Index, str]:
@@ -250,7 +256,7 @@ class Library:
             raise
 
     def _read(self) -> tuple[dict[Index, Gait], dict[Index, str]]:
-        """Return the solved gaits, and the reason for each file that does not count as solved."""
+        """Return the solved gaits, and for each rejected file the reason of the rejection."""
         gaits, rejected = dict[Index, Gait](), dict[Index, str]()
         for index in self.grid.points():
             try:
@@ -286,7 +292,9 @@ class Library:
 
 
 def solve_subject(subject: Subject) -> SolvedGait:
-    """Solve the gait of a subject, and verify it with Pinocchio. After a failure, start again, see `solve_with_second_start`.
+    """Solve the gait of a subject, and verify the gait with Pinocchio.
+
+    If this fails, solve the gait a second time, from another initial guess, see `solve_with_second_start`.
 
     Args:
         subject: patient and step parameters.
@@ -334,7 +342,7 @@ def _solve(solve: Solve, task: tuple[Index, Subject]) -> tuple[Index, SolvedGait
 
 
 def _status(path: Path) -> str:
-    """Return the failure reason from the record of an unsolved gait. If the record is damaged, return the read error."""
+    """Return why a gait is not solved, as stated in its file in `failed/`. If the file is damaged, return the read error."""
     try:
         return str(read_object(path)["status"])
     except GaitError as error:
@@ -348,7 +356,7 @@ def _read_grid(path: Path) -> Grid:
     if not isinstance(document, dict):
         raise ValueError(f"the grid of a library must be a JSON object, got {type(document).__name__}")
     if (found := document.pop("format", None)) != FORMAT:
-        raise ValueError(f"format of the grid of a library must be {FORMAT!r}, got {found!r:.80}")
+        raise ValueError(f"format must be {FORMAT!r}, got {found!r:.80}")
     size = document.pop("size", None)
     if type(size) is not int:
         raise ValueError(f"size must be an integer, got {size!r}")

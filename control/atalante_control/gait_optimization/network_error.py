@@ -22,15 +22,20 @@ from atalante_hal.types import Vector
 
 
 class Deviation(NamedTuple):
-    """Deviation of the gait of the network from the solved gait, for one subject."""
+    """Errors of the network for one subject. Two gaits are compared: one from the network, one solved by the optimiser."""
 
-    angles: Vector  # (n, 12) rad, absolute deviation of the joint angles along the step
-    landing_position: float  # m, position deviation of the swing foot at the landing, in the stance foot frame
-    landing_attitude: float  # rad, attitude deviation of the swing foot at the landing, in the stance foot frame
-    position_defect: float  # rad, largest jump of a joint angle at the stance change, in the gait of the network
-    speed_defect: float  # rad/s, largest jump of a joint speed at the stance change, in the gait of the network
-    feedforward: float  # rms of the feedforward difference, relative to the rms of the solved feedforward
-    within_limits: bool  # whether the gait of the network is valid and within the limits of the robot, see `check_gait`
+    angles: Vector  # (n, 12) rad, absolute difference of the joint angles of the two gaits in each cycle
+    #: m, distance between the landing positions of the swing foot in the two gaits, relative to the stance foot
+    landing_position: float
+    #: rad, angle between the attitudes of the swing foot at the landing in the two gaits, relative to the stance foot
+    landing_attitude: float
+    #: rad, largest jump of a joint angle at the stance change if the robot walks with the gait from the network
+    position_defect: float
+    #: rad/s, largest jump of a joint speed at the stance change if the robot walks with the gait from the network
+    speed_defect: float
+    #: rms difference of the feedforward torques of the two gaits, as a fraction of the rms torque of the solved gait
+    feedforward: float
+    within_limits: bool  # whether the gait from the network is valid and within the robot limits, see `check_gait`
 
 
 class Finding(NamedTuple):
@@ -92,7 +97,10 @@ def deviation(subject: Subject, gait: Gait, solved: Gait, robot: Robot) -> Devia
 
 
 def findings(deviations: Sequence[Deviation]) -> list[Finding]:
-    """Return the report over all subjects: 95th percentile of the joint error, and largest value of each error.
+    """Return the report: for each kind of error, the largest value over all subjects and the limit of this value.
+
+    For the joint angles, the report also contains the 95th percentile of the error. The last line is the number of gaits that are
+    invalid or beyond a limit of the robot.
 
     Args:
         deviations: deviation of each subject.

@@ -1,8 +1,9 @@
-"""Verification of the gaits of the gait network: `GaitNetwork, random subjects -> checks of each gait -> worst value per check`.
+"""Verification of the gait network: its gaits for random subjects get the same checks as solved gaits.
 
-No gait is solved. A gait of the network gets the same checks as a solved gait, at all samples of `Verifier`. These
-samples also lie between the nodes of the optimiser. Only the tolerances differ: the gaits of the network satisfy the
-equality constraints of the optimiser approximately.
+`GaitNetwork, random subjects -> checks of each gait -> worst value per check`. No gait is solved.
+A gait of the network gets the same checks as a solved gait, at all samples of `Verifier`. These samples also lie between the
+nodes of the optimiser. Only the tolerances differ: the gaits of the network satisfy the equality constraints of the optimiser
+approximately.
 """
 
 from __future__ import annotations
@@ -18,7 +19,7 @@ from atalante_hal.robot import Robot
 
 
 class WorstCheck(NamedTuple):
-    """Line of the report: largest value of one check over all gaits, and number of gaits that fail this check."""
+    """Line of the report about one check: its largest value in all gaits, its limit, and the number of gaits that fail."""
 
     name: str
     value: float

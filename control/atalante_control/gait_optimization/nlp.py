@@ -1,8 +1,9 @@
-"""Sparse nonlinear program built from small functions. Each function is repeated for several groups of unknowns.
+"""Sparse nonlinear program for IPOPT, assembled from small expressions, for example one constraint for all nodes of a step.
 
 `Rows (SX expressions of a few unknowns) -> NonlinearProgram.add -> f, g and their exact sparse derivatives as five functions`.
-The model of walking is in `step_problem`. Every repeated function is differentiated only once. For each repetition, the program
-stores the positions of the derivatives in the sparse matrices.
+The model of walking is in `step_problem`. Each repetition of an expression uses other elements of the vector of unknowns, for
+example the unknowns of the next node. Each expression is differentiated only once. For each repetition, the program stores
+the positions of the derivatives in the sparse matrices.
 """
 
 from __future__ import annotations
@@ -41,20 +42,24 @@ class Group(NamedTuple):
 
 
 class Functions(NamedTuple):
-    """Functions that the solver calls, in the order of `NAMES`. Arguments are the unknowns x and the parameters p."""
+    """Functions that the solver calls, in the order of `NAMES`.
+
+    The arguments are the unknowns x and the parameters p. The Hessian has two more arguments, the multipliers of the Lagrangian
+    L = lam_f f + dot(lam_g, g).
+    """
 
     objective: Any  # x, p -> f
     constraints: Any  # x, p -> g
     gradient: Any  # x, p -> f, df/dx
     jacobian: Any  # x, p -> g, dg/dx
-    hessian: Any  # x, p, lam_f, lam_g -> upper triangle of the second derivative of the Lagrangian
+    hessian: Any  # x, p, multipliers lam_f and lam_g -> upper triangle of the Hessian of lam_f f + dot(lam_g, g)
 
 
 NAMES = ("nlp_f", "nlp_g", "nlp_grad_f", "nlp_jac_g", "nlp_hess_l")
 
 
 class _Block(NamedTuple):
-    """Expression that is repeated for several groups of unknowns: a cost if it has weights, else a constraint."""
+    """Constraint or cost that is repeated, for example once per node of the step."""
 
     expression: Symbol  # CasADi SX expression to repeat: a scalar cost, or a column of constraints
     x: Symbol  # CasADi SX symbols of the n variables in `expression`, shape (n,)
@@ -100,7 +105,7 @@ class NonlinearProgram:
         self.lower, self.upper = np.append(self.lower, value), np.append(self.upper, value)
 
     def add(self, rows: Sequence[Rows], x: Symbol, indices: Sequence[Indices]) -> None:
-        """Add the same constraints for several groups of unknowns.
+        """Add constraints that are repeated, for example once per node of the step.
 
         Args:
             rows: constraints to repeat.
@@ -121,10 +126,10 @@ class NonlinearProgram:
         self._blocks.append(_Block(expression, x, np.array(indices), None))
 
     def minimise(self, cost: Symbol, x: Symbol, indices: Sequence[Indices], weights: Vector) -> None:
-        """Add the weighted sum of a repeated scalar expression to the objective.
+        """Add a cost to the objective, for example the squared torques, summed over all nodes with one weight per node.
 
         Args:
-            cost: scalar SX expression.
+            cost: scalar SX expression to repeat.
             x: SX symbols on which the cost depends, shape (n,).
             indices: indices of the unknowns for each repetition, each of shape (n,).
             weights: weight of each repetition.
@@ -185,7 +190,11 @@ class _Entries(NamedTuple):
 
 
 def _derivatives(block: _Block, p: Symbol) -> tuple[Any, _Entries, _Entries]:
-    """Return functions for the expression, its Jacobian, and the upper triangle of the Hessian of dot(lam, expression)."""
+    """Return functions for the values, the Jacobian and the Hessian of a repeated constraint or cost.
+
+    The arguments of the functions are x and p. The Hessian has a third argument: one multiplier `lam` for each row of the
+    expression. The Hessian function returns the upper triangle of the second derivative of dot(lam, expression).
+    """
     lam = casadi.SX.sym("lam", block.expression.shape[0])
     slopes = casadi.jacobian(block.expression, block.x)
     curvature = casadi.triu(casadi.hessian(casadi.dot(lam, block.expression), block.x)[0])

@@ -18,7 +18,7 @@ _Task = TypeVar("_Task")
 _Result = TypeVar("_Result")
 #: Timeout of the connection to a dask scheduler.
 _CONNECT_TIMEOUT: Final = "10s"
-#: Number of process crashes after which the calls run one at a time. A later crash then loses only the result of one call.
+#: After this number of process crashes, the calls run one at a time. A crash then loses the result of one call only.
 _SHARED_LOSSES: Final = 3
 _REMEDY: Final = "repeat the command, if necessary with fewer --jobs"
 _LOKY_THREAD: Final = "ExecutorManagerThread"
@@ -109,7 +109,7 @@ def fan_out(
 
 
 def _lost(calls: int) -> str:
-    """Return the first half of an error text, which states that a process ended unexpectedly.
+    """Return the beginning of an error message about a crashed process. The caller appends the consequence.
 
     Args:
         calls: number of calls that have no result.
@@ -137,7 +137,7 @@ def _without_ctrl_c() -> Iterator[None]:
 
 @contextmanager
 def _without_loky_errors() -> Iterator[None]:
-    """Suppress the report of a KeyError in the executor thread of loky.
+    """Hide the traceback of a KeyError in a thread of loky, the process pool of joblib, inside the `with` block.
 
     Before loky ends its processes, it clears the table of pending calls. If the executor thread queues a call at that moment, the
     call is not in the table (`add_call_item_to_queue` in loky 3.6). The error has no effect, because all calls are cancelled.

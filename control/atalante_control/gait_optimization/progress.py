@@ -10,7 +10,7 @@ import numpy as np
 
 from atalante_hal.types import Vector
 
-#: Progress function. Arguments: iteration number, and largest constraint violation divided by the scale of its group.
+#: Progress function. Arguments: iteration number, and largest value of (constraint violation / scale of the constraint).
 Progress = Callable[[int, float], None]
 
 

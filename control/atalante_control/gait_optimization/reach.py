@@ -17,10 +17,10 @@ from atalante_control.gait_optimization.step_problem import StepProblem
 from atalante_hal.robot import JOINTS
 from atalante_hal.types import Vector
 
-#: Accepted violation of a joint range [rad]. If a pose violates the range by less, the optimiser can find a valid pose
-#: close to this pose.
+#: The search accepts a landing pose if each joint is less than this angle outside the joint range [rad]. The optimiser can
+#: then find a pose nearby with all joints inside their ranges.
 _TOLERANCE = math.radians(0.5)
-_CENTRE_WEIGHT = 1e-6  # weight of the distance from the middle of a joint range; violations of the range have weight 1
+_CENTRE_WEIGHT = 1e-6  # cost of (joint angle - middle of the joint range)^2; (angle outside the range)^2 costs 1
 _OPTIONS: dict[str, Any] = {"ipopt.print_level": 0, "ipopt.sb": "yes", "print_time": False, "error_on_fail": False}
 
 

@@ -20,12 +20,12 @@ class Requirements:
     friction: float = 0.5  # largest ratio of horizontal to vertical ground force
     force_min: float = 300.0  # N, smallest vertical ground force
     sole_share: float = 0.6  # the centre of pressure must be inside this fraction of the sole
-    #: At each node, the centre of pressure must be inside this fraction of the rectangle between the force cells.
-    #: Between two nodes, and in gaits of the network, the centre of pressure can be up to 3.2 mm outside this area.
+    #: At each node, the centre of pressure must be inside this fraction of the rectangle between the force cells of the foot.
+    #: Between nodes, and in gaits interpolated by the gait network, the centre of pressure can be up to 3.2 mm outside this area.
     cell_share: float = 0.7
     yaw_lever: float = 0.03  # m, largest ratio of yaw moment about the sole centre to vertical ground force
-    #: Required height of the swing sole at mid-swing [m]. At other times this height is multiplied by sin(pi t / T)^2.
-    #: In start and stop steps the factor is sin(pi t / T)^4.
+    #: m, smallest height of the swing sole at mid-swing. At time t of a step with duration T, the smallest height is
+    #: clearance * sin(pi t / T)^2. In start and stop steps, the smallest height is clearance * sin(pi t / T)^4.
     clearance: float = 0.05
     corridor: tuple[float, float] = (0.17, 0.28)  # m, smallest and largest lateral distance between the ankles
     roll: float = math.radians(5.0)  # rad, largest roll of the pelvis
@@ -35,16 +35,14 @@ class Requirements:
     landing_speed: tuple[float, float] = -0.03, -0.003
     #: m/s, range of the vertical speed of each corner of the landing sole, upwards positive
     corner_speed: tuple[float, float] = -0.03, 0.0
-    corner_slide: float = (
-        0.025  # m/s, limit of the forward speed and of the lateral speed of each corner of the landing sole
-    )
-    #: Largest jump of a joint speed at the impact [rad/s].
-    #: A gait of the network keeps the fraction `fit.JUMP_KEPT` of this jump, and the fit error is added. The sum must be at most
-    #: `VELOCITY_JUMP`.
+    #: m/s, limit of the forward speed and of the lateral speed of each corner of the landing sole
+    corner_slide: float = 0.025
+    #: rad/s, largest jump of a joint speed at the impact. The gait network keeps 40 % of the jump (`fit.JUMP_KEPT`) and adds a
+    #: fit error. The remaining jump plus the fit error must be at most `VELOCITY_JUMP`.
     impact_jump: float = 0.6 * VELOCITY_JUMP
     sinking: float = 0.01  # m/s, largest downward speed of the rear foot after the impact
-    # The cost is the sum of (joint torque / 100 Nm)^2 plus three weighted sums of squares. Without the sums for tilt and
-    # pressure, similar subjects get very different swing motions.
+    # Weights of the cost. The sum of (joint torque / 100 Nm)^2 has weight 1. With `tilt_weight` and `pressure_weight` = 0,
+    # similar subjects get very different swing motions.
     acceleration_weight: float = 3e-3  # weight of the squared joint accelerations in rad/s2
     tilt_weight: float = 5.0  # weight of the squared tilt of the swing sole in rad
     pressure_weight: float = 20.0  # weight of (horizontal ground moment about the sole centre / 1500 Nm)^2

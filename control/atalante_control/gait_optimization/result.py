@@ -26,8 +26,8 @@ class SolvedGait:
     """Result of the solver: gait, status and constraint violations. `gait.solver` contains a summary."""
 
     gait: Gait  # solved gait, or the last iterate if the solver failed
-    status: str  # SOLVED, or a sentence that names the violated constraint
-    max_residual: float  # largest violation over all constraints, each in its own SI unit
+    status: str  # SOLVED, or a sentence that states why there is no gait
+    max_residual: float  # largest value in `residuals`; values in different SI units are compared as plain numbers
     solve_s: float  # s, computing time
     iterations: int  # iterations of the optimiser
     residuals: Mapping[str, Residual] = field(default_factory=dict)  # largest violation of each group of constraints

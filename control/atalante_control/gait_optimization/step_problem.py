@@ -79,7 +79,9 @@ class StepProblem:
         self.units = {group.name: (group.unit, group.size) for group in self.program.groups} | _BOUND_UNITS
 
     def parameters(self, patient: Patient, duration: float, step_length: float) -> Vector:
-        """Return the values of `symbols` for a patient and a step.
+        """Return the parameters of the program for a patient and a step: one number for each element of `symbols`.
+
+        The numbers are the masses, inertias and lengths of the robot, the step duration and the step length.
 
         Args:
             patient: patient in the exoskeleton.
@@ -119,7 +121,7 @@ class StepProblem:
 
         Args:
             coefficients: Bezier control points of the motion, shape (12, 8) [rad].
-            parameters: values of `symbols` for patient and step.
+            parameters: result of `self.parameters()` for patient and step.
         """
         motion = np.stack([basis @ coefficients.T for basis in self._bases], axis=1)  # (nodes, 3, 12)
         loads = self._loads.map(len(self.phases))(motion.reshape(len(motion), -1).T, parameters)
@@ -275,7 +277,8 @@ class StepProblem:
         if around is not None:
             end, next_one = (-1, -2) if self.kind == "start" else (0, 1)
             pose, other = around.coefficients[:, end], around.coefficients[:, next_one]
-            # For equal joint speeds, the difference of two control points is proportional to the duration of the step.
+            # Joint speed = constant * (difference of two control points) / (step duration). So for the same joint speed, a step
+            # that lasts twice as long needs twice the difference.
             points = {"gait pose": pose, "gait speed": pose + (other - pose) * TRANSITION / around.duration}
             for group in self.program.groups:
                 if group.name in points:

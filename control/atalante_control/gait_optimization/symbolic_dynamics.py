@@ -141,7 +141,7 @@ class Chain:
         self.stance_yaw = math.fsum(link.yaw for link in self.bodies if link.name.startswith(_RIGHT))
 
     def values(self, links: Sequence[Link]) -> Vector:
-        """Return the values of `symbols` for a robot.
+        """Return the masses, inertias and lengths of a robot, one number for each element of `symbols`.
 
         Args:
             links: links of the robot.

@@ -24,9 +24,9 @@ _LEFT, _RIGHT = (f"{side}_{LEG_LINKS['HA']}" for side in SIDES)
 _SAMPLES = 201  # number of samples of a step
 _LOCAL = pinocchio.ReferenceFrame.LOCAL
 _CLEARANCE = 0.05  # m, intended height of the swing sole at mid-swing
-#: Ground friction coefficient that a verified gait may need at most.
-_FRICTION = 0.5
-_SLIDING = 1.0  # Ns, accepted impact impulse above the friction limit; 1 Ns changes the robot speed by some mm/s
+_FRICTION = 0.5  # largest friction coefficient between sole and ground that a verified gait may need
+#: Ns, accepted part of the horizontal impact impulse that friction cannot transmit. 1 Ns changes the robot speed by some mm/s.
+_SLIDING = 1.0
 _SLIDE = 0.04  # m/s, accepted horizontal speed of a corner of the sole at the landing
 _DROP = 0.035  # m/s, accepted downward speed of a corner of the sole at the landing
 _LIFT = 0.005  # m/s, accepted upward speed of a corner of the sole at the landing

@@ -1,4 +1,4 @@
-r"""Backup policy of the virtual guide: acceleration gains for the coupled sagittal hip and knee (SH, SK) of the swing leg.
+r"""Backup policy of the virtual guide: control law that holds sagittal hip and knee (SH, SK) of the swing leg inside the guide.
 
 `stiffness at the joints, mass matrix -> gains Kv, Dv -> responses of the sampled loop`. The guide filter and the certificate use
 the responses. The backup torque is
@@ -88,9 +88,8 @@ class BackupPolicy:
 
     stiffness: Pair  # Nm/rad, k of SH and SK
     damping: Pair  # damping ratios of the two coupled modes of motion, the slower mode first
-    #: kg m2, elements M11, M12 and M22 of the mass matrix M at the reference knee angle. The gains Kv are computed with these
-    #: elements and are the same at all knee angles. The joint stiffness M Kv is `stiffness` at the reference knee angle. At
-    #: other knee angles M is different, so the joint stiffness is different.
+    #: kg m2, elements M11, M12 and M22 of the mass matrix of SH and SK at one knee angle in the middle of the swing. The joints
+    #: have the stiffness `stiffness` only at this knee angle, because the gains Kv, computed from `mass`, are constant.
     mass: tuple[float, float, float]
 
     def __post_init__(self) -> None:

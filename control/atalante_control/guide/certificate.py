@@ -69,11 +69,13 @@ class JointTorque:
 
 
 class Limit(NamedTuple):
-    """Condition that limits the disturbance torques for which a guide can be certified."""
+    """Condition of the guide certificate, with the largest disturbance torques that meet the condition.
 
-    #: Largest factor on the requested disturbance torques of hip and knee with which the guide meets the condition. Example: 0.8
-    #: means 24 and 14.4 Nm if 30 and 18 Nm are requested. A negative factor means that the guide does not meet the condition
-    #: even without disturbance torques.
+    The guide is certified for the requested disturbance torques of hip and knee, or for smaller torques in the same ratio.
+    """
+
+    #: Largest allowed torques / requested torques; negative if the condition fails even without disturbance torques.
+    #: Example: if 30 and 18 Nm are requested at hip and knee, 0.8 allows 24 and 14.4 Nm.
     scale: float
     what: str  # condition in words, for a message
 
@@ -88,16 +90,16 @@ class Certificate:
     reason: str  # sentence that states what limits the certified torques, or why there are none
     #: certified disturbance torques, which the running filter assumes; None if no torques are certified
     promise: JointTorque | None
-    #: largest disturbance torques for which a filter with the same gains can be certified; None if no torques are certified
+    #: largest disturbance torques that meet all conditions with these gains, at least `promise`; None if no torques are certified
     largest: JointTorque | None
     #: smallest fraction of the guide width that remains free under the certified torques; -inf if no torques are certified
     margin: float
 
 
 class PromiseLimits:
-    """Conditions that limit the certified disturbance torques of a guide filter.
+    """Conditions that a guide filter must meet for a certificate: limits of errors, torques, speeds and torque rates.
 
-    The conditions of the drives do not depend on the assistance factor, so they are computed once.
+    The conditions on torques, speeds and torque rates do not depend on the assistance factor, so they are computed once.
     """
 
     def __init__(self, guide: GuideFilter) -> None:
@@ -186,10 +188,10 @@ def _pair(torque: Vector) -> JointTorque | None:
 
 
 def _limit(room: Vector, reach: Vector, steps: int, what: str) -> Limit:
-    """Compute the largest factor on the requested disturbance torques with which a quantity stays below its limit.
+    """Compute the disturbance torques at which a quantity reaches a limit.
 
     The quantity is the tracking error, the torque, the speed or the torque change of SH and SK. The model errors use up a part
-    of the room below the limit. The disturbance torques may use the rest. The factor is therefore
+    of the room below the limit. The disturbance torques may use the rest. `Limit.scale` is therefore
     (room - effect of the model errors) / (effect of the requested torques), in the worst cycle and for the worse joint. The
     message `Limit.what` names this cycle and this joint.
 
@@ -207,7 +209,7 @@ def _limit(room: Vector, reach: Vector, steps: int, what: str) -> Limit:
 
 
 class _Horizon:
-    """Condition for the cycle after the last predicted cycle: in this cycle, the error must still be inside the guide.
+    """Condition on the tracking error one cycle after the prediction ends: the error must still be inside the guide.
 
     At the end of the prediction, fast motions have decayed. The error in the next cycle is therefore a factor times the error in
     the last predicted cycle, plus a small remainder. The errors in two earlier predicted cycles determine the remainder.
@@ -225,12 +227,11 @@ class _Horizon:
         self.cycles, self._step = len(prediction.ahead) - 1, guide.cycles
         rows = prediction.ahead @ prediction.compress * SIZES
         beyond = prediction.beyond * SIZES
-        # Error one cycle after the prediction = factor * error in the last predicted cycle + remainder.
+        # Split the error one cycle after the prediction: factor * (error in the last predicted cycle) + remainder.
         self._factor = (beyond * rows[-1]).sum(axis=1) / (rows[-1] ** 2).sum(axis=1)
         remainder = beyond - self._factor[:, None] * rows[-1]
-        #: Upper bounds of the remainder. Each element contains the two earlier cycles, and the weights of the errors in these
-        #: cycles. Weight matrix, shape (4, 2): one row per error (hip and knee in the nearer cycle, hip and knee in the farther
-        #: cycle), one column per bound (hip, knee).
+        #: Upper bounds of the remainder, each as (two predicted cycles, weights of shape (4, 2)). `errors @ weights` bounds the
+        #: remainder of hip and knee. `errors`: |hip|, |knee| in the first of the two cycles, then |hip|, |knee| in the second.
         self._remainders: list[tuple[tuple[int, int], Vector]] = []
         for near, far in ((0.1, 0.3), (0.25, 0.5), (0.4, 0.7)):
             lags = round(near * self.cycles), round(far * self.cycles)
@@ -240,9 +241,10 @@ class _Horizon:
         self._reach = prediction.reach[self._starts // START_CYCLES]
 
     def limit(self, width: Vector, narrowest: Vector, following: Vector) -> Limit:
-        """Compute the largest factor on the requested disturbance torques with which the next error is inside the guide.
+        """Compute the disturbance torques at which the next error reaches the bound of the guide.
 
-        The next error is the error one cycle after the last predicted cycle. The factor is called `scale`.
+        The next error is the error one cycle after the last predicted cycle. `scale` is the ratio of the computed torques to the
+        requested torques.
 
         In each cycle, the error without disturbances may be at most `free - scale * used`. Here, `free` is the guide width minus
         the effect of the model errors, and `used` is the effect of the requested torques. In the worst case, the error has this
@@ -263,10 +265,11 @@ class _Horizon:
         """
 
         def parts(lag: int) -> tuple[Vector, Vector]:
-            """Return the arrays `free` and `used` in cycle `lag` of each prediction, each of shape (starts, 2) [rad].
+            """Return the arrays `free` and `used` for the time `lag` cycles after the start of a prediction.
 
             `free`: largest allowed error minus the tracking error that the model errors can cause.
             `used`: tracking error that the requested disturbance torques can cause.
+            Both have the shape (starts, 2) [rad]. Row i: prediction that starts in cycle `self._starts[i]`. Columns: SH, SK.
             """
             added = self._reach[:, min(lag, self.cycles)]
             widths = width if lag < self.cycles else narrowest if lag == self.cycles else following

@@ -59,16 +59,17 @@ class Mismatch:
 class HandOver:
     """Hand-over box: largest deviations at the start of a step for which the guide certificate holds.
 
+    At a stance change, the torques that the controller computes for hip and knee jump. In the air, the controller adds a torque
+    that cancels the jump and then fades out. On the ground, the controller adds no such torque. `Leg.budget` contains a part of
+    the jump that decreases to 0: in the air while the added torque fades out, on the ground during `WalkConfig.engage`.
+
     Raises:
         ValueError: If a value is negative or not finite.
     """
 
     deviation: float = math.radians(2.7)  # rad, largest angle deviation |s(0)| of sagittal hip and knee
     rate: float = 0.25  # rad/s, largest speed deviation |s'(0)| of sagittal hip and knee
-    #: Nm, largest torque jump at a stance change, of sagittal hip and knee. In the air, the controller adds a torque that cancels
-    #: the jump, and this torque then fades out. On the ground, the controller adds no such torque, but the budget includes its
-    #: bound during `WalkConfig.engage`.
-    torque: Pair = (25.0, 13.0)
+    torque: Pair = (25.0, 13.0)  # Nm, largest jump of the torques of sagittal hip and knee at a stance change
     #: rad/s2, largest joint acceleration before the stance change. The acceleration distorts the velocity measured
     #: after the change.
     acceleration: float = 20.0
@@ -175,9 +176,9 @@ _SPEED_MARGIN = 1.0
 
 
 class Effect(NamedTuple):
-    """Matrices from a disturbance to its effect on the hip and on the knee.
+    """Effect of a short disturbance on one quantity of hip and knee, as matrices.
 
-    The effect is an error, a speed, a torque, or the change of a torque within one cycle.
+    The quantity is the tracking error, the speed, the torque, or the change of the torque within one cycle.
 
     A disturbance is an acceleration of hip and knee that lasts one cycle. The disturbance has two effects:
 
@@ -185,25 +186,27 @@ class Effect(NamedTuple):
     2. While the joints accelerate, the measured velocity lags behind the true velocity. Therefore a prediction starts with a
        wrong velocity. The matrices `hidden` describe how the wrong velocity changes the prediction.
 
-    The matrices `left` convert an acceleration to a torque. The change of a torque is converted from the change of an
-    acceleration. For an error or a speed, `left` contains unit matrices.
+    If the quantity is a torque, `pushed` contains the acceleration that belongs to the torque. The mass matrices in `left`
+    convert the acceleration to the torque, and the change of the acceleration to the change of the torque. For an error or a
+    speed, `left` contains unit matrices. In `pushed` and `hidden`, a row is the affected joint, and a column is the disturbed
+    joint (hip, knee).
     """
 
-    #: (n, 2, 2) matrix i converts an acceleration that lasts one cycle to the error or speed i cycles later. For a torque or
-    #: its change, matrix i gives an acceleration or its change, which `left` then converts.
+    #: (n, 2, 2) pushed[i]: error or speed i cycles after a disturbance of 1 rad/s2 that lasts one cycle. If the quantity is a
+    #: torque or a torque change: acceleration or change of the acceleration, to be multiplied by `left`.
     pushed: Vector
-    #: (n, 2, 2) matrix i converts an acceleration at the start of a prediction to the change of the prediction i cycles later.
-    #: With an empty array (0, 2, 2), this change is left out.
+    #: (n, 2, 2) hidden[i]: change of a prediction i cycles ahead, if an acceleration of 1 rad/s2 falsifies the start velocity.
+    #: An empty array of shape (0, 2, 2) means that the start velocity is taken as exact.
     hidden: Vector
-    #: (n, 2, 2) mass matrix in each cycle of the step if the effect is a torque or its change, otherwise unit matrices
+    #: (n, 2, 2) left[k]: mass matrix in cycle k of the step for a torque or a torque change, unit matrix for an error or a speed
     left: Vector
 
 
 class Grid(NamedTuple):
-    """Predictions for which `spread` computes the worst-case effect of disturbances: start cycles and prediction lengths."""
+    """Set of predictions that `spread` examines: each start cycle is combined with each prediction length."""
 
     starts: int  # number of start cycles; the start cycles are 0 to starts - 1
-    #: number of consecutive start cycles in a block; `spread` stores one row per block, the maximum over the block
+    #: number of start cycles that share one row of the result. Example: with 4, row 2 is the maximum for the start cycles 8 to 11
     block: int
     lags: NDArray[np.int64]  # (lags,) prediction lengths [cycles], ascending
 

@@ -58,11 +58,13 @@ class GuideConfig:
         ValueError: If a number is out of range.
     """
 
-    torque_limit: float  # Nm, largest allowed torque of sagittal hip and knee in the prediction
+    torque_limit: float  # Nm, largest allowed torque of SH and SK in the prediction
     rate_limit: float  # Nm, largest allowed change of the backup torque within one cycle
-    speed_limit: float  # rad/s, largest allowed speed of sagittal hip and knee in the prediction
-    worst_speed_limit: float  # rad/s, largest allowed speed in the prediction with the worst model errors
-    zeta: float = 0.01  # s, gain on -dh/dt; while the safety value h falls, the weight of the backup torque rises
+    speed_limit: float  # rad/s, largest allowed speed of SH and SK, predicted with the inertia and delay of the model
+    worst_speed_limit: float  # rad/s, largest allowed speed of SH and SK, predicted with the worst inertia and delay
+    #: s, gain on the fall of the safety value h (h < 0: a joint may leave the guide). A falling h raises the weight of the
+    #: backup torque. Example: with a gain of 0.01 s, dh/dt = -50 1/s raises the weight from 0 to 0.5.
+    zeta: float = 0.01
     derivative_time: float = 0.005  # s, time constant of the low-pass filter on dh/dt
     release: float = 0.03  # s, shortest time in which the weight of the backup torque falls from 1 to 0
     #: Factor on the torque u_i, in [0, 1]. u_i cancels friction, gravity, centrifugal and Coriolis torques (joint idealization).
@@ -191,7 +193,7 @@ class GuideFilter:
 
     @property
     def h(self) -> float:
-        """Return h of the last cycle. If h >= 0, the backup policy can keep both joints inside the guide."""
+        """Return the safety value h of the last cycle. If h >= 0, the backup policy can keep both joints inside the guide."""
         return float(self.tables.guards[0].h)
 
     @property
@@ -201,9 +203,9 @@ class GuideFilter:
 
 
 def tail(inverse: Vector) -> Vector:
-    """Return 1 / width at the narrowest place of the guide in the cycles k to k + `TAIL_CYCLES`, for each cycle k [1/rad].
+    """Return 1 / (smallest width of the guide in a cycle and the next `TAIL_CYCLES` cycles), plus a margin of 3 % [1/rad].
 
-    The result is multiplied by 1 + `_TAIL_MARGIN`.
+    Row k of the result, shape (n, m), is for the cycles k to k + `TAIL_CYCLES`. The margin is `_TAIL_MARGIN`.
 
     Args:
         inverse: 1 / width, shape (n, m) [1/rad]. Row k is cycle k. A width is the distance from q_des to a bound of the guide.

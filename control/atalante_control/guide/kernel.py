@@ -30,7 +30,7 @@ COMPRESSED = 5
 #: Number of consecutive predicted cycles in a `Block`. `Block.slack` bounds the effect of model errors in all these
 #: cycles.
 SLACK_CYCLES = 10
-#: Number of consecutive cycles of a step whose predictions use the same row of `GuideTables.reach`.
+#: Number of start cycles that share one row of `GuideTables.reach`. Example: predictions that start in cycle 8 to 11 use row 2.
 START_CYCLES = 4
 
 
@@ -41,12 +41,14 @@ class Guard:
     #: Columns 0 and 1: Kv, gains on the errors of hip and knee [1/s2]. Columns 2 and 3: Dv, on the error rates [1/s].
     gains: Annotated[Vector, (2, 4)]
     torque_limit: float  # Nm, largest allowed torque in the prediction
-    speed_limit: float  # rad/s, largest allowed speed of a joint in the prediction
-    worst_speed_limit: float  # rad/s, largest allowed speed of a joint in the prediction with the worst model errors
+    speed_limit: float  # rad/s, largest allowed speed of SH and SK, predicted with the inertia and delay of the model
+    worst_speed_limit: float  # rad/s, largest allowed speed of SH and SK, predicted with the worst inertia and delay
     tracking: float  # share of a commanded torque change that a motor reaches within one cycle
     keep: float  # weight of the old value in the low-pass of the measured velocity
-    zeta: float  # s, gain on -dh/dt; while the safety value h falls, the weight of the backup torque rises
-    smoothing: float  # weight of the new value in the low-pass filter of dh/dt
+    #: s, gain on the fall of the safety value h (h < 0: a joint may leave the guide). A falling h raises the weight of the
+    #: backup torque. Example: with a gain of 0.01 s, dh/dt = -50 1/s raises the weight from 0 to 0.5.
+    zeta: float
+    smoothing: float  # weight of the new value in the low-pass filter of dh/dt (h: safety value)
     #: largest decrease of the gate (weight of the backup torque) per cycle; this limit prevents oscillations of the
     #: gate
     release: float
@@ -67,7 +69,7 @@ class Guard:
     few_slack: Annotated[Vector, (STATES, 2)]  # elementwise maximum of `Few.slack` over all prediction lengths
     #: safety value 1 - `largest_ratio`^2 of the last cycle; at h >= 0, the backup policy can keep both joints inside the guide
     h: float
-    rate: float  # 1/s, dh/dt after the low-pass filter
+    rate: float  # 1/s, rate of change of the safety value h, after a low-pass filter
     #: Weight of the backup torque in the last cycle. `tick` writes a value in [0, 1]. The literal law
     #: (`literal.assistive_torque`) can write a value outside [0, 1].
     gate: float
@@ -133,7 +135,7 @@ class GuideTables(NamedTuple):
     #: (starts, blocks, 4) rad, maximum of `reach` over all cycles of a `Block`.
     #: Example: highest[2, 5] is the maximum of reach[2, 50] to reach[2, 59].
     highest: Vector
-    #: (starts, rows, 12) largest changes of torque [Nm] and speed [rad/s] that disturbances can cause. Columns: see above.
+    #: (starts, rows, 12) largest changes of torque [Nm] and speed [rad/s] due to disturbances. Columns: see the class docstring.
     #: Example: few_reach[2, 3] is the change few[3].lag cycles ahead, if the prediction starts in one of the cycles 8 to 11.
     few_reach: Vector
     #: (n, COLUMNS) values of gait and guide in each cycle of a step. In the air, additional rows after the end of the step
@@ -150,13 +152,13 @@ SPEED = 13  # columns 13 and 14 of `step`: velocity of q_des [rad/s]
 #: Column 15 of `step`: smallest allowed weight of the backup torque. This minimum falls from 1 to 0 in the first cycles of a
 #: step, while the filter takes over the joints.
 FLOOR = 15
-#: Columns 16 to 19 of `step`: maximum of columns 0 to 3 over this cycle and the next `TAIL_CYCLES` cycles, plus a margin [1/rad].
-#: See `filter.tail`.
+#: Columns 16 to 19 of `step`: 1.03 * maximum of columns 0 to 3 over this cycle and the next `TAIL_CYCLES` cycles [1/rad].
+#: The function `filter.tail` computes the columns.
 TAIL = 16
 #: Columns 20 to 23 of `step`: maximum of columns 0 to 3 over `SLACK_CYCLES` cycles from this cycle on [1/rad].
 NEAR = 20
 COLUMNS = 24
-#: Number of cycles after the last predicted cycle in which the guide must still be wider than the last predicted error.
+#: Number of cycles after the last predicted cycle. The last predicted error must be smaller than the guide width in these cycles.
 TAIL_CYCLES = 60
 
 
@@ -420,9 +422,10 @@ def _few_ratio(guide: GuideTables, cycle: int, least: float) -> float:
 
 
 def gate(h: float, xi: float) -> float:
-    """Return the weight of the backup torque without damping (lambda in the paper): (1 + (Xi^10 - 1) h)^3, limited to [0, 1].
+    """Return lambda, the weight of the backup torque for a constant h: (1 + (Xi^10 - 1) h)^3, limited to [0, 1].
 
-    If h < 0, the backup policy may not be able to keep the joints inside the guide. Then the weight is 1.
+    Lambda is the symbol in the paper. While h falls, `damped_gate` increases the weight. If h < 0, the backup policy may not be
+    able to keep the joints inside the guide. Then the weight is 1.
 
     Args:
         h: safety value, at most 1 (in the paper: function of the safe backward image).

@@ -1,10 +1,13 @@
-"""Assistive torque computed literally as the paper prints it: `measured motion -> u_a = u_i + u_f + u_v` of hip and knee.
+"""Literal law: assistive torque of hip and knee exactly as Gurriet et al., 2019, print it: `measured motion -> torque u_a`.
 
-This law is for comparisons with the paper. Its certificate contains no certified torques: it is not proven that the joints stay
-inside the guide under any disturbance torque.
-Each joint is treated as a separate inertia, J q'' = u_v + u_f + u_ext. The backup torque u_b is the PD part of the baseline PID.
-In each cycle the motion under u_b is integrated to the end of the step twice: with the largest and with the smallest constant
-u_ext. h is 1 - r^2 with the largest r = |e| / q_bound of both motions, and
+The literal law is for comparisons with this paper. Its certificate contains no certified torques: it is not proven that the
+joints stay inside the guide under any disturbance torque.
+
+The torque u_a is u_i + u_f + u_v. u_i cancels friction and gravity (joint idealization), u_f is the feedforward torque of the
+gait, and u_v is the torque of the guide. Each joint is treated as a separate inertia, J q'' = u_v + u_f + u_ext, with the
+disturbance torque u_ext. The backup torque u_b is the PD part of the baseline PID. In each cycle the motion under u_b is
+integrated to the end of the step twice: with the largest and with the smallest constant u_ext. The safety value h is 1 - r^2
+with the largest r = |e| / q_bound of both motions, and
 
     lambda = (1 + (Xi^10 - 1) h)^3,   lambda_d = -zeta dh/dt,   u_v = (lambda + (1 - lambda) lambda_d) u_b.
 
@@ -36,7 +39,7 @@ _ASSISTED = [LEG_JOINTS.index("SH"), LEG_JOINTS.index("SK")]
 
 
 class LiteralRecord:
-    """Constants and state of the control law that follows the paper literally. Each array has values for hip and knee."""
+    """Constants and state of the literal law. Each array has two elements: sagittal hip, sagittal knee."""
 
     kp: Annotated[Vector, 2]  # Nm/rad, proportional gain of the backup torque u_b
     kd: Annotated[Vector, 2]  # Nm s/rad, derivative gain of the backup torque u_b
@@ -44,7 +47,8 @@ class LiteralRecord:
     coulomb: Annotated[Vector, 2]  # Nm, Coulomb friction k_d
     viscous: Annotated[Vector, 2]  # Nm s/rad, viscous friction k_v
     push: Annotated[Vector, 2]  # Nm, largest absolute value of the external torque u_ext
-    #: s, gain on -dh/dt; while the safety value h falls, the backup torque u_b gets more weight; while h rises, less weight
+    #: s, determines how much a change of the safety value h changes the weight of the backup torque u_b: the weight is larger
+    #: while h falls, and smaller while h rises. With zeta = 0, the speed of h has no effect.
     zeta: float
     idealization: float  # factor in [0, 1] on the torque u_i, which cancels friction and gravity (joint idealization)
     xi: float  # assistance factor of the step, from 0 (widest guide) to 1 (narrowest guide)
@@ -53,31 +57,32 @@ class LiteralRecord:
 
 
 class LiteralTables(NamedTuple):
-    """Tables of the control law that follows the paper literally."""
+    """Data from which `assistive_torque` computes the torque of the literal law in each cycle of a step."""
 
-    records: Records[LiteralRecord]  # (1,) constants and state of the control law; `assistive_torque` updates the state
-    step: Vector  # (cycles + 1, 8) bounds, reference and feedforward in each cycle of the step; columns: see below
+    records: Records[LiteralRecord]  # (1,) constants and state of the literal law; `assistive_torque` updates the state
+    step: Vector  # (cycles + 1, 8) one row per cycle of the step; columns: see `BOUND`, `REFERENCE` and `FEEDFORWARD`
 
 
-BOUND = 0  # columns 0 to 3 of `step`: distances to the upper and lower bound of the hip, then of the knee [rad]
-REFERENCE = 4  # columns 4 and 5 of `step`: q_des'' of sagittal hip and knee [rad/s2]
-FEEDFORWARD = 6  # columns 6 and 7 of `step`: u_f of sagittal hip and knee times `LiteralConfig.feedforward` [Nm]
+BOUND = 0  # columns 0 to 3 of `step` [rad]: distance from q_des to hip upper, hip lower, knee upper, knee lower bound
+REFERENCE = 4  # columns 4 and 5 of `step` [rad/s2]: desired acceleration q_des'' of sagittal hip and knee
+FEEDFORWARD = 6  # columns 6 and 7 of `step` [Nm]: feedforward torque of hip and knee, u_f * `LiteralConfig.feedforward`
 
 
 @dataclass(frozen=True)
 class LiteralConfig:
-    """Parameters of the control law that follows the paper literally."""
+    """Parameters of the literal law."""
 
-    gains: LegGains  # gains of the baseline PID of the swing leg
+    gains: LegGains  # PID gains of the swing leg; kp and kd of SH and SK are also the gains of the backup torque u_b
     push: Pair  # Nm, largest absolute value of the external torque u_ext of sagittal hip and knee
-    #: s, gain on -dh/dt; while the safety value h falls, the backup torque u_b gets more weight; while h rises, less weight
+    #: s, determines how much a change of the safety value h changes the weight of the backup torque u_b: the weight is larger
+    #: while h falls, and smaller while h rises. With zeta = 0, the speed of h has no effect.
     zeta: float
     idealization: float  # factor in [0, 1] on the torque u_i, which cancels friction and gravity (joint idealization)
     feedforward: float  # factor in [0, 1] on the feedforward torque u_f
 
 
 class LiteralGuide:
-    """Control law that follows the paper literally, for one gait and one guide shape. Call `start_step` at each stance change.
+    """Literal law for one gait and one guide shape. Call `start_step` at each stance change.
 
     Attributes:
         tables: constants, state and values of each cycle, with which `assistive_torque` computes the torque.
@@ -108,7 +113,7 @@ class LiteralGuide:
         self.start_step(0.0, (0.0, 0.0), (0.0, 0.0))
 
     def start_step(self, xi: float, deviation: Pair, rate: Pair) -> None:
-        """Start a step: compute guide and reference.
+        """Start a step: compute the guide bounds and the desired accelerations q_des'' of all cycles.
 
         Args:
             xi: assistance factor of the whole step.
@@ -123,7 +128,7 @@ class LiteralGuide:
 
 
 def no_promise(shape: str, xi: float) -> Certificate:
-    """Return the certificate of the literal control law: the law is not certified for any disturbance torque.
+    """Return the certificate of the literal law. It states that no disturbance torque is certified.
 
     Args:
         shape: name of the shape.
@@ -134,12 +139,12 @@ def no_promise(shape: str, xi: float) -> Certificate:
 
 
 def assistive_torque(tables: LiteralTables, guard: Guard, cycle: int, leg: LegState, rates: Pair) -> Pair:
-    """Compute the assistive torque u_a = u_i + u_f + u_v of sagittal hip and knee for one cycle [Nm].
+    """Compute the assistive torques u_a of sagittal hip and knee for one cycle [Nm].
 
     Args:
         tables: tables of the literal law.
-        guard: record of the guide filter. For the telemetry, this record receives the minimum of h and the maximum of
-            the gate over both joints, and the bounds of the guide.
+        guard: record of the guide filter. For the telemetry, the function writes to it the smaller h and the larger gate of
+            the two joints, and the guide bounds.
         cycle: number of cycles since the stance change. A number above the length of the step is replaced by this length.
         leg: measurements of the swing leg.
         rates: q_des' of SH and SK [rad/s].
@@ -159,7 +164,7 @@ def assistive_torque(tables: LiteralTables, guard: Guard, cycle: int, leg: LegSt
 
 
 def _guide_torque(tables: LiteralTables, cycle: int, joint: int, e: float, rate: float) -> tuple[float, float, float]:
-    """Return three values of a joint: h; the gate, which is the factor of the backup torque u_b; the guide torque u_v [Nm]."""
+    """Return three values of a joint: safety value h, gate (weight of u_b), and guide torque u_v = gate * u_b [Nm]."""
     record = tables.records[0]
     ratio = max(_largest_ratio(tables, cycle, joint, e, rate, 1.0), _largest_ratio(tables, cycle, joint, e, rate, -1.0))
     h = 1.0 - ratio * ratio

@@ -1,7 +1,8 @@
-"""Tables of the prediction under the backup policy, for one set of gains and one gait. All guide shapes share the tables.
+"""Tables that predict the swing leg while only the backup policy (spring and damper) drives sagittal hip and knee.
 
-`leg, backup policy, mismatch -> rows of the predicted errors, largest effect of the disturbances`. The guide filter and the
-certificate use the tables.
+`leg, backup policy, mismatch -> matrices from state to predicted errors, largest effect of the disturbances`. The mismatch is
+the largest model errors. The guide filter and the certificate use the tables. The tables are valid for one gait and one set of
+backup gains. They do not depend on the guide shape.
 """
 
 from __future__ import annotations
@@ -20,25 +21,29 @@ from atalante_hal.types import Vector
 
 Pair = tuple[float, float]
 
-#: Prediction lengths at which torque and speed are computed [cycles].
+#: Torques and speeds are predicted only for these numbers of cycles ahead. Tracking errors are predicted for every cycle.
 FEW = np.array([1, 2, 3, 4, 6, 8, 11, 15, 20, 27, 36, 48, 64, 85, 113, 150, 200, 250, 300])
-#: Typical magnitude of each state element, see `backup_policy.STATES`. The magnitudes are weights in `Prediction.compress`.
+#: Typical magnitude of each of the 10 elements of the leg state (errors, rates and accelerations, see `backup_policy.STATES`).
+#: The compression of the state divides by these magnitudes, because the elements have different units.
 SIZES = np.repeat([0.07, 1.0, 1.0, 140.0, 140.0], 2)
 
 
 @dataclass(frozen=True)
 class Assumptions:
-    """Largest disturbances and model errors with which the joints must stay inside the guide, and lengths of the tables."""
+    """Largest disturbances and model errors under which both joints must stay inside the guide.
+
+    `horizon` and `overlap` are lengths of the prediction tables.
+    """
 
     #: Nm, requested disturbance torques: these torques at sagittal hip and knee must not move a joint out of the guide
     promise: Pair = (30.0, 18.0)
-    loop: SampledLoop = field(default_factory=SampledLoop)  # lags of motor torque and measured velocity
+    loop: SampledLoop = field(default_factory=SampledLoop)  # lag of the motor torque, and lag of the measured velocity
     mismatch: Mismatch = field(default_factory=Mismatch)  # largest errors of friction and inertia
     hand_over: HandOver = field(default_factory=HandOver)  # largest deviations when a step starts
     #: Smallest and largest number of cycles between a measurement and the torque that is computed from it.
     delays: tuple[int, int] = (1, 2)
     horizon: int = 300  # number of predicted cycles
-    overlap: int = 100  # number of cycles that the tables cover after the end of a step
+    overlap: int = 100  # number of cycles of the next step in the tables; predictions can reach into them
 
     def __post_init__(self) -> None:
         """Check the ranges of the values.
@@ -53,21 +58,21 @@ class Assumptions:
 
 
 class StartReach(NamedTuple):
-    """Largest effects of disturbances in each cycle of a step. The disturbances act from the start of the step on.
+    """Largest deviations of hip and knee in each cycle of a step, if disturbances act from the start of the step on.
 
-    Columns 0 and 1 are the effect of the model errors (`Leg.budget`) on SH and SK. Columns 2 and 3 are the effect of the
-    requested disturbance torques on SH and SK.
+    Row i: cycle i of the step. Columns 0 and 1: deviations of SH and SK due to the model errors (`Leg.budget`). Columns 2 and 3:
+    deviations of SH and SK due to the requested disturbance torques.
     """
 
-    error: Vector  # (n, 4) rad, tracking error
-    torque: Vector  # (n, 4) Nm, backup torque
-    speed: Vector  # (n, 4) rad/s, joint speed
-    worst_speed: Vector  # (n, 4) rad/s, joint speed with the worst errors of inertia and delay
-    change: Vector  # (n, 4) Nm, change of the backup torque within one cycle
+    error: Vector  # (n, 4) rad, tracking error; worst case over all inertia errors and delays
+    torque: Vector  # (n, 4) Nm, deviation of the backup torque, without inertia error and additional delay
+    speed: Vector  # (n, 4) rad/s, deviation of the joint speed, without inertia error and additional delay
+    worst_speed: Vector  # (n, 4) rad/s, deviation of the joint speed; worst case over all inertia errors and delays
+    change: Vector  # (n, 4) Nm, change of the backup torque from one cycle to the next
 
 
 class Prediction:
-    """Tables of the prediction under the backup policy.
+    """Tables that predict hip and knee while only the backup policy drives them.
 
     Attributes:
         policy: gains of the backup policy.
@@ -98,7 +103,7 @@ class Prediction:
             policy: gains of the backup policy.
             leg: swing leg along the nominal trajectory, to the end of the overlap.
             assumptions: assumptions of the promise for which the tables are computed.
-            blend: fraction of the carried-over torque that remains in each cycle since the stance change, shape (m,).
+            blend: element i is the fraction of the torque jump at the stance change that remains i cycles later, shape (m,).
             width: largest width of the guides for which the tables are used [rad].
         """
         self.policy, self.leg, self.assumptions = policy, leg, assumptions
@@ -134,15 +139,14 @@ class Prediction:
         whole = Grid(starts, START_CYCLES, np.arange(horizon + 1))
         few, none = whole._replace(lags=FEW), whole._replace(lags=FEW[:0])
 
-        # Each member of `family` is the loop with one combination of inertia error and delay. `reach` and `few_ahead[2]` contain
-        # the largest effect of disturbances over all members. For example, a joint moves faster if the leg is lighter than in the
-        # model, or if the command arrives later.
+        # Each loop in `family` has another inertia error or delay. `reach` and `few_ahead[2]` are maxima over all these loops.
+        # Example: a joint moves faster if the leg is lighter than in the model, or if the command arrives later.
         self.reach = np.zeros((blocks, len(whole.lags), 4))
-        # Largest effects of disturbances on torque and speed.
-        # Axis 0: torque, speed, speed with the worst inertia and delay.
-        # Axis 1: block of start cycles.
-        # Axis 2: prediction length. Element i is for a prediction of FEW[i] cycles.
-        # Axis 3: hip and knee due to model errors, then hip and knee due to the disturbance torques `Assumptions.promise`.
+        # `few_ahead`: largest changes of predicted torques [Nm] and speeds [rad/s] that disturbances can cause.
+        # Axis 0: 0 torque, 1 speed of the loop without model errors, 2 largest speed of all loops in `family`.
+        # Axis 1: element k is for predictions that start in one of the `START_CYCLES` cycles from cycle k * START_CYCLES on.
+        # Axis 2: element i is for the prediction FEW[i] cycles ahead.
+        # Axis 3: 0 hip and 1 knee due to model errors; 2 hip and 3 knee due to the disturbance torques `Assumptions.promise`.
         few_ahead = np.zeros((3, blocks, len(FEW), 4))
         lag = assumptions.loop.velocity_lag
         first, first_rates = [], []
@@ -155,14 +159,14 @@ class Prediction:
         torque, speed = Effect(nominal.pushed_feedback, nothing, self.mass), Effect(nominal.pushed_rate, nothing, same)
         first_torque = run(torque, mobilities, bounds, few, few_ahead[0])
         first_speed = run(speed, mobilities, bounds, few, few_ahead[1])
-        # Axes of `by_bound`: block of start cycles, element of `FEW`, cause, output, joint.
-        # Causes: model errors, disturbance torques. Outputs: torque, speed. Joints: sagittal hip, sagittal knee.
+        # Axes 0 and 1 of `by_bound` are axes 1 and 2 of `few_ahead`. Axis 2: 0 model errors, 1 disturbance torques.
+        # Axis 3: 0 torque, 1 speed. Axis 4: 0 sagittal hip, 1 sagittal knee.
         by_bound = few_ahead[:2].reshape(2, blocks, len(FEW), 2, 2).transpose(1, 2, 3, 0, 4)
         self.few_reach: Vector = np.concatenate([by_bound.reshape(blocks, len(FEW), 8), few_ahead[2]], axis=2)
         self.few_ahead: Vector = np.concatenate([nominal.feedback[FEW], nominal.rate[FEW]], axis=1)
         rates = [_for_rate_difference(one.rate[FEW] - nominal.rate[FEW]) for one in family]
         self.few_slack: Vector = np.abs(rates).max(axis=0)
-        # The torque that is carried over the stance change fades out slowly. Its change within one cycle is neglected.
+        # The torque jump at the stance change fades out slowly (`blend`), so its change within one cycle is neglected.
         bounds[:, :, 0] = leg.budget(assumptions.mismatch, hand_over, np.zeros(0))
         change = Effect(np.diff(lightest.pushed_feedback, axis=0, prepend=0.0), nothing, self.mass)
         first_change = run(change, mobilities, bounds, none, few_ahead[0])
@@ -177,13 +181,15 @@ _MOST_KEPT = 8
 
 
 def prediction_of(policy: BackupPolicy, leg: Leg, assumptions: Assumptions, blend: Vector, width: float) -> Prediction:
-    """Return the prediction of a leg. The most recent predictions are cached, because all guide shapes of a gait share them.
+    """Return the prediction for a leg, from a cache if possible.
+
+    The last `_MOST_KEPT` predictions are cached, because all guide shapes of a gait use the same prediction.
 
     Args:
         policy: gains of the backup policy.
         leg: swing leg along the nominal trajectory, to the end of the overlap.
         assumptions: assumptions of the promise for which the tables are computed.
-        blend: fraction of the carried-over torque that remains in each cycle since the stance change, shape (m,).
+        blend: element i is the fraction of the torque jump at the stance change that remains i cycles later, shape (m,).
         width: largest width of the guides for which the tables are used [rad].
     """
     parts = [leg.time, leg.q, leg.qd, leg.qdd, leg.gravity, leg.inertia.fit, blend]
@@ -199,7 +205,7 @@ def prediction_of(policy: BackupPolicy, leg: Leg, assumptions: Assumptions, blen
 
 
 def _for_rate_difference(rows: Vector) -> Vector:
-    """Convert prediction matrices for a state with (true - measured) error rates instead of true error rates.
+    """Return prediction matrices that take the differences (true - measured error rate) in place of the true error rates.
 
     The given matrices multiply a state in which elements 2 and 3 are the true error rates of SH and SK. Elements 4 and 5 are the
     measured error rates. The returned matrices multiply a state in which elements 2 and 3 are the differences true - measured.

@@ -97,7 +97,10 @@ def _shape(document: Mapping[str, Any]) -> GuideShape:
 
 
 def _warped(phase: Vector, knots: Vector) -> Vector:
-    """Warp phases so that a linear interpolation at the warped phases is a half-cosine interpolation at the given phases.
+    """Return other phases, at which `np.interp` gives the value of a half-cosine interpolation at the given phases.
+
+    Between two knots, a half-cosine interpolation follows half a period of a cosine in place of a straight line. Example: the
+    phase at one quarter of the way between two knots becomes the phase at 15 % of this way.
 
     Args:
         phase: phases of the step, shape (n,).

@@ -2,7 +2,7 @@
 
 `shape, assistance factor -> bounds over the phase`. The guide filter, the certificate and the plots use the bounds. The paper
 does not define the shape. It defines only a half-width, 0.5 + 7 (1 - Xi) degrees. A shape multiplies this half-width by
-fractions.
+fractions. The paper is Gurriet et al., 2019.
 """
 
 from __future__ import annotations
@@ -15,11 +15,11 @@ import numpy as np
 
 from atalante_hal.types import Vector
 
-#: Half-width of the shape `pinched` at the end of the step [rad]. A guide that is narrower from the start keeps its width.
+#: Half-width to which the shape `pinched` closes [rad]. With a half-width below 1 degree at the start, the guide does not close.
 PINCH_WIDTH = math.radians(1.0)
 SNAP_WIDTH = math.radians(0.1)  # rad, half-width of the shape `snap` in the narrow part of the step
-#: Smallest bound of a shape [rad], about two encoder counts at the joint.
-#: With a much smaller bound of the shape, h of the guide filter would overflow.
+#: Smallest valid distance from the desired trajectory to a bound of a guide [rad], about two encoder counts at the joint.
+#: The guide filter divides by the distance, so a much smaller distance would make its safety value h overflow.
 NARROWEST = 1e-6
 JOINTS = ("SH", "SK")  # joints with a guide, in the order of the bounds
 #: Phases and assistance factors at which a shape is checked on construction.

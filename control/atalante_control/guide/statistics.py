@@ -1,4 +1,4 @@
-"""Statistics of the virtual guide over a walk: `tracking errors, guide, h of each cycle -> counts and extremes`."""
+"""Statistics of the virtual guide over a walk: `error / guide width and safety value h of each cycle -> counts, extremes`."""
 
 from __future__ import annotations
 
@@ -7,25 +7,27 @@ from dataclasses import dataclass, field
 
 @dataclass
 class GuideStatistics:
-    """Statistics of the guide over the cycles that were added with `count`."""
+    """Statistics of the guide. Each call of `count` adds one cycle."""
 
     cycles: int = 0  # number of counted cycles
     inside: int = 0  # number of counted cycles with both assisted joints inside the guide
-    active: int = 0  # number of counted cycles with the filter active
+    #: number of counted cycles in which the weight of the backup torque was above `StepGuideConfig.active`
+    active: int = 0
     max_ratio: float = 0.0  # largest |e| / q_bound
-    #: smallest h in the first cycle of a step; at h >= 0, the backup policy can keep both joints inside the guide
+    #: Smallest safety value h among the first cycles of all steps. If h >= 0, the backup policy (spring and damper) can keep
+    #: both joints inside the guide.
     min_h_at_start: float = 1.0
-    hand_overs_exceeded: int = 0  # number of stance changes with a larger deviation than the certificate assumes
+    hand_overs_exceeded: int = 0  # number of steps that start with a larger deviation than the certificate permits
     factors: set[float] = field(default_factory=set)  # assistance factors of all steps so far
 
     @property
     def inside_fraction(self) -> float:
-        """Return the fraction of the counted time with both joints in the guide; 0 before the first counted cycle."""
+        """Return `inside` as a fraction of all counted cycles; 0 before the first counted cycle."""
         return self.inside / max(1, self.cycles)
 
     @property
     def active_fraction(self) -> float:
-        """Return the fraction of the counted time with the filter active; 0 before the first counted cycle."""
+        """Return `active` as a fraction of all counted cycles; 0 before the first counted cycle."""
         return self.active / max(1, self.cycles)
 
     def count(self, cycle: int, ratio: float, h: float, acting: bool) -> None:
@@ -34,8 +36,8 @@ class GuideStatistics:
         Args:
             cycle: number of cycles since the stance change.
             ratio: the larger |e| / q_bound of the two joints.
-            h: safe backward image function.
-            acting: whether the filter is active.
+            h: safety value of the guide filter in this cycle.
+            acting: whether the weight of the backup torque is above `StepGuideConfig.active`.
         """
         self.cycles += 1
         self.inside += ratio <= 1.0

@@ -1,7 +1,8 @@
-"""Virtual guides of a walk, in the air or on the ground: one guide filter for each set of gains, and the selection for each step.
+"""Virtual guides of a walk: some guide filters of different stiffness, from which one is selected for each step.
 
-`assistance factor -> guide filter, promise, certificate`. A narrow guide requires a stiff backup policy, but a stiff policy
-reaches the torque limit in a wide guide. Each step uses the filter with the lowest stiffness that is certified for the
+`assistance factor -> guide filter, promise, certificate`. The walk is in the air or on the ground. The backup policy is
+the spring and damper that returns the leg to its desired trajectory. A narrow guide requires a stiff backup policy, but a stiff
+policy reaches the torque limit in a wide guide. Each step uses the filter with the lowest stiffness that is certified for the
 requested promise (disturbance torques) at the assistance factor of the step.
 """
 
@@ -22,32 +23,32 @@ from atalante_control.joint.idealization import AssistedInertia
 from atalante_hal.robot import LEG_JOINTS, Robot
 from atalante_hal.types import Vector
 
-#: Reference knee angle of the backup policy [rad], in the middle of the swing, see `BackupPolicy.mass`.
+#: Knee angle [rad] at which the gains of the backup policy (spring and damper) are computed, in the middle of the swing.
+#: At other knee angles, the mass matrix and the stiffness of the joints are different, see `BackupPolicy.mass`.
 _MIDDLE = math.radians(30.0)
 #: Indices of SH and SK of the left leg. SH and SK have the same limits in both legs.
 _ASSISTED = [LEG_JOINTS.index("SH"), LEG_JOINTS.index("SK")]
 #: Largest half-width of a guide [rad]. This width applies at assistance factor 0, see `half_width`.
 _WIDEST = math.radians(7.5)
-#: If the requested disturbance torques cannot be certified, the filter is certified for this fraction of the largest certifiable
-#: torques. Every prediction of the filter includes the certified torques. With the fraction 1, a prediction would therefore reach
-#: its limit even if nobody pushes, and the filter would apply the full backup torque without need.
+#: Fraction of the largest certifiable disturbance torques that a filter assumes if the requested torques cannot be certified.
+#: With 1, a prediction would reach its limit even if nobody pushes, and the filter would apply the full backup torque.
 _MARGIN = 0.95
 #: Filters are chosen for this many assistance factors from 0 to 1, without 0: 0.01, 0.02 and so on.
 _FACTORS = 100
 
 
 class Choice(NamedTuple):
-    """Guide filter of a step, and the disturbance torques for which this filter is certified."""
+    """Guide filter that is used in a step, and its certified disturbance torques."""
 
     guide: GuideFilter
     promise: float  # certified torques as a fraction of the torques that the configuration requests, in [0, 1]
 
 
 class StepGuides:
-    """Guide filters for one gait and one guide shape, one filter for each set of backup gains.
+    """Guide filters for one gait and one guide shape, one filter for each stiffness of the backup policy.
 
     Attributes:
-        filters: guide filters in ascending order of their gains.
+        filters: guide filters in ascending order of their stiffness.
     """
 
     def __init__(
@@ -124,7 +125,9 @@ class StepGuides:
 
 
 def filter_config(config: StepGuideConfig, robot: Robot) -> GuideConfig:
-    """Return the parameters of the guide filters. The limits follow from the limits of SH and SK of the robot.
+    """Return the parameters of the guide filters.
+
+    The limits are the limits of SH and SK of the robot. `torque_limit` and `speed_limit` are smaller by the reserves in `config`.
 
     Args:
         config: reserves, gains and intensities.

@@ -1,4 +1,6 @@
-r"""Flat foot: ankle angles that keep the swing foot level. `tibia attitude -> targets of sagittal and henke ankle (SA, HA)`.
+r"""Flat foot: ankle angles that hold the sole of the swing foot horizontal. `tibia attitude -> targets of SA and HA`.
+
+SA is the sagittal ankle. HA is the henke ankle, which turns about the oblique henke axis and tilts the foot sideways.
 
 The attitude comes from the tibia IMU. If this IMU is lost, the attitude is computed from the joints and the pelvis IMU. The
 targets replace the nominal angles in the reference of the PID. The attitude of the foot in the world is
@@ -41,16 +43,21 @@ _IMU_AGE = 10  # cycles, largest valid age of an IMU message, equal to the timeo
 
 
 class Ankle:
-    """Constants of one ankle, and its deviation from the targets at the stance change. The re-centring removes the deviation."""
+    """Constants of one ankle, and its deviation from the flat-foot targets at the start of a step.
 
-    geometry: Annotated[Vector, 4]  # geometry of the ankle, see `FlatFoot.geometry`
+    The re-centring fades out the deviation: at the start of a step, the targets begin at the measured angles, and then
+    approach the flat-foot angles.
+    """
+
+    geometry: Annotated[Vector, 4]  # cosine and sine of the toe-out, then x and z of the unit henke axis
     offset: float  # rad, angle added to the target of the sagittal ankle (SA)
     joints: Annotated[npt.NDArray[np.int64], 2]  # indices of sagittal and henke ankle (SA, HA) of this leg in JOINTS
     low: Annotated[Vector, 2]  # rad, smallest targets of sagittal and henke ankle
     high: Annotated[Vector, 2]  # rad, largest targets of sagittal and henke ankle
-    #: rad, deviation of sagittal and henke ankle from their targets at the stance change
+    #: rad, measured minus flat-foot angles of sagittal and henke ankle at the start of the step
     deviation: Annotated[Vector, 2]
-    rate: Annotated[Vector, 2]  # rad/s, deviation of both joint speeds from the target rates at the stance change
+    #: rad/s, measured minus flat-foot speeds of sagittal and henke ankle at the start of the step
+    rate: Annotated[Vector, 2]
 
 
 @dataclass(frozen=True)
@@ -141,7 +148,10 @@ def ankle_records(robot: Robot, exoskeleton: ExoskeletonParameters, offset: floa
 
 
 def recentring_rows(deadbeat: Deadbeat, count: int) -> Vector:
-    """Return the basis cubics c0, c1 of the re-centring and the derivatives c0', c1', one row per cycle, shape (n, 4).
+    """Return the polynomials c0, c1 of the re-centring and their time derivatives c0', c1' in each cycle, shape (n, 4).
+
+    Let d and v be the deviations of angle and speed at the stance change. The re-centring adds c0 d + c1 v to the target angle,
+    and c0' d + c1' v to the target speed.
 
     Args:
         deadbeat: re-centring of the gait.
@@ -188,7 +198,7 @@ class LevelFeet:
         self.cubics = recentring_rows(deadbeat, len(nominal[0]))
 
     def start_step(self, state: State, side: int) -> None:
-        """Store the deviation of the swing ankle from the target. The re-centring then reduces this deviation to zero.
+        """Store the deviation of the swing ankle from its targets at the stance change, which the re-centring fades out.
 
         Args:
             state: measured state of the robot at the stance change.
@@ -233,7 +243,7 @@ class LevelFeet:
 
 
 def start_level_ankle(ankle: Ankle, tibia: Vector | Quaternion, gyro: Vector | Vector3, q: Vector, qd: Vector) -> None:
-    """Store the deviation of a swing ankle from its target at the stance change. The re-centring starts with this deviation.
+    """Store the deviation of a swing ankle from its targets at the stance change, which the re-centring fades out.
 
     Args:
         ankle: record of the swing ankle.
@@ -274,7 +284,7 @@ def write_level_ankle(
 
 
 def _write_targets(ankle: Ankle, cubics: Vector, cycle: int, target: tuple[Pair, Pair], desired: Vector) -> None:
-    """Add the re-centring to the target angles and rates of both ankle joints, and write the sums into `desired`."""
+    """Add what remains of the deviation at the stance change to the targets, and write the sums into `desired`."""
     (angles, rates), n = target, len(desired) // 2
     for i in range(2):
         angle, rate, joint = angles[i], rates[i], ankle.joints[i]

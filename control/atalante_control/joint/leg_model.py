@@ -1,4 +1,7 @@
-"""Model of the legs: `exoskeleton, patient -> LegModel`. With this model, the HAL compares motion and torque of each joint."""
+"""Rigid-body model of both legs for the HAL: `exoskeleton, patient -> LegModel`.
+
+From the model and the measured motion, the HAL computes the torque of each joint, and compares it with the sent torque.
+"""
 
 from __future__ import annotations
 
@@ -70,7 +73,7 @@ def _fused(link: Link, tree: dict[str, Link]) -> Inertia:
 
 
 def _turn(link: Link) -> Vector:
-    """Return `LegModel.turn` of a link, shape (3, 3, 3).
+    """Return the three matrices from which the HAL computes the rotation of a link (`LegModel.turn`), shape (3, 3, 3).
 
     The rotation matrix from link to parent is turn[0] + sin(q) turn[1] + (1 - cos(q)) turn[2].
     """

@@ -82,7 +82,7 @@ class PidRecord:
     gains: Annotated[Vector, (3, len(JOINTS))]  # Kp [Nm/rad], Kd [Nm s/rad], and Ki times the cycle time [Nm/rad]
     limit: float  # Nm, largest absolute value of the integral torque
     integral: Annotated[Vector, len(JOINTS)]  # Nm, integral torque
-    requested: Annotated[Vector, len(JOINTS)]  # Nm, torque command before the limiter, with all contributions
+    requested: Annotated[Vector, len(JOINTS)]  # Nm, torque command with all parts, before the HAL limits it
 
 
 class Pid:

@@ -51,11 +51,11 @@ class ExoskeletonParameters:
     cell_x: tuple[float, float] = (0.178, -0.064)  # m, x of front and rear force cells relative to the ankle
     cell_y: float = 0.027  # m, lateral distance of the force cells from the middle of the foot
     pad_radius: float = 0.005  # m, radius of the sphere in each corner of the sole; the spheres touch the sole plane
-    pad_mass: float = 0.0015  # kg, mass of each contact sphere; the foot box has the remaining mass of the foot
+    pad_mass: float = 0.0015  # kg, mass of each of the 4 contact spheres of a foot; `foot_mass` includes the spheres
 
     torso_imu: Vector3 = (-0.14, 0.0, 0.50)  # m, position of the torso IMU in the pelvis frame
     pelvis_imu: Vector3 = (-0.164, -0.015, 0.191)  # m, position of the pelvis IMU in the pelvis frame
-    tibia_imu: Vector3 = (-0.13, -0.074, 0.018)  # m, left tibia IMU: x, y relative to SK, z relative to SA
+    tibia_imu: Vector3 = (-0.13, -0.074, 0.018)  # m, left tibia IMU: x and y from joint SK, z from joint SA
 
     def __post_init__(self) -> None:
         for name in ("thigh_length", "shank_length"):
@@ -119,7 +119,7 @@ def pad_link(foot: str, cell: str) -> str:
 
 
 def _patient_segments(p: ExoskeletonParameters, patient: Patient) -> dict[str, tuple[Box, Inertia]]:
-    """Return link name -> box and mass properties of the patient's segment that is fused into this link.
+    """Return the segments of the patient: link name -> box and mass properties of the segment that moves with this link.
 
     The hip of the patient is the intersection of the axes of FH and SH, the knee is on the axis of SK, and the ankle is at SA.
     The offset `knee_lateral` of the exoskeleton shifts the shank outwards relative to the thigh. The foot is

@@ -38,7 +38,7 @@ class Attitude:
 
     rotation: Annotated[Vector, (3, 3)]  # rotation matrix from pelvis to world
     velocity: Annotated[Vector, 3]  # m/s, velocity of the IMU in the axes of the pelvis
-    bandwidth: float  # rad/s, natural frequency w of the decay of roll and pitch errors
+    bandwidth: float  # rad/s, natural frequency w with which errors of roll and pitch decay
 
 
 class AttitudeObserver:

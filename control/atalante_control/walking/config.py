@@ -19,8 +19,8 @@ from atalante_hal.types import Vector
 
 Pair = tuple[float, float]
 
-#: Default of `WalkConfig.steering`: hip offset of 0.5 rad per rad of heading error and 0.15 rad per m of sideways deviation, at
-#: most 3 degrees in each step.
+#: Default of `WalkConfig.steering`: the transverse hip turns by 0.5 rad per rad of heading error, plus 0.15 rad per metre of
+#: sideways deviation from the path, but by at most 3 degrees.
 STEERING = 0.5, 0.15, math.radians(3.0)
 
 _NO_INTEGRAL = (0.0,) * 6
@@ -32,9 +32,8 @@ TURN_MAX = math.radians(5.0)
 WALK_GAINS = PidGains(
     stance=replace(PidGains().stance, ki=_NO_INTEGRAL), swing=replace(PidGains().swing, ki=_NO_INTEGRAL)
 )
-#: Parameters of the guide on the ground. The guide is stiffer than in the air, because the leg with the patient is
-#: heavier than the empty leg. The hand-over box (deviations at a stance change for which the guide is certified) covers
-#: the deviations at the landings.
+#: Parameters of the guide on the ground. `stiffness` is larger than in the air, because the leg carries the patient's leg.
+#: `hand_over` (largest deviations at the start of a step for which the guide is certified) covers the deviations after a landing.
 WALK_GUIDE = StepGuideConfig(stiffness=(4500.0, 3300.0), hand_over=HandOver(deviation=math.radians(1.0), rate=0.3))
 
 
@@ -47,16 +46,19 @@ class WalkConfig:
     """
 
     gains: PidGains = WALK_GAINS
-    #: Reduction of the derivative gains of the stance leg (SH, SK, SA) per cycle of additional loop delay (`State.delay`), as a
-    #: fraction of the full gains. With 1/12 and 3 cycles, 75 % remain.
-    #: With full gains and 3 cycles of `State.delay`, the stance leg of a light patient oscillates with 50 Hz after a landing.
+    #: If torques act d cycles late (`State.delay`), the derivative gains of the stance leg (SH, SK, SA) are multiplied by
+    #: 1 - damping_loss * d. Example: 0.75 for 3 cycles.
+    #: With full gains and 3 cycles, the stance leg of a light patient oscillates with 50 Hz after a landing.
     damping_loss: float = 1.0 / 12.0
     impact: ImpactConfig = field(default_factory=ImpactConfig)
-    #: End of the re-centring (return from the measured to the nominal motion), as a fraction of the step duration.
+    #: Each step and each weight shift begins at the measured pose, and returns to the nominal motion within this fraction of its
+    #: duration (re-centring).
     alpha: float = 0.3
-    #: True: the periodic steps follow the control law of the paper literally, see `literal`. The guide is then not certified.
+    #: True: the periodic steps use the control law exactly as Gurriet et al., 2019, print it, see `WalkConfig.literal`.
+    #: The guide is then not certified.
     literal_law: bool = False
-    #: m/m, gain of the ankle stabiliser: shift of the centre of pressure per error of the divergent component of motion
+    #: m/m, the ankle stabiliser shifts the centre of pressure by this distance per metre of DCM error.
+    #: DCM: divergent component of motion.
     stabiliser: float = 2.5
     shift_limit: Pair = (0.12, 0.05)  # m, largest shift of the centre of pressure: along the walk; sideways
     #: m, smallest permitted distance from the centre of pressure to the front edge and to the rear edge of the stance sole.
@@ -65,18 +67,17 @@ class WalkConfig:
     placement: PlacementConfig = field(default_factory=PlacementConfig)  # parameters of foot placement and step timing
     lean: LeanConfig = field(default_factory=LeanConfig)  # parameters of the lean of the trunk
     flat_foot: bool = True  # whether the ankle of the swing leg holds the sole level
-    #: m/s, downward speed of the swing foot after the nominal end of a step. First value: start step and periodic step.
-    #: Second value: stop step.
+    #: m/s, downward speed of a late swing foot, which has not landed at the nominal end of a step.
+    #: Value 0: start step and periodic step. Value 1: stop step.
     reach_speed: Pair = (0.3, 0.03)
-    #: s, longest duration of the downward motion of the swing foot after the nominal end of a step. `reach_knee` can end
-    #: the motion earlier.
+    #: s, longest time for which a late swing foot moves down. Hip and knee stop earlier if the knee angle falls to `reach_knee`.
     reach_time: float = 0.2
     #: rad/s, largest speed of sagittal hip and knee while a late swing foot moves down.
     #: With an almost straight leg, even a slow foot needs high joint speeds. The foot is then slower than `reach_speed`.
     reach_rate: float = 2.5
     reach_knee: float = 0.05  # rad, smallest knee angle while a late swing foot moves down
-    #: Steering by an offset of the transverse hip: gain on the heading error [rad/rad], gain on the sideways deviation
-    #: [rad/m], limit [rad].
+    #: Steering adds an offset to the transverse hip. Value 0: offset per heading error [rad/rad]. Value 1: offset per sideways
+    #: deviation from the path [rad/m]. Value 2: largest offset [rad]; a turn increases it by abs(`turn`).
     steering: tuple[float, float, float] = STEERING
     #: rad, angle by which the straight path of the robot turns before each periodic step, positive to the left
     turn: float = 0.0
@@ -84,24 +85,22 @@ class WalkConfig:
     landing_timeout: float = 0.4
     load_bandwidth: float = 35.0  # Hz, cut-off frequency of the low-pass of the vertical foot forces
     observer_bandwidth: float = 2.0  # rad/s, natural frequency of the attitude observer
-    #: Whether the drift of the gyro is estimated from the heading of the pelvis IMU, see `walking.heading`. This requires an IMU
-    #: with a heading reference, because the heading of other IMUs drifts. If False, the estimated heading is the integral of the
-    #: gyro.
+    #: True: the heading of the pelvis IMU corrects the drift of the gyro, see `walking.heading`. The IMU must have a heading
+    #: reference, such as a magnetometer. False: the estimated heading is the integral of the gyro.
     heading_reference: bool = False
     loaded: float = 0.3  # smallest load with which a standing foot counts as loaded, as a fraction of the weight
-    #: Smallest load of a foot at which its leg has the full stance gains, as a fraction of the weight. First value: each leg
-    #: while the robot stands. Second value: ankle of the stance leg during a step.
+    #: Fraction of the weight that a foot must carry so that its leg has the full stance gains. Without load, it has swing gains.
+    #: Value 0: for each leg while the robot stands. Value 1: for the ankle of the stance leg during a step.
     full_gains: Pair = (0.25, 0.5)
     settle: float = 1.0  # s, time for which both feet must be loaded before the robot walks
     posture: float = 2.0  # s, duration of the motion from the measured pose to the standing pose
     shift: float = 1.5  # s, duration of a weight shift, onto one foot or back to both feet
     rest: float = 0.3  # s, wait after each weight shift
     guide: StepGuideConfig = WALK_GUIDE
-    #: End of the re-centring of sagittal hip and knee in a guided step, as a fraction of the step duration.
-    #: If hip and knee returned to the nominal motion as fast as with `alpha`, their drives would reach the torque limit.
-    #: If all other joints returned as slowly as hip and knee, the robot would fall. Therefore the other joints use `alpha`.
+    #: As `alpha`, but for sagittal hip and knee in a guided step. With `alpha`, their drives would reach the torque limit.
+    #: All other joints return with `alpha`. With `guided_alpha` for all joints, the robot would fall.
     guided_alpha: float = 0.5
-    #: s, duration of a ramp from 1 to 0 at the start of a guided step. The weight of the backup torque is never below the ramp.
+    #: s; at the start of a guided step, the smallest permitted weight of the backup torque falls from 1 to 0 during this time.
     #: The backup torque holds the leg inside the guide.
     engage: float = 0.02
     #: s, duration of the change from the guide to the baseline controller, for sagittal hip and knee, after a guided step
@@ -119,13 +118,14 @@ class WalkConfig:
         return cls(literal_law=True, gains=PidGains(), steering=(0.0, 0.0, 0.0))
 
     def leg_gains(self, delay: int = 0) -> Vector:
-        """Return the gains of a swing leg and of a stance leg: Kp [Nm/rad], Kd [Nm s/rad], Ki times the cycle time [Nm/rad].
+        """Return the PID gains of all joints, once as joints of a swing leg and once as joints of a stance leg.
 
         Args:
-            delay: further delay of the control loop, `State.delay` [cycles].
+            delay: number of cycles by which torques act late, `State.delay`.
 
         Returns:
-            Gains of both legs in each of the two roles, shape (2, 3, 12).
+            Gains, shape (2, 3, 12). Axis 0: swing leg, stance leg. Axis 1: Kp [Nm/rad], Kd [Nm s/rad], Ki times the cycle
+            time [Nm/rad]. Axis 2: joint, in the order of `JOINTS`.
         """
         roles = self.gains.swing, self.gains.stance
         gains = np.array([[2 * g.kp, 2 * g.kd, np.array(2 * g.ki) * PERIOD] for g in roles])
@@ -139,7 +139,8 @@ class WalkConfig:
                 raise ValueError(f"{name} must be at least one cycle ({PERIOD} s), got {getattr(self, name)!r}")
         if not 0.0 <= self.stabiliser <= 10.0:
             raise ValueError(
-                f"stabiliser (shift of the centre of pressure per DCM error) must be from 0 to 10 m/m, got {self.stabiliser!r}"
+                "stabiliser (shift of the centre of pressure per error of the divergent component of motion) "
+                f"must be from 0 to 10 m/m, got {self.stabiliser!r}"
             )
         if not 0.0 <= self.damping_loss <= 0.25:
             raise ValueError(f"damping_loss must be from 0 to 0.25 per cycle, got {self.damping_loss!r}")

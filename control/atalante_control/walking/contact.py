@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-#: N, largest twist (see `contact_force`) that the noise of four correct cells causes
+#: N, largest twist (forces FL - FR - RL + RR on the four cells of a foot) that noise causes if all four cells are correct
 _LARGEST_TWIST = 60.0
 
 

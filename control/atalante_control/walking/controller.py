@@ -61,8 +61,8 @@ _PELVIS, _TORSO = IMUS.index("pelvis"), IMUS.index("torso")
 _MARGIN = math.radians(1.0)
 #: Largest valid age of the message of an IMU or a foot [cycles], equal to the timeout of these messages in the DBC.
 _SENSOR_AGE = 10
-#: Largest expected deviation of the load on the stance foot from the weight, while the other foot swings, as a fraction of the
-#: weight. The load deviates from the weight, because the robot accelerates.
+#: While one foot swings, the load on the stance foot is expected to differ from the weight by at most this fraction of the
+#: weight, because the robot accelerates.
 _LOAD_ERROR = 0.15
 
 
@@ -137,10 +137,11 @@ class WalkController:
             toe=middle + half - config.edge,
         )
         force = np.zeros((len(FEET), len(CELLS), 3))
-        self._forces = force.copy()  # copy of the foot forces; contains the estimated forces of a lost foot
+        #: Foot forces of this cycle if the data of one foot is lost. They contain an estimate for this foot.
+        self._forces = force.copy()
         #: Copy of the torque that the controller requested last, used if the `State` does not contain the sent torque.
         self._sent = np.zeros(_N)
-        #: `State` object of the last `_bind`. The tuples in `_measured_by` contain the arrays of this object.
+        #: `State` object whose arrays the tuples in `_measured_by` contain. None before the first `reset` or `update`.
         self._state: State | None = None
         self._measured = Measured(np.zeros(_N), np.zeros(_N), np.zeros(3), np.zeros(3), np.zeros(3), force, self._sent)
         #: Index of the IMU in use (pelvis or torso) -> sensor arrays that the kernels read.
@@ -152,8 +153,8 @@ class WalkController:
         placements: Records[Placement] = placed
         placements[0].low[:], placements[0].high[:] = _range(robot, config)
         leans: Records[Lean] = zeros(Lean, 1)
-        # Views of two fields of `Placement`, each of shape (1,): row of the phase table, and change of the row per cycle.
-        # Python reads a view faster than the field of a record.
+        # `clock`: progress of the step, as a row of the table of the desired motion. `pace`: rows per cycle. Both arrays have
+        # the shape (1,) and share the memory of a record: Python reads an array element faster than a record field.
         self._clock, self._pace = placed["clock"], placed["pace"]
         outputs: Records[Outputs] = zeros(Outputs, 1)
         telemetry = zeros(Telemetry, 1)
@@ -300,7 +301,7 @@ class WalkController:
         self._start(self._measured, self._table, self._parts)
         self._pid.store_request(state.torque if state.torque_sent is None else state.torque_sent)
 
-    # -- one cycle ---------------------------------------------------------------------------------------------------
+    # -- computation of one cycle ------------------------------------------------------------------------------------
 
     def update(self, state: State) -> Command:
         """Compute the command of one cycle. If the current phase is over, start the next phase first.
@@ -392,7 +393,8 @@ class WalkController:
         load = self._load.tolist()
         self._loaded = self._loaded + 1 if min(load) >= self._carrying else 0
         if phase in STEPPING:
-            # Progress of the step = row of the phase table. Step timing advances the row by more or less than 1 per cycle.
+            # In a step, `elapsed` counts rows of the table of the desired motion. Step timing can use more or less than 1 row per
+            # cycle.
             elapsed = int(self._clock[0] + self._pace[0])
             swing = 1 - self._stance
             contact = contact_force(load[swing], float(self._twist[swing]))
@@ -415,8 +417,8 @@ class WalkController:
             self._stance = swing
         if phase in STEPPING:
             self._impact.start_step()
-        # In FINISH_STEP, the HAL changes to HOLD when the step number changes. A HOLD during a step would make the robot fall.
-        # Therefore, in FINISH_STEP, the controller does not change the step number until the robot stands on both feet.
+        # In FINISH_STEP, a new step number makes the HAL hold all joints at their positions (HOLD). In a step, the robot would
+        # fall. So the controller keeps the step number until the robot stands on both feet.
         if phase is Phase.REST or (phase in STEPPING and not self._finishing):
             self._command.step = (self._command.step or 0) + 1
         self._command.walking = phase in WALKING
@@ -460,7 +462,7 @@ class WalkController:
         record.assistance_factor, stage.intensity = xi, intensity(xi)
 
     def _watch_guide(self, cycle: int) -> None:
-        """Update the statistics of the guide, and set the reports to the HAL: `outside`, `guide_left` and `hand_over_exceeded`.
+        """Update the statistics of the guide, and set three flags of the command: `outside`, `guide_left`, `hand_over_exceeded`.
 
         `Command.outside` reports h < 0: the swing leg is outside the guide, or a quantity of the worst-case prediction (error,
         torque or speed) exceeds its limit.

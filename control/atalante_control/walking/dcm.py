@@ -1,10 +1,13 @@
-"""Ankle stabiliser: `error of the DCM -> shift of the centre of pressure -> torques of sagittal and henke ankle (SA, HA)`.
+"""Ankle stabiliser: ankle torques that lead the robot back to its nominal motion after a disturbance.
 
-The divergent component of motion (DCM) of an inverted pendulum moves away from the centre of pressure with the rate w. A
-shift of the centre of pressure by k times the DCM error makes this error decay with the rate (k - 1) w. Let F be the vertical
-force on a foot. The SA torque F d shifts the centre of pressure forwards by d. HA turns about the oblique henke axis and tilts
-the foot sideways. The HA torque -F d a shifts the centre of pressure sideways by d, where a is the forward component of the unit
-henke axis. F is measured, so a foot without load gets no torque.
+`DCM error -> shift of the centre of pressure -> torques of sagittal and henke ankle (SA, HA)`. The henke ankle tilts the foot
+sideways about an oblique axis, the henke axis.
+
+The divergent component of motion (DCM) of an inverted pendulum is a point on the ground, see `dcm`. It moves away from the centre
+of pressure with the rate w. A shift of the centre of pressure by k times the DCM error makes this error decay with the rate
+(k - 1) w. Let F be the vertical force on a foot. The SA torque F d shifts the centre of pressure forwards by d. The HA torque
+-F d a shifts the centre of pressure sideways by d, where a is the forward component of the unit henke axis. F is measured, so a
+foot without load gets no torque.
 """
 
 from __future__ import annotations
@@ -16,29 +19,33 @@ from atalante_hal.types import Vector
 
 Pair = tuple[float, float]
 
-#: Nm, permitted torque of the sagittal ankle of a stance foot without load, for example a foot that bounces at its landing
+#: Nm, torque of the sagittal ankle that is permitted even without load on the foot, for example while the foot bounces.
+#: `within_sole` adds this torque to the limits that follow from the load.
 _UNLOADED = 10.0
 
 
 class Stabiliser(NamedTuple):
     """Parameters of the ankle stabiliser."""
 
-    gain: float  # m/m, shift of the centre of pressure per DCM error; the error decays if the gain is above 1
-    forward: float  # m, largest shift forwards and backwards
-    sideways: float  # m, largest shift to each side
-    henke: float  # forward component of the unit henke axis in the foot frame
+    gain: float  # m/m, shift of the centre of pressure per DCM error; a gain above 1 makes the DCM error decay
+    forward: float  # m, largest shift of the centre of pressure forwards and backwards
+    sideways: float  # m, largest shift of the centre of pressure to each side
+    henke: float  # forward component (foot frame) of the unit vector along the axis of the henke ankle
     toe_out: float  # rad, toe-out of the left foot, positive to the left
     heel: float  # m, rearmost permitted centre of pressure relative to the ankle, negative
     toe: float  # m, foremost permitted centre of pressure relative to the ankle, positive
 
 
 class Balance:
-    """Divergent component of motion (DCM) of one cycle in the walking frame, with x forward and y to the left."""
+    """Balance in one cycle: divergent component of motion (DCM), and reaction of the ankle stabiliser.
+
+    The vectors are in the walking frame, with x forward and y to the left.
+    """
 
     dcm: Annotated[Vector, 2]  # m, measured DCM
-    error: Annotated[Vector, 2]  # m, measured minus nominal DCM
-    shift: Annotated[Vector, 2]  # m, shift of the centre of pressure
-    heading: float  # rad, heading of the walking frame
+    error: Annotated[Vector, 2]  # m, DCM error: measured minus nominal DCM
+    shift: Annotated[Vector, 2]  # m, shift of the centre of pressure that the ankle stabiliser requests
+    heading: float  # rad, yaw angle of the walking frame in the world
 
 
 def dcm(lever: tuple[float, float, float], speed: tuple[float, float, float], heading: float, frequency: float) -> Pair:
@@ -86,9 +93,9 @@ def within_sole(parameters: Stabiliser, torque: float, load: float) -> float:
 
 
 def ankle_torques(parameters: Stabiliser, shift: Vector, load: float, side: int) -> Pair:
-    """Return the torques of SA and HA that shift the centre of pressure of one foot [Nm].
+    """Return the torques of sagittal and henke ankle that shift the centre of pressure of one foot [Nm].
 
-    SA is the sagittal ankle (flexion). HA is the henke ankle, which tilts the foot sideways about the oblique henke axis.
+    The henke ankle tilts the foot sideways about an oblique axis.
 
     Args:
         parameters: geometry of the foot.

@@ -1,4 +1,6 @@
-"""Drift of the heading of a walk: `estimated heading, measured heading -> correction of the estimated heading`.
+"""Correction of the estimated heading, which drifts during a walk because of the gyro bias.
+
+`estimated heading, measured heading -> correction of the estimated heading`
 
 The integral of a gyro shows changes of the heading precisely, but the bias of the gyro makes it drift without bound. A heading
 reference, such as a magnetometer, has a bounded error, but this error is large and changes slowly. A Kalman filter therefore
@@ -28,14 +30,15 @@ from atalante_control.gait.gait import PERIOD
 
 
 class HeadingConfig(NamedTuple):
-    """Parameters of the heading filter. The error parameters are standard deviations."""
+    """Parameters of the heading filter."""
 
-    reference: float = 0.004  # rad, error of the heading reference
-    reference_time: float = 10.0  # s, correlation time of the error of the heading reference
-    gyro_noise: float = 1.7e-4  # rad/sqrt(s), random walk of the integral of the gyro (0.01 deg/s/sqrt(Hz))
-    gyro_bias: float = 5.2e-5  # rad/s, bias of the gyro at the start (0.003 deg/s)
-    bias_walk: float = 1e-6  # rad/s/sqrt(s), random walk of the bias
-    outlier: float = 5.0  # standard deviations; a measurement that differs more from its prediction is not used
+    reference: float = 0.004  # rad, standard deviation of the error of the heading reference (magnetometer)
+    reference_time: float = 10.0  # s, the error of the heading reference changes with this correlation time
+    #: rad/sqrt(s), standard deviation of the integrated gyro noise after 1 s. The value is a noise of 0.01 deg/s/sqrt(Hz).
+    gyro_noise: float = 1.7e-4
+    gyro_bias: float = 5.2e-5  # rad/s, standard deviation of the gyro bias at the start (0.003 deg/s)
+    bias_walk: float = 1e-6  # rad/s/sqrt(s), standard deviation of the change of the gyro bias within 1 s
+    outlier: float = 5.0  # standard deviations; a measured heading is not used if its prediction is further away
     interval: int = 100  # cycles between two updates
 
 
@@ -46,12 +49,12 @@ class HeadingFilter:
         """Compute the constant matrices of the filter.
 
         Args:
-            config: standard deviations of the errors.
+            config: parameters of the filter.
         """
         self._config, time = config, config.interval * PERIOD
         self._transition = np.array([[1.0, time, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]])
         self._process = np.diag([config.gyro_noise**2 * time, config.bias_walk**2 * time, 0.0])
-        #: Variance of the white measurement noise that stands for the slowly changing error of the reference [rad2].
+        #: rad2, variance of the white noise that replaces the slow error of the heading reference, see the module docstring
         self._measurement_noise = 2.0 * config.reference**2 * config.reference_time / time
         self.reset()
 

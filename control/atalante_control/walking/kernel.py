@@ -1,4 +1,4 @@
-"""Compiled control cycle of the walk: `measurements -> attitude, load, DCM`, then `phase -> torque command u`.
+"""Compiled control cycle of the walk: `sense` evaluates the measurements, `act` computes the torque command u.
 
     sense: foot forces -> loads; joints -> kinematics; gyro, accelerometer, sole at rest -> attitude; all -> DCM, headings
     act:   q_nom + s, steering, lowering of the swing foot, flat foot -> PID, gravity, feedforward, ankle stabiliser, guide -> u
@@ -45,7 +45,7 @@ _LEG = len(LEG_JOINTS)
 _FH, _TH, _SH, _SK, _SA, _HA = (LEG_JOINTS.index(name) for name in ("FH", "TH", "SH", "SK", "SA", "HA"))
 _ANKLES = (_SA, _HA)
 _FL, _FR, _RL, _RR = (CELLS.index(name) for name in ("FL", "FR", "RL", "RR"))
-#: s, time constant with which the downward speed of a swing foot rises after the nominal end of a step
+#: s, time constant with which a swing foot accelerates downwards if it has not landed at the nominal end of the step
 _REACH_RISE = 0.03
 
 Quaternion = tuple[float, float, float, float]
@@ -73,13 +73,15 @@ class Stage:
     deviation: Annotated[Vector, len(JOINTS)]
     #: rad/s, joint speeds at the start of the phase minus the speeds in the first row of the phase table
     rate: Annotated[Vector, len(JOINTS)]
-    placed: bool  # True: foot placement and step timing act
-    literal: bool  # True: the control law follows the paper literally, see `WalkConfig.literal`
+    placed: bool  # True: foot placement and step timing react to pushes in this phase
+    literal: bool  # True: as in the paper, joints without a guide get only PID torques, see `WalkConfig.literal`
     flat: bool  # True: the sole of the swing foot is held level
-    #: True: the guide filter drives hip and knee of the swing leg. False at assistance factor 1 and outside the periodic step.
+    #: True: the virtual guide drives sagittal hip and knee of the swing leg, so the patient can move them within bounds.
+    #: False: the baseline controller (PID) drives all joints, for example at assistance factor 1 or in the start step.
     assisted: bool
-    intensity: float  # factor of the vibration levels, see `haptics.intensity`
-    #: Nm, torque of the guide filter minus torque of the baseline controller at sagittal hip and knee, in the last guided cycle
+    intensity: float  # factor from 0 (off) to 1 on the levels of the vibration motors
+    #: Nm, torque of the virtual guide minus torque of the baseline controller, in the last cycle with the guide.
+    #: Elements: sagittal hip and knee of the swing leg.
     excess: Annotated[Vector, 2]
 
 
@@ -87,12 +89,13 @@ class Sensed:
     """Results of the first half of a cycle, `sense`: loads, kinematics, attitude."""
 
     load: Annotated[Vector, 2]  # N, filtered vertical force on the left and the right foot
-    #: N, the smaller of filtered and unfiltered vertical force. The smaller force drops without delay when a foot
-    #: leaves the ground.
+    #: N, the smaller of filtered and unfiltered vertical force on each foot.
+    #: When a foot leaves the ground, this force drops without the delay of the filter.
     bearing: Annotated[Vector, 2]
-    #: N, filtered twist FL - FR - RL + RR of each foot, see `contact_force`. With four correct cells, the twist is 0.
+    #: N, filtered difference FL - FR - RL + RR of the force cells of each foot (front left, front right, rear left, rear right).
+    #: With four correct cells, the difference is 0. `contact_force` uses the difference to detect a wrong cell.
     twist: Annotated[Vector, 2]
-    heading: Annotated[Vector, 2]  # rad, heading of each foot without the toe-out
+    heading: Annotated[Vector, 2]  # rad, yaw angle of each foot in the world, minus the toe-out of the foot
     step: Annotated[Vector, 3]  # m, position of the right sole relative to the left sole, world axes
 
 
@@ -100,23 +103,23 @@ class Constants(NamedTuple):
     """Constants of the kernel."""
 
     weight: float  # N, weight of robot and patient
-    keep: float  # factor of the previous value in the low-pass of the foot forces
-    standing_gains: float  # N, while standing: smallest load of a foot at which its leg has the full stance gains
-    walking_gains: float  # N, in a step: smallest load of the stance foot at which its ankle has the full stance gains
+    keep: float  # weight of the previous value in the low-pass of the foot forces, 0 to 1
+    standing_gains: float  # N, while standing: a leg has the full stance gains at this load on its foot or above
+    walking_gains: float  # N, in a step: the stance ankle has the full stance gains at this load or above
     gains: Vector  # (2, 3, 12) gains of swing leg and stance leg: Kp [Nm/rad], Kd [Nm s/rad], Ki times the cycle time [Nm/rad]
     placement: PlacementConfig  # parameters of foot placement and step timing
     lean: LeanConfig  # parameters of the lean
 
 
 class Assistance(NamedTuple):
-    """Guide of the swing leg in the current step."""
+    """Virtual guide that drives sagittal hip and knee of the swing leg in the current step."""
 
-    guide: GuideTables  # `GuideFilter.tables`
-    literal: LiteralTables  # `LiteralGuide.tables`, used instead of `guide` if `Stage.literal` is True
-    #: (n + 1, 2) Nm, torques of hip and knee due to the pelvis motion and the weight of the patient's leg, see `swing_leg`.
-    #: Row: cycle of the step. `_assist` adds these torques to u_g of hip and knee, except in the literal law.
+    guide: GuideTables  # tables of the guide filter (`GuideFilter.tables`)
+    literal: LiteralTables  # tables of the guide law of the paper (`LiteralGuide.tables`), used if `Stage.literal`
+    #: (n + 1, 2) Nm, torques of hip and knee that carry the patient's leg and compensate the pelvis motion. Row: cycle.
+    #: `_assist` adds these torques to the gravity torques of the exoskeleton, unless `Stage.literal` is True.
     unmodelled: Vector
-    fade: Vector  # (m,) factor of `Stage.excess` in each cycle after the nominal end of the step; falls from 1 to 0
+    fade: Vector  # (m,) weights from 1 to 0 that fade out `Stage.excess`, one for each cycle after the step
 
 
 class Parts(NamedTuple):
@@ -167,8 +170,8 @@ def sense(measured: Measured, table: PhaseTable, constants: Constants, stabilise
         sensed.bearing[side] = min(force, load[side])
     move(parts.chain, measured.q, measured.qd)
 
-    # `base` is the foot whose sole is assumed to be at rest. A foot that has just landed may bounce, so `base` is the
-    # stance foot as long as the stance foot carries load.
+    # The sole of the foot `base` is assumed to be at rest. A foot that has just landed may bounce and is therefore unsuitable.
+    # So `base` is the stance foot, unless both feet are down and the stance foot carries less than 10 % of the load.
     base = stage.stance
     if stage.double and load[base] < 0.1 * (load[0] + load[1]):
         base = 1 - base
@@ -220,7 +223,7 @@ def _velocity(point: Vector, sole: Vector, sole_velocity: Vector, gyro: Vector) 
 
 
 def start(measured: Measured, table: PhaseTable, parts: Parts) -> None:
-    """Store the deviations of the measured motion at the start of a phase.
+    """Store how far the measured joint motion is from the first row of the phase table, at the start of a phase.
 
     The re-centring fades out these deviations during the phase. If no foot swings, the speed deviations are set to 0. With the
     measured speeds, the re-centring would continue the downward motion of a foot that has just landed, and press the foot into
@@ -245,7 +248,7 @@ def start(measured: Measured, table: PhaseTable, parts: Parts) -> None:
 
 def _tibia(side: int, measured: Measured, parts: Parts) -> tuple[Quaternion, Vector3]:
     """Return the tilt of a tibia as a unit quaternion wxyz, and its angular velocity in the axes of the tibia [rad/s]."""
-    # The link of the tibia is two links above the foot.
+    # The tibia is two links above the foot.
     shank = parts.chain.links[parts.chain.soles[side].link - 2]
     rotation, up, gyro = shank.rotation.T, parts.attitudes[0].rotation[2], measured.gyro
     rate = rotated(
@@ -317,11 +320,12 @@ def act(
 
 
 def _assist(cycle: int, measured: Measured, assistance: Assistance, parts: Parts) -> None:
-    """Replace the torques of SH and SK of the swing leg by the torques of the guide filter, and set the vibration levels.
+    """Let the virtual guide drive sagittal hip and knee (SH, SK) of the swing leg, and set the vibration levels.
 
-    After the nominal end of the step, the baseline controller lowers the foot. `Stage.excess` is the torque of the guide
-    filter minus the torque of the baseline controller in the last guided cycle. This difference is added to the torque of
-    the baseline controller and fades out with `fade`, so the command is continuous.
+    The torques of the guide replace the torques of the baseline controller (PID). After the nominal end of the step, the baseline
+    controller lowers the foot. `Stage.excess` is the torque of the guide minus the torque of the baseline controller in the last
+    cycle with the guide. This difference is added to the torque of the baseline controller and fades out with `fade`, so the
+    command is continuous.
 
     Args:
         cycle: cycles since the start of the step.
@@ -356,9 +360,10 @@ def _assist(cycle: int, measured: Measured, assistance: Assistance, parts: Parts
 
 
 def _place(cycle: int, table: PhaseTable, constants: Constants, gain: float, parts: Parts) -> None:
-    """Update the lean of the trunk, the landing offset and the phase rate. Apply lean and offset to the desired motion.
+    """React to a DCM error: lean the trunk, shift the landing of the swing foot, and change the speed of the step.
 
-    The phase rate is the speed of the step relative to the gait. The new phase rate acts from the next cycle on.
+    Lean and shift change the desired motion of this cycle. The phase rate is the speed of the step relative to the gait. A new
+    phase rate acts from the next cycle on.
 
     Args:
         cycle: cycles since the start of the phase.
@@ -380,7 +385,7 @@ def _place(cycle: int, table: PhaseTable, constants: Constants, gain: float, par
         motion = Motion(error, nominal, final, table.frequency * remaining, side)
         placement.target[0], placement.target[1], rate = landing(config, gain, motion)
     outward = leg_target(constants.lean, balance.dcm[1], side)
-    # In the first cycle, the DCM is still relative to the previous stance foot.
+    # In the first cycle of a step, the DCM is still relative to the previous stance foot, so `outward` is not used.
     if outward != 0.0 and cycle > 0:
         placement.target[1] = outward
     follow(config, placement, rate)
@@ -395,7 +400,9 @@ def _place(cycle: int, table: PhaseTable, constants: Constants, gain: float, par
 
 
 def _hold_foot(row: int, table: PhaseTable, parts: Parts) -> None:
-    """Move the desired swing ankle to its nominal position relative to the stance foot, plus the landing offset.
+    """Move the desired swing ankle to its nominal position relative to the stance foot, shifted by the landing offset.
+
+    The landing offset is the shift of the landing position that foot placement requests.
 
     Args:
         row: current row of the table.
@@ -473,8 +480,7 @@ def _lowered(cycles: float, longest: int) -> tuple[float, float]:
         cycles: cycles since the nominal end of the step, above 0.
         longest: number of cycles after which the motion ends.
     """
-    # The downward speed of the foot rises slowly. If one corner of the foot already touches the ground, a sudden rise of
-    # the speed would turn the foot.
+    # The downward speed rises slowly. A sudden rise would turn a foot that already touches the ground with one corner.
     time = min(cycles, float(longest)) * PERIOD
     moving = 1.0 - math.exp(-time / _REACH_RISE)
     return time - _REACH_RISE * moving, moving if cycles < longest else 0.0

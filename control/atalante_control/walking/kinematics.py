@@ -27,7 +27,7 @@ class Link:
     joint: int  # index in JOINTS
     parent: int  # index of the parent link
     offset: Annotated[Vector, 3]  # m, position of the joint in the frame of the parent link
-    # The rotation matrix from link to parent is turn[0] + sin(q) turn[1] + (1 - cos(q)) turn[2].
+    # Three matrices: the rotation matrix from link to parent is turn[0] + sin(q) turn[1] + (1 - cos(q)) turn[2].
     turn: Annotated[Vector, (3, 3, 3)]
     axis: Annotated[Vector, 3]  # unit vector of the joint axis in the frame of the link
     mass: float  # kg

@@ -1,4 +1,6 @@
-"""Lean of the trunk and motion of the swing leg against sideways pushes: `DCM error -> lean, outward motion of the swing foot`.
+"""Reaction to sideways pushes: the trunk leans, and the swing foot moves outwards.
+
+`DCM error -> lean, outward motion of the swing foot`
 
 The ankle moves the centre of pressure only within the sole. If the divergent component of motion (DCM, `walking.dcm`) is moved
 beyond the edge of the sole, the ankle alone cannot stop it. A trunk that accelerates its rotation in the direction of the push
@@ -27,19 +29,19 @@ from atalante_control.gait.gait import PERIOD
 class LeanConfig(NamedTuple):
     """Parameters of the lean."""
 
-    gain: float = 6.0  # rad/m, lean per DCM error beyond the dead zone; 0: no lean
+    gain: float = 6.0  # rad/m, lean per metre of DCM error beyond `dead_zone`; 0: the trunk does not lean
     dead_zone: float = 0.02  # m, sideways DCM error up to which the trunk does not lean
-    #: m, limit for the DCM, measured from the middle of the stance sole towards the swing foot.
-    #: If the DCM is on the swing foot's side of this limit, the trunk does not lean over the stance foot.
+    #: m, the trunk does not lean over the stance foot if the DCM is further than this on the swing side of the stance sole.
+    #: The distance is measured from the middle of the stance sole towards the swing foot.
     inside: float = 0.015
     outward: float = 0.22  # rad, largest lean over the stance foot
     inward: float = 0.08  # rad, largest lean to the side of the swing foot
-    rise: float = 14.0  # rad/s, natural frequency of the critically damped filter while the lean grows
-    fall: float = 5.0  # rad/s, natural frequency of the filter while the lean decreases
+    rise: float = 14.0  # rad/s, natural frequency of the lean motion (critically damped) while the trunk leans further
+    fall: float = 5.0  # rad/s, natural frequency of the lean motion (critically damped) while the trunk returns
     acceleration: float = 25.0  # rad/s2, largest acceleration of the lean
-    leg_gain: float = 8.0  # m/m, outward shift of the swing foot per distance of the DCM beyond `leg_zone`; 0: no shift
-    #: m, limit for the DCM, measured from the middle of the stance sole away from the swing foot.
-    #: If the DCM is beyond this limit, the swing foot is shifted away from the stance foot.
+    leg_gain: float = 8.0  # m/m, outward shift of the swing foot per metre of DCM beyond `leg_zone`; 0: no shift
+    #: m, the swing foot moves outwards if the DCM is further than this on the outer side of the stance sole.
+    #: The distance is measured from the middle of the stance sole away from the swing foot.
     leg_zone: float = 0.02
     leg: float = 0.15  # m, largest shift of the swing foot away from the stance foot
 

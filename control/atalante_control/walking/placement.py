@@ -1,4 +1,6 @@
-"""Foot placement and step timing against pushes: a DCM error changes the landing position and the speed of a step.
+"""Foot placement and step timing: a push changes the landing position of the swing foot and the speed of the step.
+
+The reaction follows from the error of the DCM.
 
 DCM is the divergent component of motion (`walking.dcm`). Let e be the DCM error, w the natural frequency, k the gain of
 the ankle stabiliser and L the largest shift of the centre of pressure by the ankle. With the ankle stabiliser, e obeys
@@ -37,14 +39,14 @@ from atalante_hal.vectors import Vector3, cross, dot, rotated
 Pair = tuple[float, float]
 
 _FH, _SH, _SK = (LEG_JOINTS.index(name) for name in ("FH", "SH", "SK"))
-#: Joints of the swing leg with which the foot is shifted.
+#: Joints of the swing leg that move to shift the foot: frontal hip, sagittal hip, sagittal knee.
 _SHIFTING = (_FH, _SH, _SK)
 #: Number of joints from the pelvis to the ankle.
 _LINKS = LEG_JOINTS.index("SA") + 1
-#: m3, lower limit of the absolute determinant of the ankle Jacobian. Below this limit, the leg is almost straight (singular), and
-#: the foot is not shifted further.
+#: m3, lower limit of the absolute determinant of the ankle Jacobian. Below this limit, the leg is almost straight (singular).
+#: With an almost straight leg, the foot is not shifted further.
 _SINGULAR = 1e-3
-#: The cost is computed for `_RATES` + 1 phase rates from `slowest` to `fastest`. The ratio of neighbouring rates is constant.
+#: `landing` compares `_RATES` + 1 phase rates from `slowest` to `fastest`, with a constant ratio between neighbouring rates.
 _RATES = 32
 _FASTEST = 3.0  # rad/s, largest desired speed of a joint that shifts the foot
 
@@ -57,28 +59,29 @@ class PlacementConfig(NamedTuple):
     larger, because the trunk leans in addition.
     """
 
-    #: m, placement and timing react only to a predicted DCM error at the landing above this value; infinity switches both off
+    #: m, foot placement and step timing ignore a DCM error that is predicted to be smaller than this value at the landing.
+    #: With infinity, foot placement and step timing are off.
     dead_zone: float = 0.015
-    forward: float = 0.15  # m, largest offset of a landing forwards and backwards
-    outward: float = 0.22  # m, largest offset of a landing away from the stance foot
-    inward: float = 0.02  # m, largest offset of a landing towards the stance foot
+    forward: float = 0.15  # m, largest shift of the landing position forwards and backwards
+    outward: float = 0.22  # m, largest shift of the landing position away from the stance foot
+    inward: float = 0.02  # m, largest shift of the landing position towards the stance foot
     slowest: float = 0.1  # smallest phase rate; the phase rate is the speed of the step relative to the gait
     fastest: float = 1.6  # largest phase rate
     #: s, the DCM error is ignored for this time after the start of a step, because the new stance foot is not yet at rest
     settled: float = 0.08
-    #: s, last part of the step before the nominal landing. In this part, the phase rate returns to 1, and `late_landing`
-    #: computes the offset of the landing.
+    #: s, duration of the last part of a step, up to the nominal landing. In this part, the phase rate returns to 1.
+    #: In the last part, the landing offset follows from the present DCM error, not from the predicted error (`late_landing`).
     frozen: float = 0.05
     #: m, largest DCM error (forwards, sideways) that ankle and trunk can stop. A larger error grows until the landing.
     capacity: Pair = (0.10, 0.08)
-    bandwidth: float = 25.0  # rad/s, natural frequency of the critically damped filter of the landing offset
-    speed: float = 1.2  # m/s, largest rate of change of the landing offset
+    bandwidth: float = 25.0  # rad/s, natural frequency of the critically damped motion of the landing offset
+    speed: float = 1.2  # m/s, largest speed at which the landing offset changes
     acceleration: float = 25.0  # m/s2, largest acceleration of the landing offset
-    #: weight of the missing landing offset in the cost, see `_cost`; the missing offset is the needed minus the permitted offset
+    #: weight in `_cost` of the part of the needed landing offset that exceeds the limits `forward`, `outward` and `inward`
     missed: float = 30.0
-    timing: float = 0.03  # m, weight of a change of the landing time in the cost, see `_cost`
-    #: s, duration of a transition after a push: from the joint angles of the gait to a path of the swing foot.
-    #: The path is fixed relative to the stance foot, so a tilt of the pelvis does not move the swing foot.
+    timing: float = 0.03  # m, weight in `_cost` of a landing before or after the nominal time
+    #: s, within this time after the first reaction, the goal of the swing leg changes from joint angles to foot positions.
+    #: The foot positions are relative to the stance foot, so a tilt of the pelvis does not move the swing foot.
     hold: float = 0.1
     slew: float = 15.0  # 1/s, largest change of the phase rate per second
 
@@ -86,17 +89,17 @@ class PlacementConfig(NamedTuple):
 class Placement:
     """State of foot placement and step timing in the current phase, and working memory of `shift_foot`."""
 
-    clock: float  # cycles, current row of the phase table, not rounded to an integer
-    pace: float  # phase rate: progress of the step in one cycle, in nominal cycles
-    #: 0: the swing leg follows the joint angles of the gait. 1: the swing foot follows its path relative to the stance foot.
-    #: Between 0 and 1: the desired position of the swing foot is between these two positions.
+    clock: float  # position in the phase table, in rows; for example, 10.5 is between row 10 and row 11
+    pace: float  # phase rate: rows of the phase table per cycle; 1 is the speed of the gait
+    #: 0: the swing leg follows the joint angles of the gait. 1: the swing ankle follows positions relative to the stance foot.
+    #: Between 0 and 1: the desired position of the swing ankle is between the positions for 0 and 1.
     held: float
-    target: Annotated[Vector, 2]  # m, requested offset of the landing in the walking frame
-    offset: Annotated[Vector, 2]  # m, current offset of the swing foot in the walking frame
-    speed: Annotated[Vector, 2]  # m/s, speed of the offset
+    target: Annotated[Vector, 2]  # m, requested landing offset in the walking frame: forwards, to the left
+    offset: Annotated[Vector, 2]  # m, present landing offset, which follows `target` smoothly
+    speed: Annotated[Vector, 2]  # m/s, speed at which `offset` changes
     change: Annotated[Vector, 3]  # rad, sum of the changes of FH, SH and SK by `shift_foot` in this phase
-    low: Annotated[Vector, 12]  # rad, lower limits of the desired angles
-    high: Annotated[Vector, 12]  # rad, upper limits of the desired angles
+    low: Annotated[Vector, 12]  # rad, lower limits of the desired joint angles
+    high: Annotated[Vector, 12]  # rad, upper limits of the desired joint angles
     rotation: Annotated[Vector, (3, 3)]  # rotation matrix from the ankle link to the pelvis
     origin: Annotated[Vector, (_LINKS, 3)]  # m, positions of the joints of the swing leg in the pelvis frame
     axis: Annotated[Vector, (_LINKS, 3)]  # joint axes of the swing leg in the axes of the pelvis
@@ -113,7 +116,10 @@ class Motion(NamedTuple):
 
 
 def predicted(error: float, gain: float, limit: float, exponent: float) -> float:
-    """Predict the DCM error at the landing [m], with the ankle stabiliser acting: the solution of e' = w (e - sat(k e, L)).
+    """Predict the DCM error at the landing [m].
+
+    The ankle stabiliser acts until the landing, so the error is the solution of e' = w (e - sat(k e, L)). sat limits k e to the
+    range from -L to L.
 
     Args:
         error: present error e [m].
@@ -145,7 +151,10 @@ def beyond(value: float, zone: float) -> float:
 
 
 def landing(config: PlacementConfig, gain: float, motion: Motion) -> tuple[float, float, float]:
-    """Return the offset of the landing in the walking frame, forwards and to the left [m], and the phase rate.
+    """Return the landing offset (forwards, to the left) [m] and the phase rate that remove a DCM error.
+
+    The landing offset is the shift of the landing position, in the walking frame. The phase rate is the speed of the step
+    relative to the gait.
 
     The candidates for the phase rate are 1 and `_RATES` + 1 rates from `slowest` to `fastest`. The rate with the lowest cost is
     returned. This rate may jump between two cycles. `follow` limits the changes of offset and phase rate.
@@ -170,7 +179,7 @@ def landing(config: PlacementConfig, gain: float, motion: Motion) -> tuple[float
 
 
 def _needed(config: PlacementConfig, gain: float, motion: Motion, rate: float) -> Pair:
-    """Return the offset by which the landing must be shifted, forwards and to the left [m].
+    """Return the landing offset (forwards, to the left) that removes the DCM error at the landing [m].
 
     With this offset, the DCM at the landing has the nominal position relative to the new stance foot, except for the dead zone.
     Sideways, the centre of pressure c of the nominal motion is taken as constant until the landing, so the nominal DCM x obeys
@@ -215,7 +224,7 @@ def _cost(config: PlacementConfig, gain: float, motion: Motion, rate: float) -> 
 
 
 def late_landing(config: PlacementConfig, error: Pair, side: float) -> Pair:
-    """Return the landing offset for a foot that is about to land, in the walking frame, forwards and to the left [m].
+    """Return the landing offset (forwards, to the left) for a foot that is about to land, in the walking frame [m].
 
     Args:
         config: parameters.
@@ -279,7 +288,7 @@ def shift_foot(
 
 
 def _step(placement: Placement, desired: Vector, leg: int, k: int, step: float) -> float:
-    """Change the desired angle of a joint in `_SHIFTING` within the limits of angle and speed, and return the change [rad]."""
+    """Change the desired angle of the joint `_SHIFTING[k]` within its limits of angle and speed. Return the change [rad]."""
     joint, rate = leg + _SHIFTING[k], len(desired) // 2 + leg + _SHIFTING[k]
     least, most = (-_FASTEST - desired[rate]) * PERIOD, (_FASTEST - desired[rate]) * PERIOD
     angle = desired[joint] + min(max(step, min(least, 0.0)), max(most, 0.0))

@@ -1,4 +1,6 @@
-"""Tables of one phase of the walk, sampled at every cycle: `gait or weight shift -> desired motion, feedforward, DCM`.
+"""Tables of the desired motion in one phase of the walk, with one row for each control cycle.
+
+`gait or weight shift -> desired motion, feedforward, DCM`
 
 The divergent component of motion (DCM) is c + c' / w, with the horizontal position c of the centre of mass and
 w = sqrt(g / height). In a step the DCM is relative to the centre of the stance sole. While standing the DCM is relative to the
@@ -41,18 +43,18 @@ class PhaseTable(NamedTuple):
     rows: Vector  # (n + 1, 24) q_nom [rad], then q_nom' [rad/s]
     feedforward: Vector  # (n + 1, 12) Nm, u_f
     dcm: Vector  # (n + 1, 2) m, nominal DCM
-    #: (n + 1, 3) m, nominal position of the ankle of the swing leg relative to the centre of the stance sole, walking frame
+    #: (n + 1, 3) m, nominal position of the swing ankle relative to the centre of the stance sole, in the walking frame
     ankle: Vector
     frequency: float  # rad/s, natural frequency w of the pendulum
-    recentring: Vector  # (m, 4) c0, c1, c0', c1' of the re-centring in each cycle, for all joints without a guide
-    guided: Vector  # (m, 4) c0, c1, c0', c1' of the re-centring in each cycle, for hip and knee (SH, SK) with a guide
-    reach: Vector  # (2,) rad/s, speeds of SH and SK of the swing leg that move a late swing foot down
-    lowering: float  # m/s, downward speed of a late swing foot at the joint speeds `reach`
-    #: SH and SK move with the speeds `reach` for this number of cycles after the end of the table. The number is smaller if the
-    #: knee would become too straight.
+    recentring: Vector  # (m, 4) re-centring polynomials c0, c1, c0', c1' for all joints without a guide; row: cycle
+    guided: Vector  # (m, 4) re-centring polynomials c0, c1, c0', c1' for hip and knee with a guide; row: cycle
+    reach: Vector  # (2,) rad/s, speeds of sagittal hip and knee of the swing leg that move a late swing foot down
+    lowering: float  # m/s, downward speed of a late swing foot that results from the joint speeds `reach`
+    #: Hip and knee move with the speeds `reach` for this number of cycles after the end of the table.
+    #: The number `reach_cycles` is chosen so that the knee does not become straighter than `Reach.knee`.
     reach_cycles: int
-    #: Foot placement lowers a late swing foot for this number of cycles after the end of the table. The number does not depend on
-    #: the knee angle.
+    #: After a push, foot placement lowers a late swing foot for this number of cycles after the end of the table.
+    #: Unlike `reach_cycles`, the number `lowering_cycles` does not depend on the knee angle.
     lowering_cycles: int
 
 
@@ -83,7 +85,7 @@ def step_table(
     yaw = -toe_out if stance == RIGHT else toe_out
     centre, speed, ankle = np.zeros((3, gait.cycles + 1, 3))
     heading, upright = about_z(yaw), about_z(0.0)
-    # These views are created only once, because creating a view takes longer than the computation of a cycle.
+    # The array views are created once, before the loop: creating a view takes longer than the computation of one cycle.
     sole, body = kinematics.chain.soles[stance], kinematics.chain.centre[0]
     rotation, position, linear, angular = sole.rotation, sole.position, sole.linear, sole.angular
     body_position, body_velocity = body.position, body.velocity
@@ -154,7 +156,7 @@ def _product(a: Vector, b: Vector) -> Vector:
 
 
 def _reach(q: Vector, swing: int, kinematics: Kinematics, upright: Vector) -> Vector:
-    """Return the angle changes of hip and knee per metre of vertical downward motion of the swing foot, shape (2,) [rad/m]."""
+    """Return how far hip and knee must turn to move the swing foot straight down, per metre, shape (2,) [rad/m]."""
     columns = []
     for joint in (_SH, _SK):
         rate = np.zeros(len(q))

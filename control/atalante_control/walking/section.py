@@ -1,4 +1,6 @@
-"""Sections of a walk: `gaits, number of steps -> phase tables, swing leg and guides of these steps`.
+"""Sections of a walk: each section is a group of successive steps with the same gait.
+
+`gaits, number of steps -> phase tables, swing leg and guides of the section`
 
 A walk has one section for each periodic gait, in walking order. A speed change is the end of a section: the next step has the
 gait of the next section. This step starts at the last pose of the old gait, and the re-centring leads to the new gait.
@@ -35,8 +37,8 @@ from atalante_hal.types import Vector
 Pair = tuple[float, float]
 
 _N = len(JOINTS)
-#: Number of fully assisted steps after a change of the gait: one step with each leg. At the start of each of them, the deviation
-#: from the gait is larger than the certificate of a guide assumes.
+#: Number of steps without a virtual guide after a change of the gait: one step with each leg.
+#: A guide is certified only for steps that start near the gait. The first step of each leg starts too far from the new gait.
 _JOINING = 2
 _SH, _SK = LEG_JOINTS.index("SH"), LEG_JOINTS.index("SK")
 
@@ -44,8 +46,8 @@ _SH, _SK = LEG_JOINTS.index("SH"), LEG_JOINTS.index("SK")
 class Section(NamedTuple):
     """Section of a walk: a number of periodic steps with one gait."""
 
-    #: Periodic step, start step and stop step. The start step is used only if the walk begins with this section. The stop step is
-    #: used only if the walk ends in this section.
+    #: Periodic step, start step and stop step. Only the section in which the walk begins uses its start step.
+    #: Only the section in which the walk ends uses its stop step.
     gaits: WalkGaits
     steps: int  # number of periodic steps
 
@@ -61,7 +63,7 @@ class Models(NamedTuple):
 
 
 class SectionMotion:
-    """Phase tables and guides of a section.
+    """Phase tables of a section, and virtual guides of the swing leg.
 
     Attributes:
         guided: index (within the walk) of the first periodic step of the section that can be guided.
@@ -94,7 +96,7 @@ class SectionMotion:
         _, worn, gravity, kinematics, _ = models
         guide = config.guide
         swinging = swing_leg(gaits.step, config.guided_alpha, worn, kinematics, gravity, guide.friction)
-        # On the ground the guide ends with the step, because the foot lands. So the prediction covers no cycles of the next step.
+        # On the ground, the guide ends at the landing. So its prediction needs no cycles after the end of the step (overlap 0).
         self._guides = StepGuides(guide, models.robot, shape, swinging.leg, _fading(config.engage), 0)
         self._literal = LiteralGuide(
             LiteralConfig(config.gains.swing, guide.promise, guide.zeta, guide.idealization, guide.feedforward),
@@ -108,12 +110,12 @@ class SectionMotion:
         )
 
     def prepare(self) -> None:
-        """Compute the guides for all assistance factors, see `StepGuides.prepare`."""
+        """Choose and store the guide for every assistance factor, before the walk (`StepGuides.prepare`)."""
         if not self._literal_law:
             self._guides.prepare()
 
     def certificate(self, xi: float) -> Certificate:
-        """Return the certificate of the guide used at an assistance factor, see `StepGuides.certificate`.
+        """Return the certificate of a guide: the disturbance torques that the guide provably withstands.
 
         Args:
             xi: assistance factor in [0, 1].
@@ -123,7 +125,7 @@ class SectionMotion:
         return self._guides.certificate(xi)
 
     def start_guide(self, xi: float, angles: Pair, rates: Pair) -> float:
-        """Start the guide of a step, and return its certified disturbance torques as a fraction of the requested torques.
+        """Start the guide of a step, and return which fraction of the requested disturbance torques is certified.
 
         Args:
             xi: assistance factor in [0, 1].

@@ -36,14 +36,16 @@ class Stance(NamedTuple):
 
 
 class Shift(NamedTuple):
-    """Weight shift from the middle between the feet onto one foot, as Bezier control points along the path.
+    """Weight shift from the middle between the feet onto one foot.
+
+    Each row of a field contains the control points of a Bezier polynomial along the path of the weight shift.
 
     The controller adds the gravity torques u_g of the suspended exoskeleton to `feedforward`. The sum is the static torque on the
     ground, which also holds the weight of the patient.
     """
 
     q: Vector  # (12, 8) rad, joint angles
-    feedforward: Vector  # (12, 8) Nm, static torques of the pose on the ground, minus u_g, which the controller adds
+    feedforward: Vector  # (12, 8) Nm, static torques on the ground minus the gravity torques u_g (see above)
     centre: Vector  # (3, 8) m, centre of mass relative to the middle between the soles, in the walking frame
 
 
@@ -94,7 +96,7 @@ class Standing:
         return Stance((feet[0].rotation.copy(), feet[1].rotation.copy()), (left, right), centre)
 
     def shift(self, onto: Vector, side: int) -> Shift:
-        """Return the weight shift from the middle between the feet to a pose with the centre of mass above one foot.
+        """Return the weight shift from the middle between the feet onto one foot.
 
         Args:
             onto: angles of a pose with both soles flat on the ground and the centre of mass above one sole, shape (12,) [rad].

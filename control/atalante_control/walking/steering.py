@@ -1,4 +1,6 @@
-"""Steering along a line: `positions and headings of the soles -> deviation from the line -> hip rotation in the next step`.
+"""Steering along a line: a rotation of the hip in the next step corrects the deviation from the line.
+
+`positions and headings of the soles -> deviation from the line -> hip rotation in the next step`
 
 The line is the straight path that the robot must follow. The line starts in the middle between the feet when the walk begins,
 in the direction of the mean heading of the soles. The position on the ground is the sum of the relative sole positions at each

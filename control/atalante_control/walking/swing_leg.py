@@ -1,4 +1,6 @@
-"""Model of the swing leg in a step on the ground: `gait, kinematics -> model for the guide filter, unmodelled torque`.
+"""Model of the swing leg in a step on the ground, for the guide filter.
+
+`gait, kinematics -> model, torque w that the model leaves out`
 
 The guide filter computes the torques of sagittal hip and knee (SH, SK) with the mass matrix of the swing leg. The mass matrix
 includes the leg of the patient, and is computed for a fixed pelvis. On the ground, the pelvis moves with the stance leg. The
@@ -34,11 +36,11 @@ _SH, _SK = LEG_JOINTS.index("SH"), LEG_JOINTS.index("SK")
 
 
 class SwingLeg(NamedTuple):
-    """Model of the swing leg in one step, and the torque w that the mass matrix and u_g leave out."""
+    """Model of the swing leg in one step with a fixed pelvis, and the torque w that the model leaves out."""
 
-    leg: Leg  # model of sagittal hip and knee with a fixed pelvis, for the guide filter; `leg.gravity` is u_g + w
-    #: (n + 1, 2) Nm, torque w of sagittal hip and knee: effect of the pelvis motion, and weight of the patient's leg.
-    #: The controller adds w to u_g of the measured pose. Row: cycle of the step.
+    leg: Leg  # model of sagittal hip and knee for the guide filter; its gravity torque `leg.gravity` includes w
+    #: (n + 1, 2) Nm, torque w of hip and knee. w carries the patient's leg and compensates the pelvis motion. Row: cycle.
+    #: The controller adds w to the gravity torque of the exoskeleton in the measured pose.
     unmodelled: Vector
 
 

@@ -1,4 +1,6 @@
-"""Telemetry and statistics of the walking controller: `q_des, loads, DCM, attitude -> recorded telemetry`.
+"""Recorded values (telemetry) and statistics of the walking controller.
+
+`q_des, loads, DCM, attitude -> recorded telemetry`
 
 DCM is the divergent component of motion, see `walking.dcm`.
 """
@@ -29,25 +31,25 @@ class Telemetry:
     q_des: Annotated[Vector, len(JOINTS)]  # rad
     dcm: Annotated[Vector, 2]  # m, measured divergent component of motion (DCM) in the walking frame
     dcm_error: Annotated[Vector, 2]  # m, measured minus nominal DCM
-    pressure_shift: Annotated[Vector, 2]  # m, shift of the centre of pressure
+    pressure_shift: Annotated[Vector, 2]  # m, shift of the centre of pressure that the ankle stabiliser requests
     load: Annotated[Vector, 2]  # N, filtered vertical force on the left and the right foot
     vertical: Annotated[Vector, 3]  # upward unit vector in the axes of the pelvis
-    feet: Annotated[Vector, 4]  # m, positions (x, y) of left sole and right sole, each at the last landing of this sole
+    feet: Annotated[Vector, 4]  # m, (x, y) of left and right sole, each at its own last landing; x is along the line
     yaw: float  # rad, mean heading of the soles relative to the desired line at the last landing
     phase: float  # value of `phases.Phase`
     step: float  # number of completed steps
     stance: float  # 0 left, 1 right
     elapsed: float  # s, time since the start of the phase
     max_dcm_error: float  # m, largest error of the DCM in the steps so far
-    assistance_factor: float  # assistance factor of this step; 1 outside the periodic gait
+    assistance_factor: float  # assistance factor: 0 (widest guide) to 1 (no guide); 1 outside the periodic gait
     # The controller reads the fields from `error` to `gate` as one vector.
-    error: Annotated[Vector, 2]  # rad, q - q_des of sagittal hip and knee of the swing leg, in the last guided cycle
-    q_bound: Annotated[Vector, 2]  # rad, distance from q_des to the bound of the guide on the side of the error
-    h: float  # h of the paper: at least 0 if the backup policy can keep both joints inside the guide
-    gate: float  # weight of the backup torque; published as `lambda`
+    error: Annotated[Vector, 2]  # rad, q - q_des of sagittal hip and knee in the last cycle with a guide (swing leg)
+    q_bound: Annotated[Vector, 2]  # rad, largest tracking error inside the guide, in the direction of `error`
+    h: float  # safety value h of the paper: at least 0 if the stiff backup torque can keep both joints inside the guide
+    gate: float  # weight of the backup torque, 0 (free motion) to 1 (full backup torque); published as `lambda`
 
 
-#: The DCM error is evaluated only after this time since the start of a step [s]. Earlier, the landed foot is not at rest.
+#: s, `max_dcm_error` ignores the DCM error for this time after the start of a step: the landed foot is not yet at rest
 _SETTLED = 0.1
 _DTYPE = dtype_of(Telemetry)
 #: Name and number of values of each published field, in the order of the record.
@@ -74,7 +76,9 @@ def write_telemetry(
     balance: Balance,
     up: Vector,
 ) -> None:
-    """Write the telemetry values that change in each cycle. The controller writes the constant values at the start of a phase.
+    """Write the telemetry values that change in each cycle.
+
+    The controller writes the values that stay constant during a phase, at the start of the phase.
 
     Args:
         telemetry: record to write, shape (1,).
@@ -99,9 +103,9 @@ def write_telemetry(
 
 
 def write_guide(telemetry: Records[Telemetry], guard: Guard, errors: tuple[float, float]) -> tuple[float, float]:
-    """Write the telemetry of a guided cycle, and return the width of the guide at SH and SK [rad].
+    """Write the telemetry of a cycle with a guide, and return `q_bound` of sagittal hip and knee [rad].
 
-    The width q_bound is the distance from q_des to the bound of the guide, on the side of the present error.
+    `q_bound` is the distance from q_des to the bound of the guide, on the side of the present error.
 
     Args:
         telemetry: record to write, shape (1,).

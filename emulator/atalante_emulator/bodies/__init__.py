@@ -31,16 +31,17 @@ class Pose(NamedTuple):
     """Position and attitude of a link in the world."""
 
     position: Sequence[float]  # position of the link in the world [m], shape (3,)
-    attitude: Sequence[float] = (0.0, 0.0, 0.0, 1.0)  # quaternion xyzw from the link frame to the world
+    #: Quaternion xyzw that turns a vector from link axes into world axes, shape (4,).
+    attitude: Sequence[float] = (0.0, 0.0, 0.0, 1.0)
 
 
 class Motion(NamedTuple):
     """Pose and velocity of a link frame in the world, in world axes."""
 
     position: Vector  # position of the origin of the link frame [m], shape (3,)
-    attitude: Vector  # quaternion xyzw from the link frame to the world, shape (4,)
-    velocity: Vector  # velocity of the origin of the link frame [m/s], shape (3,)
-    rate: Vector  # angular velocity [rad/s], shape (3,)
+    attitude: Vector  # quaternion xyzw that turns a vector from link axes into world axes, shape (4,)
+    velocity: Vector  # velocity of the origin of the link frame, in world axes [m/s], shape (3,)
+    rate: Vector  # angular velocity of the link, in world axes [rad/s], shape (3,)
 
 
 class Body(Protocol):
@@ -66,7 +67,10 @@ class Body(Protocol):
 
     @property
     def sole_force(self) -> Vector:
-        """Forces of the floor on the corners of the soles in the last time step, shape (2, 4, 3) [N], in the axes of the foot."""
+        """Force of the floor on each corner of each sole in the last time step, shape (2, 4, 3) [N].
+
+        The indices count the foot, the corner of its sole and the axis. The axes are x, y and z of the foot link.
+        """
 
     @property
     def touching(self) -> bool:
@@ -74,7 +78,7 @@ class Body(Protocol):
 
     @property
     def soles(self) -> Soles:
-        """Positions of the force cells and of the corners of the soles in the frames of the feet."""
+        """Positions of force cells and sole corners. Each position is in the frame of its own foot link."""
 
     @property
     def mass(self) -> float:
@@ -113,7 +117,7 @@ class Body(Protocol):
         """
 
     def step(self, torque: Sequence[float]) -> None:
-        """Apply joint torques for one `PERIOD` and update the motion, the link states and the sole forces.
+        """Apply joint torques for one time step of 1 ms (`PERIOD`), and update all properties.
 
         Args:
             torque: joint torques, shape (12,) [Nm]. A list is fastest.
@@ -167,7 +171,9 @@ def hang(body: Body, position: Sequence[float], clearance: float, floor: float =
 
 
 def lowest_corner(body: Body) -> float:
-    """Return the height of the lowest corner of both soles in the world [m].
+    """Return the world height of the lowest point of the two soles [m].
+
+    A sole touches the floor only at its four corners. So the function compares eight corners.
 
     Args:
         body: robot whose soles are measured.

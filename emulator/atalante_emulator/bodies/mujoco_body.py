@@ -15,7 +15,8 @@ from atalante_hal.compiled import specialised
 from atalante_hal.robot import CELLS, FEET, IMUS, JOINTS
 from atalante_hal.types import PERIOD, Vector
 
-_FREE: Final = 7  # number of elements of the pose of a free pelvis in qpos: position (3), quaternion wxyz (4)
+#: MuJoCo's vector `qpos` starts with this number of elements for a free pelvis: position (3) and quaternion wxyz (4).
+_FREE: Final = 7
 #: Warnings after which MuJoCo resets the simulation.
 _DIVERGED: Final = (
     mujoco.mjtWarning.mjWARN_BADQPOS,
@@ -25,15 +26,19 @@ _DIVERGED: Final = (
 
 
 class Contact(NamedTuple):
-    """Contact model of MuJoCo, see "Solver parameters" in its documentation.
+    """Contact parameters with the names that MuJoCo uses in the chapter "Solver parameters" of its documentation.
 
+    MuJoCo lets two touching shapes sink into each other slightly, and pushes them apart like a spring and a damper.
     With the default values of this class, the stiffness at each corner is 1.4 MN/m. With MuJoCo's own default, solimp
     (0.9, 0.95), the soles sink so far into the floor that a walking robot falls.
     """
 
-    solref: tuple[float, float] = (0.02, 1.0)  # time constant [s] and damping ratio
-    solimp: tuple[float, float] = (0.99, 0.99)  # constraint impedance (0 to 1) at zero and at full penetration
-    impratio: float = 1.0  # friction impedance divided by normal impedance
+    #: Time constant [s] and damping ratio of the spring that pushes the shapes apart.
+    solref: tuple[float, float] = (0.02, 1.0)
+    #: Hardness of the contact from 0 (soft) to 1 (rigid), which MuJoCo calls impedance: first when the shapes begin to touch,
+    #: then when they are pressed deep into each other.
+    solimp: tuple[float, float] = (0.99, 0.99)
+    impratio: float = 1.0  # hardness of the contact against sliding, divided by its hardness against sinking in
 
 
 class _Sensed(NamedTuple):
@@ -41,19 +46,19 @@ class _Sensed(NamedTuple):
 
     position: Vector  # joint positions, shape (12,) [rad]
     motion: Vector  # joint velocities, shape (12,) [rad/s]
-    attitude: Vector  # quaternion wxyz of the IMU links and the feet, shape (6, 4)
-    velocity: Vector  # velocity of the IMU links in the world, shape (4, 3) [m/s]
-    rate: Vector  # angular velocity of the IMU links in world axes, shape (4, 3) [rad/s]
-    force: Vector  # force of the floor on each corner in world axes, shape (8, 3) [N]
+    attitude: Vector  # quaternions wxyz from link axes to world axes; rows: four IMU links, left foot, right foot; shape (6, 4)
+    velocity: Vector  # velocity of each IMU link in world axes, shape (4, 3) [m/s]
+    rate: Vector  # angular velocity of each IMU link in world axes, shape (4, 3) [rad/s]
+    force: Vector  # force of the floor on each sole corner in world axes; rows: four left, four right; shape (8, 3) [N]
 
 
 class _Read(NamedTuple):
-    """Results of a time step, as the properties of `Body` return them. The body owns the arrays."""
+    """Arrays behind the properties of a `MuJoCoBody`. Each time step writes its results into these arrays."""
 
     position: Vector  # joint positions, shape (12,) [rad]
     velocity: Vector  # joint velocities, shape (12,) [rad/s]
     imu: Vector  # link states of the IMUs, shape (4, LINK_STATE)
-    force: Vector  # forces on the corners in the axes of the feet, shape (2, 4, 3) [N]
+    force: Vector  # force on each corner of each sole, in the axes of its foot, shape (2, 4, 3) [N]
 
 
 def _unpack(sensed: _Sensed, read: _Read) -> bool:
@@ -84,7 +89,7 @@ def _unpack(sensed: _Sensed, read: _Read) -> bool:
 
 
 class MuJoCoBody:
-    """Exoskeleton in MuJoCo, see `Body`.
+    """Mechanics of the robot, simulated by MuJoCo. `Body` documents the methods and properties.
 
     Two bodies with the same URDF and the same calls give identical results, bit by bit.
     """
@@ -127,7 +132,7 @@ class MuJoCoBody:
         q = model.jnt_qposadr[model.joint(JOINTS[0]).id]
         self._q = data.qpos[q : q + len(JOINTS)]
         self._torque = data.qfrc_applied[first : first + len(JOINTS)]
-        self._body_of: dict[str, int] = {}  # MuJoCo's index of each link for which `motion` was called
+        self._body_of: dict[str, int] = {}  # cache of `motion`: link name -> body index in MuJoCo
         pelvis = model.body(PELVIS).id
         self._wrench = data.xfrc_applied[pelvis]
         self._sensed = _Sensed(self._q, data.qvel[first : first + len(JOINTS)], *_views(data.sensordata))
@@ -135,7 +140,7 @@ class MuJoCoBody:
         self.imu = np.zeros((len(IMUS), LINK_STATE))
         self.sole_force, self.touching = np.zeros((len(FEET), len(CELLS), 3)), False
         self._results = _Read(self.position, self.velocity, self.imu, self.sole_force)
-        # Compile the kernel now, because compilation takes longer than a cycle.
+        # Compile `_unpack` now. A compilation in the first time step would delay this step by more than 1 ms.
         self._unpack = specialised(_unpack, self._sensed, self._results)
         self.reset([0.0] * len(JOINTS))
 
@@ -182,7 +187,7 @@ class MuJoCoBody:
         return Motion(self._data.xpos[body].copy(), np.array([x, y, z, w]), twist[3:], twist[:3])
 
     def step(self, torque: Sequence[float]) -> None:
-        """Apply joint torques for one `PERIOD` and update the motion, the link states and the sole forces.
+        """Apply joint torques for one time step of 1 ms (`PERIOD`), and update all properties.
 
         Args:
             torque: joint torques, shape (12,) [Nm].
@@ -194,14 +199,16 @@ class MuJoCoBody:
         self._read()
 
     def exchange(self, torque: Sequence[float]) -> None:
-        """Run the MuJoCo calls of `step` without unpacking the results. Benchmarks use this as a baseline.
+        """Compute one time step in MuJoCo, but do not update the properties of the body.
+
+        Benchmarks compare the duration of `step` with the duration of this method.
 
         Args:
             torque: joint torques, shape (12,) [Nm].
         """
         self._torque[:] = torque
-        # Run the second half of a time step, then the first half of the next time step.
-        # Because the first half runs last, the sensor data belong to the same time as the positions and velocities.
+        # `mj_step2` moves the robot by one time step. `mj_step1` computes the sensor data of the new position.
+        # Without the last call, the sensor data would still belong to the position before the time step.
         mujoco.mj_step2(self._model, self._data)
         mujoco.mj_step1(self._model, self._data)
 
@@ -213,7 +220,7 @@ class MuJoCoBody:
 
 
 def _prepare(spec: Any, free: bool, ground: float | None, friction: float, contact: Contact) -> None:
-    """Complete the model of a URDF with solver settings, floor and sensors.
+    """Add solver settings, floor and sensors to a model that MuJoCo loaded from a URDF.
 
     Args:
         spec: model as loaded from the URDF.
@@ -222,7 +229,8 @@ def _prepare(spec: Any, free: bool, ground: float | None, friction: float, conta
         friction: coefficient of friction between soles and floor.
         contact: contact model.
     """
-    # By default, MuJoCo merges fixed links. The sensor links would lose their names, and a fixed pelvis would lose its mass.
+    # By default, MuJoCo merges a link on a fixed joint into its parent link. IMU links would then be missing by name,
+    # and a fixed pelvis would become part of the world, without mass.
     spec.compiler.fusestatic = False
     option = spec.option
     option.timestep, option.gravity = PERIOD, [0.0, 0.0, -GRAVITY]
@@ -268,7 +276,7 @@ def _add_sensors(spec: Any, floor: bool) -> None:
 
 
 def _views(data: Any) -> tuple[Vector, Vector, Vector, Vector]:
-    """Return the last four fields of `_Sensed` as views of the sensor data."""
+    """Return the fields attitude, velocity, rate and force of `_Sensed` as views of MuJoCo's array of sensor data."""
     attitudes, imus, pads = len(IMUS) + len(FEET), len(IMUS), len(PAD_LINKS)
     ends = np.cumsum([4 * attitudes, 3 * imus, 3 * imus])
     attitude, velocity, rate, force = np.split(data, ends)

@@ -20,12 +20,13 @@ from atalante_hal.types import PERIOD, Vector
 
 #: Number of PyBullet solver iterations in each time step. Another number changes the computed motion.
 SOLVER_ITERATIONS = 50
-#: Indices of attitude, velocity and angular velocity in the link state tuple of PyBullet.
+#: `pybullet.getLinkStates` returns a tuple for each link, with attitude, velocity and angular velocity at these indices.
 _ATTITUDE, _LINEAR, _ANGULAR = 5, 6, 7
 _BASE: Final = -1  # link index of the root link in PyBullet
-#: Number of elements of a contact: pad, normal vector (3), normal force, and both friction forces (value, direction (3)).
+#: Number of elements of a row of contact data: pad index (1), normal vector (3), normal force [N] (1),
+#: first friction force [N] (1) and its direction (3), second friction force [N] (1) and its direction (3).
 _CONTACT: Final = 13
-#: Largest number of contacts in a time step. A sphere has at most one contact with a plane.
+#: Largest number of contacts in a time step: one for each contact pad, because a pad is a sphere and the floor is a plane.
 _CONTACTS: Final = len(FEET) * len(CELLS)
 _PACK_JOINTS, _PACK_LINK = Struct(f"{2 * len(JOINTS)}d").pack_into, Struct(f"{LINK_STATE}d").pack_into
 _PACK_CONTACT, _CONTACT_BYTES = Struct(f"{_CONTACT}d").pack_into, 8 * _CONTACT
@@ -33,7 +34,9 @@ _PACK_ATTITUDES = Struct(f"{4 * len(FEET)}d").pack_into
 
 
 def _sum_contacts(contacts: Vector, count: int, attitude: Vector, force: Vector) -> None:
-    """Sum the contact forces on each corner of the soles, and transform the sums into the axes of the feet.
+    """Compute the force of the floor on each sole corner, in the axes of the foot.
+
+    The force is the sum of a normal force and two friction forces, which PyBullet returns in world axes.
 
     Args:
         contacts: array whose first `count` rows are the contacts of the time step, shape (_CONTACTS, _CONTACT).
@@ -56,7 +59,7 @@ def _sum_contacts(contacts: Vector, count: int, attitude: Vector, force: Vector)
 
 
 class PyBulletBody:
-    """Exoskeleton in PyBullet, see `Body`.
+    """Mechanics of the robot, simulated by PyBullet. `Body` documents the methods and properties.
 
     Two bodies with the same URDF and the same calls give identical results, bit by bit.
     """
@@ -75,7 +78,8 @@ class PyBulletBody:
         Raises:
             ValueError: If the text is not a URDF, or a required joint or link is missing.
         """
-        # Simulations with a new client repeat exactly. Simulations that start from `pybullet.restoreState` do not.
+        # Each body has its own PyBullet client, so that equal inputs give identical motions. Do not share a client and
+        # return to the start with `pybullet.restoreState`: the motion after this call can differ.
         self._client = pybullet.connect(pybullet.DIRECT)
         client = {"physicsClientId": self._client}
         pybullet.setPhysicsEngineParameter(
@@ -96,7 +100,7 @@ class PyBulletBody:
             raise
         for link in range(_BASE, self._links):
             pybullet.changeDynamics(self._body, link, linearDamping=0.0, angularDamping=0.0, jointDamping=0.0, **client)
-        # By default, PyBullet brakes every joint with a velocity motor. The motor is off if its largest force is zero.
+        # PyBullet starts with a motor in every joint that brakes the joint. A force limit of 0 turns these motors off.
         pybullet.setJointMotorControlArray(
             self._body, self._joints, pybullet.VELOCITY_CONTROL, forces=[0.0] * len(JOINTS), **client
         )
@@ -116,7 +120,7 @@ class PyBulletBody:
         self._contacts, self._attitude = np.zeros((_CONTACTS, _CONTACT)), np.zeros((len(FEET), 4))
         self._contact_memory, self._attitude_memory = self._contacts.reshape(-1).data, self._attitude.reshape(-1).data
         self._sum_contacts = compiled(_sum_contacts)
-        # Compile the kernel now, because compilation takes longer than a cycle.
+        # Compile `_sum_contacts` now. A compilation in the first time step would delay this step by more than 1 ms.
         self._sum_contacts(self._contacts, 0, self._attitude, self.sole_force)
         self.reset([0.0] * len(JOINTS))
 
@@ -133,13 +137,13 @@ class PyBulletBody:
         self._imus = find(IMU_LINKS, self._index_of, "link")
         self._feet = find(FOOT_LINKS, self._index_of, "link")
         self._pad_of = {pad: index for index, pad in enumerate(find(PAD_LINKS, self._index_of, "link"))}
-        #: Indices of the IMUs that can move. All other IMUs are attached to a fixed pelvis.
+        #: Rows of `imu` that `step` updates. An IMU on a fixed pelvis cannot move, so its row is written only once.
         self._moving = [
             row for row, link in enumerate(self._imus) if self._free or _is_movable(link, set(self._joints), infos)
         ]
         self._moving_links = [self._imus[row] for row in self._moving]
-        # For the root link, PyBullet sets and returns the pose of the inertial frame. These transforms convert between this pose
-        # and the pose of the link frame.
+        # PyBullet describes the pelvis by a frame at its centre of mass (inertial frame), not by the URDF link frame.
+        # `_inertial_in_base` is the pose of the inertial frame in the link frame. `_base_in_inertial` is the inverse.
         dynamics = pybullet.getDynamicsInfo(self._body, _BASE, physicsClientId=client)
         self._inertial_in_base = dynamics[3], dynamics[4]
         self._base_in_inertial = pybullet.invertTransform(*self._inertial_in_base)
@@ -154,8 +158,8 @@ class PyBulletBody:
             pybullet.changeDynamics(self._body, pad, lateralFriction=friction, **client)
 
     def _link_states(self, links: Sequence[int]) -> Any:
-        # The first 1 requests velocities, the second 1 requests the forward kinematics.
-        # Without forward kinematics, PyBullet returns the poses of the previous time step.
+        # Arguments 1, 1: return velocities, and compute the link poses from the current joint positions.
+        # With 0 as last argument, PyBullet would return the link poses of the previous time step.
         return pybullet.getLinkStates(self._body, links, 1, 1, physicsClientId=self._client)
 
     def reset(self, position: Sequence[float], base: Pose | None = None) -> None:
@@ -202,14 +206,15 @@ class PyBulletBody:
             state = self._link_states([self._index_of[link]])[0]
             centre, position, attitude = state[0], state[4], state[_ATTITUDE]
             velocity, rate = state[_LINEAR], state[_ANGULAR]
-        # PyBullet returns the velocity of the centre of mass. Another point has the velocity v + w x r.
+        # PyBullet returns the velocity v of the centre of mass. The origin of the link frame has the velocity v + w x r,
+        # where w is the angular velocity and r the vector from the centre of mass to the origin.
         rx, ry, rz = (a - b for a, b in zip(position, centre, strict=True))
         (vx, vy, vz), (wx, wy, wz) = velocity, rate
         moved = vx + (wy * rz - wz * ry), vy + (wz * rx - wx * rz), vz + (wx * ry - wy * rx)
         return Motion(np.array(position), np.array(attitude), np.array(moved), np.array(rate))
 
     def step(self, torque: Sequence[float]) -> None:
-        """Apply joint torques for one `PERIOD` and update the motion, the link states and the sole forces.
+        """Apply joint torques for one time step of 1 ms (`PERIOD`), and update all properties.
 
         Args:
             torque: joint torques, shape (12,) [Nm]. A list is fastest.
@@ -217,7 +222,9 @@ class PyBulletBody:
         self._unpack(*self.exchange(torque))
 
     def exchange(self, torque: Sequence[float]) -> tuple[Any, Any, Any]:
-        """Run the PyBullet calls of `step` without unpacking the results. Benchmarks use this as a baseline.
+        """Compute one time step in PyBullet, but do not update the properties of the body.
+
+        Benchmarks compare the duration of `step` with the duration of this method.
 
         Args:
             torque: joint torques, shape (12,) [Nm].
@@ -242,17 +249,17 @@ class PyBulletBody:
 
     def _read(self) -> tuple[Any, Any, Any]:
         contacts = pybullet.getContactPoints(self._body, physicsClientId=self._client) if self._touches else ()
-        # One call for IMUs and feet, because PyBullet computes the forward kinematics of the robot in each call.
+        # Request IMU links and feet in one call: each call of `_link_states` computes the poses of all links again.
         links = (*self._moving_links, *self._feet) if contacts else self._moving_links
         return pybullet.getJointStates(self._body, self._joints, self._client), self._link_states(links), contacts
 
     def _unpack(self, joints: Any, links: Any, contacts: Any) -> None:
-        # The twelve joints are written out, because a loop over the joints would take twice as long.
+        # Write the twelve joints out: a loop over the joints would take twice as long.
         a, b, c, d, e, f, g, h, i, j, k, m = joints
         position = a[0], b[0], c[0], d[0], e[0], f[0], g[0], h[0], i[0], j[0], k[0], m[0]
         velocity = a[1], b[1], c[1], d[1], e[1], f[1], g[1], h[1], i[1], j[1], k[1], m[1]
         _PACK_JOINTS(self._joint_memory, 0, *position, *velocity)
-        # `links` contains the states of the IMU links, then the states of the feet if the sole forces are needed.
+        # `links` begins with the states of the moving IMU links. The two feet follow only if a sole touches the floor.
         for memory, state in zip(self._imu_memory, links, strict=False):
             _PACK_LINK(memory, 0, *state[_ATTITUDE], *state[_LINEAR], *state[_ANGULAR])
         if contacts:
@@ -265,7 +272,7 @@ class PyBulletBody:
         left, right = feet
         _PACK_ATTITUDES(self._attitude_memory, 0, *left[_ATTITUDE], *right[_ATTITUDE])
         memory, pad_of, offset = self._contact_memory, self._pad_of, 0
-        # Vectors of a contact are unpacked by name, because unpacking with `*` would take almost twice as long.
+        # Write the components out (nx, ny, nz): unpacking the vectors with `*` would take almost twice as long.
         for _, _, _, pad, _, _, _, (nx, ny, nz), _, normal, first, (ax, ay, az), second, (bx, by, bz) in contacts:
             _PACK_CONTACT(memory, offset, pad_of[pad], nx, ny, nz, normal, first, ax, ay, az, second, bx, by, bz)
             offset += _CONTACT_BYTES
@@ -306,7 +313,7 @@ def load_urdf(urdf: str, client: int, *, fixed: bool = True) -> int:
 
 
 def _is_movable(link: int, joints: set[int], infos: Sequence[Any]) -> bool:
-    """Return whether a joint between the link and the base can move the link."""
+    """Return whether the link moves when the robot's joints move. False for a link fixed to the root link."""
     while link >= 0:
         if link in joints:
             return True

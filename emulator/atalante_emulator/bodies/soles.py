@@ -1,4 +1,7 @@
-"""Soles of the robot as rigid plates on force cells: `URDF -> positions of cells and corners -> forces of the cells`.
+"""Geometry of the two soles, and the forces that they pass on to the force cells.
+
+A sole is a rigid plate below four force cells. `read_soles` reads the positions of cells and sole corners from a URDF.
+`Soles.plate` computes how forces on the corners load the cells.
 
 The floor touches a sole at its corners. Four force cells connect the sole to the foot. The cells are equal springs in all three
 directions. So the force of a cell is a linear function of the forces on the corners. Let the cells be at x = x0 +- a and
@@ -22,15 +25,18 @@ Quaternion = tuple[float, float, float, float]
 
 @dataclass(frozen=True)
 class Soles:
-    """Positions on both soles, in the frame of each foot. Arrays have shape (2, 4, 3) [m], in the order of FEET and CELLS."""
+    """Positions of force cells and sole corners. Each position is in the frame of its own foot link.
 
-    cell: Vector  # centres of the force cells
-    corner: Vector  # points of the sole that touch the floor
+    Both arrays have shape (2, 4, 3) [m]. The indices count the foot (order FEET), the cell or corner (order CELLS) and the axis.
+    """
+
+    cell: Vector  # centre of each force cell, shape (2, 4, 3) [m]
+    corner: Vector  # sole corner next to each force cell: point that touches the floor, shape (2, 4, 3) [m]
 
     def plate(self) -> Vector:
-        """Return the matrix from the forces on all corners to the forces of all cells, shape (24, 24).
+        """Return the matrix P of `cell forces = P @ corner forces` for both feet, shape (24, 24).
 
-        Rows and columns are in the order of arrays of shape (2, 4, 3).
+        Cell forces and corner forces are flattened arrays of shape (2, 4, 3): foot, cell or corner, axis.
         """
         count = 3 * len(CELLS)
         matrix = np.zeros((len(FEET) * count, len(FEET) * count))
@@ -40,7 +46,7 @@ class Soles:
         return matrix
 
     def lowest(self, foot: int, position: Vector, attitude: Vector) -> float:
-        """Return the height of the lowest corner of a sole in the world [m].
+        """Return the world height of the lowest corner of one sole [m].
 
         Args:
             foot: index of the foot in FEET.
@@ -53,7 +59,9 @@ class Soles:
 
 
 def read_soles(urdf: str) -> Soles:
-    """Read the positions of cells and corners from a URDF. Each force cell has one link (contact pad) with one contact sphere.
+    """Read the positions of force cells and sole corners from a URDF.
+
+    The URDF has one link (contact pad) at each force cell. The pad carries one sphere. Its lowest point is the sole corner.
 
     Args:
         urdf: text of the URDF.
@@ -64,7 +72,7 @@ def read_soles(urdf: str) -> Soles:
     try:
         root = ET.fromstring(urdf)
     except ET.ParseError as error:
-        raise ValueError(f"the URDF must be valid XML, got a text with an error: {error}") from error
+        raise ValueError(f"the URDF must be valid XML, got invalid XML: {error}") from error
     cell, corner = np.zeros((2, len(FEET), len(CELLS), 3))
     for i, foot in enumerate(FEET):
         for k, name in enumerate(CELLS):
@@ -74,10 +82,12 @@ def read_soles(urdf: str) -> Soles:
             sphere = None if collision is None else collision.find("geometry/sphere")
             if mount is None:
                 raise ValueError(
-                    f"contact pad {pad} must be the child link of a joint with an origin, got no such joint"
+                    f"in the URDF, contact pad {pad} must be attached by a joint with an origin, got no such joint"
                 )
             if collision is None or sphere is None:
-                raise ValueError(f"contact pad {pad} must be a link with a collision sphere, got no such link")
+                raise ValueError(
+                    f"in the URDF, contact pad {pad} must be a link with a collision sphere, got no such link"
+                )
             cell[i, k] = _numbers(mount)
             corner[i, k] = cell[i, k] + _numbers(collision.find("origin"))
             corner[i, k, 2] -= float(sphere.attrib["radius"])
@@ -94,7 +104,9 @@ def total_mass(urdf: str) -> float:
 
 
 def into_frame(attitude: Vector | Quaternion, x: float, y: float, z: float) -> tuple[float, float, float]:
-    """Transform a vector from world axes into the axes of a frame. Compiled kernels call this function.
+    """Return the components of a vector in a rotated frame, from its components in world axes.
+
+    Numba-compiled functions call this function.
 
     Args:
         attitude: quaternion xyzw from the frame to the world, shape (4,).
@@ -120,14 +132,17 @@ def _numbers(origin: ET.Element | None) -> Vector:
 
 
 def _plate(cell: Vector, corner: Vector) -> Vector:
-    """Return the matrix from the forces on the corners to the forces of the cells of one foot, shape (12, 12)."""
+    """Return the matrix P of `cell forces = P @ corner forces` for one foot, shape (12, 12).
+
+    Cell forces and corner forces are flattened arrays of shape (4, 3): cell or corner, axis.
+    """
     centre = cell.mean(axis=0)
     (a, b), (x, y) = (cell - centre).T[:2], (corner - centre).T[:2]
     matrix = np.zeros((len(cell), 3, len(corner), 3))
     share = 1.0 / len(cell)
     matrix[:, 2, :, 2] = share + np.outer(a, x) / (a @ a) + np.outer(b, y) / (b @ b)
-    # A horizontal force on the corner (x, y) has the yaw moment x F_y - y F_x about the centre of the plate. Horizontal forces of
-    # the cells, proportional to the distance of each cell from the centre, carry this moment.
+    # A horizontal force (F_x, F_y) on the corner (x, y) twists the plate with the yaw moment x F_y - y F_x about its centre.
+    # Each cell resists the twist by a horizontal force. The force is proportional to the distance of the cell from the centre.
     polar = a @ a + b @ b
     matrix[:, 0, :, 0] = share + np.outer(b, y) / polar
     matrix[:, 0, :, 1] = -np.outer(b, x) / polar

@@ -52,7 +52,7 @@ def test_line_turns_before_each_step(turn: float, xi: float) -> None:
 def test_turn_is_refused_without_steering() -> None:
     code, _, errors = run("--turn", "2", "--literal")
     assert code == 2
-    assert "--turn requires steering, which --literal does not have" in errors
+    assert "--turn has no effect with --literal, because --literal switches steering off" in errors
 
 
 @pytest.mark.long
@@ -210,7 +210,10 @@ def test_robot_that_is_pushed_over_ends_with_code_1() -> None:
         (("--engine", "pybullet", "-i", "socketcan", "-c", "vcan0"), "--engine requires the emulated robot"),
         (("--then", "0", "0.18", "0.8"), "0 is not in the range x>=1"),
         (("--then", "3", "0.9", "0.8"), "step length must be 0.05 to 0.4 m, got 0.9 m"),
-        (("--then", "3", "0.18", "0.8", "--literal"), "--then requires the ankle stabiliser, which --literal does not"),
+        (
+            ("--then", "3", "0.18", "0.8", "--literal"),
+            "--then requires the ankle stabiliser, but --literal switches it off",
+        ),
         (("--then", "3", "0.18", "0.8", "--gait", "walk.json"), "--gait gives one gait: remove one of them"),
         (("--step-length", "0.9"), "step length must be 0.05 to 0.4 m, got 0.9 m"),
     ],

@@ -1,4 +1,8 @@
-"""Benchmarks of the gait optimiser on one core. The initial guess is a kinematic guess or a neighbouring gait."""
+"""Benchmarks of the gait optimiser on one core, from a rough initial guess or from a similar gait.
+
+The rough initial guess is a simple step, computed by inverse kinematics. The similar gait differs in one of mass, height, step
+length and step duration.
+"""
 
 from __future__ import annotations
 
@@ -13,9 +17,9 @@ from atalante_control.gait.subject import Subject
 from atalante_control.model import Patient
 from atalante_tools.bench.measure import Effort, Measurement, require
 
-#: Target time to solve a gait from the kinematic guess [s].
+#: Target time to solve a gait from a rough initial guess [s].
 _COLD_LIMIT: Final = 3.0
-#: Target time to solve a gait from a neighbouring gait [s].
+#: Target time to solve a gait from a similar gait [s].
 _WARM_LIMIT: Final = 1.0
 _ROUNDS: Final = 12
 _CENTRE: Final = Subject(Patient(75.0, 1.75), 0.15, 0.9)
@@ -28,18 +32,18 @@ _SUBJECTS: Final = (
 
 
 def gait_solve_cold(effort: Effort) -> Measurement:
-    """Measure the time to solve a gait from the kinematic guess."""
+    """Measure the time to solve a gait from a rough initial guess."""
     return Measurement(_solved(effort, None), _COLD_LIMIT)
 
 
 def gait_solve_warm(effort: Effort) -> Measurement:
-    """Measure the time to solve a gait from a neighbouring gait."""
+    """Measure the time to solve a gait from a similar gait."""
     return Measurement(_solved(effort, _centre()), _WARM_LIMIT)
 
 
 @cache
 def _centre() -> Gait:
-    """Return the neighbouring gait that serves as initial guess. The first call solves this gait."""
+    """Return the gait of `_CENTRE`, which is similar to the gaits of `_SUBJECTS`. The first call solves this gait."""
     from atalante_control.gait_optimization.solve import solve
 
     return solve(_CENTRE).gait

@@ -1,4 +1,6 @@
-"""Baseline of `decode_cycle` and `encode_cycle`: C code that cantools generates from the DBC, compiled with gcc -O2.
+"""Baseline of the codec benchmarks: C code that cantools generates from the DBC, compiled with gcc -O2.
+
+The codec benchmarks are `wire.decode_cycle` and `wire.encode_cycle`.
 
 `network -> cantools generate_c_source -> driver -> gcc -> ctypes`. The driver is a C function that does the work of the codec.
 To decode, the driver unpacks the payload of each message, checks the range of every signal and converts every signal to a double.

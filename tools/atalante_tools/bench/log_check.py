@@ -136,7 +136,7 @@ def _log(effort: Effort) -> Iterator[tuple[Path, Frames]]:
 
 
 class _Tap:
-    """`FrameTap` that records every frame of the HAL: content, cycle and direction."""
+    """Recorder that the HAL calls with every sent and every received frame: stores content, cycle and direction."""
 
     def __init__(self) -> None:
         self.cycle = 0

@@ -64,9 +64,10 @@ def median(measured: Sequence[Measurement]) -> Measurement:
 
 @dataclass(frozen=True)
 class Effort:
-    """Settings of a measurement. The function `progress(done, total)` is called after each round."""
+    """Settings of a measurement: how many rounds, and how to show the progress."""
 
-    quick: bool = False
+    quick: bool = False  # True for a short run (option `--quick`), which only checks that the benchmark works
+    #: Function `progress(done, total)`, called after each round with the numbers of completed rounds and of all rounds.
     progress: Callable[[int, int], None] = field(default=lambda _done, _total: None)
 
     def rounds(self, share: float = 1.0) -> int:

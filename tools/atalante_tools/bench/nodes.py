@@ -39,9 +39,10 @@ TURN = 256
 #: Number of poses in the recording. The number has no common factor with 16: the HAL runs slow checks in every 16th cycle.
 #: With 16 poses, the slow checks would always read the same pose, and report constant sensor values as a fault.
 POSES = 15
-#: Tracking error of the recorded joints [rad], too small to saturate the guide filter.
+#: Largest constant part of recorded minus desired joint angle [rad].
+#: With such small errors, the guide filter does not saturate: its output is not at a limit.
 ERROR = 0.01
-#: Rate of the tracking error of the recorded joints [rad/s].
+#: Largest rate of recorded minus desired joint angle [rad/s].
 ERROR_RATE = 0.05
 ASSISTANCE = 0.5
 _E2E = Struct("<HB")
@@ -164,8 +165,9 @@ class Recording:
 
 
 class _Sealed(NamedTuple):
-    payloads: list[bytes]  # all frames of each pose
-    checksums: npt.NDArray[np.uint16]  # CRC of each message for each counter value, shape (TURN, messages)
+    payloads: list[bytes]  # element k contains the frames of all messages in pose k
+    #: Element [c, m] is the CRC of message m with the alive counter c, shape (TURN, messages).
+    checksums: npt.NDArray[np.uint16]
 
 
 def _seal(image: TransmitImage, values: Vector) -> _Sealed:
@@ -286,7 +288,7 @@ def active_hal() -> RecordedHal:
 
 
 class FilterOnly:
-    """Controller that consists only of the guide filter for the left SH and SK."""
+    """Controller that consists only of the guide filter for left hip (SH) and left knee (SK)."""
 
     def __init__(self, walk: Walk) -> None:
         self._guide, self._cycle = walk.guide, 0

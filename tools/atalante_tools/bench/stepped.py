@@ -31,7 +31,9 @@ class SteppedRollout:
         self._cycles = len(guide.prediction.ahead)
 
     def errors(self, state: Vector) -> Vector:
-        """Return the tracking errors of hip and knee in the next n cycles, without disturbances. Shape (n, 2) [rad].
+        """Simulate all cycles of the prediction horizon without disturbances, and return the tracking errors.
+
+        Row k has the errors of hip and knee k cycles from now. Shape (cycles, 2) [rad].
 
         Args:
             state: state of the sampled loop, see `backup_policy`, shape (10,).

@@ -210,7 +210,10 @@ def _no_compiler() -> Measurement | None:
 
 
 def _frame_checker() -> tuple[Callable[[bytes, int], bool], tuple[str, ...]]:
-    """Return the baseline of `e2e_check` and the remarks for the report. The baseline checks the CRC of one payload."""
+    """Return the baseline function of the benchmark `e2e_check`, and the remarks for the report.
+
+    The function checks the CRC of one payload. Its arguments are payload and Data ID.
+    """
     try:
         import e2e
     except ModuleNotFoundError:

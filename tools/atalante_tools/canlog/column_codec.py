@@ -92,7 +92,8 @@ class ColumnCodec:
         rows: dict[tuple[str, int], int] = {}
         self._little: list[int] = []  # Intel words
         self._big: list[int] = []  # Motorola words, byte-swapped
-        self._joined: list[tuple[bool, int, int]] = []  # fields that span two words: (big endian, word, first bit)
+        #: Fields that span two payload words, as (is big endian, index of the first word, start bit in the first word).
+        self._joined: list[tuple[bool, int, int]] = []
         sources: list[tuple[str, int]] = []
         left: list[int] = []
         for number, field in enumerate(self.fields):
@@ -156,7 +157,7 @@ class ColumnCodec:
         field, codes = self.fields[index], raw[index]
         if field.kind == "float":
             unsigned, floating = _FLOATS[field.length]
-            with np.errstate(invalid="ignore", over="ignore"):  # a payload may contain a signalling NaN
+            with np.errstate(invalid="ignore", over="ignore"):  # no numpy warning about a NaN or an overflow
                 real = codes.astype(unsigned).view(floating).astype(np.float64)
                 return np.asarray(real * field.factor + field.offset)
         integers = codes.view(np.int64) if field.kind == "signed" or field.length < _WORD else codes
@@ -274,10 +275,11 @@ def crc_of_zeros(length: int, data_id: int) -> int:
 
 
 def crc_differences(frames: Frames, length: int) -> npt.NDArray[np.uint16]:
-    """Return for each frame its received CRC, XORed with the CRC contributions of all its payload bytes. Shape (n,).
+    """Return a check value for each frame, which shows whether the CRC of the frame is right. Shape (n,).
 
-    The CRC is affine over GF(2), so a frame is intact if and only if the result is `crc_of_zeros(length, data_id)`. A lookup
-    table of 65536 entries gives the contribution of each pair of bytes.
+    The check value is the received CRC, XORed with the contributions of all payload bytes to the CRC. The CRC is affine over
+    GF(2), so a frame is intact if and only if the check value is `crc_of_zeros(length, data_id)`, with the Data ID of the
+    message. A lookup table of 65536 entries gives the contribution of each pair of bytes.
 
     Args:
         frames: `FRAME` records, shape (n,), whose payloads begin with the CRC, low byte first.

@@ -52,7 +52,8 @@ class Plan:
         self._index_identifiers()
         count = len(self.layouts)
         headers = [header_word(_can_id(m), m.length, _flags(m)) for m in self.layouts]
-        #: Expected header word of each message; 0 for an unsupported layout. The last element, for `UNKNOWN`, is 0.
+        #: Identifier, length and flags that the frames of each message must have, as one number (`header_word`).
+        #: The number is 0 for an unsupported layout, and in the last element, which has the index `UNKNOWN` (-1).
         self.headers = np.array([*headers, *([0] * len(self.refused)), 0], np.uint64)
         self.lengths = np.array([m.length for m in self.layouts], np.int64)
         self.cycle_ns = np.array([1e6 * (m.cycle_ms or 0.0) if m.cyclic else 0.0 for m in self.layouts])
@@ -103,7 +104,7 @@ class Plan:
                 continue
             extended[frame_id] = row
             if mask != _ALL_BITS:
-                # If two messages belong to one J1939 parameter group, the masked identifier is ambiguous and treated as unknown.
+                # Two messages of one J1939 parameter group are equal after masking. Such an identifier is treated as unknown.
                 known = groups.setdefault(mask, {})
                 known[frame_id & mask] = UNKNOWN if frame_id & mask in known else row
         self._standard = standard
@@ -135,9 +136,9 @@ class Plan:
         return rows
 
     def rows_in_other_format(self, can_ids: npt.NDArray[np.uint32]) -> Rows:
-        """Return the index of the message with the same number in the other identifier format (11 or 29 bits). Shape (n,).
+        """Look up each 11-bit identifier as a 29-bit identifier, and vice versa, and return the message indices. Shape (n,).
 
-        Example: the 11-bit identifier 0x123 gives the message with the 29-bit identifier 0x00000123, and vice versa.
+        Example: the 11-bit identifier 0x123 gives the message with the 29-bit identifier 0x00000123.
         The index is `UNKNOWN` if the DBC has no such message.
 
         Args:

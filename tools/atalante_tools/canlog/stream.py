@@ -21,15 +21,18 @@ _Column = TypeVar("_Column", bound=npt.NDArray[Any])
 
 @dataclass(frozen=True)
 class Stream:
-    """Frames of a chunk: n frames of m messages, sorted by message. Frames of the same message keep the order of the log."""
+    """Frames of a chunk: n frames of m messages, sorted by message. Frames of the same message keep the order of the log.
 
-    rows: Rows  # for each frame, the index of its message in the plan, shape (n,)
+    A message index is the position of a message in the arrays of `Plan` (the compiled DBC).
+    """
+
+    rows: Rows  # message index (position in the arrays of `Plan`) of each frame, shape (n,)
     stamps: npt.NDArray[np.int64]  # time stamp of each frame [ns], shape (n,)
-    indices: npt.NDArray[np.intp]  # index of each frame in the chunk, shape (n,)
+    indices: npt.NDArray[np.intp]  # position of each frame in the chunk, shape (n,)
     frames: Frames
-    present: npt.NDArray[np.intp]  # plan indices of the messages that have frames, ascending, shape (m,)
-    starts: npt.NDArray[np.intp]  # for each message, index of its first frame in the stream, shape (m,)
-    stops: npt.NDArray[np.intp]  # for each message, 1 + index of its last frame in the stream, shape (m,)
+    present: npt.NDArray[np.intp]  # message indices of the m messages with frames in the chunk, ascending, shape (m,)
+    starts: npt.NDArray[np.intp]  # for each message, position of its first frame in the stream, shape (m,)
+    stops: npt.NDArray[np.intp]  # for each message, 1 + position of its last frame in the stream, shape (m,)
 
     def __len__(self) -> int:
         return len(self.rows)
@@ -60,7 +63,7 @@ class Stream:
         """Return the slice of the stream that contains all frames of several messages.
 
         Args:
-            rows: indices of the messages in the plan. Their frames are contiguous, because the stream is sorted by message.
+            rows: message indices. The frames of these messages are contiguous, because the stream is sorted by message.
         """
         first, end = self.present.searchsorted((rows.start, rows.stop)).tolist()
         if first == end:
@@ -72,9 +75,10 @@ class Stream:
         return self.span(range(row, row + 1))
 
     def bounds(self, family: Family) -> list[tuple[int, int, int]]:
-        """Return (message index, first, end) for each message of a family.
+        """Return a tuple (message index, first, end) for each message of a family that has frames in the stream.
 
-        The slice `[first:end]` of the frames of the family contains the frames of the message.
+        A family contains all messages with the same signal layout, and its frames are contiguous in the stream. If `x` is
+        an array with one element per frame of the family, `x[first:end]` selects the frames of the message.
         """
         first, end = self.present.searchsorted((family.rows.start, family.rows.stop)).tolist()
         if first == end:
@@ -104,7 +108,7 @@ def sort(chunk: Chunk, rows: Rows, indices: npt.NDArray[np.intp] | None) -> Stre
 
     Args:
         chunk: n frames of the log.
-        rows: for each frame, the index of its message in the plan, shape (n,).
+        rows: message index (position in the arrays of `Plan`) of each frame, shape (n,).
         indices: indices of the frames to keep, shape (k,); None means all frames.
     """
     wanted = rows if indices is None else rows[indices]

@@ -17,9 +17,11 @@ from atalante_hal.types import PERIOD
 from atalante_hal.wire.frame import Frames
 from atalante_tools.session.rig import PATIENCE
 
-#: Longest accepted time from a SYNC to the state frame of a node [us]. In real time, the HAL waits half a cycle for the states.
+#: Longest accepted time from a SYNC to the state frame of a node [us].
+#: The HAL waits just as long for the state frames after a SYNC (half a cycle), except in lock-step.
 STATE_BUDGET: Final = PATIENCE * 1e6
-#: Longest accepted time from a SYNC to a command frame of the HAL [us]. Drives apply a command at the next SYNC.
+#: Longest accepted time from a SYNC to a command frame of the HAL [us]: one cycle.
+#: A drive applies a command at the next SYNC, so a later command frame misses this SYNC.
 COMMAND_BUDGET: Final = PERIOD * 1e6
 #: Node kinds that answer every SYNC with a state frame.
 _ANSWERING: Final = ("drive", "imu", "foot")

@@ -218,8 +218,7 @@ def _interface(name: str, interface: Interface | None, needed: bool) -> CheckRes
     if not interface.up:
         return CheckResult(name, False, needed, "the interface is down", f"ip link set {name} up")
     if interface.queue < QUEUE:
-        # A short queue is reported, but `atalante doctor` does not fail: the queue overflows only if the receiver is slow for
-        # several cycles.
+        # `needed` is False, because a short transmit queue overflows only if the receiver is slow for several cycles.
         text = f"CAN FD, up, but its transmit queue holds only {interface.queue} frames"
         return CheckResult(name, False, False, text, f"ip link set {name} txqueuelen {QUEUE}")
     return CheckResult(name, True, needed, f"CAN FD, up, txqueuelen {interface.queue}")

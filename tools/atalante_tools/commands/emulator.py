@@ -33,7 +33,7 @@ if TYPE_CHECKING:
 
 #: Period of the status line [s].
 STATUS_PERIOD: Final = 1.0
-#: Longest wait for a SYNC in lock-step [s]. After this time, the stop request is checked.
+#: Longest wait for a SYNC in lock-step [s]. Without a HAL, Ctrl-C takes effect after at most this time.
 POLL_TIMEOUT: Final = 0.1
 #: Time to listen for another robot before the first frame [s]. Without a HAL, each node sends its status every 0.1 s.
 LISTEN: Final = 0.25
@@ -185,7 +185,9 @@ def run(emulator: Emulator, target: Target, is_over: Callable[[], bool]) -> None
 
 
 def end_condition(stop: StopRequest, emulator: Emulator, bus: Line) -> Callable[[], bool]:
-    """Return the end condition of the emulator. Each call of the end condition also prints the status line if due.
+    """Return a function that returns whether the emulator must stop.
+
+    Each call of the returned function also prints warnings, and the status line once per `STATUS_PERIOD`.
 
     Args:
         stop: Stop request of the process.
@@ -195,7 +197,7 @@ def end_condition(stop: StopRequest, emulator: Emulator, bus: Line) -> Callable[
     progress = Progress(period=STATUS_PERIOD)
     has_pendant = emulator.operator is not None
     alone = True
-    received = 0  # number of frames received before the last status line
+    received = 0  # value of `bus.received` at the last status line
 
     def is_over() -> bool:
         nonlocal has_pendant, alone, received

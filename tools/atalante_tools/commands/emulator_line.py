@@ -18,24 +18,24 @@ from atalante_hal.wire.e2e import COUNTER_BYTE, check_counter
 from atalante_hal.wire.frame import Frames, new_frames
 from atalante_tools.session.takeover import PendantReader, Takeover
 
-#: The silent emulated pendant resumes sending if no frame of another pendant arrives for this time [cycles].
-#: A silent pendant in another process resumes after `takeover.QUIET_CYCLES`. `PENDANT_QUIET` is longer, so that the pendant in
-#: the other process resumes first.
+#: The emulated pendant stops for another pendant. It sends again after 12 cycles without frames of another pendant.
+#: If both pendants are silent, the pendant in another process sends first, after only 3 cycles (`takeover.QUIET_CYCLES`).
 PENDANT_QUIET: Final = 12
-#: Only the emulator should send the messages of the emulated nodes, except those of the pendant. Another robot is on the bus if
-#: this number of frames of such a message is received in a row with increasing counters.
+#: A second robot is reported if a message of an emulated node, such as LEFT_SH_STATE, is received 3 times in a row.
+#: The alive counters of these 3 frames must increase. Messages of a pendant do not count.
 ROBOT_FRAMES: Final = 3
 
 
 class Line(ResilientBus):
-    """Bus of the emulated robot. It counts frames, and detects whether another robot sends messages of the emulated nodes.
+    """Bus of the emulated robot, which also counts frames and detects a second robot.
 
-    The frames of the emulated pendant are dropped during and after a takeover by another pendant, see `takeover`.
+    A HAL sends no messages of drives, sensors or the vibration node. So such a message is received only from a second robot.
+    `send` drops the frames of the emulated pendant during and after a takeover by another pendant, see `takeover`.
 
     Attributes:
         sent: Number of frames sent so far.
         received: Number of frames received so far.
-        other_robot: Name of a message of the emulated nodes that another robot sends. Empty if no other robot was recognised.
+        other_robot: Name of a message received from a second robot, such as "LEFT_SH_STATE". Empty without a second robot.
     """
 
     def __init__(self, bus: Bus, network: Network) -> None:
@@ -51,7 +51,7 @@ class Line(ResilientBus):
         self._pendant_ids = [m.frame_id for m in network.sent_by("PENDANT")]
         nodes = [node.name for node in network.nodes if node.kind not in ("master", "pendant")]
         self._own = {m.frame_id: m for name in nodes for m in network.sent_by(name)}
-        #: CAN identifier -> last counter, number of frames in a row with increasing counters
+        #: CAN identifier -> (alive counter of the last frame, number of consecutive frames with increasing alive counters)
         self._in_row: dict[int, tuple[int, int]] = {}
         self.sent = 0
         self.received = 0
@@ -79,7 +79,7 @@ class Line(ResilientBus):
         return ""
 
     def send(self, frames: Frames) -> None:
-        """Send frames with `ResilientBus.send`. Omit frames of the emulated pendant while the takeover rule forbids these frames.
+        """Send frames with `ResilientBus.send`. Drop the frames of the emulated pendant if another pendant takes over.
 
         Args:
             frames: Frames to send.
@@ -91,7 +91,7 @@ class Line(ResilientBus):
             self.sent += len(frames)
 
     def receive(self, frames: Frames, timeout: float = 0.0) -> int:
-        """Receive frames with `ResilientBus.receive`, and detect another pendant and another robot.
+        """Receive frames with `ResilientBus.receive`. Detect another pendant and a second robot.
 
         Args:
             frames: Buffer for the received frames.
@@ -111,7 +111,7 @@ class Line(ResilientBus):
         return count
 
     def _from_another_robot(self, frames: Frames) -> list[tuple[int, int]]:
-        """Return identifier and counter of each received frame that only this emulator should send, except pendant frames."""
+        """Return (CAN identifier, alive counter) of each intact frame of a drive, a sensor or the vibration node."""
         ids = frames["can_id"].tolist()
         if self._own.keys().isdisjoint(ids):
             return []

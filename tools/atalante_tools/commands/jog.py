@@ -19,9 +19,9 @@ if TYPE_CHECKING:
 
 #: Longest wait after the move until the joint is at rest [s].
 SETTLE: Final = 1.0
-#: Position deviation [rad] and speed [rad/s] below which the joint is considered to be at rest.
+#: The joint is at rest if it is closer to the target angle than RESTED[0] [rad] and slower than RESTED[1] [rad/s].
 RESTED: Final = (math.radians(0.05), math.radians(0.5))
-#: Largest accepted position deviation at the end of the move [rad]. If the deviation is larger, the command fails.
+#: The command fails if the joint ends the move further than this angle [rad] from its target angle.
 TOLERANCE: Final = math.radians(1.0)
 
 

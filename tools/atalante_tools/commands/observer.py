@@ -29,9 +29,9 @@ class NodeReport:
 
     node: str
     kind: str
-    #: Age of the newest frame [ms] among the messages that the node sends most often. None if no such frame was received.
+    #: Time since the last frame of a message that the node sends at its highest rate [ms]. None before the first such frame.
     age_ms: int | None
-    late: bool  # whether the age exceeds the timeout in the DBC
+    late: bool  # whether `age_ms` exceeds the message timeout in the DBC
     state: str | None
     dbc_ok: bool | None
     supply_v: float | None
@@ -53,7 +53,10 @@ class JointReport:
 
 @dataclass(frozen=True)
 class Report:
-    """State of all nodes and joints. Bus load and counts cover the time since the previous report."""
+    """State of all nodes and joints.
+
+    The fields `load`, `frames`, `foreign`, `crc_errors` and `dropped` cover the time since the previous report.
+    """
 
     seconds: float
     supervisor: str | None
@@ -152,9 +155,9 @@ class Observer:
         return report
 
     def _fast(self, node: Node) -> list[Message]:
-        """Return the messages that a node sends most often, that is, with the shortest cycle time.
+        """Return the messages with the shortest period of all periodic messages of a node.
 
-        For the HAL, return only the SYNC messages. The commands have the same cycle time, but the HAL does not always send them.
+        For the HAL, return only the SYNC messages. The commands have the same period, but the HAL does not always send commands.
         """
         cyclic = [m for m in self._network.sent_by(node.name) if m.cycle_ms]
         fastest = min(m.cycle_ms for m in cyclic)

@@ -15,10 +15,10 @@ from atalante_tools.console.terminal import print_message, show_json
 if TYPE_CHECKING:
     from atalante_hal.types import State
 
-#: Shortest vibration whose measured level is checked [s]. A motor with a time constant of 0.06 s, the largest that `atalante
-#: conform` accepts, then reaches 80 % of the level.
+#: A vibration shorter than this time [s] is not checked. In 0.1 s, the slowest accepted motor reaches 80 % of its level.
+#: `atalante conform` accepts motors with a time constant of up to 0.06 s.
 _CHECKED: Final = 0.1
-#: Share of the commanded level that the motor must reach.
+#: The command fails if the measured level stays below this share of the commanded level.
 _REACHED: Final = 0.5
 
 

@@ -53,7 +53,8 @@ def _protocol(_ctx: click.Context, _param: click.Parameter, text: str | None) ->
     default=20,
     show_default=True,
     metavar="N",
-    help="Number of periodic steps. With --then: number of periodic steps before the first change.",
+    help="Number of periodic steps, that is, of the steps between the start step and the stop step. With --then: number of "
+    "periodic steps before the first change.",
 )
 @click.option(
     "--xi",
@@ -61,7 +62,8 @@ def _protocol(_ctx: click.Context, _param: click.Parameter, text: str | None) ->
     default=1.0,
     show_default=True,
     metavar="X",
-    help="Assistance factor Xi of the periodic steps: 1 is full assistance. Below 1, the swing leg moves in a guide.",
+    help="Assistance factor Xi of the periodic steps: 1 is full assistance. Below 1, hip and knee of the swing leg (SH, SK) "
+    "may move freely inside a virtual guide, a region around the desired trajectory.",
 )
 @click.option(
     "--shape", default="pinched", show_default=True, metavar="NAME|FILE", help=f"Shape of the guide: {SHAPE_HELP}."
@@ -213,7 +215,9 @@ def command(
     if out is None and typed("record_rate"):
         raise click.UsageError("--record-rate requires a recording: add --out")
     if turn and law.literal:
-        raise click.UsageError("--turn requires steering, which --literal does not have: remove one of them")
+        raise click.UsageError(
+            "--turn has no effect with --literal, because --literal switches steering off: remove one of them"
+        )
     if then:
         _require_speed_changes(law, files)
     if protocol is not None:
@@ -249,21 +253,21 @@ def _require_speed_changes(law: Law, files: GaitFiles) -> None:
     """
     if law.literal:
         raise click.UsageError(
-            "--then requires the ankle stabiliser, which --literal does not have: remove one of them"
+            "--then requires the ankle stabiliser, but --literal switches it off: remove one of them"
         )
     if files.gait is not None:
         raise click.UsageError("--then requires the gaits of a network, and --gait gives one gait: remove one of them")
 
 
 def _subject(patient: Patient | None, step_length: float, step_duration: float) -> Subject | None:
-    """Return patient, step length and step duration as a subject; None if `patient` is None and the step is the default."""
+    """Return the patient and the step in one `Subject`, or None if there is no patient and the step is `DEFAULT_STEP`."""
     if patient is None and (step_length, step_duration) == DEFAULT_STEP:
         return None
     return _walking_with(patient, step_length, step_duration)
 
 
 def _walking_with(patient: Patient | None, step_length: float, step_duration: float) -> Subject:
-    """Return patient, step length and step duration as a subject. If `patient` is None, use the default patient."""
+    """Return the patient and the step in one `Subject`. If `patient` is None, use the default patient."""
     from atalante_control.gait.subject import Subject
     from atalante_control.model import Patient
 

@@ -27,12 +27,12 @@ _HEARTBEAT_CYCLES, _ANSWER_CYCLES = 520, 200
 _MEAN, _SINGLE = 0.1, 0.5
 #: The flood test sends `_FLOOD` random frames in each of `_FLOOD_CYCLES` cycles. The bus load stays below 100 %.
 _FLOOD, _FLOOD_CYCLES = 6, 100
-#: Bits of the SYNC payload that a test flips, one bit in each damaged SYNC.
-#: These bits belong to the CRC, the HAL state or the cycle number.
+#: Bit numbers in the SYNC payload. To damage SYNC number k, a test inverts only the bit `_DAMAGED[k]`.
+#: The bits belong to the CRC (0 to 15), the HAL state or the cycle number.
 _DAMAGED: Final = (0, 5, 10, 15, *range(24, 32), *range(48, 56))
-#: Number of wrong SYNCs sent for each kind of defect.
+#: Each SYNC test sends this number of defective SYNCs, and a valid SYNC after each of them.
 _WRONG: Final = len(_DAMAGED)
-#: Maximum number of defects that a result names. Further defects are only counted.
+#: A test result describes only the first 3 defects. It also gives the number of all defects.
 _LISTED: Final = 3
 
 
@@ -353,7 +353,10 @@ def _statuses(tester: NodeTester, received: list[ReceivedFrame] | None = None) -
 
 
 def _answered(tester: NodeTester, received: list[ReceivedFrame], cycles: int) -> Outcome:
-    """Check the number of state frames, and the number of cycles between them.
+    """Return an outcome that passes if the node sent its state frame in every period.
+
+    With a period of 1 ms, exactly one state frame must answer each SYNC. With a longer period, each gap between two state
+    frames may deviate from the period by at most half a period, and at least `cycles // period - 1` state frames are required.
 
     Args:
         tester: tester of the node.

@@ -24,7 +24,8 @@ LEGAL: Final[dict[tuple[DriveState, Controlword], tuple[int, DriveState]]] = {
     (_S.SWITCH_ON_DISABLED, _C.SHUTDOWN): (2, _S.READY_TO_SWITCH_ON),
     (_S.READY_TO_SWITCH_ON, _C.SWITCH_ON): (3, _S.SWITCHED_ON),
     (_S.SWITCHED_ON, _C.ENABLE_OPERATION): (4, _S.OPERATION_ENABLED),
-    (_S.OPERATION_ENABLED, _C.SWITCH_ON): (5, _S.SWITCHED_ON),  # SWITCH ON acts as DISABLE OPERATION
+    # In OPERATION ENABLED, the command with the code 0x07 (SWITCH_ON) has the CiA 402 name DISABLE OPERATION.
+    (_S.OPERATION_ENABLED, _C.SWITCH_ON): (5, _S.SWITCHED_ON),
     (_S.SWITCHED_ON, _C.SHUTDOWN): (6, _S.READY_TO_SWITCH_ON),
     (_S.READY_TO_SWITCH_ON, _C.DISABLE_VOLTAGE): (7, _S.SWITCH_ON_DISABLED),
     (_S.READY_TO_SWITCH_ON, _C.QUICK_STOP): (7, _S.SWITCH_ON_DISABLED),
@@ -36,7 +37,7 @@ LEGAL: Final[dict[tuple[DriveState, Controlword], tuple[int, DriveState]]] = {
     (_S.QUICK_STOP_ACTIVE, _C.DISABLE_VOLTAGE): (12, _S.SWITCH_ON_DISABLED),
     (_S.QUICK_STOP_ACTIVE, _C.ENABLE_OPERATION): (16, _S.OPERATION_ENABLED),
 }
-#: Commands that lead from SWITCH ON DISABLED to each state.
+#: Drive state -> commands that bring the drive from SWITCH ON DISABLED to this state, in the order of sending.
 ROUTES: Final[dict[DriveState, tuple[Controlword, ...]]] = {
     _S.SWITCH_ON_DISABLED: (),
     _S.READY_TO_SWITCH_ON: (_C.SHUTDOWN,),
@@ -45,13 +46,13 @@ ROUTES: Final[dict[DriveState, tuple[Controlword, ...]]] = {
     _S.QUICK_STOP_ACTIVE: (_C.SHUTDOWN, _C.SWITCH_ON, _C.ENABLE_OPERATION, _C.QUICK_STOP),
 }
 
-#: Largest number of cycles that a drive may take for a transition. If a transition takes longer, the HAL aborts the START.
+#: A drive must make each transition within this number of cycles. If a transition takes longer, the HAL aborts the START.
 FOLLOW: Final = STALLED_CYCLES
 #: Number of cycles for which the test repeats a command that must leave the drive state unchanged.
 STAY: Final = 8
-#: Largest number of cycles from a command to the first state frame that shows the effect of the command.
+#: A state frame must show the effect of a command at most this number of cycles after the command.
 SHOWN: Final = 3
-#: Largest difference between measured and commanded torque that is attributed to noise [Nm].
+#: A torque test fails if the measured torque differs from the expected torque by more than this value [Nm].
 NOISE: Final = 0.3
 
 
@@ -68,7 +69,7 @@ class Axis:
         )
 
     def signal(self, name: str) -> str:
-        """Return the full name of a signal in the command message: prefix of this joint, then `name`."""
+        """Return the full name of a signal of this joint, for example "SK_TargetTorque" for "TargetTorque"."""
         return f"{self._prefix}_{name}"
 
     def command(
@@ -88,7 +89,7 @@ class Axis:
         Args:
             controlword: CiA 402 command.
             torque: target torque [Nm].
-            limit: largest torque [Nm]; None means the limit of the examination.
+            limit: largest torque [Nm]; None means `Limits.torque`.
             raw: raw code for each named signal of this joint, which replaces the encoded value of the signal.
             counter: alive counter of the frame; None means the next alive counter.
             data_id: E2E Data ID for the CRC; None means the Data ID of the message.
@@ -111,7 +112,10 @@ class Axis:
         length: int | None = None,
         flip: int | None = None,
     ) -> Frames:
-        """Return a defective command frame, shape (1,). The commanded torque is the torque limit of the examination.
+        """Return a defective command frame, shape (1,).
+
+        The command is ENABLE OPERATION with the largest permitted torque, `Limits.torque`. A drive that accepts the defective
+        frame produces this torque.
 
         Args:
             counter: alive counter of the frame; None means the next alive counter.

@@ -34,8 +34,8 @@ _S, _C = DriveState, Controlword
 
 #: Controlwords outside the DBC range: four valid controlwords with the highest bit set, and 0xFE.
 UNKNOWN: Final = (0x82, 0x86, 0x87, 0x8F, 0xFE)
-#: `TOLERATED` is the number of consecutive lost commands that a drive must tolerate.
-#: `LATCHED` is the number of consecutive lost commands after which a drive must latch its position hold.
+#: `TOLERATED`: 4 consecutive lost commands must change neither the state nor the torque of the drive.
+#: `LATCHED`: after 5 consecutive lost commands, the drive must hold its position and stay in QUICK STOP ACTIVE.
 TOLERATED, LATCHED = 4, 5
 #: CiA 301 emergency code for loss of the HAL command (RPDO timeout).
 COMMAND_TIMEOUT: Final = 0x8250
@@ -61,7 +61,7 @@ def ignores_invalid_codes(tester: NodeTester) -> Outcome:
     for quantity in ("Controlword", "TargetTorque", "MaxTorque"):
         code = message.signal(axis.signal(quantity)).invalid_raw
         assert code is not None
-        # A drive that accepts the invalid code as MaxTorque would exceed the last valid torque limit.
+        # The invalid code of MaxTorque is a large torque. A drive that uses it as limit produces the target torque and fails.
         limit, target = tester.limits.torque / 3.0, tester.limits.torque
         received = axis.run(6, _C.ENABLE_OPERATION, 0.0, limit)[2 * SHOWN :]
         for _ in range(2):
@@ -137,8 +137,8 @@ def latches(tester: NodeTester) -> Outcome:
     axis.enable()
     last = tester.command.counter
     received = tester.states([frame for _ in range(LATCHED) for frame in tester.cycle()])
-    # The alive counter of the next command is valid, because it increases by the largest valid step.
-    # A drive accepts this command, unless its watchdog has already latched the position hold.
+    # The next command is valid: its alive counter increases by MAX_DELTA, the largest increase that a drive accepts.
+    # A drive without a watchdog obeys the command, stays in OPERATION ENABLED and fails this test.
     received += axis.send(axis.command(_C.ENABLE_OPERATION, counter=last + MAX_DELTA & 0xFF))
     received += axis.run(2 * SHOWN, _C.ENABLE_OPERATION)
     stopped = any(state_of(frame) == _S.QUICK_STOP_ACTIVE for frame in received)
@@ -146,10 +146,10 @@ def latches(tester: NodeTester) -> Outcome:
 
 
 def latches_late_commands(tester: NodeTester) -> Outcome:
-    """Test DRIVE-24: several short delays of the commands add up, and then lead to QUICK STOP ACTIVE.
+    """Test DRIVE-24: commands that are too old lead to QUICK STOP ACTIVE, although no command is lost.
 
-    The test pauses the commands three times for `TOLERATED` cycles. The drive tolerates a single pause. After each pause,
-    the alive counter continues with the next value, so the commands fall behind the SYNC by one more pause.
+    The test delays the commands by 4 cycles (`TOLERATED`) three times, so the last commands are 12 cycles late. The drive
+    tolerates a delay of 4 cycles. The alive counters are consecutive, so only a comparison with the SYNC shows the delay.
     """
     axis = Axis(tester)
     axis.enable()
@@ -201,8 +201,7 @@ def latches_without_sync(tester: NodeTester) -> Outcome:
     for _ in range(20):
         tester.silent_cycle()
     long = axis.run(2 * SHOWN, _C.ENABLE_OPERATION)
-    # This test checks only that the drive enters QUICK STOP ACTIVE. DRIVE-14 tests that the drive stays in this state until
-    # the HAL releases the drive.
+    # The drive only has to enter QUICK STOP ACTIVE. DRIVE-14 tests which commands end this state.
     passed = all_in(short, _S.OPERATION_ENABLED) and any(state_of(frame) == _S.QUICK_STOP_ACTIVE for frame in long)
     return Outcome(passed, f"after 3 ms {names_of(short)}, after 20 ms {names_of(long)}")
 

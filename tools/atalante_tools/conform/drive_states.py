@@ -28,11 +28,11 @@ from atalante_tools.conform.technician import Action
 
 _S, _C = DriveState, Controlword
 
-#: Largest number of cycles from the command QUICK_STOP to the state QUICK STOP ACTIVE.
+#: After the command QUICK_STOP, a drive must reach QUICK STOP ACTIVE within this number of cycles.
 STOP: Final = 5
-#: Largest movement of a joint in QUICK STOP ACTIVE [rad].
+#: In QUICK STOP ACTIVE, a joint may move by at most this angle [rad].
 MOVEMENT: Final = math.radians(1.0)
-#: Class of the CiA 301 emergency codes that report a temperature fault.
+#: CiA 301 emergency codes for a temperature fault are 0x4000 to 0x4FFF.
 TEMPERATURE_CLASS: Final = 0x4000
 
 

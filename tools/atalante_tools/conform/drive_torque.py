@@ -38,7 +38,7 @@ def follows_torque(tester: NodeTester) -> Outcome:
 
 
 def respects_the_limit(tester: NodeTester) -> Outcome:
-    """Test DRIVE-08: the torque stays within MaxTorque for the largest target torques."""
+    """Test DRIVE-08: the drive limits its torque to MaxTorque, even if TargetTorque is the largest or smallest DBC value."""
     axis, found, passed = Axis(tester), [], True
     target = tester.command.message.signal(axis.signal("TargetTorque"))
     axis.enable()
@@ -51,7 +51,7 @@ def respects_the_limit(tester: NodeTester) -> Outcome:
 
 
 def takes_the_largest_limit(tester: NodeTester) -> Outcome:
-    """Test DRIVE-09: the drive accepts the largest MaxTorque of the DBC as torque limit."""
+    """Test DRIVE-09: the drive accepts a command in which MaxTorque has the largest value of its DBC range."""
     axis, target_torque = Axis(tester), tester.limits.torque
     axis.enable()
     usual = mean_torque(axis.run(12, _C.ENABLE_OPERATION, target_torque)[2 * SHOWN :])

@@ -1,4 +1,4 @@
-"""Sender of valid or defective test frames of a message, and receiver that records every defect of a received frame."""
+"""Frames of a test: `MessageSender` builds valid or defective frames, `MessageReceiver` decodes and checks received frames."""
 
 from __future__ import annotations
 
@@ -21,7 +21,8 @@ class MessageSender:
 
     Args:
         message: message to send.
-        sync: sender of the SYNC if the message is a command. A command has the alive counter of the SYNC of the next cycle.
+        sync: sender of the SYNC if the message is a command, otherwise None. The alive counter of a command is the alive counter
+            of the SYNC in the next cycle.
     """
 
     def __init__(self, message: Message, sync: MessageSender | None = None) -> None:
@@ -29,7 +30,7 @@ class MessageSender:
         self._codec = Codec([message])
         self._template = self._codec.template()
         self._values = np.zeros(self._codec.size)
-        self._counter = 255  # alive counter of the last frame
+        self._counter = 255  # alive counter of the last frame, 255 before the first frame
 
     def frame(
         self,
@@ -84,19 +85,19 @@ class MessageSender:
 
     @property
     def counter(self) -> int:
-        """Return the alive counter of the last frame that was created without the argument `counter`."""
+        """Return the alive counter of the last frame. Frames whose alive counter the caller chose do not count."""
         return self._counter
 
 
 @dataclass(frozen=True)
 class ReceivedFrame:
-    """Received frame of the node under test, with a list of all defects of the frame."""
+    """Received frame of the node under test, with the result of each check of the frame."""
 
     message: Message
     cycle: int  # number of the cycle in which the frame was received
     time: float  # receive time [s]
     length_valid: bool
-    format_valid: bool  # CAN FD frame with bit rate switch
+    format_valid: bool  # whether the frame is a CAN FD frame with bit rate switch
     crc_valid: bool
     counter: int
     reserved_zero: bool
@@ -121,7 +122,7 @@ class MessageReceiver:
         self._reserved = (~used)[: message.length]
 
     def decode(self, frame: Frames, cycle: int, time: float) -> ReceivedFrame:
-        """Decode one frame and record all defects of the frame.
+        """Decode and check one frame.
 
         Args:
             frame: received frame, shape (1,).

@@ -1,4 +1,7 @@
-"""Requirements for the haptics node: its eight motors follow the commanded levels with a lag, and stop without commands."""
+"""Requirements for the haptics node, which drives eight vibration motors.
+
+The measured amplitude of each motor must follow the commanded level with a lag. Without commands, the motors must stop.
+"""
 
 from __future__ import annotations
 
@@ -14,13 +17,14 @@ from atalante_tools.conform.node_tester import NodeTester, NotTested
 from atalante_tools.conform.requirement import Outcome, Requirement
 
 E2E: Final = "AUTOSAR E2E Profile 5"
-#: Largest accepted time constant of a motor [s].
+#: Amplitudes and levels are 0 (off) to 1 (strongest). A motor fails if its time constant is larger than this time [s].
 TIME_CONSTANT = 0.06
-#: Largest accepted deviation of the amplitude from a first-order lag, as a fraction of full amplitude.
+#: In HAPTICS-02, -04 and -05, an amplitude may deviate from the expected amplitude by at most this number.
+#: In HAPTICS-02, the expected amplitudes are an exponential curve that is fitted to the measured amplitudes.
 LAG = 0.05
-#: Number of cycles within which a motor must reach its commanded level.
+#: A motor must reach its commanded level within this number of cycles.
 _SETTLED: Final = 250
-#: Largest difference between measured and expected amplitude that is attributed to noise (fraction of full amplitude).
+#: A motor is considered to be at its commanded level if amplitude and level differ by at most this number.
 _STILL: Final = 0.02
 #: Number of defective commands that a test sends, one per cycle.
 _BAD: Final = 40
@@ -153,7 +157,7 @@ def moves_one_motor(tester: NodeTester) -> Outcome:
 
 
 def stays_in_range(tester: NodeTester) -> Outcome:
-    """Test HAPTICS-05: a level above the DBC range neither lowers the amplitude of a motor nor raises it above 1."""
+    """Test HAPTICS-05: with a level above the DBC range, the amplitude of a motor stays at 0.5 or rises to at most 1."""
     found, passed = [], True
     for code in (201, 230, 254):
         _settle(tester, 0.5)
@@ -213,7 +217,7 @@ def _run(tester: NodeTester, cycles: int, level: float, only: str | None = None)
 
 
 def _settle(tester: NodeTester, level: float, only: str | None = None) -> Vector:
-    """Command a level until the motors reach this level or `_SETTLED` cycles have passed; return the last amplitudes.
+    """Command a level until the motors reach the level, for at most `_SETTLED` cycles.
 
     Args:
         tester: tester of the haptics node.

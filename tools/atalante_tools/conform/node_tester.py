@@ -23,7 +23,7 @@ from atalante_tools.console.outcome import Failed
 if TYPE_CHECKING:
     from atalante_emulator.emulator import Emulator
 
-#: Largest number of frames that one `receive` call returns.
+#: Size of the receive buffer [frames].
 _RECEIVE_BUDGET: Final = 128
 #: Longest wait for the state message that answers SYNC [s]. After this time, the tester sends the command anyway.
 _PATIENCE: Final = 0.6e-3
@@ -38,7 +38,7 @@ class NotTested(Exception):  # noqa: N818
 class Clock(Protocol):
     """Clock that starts the cycles."""
 
-    delay: float  # longest delay of a cycle start on this computer [s], reset to 0 at the start of each test
+    delay: float  # largest delay with which this computer started a cycle of the current test [s]
 
     def next_cycle(self, *, sync: bool, listen: Callable[[float], None]) -> None:
         """Wait for the start of the next cycle.
@@ -86,18 +86,22 @@ class LockStep:
 
 
 class WallClock:
-    """Real-time clock at 1 kHz with absolute deadlines. The clock skips missed cycles to avoid SYNC bursts."""
+    """Real-time clock that starts a cycle every millisecond.
+
+    After a delay of more than 1 ms, the clock continues from the current time. It does not make up for missed cycles, because the
+    node would then receive several SYNCs at once.
+    """
 
     def __init__(self) -> None:
         self.delay = 0.0
         self._deadline = time.monotonic()
 
     def next_cycle(self, *, sync: bool, listen: Callable[[float], None]) -> None:
-        """Receive frames until the deadline."""
+        """Receive frames until the next cycle starts."""
         self._deadline += PERIOD
         while (left := self._deadline - time.monotonic()) > 0.0:
             listen(left)
-        listen(0.0)  # after a late wake-up, record the frames that arrived before the next SYNC
+        listen(0.0)  # frames that are still waiting after a late wake-up of this process belong to the old cycle
         delay = -left
         self.delay = max(self.delay, delay)
         if delay > PERIOD:
@@ -231,14 +235,13 @@ class NodeTester:
         return self.sync.frame(cycle, counter=counter, length=length, classic=classic, flip=flip)
 
     def _send(self, frames: Frames) -> None:
-        # A bus caches the memory address of each array that it sends, so the tester reuses its arrays.
-        # The key of `_outboxes` is the number of frames in the array.
+        # `_outboxes[n]` is the only array in which n frames are sent, because a bus caches views of each array object.
         outbox = self._outboxes.setdefault(len(frames), new_frames(len(frames)))
         as_words(outbox)[:] = as_words(frames)
         try:
             self._bus.send(outbox)
         except BusFull:
-            # While the node is switched off, no frame is acknowledged and the transmit queue fills up. Discard the frames.
+            # Normal while the node is switched off: no node acknowledges frames, so the transmit queue is full.
             return
 
     def _listen(self, timeout: float) -> None:

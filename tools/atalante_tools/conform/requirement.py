@@ -1,4 +1,4 @@
-"""Requirement for a node, and examination that tests all requirements in order and returns a verdict on each."""
+"""Requirements for a node, and `examine`, which tests each requirement and yields a verdict."""
 
 from __future__ import annotations
 
@@ -9,9 +9,9 @@ from typing import Final
 
 from atalante_tools.conform.node_tester import NodeTester, NotTested
 
-#: Largest accepted delay of a cycle start [s]. After a larger delay, this computer may be the cause of a failed test.
+#: A failed test does not count if this computer started a cycle with at least this delay [s]. The test is then repeated.
 LATE: Final = 2e-3
-#: Number of attempts for a test that fails while this computer is late.
+#: If a test fails this number of times while this computer is late, the verdict is "not tested".
 ATTEMPTS: Final = 3
 
 
@@ -69,8 +69,7 @@ def _result(tester: NodeTester, requirement: Requirement) -> Result:
         silence = _silence(tester, frames, cycle)
         measured = silence + outcome.measured
         if outcome.passed:
-            # If no frame of the node was received, the requirement is not tested.
-            # A node that is switched off would pass the tests for forbidden frames, because it sends no frame at all.
+            # Some tests pass if a forbidden frame is absent. A node without power must not pass such a test.
             return Result(requirement, Verdict.NOT_TESTED if silence else Verdict.PASSED, measured)
         if tester.clock.delay < LATE:
             return Result(requirement, Verdict.FAILED, measured)

@@ -16,12 +16,14 @@ from atalante_tools.conform.requirement import Outcome, Requirement
 GRAVITY: Final = 9.81  # m/s2
 #: Number of cycles in which a test measures a sensor.
 _MEASURED: Final = 100
-NORM: Final = 1e-3  # largest deviation of a quaternion from unit length
-SPECIFIC_FORCE: Final = 0.3  # largest deviation of the mean acceleration from gravity [m/s2]
-#: Largest angle between the mean acceleration and the vertical direction according to the quaternion [rad].
+NORM: Final = 1e-3  # the length of a quaternion may differ from 1 by at most this number
+#: Largest difference between the magnitude of the mean acceleration and `GRAVITY` [m/s2].
+SPECIFIC_FORCE: Final = 0.3
+#: Accelerometer and quaternion of a resting IMU both give the upward direction. Largest angle between them [rad].
 TILT: Final = math.radians(3.0)
-RATE: Final = 0.05  # largest deviation of the mean gyro rate from the rate of change of the attitude [rad/s]
-UNLOADED: Final = 10.0  # largest mean force on an axis of an unloaded force cell [N]
+#: Largest difference between the rate of the gyro and the angular rate computed from the quaternions [rad/s].
+RATE: Final = 0.05
+UNLOADED: Final = 10.0  # the mean force on each axis of an unloaded force cell may be at most this force [N]
 
 _VECTOR: Final = ("X", "Y", "Z")
 _AT_REST: Final = f"mean of {_MEASURED} ms at rest"
@@ -108,7 +110,7 @@ def measures_gravity(tester: NodeTester) -> Outcome:
 
 
 def agrees_with_gravity(tester: NodeTester) -> Outcome:
-    """Test IMU-03: the mean acceleration is vertical after rotation by the measured attitude."""
+    """Test IMU-03: accelerometer and quaternion give the same upward direction."""
     _, quaternions, acceleration = _attitudes(tester, "Accel")
     mean, force = quaternions.mean(axis=0), acceleration.mean(axis=0)
     w, x, y, z = mean / np.linalg.norm(mean)
@@ -120,14 +122,15 @@ def agrees_with_gravity(tester: NodeTester) -> Outcome:
 
 
 def agrees_with_attitude(tester: NodeTester) -> Outcome:
-    """Test IMU-04: the mean gyro rate equals the rate of change of the attitude.
+    """Test IMU-04: the mean gyro rate equals the angular rate computed from the quaternions.
 
     An emulated robot without power sinks slowly, so the expected gyro rate is not zero.
     """
     cycles, quaternions, rate = _attitudes(tester, "Gyro")
     (w0, *v0), (w1, *v1) = quaternions[0].tolist(), quaternions[-1].tolist()
     first, last = np.array(v0), np.array(v1)
-    # For small angles, the vector part of conj(q0) q1 is half the rotation vector in the sensor frame.
+    # `turned` is the rotation between the first and the last frame, as a rotation vector in the sensor frame [rad].
+    # For a small angle, `turned` is twice the vector part of the quaternion product conj(q0) q1.
     turned = 2.0 * (w0 * last - w1 * first - np.cross(first, last))
     duration = max(1, cycles[-1] - cycles[0]) * PERIOD
     deviation = np.abs(rate.mean(axis=0) - turned / duration).max()

@@ -31,9 +31,9 @@ class Technician(Protocol):
     """Person or program that carries out manual actions on the node."""
 
     patience: float  # longest wait for the effect of an action [s]
-    #: True if the node was powered on just before the tests, so that its boot-up can be tested without a power cycle
+    #: whether the node was powered on just before the tests; NODE-01 then does not request a power-up
     fresh: bool
-    certain: bool  # whether every requested action is carried out; a person may ignore a request
+    certain: bool  # True for a program, which carries out every action; False for a person, who may ignore a request
 
     def request(self, action: Action, node: str) -> None:
         """Carry out the action, or ask a person to carry out the action."""
@@ -53,7 +53,10 @@ class HumanTechnician:
 
 
 class EmulatorTechnician:
-    """Program that carries out manual actions on an emulated robot, which is powered on when the examination starts."""
+    """Program that carries out manual actions on an emulated robot.
+
+    The emulated robot is powered on when the examination starts.
+    """
 
     def __init__(self, emulator: Emulator, operator: Operator) -> None:
         self._emulator, self._operator = emulator, operator

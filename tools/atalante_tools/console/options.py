@@ -50,12 +50,12 @@ dask_option = click.option(
     help="Run on the workers of this dask scheduler, such as tcp://127.0.0.1:8786.",
 )
 
-#: Option `--network`: file of the gait network that computes the gaits.
+#: Option `--network`: file of the neural network that computes the gaits.
 network_option = click.option(
     "--network",
     type=click.Path(path_type=Path, dir_okay=False),
     metavar="FILE",
-    help="Network file of `atalante gait fit`.  [default: the network of the package]",
+    help="File of a neural gait network, as written by `atalante gait fit`.  [default: the installed gait network]",
 )
 
 #: Option type for a seed of random numbers.
@@ -101,7 +101,7 @@ class OutputFile(click.Path):
         return path
 
 
-#: If the user enters a length as a number of at least 5, the number is in centimetres. A smaller number is in metres.
+#: A length that the user types is in centimetres from this number on, and in metres below: 175 is 175 cm, 1.75 is 1.75 m.
 _CENTIMETRES: Final = 5.0
 
 #: Default step length [m] and default step duration [s] of a patient.
@@ -167,7 +167,7 @@ class GaitFiles:
     """Files from which a command takes its gait. At most one of them is given."""
 
     gait: Path | None = None  # gait file or walk file
-    network: Path | None = None  # file of a gait network; None means the network of the package
+    network: Path | None = None  # file of a neural gait network; None means the file installed with `atalante_control`
 
     @property
     def arguments(self) -> str:
@@ -326,7 +326,8 @@ class Target:
 
     interface: str
     channel: str  # one channel, or a channel map of the four buses. Empty for the embedded robot.
-    lockstep: bool  # whether a cycle ends after the answers of all nodes (lock-step) instead of after 1 ms (wall clock)
+    #: True: a cycle ends when all nodes have answered (lock-step). False: a cycle takes 1 ms (wall clock).
+    lockstep: bool
     engine: str = PYBULLET  # physics engine of the embedded robot
 
     @property
@@ -389,7 +390,7 @@ def target_options(*, embedded: bool, clock: bool = True) -> Callable[[_Command]
 def _refusal(interface: str) -> str:
     from atalante_hal.bus.adapters import ADAPTERS, refusal
 
-    # The error of an unknown interface is raised later, when the bus is opened.
+    # An unknown name may be an interface of a python-can plug-in. `open_bus` raises an error if there is no such interface.
     return refusal(interface) if interface in ADAPTERS else ""
 
 

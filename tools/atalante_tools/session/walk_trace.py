@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from atalante_control.walking.controller import WalkController
     from atalante_hal.types import Vector
 
-#: Period of the samples [cycles].
+#: Number of cycles from one sample of the telemetry to the next.
 PERIOD_CYCLES: Final = 10
 _COLOURS: Final = ("tab:blue", "tab:orange")
 
@@ -89,7 +89,10 @@ def foot_prints(columns: Mapping[str, Vector]) -> list[tuple[int, float, float, 
 
 
 def draw(columns: Mapping[str, Vector], picture: Path) -> None:
-    """Draw foot prints with the divergent component of motion (DCM), and the ratio of error to guide width of SH and SK.
+    """Draw the foot prints on the ground, and the angle errors of the swing leg over the time.
+
+    The upper panel also shows the path of the divergent component of motion (DCM). The lower panel shows the angle errors of hip
+    (SH) and knee (SK), each divided by the half-width of the guide. At 1 and -1, the joint is at an edge of the guide.
 
     Args:
         columns: Samples of `WalkTrace.columns`.
@@ -132,7 +135,11 @@ def _draw_ground(axis: Any, columns: Mapping[str, Vector]) -> None:
 
 
 def _dcm_on_ground(columns: Mapping[str, Vector]) -> Vector:
-    """Return the DCM [m] in the axes of the walking line, shape (n, 2); NaN outside the steps."""
+    """Return the path of the divergent component of motion (DCM) on the ground [m], shape (n, 2).
+
+    The columns are the distances along the walking line, and to the left of this line. A row is NaN if no foot swings, and in the
+    first cycle of a step.
+    """
     from atalante_control.walking.phases import STEPPING
 
     stance = columns["stance"][:, 0].astype(int)
@@ -140,7 +147,7 @@ def _dcm_on_ground(columns: Mapping[str, Vector]) -> Vector:
     c, s = np.cos(columns["yaw"][:, 0]), np.sin(columns["yaw"][:, 0])
     x, y = columns["dcm"].T
     dcm = feet + np.column_stack([c * x - s * y, s * x + c * y])
-    # In the first cycle of a step, the DCM is still relative to the stance foot of the step before.
+    # In the first cycle of a step, the telemetry still contains the DCM relative to the previous stance foot.
     valid = np.isin(columns["phase"][:, 0], list(STEPPING)) & (columns["elapsed"][:, 0] > 0.0)
     dcm[~valid] = math.nan
     return np.asarray(dcm)

@@ -107,12 +107,12 @@ class WalkWatch:
         )
 
     def conclude(self) -> None:
-        """End the command with an error unless the robot walked to the end.
+        """End the command with an error, unless the robot stands after all steps or after STOP of the operator.
 
         Raises:
             SystemExit: If a signal ended the walk, with its exit code.
             FaultLatched: If the robot is in FAULT.
-            Failed: If the robot fell, or left ACTIVE early.
+            Failed: If the robot fell, went to HOLD during the walk, or ended the walk early without a request to stop.
         """
         from atalante_hal.safety.start import WALK_ENDS, stop_text
         from atalante_tools.console.outcome import FaultLatched

@@ -80,7 +80,7 @@ class FrameFilter(WrappedBus):
         self._random = np.random.default_rng(seed)
         self._syncs = {m.frame_id for m in network.messages if m.name.startswith("SYNC_")}
         self._cycle = 0
-        #: Delayed frames of the HAL, and delayed frames of the nodes, each as (cycle in which the frame is due, frame).
+        #: Two lists of delayed frames: from the HAL, and from the nodes. An item is (cycle from which the frame may pass, frame).
         self._delayed: tuple[list[tuple[int, Frames]], list[tuple[int, Frames]]] = ([], [])
 
     def drop(self, name: str, *, frames: int | None = None, probability: float = 1.0) -> Fault:
@@ -176,7 +176,7 @@ class FrameFilter(WrappedBus):
         try:
             self.bus.send(frames)
         except BusError as error:
-            # The faults may have removed or changed frames. So the caller cannot compute the accepted frames from its own batch.
+            # Faults drop or change frames of the caller. So the error must contain the frames that the bus really accepted.
             error.accepted = accepted = error.accepted_of(frames)
             if self.tap is not None and error.sent:
                 self.tap.sent(accepted)

@@ -30,13 +30,13 @@ from atalante_tools.session.rig import join, open_buses
 if TYPE_CHECKING:
     from atalante_emulator.emulator import Emulator
 
-#: On a CAN interface, the emulated robot waits at most this time for the frames of one cycle [s].
+#: Longest time for which the emulated robot waits for the frames of one cycle on a CAN interface [s].
 _POLL: Final = 0.01
 #: Time to listen on a CAN interface before the emulated robot uses it [s]. The interface is free if no frame arrives.
 _QUIET: Final = 0.15
 #: Largest number of frames in a recording (about 30 s).
 KEPT: Final = 600_000
-#: In a recording, the time stamps of consecutive frames of one cycle differ by this time [ns].
+#: Interval between the time stamps of two consecutive frames of one cycle in a recording [ns].
 _FRAME_NS: Final = 20_000
 
 
@@ -64,7 +64,7 @@ def open_bus(network: Network, target: Target, *, emulated: bool) -> tuple[Bus, 
     hal_bus = join(network, open_buses(network, target))
     if not emulated:
         return hal_bus, None
-    # A connected robot is detected even without a HAL, because its nodes send heartbeats without SYNC.
+    # The nodes of a real robot send heartbeats even if no HAL sends SYNC. So a received frame shows that a robot is connected.
     scratch = new_frames(1)
     if hal_bus.receive(scratch, _QUIET):
         hal_bus.close()
@@ -126,7 +126,7 @@ class Stepper:
 
     @property
     def codes(self) -> list[str]:
-        """Return the diagnostic codes of the last `fault_memory.EVENTS_KEPT` events."""
+        """Return the diagnostic code of each event that the HAL still keeps, at most `fault_memory.EVENTS_KEPT` codes."""
         return [event.code for event in self.hal.events]
 
     def cycle(self) -> State:

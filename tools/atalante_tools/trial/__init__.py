@@ -48,17 +48,18 @@ class Running:
 
 @dataclass(frozen=True)
 class Walking:
-    """Options of the experiments on the ground."""
+    """Options of the experiments in which virtual subjects walk on the ground."""
 
     shape: str  # guide shape
+    #: share of the gravity, friction, Coriolis and centrifugal torques of the leg that the exoskeleton compensates, 0 to 1
     idealization: float
-    feedforward: float
+    feedforward: float  # share of the torques for the acceleration of the leg that the exoskeleton produces, 0 to 1
     network: Path | None  # file of the neural gait network; None means the network of the package
     haptics: bool  # whether active subjects respond to the vibration motors
 
 
 def _running(experiment: str) -> Callable[[_Command], _Command]:
-    """Return a decorator that adds the options of all experiments. The command gets their values as the argument `running`."""
+    """Return a decorator that adds the options of `Running`. The command gets their values as the argument `running`."""
     options = [
         click.option("--out", type=click.Path(path_type=Path, file_okay=False), default=f"runs/{experiment}", show_default=True,
                      metavar="DIR", help="Folder for report.html, report.md and one file per trial. A trial with a valid "
@@ -75,7 +76,7 @@ def _running(experiment: str) -> Callable[[_Command], _Command]:
 
 
 def _walking() -> Callable[[_Command], _Command]:
-    """Return a decorator that adds the options of the experiments on the ground. The command gets the argument `walking`."""
+    """Return a decorator that adds the options of `Walking`. The command gets their values as the argument `walking`."""
     options = [
         click.option("--shape", type=click.Choice(("constant", "pinched")), default="constant", show_default=True,
                      help="Shape of the guide. The guide of the paper is constant."),
@@ -217,7 +218,7 @@ def faults(ids: tuple[str, ...], running: Running, as_json: bool) -> None:
 @click.option(
     "--literal",
     is_flag=True,
-    help="Use the control law as the paper prints it. The guides are then not certified.",
+    help="Use the control law as the paper prints it. With this law, no push is certified to keep the joints inside the guide.",
 )
 @click.option(
     "--xi",
@@ -225,7 +226,7 @@ def faults(ids: tuple[str, ...], running: Running, as_json: bool) -> None:
     type=Between(0.0, 1.0),
     multiple=True,
     metavar="X",
-    help="Assistance factor after the transition. Repeat the option for several factors. With 1, all steps have full "
+    help="Assistance factor of the last part of the walk. Repeat the option for several factors. With 1, all steps have full "
     "assistance.  [default: 0.5 and 0]",
 )
 @click.option(
@@ -327,10 +328,10 @@ def _record_failures(trials: Sequence[Trial], running: Running) -> None:
 
 
 def _known(masses: tuple[float, ...]) -> tuple[float, ...]:
-    """Return the masses if each of them is the mass of a virtual subject.
+    """Return `masses` unchanged if each value is the mass of a virtual subject.
 
     Raises:
-        UsageError: If no subject has one of the masses.
+        UsageError: If a value is not the mass of a virtual subject.
     """
     from atalante_control.gait.subject import STUDY_PATIENTS
 

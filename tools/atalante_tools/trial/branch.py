@@ -18,7 +18,10 @@ from typing import Any
 
 
 class Branch:
-    """Pipe from the run to a branch: a forked process that waits at one moment of the run and can continue from there."""
+    """Handle of a forked process that waits at one moment of a run.
+
+    `ask` continues the run from this moment, in a further copy of the process. The handle owns the pipe to the waiting process.
+    """
 
     def __init__(self, channel: Connection) -> None:
         self._channel = channel
@@ -89,7 +92,7 @@ def branch() -> Branch | Continuation:
         theirs.close()
         return Branch(ours)
     ours.close()
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C does not end a branch, but a closed channel does
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # this process ignores Ctrl-C; it ends when the run closes the pipe
     signal.signal(signal.SIGTERM, signal.SIG_DFL)
     try:
         while True:
@@ -100,9 +103,9 @@ def branch() -> Branch | Continuation:
             _, status = os.waitpid(child, 0)
             if status:
                 theirs.send(_NoAnswer(os.waitstatus_to_exitcode(status)))
-    except EOFError:  # the process of the run has closed the branch, or has ended
+    except EOFError:  # the run has closed its end of the pipe, or has ended
         os._exit(0)
-    except BaseException:  # noqa: BLE001 - in this copy of the process, no error may reach the caller
+    except BaseException:  # noqa: BLE001 - an error ends this waiting process, which must not run the code of the caller
         os._exit(1)
     return Continuation(request, theirs)
 

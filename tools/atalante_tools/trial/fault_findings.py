@@ -72,7 +72,11 @@ def _claim(id_: str) -> str:
 
 
 def _wrong_fall(id_: str, case: str, run: dict[str, Any]) -> bool:
-    """Return whether a run ended in a fall that is not accepted."""
+    """Return whether a run ended in a fall for which the finding fails.
+
+    Each of the following is sufficient: the robot must not fall in this case (`NO_FALL`, `NO_FALL_IN_DOUBLE_SUPPORT`), the HAL
+    reported no diagnostic, or the HAL ended in ACTIVE or FULL_ASSIST.
+    """
     if run["outcome"] != "fell":
         return False
     required = (id_ in NO_FALL and re.match(NO_FALL[id_], case)) or (
@@ -94,10 +98,10 @@ def _moments(falls: Sequence[dict[str, Any]]) -> str:
 
 
 def _longest(result: Result) -> str:
-    """Return the worst moment and the longest fault duration without a fall at this moment, as text.
+    """Return as text the longest fault duration that causes no fall at any moment of the walk.
 
-    For example, the robot withstands a fault of 80 cycles in the weight shift, but only of 30 cycles at phase 0.375. Then the
-    text is "30 cycles (at phase 0.375)".
+    For example, the robot withstands a fault of 80 cycles in the weight shift, but only of 30 cycles at phase 0.375. The text is
+    then "30 cycles (at phase 0.375)". If the robot withstands a permanent fault at all moments, the text is "is not limited".
     """
     limited = [
         (cycles, run["moment"])

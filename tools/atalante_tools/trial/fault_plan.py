@@ -17,18 +17,20 @@ class Moment(NamedTuple):
     """Moment of a walk at which a fault begins, as the time since the start of a phase of the walk."""
 
     phase: str  # name of a member of `atalante_control.walking.phases.Phase`
-    step: int  # number of steps before the phase
+    step: int  # number of periodic steps (phase STEP) that the robot has completed before this phase
     share: float  # time since the first cycle of the phase, divided by the nominal duration of a step
 
 
-#: Number of steps of a walk before its stop step.
+#: Number of periodic steps of a walk, between its start step and its stop step.
 STEPS: Final = 2
-#: Name -> moment at which each fault begins. Both feet carry load in the weight shifts before and after the steps.
+#: Moments at which every fault is tried: name -> moment. One walk has one fault, which begins at one moment.
+#: In "weight shift" and "shift back", both feet carry load.
 MOMENTS: Final = {
     "weight shift": Moment("SHIFT", 0, 0.75),
     **{f"phase {k / 8:g}": Moment("STEP", STEPS - 1, k / 8) for k in range(8)},
     "shift back": Moment("BACK", STEPS, 0.25),
 }
+#: Names of the moments that `--quick` uses.
 QUICK_MOMENTS: Final = ("weight shift", "phase 0.375")
 #: Further moments with both feet on the ground, for the faults after which the HAL sends no more frames.
 FURTHER_MOMENTS: Final = {
@@ -42,24 +44,24 @@ DOUBLE_SUPPORT: Final = frozenset({"weight shift", "shift back", *FURTHER_MOMENT
 NO_FRAMES: Final = frozenset({"F15", "F16", "F41"})
 #: IDs of the faults that `--quick` injects.
 QUICK_IDS: Final = ("F05", "F56")
-#: Value of `FaultTrial.index` for the permanent case of a scenario.
+#: Value of `FaultTrial.index` for the case `Scenario.permanent`, which contains a fault without an end.
 PERMANENT: Final = -1
 
 
 @dataclass(frozen=True)
 class FaultTrial:
-    """Trial of one case of a fault scenario, with one walk for each moment at which the fault begins."""
+    """Trial of one case of a fault: one walk for each moment at which the fault begins."""
 
     kind: ClassVar[str] = "fault"
     id: str  # fault ID, as in the fault matrix
-    index: int  # index of the case in its scenario, or `PERMANENT`
+    index: int  # key of the case in the mapping `ground_cases(id)`: a number from 0 on, or `PERMANENT`
     case: str  # name of the case
     moments: tuple[str, ...]  # keys of `MOMENTS` and `FURTHER_MOMENTS`
     mass: float  # mass of the wearer [kg]
     height: float  # height of the wearer [m]
     seed: int
     engine: str
-    sources: str  # hash of the source files of `atalante_tools.faults`
+    sources: str  # hash of the files of `atalante_tools.faults`; if it changes, the stored result is not used again
 
     @property
     def name(self) -> str:

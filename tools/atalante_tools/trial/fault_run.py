@@ -77,17 +77,17 @@ class FaultRun:
     state: str  # state of the HAL at the end
     #: diagnostics since the first faulty cycle, in the order of their first report; the severity `info` is left out
     codes: tuple[str, ...]
-    #: number of cycles from the first faulty cycle to the diagnostic expected by the fault matrix, both included; None if missing
+    #: cycle in which the expected diagnostic was reported, where 1 is the first faulty cycle; None: no such diagnostic
     detected: int | None
     reason: str  # reason that the HAL states for its last state, or the exception
-    fallen: int | None = None  # number of cycles from the start of the case to the fall
+    fallen: int | None = None  # number of cycles from `moment` to the fall; None: no fall
 
 
 class _Request(NamedTuple):
     """Request to a branch (a waiting copy of the walk): continue the walk with these faults and actions."""
 
-    stimuli: tuple[Stimulus, ...]  # faults and actions of the operator
-    begins: int  # HAL cycle in which the case begins
+    stimuli: tuple[Stimulus, ...]  # injected faults, and actions of the operator
+    begins: int  # HAL cycle from which the times of the stimuli count
     ends: int | None  # first cycle after all faults and actions, counted from `begins`; None if a fault is permanent
 
 
@@ -202,7 +202,7 @@ def diagnosed(events: Sequence[Event], expected: str, first: int) -> tuple[tuple
 def _branches(mass: float, height: float, seed: int, engine: str) -> dict[str, tuple[int, Branch]]:
     """Return for each moment the cycle in which the fault begins, and a forked process paused shortly before this cycle.
 
-    The paused process is a copy of a walk without a fault. Through its `Branch`, walks with a fault continue from this pause.
+    The paused process is a copy of a walk without a fault. `Branch.ask` continues this walk from the pause, now with a fault.
 
     Args:
         mass: mass of the wearer [kg].
@@ -229,10 +229,12 @@ def _branches(mass: float, height: float, seed: int, engine: str) -> dict[str, t
 
 
 class _Walk:
-    """Walk on the ground.
+    """One walk on the ground, which forks waiting copies of its process at chosen cycles.
+
+    A waiting copy gets a `_Request` with faults. A further copy of the process then continues the walk with these faults.
 
     Attributes:
-        begins: (phase, number of steps before the phase) -> first cycle of the phase.
+        begins: (phase, number of periodic steps completed before the phase) -> first cycle of the phase.
         branches: cycle -> branch, a forked copy of the walk that waits at the end of this cycle.
         outcome: how the walk ended, as in `FaultRun`.
         reason: reason of the last state.

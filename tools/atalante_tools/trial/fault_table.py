@@ -1,4 +1,7 @@
-"""Table of the experiment `faults`: `results -> one row per fault and kind of outcome, one column per moment`."""
+"""Table of the experiment `faults`: `results -> headings, rows`.
+
+A row shows how the walks with one fault ended, with a column for each moment at which the fault begins.
+"""
 
 from __future__ import annotations
 
@@ -12,7 +15,9 @@ _WORDS: Final = {"walked": "walks", "hold": "stops", "fell": "FALLS", "exception
 
 
 def fault_table(results: Sequence[dict[str, Any]]) -> tuple[list[str], list[list[str]]]:
-    """Return headings and rows. Cases of a fault with equal outcomes share a row.
+    """Return headings and rows of the table.
+
+    Cases of the same fault share a row if their outcomes and their longest durations without a fall are equal.
 
     Args:
         results: results of `fault` trials.

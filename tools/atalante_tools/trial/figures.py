@@ -40,7 +40,10 @@ def shapes(results: Sequence[Result]) -> bytes:
 
 
 def robustness(results: Sequence[Result]) -> bytes:
-    """Draw mass error and friction of each walk, with a filled marker if the walk ended standing, otherwise with a cross.
+    """Draw one marker for each walk, at its mass error (x) and its floor friction (y).
+
+    The marker is a dot if the robot stood at the end, otherwise a cross. The mass error is a ratio: the true mass of the patient,
+    divided by the mass in the model of the controller.
 
     Args:
         results: results of `robust` trials.
@@ -60,7 +63,9 @@ def robustness(results: Sequence[Result]) -> bytes:
 
 
 def pushes(results: Sequence[Result]) -> bytes:
-    """Draw the largest push over its direction: one thin line for each phase, and a thick line for the worst phase.
+    """Draw a polar figure: for each push direction, the largest push that the robot withstands.
+
+    A thin line shows the pushes at one phase of the step. The thick line shows the smallest force of all phases.
 
     Args:
         results: results of `push` trials.
@@ -114,7 +119,9 @@ def joints(results: Sequence[Result], mass: float) -> bytes:
 
 
 def positions(results: Sequence[Result]) -> bytes:
-    """Draw how often passive and active subjects were at each position in the guide.
+    """Draw histograms of the angle errors of hip and knee, each divided by the half-width of the guide.
+
+    At 1 and -1, the joint is at an edge of the guide. Passive and active subjects have separate curves.
 
     Args:
         results: results of `assist` trials.
@@ -236,9 +243,10 @@ def sweep_trend(results: Sequence[Result]) -> bytes:
 
 
 def _steps(axis: Any, steps: Sequence[Sequence[Sequence[float]]], columns: Sequence[int]) -> None:
-    """Draw steps over each other. A sample contains phase, measured angle, desired angle, upper and lower edge of the guide.
+    """Draw the angle curves of several steps in one panel.
 
-    The edges are drawn only if `columns` contains their indices.
+    A sample is (phase, measured angle, desired angle, upper edge of the guide, lower edge of the guide). `columns` begins with 0,
+    1, 2. If the edges must be drawn, 3 and 4 follow.
     """
     for number, step in enumerate(steps):
         data, last = np.array(step), number == len(steps) - 1

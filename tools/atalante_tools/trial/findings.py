@@ -19,29 +19,30 @@ from atalante_tools.faults.false_alarms import EXPECTED
 
 Result = dict[str, Any]
 
-#: Phases at which steps are compared with each other. An early landing ends a step at a phase of about 0.9.
+#: Phases of a step at which `step_variation` compares steps with each other. The last phase is 0.8, because an early landing
+#: ends a step at a phase of about 0.9.
 _PHASES: Final = np.linspace(0.1, 0.8, 29)
 
 #: Two metabolic rates count as equal if their means differ by at most this fraction of the rate of quiet standing.
 SAME: Final = 0.02
 STANDING: Final = 1.44  # metabolic rate of quiet standing [W/kg]
-#: A quantity has a falling trend if its rank correlation with the assistance factor is between -1 and -`TREND`.
-#: On each day of the sweep, the assistance factor falls from 1 to 0 and then rises to 1. The two walks with the same factor must
-#: give nearly the same value. The mean absolute difference of all these pairs, divided by the range of all values, must be at
-#: most `ASYMMETRY`.
+#: `TREND`: A value falls with the assistance factor if the rank correlation of both is between -1 and -`TREND`.
+#: `ASYMMETRY` concerns the pairs of walks with the same factor: on each day of the sweep, the factor falls from 1 to 0 and rises
+#: to 1. The mean absolute difference in a pair, divided by the range of all values, must be at most `ASYMMETRY`.
 TREND, ASYMMETRY = 0.8, 0.25
-#: Largest coefficient of variation of the baseline metabolic rates of a sweep.
+#: Largest accepted coefficient of variation of the metabolic rates with full assistance in the walks of a sweep.
 VARIATION: Final = 0.05
 
 
-#: `CERTIFIED` is the smallest accepted share of certified guides.
-#: `ROBUST` is the smallest accepted share of robots that complete all steps of `robustness` and stand at the end.
+#: `CERTIFIED` is the smallest accepted share of guides with a promise: disturbance torques up to which the joints stay inside.
+#: `ROBUST` is the smallest accepted share of walks of `robustness` in which the robot completes all steps and stands at the end.
 CERTIFIED, ROBUST = 0.95, 0.98
-#: Largest deviation from the line after the walks of `protocol` [m]: with the gyro alone, and with a heading reference.
+#: Largest accepted distance between robot and start line at the end of a walk of `protocol` [m]: if the heading comes from the
+#: gyro alone, and if the IMUs have a heading reference.
 SIDEWAYS, SIDEWAYS_WITH_REFERENCE = 1.5, 0.5
-#: Largest root mean square error of the estimated vertical [deg].
+#: The root mean square error of the estimated vertical must be below this angle in every walk [deg].
 ATTITUDE: Final = 0.5
-#: Pushes of 0.2 s that the robot must withstand [N]: in the worst direction and phase, and forwards in the worst phase.
+#: Force of a push of 0.2 s that the robot must withstand at every phase of a step [N]: in every direction, and forwards.
 PUSH_WORST, PUSH_FORWARD = 200.0, 300.0
 
 
@@ -270,7 +271,10 @@ def normalised(result: Result) -> float:
 
 
 def step_variation(result: Result) -> float:
-    """Return the standard deviation of e / q_bound over the last steps, averaged over phases and joints.
+    """Return how much the last steps of a walk differ from each other.
+
+    The ratio e / q_bound is the angle error of a joint divided by the half-width of the guide. Its standard deviation over the
+    steps is computed at each phase and for each joint. The result is the mean of these standard deviations.
 
     Args:
         result: result of a guided walk.
@@ -285,7 +289,7 @@ def step_variation(result: Result) -> float:
 
 
 def _alarms(results: Sequence[Result]) -> str:
-    """Return text: each diagnostic that a walk without a fault must not report, with its number of reports."""
+    """Return the unexpected diagnostics of walks without a fault, each with the number of its reports, as text."""
     counts: dict[str, int] = {}
     for result in results:
         for code, count in result["diagnostics"].items():

@@ -1,4 +1,4 @@
-"""Parts that all trials share: the emulated robot in lock-step as target, and the end condition of a trial."""
+"""Parts that all trials share: the connection to an emulated robot in lock-step, and the end condition of a trial."""
 
 from __future__ import annotations
 
@@ -11,12 +11,12 @@ from atalante_tools.console.stop_request import check_stop
 from atalante_tools.session.rig import Rig
 from atalante_tools.session.walk_observation import AFTERMATH, Observation
 
-#: Time within which the robot must become ACTIVE [cycles].
+#: If the robot is not ACTIVE after this time, the trial ends with the outcome "no start" [cycles].
 _START: Final = 30_000
 
 
 def target(engine: str) -> Target:
-    """Return the target of a trial: an emulated robot in this process, in lock-step.
+    """Return the connection settings of a trial: an emulated robot in this process, in lock-step with the HAL.
 
     Args:
         engine: name of the physics engine.

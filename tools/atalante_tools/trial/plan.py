@@ -25,7 +25,8 @@ from atalante_tools.trial.fault_plan import FaultTrial
 if TYPE_CHECKING:
     from atalante_control.model import Patient
 
-#: Numbers of steps of 0.8 s: with full assistance (90 s), in the transition (30 s), with the factor of the trial (180 s).
+#: Numbers of steps in the three parts of a walk: full assistance, changing assistance factor, factor of the trial.
+#: A step takes 0.8 s, so the parts take about 90 s, 30 s and 180 s.
 PROTOCOL: Final = (112, 38, 225)
 QUICK_PROTOCOL: Final = (2, 1, 3)
 #: Step of all walks: length [m] and duration [s].
@@ -37,7 +38,7 @@ SWEEP: Final = (1.0, 0.75, 0.5, 0.25, 0.0, 0.25, 0.5, 0.75, 1.0)
 QUICK_SWEEP: Final = (1.0, 0.5, 0.0, 0.5, 1.0)
 #: Number of days of the sweep, in a normal run and with `--quick`.
 DAYS, QUICK_DAYS = 3, 1
-#: Number of right-stance steps in each guide shape, in a normal run and with `--quick`.
+#: Number of steps in each guide shape that have the right leg as stance leg, in a normal run and with `--quick`.
 SHAPE_STEPS, QUICK_SHAPE_STEPS = 30, 2
 #: Duration of the trial on the treadmill [s].
 TREADMILL_TIME: Final = 300
@@ -45,19 +46,19 @@ TREADMILL_TIME: Final = 300
 SWEEP_SUBJECT: Final = (75.0, 1.75)
 #: Masses of the subjects of `assist --quick` [kg].
 QUICK_MASSES: Final = (58.0, 75.0)
-#: Range of the random ratio of true mass to known mass in `robustness`.
+#: Range of a random ratio in `robustness`: true mass of the patient divided by the mass in the model of the controller.
 MASS_SHARE: Final = (0.9, 1.1)
 #: Range of the random coefficient of friction between soles and floor in `robustness`.
 FRICTION: Final = (0.25, 0.8)
-#: Number of parts of the control loop that can be one cycle late in `robustness`: state messages, command messages, motors.
-#: Data times out at an age of five cycles. With a delay of one cycle, the timeout needs four consecutive lost frames.
-#: With a longer delay, fewer lost frames than the fault matrix intends would cause a timeout.
+#: Length of `RobustTrial.delay`: state messages, command messages and motor torques can each be one cycle late in `robustness`.
+#: Longer delays are not tried, because a drive times out when its last command is five cycles old. With commands one cycle late,
+#: the timeout needs four consecutive lost frames. With a longer delay, it needs fewer lost frames than the fault matrix intends.
 LATE_PARTS: Final = 3
-#: Probability of a lost frame in `robustness`.
+#: Probability with which a frame is lost in `robustness`.
 LOSS: Final = 0.01
 #: Force of a push in `robustness` [N].
 PUSH: Final = 100.0
-#: Number of steps per push in `robustness`. A push begins at a random time in the first 70 % of these steps.
+#: The robot is pushed once in this number of steps of `robustness`, at a random time in the first 70 % of these steps.
 PUSH_STEPS: Final = 10
 #: Number of trials and number of steps per trial of `robustness`, in a normal run and with `--quick`.
 ROBUST, QUICK_ROBUST = (100, 60), (2, 4)
@@ -77,7 +78,7 @@ class ShapeTrial:
 
     kind: ClassVar[str] = "shape"
     shape: str
-    steps: int  # number of right-stance steps
+    steps: int  # number of steps with the right leg as stance leg
     xi: float
     seed: int
     engine: str
@@ -100,16 +101,17 @@ class WalkTrial:
     mass: float  # mass of the subject [kg]
     height: float  # height of the subject [m]
     active: bool  # whether the muscles of the subject track the gait
-    xi: float  # assistance factor after the transition
-    protocol: tuple[int, int, int]  # numbers of steps: with full assistance, in the transition, with `xi`
+    xi: float  # assistance factor in the last part of the walk
+    protocol: tuple[int, int, int]  # numbers of steps: with full assistance, with changing assistance factor, with `xi`
     shape: str  # guide shape
     idealization: float
     feedforward: float
     seed: int
     engine: str
-    order: str = ""  # day of the sweep, and position of the trial in this day; empty outside the sweep
-    literal: bool = False  # whether the control law follows the paper literally
-    heading_reference: bool = False  # whether the IMUs have a heading reference and the controller follows it
+    order: str = ""  # place in the sweep, such as "day2-03" for the third walk of day 2; empty in other experiments
+    literal: bool = False  # whether the controller uses the control law exactly as the paper prints it
+    #: whether the IMUs have a heading reference, such as a magnetometer, and the controller corrects the gyro drift with it
+    heading_reference: bool = False
     #: path and SHA-256 of the file of the neural gait network; empty for the network of the package
     network: tuple[str, ...] = ()
     haptics: bool = False  # whether an active subject responds to the vibration motors
@@ -132,7 +134,8 @@ class RobustTrial:
     friction: float  # coefficient of friction between soles and floor
     delay: tuple[int, int, int]  # cycles by which state messages, command messages and motor torques are late
     loss: float  # probability that a frame is lost, on all buses
-    pushes: tuple[tuple[float, float], ...]  # time since the first periodic step [s] and direction [deg] of each push
+    #: time [s] and direction [deg] of each push; time 0 is the end of the start step, with which the robot begins to walk
+    pushes: tuple[tuple[float, float], ...]
     force: float  # force of each push [N]
     steps: int
     seed: int
@@ -150,7 +153,7 @@ class PushTrial:
 
     kind: ClassVar[str] = "push"
     direction: float  # direction of the push [deg]: 0 is forwards, 90 is to the left
-    phase: float  # phase of a right-stance step at which the push begins
+    phase: float  # phase at which the push begins, in a step with the right leg as stance leg
     forces: tuple[float, ...]  # forces of the pushes [N], in rising order
     mass: float  # mass of the wearer [kg]
     height: float  # height of the wearer [m]
@@ -207,9 +210,9 @@ class WalkSetting:
         Args:
             patient: mass and height of the subject.
             active: whether the subject is active.
-            xi: assistance factor after the transition.
+            xi: assistance factor in the last part of the walk.
             index: number of the trial in the experiment.
-            order: day and position of a trial of the sweep.
+            order: place in the sweep, such as "day2-03".
         """
         return WalkTrial(
             patient.mass, patient.height, active, xi, self.protocol, self.shape, self.idealization, self.feedforward,
@@ -239,7 +242,7 @@ def shape_trials(names: Sequence[str], steps: int, xi: float, seed: int, engine:
 
     Args:
         names: names of the shapes.
-        steps: number of right-stance steps in each trial.
+        steps: number of steps with the right leg as stance leg in each trial.
         xi: assistance factor.
         seed: seed of the sensor noise.
         engine: name of the physics engine.
@@ -284,7 +287,7 @@ def protocol_trials(
 
     Args:
         setting: settings that all walks share.
-        factors: assistance factors after the transition.
+        factors: assistance factors in the last part of the walks.
         masses: masses of the subjects [kg]; empty means all eight subjects.
         kinds: one or both of `KINDS`. The seed of a trial does not depend on this choice.
     """
@@ -348,7 +351,7 @@ def push_trials(
 
     Args:
         directions: directions of the pushes [deg].
-        phases: phases of a right-stance step at which the pushes begin.
+        phases: phases at which the pushes begin, in a step with the right leg as stance leg.
         forces: forces in rising order [N].
         seed: seed of the sensor noise.
         engine: name of the physics engine.

@@ -198,7 +198,7 @@ def _number(value: float | None, digits: int) -> str:
 
 
 def _provenance(results: Sequence[Result]) -> list[tuple[str, str]]:
-    """Return versions, seeds, engine, options and mode of the trials, as pairs of name and text."""
+    """Return how the results were computed, as pairs of name and text: versions, seeds, engine, options, kind of robot."""
     versions = {f"{name} {value}" for r in results for name, value in r["versions"].items()}
     rows = [("versions", ", ".join(sorted(versions)))]
     for name, meaning in (

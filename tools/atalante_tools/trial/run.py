@@ -60,9 +60,9 @@ _FELT_VIBRATION: Final = 0.1
 _SAMPLING = 20  # cycles between two samples of the motion
 #: Number of swings of the left leg whose curves are stored in a result.
 _CURVES: Final = 15
-#: Edges of the histogram of e / q_bound.
+#: Edges of the bins in a histogram of e / q_bound: the angle error of a joint, divided by the half-width of the guide.
 EDGES: Final = tuple(round(-1.0 + 0.05 * k, 2) for k in range(41))
-#: Names of the three parts of a walk: full assistance, transition, and assistance factor of the trial.
+#: Names of the three parts of a walk, with full assistance, with changing assistance factor, and with the factor of the trial.
 SEGMENTS: Final = ("full", "transition", "target")
 
 
@@ -199,7 +199,7 @@ def _walk(trial: WalkTrial) -> dict[str, Any]:
 
 
 def _task(trial: WalkTrial, gaits: WalkGaits, patient: Patient) -> ActiveTask | None:
-    """Return the task of an active subject; None for a passive subject."""
+    """Return the motion that the muscles of an active subject track; None for a passive subject."""
     if not trial.active:
         return None
     parameters = ActiveParameters(vibration=_FELT_VIBRATION) if trial.haptics else None
@@ -207,7 +207,10 @@ def _task(trial: WalkTrial, gaits: WalkGaits, patient: Patient) -> ActiveTask | 
 
 
 class Motion:
-    """Samples of SH and SK of the swing leg during the periodic steps. Samples after the nominal end of a step are omitted."""
+    """Measured and desired angles of hip (SH) and knee (SK) of the swing leg, sampled during the periodic steps.
+
+    If a step lasts longer than its nominal duration, the rest of the step has no samples.
+    """
 
     def __init__(self, rig: Rig, controller: WalkController) -> None:
         """Create an empty series of samples.
@@ -237,7 +240,7 @@ class Motion:
             )  # fmt: skip
 
     def result(self, protocol: tuple[int, int, int]) -> dict[str, Any]:
-        """Return tracking errors, position in the guide, and curves of the last swings of the left leg.
+        """Return tracking errors, statistics of the angles in the guide, and curves of the last swings of the left leg.
 
         Args:
             protocol: numbers of steps of the three segments.
@@ -257,7 +260,11 @@ class Motion:
         }
 
     def _curves(self, rows: Vector) -> list[list[list[float]]]:
-        """Return the samples of the last steps: phase, then measured angles, desired angles and q_bound of SH and SK [deg]."""
+        """Return the angle curves of the last steps in `rows`: for each step, a list of samples.
+
+        A sample has seven numbers: phase, two measured angles, two desired angles, and two half-widths of the guide (q_bound).
+        Each pair belongs to hip (SH) and knee (SK) [deg].
+        """
         chosen = np.unique(rows[:, 0])[-_CURVES:]
         return [
             [[round(row[1] / STEP[1], 4), *_rounded(np.degrees(row[3:]))] for row in rows[rows[:, 0] == step]]
@@ -266,15 +273,15 @@ class Motion:
 
 
 def _position(ratio: Vector) -> dict[str, Any]:
-    """Return statistics of the position in the guide, e / q_bound.
+    """Return statistics of the angle errors, each divided by the half-width of the guide.
 
     Args:
-        ratio: e / q_bound of SH and SK, shape (n, 2).
+        ratio: angle error e divided by the half-width q_bound, for hip (SH) and knee (SK), shape (n, 2).
     """
     return {
-        # share of the samples in which |e| / q_bound of a joint is above 0.5
+        # share of the samples in which the absolute ratio of hip or knee is above 0.5
         "outer": round(float(np.mean(np.abs(ratio).max(axis=1) > 0.5)), 4),
-        "spread": round(float(ratio.std(axis=0).mean()), 4),  # standard deviation, averaged over both joints
+        "spread": round(float(ratio.std(axis=0).mean()), 4),  # standard deviation, mean of hip and knee
         "histogram": [np.histogram(ratio[:, k], EDGES)[0].tolist() for k in range(2)],
     }
 
@@ -297,7 +304,10 @@ class Effort:
         self._cycle, self._totals, self._segments = 0, [(0.0, 0.0, 0.0)], list[int]()
 
     def sample(self) -> None:
-        """Count a cycle of the periodic steps. At the end of each second, store the work and impulse of the muscles so far."""
+        """Store the total work and impulse of the muscles once per second of the periodic steps.
+
+        Call this function in every cycle.
+        """
         if self._controller.phase is not Phase.STEP:
             return
         self._cycle += 1

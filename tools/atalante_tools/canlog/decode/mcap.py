@@ -40,7 +40,7 @@ class McapSink:
         self._writer = Writer(self._file, compression=CompressionType.ZSTD)
         self._writer.start(profile="", library="atalante decode")
         self._writer.add_metadata("dbc", {"file": plan.catalogue.path.name, "crc32": f"{plan.catalogue.hash32:08X}"})
-        #: Topic number of each message (index in the plan) on each channel (name in the log).
+        #: (message index in the plan, channel name in the log) -> number of the MCAP topic.
         self._topics: dict[tuple[int, str], int] = {}
         self._schemas: dict[int, int] = {}
         #: Messages to write at the next `flush`: (index in the chunk, topic number, time stamp [ns], payload).

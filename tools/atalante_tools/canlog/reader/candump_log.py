@@ -15,7 +15,9 @@ from atalante_tools.canlog.reader.candump import MARGIN
 from atalante_tools.canlog.reader.chunk import Chunk, concatenated
 from atalante_tools.canlog.reader.log_file import LogFile
 
-_TEXT_BYTES = 1 << 21  # length of the text parsed in one call [byte]; the arrays fit into the processor cache
+#: Number of bytes of the log that one call of `candump.parse` parses.
+#: The arrays that the parser creates for this number of bytes fit into the processor cache.
+_TEXT_BYTES = 1 << 21
 
 
 def read(log: LogFile, chunk_frames: int) -> Iterator[Chunk]:
@@ -37,7 +39,7 @@ def read(log: LogFile, chunk_frames: int) -> Iterator[Chunk]:
             log.position = file.tell() if not log.compressed else log.position
             end = MARGIN + kept + got
             if not got:
-                break  # the file has ended, or `broken` describes a read error
+                break  # end of the file, or a read error; `broken` is the text of the read error
             stop = _after_last_newline(text, end - got, end)
             if not stop:
                 kept += got

@@ -73,7 +73,9 @@ def read(log: LogFile, chunk_frames: int) -> Iterator[Chunk]:
         except (*UNREADABLE, _mdf_error()) as error:
             broken = " ".join(str(error).split()) or type(error).__name__
         if broken and log.suffix == ".mf4":
-            gc.collect()  # destroy the half-opened MDF object while `_quiet_asammdf` suppresses the destructor's error
+            # If asammdf cannot open the file, an MDF object remains, and its destructor raises an error.
+            # Destroy this object here, because `_quiet_asammdf` suppresses the error only inside the `with` block.
+            gc.collect()
     if batch.count:
         yield batch.take()
     _remark(log, count, broken, ends_within, warnings)
@@ -232,10 +234,11 @@ def _last_byte(path: Path) -> bytes:
 
 
 def _size_defect(log: LogFile) -> str:
-    """Return how the size of a .blf file differs from the size in its header; empty if the file is complete.
+    """Return the reason why a .blf file is incomplete, or an empty text if the file is complete.
 
-    The recorder writes the final size into the header when it closes the log. Until then, the header states a smaller
-    size. For a compressed log, this function checks only whether the header states any data.
+    The function compares the size of the file with the size in the file header. The recorder writes the final size into
+    the header when it closes the log. Until then, the header states a smaller size. For a compressed log, this function
+    checks only whether the header states any data.
     """
     with gzip.open(log.path) if log.compressed else log.path.open("rb") as file:
         header = file.read(_BLF_HEADER.size)

@@ -10,7 +10,8 @@ import numpy.typing as npt
 from atalante_tools.canlog.plan import UNKNOWN, Plan, Rows
 from atalante_tools.canlog.reader.chunk import Chunk
 
-#: A channel is assigned to a bus if at least this share (0 to 1) of the known frames on the channel belongs to the bus.
+#: A channel is assigned to a bus if at least this share (0 to 1) of its frames are messages of the bus.
+#: Frames of messages that are unknown or unsupported do not count.
 _MAJORITY = 0.9
 
 
@@ -66,7 +67,10 @@ class ChannelMap:
                 self._channel_of_row[row] = self._expected_channel(row, int(chunk.channels[index]))
 
     def on_wrong_channel(self, chunk: Chunk, rows: Rows) -> npt.NDArray[np.bool_]:
-        """Return the mask of the frames whose channel differs from the expected channel of the message. Shape (n,)."""
+        """Return True for each frame that was received on a wrong channel. Shape (n,).
+
+        The right channel is the expected channel of the message. A frame with an unknown identifier is never wrong.
+        """
         if len(self.bus_of_channel) < 2:
             return np.zeros(len(chunk), np.bool_)
         known = rows >= 0

@@ -22,17 +22,18 @@ from atalante_tools.canlog.validate.value_rules import Decoded
 
 _S, _C = DriveState, Controlword
 _STATES = {int(state) for state in DriveState}
-#: Transitions that a drive makes without a command: fault detected, fault reaction finished, boot finished.
+#: State changes (state, next state) that a drive makes without a command.
+#: A fault leads from any state to FAULT_REACTION_ACTIVE or FAULT. The end of the boot leads to SWITCH_ON_DISABLED.
 _SPONTANEOUS = {(s, f) for s in DriveState for f in (_S.FAULT_REACTION_ACTIVE, _S.FAULT)} | {
     (_S.NOT_READY_TO_SWITCH_ON, _S.SWITCH_ON_DISABLED)
 }
-#: Legal transitions of a drive: (state, next state).
+#: All state changes (state, next state) that a drive may make. Any other state change is a violation.
 LEGAL = {(int(state), int(after)) for (state, _), after in TRANSITIONS.items()} | {
     (int(a), int(b)) for a, b in _SPONTANEOUS
 }
-#: Pairs (state, controlword) to which a drive need not respond.
-#: In QUICK_STOP_ACTIVE, a drive that stopped without a command may ignore ENABLE_OPERATION until it receives QUICK_STOP.
-#: A drive may ignore FAULT_RESET while the cause of the fault persists.
+#: Pairs (drive state, controlword) without a check of the response, because the drive may ignore the controlword.
+#: ENABLE_OPERATION: a drive that stopped by itself may ignore this controlword until it receives QUICK_STOP.
+#: FAULT_RESET: a drive may ignore this controlword while the cause of the fault persists.
 EXEMPT = {(int(_S.QUICK_STOP_ACTIVE), int(_C.ENABLE_OPERATION)), (int(_S.FAULT), int(_C.FAULT_RESET))}
 _NOTHING = -1
 
@@ -51,25 +52,25 @@ def must_respond(state: int, controlword: int) -> bool:
 
 @dataclass
 class _Drive:
-    """Drive: indices of its messages, last reported state and last command."""
+    """Drive: its messages, its last reported state and the last controlword for it."""
 
-    row: int  # index of the state message in the plan
-    command_row: int  # index of the command message in the plan; -1 if the DBC has no command for the drive
-    command_index: int  # index of the controlword in the fields of the command message
+    row: int  # message index (position in the arrays of `Plan`) of the state message
+    command_row: int  # message index of the command message; -1 if the DBC has no controlword for the drive
+    command_index: int  # position of the controlword among the signals of the command message; -1 if there is none
     state: int = _NOTHING
     command: int = _NOTHING
-    since: int = 0  # time stamp of the last frame with a changed state or command [ns]
-    state_stamp: int = 0  # time stamp of the last state frame [ns]
+    since: int = 0  # time stamp of the last change of the drive state or of the controlword [ns]
+    state_stamp: int = 0  # time stamp of the last frame of the state message [ns]
 
 
 @dataclass(frozen=True)
 class _CommandField:
-    """Controlword field of a command message."""
+    """Signal of a command message that contains a controlword."""
 
-    row: int  # index of the command message in the plan
-    index: int  # index of the field in the fields of its message
-    joint: str  # joint in the name of the signal; empty if the name has no joint
-    receivers: tuple[str, ...]  # nodes that receive the field
+    row: int  # message index (position in the arrays of `Plan`) of the command message
+    index: int  # position of the controlword among the signals of the command message
+    joint: str  # joint in the signal name, such as FH in FH_Controlword; empty for the name Controlword
+    receivers: tuple[str, ...]  # nodes that receive the controlword
 
 
 class DriveRules:
@@ -80,7 +81,8 @@ class DriveRules:
         self._limit_ns = project.number("cia402-response", "limit_ms") * 1e6
         state, command = project.text("cia402-transition", "state"), project.text("cia402-response", "command")
         commands = _command_fields(plan, command)
-        #: Drives, grouped by the family (`plan.Family`) of their state messages. Key: first message index of the family.
+        #: Lists of drives. The state messages of all drives in one list have the same signal layout (a family).
+        #: The key of a list is the smallest message index in the family.
         self.drives: dict[int, list[_Drive]] = {}
         for family in plan.families:
             index = next((p for p, f in enumerate(family.codec.fields) if f.name == state), None)

@@ -14,8 +14,8 @@ from atalante_tools.canlog.validate.findings import Findings
 
 Steps = npt.NDArray[np.int64]
 
-#: `REPEATED` is the counter increment at a repeated frame.
-#: `NO_STEP` replaces the increment at a frame that has no alive counter or no previous frame.
+#: Increment `REPEATED`: the alive counter did not change, so the frame repeats the previous frame.
+#: Increment `NO_STEP`: unknown, because the frame has no alive counter or is the first frame of its message.
 REPEATED, NO_STEP = 0, -1
 
 
@@ -30,13 +30,16 @@ def counter_steps(counters: npt.NDArray[np.uint8], before: npt.NDArray[np.uint8]
 
 
 class CrcRules:
-    """Rules for the CRC, which covers payload and Data ID."""
+    """Rules for the CRC of each frame.
+
+    The CRC covers the payload and the Data ID, a number that the DBC assigns to each message with a CRC.
+    """
 
     def __init__(self, plan: Plan, findings: Findings) -> None:
         self._plan, self._findings = plan, findings
         lengths = np.where(plan.protected, plan.lengths, 0)
-        #: One range of message indices for each payload length. The range contains all messages of this length, with and
-        #: without a CRC. A range exists only if at least one of its messages has a CRC.
+        #: Ranges of message indices: one range for each payload length that at least one message with a CRC has.
+        #: A range contains all messages of this length. `check` reports nothing for messages without a CRC.
         self._spans = [
             range(int(r[0]), int(r[-1]) + 1) for n in np.unique(lengths[lengths > 0]) for r in [_at(plan, n)]
         ]

@@ -13,11 +13,10 @@ from atalante_tools.canlog.plan import Plan
 from atalante_tools.canlog.validate.rules import RULE_OF
 
 Stamps = npt.NDArray[np.int64]
-#: Maximum number of unknown identifiers that get a finding of their own. All others share the finding `OTHERS`.
+#: Maximum number of findings about one unknown identifier each. The finding `OTHERS` counts all further unknown identifiers.
 MAX_UNKNOWN_IDS = 100
 OTHERS = "(others)"
-#: Rules with one finding per unknown identifier. A log can have any number of unknown identifiers, so `MAX_UNKNOWN_IDS` limits
-#: the number of these findings.
+#: Rules for which `MAX_UNKNOWN_IDS` limits the number of findings.
 _UNBOUNDED = ("unknown-id",)
 
 
@@ -32,8 +31,8 @@ class Finding:
     count: int
     first: int  # time stamp of the first violation [ns]
     last: int  # time stamp of the last violation [ns]
-    worst: str  # value at the worst violation, with unit
-    badness: float  # severity of the worst violation; larger is worse
+    worst: str  # text for the report: value and unit of the worst violation
+    badness: float  # number that ranks the violations of a rule; the worst violation has the largest number
 
     @property
     def first_s(self) -> float:

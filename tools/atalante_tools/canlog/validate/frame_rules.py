@@ -21,11 +21,12 @@ Indices = npt.NDArray[np.intp]
 
 _FD_LENGTH = np.isin(np.arange(256), FD_LENGTHS)
 _CLASSIC_LENGTH = np.arange(256) <= 8
-#: Bits of an error frame (linux/can/error.h). `_CONTROLLER` is the identifier bit "controller problem".
-#: `_OVERFLOW` is the mask of two bits in payload byte 1: receive overflow and transmit overflow.
+#: `_CONTROLLER` is a bit in the identifier of an error frame. It means "controller problem" (linux/can/error.h).
+#: `_OVERFLOW` is two bits in payload byte 1 of an error frame. They mean "receive overflow" and "transmit overflow".
 _CONTROLLER, _OVERFLOW = 0x4, 0x3
 _NUMBER = 0x1FFF_FFFF
-#: A node is the recorder of the log if at least this share (0 to 1) of the frames marked as sent comes from the node.
+#: The recorder is the node that wrote the log. The log marks the frames of the recorder as sent.
+#: A node counts as the recorder if it sends at least this share (0 to 1) of the frames that the log marks as sent.
 _RECORDER = 0.99
 
 
@@ -33,9 +34,9 @@ _RECORDER = 0.99
 class Sorted:
     """Result of the header check: frames that can be decoded, and rejected frames."""
 
-    good: Indices | None  # indices in the chunk of the frames that can be decoded; None means all frames
-    rejected_rows: Rows  # for each rejected frame, index of the message in the plan; shape (k,)
-    rejected_indices: Indices  # for each rejected frame, index of the frame in the chunk; shape (k,)
+    good: Indices | None  # positions in the chunk at which a frame can be decoded; None means all positions
+    rejected_rows: Rows  # message index (position in the arrays of `Plan`) of each rejected frame, shape (k,)
+    rejected_indices: Indices  # position of each rejected frame in the chunk, shape (k,)
 
 
 class FrameRules:
@@ -47,8 +48,8 @@ class FrameRules:
         #: Expected FDF and BRS flags of each message: 0, 1, or `UNKNOWN` if the DBC does not define the flag.
         fd = [UNKNOWN if m.fd is None else int(m.fd) for m in layouts]
         switch = [UNKNOWN if m.bit_rate_switch is None else int(m.bit_rate_switch) for m in layouts]
-        # Frames without a known message read element 0. The dummy at the end of each array is this element if the DBC has
-        # no messages.
+        # For a frame of an unknown message, the code reads element 0 and ignores the result.
+        # The additional last element of each array ensures that element 0 exists even if the DBC has no message.
         self._fd, self._switch = np.array([*fd, UNKNOWN], np.int8), np.array([*switch, UNKNOWN], np.int8)
         self._length, self._sender = np.append(plan.lengths, 0), np.append(plan.sender_of_row, UNKNOWN)
         #: Node that recorded the log; None if not known yet; empty if the node cannot be determined (see `_RECORDER`).

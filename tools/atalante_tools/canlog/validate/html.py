@@ -20,7 +20,7 @@ _WIDTH, _HEIGHT = 760, 200
 _LEFT, _RIGHT, _TOP, _BOTTOM = 64, 28, 24, 36
 _LETTER = 7.0  # width of a character in the legend [px]
 _COLOURS = ("#1b6ca8", "#c8553d", "#4f772d", "#7b4b94", "#b08900", "#3d5a6c", "#8d5524", "#555555")
-_POINTS = 720  # maximum number of points of a curve, about one point per pixel
+_POINTS = 720  # maximum number of points in a plotted curve, about one point per pixel of the plot width
 _HISTOGRAMS = 12  # maximum number of interval histograms in the report of a log
 _TIMING = ("cycle-mean", "cycle-jitter", "cycle-gap", "cycle-fast", "timeout", "recovered", "state-late")
 
@@ -180,7 +180,10 @@ def _load_plot(result: Report) -> str:
 
 
 def _thinned(x: Vector, y: Vector) -> tuple[Vector, Vector]:
-    """Reduce a curve to at most `_POINTS` points. Each point has the maximum value in its section of the curve."""
+    """Reduce a curve to at most `_POINTS` points.
+
+    The curve is divided into sections of consecutive points. Each section becomes one point: the first x and the largest y.
+    """
     step = math.ceil(len(x) / _POINTS)
     if step == 1:
         return x, y
@@ -205,7 +208,11 @@ def _gap_plot(result: Report) -> str:
 
 
 def _histograms(result: Report) -> list[str]:
-    """Plot interval histograms. Messages with timing findings come first, then messages with wide histograms."""
+    """Plot the histogram of the frame intervals for at most `_HISTOGRAMS` messages.
+
+    Messages with timing findings come before messages without. In both groups, the message with the largest spread of the
+    intervals comes first.
+    """
     validator = result.validator
     reported = {f.message for f in result.findings if f.rule in _TIMING}
     rows = [r for r in np.flatnonzero(validator.timing.intervals > 0).tolist() if validator.plan.cycle_ns[r] > 0]

@@ -14,7 +14,7 @@ from atalante_tools.canlog.validate.buses import ChannelMap
 from atalante_tools.canlog.validate.findings import Findings
 from atalante_tools.canlog.validate.project import Project
 
-#: Minimum length of an error frame with delimiter and intermission [bit].
+#: Minimum length of an error frame [bit], including the error delimiter and the pause before the next frame.
 _ERROR_BITS = 17
 
 
@@ -54,12 +54,15 @@ class LoadRules:
         self._over, self._limit = project.number("bus-load", "over_nominal"), project.number("bus-load", "limit")
         self._of_row = np.array([self._layout_time(row) for row in range(len(plan.layouts))] + [0.0])
         self._bus_of_row = np.append(plan.bus_of_row, 0)
-        self._numbers: list[npt.NDArray[np.int64]] = []  # for each chunk: window numbers, shape (windows,)
-        self._busy: list[npt.NDArray[np.float64]] = []  # for each chunk: wire times [s], shape (windows, buses)
+        #: For each chunk: numbers of the time windows that contain frames, shape (windows,).
+        #: The number of a time window is its start time divided by its length.
+        self._numbers: list[npt.NDArray[np.int64]] = []
+        #: For each chunk: sum of the wire times of all frames in a time window on a bus [s], shape (windows, buses).
+        self._busy: list[npt.NDArray[np.float64]] = []
         #: Start time of each time window with at least one frame [s], set by `finish`. Shape (windows,).
         self.begins: npt.NDArray[np.float64] = np.zeros(0)
-        #: Bus load in each time window as a fraction of full load, set by `finish`. Shape (windows, buses).
-        #: The first columns are the buses of the DBC. The other columns are the log channels without a bus.
+        #: Bus load in each time window, set by `finish`. Frames that fill a whole window give 1.0. Shape (windows, buses).
+        #: The first columns of `load` are the buses of the DBC. The further columns are log channels, for frames without a bus.
         self.load: npt.NDArray[np.float64] = np.zeros((0, len(plan.buses)))
 
     @property
@@ -69,7 +72,10 @@ class LoadRules:
 
     @property
     def windows(self) -> int:
-        """Return the number of complete time windows, which `finish` checks. The first and the last are incomplete."""
+        """Return the number of time windows that `finish` checks.
+
+        The first and the last time window are not checked, because the log may cover only a part of them.
+        """
         return max(0, len(self.load) - 2)
 
     def _layout_time(self, row: int) -> float:
@@ -80,7 +86,9 @@ class LoadRules:
         return wire_time(layout.extended, fd, switch, layout.length, self._nominal, self._data)
 
     def expected(self, bus: int) -> float | None:
-        """Return the largest bus load that the messages of the DBC can cause, as a fraction of full load.
+        """Return the largest bus load that the DBC allows. Frames without a pause give 1.0.
+
+        A cyclic message is sent once per cycle time. Any other message is sent at most once per inhibit time.
 
         Args:
             bus: index of the bus in the plan.

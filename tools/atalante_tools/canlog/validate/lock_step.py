@@ -21,38 +21,39 @@ from atalante_tools.canlog.validate.order_rules import SYNC
 
 Stamps = npt.NDArray[np.int64]
 
-#: Signal of SYNC that contains the cycle number.
+#: Name of the signal in a SYNC message that contains the cycle number.
 CYCLE: Final = "Cycle"
 #: If no SYNC arrives within this time [ns], the HAL has probably stopped, and the time stamps follow the wall clock.
 PAUSE_NS: Final = 200_000_000
-#: Largest accepted increment of the cycle number between two SYNCs. A larger or a negative increment counts as 1.
-#: Such an increment follows from a restart of the HAL or from a damaged frame.
+#: Largest plausible increase of the cycle number from one SYNC to the next. A larger increase or a decrease counts as 1.
+#: A restart of the HAL or a damaged SYNC frame makes the cycle number jump, so the increase is then not plausible.
 MOST_STEPS: Final = 1000
-#: `_SPACING_NS` is the time between the stamps of two consecutive frames in a cycle [ns].
-#: `_LAST` is the latest stamp in a cycle, as a share of the cycle time (0 to 1).
+#: The new stamps of consecutive frames in a cycle are `_SPACING_NS` apart [ns]: 0 for SYNC, then 1000, 2000 and so on.
+#: `_LAST` limits the new stamps: no frame is stamped later than `_LAST` (0 to 1) times the cycle time after SYNC.
 _SPACING_NS, _LAST = 1000, 0.7
 
 
 @dataclass
 class _Channel:
-    """State of the clock for one channel."""
+    """Last SYNC and last frame on one channel, which the lock-step clock needs for the next chunk."""
 
-    #: Plan index of the first SYNC message that was received on this channel; -1 before the first SYNC.
-    #: The clock reads the cycle number from this message.
+    #: Message index (position in the arrays of `Plan`) of the first SYNC received on this channel; -1 before this SYNC.
+    #: The clock reads the cycle number only from the message with this index.
     sync: int = -1
-    cycle: int = 0  # cycle number of the last SYNC
-    begin: int = 0  # time stamp of the last SYNC in robot time [ns]
-    wall: int = 0  # time stamp of the last SYNC on the wall clock [ns]
+    cycle: int = 0  # cycle number in the last SYNC
+    begin: int = 0  # new stamp (robot time) of the last SYNC [ns]
+    wall: int = 0  # wall-clock stamp of the last SYNC [ns]
     count: int = 0  # number of frames since the last SYNC, including this SYNC
-    last: int = -(1 << 62)  # stamp of the last frame [ns]
+    last: int = -(1 << 62)  # new stamp (robot time) of the last frame [ns]
 
 
 class LockStepClock:
-    """Clock that replaces wall-clock stamps by robot time, in which each cycle has the nominal cycle time.
+    """Clock that replaces the wall-clock stamps of frames by stamps in robot time.
 
-    The new stamp of a frame is the start time of the cycle plus a small offset, which grows in the order of arrival.
-    The first SYNC has the same stamp in robot time and on the wall clock. Before the first SYNC on a channel, and
-    during a pause without SYNC, the stamps follow the wall clock.
+    In robot time, each cycle takes exactly the cycle time that the DBC gives for SYNC. The new stamp of a frame is the
+    start time of the cycle plus a small offset, which grows in the order of arrival. The first SYNC has the same stamp in
+    robot time and on the wall clock. Before the first SYNC on a channel, and during a pause without SYNC, the stamps
+    follow the wall clock.
 
     Args:
         plan: compiled DBC.
@@ -89,7 +90,7 @@ class LockStepClock:
         return Chunk(chunk.frames, stamps, chunk.channels, chunk.sent)
 
     def _of_channel(self, channel: _Channel, chunk: Chunk, rows: npt.NDArray[np.int16]) -> Stamps:
-        """Return the stamp of each frame on one channel in robot time [ns]. Shape (n,)."""
+        """Compute the new stamps (robot time) of the frames on one channel [ns]. Shape (n,)."""
         wall = chunk.stamps
         if channel.sync < 0:
             known = np.flatnonzero(np.isin(rows, list(self._codecs)))
@@ -126,7 +127,7 @@ class LockStepClock:
         return numbers
 
     def _next_begin(self, channel: _Channel, cycle: int, wall: int, wall_before: int) -> int:
-        """Return the robot time of a SYNC [ns], and store this SYNC as the last SYNC of the channel.
+        """Compute the new stamp (robot time) of a SYNC [ns], and store it in the clock state of the channel.
 
         Args:
             channel: clock state of the channel, which is updated.

@@ -89,8 +89,9 @@ class MotionRules:
 
 
 class _Velocity:
-    """Rule that compares the mean of the velocity signal in a window of frames with the mean slope of the position signal.
+    """Rule that compares the velocity signal with the change of the position signal.
 
+    In a window of frames, the mean velocity must equal the change of the position, divided by the duration of the window.
     The tolerance allows for the lag of the velocity filter in the drive.
     """
 
@@ -141,7 +142,7 @@ class _Velocity:
             return
         ends = np.arange(windows + 1) * width
         duration = np.diff(stamps[ends]) * 1e-9
-        # The first velocity value covers the time before the window, so the mean excludes this value.
+        # The velocity in the first frame of a window describes the motion before the window, so the mean omits this frame.
         inside = velocity[1 : whole + 1].reshape(windows, width)
         mean = inside.mean(axis=1)
         moved = np.diff(position[ends]) / np.where(duration > 0, duration, np.inf)
@@ -236,7 +237,8 @@ class _Steps:
         fields = [family.codec.fields[p] for p in self.indices]
         self._limits = np.array([limit / abs(f.factor) for limit, f in zip(limits.values(), fields, strict=True)])
         self._first_row = family.rows.start
-        #: Whether the last value was invalid, shape (fields, messages). The change after an invalid value is not checked.
+        #: True if the last frame of a message had an invalid value in a field, shape (fields, messages).
+        #: The change from an invalid value to the value in the next frame is not checked.
         self._was_bad = np.zeros((len(self.indices), len(family.rows)), np.bool_)
 
     @classmethod

@@ -21,17 +21,19 @@ SYNC = "SYNC"
 
 @dataclass
 class _Bus:
-    """Bus with a SYNC message: its messages, and the results of earlier chunks that the next check needs."""
+    """Bus with a SYNC message. The last SYNC frame and the last state frames are stored for the check of the next chunk."""
 
-    sync: int  # index of the SYNC message in the plan
-    states: list[int]  # indices of the state messages in the plan
+    sync: int  # message index (position in the arrays of `Plan`) of the SYNC message
+    states: list[int]  # message indices (positions in the arrays of `Plan`) of the state messages on the bus
     cycle_ns: float
     count: int = 0  # number of SYNC frames so far
     stamp: int = 0  # time stamp of the last SYNC frame [ns]
-    cycle_of: dict[int, int] = field(default_factory=dict)  # cycle number of the last state frame, by message index
-    #: number of cycles between the last two state frames, by message index
+    #: Message index of a state message -> number of the cycle in which its last frame was received.
+    cycle_of: dict[int, int] = field(default_factory=dict)
+    #: Message index of a state message -> number of cycles from its second-last frame to its last frame.
     jump_of: dict[int, int] = field(default_factory=dict)
-    #: time stamp [ns] of a state frame that is judged in the next chunk (see `_check_order`), by message index
+    #: Message index of a state message -> time stamp of a frame that was perhaps received before its SYNC [ns].
+    #: The next chunk shows whether the frame was received before its SYNC (see `_check_order`).
     doubtful: dict[int, int] = field(default_factory=dict)
 
 
@@ -80,9 +82,10 @@ class OrderRules:
     def _check_lateness(
         self, bus: _Bus, row: int, stamps: npt.NDArray[np.int64], begins: npt.NDArray[np.int64], number: Indices
     ) -> None:
-        """Report the state frames that were received after the deadline, but less than one cycle time after the SYNC.
+        """Report the state frames that were received late in their cycle.
 
-        State frames that were received after the next SYNC are reported by `_check_order`.
+        A state frame is late if it was received after the deadline, but less than one cycle time after the SYNC.
+        `_check_order` reports the state frames that were received after the next SYNC.
         """
         after = stamps - begins
         late = (after > self._deadline * bus.cycle_ns) & (after < bus.cycle_ns)

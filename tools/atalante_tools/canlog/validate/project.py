@@ -64,7 +64,7 @@ class Project:
         return self.thresholds.get(rule, {}).get(name, RULE_OF[rule].thresholds[name])
 
     def number(self, rule: str, name: str) -> float:
-        """Return a numeric threshold of a rule, in the unit of the rule."""
+        """Return a threshold that is a number, such as `limit_ms` of the rule cia402-response."""
         value = self.threshold(rule, name)
         assert isinstance(value, float)
         return value

@@ -56,7 +56,10 @@ def report(name: str, validator: Validator, *, live: bool = False) -> Report:
 
 
 def text(result: Report) -> str:
-    """Return the report as text: log, findings, silenced findings, and messages and signals that were not checked."""
+    """Return the report as text for the terminal.
+
+    The text describes the log, then lists the findings, the silenced findings, and everything that was not checked.
+    """
     validator = result.validator
     channels = ", ".join(name or "without a name" for name in validator.channels) or "none"
     lines = [
@@ -78,7 +81,10 @@ def text(result: Report) -> str:
 
 
 def verdict(result: Report) -> str:
-    """Return one line with the number of findings and the total number of violations."""
+    """Return the result of the check in one line, such as "2 findings (5 occurrences)".
+
+    Without findings, the line says that there are no findings, or that no frame was checked.
+    """
     if result.findings:
         count = sum(finding.count for finding in result.findings)
         findings = "1 finding" if len(result.findings) == 1 else f"{len(result.findings)} findings"

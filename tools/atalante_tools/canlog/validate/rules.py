@@ -17,12 +17,12 @@ Threshold = float | str | Mapping[str, float] | tuple[str, ...]
 
 @dataclass(frozen=True)
 class Rule:
-    """Rule of the validator: a property of frames or logs that must hold."""
+    """Rule of the validator: a kind of violation that the validator finds in frames or log files."""
 
     id: str
     meaning: str  # the violation, in one line
     source: str  # DBC attribute or standard that defines the correct value
-    worst: str = ""  # unit of the worst value
+    worst: str = ""  # unit of the value that the report shows for the worst violation
     thresholds: Mapping[str, Threshold] = field(default_factory=dict)
 
 

@@ -18,12 +18,12 @@ from atalante_tools.canlog.validate.e2e_rules import REPEATED, Steps
 from atalante_tools.canlog.validate.findings import Findings
 from atalante_tools.canlog.validate.project import Project
 
-#: The interval histogram of a message has `BINS_A_CYCLE` bins per cycle time, and covers intervals up to `CYCLES` cycle times.
-#: The last bin of the interval histogram counts all intervals longer than `CYCLES` cycle times.
+#: An interval histogram counts the intervals between the frames of a message. `BINS_A_CYCLE` bins cover one cycle time.
+#: The last bin of an interval histogram counts all intervals of at least `CYCLES` cycle times.
 BINS_A_CYCLE, CYCLES = 100, 4
 BINS = BINS_A_CYCLE * CYCLES + 1
 _NEVER = -(1 << 62)
-#: Maximum number of alive counter gaps that are stored for the plot in the report.
+#: Maximum number of gaps in the alive counters that are stored for the plot in the report.
 _MAX_GAPS = 20_000
 
 
@@ -41,17 +41,19 @@ class TimingRules:
         self._jitter_limit = project.number("cycle-jitter", "p99")
         default = project.number("timeout", "default_cycles") * plan.cycle_ns
         self._timeout = np.where(plan.cycle_ns > 0, np.where(plan.timeout_ns > 0, plan.timeout_ns, default), 0.0)
-        self._last = np.full(count, _NEVER, np.int64)  # time stamp of the last valid frame of each message [ns]
-        self._arrived = np.full(count, _NEVER, np.int64)  # time stamp of the last frame of each message [ns]
+        self._last = np.full(count, _NEVER, np.int64)  # for each message: time stamp of the last valid frame [ns]
+        #: For each message: time stamp of the last frame, which may be valid or rejected [ns].
+        self._arrived = np.full(count, _NEVER, np.int64)
         self._first = np.full(count, _NEVER, np.int64)
         self._last_share = np.full(count, np.inf)
         self._last_steps = np.zeros(count, np.int64)
-        #: Histogram of the intervals of each message, without intervals with lost, repeated or rejected frames.
+        #: For each message: interval histogram, the number of intervals in each bin. Shape (messages, BINS).
+        #: The histogram does not count every interval. `_count` leaves out, for example, an interval with a lost frame.
         self.histogram = np.zeros((count, BINS), np.int64)
-        #: Number of intervals in the histogram of each message.
+        #: For each message: number of intervals in the interval histogram. Shape (messages,).
         self.intervals = np.zeros(count, np.int64)
-        self._sum = np.zeros(count)  # sum of the intervals in the histogram of each message [ns]
-        #: Counter gaps for the plot: (time stamp of the frame after the gap [ns], message index, lost frames).
+        self._sum = np.zeros(count)  # for each message: sum of the intervals in the interval histogram [ns]
+        #: Gaps in the alive counters: (time stamp of the frame after the gap [ns], message index, number of lost frames).
         self.gaps: list[tuple[int, int, int]] = []
 
     def exclude(self, row: int) -> None:
@@ -195,12 +197,14 @@ class TimingRules:
         steps: Steps,
         rejected_before: Steps | None,
     ) -> None:
-        """Add the intervals to the statistics, except timeouts and intervals with lost, repeated or rejected frames."""
+        """Add the intervals in a chunk to the interval histograms, and update the numbers and sums of the intervals.
+
+        Timeouts and intervals with lost, repeated or rejected frames are not added.
+        """
         bins = np.minimum(np.maximum(share * BINS_A_CYCLE, 0.0), float(BINS - 1)).astype(np.int64)
         bins += (np.arange(len(stream.present)) * BINS).repeat(stream.stops - stream.starts)
-        # Excluded are intervals with lost or rejected frames, and intervals that begin or end at a repeated frame.
-        # Without an alive counter (`NO_STEP`), it is unknown which intervals contain a lost frame. So no interval is excluded for
-        # a lost frame.
+        # Leave out the intervals with lost or rejected frames, and the intervals that begin or end at a repeated frame.
+        # Without an alive counter (`NO_STEP`), lost frames cannot be noticed, so intervals with lost frames are added.
         incomplete = (
             odd[steps[odd] >= REPEATED]
             if rejected_before is None
@@ -263,8 +267,8 @@ class TimingRules:
             return
         first, last = int(self._first[row]), int(self._last[row])
         mean = self._sum[row] / count
-        # A wrong cycle time changes the mean and the median, so report only if both deviate.
-        # A long gap changes only the mean interval, and the rule cycle-gap reports the gap.
+        # Report a wrong cycle time only if the mean and the median of the intervals both differ from the cycle time.
+        # A single long gap changes only the mean of the intervals. The rule cycle-gap reports such a gap.
         if (
             count >= self._mean_intervals
             and abs(mean / cycle - 1.0) > self._mean_tolerance
@@ -277,18 +281,21 @@ class TimingRules:
                 self._findings.add_whole("cycle-jitter", row, first, last, shown=jitter * cycle * 1e-6, count=count)
 
     def mean_ms(self, row: int) -> float:
-        """Return the mean interval between consecutive frames of a message [ms]."""
+        """Return the mean of all intervals in the interval histogram of a message [ms]."""
         return float(self._sum[row] / max(1, self.intervals[row]) * 1e-6)
 
 
 def median(histogram: npt.NDArray[np.int64]) -> float:
-    """Return the median interval of a histogram, divided by the cycle time. The histogram has the shape (BINS,)."""
+    """Return the median of the intervals in an interval histogram of shape (BINS,), divided by the cycle time."""
     half = (int(histogram.sum()) + 1) // 2
     return (int(np.searchsorted(np.cumsum(histogram), half)) + 0.5) / BINS_A_CYCLE
 
 
 def jitter_p99(histogram: npt.NDArray[np.int64]) -> float:
-    """Return the 99 % quantile of the deviation from the median interval, divided by the cycle time."""
+    """Return the jitter: 99 % of the intervals differ from the median interval by at most this value.
+
+    The jitter is divided by the cycle time. For example, 0.25 means a quarter of the cycle time.
+    """
     total = int(histogram.sum())
     distance, order = _by_distance(len(histogram), int(median(histogram) * BINS_A_CYCLE))
     reached = np.cumsum(histogram[order])

@@ -100,7 +100,12 @@ class Validator:
         self._check_payloads(stream, steps)
 
     def _check_crc(self, stream: Stream, sorted_frames: Sorted) -> tuple[Stream, tuple[Rows, npt.NDArray[np.intp]]]:
-        """Return the frames with a valid CRC, and the message indices and frame indices of all rejected frames."""
+        """Check the CRC of each frame, and reject the frames with a wrong CRC.
+
+        Returns:
+            The frames with a valid CRC, and two arrays of shape (k,) for all rejected frames, including the frames that the
+            header check rejected: the message index of each frame, and the position of each frame in the chunk.
+        """
         refused = sorted_frames.rejected_rows, sorted_frames.rejected_indices
         intact = self._crc.check(stream)
         if intact is not None:

@@ -21,7 +21,7 @@ from atalante_tools.canlog.stream import Stream
 from atalante_tools.canlog.validate.findings import Findings
 from atalante_tools.canlog.validate.project import Project
 
-#: Maximum length of a field [bit] whose value table is stored as a lookup array.
+#: The value table of a field up to this length [bit] becomes a lookup array. A longer field has a list of valid codes.
 _TABLE_BITS = 16
 _WORD = 64
 _HASH_BITS = 32
@@ -217,7 +217,7 @@ class _FamilyChecks:
         self.limited = np.array(list(self.bounds), np.intp)
         self.low = np.array([low for low, _ in self.bounds.values()], np.int64)
         self.high = np.array([high for _, high in self.bounds.values()], np.int64)
-        #: Field index -> raw code that means "no value". Only for fields that have such a code, and have no range.
+        #: Field index -> raw code that means "no value", for all fields with such a code but without a limited range.
         self.coded = {
             p: _as_signed(f, f.invalid_raw) for p, f in fields if f.invalid_raw is not None and (p, f) not in ranged
         }
@@ -304,7 +304,10 @@ def _table(named: Field) -> npt.NDArray[np.bool_] | Sequence[int]:
 
 
 def _as_signed(limits: Field, raw: int) -> int:
-    """Convert a raw code from an unsigned integer to the signed integer that `Decoded.codes` contains."""
+    """Convert an unsigned raw code to a signed integer, such as 0xFF in a signed 8-bit field to -1.
+
+    The result has the form of the raw codes in `Decoded.codes`.
+    """
     if limits.kind == "signed" and raw >> limits.length - 1:
         return raw - (1 << limits.length)
     return raw - (1 << _WORD) if raw >= 1 << _WORD - 1 else raw
