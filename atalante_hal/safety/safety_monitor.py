@@ -38,8 +38,8 @@ from atalante_hal.wire.e2e import SETTLED, Check, Qualification, qualify
 from atalante_hal.wire.frame import Frames
 from atalante_hal.wire.process_image import ReceiveImage
 
-#: Maximum duration of FINISH_STEP [cycles].
-#: The rest of a step, a stop step and the weight shift back together take less time.
+#: Maximum duration of FINISH_STEP [cycles]. In this state, a walking robot ends its current step, makes a stop step and shifts
+#: its weight back, which takes less time.
 FINISH_STEP_CYCLES = 6000
 
 #: If a drive does not report QUICK STOP within this time [cycles] after the command QUICK_STOP, the command was lost.
@@ -60,7 +60,7 @@ class Verdict(NamedTuple):
 
     supervisor: SupervisorState  # state of the state machine
     assistance_factor: float  # Xi in [0, 1]
-    torque_limit: Vector  # (12,) Nm, torque limit of the drives in this cycle; the limiter owns the array
+    torque_limit: Vector  # (12,) Nm, torque limit of each drive in this cycle; the array of the limiter, not a copy
     diagnostics: int  # bit set of the active diagnostics, see `diagnostics.dtcs_of`
     acknowledged: bool  # True if the operator pressed START in this cycle, which also acknowledges a bus-off
 
@@ -137,7 +137,7 @@ class SafetyMonitor:
         self._joint_rows = np.array(rows_of(image.codec, JOINT_MESSAGES))
         self.torque_tracking = TorqueTracking(robot.breakaway)
         self.torque_motion: TorqueMotion | None = None
-        #: DBC names of the drives that are kept off until a start passes its direction test, see `proof`.
+        #: DBC names of the drives that stay off until a start passes its direction test (attribute `proof`).
         #: These are drives with a wrong torque, drives that did not hold their joints, drives whose joints failed the test, and
         #: drives that were off when START was pressed in READY.
         #: A start enables these drives for the test. If the start fails, the drives are switched off again.
@@ -147,13 +147,14 @@ class SafetyMonitor:
         self._steady = False
         self._reports: list[Finding] = []  # faults that loop and controller reported since the last `evaluate`
         self._acknowledged = False  # True if START was pressed in this cycle
-        #: Leaky bucket of each drive whose torque limit is far lower than in the other leg. No entry means an empty bucket.
+        #: Leaky bucket (error counter) of each drive, by DBC name. It fills while the drive is far weaker than the same drive of
+        #: the other leg. No entry means an empty bucket.
         self._weak: dict[str, Qualification] = {}
         self._ending = False
         self._duplicate_found = False  # True if another HAL was detected while this HAL was in OFF or READY
         self._assistance_factor = state.assistance_factor  # assistance factor set by the operator
         self._ramping = False  # True while the assistance factor ramps to 1 or back to the operator's value
-        #: Number of the walking step in which FINISH_STEP began, and latest end of FINISH_STEP [cycle number].
+        #: Number of the walking step in which FINISH_STEP began, and number of the cycle in which FINISH_STEP ends at the latest.
         self._finish: tuple[int | None, int] = None, 0
         self._drives_evaluated = b""  # drive states and temperatures of the last evaluation
 
@@ -242,10 +243,10 @@ class SafetyMonitor:
         self._ending, self._steady = True, False
 
     def check_timeouts(self) -> None:
-        """Request an evaluation of the next cycle if a status message timed out or the counting window of an event is over.
+        """Request an evaluation of the next cycle if a status message timed out or the repeats of an event must be logged.
 
-        At the end of a counting window, the fault memory logs the number of repeats of the event. Call this method periodically,
-        because cycles without a fault are not evaluated.
+        The fault memory counts equal events for some time (counting window). When this time is over, it logs their number. Call
+        this method periodically, because cycles without a fault are not evaluated.
         """
         cycle = self._state.cycle
         if self._heartbeats.overdue(cycle) or self.memory.window_over(cycle):
@@ -257,7 +258,11 @@ class SafetyMonitor:
         return self._image.crc_errors + self._heartbeats.image.crc_errors
 
     def missing(self) -> set[str]:
-        """Return the nodes that prevent READY: timed out, not trusted yet, without a status message, or with a different DBC."""
+        """Return the nodes that prevent READY.
+
+        A node prevents READY if its messages are not trusted (for example after a timeout), if it has sent no status message, or
+        if it uses a different DBC.
+        """
         return self._message_monitor.missing() | self._heartbeats.missing()
 
     def _evaluate(self, findings: Sequence[Finding]) -> None:
@@ -433,8 +438,8 @@ class SafetyMonitor:
             return None
         self._stalled = 0
         if not self._proof_begun:
-            # The test starts from the last output of the limiter. So wait until the limiter has been restarted with the torques
-            # that the drives report. `enabling` is then True.
+            # The test starts from the torques sent last (`limiter.last`). Only while `enabling` is True, these torques follow the
+            # torques that the drives report, so wait for `enabling`.
             if not self.enabling:
                 return None
             self._proof_begun = True
@@ -536,11 +541,11 @@ class SafetyMonitor:
             state.assistance_factor = target
 
     def _update_lowered(self) -> None:
-        """Update the set `lowered` with the drives that have a confirmed diagnostic whose reaction is LOWER.
+        """Update the set `lowered`.
 
-        In LOWER and FAULT, drives are only added. In all other states, `lowered` also contains the drives in `_kept_off`. A START
-        enables the drives in `_kept_off`, too. If the START ends before the test of the joint directions is passed, these drives
-        are switched off again.
+        A drive belongs to `lowered` if it has a confirmed diagnostic that demands LOWER. In LOWER and FAULT, drives are only
+        added. In all other states, `lowered` also contains the drives in `_kept_off`. A START enables the drives in `_kept_off`,
+        too. If the START ends before the test of the joint directions is passed, these drives are switched off again.
         """
         lower = frozenset(dtc for dtc in self.memory.confirmed if dtc.reaction is Reaction.LOWER)
         off = {node for node in self.memory.nodes_of(lower) if node in DRIVE_NODES}

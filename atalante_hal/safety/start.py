@@ -23,19 +23,19 @@ from atalante_hal.wire.cia402 import Controlword, DriveState, controlword_toward
 
 #: All drives must be in OPERATION ENABLED within this time after START [cycles].
 ENABLE_CYCLES = 200
-#: A start ends if no drive changes its state for this time [cycles]. The time suffices if a command and its answer are each lost
-#: four times in a row.
+#: A start ends if no drive changes its state for this time [cycles]. The time suffices even if four commands in a row and
+#: then four answers in a row are lost.
 STALLED_CYCLES = 10
-#: In HOLD, a START is refused while a joint whose drive is on is faster than this [rad/s], because the test of the joint
-#: directions needs joints at rest. A sinking joint whose drive is off does not prevent the START,
-#: because the start first lets this drive stop and hold the joint.
+#: Largest speed of a joint at which START is accepted in HOLD [rad/s]. The test of the joint directions needs joints at rest.
+#: The limit does not apply to a joint whose drive is off: the start first lets this drive stop and hold the sinking joint.
 AT_REST = 0.3
 #: Prefix of the event text for a refused START.
 REFUSED = "START refused: "
-#: Suffix of the reason text of FINISH_STEP if the operator ends a walk on the ground. The next HOLD keeps this text.
+#: End of the sentence that explains FINISH_STEP if the operator ends a walk on the ground. The next HOLD keeps this sentence.
 WALK_ENDS = ", so the walk ends on both feet"
 _S = SupervisorState
-#: States in which START only acknowledges faults. An acknowledged fault may stay active for some cycles.
+#: States in which START acknowledges faults, but enables no drive. In these states, an active diagnostic does not end the start,
+#: because an acknowledged fault may stay active for some cycles.
 _ACKNOWLEDGING = (_S.LOWER, _S.FAULT)
 #: States in which START enables the drives.
 _ENABLING = (_S.READY, _S.HOLD)
@@ -77,7 +77,7 @@ class StartRequest(NamedTuple):
 class Refusal(NamedTuple):
     """Event that is logged when a start is refused or fails."""
 
-    code: str  # START_REFUSED, or START_FAILED if the drives were not enabled in time, or if a direction test failed
+    code: str  # START_FAILED if a drive was not enabled in time or a direction test failed, otherwise START_REFUSED
     severity: str  # severity of the event, one of `events.SEVERITIES`
     text: str  # one sentence for the operator
 
@@ -185,7 +185,9 @@ def missing_text(missing: Collection[str]) -> str:
 
 
 def entry_text(state: SupervisorState, missing: Collection[str], stop_requested: bool) -> str:
-    """Return the reason for a change of the state that no diagnostic caused, as one sentence.
+    """Return why the robot entered a state, as one sentence.
+
+    The caller uses this sentence only if no diagnostic caused the change of the state.
 
     Args:
         state: state that was entered.

@@ -40,7 +40,8 @@ _HOLD, _LOWER, _FAULT = SupervisorState.HOLD, SupervisorState.LOWER, SupervisorS
 
 #: States in which the HAL sends the controller's torques to the drives.
 MOVING = frozenset({_ACTIVE, _FULL_ASSIST, _FINISH_STEP})
-#: State that each reaction demands of a moving robot. A reaction never changes the state to a better state.
+#: State that a moving robot enters because of the reaction of a diagnostic. If the robot is already in a worse state (a later one
+#: in this table), the state does not change.
 _STATE_OF = {
     Reaction.INFO: _ACTIVE,
     Reaction.NOT_READY: _ACTIVE,

@@ -44,36 +44,37 @@ from atalante_hal.types import State, Vector
 
 #: Interval between two checks of a leg [cycles]. The legs are checked alternately.
 INTERVAL: Final = 4
-#: Ranges of the share s of a faulty motor (produced torque = s times sent torque). The first range covers reversed, dead and weak
-#: motors. The second range covers motors that are too strong.
+#: A faulty motor produces s times the sent torque, with a share s in one of these ranges: reversed (s < 0), dead (s = 0) and weak
+#: motors are in the first range, and motors that are too strong are in the second range.
 SHARES: Final = ((-1.5, 0.6), (1.4, 2.2))
-#: Ratio of two mean square errors: of the explanation by an external torque, and of the explanation by a faulty motor.
-#: If this ratio is exceeded, the motor is suspected. The module docstring states the exact condition.
+#: A motor is suspected if the explanation "faulty motor" fits the torques better than "external torque" by more than this factor.
+#: The factor compares mean square errors: E > `RATIO` * (F + error^2), see the module docstring.
 RATIO: Final = 2.5
 #: Number of consecutive checks that must suspect the motor before the drive is reported.
 CONFIRM: Final = 2
-#: A produced torque deviates if it differs from the sent torque by more than `BAND` times `Robot.torque_error` plus
-#: `_BAND_SHARE` times the sent torque.
+#: A joint deviates if |produced torque - sent torque| > `BAND` * error + `_BAND_SHARE` * |sent torque|.
+#: Here, error is the rms error of the produced torque [Nm], `Robot.torque_error`.
 BAND: Final = 2.0
 _BAND_SHARE: Final = 0.2
-#: A deviation does not count while another joint of the leg deviates by more than `OTHER_BAND` times `Robot.torque_error` plus
-#: `_OTHER_SHARE` times the sent torque.
+#: Wider limits in the formula of `BAND`. While another joint of the leg exceeds these limits, a deviation is discarded: a wrong
+#: sensor or an unmeasured load on the leg changes the produced torques of several joints.
 OTHER_BAND: Final = 4.5
 _OTHER_SHARE: Final = 0.25
-#: Each check multiplies the two sums in `Deviations.sums` by these factors before it adds the torques of the check. A joint is
-#: checked every `INTERVAL` cycles, so the sums cover about the last 20 and the last 100 cycles.
+#: Each check multiplies the old `Deviations.sums` by this factor, and then adds its own torques. Each factor has its own sums:
+#: with 0.8 they cover about the last 5 checks (20 cycles), with 0.96 about the last 25 checks (100 cycles).
 DECAY: Final = (0.8, 0.96)
-#: When the produced torque begins to deviate, this number of checks is not added to `Deviations.sums`. The torques of these
-#: checks are averages that also contain cycles before the deviation.
+#: Number of checks at the start of a deviation that are not added to `Deviations.sums`. The torques of these checks are averages
+#: that also contain cycles before the deviation.
 LEFT_OUT: Final = 2
 #: A deviation ends if more than this number of consecutive checks find no deviation.
 PAUSE: Final = 5
-#: A check is left out if the deviation has fallen below this fraction of its peak, because an external torque may be ending.
+#: A check is not added to `Deviations.sums` if its deviation is below this fraction of `Deviations.peak`, the recent maximum.
+#: A push on the joint may then be ending.
 _PEAK_SHARE: Final = 0.8
-#: In each check with a deviation, the stored peak of the deviation is multiplied by this factor.
+#: Factor by which each check with a deviation reduces `Deviations.peak`, so that an old maximum is forgotten.
 _PEAK_DECAY: Final = 0.97
-#: A motor can be suspected only if the weights of its added checks sum to at least this value. This takes three checks.
-#: With the weights of `DECAY`, three checks reach at least 1 + 0.8 + 0.8^2 = 2.44, and two checks at most 1 + 0.96 = 1.96.
+#: A motor is suspected only if element 0 of its `Deviations.sums`, the decaying number of checks, is at least this value.
+#: This takes three checks: they count at least 1 + 0.8 + 0.8^2 = 2.44. Two checks count at most 1 + 0.96 = 1.96.
 _LEAST_WEIGHT: Final = 2.4
 #: A joint closer to its position limit than this angle [rad] is at its end stop.
 _AT_STOP: Final = 0.005
@@ -83,18 +84,18 @@ _LEG: Final = len(LEG_JOINTS)
 class Tolerances(NamedTuple):
     """Properties of the joints that the check uses, shape (12,) each."""
 
-    error: Vector  # Nm rms, error of the produced torque
+    error: Vector  # Nm rms, error of the produced torque, which is computed from the motion
     low: Vector  # rad, position below which a joint is at its lower end stop
     high: Vector  # rad, position above which a joint is at its upper end stop
 
 
 class Deviations(NamedTuple):
-    """State of the check of each joint."""
+    """Current deviation of each joint between its produced and its sent torque."""
 
-    #: (2, 12, 6), for each factor of `DECAY` and each joint: decaying sums of 1, t, e, t*t, t*e and e*e over the added checks,
-    #: with the sent torque t and the produced torque e
+    #: Sums of 1, t, e, t*t, t*e and e*e over the added checks of the deviation, with the sent torque t and the produced torque e.
+    #: Shape (2, 12, 6), for each factor of `DECAY` and each joint. Older checks count less, see `DECAY`.
     sums: Vector
-    length: npt.NDArray[np.int64]  # (12,) number of checks that found the current deviation
+    length: npt.NDArray[np.int64]  # (12,) number of checks with a deviation since the deviation began
     pause: npt.NDArray[np.int64]  # (12,) number of checks since the last check with a deviation
     peak: Vector  # (12,) Nm, decaying maximum of |produced torque - sent torque| in the current deviation
     found: npt.NDArray[np.int64]  # (12,) number of consecutive checks that suspected the motor
@@ -102,7 +103,7 @@ class Deviations(NamedTuple):
 
 
 class Memory(NamedTuple):
-    """Memory of the check of both legs."""
+    """Values that the check keeps from cycle to cycle."""
 
     history: History
     torques: Torques

@@ -25,7 +25,8 @@ from atalante_hal.robot import JOINTS
 from atalante_hal.safety.diagnostics import Dtc, Finding
 from atalante_hal.types import Vector
 
-#: Largest time from sending a torque to its report by the drive [cycles]: 4 lost commands, 4 late cycles, 4 for the answer.
+#: A drive reports a sent torque at most this time later [cycles]: four commands may be lost, the frame of the drive may be four
+#: cycles late, and the answer takes four cycles.
 SPAN: Final = 12
 #: A reported torque may lie outside the range of the last sent torques (smallest to largest) by this tolerance.
 #: The tolerance is a fraction of the breakaway torque of the joint.

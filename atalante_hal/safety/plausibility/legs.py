@@ -52,19 +52,20 @@ STANDSTILL_SAMPLES = 2
 EXCHANGE_SAMPLES = 2
 #: The encoders of a joint can be recognised as exchanged only if the left and the right reading differ by more than this [rad].
 _APART = math.radians(1.2)
-#: Exchanged encoders cause an error (encoder angle minus IMU angle) in each leg: the reading of this leg minus the reading of the
-#: other leg. Encoders count as exchanged if the errors of both legs deviate from these values by at most 35 %.
+#: Largest mismatch at which encoders count as exchanged, as a fraction of the difference between the left and the right reading.
+#: Example: readings of 5 and 2 degrees must cause the errors (encoder minus IMU) 3 and -3 degrees, each within 0.35 * 3 degrees.
 _AGREEMENT = 0.35
-#: The standstill check tolerates this drift of the IMUs per sample [rad]. Intact IMUs drift less than a tenth as much.
+#: Drift of the angle between pelvis IMU and tibia IMU that the standstill check tolerates in each sample [rad].
+#: The drift of intact IMUs is less than a tenth of this value.
 _IMU_DRIFT = 2e-5
-#: Largest change [rad] of the estimated heading drift between pelvis IMU and tibia IMU in one sample.
-#: A leg is sampled every 32 cycles, so this limit corresponds to 3e-4 rad/s.
+#: The headings of intact IMUs drift slowly. The check of TH follows this drift by at most this angle in each sample [rad].
+#: A leg is sampled every 32 cycles, so the check follows at most 3e-4 rad/s.
 _HEADING_DRIFT = 1e-5
 _PELVIS = IMUS.index("pelvis")
 _TIBIAE = tuple(IMUS.index(f"{side}_tibia") for side in SIDES)
 #: Angles of a leg that are compared with the IMUs: angle of FH, angle of TH, sum of the angles of SH and SK.
 _AXES = (("FH",), ("TH",), ("SH", "SK"))
-#: Index in `_AXES` of the only axis that a heading drift of the IMUs affects.
+#: Index of TH in `_AXES`. A heading drift of the IMUs changes only the IMU angle of TH.
 _HEADING = _AXES.index(("TH",))
 #: For each of the first four joints of a leg: index of its axis in `_AXES`.
 _AXIS_OF = (0, 1, 2, 2)
@@ -101,7 +102,7 @@ class Legs:
         self._to_joint: Vector = robot.polarity / robot.gear
         self._attitude_error = robot.sensors.attitude_error
         self._attitude_change, self._misalignment = robot.sensors.attitude_change, robot.sensors.misalignment
-        #: Estimated heading drift between the IMUs of each leg [rad]. It is subtracted from the error of TH.
+        #: For each leg: estimated heading drift between pelvis IMU and tibia IMU [rad], subtracted from the error of TH.
         self._heading = [0.0 for _ in SIDES]
         self.encoder_error: Vector = np.full(len(JOINTS), math.inf)
         self._contradicts = [[0] * len(_AXES) for _ in SIDES]
@@ -211,8 +212,8 @@ class Legs:
                 continue
             change = comparison.errors[axis] - moved.errors[axis]
             turned = max(abs(angle - moved.angles[i]) for i, angle in enumerate(comparison.angles))
-            # The encoder is stuck only if the leg turned and the deviation changed. A change of the deviation without a turn of
-            # the leg means that the encoder jumped or drifts.
+            # A stuck encoder changes the error (encoder minus IMU) while the leg turns: change and turn must exceed `allowed`.
+            # If the error changes while the leg is at rest, the encoder has jumped or drifts.
             allowed = self._attitude_change + self._misalignment * turned + comparison.uncertainty + moved.uncertainty
             if min(abs(change), turned) <= allowed:
                 self._turned[joint] = 0
@@ -302,7 +303,16 @@ def extrapolated(quaternion: list[float], gyro: list[float], time: float) -> lis
 
 
 def _follow_imu_drift(moved: _Comparison, axis: int, change: float) -> _Comparison:
-    """Return a copy of `moved` with `change` added to the error about one axis; `change` is limited to +-`_IMU_DRIFT`."""
+    """Let the stored comparison `moved` follow a slow drift of the IMUs.
+
+    Args:
+        moved: comparison when the encoder reading of the joint last changed.
+        axis: index in `_AXES`.
+        change: change of the error about this axis since then [rad].
+
+    Returns:
+        A copy of `moved`, whose error about the axis has changed by `change`, but by at most `_IMU_DRIFT`.
+    """
     errors = list(moved.errors)
     errors[axis] += max(-_IMU_DRIFT, min(_IMU_DRIFT, change))
     return moved._replace(errors=(errors[0], errors[1], errors[2]))

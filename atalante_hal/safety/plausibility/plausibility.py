@@ -42,7 +42,8 @@ FEET = 4
 SLOW = 16
 #: Period of the schedule of all slow checks [cycles]. Each leg, each sole and the support are checked once per period.
 _PERIOD = 32
-#: Alternating intervals of the inertial checks [cycles].
+#: Intervals between the inertial checks [cycles], used alternately. Both are odd, so the checks run alternately in even and in
+#: odd cycles. A vibration of half the sampling rate of the IMUs then has no effect.
 _INERTIAL_INTERVALS = (15, 17)
 #: Largest age of values that the trunk check uses [cycles].
 #: If a node always answers one cycle late, its values have the age 1 in every cycle.
@@ -90,15 +91,16 @@ class Plausibility:
         self._unchecked = Unchecked(self._rows, image.check, SLOW)
         self._joint_rows, self._imu_rows = self._rows.joint.tolist(), self._rows.imu.tolist()
         self._foot_ages = [NEVER] * len(self._rows.foot)  # age of the values of each foot at its last check [cycles]
-        #: Cycle in which the last good values of each row were measured. Updated only while `_settled` is False.
+        #: Cycle in which the last good values of each joint and IMU were measured, by row in the process image.
+        #: Not updated while `_settled` is True, because the cycle is then the previous cycle for all rows.
         self._measured = dict.fromkeys((*self._joint_rows, *self._imu_rows), -NEVER)
         #: Measured force of each faulty cell, by (foot, cell), shape (3,) [N]. In the process image, this force is set to 0.
         self._measured_forces: dict[tuple[int, int], Vector] = {}
-        self._settled = False  # True if the last values of all rows were good and new
+        self._settled = False  # True if all joints and IMUs had good and new values in the previous cycle
         self._turns = self._build_turns()
         self._cycle = 0
         self.findings: tuple[Finding, ...]
-        #: Findings at the last check of all rows. If `findings` has changed since then, all rows are checked.
+        #: `findings` before the last call of `_check_rows`. If `findings` has changed, the next cycle calls `_check_rows` again.
         self._evaluated: tuple[Finding, ...]
         self.findings = self._evaluated = ()
 

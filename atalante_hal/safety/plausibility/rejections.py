@@ -1,10 +1,11 @@
-"""Leaky buckets of rejected values, which detect a sensor with frequent implausible values.
+"""Error counters of the joints and the IMUs, which detect a sensor with frequent implausible values.
 
 Single implausible values of a joint or an IMU are tolerated: the robot uses the previous values. If every new value is
 implausible, the check that rejects the values confirms its diagnostic. If good values arrive in between, this check does not
-confirm its diagnostic, because each good value ends the fault. So each sensor has a leaky bucket that counts its rejected values.
-The bucket has the same size as the buckets in `message_monitor`. The bucket is full if more than a fifth of the values are
-rejected. Then the diagnostic is confirmed, until 16 values in a row are good.
+confirm its diagnostic, because each good value ends the fault. So each sensor has an error counter, called leaky bucket: each
+rejected value fills the bucket, and each good value empties it a little. The bucket has the same size as the buckets in
+`message_monitor`. The bucket becomes full if more than a fifth of the values are rejected. Then the diagnostic is confirmed,
+until 16 values in a row are good.
 """
 
 from __future__ import annotations
@@ -22,7 +23,10 @@ _NODES = (*JOINT_NODES, *IMU_NODES)
 
 
 class Rejections:
-    """Leaky bucket of each sensor. A sensor index is a joint index, or the number of joints plus an IMU index."""
+    """Leaky bucket (error counter) of each sensor.
+
+    The index of a sensor is a joint index, or the number of joints plus an IMU index.
+    """
 
     def __init__(self) -> None:
         #: Bucket and last diagnostic of each sensor, by sensor index. A sensor without an entry has an empty bucket.

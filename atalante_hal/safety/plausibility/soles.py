@@ -21,17 +21,17 @@ from atalante_hal.safety.diagnostics import Dtc, Finding
 from atalante_hal.safety.plausibility.finding import JOINT_NODES, Ages, Signals
 from atalante_hal.wire.process_image import NEVER
 
-#: A fault is reported after this number of consecutive samples in which the forces show that the foot is flat, but the ankle
-#: encoders and the tibia IMU show that its sole is tilted. A foot is sampled every 32 cycles.
+#: Number of consecutive samples after which an ankle encoder is reported. In each of these samples, the forces show a flat foot,
+#: but the ankle encoders and the tibia IMU show a tilted sole. A foot is sampled every 32 cycles.
 SOLE_SAMPLES = 4
-#: A foot counts as flat on the floor only if its load exceeds this multiple of `cell_free`.
+#: A foot counts as flat on the floor only if its load exceeds this multiple of `cell_free` (largest force of an unloaded cell).
 _LOAD = 4.0
-#: A foot counts as flat only if its centre of pressure is at most this far from the middle of its cells: along, across.
-#: The unit is the distance of a force cell from this middle. In this unit, the sole ends at 1.1 along and at 2.0 across the foot.
+#: Largest distance of the centre of pressure from the middle of a flat foot: along the foot, across the foot.
+#: The force cells are at the distance 1. The sole ends at the distance 1.1 along the foot, and 2.0 across the foot.
 _CENTRE = (0.8, 1.4)
 #: Outward rotation of the foot about the vertical axis of the tibia [rad].
 TOE_OUT = math.radians(8.0)
-#: Components x and z of a vector along the henke axis, in the axes of the sole. The length of the vector is not 1.
+#: Direction of the henke axis in the axes of the sole: components x and z, not scaled to the length 1. Component y is 0.
 HENKE_AXIS = (0.788, 0.616)
 _TIBIAE = [IMUS.index(f"{side}_tibia") for side in SIDES]
 _ANKLES = [[JOINTS.index(f"{side}_{name}") for name in ("SA", "HA")] for side in SIDES]

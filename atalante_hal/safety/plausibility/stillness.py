@@ -70,24 +70,25 @@ _SHANK_OF = [IMUS.index(f"{side}_tibia") for side in SIDES for _ in ("SA", "HA")
 
 
 class Readings(NamedTuple):
-    """Signals that update the `Drive` record in each cycle. Positions are on the motor side."""
+    """Signals of one cycle that `follow_one` uses. Positions are on the motor side."""
 
-    position: Vector  # (12,) rad
-    before: Vector  # (12,) rad, positions of the previous cycle
-    torque: Vector  # (12,) Nm
-    force: Vector  # (2, 4, 3) N
+    position: Vector  # (12,) rad, measured positions
+    before: Vector  # (12,) rad, measured positions of the previous cycle
+    torque: Vector  # (12,) Nm at the joint, torques that the drives report
+    force: Vector  # (2, 4, 3) N, forces on the cells of both feet
 
 
 class Drive(NamedTuple):
-    """Torque of each joint since its encoder reading last changed, and a simulated motion. Shape (12,) each.
+    """Torques and simulated motion of each joint since its encoder reading last changed, shape (12,) each.
 
-    The simulated joint starts at rest. If the torque changes by more than `breakaway`, the part of the change above `breakaway`
-    accelerates the joint. If the torque changes by less, the missing part brakes the joint, at most to rest. The inertia of the
-    simulated joint is `_INERTIA`, an upper bound, so a real joint turns further.
+    The simulation computes how far the torques turn a joint at least. The simulated joint starts at rest. If the torque changes
+    by more than `breakaway`, the part of the change above `breakaway` accelerates the joint. If the torque changes by less, the
+    missing part brakes the joint, at most to rest. The inertia of the simulated joint is `_INERTIA`, an upper bound, so a real
+    joint turns further.
     """
 
     cycles: Vector  # number of cycles since the encoder reading last changed
-    rest: Vector  # torque of the joint at rest [Nm]: its torque in the third cycle (`_AT_REST`) with a constant reading
+    rest: Vector  # torque that holds the joint at rest [Nm], measured in the third cycle (`_AT_REST`) with a constant reading
     low: Vector  # lowest torque since the encoder reading last changed [Nm]
     high: Vector  # highest torque since the encoder reading last changed [Nm]
     momentum: Vector  # angular momentum of the simulated joint [Nm s], at least 0
@@ -113,15 +114,16 @@ class Stillness:
         where = measured(codec)
         self._values, self._now, self._age = image.values[where], now, image.age
         self._every = every
-        #: For each row: age of the values that were sampled last [cycles]. If `_age` is lower, newer values have arrived.
+        #: Age of the values in the last sample [cycles], by row in the process image.
+        #: A message has newer values if its current age (`_age`) is lower.
         self._sampled_age: Cycles = np.full(len(image.age), 2 * NEVER)
         self._row_of = codec.row_of[where]
         size = len(self._values)
         self._sampled = np.full(size, np.nan)
         self._same = np.empty(size, np.bool_)
         self._repeats = np.full(size, 0)
-        # Convert the limits from cycles to numbers of samples. A reading may already be constant for `every` - 1 cycles when it
-        # is sampled first, so these cycles are subtracted.
+        # Convert the limits from cycles to samples. Example: with `every` = 16, 50 cycles become (50 - 15) // 16 = 2 samples.
+        # The 15 cycles are subtracted because they may pass between the first repeated reading and its sample.
         limit = np.full(size, _NEVER)
         limit[codec.slice("Position")] = self._to_stuck = (STUCK_CYCLES - every + 1) // every
         limit[codec.slice("Gyro")] = limit[codec.slice("Force")] = to_freeze = (FROZEN_CYCLES - every + 1) // every
@@ -138,7 +140,7 @@ class Stillness:
         self._loaded = 2.0 * robot.sensors.cell_free  # a foot with more than this vertical force [N] is on the ground
         self._interval = every * period
         self._drive = Drive(*np.zeros((6, len(JOINTS))))
-        #: Joints with a constant encoder reading despite a large torque, see the module docstring.
+        #: Indices of the joints whose encoder reading is constant despite a large torque, see *Large torque* above.
         self._driven: list[int] = []
         #: Arguments of the function `follow`. The array objects are the same in every call.
         self._readings = (
@@ -148,8 +150,8 @@ class Stillness:
         self._follow = specialised(follow, *self._readings)
         for joint in range(len(JOINTS)):
             release(self._drive, joint)
-        #: Rotation vector of the shank while the encoder reading of an ankle joint is constant [rad], one row per ankle joint,
-        #: shape (4, 3). The row is 0 if the foot is not on the ground.
+        #: For each ankle joint: rotation vector by which its shank has turned while the encoder reading was constant [rad].
+        #: Shape (4, 3). The row of an ankle joint is 0 while its foot is not on the ground.
         self._turn = np.zeros((len(_ANKLES), 3))
         self._to_joint: Vector = robot.polarity / robot.gear
         self._low_stop, self._high_stop = robot.position_min + _AT_STOP, robot.position_max - _AT_STOP
@@ -324,7 +326,9 @@ def follow_one(joint: int, readings: Readings, drive: Drive, breakaway: float, l
 
 
 def release(drive: Drive, joint: int) -> None:
-    """Clear the `Drive` record of a joint whose encoder reading has changed, or whose foot is on the ground.
+    """Clear the `Drive` record of a joint.
+
+    Call this if the encoder reading of the joint has changed, or if the joint is an ankle whose foot is on the ground.
 
     Args:
         drive: record of all joints. Updated here.

@@ -23,9 +23,9 @@ from atalante_hal.robot import FEET, IMUS, JOINTS, SIDES, Robot
 from atalante_hal.safety.diagnostics import Dtc, Finding
 from atalante_hal.safety.plausibility.finding import FOOT_NODES, Ages, Signals
 
-#: A loaded foot is reported after it has been too high for this time [cycles].
+#: A foot is reported after this time [cycles] in which it alone carries load, although it is higher by more than `_HEIGHT`.
 HEIGHT_CYCLES = 64
-#: The load is reported after it has been on the wrong leg for this time [cycles].
+#: The feet are reported as exchanged after this time [cycles] in which the robot leans away from the leg with clearly more load.
 WEIGHT_CYCLES = 128
 #: Mean length of a thigh or a shank [m]. The real lengths are adjusted to the patient.
 SEGMENT = 0.4
@@ -62,10 +62,10 @@ class Support:
     def __init__(self, robot: Robot, now: Signals, every: int) -> None:
         self._now, self._every, self._free = now, every, robot.sensors.cell_free
         self._to_joint = (robot.polarity / robot.gear)[_KNEES].tolist()
-        #: For each foot: time for which only this foot has reported load [cycles], although it is more than `_HEIGHT` above the
-        #: other foot.
+        #: Time [cycles] for which one foot alone has reported load while it was more than `_HEIGHT` above the other foot.
+        #: One element for each foot.
         self._too_high = [0 for _ in FEET]
-        self._wrong_leg = 0  # time for which the load has been on the wrong leg [cycles]
+        self._wrong_leg = 0  # time for which the robot has leaned away from the leg with clearly more load [cycles]
         self._found: tuple[Finding, ...] = ()
 
     def evaluate(self, ages: Ages | None) -> bool:

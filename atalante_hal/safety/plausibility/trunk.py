@@ -31,35 +31,37 @@ from atalante_hal.types import Vector
 TORSO_HEIGHT = 0.309
 #: Time constant of both high-pass filters [s].
 _FILTER_TIME = 0.1
-#: Time constant of the mean values `Filters.moments` [s].
+#: Time constant of the running means in `Filters.moments` [s].
 _MEAN_TIME = 0.25
 #: Time that the filters need to settle after the start [s]. `Filters.moments` is updated only after this time.
 _SETTLING_TIME = 0.3
-#: The check decides only above this root mean square of the filtered angular velocity [rad/s].
-#: At rest, the noise of the gyroscopes is up to 0.004 rad/s rms.
+#: The trunk must turn faster than this [rad/s], or the check makes no decision. The value is the root mean square of the filtered
+#: angular velocity. At rest, the noise of the gyroscopes is up to 0.004 rad/s rms.
 _LEAST_RATE = 0.008
-#: The IMUs of torso and pelvis are exchanged if the computed height is less than -`_SHARE` * `TORSO_HEIGHT`.
-#: In walks, pushes and falls of a healthy robot, the computed height is at least 0.6 times `TORSO_HEIGHT`.
+#: The IMUs count as exchanged if the height of the torso IMU, computed from the motion, is less than -`_SHARE` * `TORSO_HEIGHT`.
+#: In walks, pushes and falls of a healthy robot, this computed height is at least 0.6 * `TORSO_HEIGHT`.
 _SHARE = 0.5
 _TORSO, _PELVIS = IMUS.index("torso"), IMUS.index("pelvis")
 
 
 class Filters(NamedTuple):
-    """Values of the filters.
+    """State of the filters.
 
+    Speed is the velocity of the torso IMU relative to the pelvis IMU, and rate is the mean angular velocity of both IMUs.
     The first four arrays have one element for each axis: element 0 for the acceleration along x, element 1 along y.
     The rate of element 0 is the angular velocity about y. The rate of element 1 is minus the angular velocity about x.
+
     The filtered rate is rate - `slow_rate` - `slower_rate`. The filtered speed is `speed` - `slow_speed`.
     The height of the torso IMU above the pelvis IMU is `moments[0]` / `moments[1]`.
     """
 
-    speed: Vector  # (2,) leaky integral of the torso acceleration minus the pelvis acceleration [m/s]
+    speed: Vector  # (2,) decaying integral of torso acceleration minus pelvis acceleration, time constant `_FILTER_TIME` [m/s]
     slow_speed: Vector  # (2,) low-pass of `speed` [m/s]
     slow_rate: Vector  # (2,) low-pass of the rate [rad/s]
-    slower_rate: Vector  # (2,) low-pass of (rate - `slow_rate`) [rad/s]
+    slower_rate: Vector  # (2,) low-pass of the remaining rate, which is rate - `slow_rate` [rad/s]
     time: Vector  # (1,) time since the start, up to `_SETTLING_TIME` [s]
-    #: (2,) element 0: mean of (filtered speed * filtered rate), x and y added [m/s2];
-    #: element 1: mean of (filtered rate squared), x and y added [rad2/s2]
+    #: (2,) running means. Element 0: filtered speed * filtered rate, the sum over both axes [m/s2].
+    #: Element 1: square of the filtered rate, the sum over both axes [rad2/s2].
     moments: Vector
 
 

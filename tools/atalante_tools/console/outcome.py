@@ -69,7 +69,7 @@ KNOWN: Final[tuple[tuple[str, str, type[Failed]], ...]] = (
     ("atalante_tools.canlog.validate.project", "ProjectError", InvalidUsage),
 )
 
-#: Largest number of lines after the first line of a message. Longer messages are shortened.
+#: Largest number of lines after the first line of a message. A longer message is cut to its first line and "and N more".
 MOST: Final = 2
 #: Error numbers of a failed write: disk full, over quota, read-only, I/O error.
 DISK: Final = frozenset({errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EIO})

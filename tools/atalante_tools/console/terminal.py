@@ -87,7 +87,10 @@ class Progress:
         self._width = 0
 
     def due(self) -> bool:
-        """Return whether one period has passed since the last progress line; before the first line, since `__init__`."""
+        """Return whether it is time to print the next progress line.
+
+        One period must have passed since the last progress line. The first period begins in `__init__`.
+        """
         return self._now() >= self._next
 
     def show(self, text: str) -> None:

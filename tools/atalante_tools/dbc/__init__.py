@@ -124,7 +124,7 @@ def diff(old: Path, new: Path, as_json: bool) -> None:
 @click.option(
     "--check",
     is_flag=True,
-    help="Compile the host test, and use it to compare the C code with the Python codec.",
+    help="Compile and run the C code on this computer, and compare its results with the Python codec.",
 )
 @click.option(
     "--images",

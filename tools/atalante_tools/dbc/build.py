@@ -27,7 +27,7 @@ class Build:
 
         Args:
             path: DBC file.
-            node: name of the node whose messages are generated; None means all messages.
+            node: name of the node for which code is generated; None means all nodes.
 
         Raises:
             DbcError: If the strict loader rejects the file.

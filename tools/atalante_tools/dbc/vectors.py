@@ -60,10 +60,10 @@ class Vectors:
         self._order = self._stream_order()
 
     def _stream_order(self) -> npt.NDArray[np.intp]:
-        """Return indices that sort the computed bytes of an image (one payload per message) into the order of the stream.
+        """Return an index array that reorders the bytes of an image (one payload per message) for the stream.
 
-        Element k is the index of the computed byte that becomes byte k of the image in the stream. The computed bytes are the
-        concatenated `parts` in the method `images`.
+        The method `images` joins one array per kind of data, such as all payloads and all signal values. The stream has the
+        order of the messages instead. Element k is the index, in the joined arrays, of byte k of an image in the stream.
         """
         build, codec = self._build, self._codec
         rows = len(build.messages)

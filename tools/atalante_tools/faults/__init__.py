@@ -45,7 +45,7 @@ def command() -> None:
 @command.command("list", short_help="List all faults with time limit, diagnostic code and tests.")
 @json_option
 def list_(as_json: bool) -> None:
-    """List all faults: time limit of the reaction, final state, diagnostic code, and proof (tests of the reaction)."""
+    """List all faults: time limit of the reaction, final state, diagnostic code, and tests (column "proof")."""
     from atalante_tools.faults.matrix import load_matrix
 
     rows = load_matrix().values()
@@ -160,7 +160,7 @@ def _counts(counts: dict[str, int]) -> str:
     "--endurance/--no-endurance",
     default=True,
     show_default=True,
-    help="Also measure for each fault the longest duration that the walk survives.",
+    help="Also measure how long each fault that may be permanent can last before the robot stops walking.",
 )
 @click.option(
     "--out",

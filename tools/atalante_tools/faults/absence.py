@@ -1,4 +1,4 @@
-"""Lock-step clock of the HAL that advances the emulated robot while the HAL loop is late or sends no SYNC.
+"""Clock of the HAL loop that keeps the emulated robot running while the loop is late or sends no SYNC.
 
 In lock-step, the emulated robot runs one cycle per SYNC. Without this clock, the robot would stand still while a fault of the
 host suppresses the SYNC or delays the loop, and a robot on the ground would not fall.
@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 
 class Absence:
-    """Lock-step clock of the HAL. While the HAL sends no SYNC, the clock advances the emulated robot."""
+    """Clock of the HAL loop. While the loop is late or sends no SYNC, this clock keeps the emulated robot running."""
 
     def __init__(self, clock: DisturbedClock, emulator: Emulator) -> None:
         """Start the cycle counts of HAL and robot at 0.
@@ -28,7 +28,8 @@ class Absence:
         """
         self._clock, self._emulator = clock, emulator
         self._begun = 0  # number of HAL cycles that have begun
-        # Time that the HAL has lost for good [s]: sum of all delays above one period. Later cycles make up for shorter delays.
+        # Time by which the deadlines of the HAL cycles have moved [s]. A cycle that is late by more than one period moves all
+        # later deadlines by its whole delay. A cycle that is late by one period or less moves no deadline.
         self._skipped = 0.0
         self._seen = 0  # cycle number of the robot at the end of the last call of `wait`
         self._alone = 0  # number of robot cycles since the last SYNC

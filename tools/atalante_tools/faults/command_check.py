@@ -141,9 +141,10 @@ class Commands:
         return float(steps.max(initial=0.0))
 
     def violations(self, robot: Robot, drive_state: Vector | None = None) -> list[str]:
-        """Return one sentence per foreign identifier, and one sentence per leg for each kind of violation.
+        """Return the errors in the sent frames as sentences: wrong CAN identifiers and wrong torques.
 
-        The four kinds are: torque too large, torque limit too large, torque change too large, torque with QUICK STOP.
+        Each identifier that the HAL must not send gives one sentence. Each leg gives at most one sentence for each of four
+        errors: torque too large, torque limit too large, torque change too large, torque with QUICK STOP.
 
         Args:
             robot: torque limits of the joints.

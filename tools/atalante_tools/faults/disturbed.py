@@ -155,7 +155,10 @@ class DisturbedController:
 
 
 class DisturbedClock:
-    """Lock-step clock that injects the faults `late` and `slow`."""
+    """Clock of the HAL loop that injects the faults `late` (a cycle begins late) and `slow` (a cycle takes too long).
+
+    The clock only reports delays to the HAL. No real time passes.
+    """
 
     def __init__(self, now: HostFaults) -> None:
         self._now = now

@@ -120,7 +120,8 @@ SCENARIOS: Final = (
         ),
         permanent=Case("one leg", (Fault("drop", "SYNC_LEFT_LEG"),)),
     ),
-    # A drive detects lost commands from the alive counter of the next command, so the detection takes one cycle longer.
+    # A drive detects lost commands by the gap in the alive counter of the next command. Example: if the commands of the cycles
+    # 1 and 2 are lost, the command of cycle 3 shows the gap, so `detected` is 3.
     Scenario("F24", tuple(Case(f"{n} frames", (Fault("drop", _COMMAND, 0, n),), detected=n + 1) for n in range(1, 5))),
     Scenario(
         "F25",
@@ -275,7 +276,7 @@ SCENARIOS: Final = (
             ),
         ),
     ),
-    # There is no case with TH. The left and the right TH are at nearly the same position, so an exchange causes no jump.
+    # There is no case with TH. The left and the right TH are at nearly the same position, so exchanged encoders show no jump.
     Scenario(
         "F85",
         tuple(

@@ -302,7 +302,8 @@ SCENARIOS: Final = (
         ),
         permanent=Case("permanent", (Fault("flags", _STATE, flags=_ERROR_PASSIVE),)),
     ),
-    # The alive counter in a frame of the second sender is the last counter of the genuine sender plus `ahead`.
+    # A second sender repeats the last frame of a node, with other signals and with `ahead` added to the alive counter.
+    # If `ahead` is 1, the node's next frame has the same counter. If `ahead` is 0, the node's last frame has the same counter.
     Scenario(
         "F58",
         (

@@ -44,9 +44,9 @@ _S = SupervisorState
 SAG_MAX: Final = 1.0
 #: Events with which the HAL ends a start before ACTIVE.
 _ENDS_OF_START: Final = ("START_FAILED", "START_REFUSED")
-#: Kind of a fault that moves a joint during a start -> largest accepted motion of the joints of its leg [deg]. A wrong motor or
-#: encoder moves the joint until the test of the joint directions finds the fault (F72). A push may exceed the torque that holds
-#: the joint.
+#: Kind of a fault that moves joints during a start -> largest accepted motion [deg] of every joint in the leg with the fault.
+#: A wrong motor or encoder moves its joint until the direction test finds the fault (F72). A push may exceed the torque that
+#: holds the joint, so the motion has no limit.
 SAG_OF: Final = {
     "torque_wrong": 5.0,
     "torque_weak": 5.0,
@@ -56,8 +56,8 @@ SAG_OF: Final = {
     "value": 5.0,
     "push": math.inf,
 }
-#: Kinds of motor faults. Until the HAL finds a motor fault, the fault may move a joint above its velocity limit. The run accepts
-#: such a speed for `FOUND` cycles after the fault begins, and for `FOUND` cycles after each later START.
+#: Kinds of motor faults. Until the HAL finds a motor fault, the fault may move a joint above its velocity limit. So the speed
+#: is not checked for `FOUND` cycles after a motor fault begins, and for `FOUND` cycles after each later START.
 _MOTOR: Final = ("torque_wrong", "torque_weak")
 #: Number of cycles within which the HAL must find a faulty motor: time limit of F84 in FAULTS.md.
 FOUND: Final = 200
@@ -67,11 +67,11 @@ _PAUSE: Final = 50
 _STOPPED: Final = 60
 #: Number of cycles from the operator's STOP to the START that restarts the walk.
 _RESTART: Final = 200
-#: Longest observation of a fault [cycles]. A permanent fault is observed for this time.
+#: Longest wait for the end of a fault [cycles]. The run goes on after this wait, even if the fault is permanent.
 _LONGEST: Final = 400
-#: Number of cycles from the end of the observation to the operator's START.
+#: Smallest number of cycles from the end of the wait for the fault to the next press of START.
 _REST: Final = 60
-#: Number of cycles from the second press of START to the end of the run.
+#: Number of cycles from the second press of START after the fault to the end of the run.
 _END: Final = 300
 
 
@@ -91,7 +91,7 @@ class Schedule:
     """Times of a run, in HAL cycles."""
 
     begins: int  # first faulty cycle
-    #: cycles in which the operator presses START; the two presses that `_observe` adds after the fault are not included
+    #: cycles in which the operator presses START, without the two presses that `_observe` adds after the fault
     starts: tuple[int, ...]
     stop: int | None = None  # cycle in which the operator presses STOP
 
@@ -125,12 +125,12 @@ class Extreme(NamedTuple):
 
 @dataclass(frozen=True)
 class Extremes:
-    """Largest values of a run: speed and torque step of a joint, and motion of a joint during a start and in HOLD."""
+    """Largest values of a run: speed and torque step of a joint, and motion of a joint during a start and after the walk."""
 
-    speed: Extreme  # joint velocity as a share of its limit
+    speed: Extreme  # joint velocity divided by the velocity limit of the joint
     torque_step: Extreme  # change of the commanded torque in one cycle [Nm]
-    sag: Extreme  # motion during a start [deg], see `SAG_MAX`
-    lost: Extreme  # motion since the first cycle in HOLD or a more severe state [deg]
+    sag: Extreme  # motion of a joint during a start [deg], measured as in `SAG_MAX`
+    lost: Extreme  # distance of a joint from its position in the first cycle after the walk [deg], until the robot walks again
 
 
 @dataclass(frozen=True)
@@ -172,7 +172,8 @@ class MomentTask:
         starts = [cycle for cycle in presses if cycle >= min(begins, default=math.inf)]
         unlimited = [range(cycle, cycle + FOUND) for cycle in (*begins, *starts)]
         failures = [*limit_violations(run, unlimited, _strength(stimuli)), *_premature(run, plan.starts[0])]
-        # No check for a fault at BOOT or READY: the fault begins before the first START, and may delay the effect of this START.
+        # `automatic_improvements` requires that the HAL receives START before the fault begins. At BOOT and READY, the fault
+        # begins before the first START, and may delay the effect of START.
         if self.moment not in (Moment.BOOT, Moment.READY):
             failures += automatic_improvements(run, before, plan.starts)
         failures += _sag_violations(_sag(run, plan.starts), _sag_limits(stimuli))
@@ -304,7 +305,7 @@ def _sag(run: Observation, starts: Sequence[int]) -> Vector:
 
 
 def _extremes(run: Observation, starts: Sequence[int]) -> Extremes:
-    """Return the largest values of a run.
+    """Return the largest speed, torque step and joint motion of a run (see `Extremes`).
 
     Args:
         run: observation of the run.

@@ -20,7 +20,7 @@ from atalante_tools.faults.verdict import Verdict
 
 @dataclass(frozen=True)
 class Line:
-    """Result of one fault. The field names are the keys of `--json`.
+    """Result of all test cases of one fault. The field names are the JSON keys of the command `atalante faults`.
 
     The fields `state`, `cycles`, `bound` and `dtc` come from the worst test case. If a case failed, a failed case is the worst.
     If all cases passed, the case closest to its time limit is the worst.
@@ -29,7 +29,7 @@ class Line:
     id: str
     passed: bool
     state: str
-    cycles: int | None  # cycles until the reaction, or else until the diagnostic; None if there was neither
+    cycles: int | None  # cycles from fault to reaction; without reaction: from fault to diagnostic; without both: None
     bound: int  # time limit for `cycles`
     dtc: str
     cases: int
@@ -54,7 +54,7 @@ class Summary:
     lines: tuple[Line, ...]
     endurance: tuple[Endurance, ...]
     pairs: tuple[PairVerdict, ...]
-    moments: tuple[MomentVerdict, ...]  # runs in which single faults or random pairs begin at each `Moment`
+    moments: tuple[MomentVerdict, ...]  # results of runs with one or two faults that begin at a `Moment`, such as READY
     seconds: float  # duration of the campaign [s]
 
     @classmethod
@@ -140,7 +140,10 @@ class Summary:
         return "\n\n".join(parts) + "\n"
 
     def _moments(self) -> str:
-        """Return a table of the largest values: one row per `Moment`, one row for the random pairs, one row per fault."""
+        """Return the Markdown table of all runs in `moments`, and a list of the failed runs.
+
+        One row summarizes all runs with the same `Moment`, all random pairs, or all runs with the same fault.
+        """
         single = [run for run in self.moments if len(run.faults) == 1]
         pairs = [run for run in self.moments if len(run.faults) > 1]
         groups = [(f"all, {moment}", [run for run in single if run.moment == moment]) for moment in Moment]
@@ -184,7 +187,7 @@ def _moment_row(runs: Sequence[MomentVerdict]) -> list[str]:
 
 
 def survived(endurance: Endurance) -> str:
-    """Return the number of cycles for which the walk survives a fault, as text for a table.
+    """Return the longest fault with which the walk continues [cycles], as text for a table.
 
     Args:
         endurance: result of the run.

@@ -35,7 +35,8 @@ if TYPE_CHECKING:
     from atalante_emulator.pendant import Operator
     from atalante_hal.safety.events import Event
 
-#: Telemetry fields of the controller: tracking errors of the assisted joints, and half-widths of their guides [rad].
+#: Telemetry fields of the controller for the assisted hip and knee. `error` is the tracking error [rad].
+#: `q_bound` is the distance from the desired angle to the edge of the guide (corridor around the desired motion) [rad].
 _GUIDE: Final = ("error", "q_bound")
 #: Controller settings. A short startup is sufficient, because the robot is already in the first pose of the gait.
 CONFIG: Final = AirwalkConfig(startup=0.1)
@@ -44,7 +45,7 @@ ASSISTANCE: Final = 0.5
 _START: Final = 600
 #: Number of cycles between two presses of START after the fault. The first press ends FAULT, the second press ends HOLD.
 RECOVERY: Final = 100
-#: Number of cycles after the second press within which the robot must be ACTIVE.
+#: Number of cycles from the press of START that ends HOLD until the end of the run. The robot must become ACTIVE in this time.
 _RESTART: Final = 300
 
 
@@ -158,7 +159,7 @@ class CaseRun:
         self._sent = SentFrames()
         self._samples: list[_Sample] = []
         self._events: list[Event] = []  # events that the HAL reported before its shutdown
-        self._copied = 0  # total number of HAL events at the last copy to `_events`
+        self._copied = 0  # value of `hal.events.count` after the last copy of events to `_events`
 
     def execute(self, until: Callable[[State], bool]) -> None:
         """Run the HAL and the emulator.

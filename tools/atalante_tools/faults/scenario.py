@@ -87,8 +87,8 @@ class Case:
     reacted: int | None = None  # time limit for the reaction [cycles]; None means as in the fault matrix
     node: str | None = None  # node that the diagnostic must name; None means any node
     recovers: bool = True  # True: START after the fault must lead to ACTIVE; False: START must not lead to ACTIVE
-    #: START is pressed this number of cycles after the fault has ended and the time limit `reacted` has passed. A permanent fault
-    #: does not end, so only the time limit counts.
+    #: wait before START is pressed [cycles]. The wait begins when all faults have ended and the time limit `reacted` has passed.
+    #: In a case with a permanent fault, the wait begins when the time limit `reacted` has passed.
     observed: int = 60
     seed: int = 0  # seed of the random numbers in the emulator
     checks: tuple[ObservationCheck, ...] = ()  # additional checks of the run
@@ -98,7 +98,10 @@ class Case:
 
     @property
     def ends(self) -> int | None:
-        """Return the first cycle after all faults and actions, counted from the start of the case. None: a fault is permanent."""
+        """Return the first cycle after all faults and actions, or None if a fault or an action is permanent.
+
+        The cycle counts from the start of the case.
+        """
         ends = [None if one.cycles is None else one.start + one.cycles for one in self.stimuli]
         return None if None in ends else max((end for end in ends if end is not None), default=0)
 

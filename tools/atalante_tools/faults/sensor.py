@@ -18,11 +18,11 @@ _KNEE: Final = "LEFT_SK"
 _STILL: Final = "RIGHT_FH"
 _IMUS: Final = tuple(f"IMU_{name.upper()}" for name in IMUS)
 _FEET: Final = tuple(f"FOOT_{name.upper()}" for name in FEET)
-#: Share of doubled frames that the HAL tolerates permanently. The HAL does not tolerate a share above 0.2.
+#: Probability that a frame arrives twice. The HAL tolerates this value permanently, but no value above 0.2.
 _OFTEN: Final = 0.15
-#: Permanent communication faults that must not prevent the detection of a sensor fault.
-#: The delayed messages include those of a joint and of the pelvis IMU, because the sensor checks use these two messages.
-#: Only some frames are doubled, because a message that is doubled in every cycle is itself a fault (F63).
+#: Name for a test case -> permanent communication fault during which the HAL must still detect a drifting encoder.
+#: Two of the delayed messages, from a joint drive and from the pelvis IMU, are inputs of the sensor checks.
+#: Frames are doubled at random, because the HAL stops the walk if a message arrives twice in every cycle (fault F63).
 _TOLERATED: Final = {
     "FOOT_LEFT often doubled": Fault("duplicate", "FOOT_LEFT_STATE", p=_OFTEN),
     "FOOT_LEFT a cycle late": Fault("delay", "FOOT_LEFT_STATE"),
@@ -102,7 +102,7 @@ def _never_ready(name: str, fault: Fault, *, node: str) -> Case:
     )
 
 
-#: Raw code of the signal Position that marks an invalid value.
+#: Raw value of the CAN signal Position with which a drive reports: the position is invalid.
 _INVALID_CODE: Final = 1 << 23
 
 SCENARIOS: Final = (
@@ -110,7 +110,8 @@ SCENARIOS: Final = (
         "F27",
         (
             *(Case(node, _stuck(node, 200), node=node) for node in ("LEFT_SH", "RIGHT_SH")),
-            # If the knee encoder is stuck, the guide commands the largest torque of the drive. So the fault is detected early.
+            # A stuck knee encoder makes the guide command the largest torque of the drive. With a large torque, the HAL detects a
+            # stuck encoder within 20 cycles.
             *(
                 Case(f"{_KNEE} at {phase:g} T", _stuck(_KNEE, 200), node=_KNEE, phase=phase, detected=20, reacted=20)
                 for phase in (0.1, MID_SWING, 0.65, 0.8)
@@ -153,7 +154,8 @@ SCENARIOS: Final = (
             ),
             *(
                 Case(f"{1e3 * by:g} mrad for 100 cycles", (Fault("encoder_jump", _STILL, 0, 100, by=by),), node=_STILL)
-                for by in (0.025, -0.025, 0.1, -1.0)  # every jump exceeds 22.5 mrad, the largest motion in five cycles
+                # 22.5 mrad is the largest joint motion that the HAL accepts within five cycles, and each jump is larger.
+                for by in (0.025, -0.025, 0.1, -1.0)
             ),
             Case(
                 "25 mrad, permanent",
@@ -216,8 +218,8 @@ SCENARIOS: Final = (
             for cell, force in zip(CELLS, (400.0, 0.0, -50.0, 61.0), strict=True)
         ),
     ),
-    # Injected forces simulate that the robot stands on both feet. The fault begins when these forces end.
-    # After 140 cycles without contact, the HAL assumes that the robot was lifted on purpose, and the fault ends.
+    # The robot hangs in the air. Injected foot forces simulate that both feet stand. Fault F34 (no contact) begins when the
+    # injected forces end. After 140 cycles without contact, the HAL takes the robot as lifted on purpose, and F34 ends.
     Scenario(
         "F34",
         tuple(
@@ -279,9 +281,9 @@ SCENARIOS: Final = (
                 recovers=False,
                 checks=(start_is_rejected,),
             ),
-            # The controller corrects the reported position, so the real joint moves against the drift to its end stop. The HAL
-            # then detects one of two effects: the reported position leaves its range (POSITION_RANGE), or the joint does not
-            # follow its torque, like a joint with a dead motor (TORQUE_MOTION). The detection takes up to 400 cycles.
+            # The controller compensates the drift of the encoder by moving the real joint the other way, to the end stop.
+            # POSITION_RANGE: the reported position leaves its range. TORQUE_MOTION: the joint does not follow its
+            # torque, as with a dead motor.
             Case(
                 "RIGHT_SA at 2 rad/s",
                 (Fault("encoder_drift", "RIGHT_SA", rate=2.0),),

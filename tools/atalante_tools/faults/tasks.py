@@ -35,7 +35,7 @@ from atalante_tools.faults.verdict import (
 HORIZON: Final = 1000
 #: Number of cycles between the first and the second fault of a pair.
 PAIR_DELAY: Final = 3
-#: Test cases that a campaign also runs in pairs: (fault ID, name of a case of this fault).
+#: Test cases of which a campaign runs every pair: (fault ID, name of a test case of this fault).
 REPRESENTATIVES: Final = (
     ("F03", "4 frames"),
     ("F04", "LEFT_SK"),
@@ -206,7 +206,7 @@ def run_task(task: Task) -> Result:
 
 
 def _cycles_until_stop(case: Case, cycles: int) -> int | None:
-    """Run a case with its permanent fault limited to `cycles` cycles.
+    """Run a case whose permanent faults are limited to `cycles` cycles.
 
     Return the number of cycles until the walk stopped, or None if the walk continued.
     """
@@ -223,7 +223,7 @@ def _case_of(id_: str, name: str) -> Case:
 
 
 def limited(stimulus: Stimulus, cycles: int) -> Stimulus:
-    """Return the fault or action. If it is permanent, its duration is limited to `cycles` cycles."""
+    """Return a fault or action that ends: a permanent fault or action is limited to `cycles` cycles."""
     if stimulus.cycles is not None:
         return stimulus
     if isinstance(stimulus, Fault):

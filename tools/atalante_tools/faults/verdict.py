@@ -78,7 +78,7 @@ class Verdict:
     id: str
     case: str
     state: str  # state of the HAL just before the operator presses START
-    #: cycles until the reaction, or until the diagnostic if there was no reaction; None if there was neither
+    #: cycles from fault to reaction; without reaction: from fault to diagnostic; without both: None
     cycles: int | None
     bound: int  # time limit for `cycles`
     dtc: str  # first reported diagnostic code that matches the expected code
@@ -91,7 +91,7 @@ class Verdict:
 
 
 def evaluate(row: Row, case: Case, run: Observation) -> Verdict:
-    """Evaluate a run by the four checks of this module and the additional checks of the test case.
+    """Evaluate a run: state, diagnostic, limits, recovery, and the additional checks of the test case.
 
     Args:
         row: row of the fault matrix.
@@ -236,8 +236,7 @@ def _reported(run: Observation, expected: Expectation) -> list[Event]:
 
 
 def _recovery(run: Observation, case: Case, expected: Expectation) -> list[str]:
-    # After power-on, the HAL changes to less severe states without the operator. In a case that begins at power-on, such changes
-    # are therefore accepted.
+    # A case that begins at power-on skips this check, because the HAL itself changes to less severe states after power-on.
     found = [] if case.phase is None else automatic_improvements(run, run.last_before_start)
     if run.pressed is None:
         return found

@@ -42,7 +42,7 @@ def _count_option(default: int) -> Callable[[Any], Any]:
 
 
 def levels_of(text: str) -> tuple[float, ...]:
-    """Convert comma-separated numbers to the levels of a grid parameter.
+    """Convert the text of a grid option to numbers, for example "58,75" to (58.0, 75.0).
 
     Raises:
         click.BadParameter: If the text is not a list of numbers.
@@ -54,7 +54,9 @@ def levels_of(text: str) -> tuple[float, ...]:
 
 
 def lengths_of(text: str) -> tuple[float, ...]:
-    """Convert comma-separated lengths to the levels of a grid parameter [m]. Each length is in metres or centimetres.
+    """Convert the text of a grid option to lengths [m], for example "0.15,20" to (0.15, 0.2).
+
+    A number below 5 is in metres, any other number is in centimetres.
 
     Raises:
         click.BadParameter: If the text is not a list of lengths.
@@ -109,13 +111,13 @@ command.add_command(solve)
     "--thigh",
     type=levels_of,
     metavar="X,...",
-    help="Thigh lengths of the grid, as multiples of the length in Winter's table, such as 0.94,1,1.06.",
+    help="Thigh lengths of the grid, as multiples of the usual length for the height (Winter's table), such as 0.94,1,1.06.",
 )
 @click.option(
     "--shank",
     type=levels_of,
     metavar="X,...",
-    help="Shank lengths of the grid, as multiples of the length in Winter's table, such as 0.94,1,1.06.",
+    help="Shank lengths of the grid, as multiples of the usual length for the height (Winter's table), such as 0.94,1,1.06.",
 )
 @click.option(
     "--size",

@@ -31,7 +31,8 @@ class _Demands(NamedTuple):
     phase: Vector  # time divided by the step duration, 0 to 1, shape (n,)
     q: Vector  # joint angles [rad], shape (n, 12)
     torque: Vector  # joint torques [Nm], shape (n, 12)
-    pressure: Vector  # centre of pressure relative to the sole centre, in the axes of the stance foot [m], shape (n, 2)
+    #: vector from the sole centre to the centre of pressure [m], columns: x and y of the stance foot, shape (n, 2)
+    pressure: Vector
     clearance: Vector  # height of the lowest corner of the swing sole above the ground [m], shape (n,)
 
 
@@ -119,7 +120,7 @@ def _colour(name: str) -> str:
 
 
 class _Sticks:
-    """Stick figure of the robot. The origin of its coordinates is on the ground below the stance ankle."""
+    """Stick figure of the robot. The origin of the drawing is on the ground below the ankle of the stance leg."""
 
     def __init__(self, patient: Patient) -> None:
         self._exo = ExoskeletonParameters()
@@ -131,7 +132,11 @@ class _Sticks:
         self._trunk = np.array([[-0.05, 0.0, 0.0], [-0.05, 0.0, 0.55]])  # in the pelvis frame [m]
 
     def points(self, pose: Vector) -> dict[str, Vector]:
-        """Return the polylines [m] of trunk and legs, shape (n, 3), for the joint angles `pose` [rad], shape (12,)."""
+        """Return the points of the stick figure [m] for the joint angles `pose` [rad], shape (12,).
+
+        Returns:
+            Polyline of "trunk", "left" and "right" (leg). Each polyline has n points, shape (n, 3).
+        """
         model, data = self._articulated.model, self._data
         q = pinocchio.neutral(model)
         q[self._articulated.q] = pose

@@ -99,7 +99,9 @@ def solve(
 
 
 def _walk(subject: Subject, network: Path | None, as_json: bool) -> WalkGaits:
-    """Return a verified walk: periodic step from the solver or from a network, and start step and stop step from the solver.
+    """Return a verified walk, which consists of a start step, a periodic step and a stop step.
+
+    The solver computes the steps. If a network file is given, the periodic step comes from the network.
 
     Raises:
         Failed: If a step has no solution or fails the verification.

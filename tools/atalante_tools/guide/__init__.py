@@ -1,5 +1,6 @@
-"""Command `atalante guide`: search for pushes that move a joint out of a certified virtual guide.
+"""Command `atalante guide`: search for pushes that move a joint out of its virtual guide.
 
+A guide is a corridor of joint angles around the desired motion of hip and knee. The controller must keep both joints inside.
 The promise of a guide is one torque at the hip and one torque at the knee. The certificate of the guide states that no
 push up to these torques moves a joint out of the guide. The adversary searches for a push up to these torques that
 nevertheless moves a joint out of the guide.
@@ -26,7 +27,7 @@ if TYPE_CHECKING:
 
 #: Names of the conditions, copied from `promise_check.CONDITIONS` because the help must not import the slow controller.
 CONDITION_NAMES = ("model", "friction", "mass", "both", "noise", "loss", "delay")
-#: Assistance factors of a complete check.
+#: Assistance factors Xi that are checked if the user gives no option --xi.
 FACTORS = (0.0, 0.25, 0.5, 0.75, 0.9, 0.95, 0.99)
 
 
@@ -50,19 +51,22 @@ class CheckOptions:
     shapes: tuple[str, ...]  # names or files of the guide shapes; empty means all shapes of the package
     factors: tuple[float, ...]  # assistance factors; empty means `FACTORS`
     patients: bool  # whether to check the network gaits of several patients, too
-    conditions: tuple[str, ...]  # names of conditions; empty means all
+    conditions: tuple[str, ...]  # names of deviations from the model, such as "friction"; empty means all deviations
     push: tuple[float, float] | None  # largest push at hip and knee [Nm]; None means the certified torques
-    steps: int | None  # steps on the ideal plant per guide; None means the preset number of the search effort
-    robot_steps: int | None  # steps on the emulated robot per guide; None means the preset number of the search effort
+    steps: int | None  # number of steps per guide on the ideal plant; None: 60 if `quick` is set, otherwise 1500
+    robot_steps: int | None  # number of steps per guide on the emulated robot; None: 0 if `quick` is set, otherwise 60
     seed: int  # seed of the search and of the noise
-    quick: bool  # whether the search effort is `QUICK` instead of `COMPLETE`
+    quick: bool  # whether the search is short, with the settings `QUICK` instead of `COMPLETE`
     plot: Path | None  # picture file; None means no picture
     table: Path | None  # Markdown file for the table; None means no file
     results: Path | None  # file of the results; an interrupted check is resumed from this file; None means no file
     law: Law  # control law of the assisted joints
 
     def effort(self) -> Effort:
-        """Return the search effort for each guide: `QUICK` or `COMPLETE`, with the numbers of steps that the user gave."""
+        """Return the settings for the search in each guide.
+
+        The settings are `QUICK` or `COMPLETE`. The options --steps and --robot-steps replace the numbers of steps.
+        """
         from atalante_tools.guide.promise_check import COMPLETE, QUICK
 
         effort = QUICK if self.quick else COMPLETE
@@ -72,7 +76,7 @@ class CheckOptions:
         )
 
     def task(self) -> dict[str, Any]:
-        """Return the options that affect the verdict of each guide. The file of the results stores these options."""
+        """Return the options on which all verdicts depend. The first line of the results file contains these options."""
         return {
             "conditions": self.conditions,
             "effort": asdict(self.effort()),
@@ -102,10 +106,10 @@ _CHECK_OPTIONS = [
                  help="Steps on the emulated robot per guide.  [default: 60; with --quick: 0]"),
     click.option("--seed", type=SEED, default=0, show_default=True, metavar="N", help="Seed of the search and of the noise."),
     click.option("--quick", is_flag=True,
-                 help="Run a short search: only on the ideal plant, and only pushes up to the certified torques."),
+                 help="Run a short search, by default only on the ideal plant and without pushes above the certified torques."),
     click.option("--plot", type=OutputFile(".png", ".svg", ".pdf"), metavar="FILE",
-                 help="Draw the last guide: its bounds, the worst step, and the safe backward image (tracking errors from which "
-                      "the backup policy keeps the joints inside the guide)."),
+                 help="Draw the last guide with its bounds, the worst step, and the tracking errors from which the controller "
+                      "can still keep the joints inside the guide (safe backward image)."),
     click.option("--table", type=OutputFile(".md"), metavar="FILE", help="Write the results as a Markdown table."),
     click.option("--results", type=OutputFile(".jsonl"), metavar="FILE",
                  help="Append each result to this file. Guides that the file already contains are not checked again, so the same "
@@ -116,11 +120,12 @@ _CHECK_OPTIONS = [
 @command.command(short_help="Search for the worst push within the promise of a guide.")
 @options_as("options", CheckOptions, [*_CHECK_OPTIONS, law_options(), json_option, subject_options])
 def check(options: CheckOptions, as_json: bool, subject: Subject | None) -> None:
-    """Search for the worst push up to the certified torques of each guide, and print the torques and the worst |e| / q_bound.
+    """Search for the worst push up to the certified torques of each guide, and print a table of the results.
 
     A push acts on hip and knee of the swing leg at the same time. The torque at each joint is at most the certified torque, and
-    its direction may change at any time. The promise is kept if the ratio |e| / q_bound is at most 1. The column "left at" is
-    the smallest multiple of the promise that moved a joint out of the guide. The exit code is 1 if a promise is broken. With
+    its direction may change at any time. The result of a push is the ratio |e| / q_bound: the tracking error, divided by the
+    distance from the desired angle to the edge of the guide. The promise is kept if the ratio is at most 1. The column "left at"
+    is the smallest multiple of the promise that moved a joint out of the guide. The exit code is 1 if a promise is broken. With
     --push, a broken promise does not change the exit code. --literal certifies no torque: a search needs --push.
 
     \b
@@ -153,7 +158,8 @@ def check(options: CheckOptions, as_json: bool, subject: Subject | None) -> None
         worst = max(broken, key=lambda verdict: verdict.worst_ratio or 0.0)
         raise Failed(
             f"all {len(verdicts)} certified guides must withstand the pushes, but {len(broken)} did not; worst: {worst.shape} at "
-            f"Xi {worst.xi:g} with |e| / q_bound {worst.worst_ratio:.3f}{f' ({worst.stopped})' if worst.stopped else ''}"
+            f"Xi {worst.xi:g} with |e| / q_bound {worst.worst_ratio:.3f} (1: edge of the guide)"
+            f"{f', {worst.stopped}' if worst.stopped else ''}"
         )
 
 
@@ -316,5 +322,5 @@ def random_command(count: int, first: int, steps: int, seed: int, as_json: bool)
         worst = max(left, key=lambda v: v.worst_ratio or 0.0)
         raise Failed(
             f"no joint may leave a certified guide, but in {len(left)} certified guides a joint moved out; worst: "
-            f"{worst.shape} at Xi {worst.xi:.3f} with |e| / q_bound {worst.worst_ratio:.3f}"
+            f"{worst.shape} at Xi {worst.xi:.3f} with |e| / q_bound {worst.worst_ratio:.3f} (1: edge of the guide)"
         )

@@ -1,4 +1,7 @@
-"""Simulation of walking steps on the ideal plant with the controller of the robot: `start, push -> |e| / q_bound over the step`.
+"""Simulation of single walking steps on the ideal plant (model of one swing leg), with the controller of the robot.
+
+`state at the start, push -> |e| / q_bound in each cycle`. The ratio is the tracking error e, divided by the distance q_bound from
+the desired angle to the edge of the guide. A joint with a ratio above 1 is outside the guide.
 
 Each step calls the compiled cycle of the real controller, so the check covers the control law that runs on the robot. At the
 start of a step, the torques from before the stance change still act. The plant, the limiter and the drives are the same as in the
@@ -43,47 +46,48 @@ LOG = (
     "rate_hip",
     "rate_knee",
 )
-#: Number of features, the inputs of `Push.feedback`: e / q_bound of hip and knee, then e' / `RATE` of hip and knee. e is the
-#: tracking error.
+#: Number of values to which a push can react (`Push.feedback`): tracking error and error rate, each of hip and knee.
 FEATURES = 4
-#: Error rate e' for which a feature has the value 1 [rad/s].
+#: Unit of the error rate in `Push.feedback` [rad/s]: a rate of 0.5 rad/s counts as 1.
 RATE = 0.5
 
 
 class Push(NamedTuple):
     """Push at hip and knee during one step. The push always has the largest torque, and only its direction changes.
 
-    The direction is the sign of the sum `signs[cycle] + feedback @ features`. The features describe the motion of the leg in
-    the current cycle: e / q_bound and e' / `RATE` of hip and knee. e is the tracking error.
+    The direction at hip and knee is the sign of `signs[cycle] + feedback @ features`. The array `features` describes the motion
+    of the leg in the current cycle, shape (4,): e / q_bound of hip and knee, then e' / `RATE` of hip and knee. e is the tracking
+    error.
     """
 
-    signs: Vector  # part of the sum that ignores the motion; rows: cycles, columns: hip, knee; shape (cycles + 1, 2)
-    feedback: Vector  # weight of each feature in the sum; rows: hip, knee; columns: features; shape (2, FEATURES)
+    signs: Vector  # planned direction, positive or negative, in each cycle (row) at hip and knee (columns); shape (cycles + 1, 2)
+    feedback: Vector  # reaction of the push at hip and knee (rows) to each of the four features (columns); shape (2, FEATURES)
 
 
 class Start(NamedTuple):
     """State of the leg at the stance change."""
 
-    deviation: Pair  # q - q_nom of SH and SK [rad]
-    rate: Pair  # q' - q_nom' of SH and SK [rad/s]
-    #: surplus torque at the stance change [Nm]: torque just before, minus the torque for the nominal acceleration just after
+    deviation: Pair  # angle minus nominal angle, of hip and knee [rad]
+    rate: Pair  # speed minus nominal speed, of hip and knee [rad/s]
+    #: motor torque before the stance change, minus the torque for the nominal acceleration after the change, of hip and knee [Nm]
     carried: Pair
-    ahead: Pair  # true minus measured speed of SH and SK [rad/s]; the measured speed lags, because it is filtered
+    ahead: Pair  # real speed minus measured speed, of hip and knee [rad/s]; a filter delays the measured speed
 
 
 class Goal(NamedTuple):
     """Desired motion of the plant, and the guide around this motion."""
 
-    q: Vector  # q_des [rad], shape (cycles + 1, 2)
-    qd: Vector  # q_des' [rad/s], shape (cycles + 1, 2)
-    bounds: Vector  # distances from q_des to the guide edges [rad], shape (2, cycles + 1, 2): joint, cycle, edge (upper, lower)
+    q: Vector  # desired angles of hip and knee (columns) in each cycle (row) [rad], shape (cycles + 1, 2)
+    qd: Vector  # desired speeds of hip and knee (columns) in each cycle (row) [rad/s], shape (cycles + 1, 2)
+    #: distances from the desired angle to the guide edge [rad], shape (2, cycles + 1, 2). Axes: joint, cycle, edge (upper, lower)
+    bounds: Vector
 
 
 class Walked(NamedTuple):
     """Result of a simulated step."""
 
-    ratio: float  # largest |e| / q_bound
-    cycle: int  # cycle with the largest ratio
+    ratio: float  # largest ratio |e| / q_bound of the step; above 1: a joint was outside the guide
+    cycle: int  # cycle with the largest ratio |e| / q_bound
     joint: int  # joint with the largest ratio |e| / q_bound: 0 for the hip, 1 for the knee
     log: Vector  # values of each cycle, shape (cycles + 1, len(LOG)); zero after an early end of the step
 
@@ -123,10 +127,10 @@ class Setup:
 
 
 class IdealLeg:
-    """Left leg of the ideal plant. The leg swings in one guide at one assistance factor."""
+    """Simulated left leg that swings, for one guide and one assistance factor."""
 
     def __init__(self, setup: Setup, controller: AirwalkController, xi: float) -> None:
-        """Sample the nominal motion and the guide.
+        """Compute the nominal motion and the bounds of the guide at every cycle of a step.
 
         Args:
             setup: gait, robot and model.
@@ -140,10 +144,12 @@ class IdealLeg:
         time: Vector = np.arange(self.cycles + 1, dtype=np.float64) * PERIOD
         phase: Vector = time / duration
         x: Vector = np.minimum(time / end, 1.0)[:, None]
-        #: q_nom [rad], q_nom' [rad/s] and q_nom'' [rad/s2] of hip and knee, each of shape (cycles + 1, 2).
+        #: Nominal angles [rad], speeds [rad/s] and accelerations [rad/s2] of hip and knee, each of shape (cycles + 1, 2).
         self.nominal: tuple[Vector, Vector, Vector] = motion(coefficients, duration, phase)
-        # s = q_des - q_nom is a cubic polynomial of time: s(t) = s(0) * _s[0] + s'(0) * _s[1]. From the time `end` on, s is zero.
+        # The desired motion leads from the start state back to the nominal motion, which it reaches at the time `end`.
+        # Remaining angle deviation = angle deviation at the start * `_s[0]` + speed deviation at the start * `_s[1]`.
         self._s = 1.0 - 3.0 * x**2 + 2.0 * x**3, end * (x - 2.0 * x**2 + x**3)
+        # `_sd` is the time derivative of `_s`.
         self._sd = (-6.0 * x + 6.0 * x**2) / end, 1.0 - 4.0 * x + 3.0 * x**2
         self.bounds: Vector = controller.guide_at(xi).shape.bounds(phase, xi)
         self._mean = gait.tables().q.mean(axis=0)
@@ -181,11 +187,11 @@ class IdealLeg:
         return Walked(float(ratio), int(cycle), int(joint), log)
 
     def image(self, start: Start) -> Vector:
-        """Return the largest safe tracking errors of each joint, in positive and in negative direction.
+        """Return the largest tracking errors from which the controller can still keep both joints inside the guide.
 
-        An error is safe (h >= 0) if the backup policy can keep both joints inside the guide after this error. Only the angle of
-        one joint deviates from the desired motion. The angle of the second joint and both speeds do not deviate. The set of safe
-        states is called the safe backward image.
+        For such an error, the safety value h is at least 0, so the backup policy can keep both joints inside the guide. Only the
+        angle of one joint deviates from the desired motion. The angle of the second joint and both speeds do not deviate. The set
+        of all states with h >= 0 is called the safe backward image.
 
         Args:
             start: state at the stance change.
@@ -217,9 +223,10 @@ class Episode(NamedTuple):
     goal: Goal
     push: Push
     box: Vector  # largest push at hip and knee [Nm], shape (2,)
-    noise: Vector  # random numbers from `noise_of`, shape (cycles + 1, 4)
+    noise: Vector  # encoder noise, and random numbers that select lost frames, see `noise_of`; shape (cycles + 1, 4)
     before: Vector  # torque before the stance change [Nm], shape (2,)
-    other: Vector  # angles [rad], then speeds [rad/s] of all joints, shape (24,); hip and knee are not used
+    #: 12 angles [rad], then 12 speeds [rad/s], shape (24,): values of the ten joints at rest. Values of hip and knee are ignored
+    other: Vector
     log: Vector  # values of each cycle, overwritten by `walk_step`, shape (cycles + 1, len(LOG))
 
 
@@ -300,7 +307,7 @@ def walk_step(
             motor[i] += constants.tracking * (latched[i] - motor[i])
         if cycle < cycles:
             advance(constants, leg, motor[0] + log[cycle, 4], motor[1] + log[cycle, 5])
-        # The drives apply the command of this cycle `1 + constants.delay` cycles later.
+        # `waiting` is a ring buffer. The drives apply the command of this cycle `1 + constants.delay` cycles later.
         waiting[cycle % len(waiting)] = last
         if noise[cycle, 3] >= constants.loss:
             latched[:] = waiting[(cycle + 1) % len(waiting)]
@@ -308,9 +315,10 @@ def walk_step(
 
 
 def safe_errors(goal: Goal, row: Vector, image: Vector, measured: Measured, guide: GuideTables, parts: Parts) -> None:
-    """Find the largest safe tracking errors of each joint at every tenth cycle, by bisection.
+    """Find the largest tracking errors from which the controller can still keep both joints inside the guide.
 
-    An error is safe if the controller returns h >= 0. Then the backup policy can keep both joints inside the guide.
+    A bisection finds the errors of each joint at every tenth cycle. An error is safe if the controller returns h >= 0. Then the
+    backup policy can keep both joints inside the guide.
 
     Args:
         goal: desired motion and guide.

@@ -1,4 +1,4 @@
-"""Figure of a checked guide: bounds, states from which the backup policy keeps the joints inside, and worst step."""
+"""Figure of a checked guide: the bounds, the safe area inside the bounds, and the worst simulated step."""
 
 from __future__ import annotations
 

@@ -1,6 +1,7 @@
-r"""Ideal plant for the search for the worst push: hip and knee of one swing leg in the air, with drives, encoders and limiter.
+r"""Ideal plant: simulated hip and knee of one swing leg in the air, with drives, encoders and limiter.
 
-`torque command, push -> motion, measurements`. The plant shares no table with the controller. Its equation of motion is
+`torque command, push -> motion, measurements`. The search for the worst push uses the plant. The plant shares no table with the
+controller. The equation of motion of the plant is
 
 .. math:: m\,[M(q) \ddot q + c(q, \dot q) + g(q)] + f\,r(\dot q) = u + d
 
@@ -31,7 +32,7 @@ from atalante_hal.types import Vector
 
 #: Indices in JOINTS of the sagittal hip and the sagittal knee of the left leg.
 HIP, KNEE = JOINTS.index("left_SH"), JOINTS.index("left_SK")
-#: Angles of hip and knee at which the rigid-body dynamics are evaluated for the fit [rad].
+#: Angles of hip and knee at which the coefficients of the plant are fitted to the rigid-body dynamics [rad].
 _HIP_ANGLES = np.linspace(-1.6, 0.2, 7)
 _KNEE_ANGLES = np.linspace(0.0, 1.9, 7)
 #: Number of integration steps per cycle.
@@ -42,11 +43,11 @@ _SUBSTEPS = 2
 class Condition:
     """Deviation of the plant from the model of the controller."""
 
-    friction: float = 1.0  # true friction as a multiple of the compensated friction
-    mass: float = 1.0  # true mass as a multiple of the mass in the model; scales inertia and weight
+    friction: float = 1.0  # real friction divided by the friction that the controller compensates
+    mass: float = 1.0  # real mass divided by the mass in the model; scales inertia and weight
     noise: float = 0.0  # noise of the joint encoders [rad rms]
-    loss: float = 0.0  # probability of losing the measurement of a cycle; the same probability holds for the command
-    delay: int = 0  # additional cycles until a command acts
+    loss: float = 0.0  # probability that the measurements of a cycle are lost; same value for the commands of a cycle
+    delay: int = 0  # further delay of a command [cycles]; with 0, a command acts one cycle after it is computed
 
     def __str__(self) -> str:
         """Return the deviations as text, for example "friction +20 %, 1 ms delay". The text for no deviation is "as modelled"."""
@@ -62,23 +63,24 @@ class Condition:
 class Plant(NamedTuple):
     """Constants of the plant for compiled functions. Index 0 is the hip, index 1 the knee."""
 
-    #: Coefficients a, b, c (columns) of the elements M11, M12, M22 (rows) of the 2x2 mass matrix [kg m2], shape (3, 3).
-    #: Each element is a + b cos(knee angle) + c sin(knee angle).
+    #: Mass matrix of hip and knee [kg m2]: coefficients a, b, c of the element M11, then of M12, then of M22, shape (3, 3).
+    #: An element of the mass matrix is a + b cos(knee angle) + c sin(knee angle).
     mass: Vector
-    #: Coefficients a, b, c, d (columns) of the gravity torques of hip and knee (rows) [Nm], shape (2, 4).
-    #: Each torque is a cos(q_SH) + b sin(q_SH) + c cos(q_SH + q_SK) + d sin(q_SH + q_SK).
+    #: Gravity torques [Nm]: coefficients a, b, c, d of the torque at the hip, then of the torque at the knee, shape (2, 4).
+    #: A gravity torque is a cos(q_SH) + b sin(q_SH) + c cos(q_SH + q_SK) + d sin(q_SH + q_SK).
     weight: Vector
     coulomb: Vector  # dry friction [Nm], shape (2,)
     viscous: Vector  # viscous friction [Nm s/rad], shape (2,)
     friction_speed: float  # speed at which dry friction reaches 76 % of its full value [rad/s]
-    tracking: float  # in each cycle, the difference between command and motor torque falls by this share, 0 to 1
+    tracking: float  # share of the difference between command and motor torque that disappears in one cycle, 0 to 1
     keep: float  # weight of the old value in the velocity filter, 0 to 1
     torque_max: Vector  # torque limit of the limiter [Nm], shape (2,)
     torque_step: Vector  # largest change of the command in a cycle [Nm], shape (2,)
     velocity_max: Vector  # speed above which the limiter reduces the torque [rad/s], shape (2,)
-    velocity_margin: float  # at `velocity_max` plus this speed, the limiter has reduced the torque to zero [rad/s]
-    delay: int  # additional cycles until a command acts
-    loss: float  # probability of losing the measurement of a cycle; the same probability holds for the command
+    #: width of the speed range above `velocity_max` in which the limiter reduces the torque to zero [rad/s]
+    velocity_margin: float
+    delay: int  # further delay of a command [cycles]; with 0, a command acts one cycle after it is computed
+    loss: float  # probability that the measurements of a cycle are lost; same value for the commands of a cycle
 
 
 def plant(
@@ -144,12 +146,18 @@ def _fitted(articulated: ArticulatedModel, pose: Vector) -> tuple[Vector, Vector
     weight, weight_error = _least_squares(sums, weights)
     error = max(mass_error, weight_error)
     if not error < 1e-6:
-        raise RuntimeError(f"the swing leg must be a planar chain of hip and knee, got a deviation of {error:.3g}")
+        raise RuntimeError(
+            f"the plant must match the dynamics of the swing leg to 1e-6 (Nm, kg m2), got an error of {error:.3g}"
+        )
     return mass, weight
 
 
 def _least_squares(basis: list[list[float]], values: list[Any]) -> tuple[Vector, float]:
-    """Fit each column of `values` by the columns of `basis`. Return a row of coefficients per fit, and the largest error."""
+    """Fit each column of `values` with a weighted sum of the columns of `basis`.
+
+    Returns:
+        Weights, one row per column of `values`, and the largest error of all fits.
+    """
     x, y = np.array(basis), np.array(values)
     coefficients: Vector = np.linalg.lstsq(x, y, rcond=None)[0].T.copy()
     return coefficients, float(np.abs(x @ coefficients.T - y).max())
@@ -171,7 +179,7 @@ def inverse_dynamics(constants: Plant, q: Vector, qd: Vector, qdd: Vector) -> Ve
 def dynamics(
     constants: Plant, hip: float, knee: float, hip_rate: float, knee_rate: float
 ) -> tuple[float, float, float, float, float]:
-    """Return the mass matrix of hip and knee, and for each joint the torque that does not depend on the acceleration.
+    """Return the mass matrix of hip and knee, and the torques at hip and knee without acceleration.
 
     Args:
         constants: constants of the plant.
@@ -236,7 +244,7 @@ def _acceleration(
 
 
 def limited(constants: Plant, joint: int, requested: float, last: float, velocity: float) -> float:
-    """Return the command [Nm] after the limits of torque, speed and torque rate.
+    """Limit a requested torque by torque, speed and torque rate, and return the command [Nm].
 
     Args:
         constants: constants of the plant.

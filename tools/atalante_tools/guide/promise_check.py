@@ -1,11 +1,11 @@
-"""Check of a guide: search for the worst push, and comparison with the certified torques. `gait, shape, Xi -> Verdict`.
+"""Check of a guide: search for a push up to the promised torques that moves a joint out of the guide.
 
-The promise of a guide is one torque at the hip and one torque at the knee. The search (class `Adversary`) uses pushes
-up to these torques, unless `Task.push` gives other limits. At the start of a step, the leg deviates from the nominal
-motion. The hand-over box (`HandOver`) is the range of start deviations for which the promise holds. The steps of the
-search start in the centre and in corners of this box. The search runs on the ideal plant. Then the worst pushes are
-repeated on the emulated robot, together with constant pushes, pushes that follow the error or its rate, and pushes that
-switch at random.
+`gait, shape, Xi -> Verdict`. The promise of a guide is one torque at the hip and one torque at the knee. The search
+(class `Adversary`) uses pushes up to these torques, unless `Task.push` gives other limits. At the start of a step, the leg
+deviates from the nominal motion. The hand-over box (`HandOver`) is the range of start deviations for which the promise holds. The
+steps of the search start in the centre and in corners of this box. The search runs on the ideal plant. Then the worst pushes are
+repeated on the emulated robot, together with constant pushes, pushes that follow the error rate or the sum of error and error
+rate, and pushes that switch at random.
 """
 
 from __future__ import annotations
@@ -34,8 +34,8 @@ from atalante_tools.guide.search import DIRECTIONS, Adversary, Tried
 
 Pair = tuple[float, float]
 
-#: Name for the option --condition -> deviations of plant and robot from the model that the search tries. For example, the name
-#: "friction" stands for 80 % and 120 % of the modelled friction.
+#: Value of the option --condition -> deviations from the model of the controller. The search tries all these deviations.
+#: For example, the value "friction" stands for two deviations: 80 % and 120 % of the modelled friction.
 CONDITIONS: Final = {
     "model": (Condition(),),
     "friction": (Condition(friction=0.8), Condition(friction=1.2)),
@@ -45,28 +45,28 @@ CONDITIONS: Final = {
     "loss": (Condition(loss=0.01),),
     "delay": (Condition(delay=1),),
 }
-#: Patients of the option --patients, for whom the neural gait network computes gaits. An entry has the mass [kg], height [m],
-#: step length [m] and step duration [s].
+#: Patients of the option --patients: (mass [kg], height [m], step length [m], step duration [s]).
+#: The neural gait network computes a gait for each patient.
 PATIENTS: Final = (
     (58.0, 1.62, 0.10, 0.9), (58.0, 1.65, 0.15, 0.9), (61.0, 1.65, 0.15, 0.8), (64.0, 1.70, 0.12, 1.0),
     (67.0, 1.68, 0.18, 0.9), (70.0, 1.75, 0.15, 0.9), (73.0, 1.70, 0.10, 0.8), (76.0, 1.80, 0.15, 1.0),
     (80.0, 1.75, 0.18, 0.9), (84.0, 1.80, 0.12, 0.9), (88.0, 1.85, 0.15, 0.9), (91.0, 1.85, 0.15, 0.9),
 )  # fmt: skip
-#: Number of corners of the hand-over box (range of start deviations) in which steps start.
+#: Number of start states that are corners of the hand-over box (range of deviations at the start of a step).
 _CORNERS: Final = 64
 #: Lag of the measured velocity of a drive [s], caused by the low-pass filter and by the sampling (half a cycle).
 _VELOCITY_LAG: Final = 2.0e-3
-#: The search for the smallest push that moves a joint out of the guide multiplies the push limits by at most this factor.
+#: Largest factor on the push limits that is tried in the search for the smallest push that moves a joint out of the guide.
 LARGEST_FACTOR: Final = 6.0
-#: For each factor on the push limits, the search for this smallest push simulates a share of `Effort.steps`: 150 of 1500 steps.
+#: Number of steps per tried factor on the push limits, divided by `Effort.steps`. With 1500 steps, each factor gets 150 steps.
 _SHARE: Final = 0.1
 
 
 @dataclass(frozen=True)
 class Effort:
-    """Number of steps and extent of the search for the check of one guide."""
+    """Settings for the search in one guide: numbers of steps, and whether to search for larger pushes."""
 
-    steps: int  # number of steps on the ideal plant with pushes up to the certified torques
+    steps: int  # number of steps on the ideal plant with pushes up to the push limits of the check
     robot_steps: int  # number of steps on the emulated robot; 0: the robot is not used
     tightness: bool  # whether to search for the smallest push that moves a joint out of the guide
 
@@ -87,25 +87,28 @@ class Task:
 
 @dataclass(frozen=True)
 class Verdict:
-    """Result of a check. The field names are the keys of `--json`."""
+    """Result of the check of one guide. The field names are the JSON keys of `atalante guide check --json`.
+
+    A ratio is |e| / q_bound: the tracking error, divided by the distance from the desired angle to the edge of the guide. If a
+    ratio is above 1, a joint was outside the guide.
+    """
 
     shape: str
     xi: float
     gait: str
     certified: bool
-    #: largest push at the hip [Nm]: `Task.push` if given, otherwise the certified torque; None if there is neither
+    #: push limit at the hip [Nm]: `Task.push`, or the certified torque if `Task.push` is None; None: no search was possible
     promise_hip_nm: float | None
-    #: largest push at the knee [Nm]: `Task.push` if given, otherwise the certified torque; None if there is neither
+    #: push limit at the knee [Nm]: `Task.push`, or the certified torque if `Task.push` is None; None: no search was possible
     promise_knee_nm: float | None
-    worst_ratio: float | None  # largest |e| / q_bound of plant and robot; None if no step was walked
-    steps: int  # number of steps on plant and robot
-    plant_ratio: float | None  # largest |e| / q_bound on the ideal plant
-    robot_ratio: float | None  # largest |e| / q_bound on the emulated robot; None if the robot was not used
-    worst_push: str  # kind of the worst push on the plant
+    worst_ratio: float | None  # larger one of `plant_ratio` and `robot_ratio`; None if no step was simulated
+    steps: int  # total number of steps on the ideal plant and on the emulated robot
+    plant_ratio: float | None  # largest ratio |e| / q_bound on the ideal plant; None if no step was simulated
+    robot_ratio: float | None  # largest ratio |e| / q_bound on the emulated robot; None if the robot was not used
+    worst_push: str  # kind of the worst push on the ideal plant, for example "constant" or "bang-bang"
     worst_condition: str  # deviation of the plant from the model in the worst step, for example "friction +20 %"
     stopped: str  # reason why the robot left ACTIVE; empty if the robot stayed in ACTIVE
-    #: smallest factor on the largest push (`promise_hip_nm`, `promise_knee_nm`) with which a joint left the guide; None if not
-    #: searched or not found
+    #: smallest multiple of the push limits with which a joint left the guide, such as 1.3; None if not searched or not found
     left_at: float | None
     reason: str  # what limits the certified torques, or why there are none
 
@@ -121,12 +124,14 @@ class Checked:
 
     verdict: Verdict
     leg: IdealLeg  # simulated leg that swings in the guide
-    #: simulated step with the largest |e| / q_bound; None if the guide has no promise and `Task.push` is None
+    #: step on the ideal plant with the largest |e| / q_bound; None if there was no search, because there were no push limits
     worst: Tried | None
 
 
 def setup_of(subject: Subject | None, robot: Robot, config: AirwalkConfig | None = None) -> Setup:
-    """Return gait, robot and model for the default gait, or for the network gait of a subject.
+    """Return gait, robot and model, the inputs of a check.
+
+    The gait is the default gait, or the gait that the gait network computes for the subject.
 
     Args:
         subject: patient and step; None means the default gait.
@@ -142,7 +147,7 @@ def setup_of(subject: Subject | None, robot: Robot, config: AirwalkConfig | None
 
 
 def patients() -> list[Subject]:
-    """Return the patients and step parameters of `PATIENTS` as inputs of the gait network."""
+    """Convert `PATIENTS` to subjects, the inputs of the gait network."""
     return [Subject(Patient(mass, height), length, duration) for mass, height, length, duration in PATIENTS]
 
 
@@ -231,14 +236,18 @@ def _on_robot(robot: PushedRobot, box: Pair, found: Sequence[Tried], task: Task)
     each = -(-task.effort.robot_steps // len(conditions))
     walks = []
     for number, condition in enumerate(conditions):
-        first = number * each % len(pushes)  # rotate the list, so that every walk begins with another push
+        first = number * each % len(pushes)  # rotate the list of pushes, so that the walks begin at different pushes
         walks.append(robot.walk(box, [*pushes[first:], *pushes[:first]], condition, each, seed + number))
     stopped = next((walk.stopped for walk in walks if walk.stopped), "")
     return RobotWalk(tuple(step for walk in walks for step in walk.steps), stopped)
 
 
 def _robot_pushes(cycles: int, generator: np.random.Generator) -> list[Push]:
-    """Return pushes of three kinds: constant, following the error and its rate, and switching at random."""
+    """Return constant pushes, pushes that react to the motion of the leg, and pushes that switch at random.
+
+    A push that reacts follows the sign of the error rate of one joint, or of the sum of error and error rate. At the second
+    joint, the push has the same direction or the opposite direction.
+    """
     none = np.zeros((2, FEATURES))
     pushes = [Push(np.tile(direction, (cycles, 1)), none) for direction in DIRECTIONS]
     for joint, other, (error, rate) in itertools.product((0, 1), (-1.0, 1.0), ((0.0, 1.0), (1.0, 1.0))):
@@ -254,7 +263,7 @@ def _robot_pushes(cycles: int, generator: np.random.Generator) -> list[Push]:
 
 
 def conditions_of(names: Sequence[str]) -> list[Condition]:
-    """Return the conditions with the given names, or all conditions if there are no names.
+    """Return the deviations from the model with the given names, or all deviations if `names` is empty.
 
     Args:
         names: keys of `CONDITIONS`.

@@ -12,8 +12,8 @@ from atalante_control.guide.shapes import GuideShape
 from atalante_hal.types import Vector
 
 KINDS: Final = ("smooth", "notched", "piecewise")
-#: Smallest and largest random width above or below the desired trajectory, as fractions of `half_width(xi)`.
-#: In a notch, `_NARROW` has another meaning: smallest width in the notch, divided by the width beside the notch.
+#: Range of the random distances from the desired trajectory to an edge of the guide, as fractions of `half_width(xi)`.
+#: `_NARROW` is also the smallest width inside a notch, as a fraction of the width beside the notch.
 _NARROW, _WIDE = 0.15, 1.0
 #: Largest assistance factor of a random guide.
 _LARGEST_FACTOR: Final = 0.95
@@ -39,7 +39,7 @@ def random_guide(seed: int, number: int) -> RandomGuide:
         "smooth": _smooth, "notched": _notched, "piecewise": _piecewise,
     }[kind]  # fmt: skip
     sides = [make(generator) for _ in range(4)]
-    if generator.random() < 0.5:  # equal distances above and below the desired trajectory
+    if generator.random() < 0.5:  # upper and lower edge at the same distance from the desired trajectory
         sides[1], sides[3] = sides[0], sides[2]
     xi = float(generator.uniform(0.0, _LARGEST_FACTOR))
 
@@ -51,7 +51,7 @@ def random_guide(seed: int, number: int) -> RandomGuide:
 
 
 def _smooth(generator: np.random.Generator) -> Callable[[Vector], Vector]:
-    """Return a function of the phase: the sum of four sine waves, scaled to a random range."""
+    """Return a smooth guide width as a function of the phase: a sum of four sine waves, scaled to a random range of widths."""
     waves = generator.normal(size=4) / np.arange(1, 5), 2.0 * math.pi * generator.random(4)
     low, high = np.sort(generator.uniform(_NARROW, _WIDE, 2))
     samples = _waves(np.linspace(0.0, 1.0, 801), *waves)
@@ -64,7 +64,7 @@ def _waves(phase: Vector, sizes: Vector, shifts: Vector) -> Vector:
 
 
 def _notched(generator: np.random.Generator) -> Callable[[Vector], Vector]:
-    """Return a function of the phase: a constant with one to four notches. Each notch lasts 0.2 to 5 % of the step."""
+    """Return a guide width as a function of the phase: constant, but narrower in one to four notches (0.2 to 5 % of the step)."""
     width, count = float(generator.uniform(0.5, _WIDE)), int(generator.integers(1, 5))
     centres, lengths = generator.random(count), 0.5 * 10.0 ** generator.uniform(-2.7, -1.3, count)
     depths = generator.uniform(_NARROW, 0.9, count)
@@ -77,7 +77,7 @@ def _notched(generator: np.random.Generator) -> Callable[[Vector], Vector]:
 
 
 def _piecewise(generator: np.random.Generator) -> Callable[[Vector], Vector]:
-    """Return a function of the phase that consists of three to twelve constant pieces."""
+    """Return a guide width as a function of the phase, with three to twelve constant pieces."""
     edges = np.sort(generator.random(int(generator.integers(2, 12))))
     widths = generator.uniform(_NARROW, _WIDE, len(edges) + 1)
     return lambda phase: np.asarray(widths[np.searchsorted(edges, phase, side="right")])

@@ -40,10 +40,10 @@ LATCH_PROPERTY: Final = "a local hold ends only on QUICK STOP and then ENABLE OP
 
 
 class Drive(NamedTuple):
-    """State of a drive."""
+    """State of a drive between two cycles."""
 
     state: DriveState
-    latched: bool
+    latched: bool  # whether the drive left OPERATION ENABLED by itself; a latched drive ignores ENABLE OPERATION
     missed: int  # age of the last valid command [cycles]; ages above `WATCHDOG` are stored as `WATCHDOG`
     unsynced: int  # number of consecutive cycles without SYNC; higher numbers are stored as `WATCHDOG`
     errors: tuple[int, ...]  # codes of the errors whose cause persists
@@ -65,8 +65,8 @@ class DriveCycle(NamedTuple):
 
     word: int | None = None  # controlword of a valid new command; None: no valid command arrives
     delay: int = 0  # delay of the command [cycles]
-    sync: bool = True
-    second_sender: bool = False
+    sync: bool = True  # whether SYNC arrives
+    second_sender: bool = False  # whether the drive detects commands of two senders
     error: tuple[int, bool] | None = None  # code of an error that begins in this cycle, and whether its cause persists
     ended: int | None = None  # code of the error whose cause ends in this cycle
     rest: bool = False  # the joint comes to rest

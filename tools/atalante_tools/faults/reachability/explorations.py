@@ -34,7 +34,7 @@ from atalante_tools.faults.reachability.search import Exploration, Transition, e
 _S = SupervisorState
 #: Stop actions of the operator: no stop action, dead-man switch released, STOP pressed, HOLD pressed.
 NOTHING, RELEASED, STOPPED, HELD = range(4)
-#: Value of `Inputs.stop` after the HAL has received HOLD. The stop actions above have other numbers than `Inputs.stop`.
+#: Value of `Inputs.stop` after the HAL has received HOLD. `HELD` (3) has another meaning: the operator has pressed HOLD.
 RECEIVED_HOLD: Final = 2
 #: If no new pendant frame arrives after a stop action, the HAL may still enable a drive for this number of cycles.
 SILENT_PENDANT: Final = LOST - 1
@@ -50,13 +50,13 @@ RESTART_PROPERTY: Final = "no change from HOLD, LOWER or FAULT to ACTIVE without
 
 
 class Operator(NamedTuple):
-    """Stop action of the operator, and number of cycles since then.
+    """Stop action of the operator, and number of cycles since this action.
 
     The search `stops` checks its property with these values.
     """
 
-    stop: int = NOTHING
-    cycles: int = 0
+    stop: int = NOTHING  # stop action: `NOTHING`, `RELEASED`, `STOPPED` or `HELD`
+    cycles: int = 0  # number of cycles since the stop action; numbers above `_LONG` are stored as `_LONG`
 
 
 class Presses(NamedTuple):
@@ -99,16 +99,16 @@ class Cycle(NamedTuple):
     operator: Operator = Operator()
 
 
-#: Dictionary of the possible results of receiving pendant frames. The key is a result, and the value is a tuple of frames that
-#: causes the result. A result has three elements: state of the reception, inputs of the operator, and whether the HAL received
-#: a press of START from the genuine pendant.
+#: All results that pendant frames can have in one cycle: result -> one example of frames that cause the result.
+#: A result consists of the state of the reception, the inputs of the operator, and whether the HAL received a press of START from
+#: the genuine pendant (not from a second sender).
 _Receptions = dict[tuple[Reception, Inputs, bool], tuple[PendantFrame, ...]]
 
 
 class _Decided(NamedTuple):
     supervision: Supervision
-    energises: bool  # the HAL sends ENABLE OPERATION to a drive
-    entered: bool
+    energises: bool  # whether the HAL sends ENABLE OPERATION to a drive
+    entered: bool  # whether the supervisor state changed
 
 
 #: Initial states of both searches: a moving robot, and a HAL after power-on.
@@ -135,10 +135,7 @@ class OperatorPath:
         self._decided, self._commanded = cache(self._decide), cache(self._command)
 
     def stops(self) -> Exploration[StopState, Cycle]:
-        """Search for a case in which the HAL still enables a drive too long after a stop action of the operator.
-
-        The time limit is `SILENT_PENDANT` cycles.
-        """
+        """Search for a drive that the HAL still enables `SILENT_PENDANT` or more cycles after a stop action of the operator."""
         return explore([StopState(*state) for state in _INITIAL], self._stop_successors)
 
     def moves(self) -> Exploration[MoveState, Cycle]:
@@ -216,7 +213,7 @@ class OperatorPath:
         return results
 
     def _command(self, state: Supervision, prevented: bool) -> tuple[bool, bool]:
-        """Return whether the HAL sends ENABLE OPERATION to a drive, and the new value of `Supervision.enabling`."""
+        """Return whether the HAL sends ENABLE OPERATION to a drive, and whether drives are being enabled."""
         sent = [self._steps.command(state, prevented, drive, "torque") for drive in DriveState]
         return any(word == ENERGISING for word, _ in sent), sent[0][1]
 
@@ -284,9 +281,13 @@ def _contents(before: Reception, age: int) -> Iterator[PendantFrame]:
 
 
 def _agrees(frame: PendantFrame, operator: Operator) -> bool:
-    """Return whether a frame agrees with the operator's stop action. A frame from before the action always agrees."""
+    """Return whether the pendant can have sent a frame with this content.
+
+    A frame that the pendant sampled after the operator's stop action must report the action. An earlier frame may have any
+    content.
+    """
     if frame.age > operator.cycles:
-        return True  # the pendant sampled the frame before the action of the operator
+        return True  # the pendant sampled the frame before the stop action
     return {
         NOTHING: True,
         RELEASED: not frame.dead_man,

@@ -38,20 +38,20 @@ _TAG: Final = _CYCLE & 0xFF
 #: `_PRESSES` is the RequestCounter in the last accepted frame of the pendant.
 #: `_ROGUE_PRESSES` is the RequestCounter in a frame in which a second sender reports a press.
 _PRESSES, _ROGUE_PRESSES = 10, 12
-#: Cycles in which the HAL may still process a START: none, only this cycle, or this cycle and further cycles.
+#: Time in which a pressed START can still change the supervisor state: no time, one cycle, or several cycles.
 NO_START, LAST_START, START = 0, 1, 2
-#: Value of `SafetyMonitor.start_cycles_left` for each of these three cases: number of cycles in which a START can still change
-#: the state.
+#: `NO_START`, `LAST_START` or `START` -> number of cycles in which a pressed START can still change the supervisor state. The
+#: search writes this number into `SafetyMonitor.start_cycles_left`.
 START_CYCLES: Final = {NO_START: 0, LAST_START: 1, START: 100}
-#: Whether the HAL trusts the pendant -> values of `Qualification` that the search tries in this case.
+#: Whether the HAL trusts the pendant -> error counters of the pendant (`Qualification`) that the search tries.
 QUALIFICATIONS: Final = {
     False: (Qualification(0, 0, False), Qualification(0, REQUALIFY - 1, False)),
     True: (SETTLED, Qualification(FULL - 4, REQUALIFY, True)),
 }
-#: Frame that `Pendant.evaluate` compares with the next frame, to find a press: no frame, the last accepted frame, an earlier
-#: frame, or a frame of a second sender.
+#: Last frame that the HAL checked for a press of a button: no frame, the last accepted frame, an earlier frame, or a frame of a
+#: second sender. If the next frame has another RequestCounter than the checked frame, a button was pressed.
 _NONE, _LATEST, _OLDER, _ROGUE = range(4)
-#: RequestCounter (counter of button presses) in each of these four frames.
+#: `_NONE`, `_LATEST`, `_OLDER` or `_ROGUE` -> RequestCounter (counter of button presses) in that frame.
 _EVALUATED: Final = {_NONE: None, _LATEST: _PRESSES, _OLDER: _PRESSES - 1, _ROGUE: _ROGUE_PRESSES}
 
 
@@ -64,7 +64,7 @@ class Reception(NamedTuple):
     evaluated: int = _LATEST  # last frame that the HAL checked for a press: `_NONE`, `_LATEST`, `_OLDER` or `_ROGUE`
     rogue: bool = False  # whether the last accepted frame has the RequestCounter of a second sender
     stored: bool = False  # whether a START is stored until the pendant is trusted
-    trusted: bool = True
+    trusted: bool = True  # whether the HAL trusts the pendant
     #: `Request` in the last intact frame of the genuine pendant, not of a second sender
     own_request: int = Request.START
 
@@ -77,8 +77,8 @@ class PendantFrame(NamedTuple):
     """Pendant frame that arrives in a cycle."""
 
     age: int  # number of cycles since the pendant sampled the content of the frame
-    dead_man: bool
-    request: int
+    dead_man: bool  # whether the dead-man switch is pressed
+    request: int  # `Request` of the frame
     pressed: bool  # whether a button was pressed since the last accepted frame
     sender: str = ""  # "" for the pendant, "rogue" for a second sender, "damaged" for a frame with a wrong CRC
 
@@ -86,20 +86,20 @@ class PendantFrame(NamedTuple):
 class Inputs(NamedTuple):
     """Inputs of the operator, as computed by `Pendant.evaluate`."""
 
-    dead_man: bool
+    dead_man: bool  # whether the dead-man switch is pressed
     stop: int  # stop request: 0 none, 1 STOP, 2 HOLD
-    started: bool
+    started: bool  # whether a press of START is accepted in this cycle
 
 
 class Supervision(NamedTuple):
-    """Part of the search state that belongs to the safety monitor of the HAL.
+    """Part of the search state: state of the safety monitor of the HAL.
 
     The search follows only one drive, the left frontal hip.
     """
 
     supervisor: SupervisorState
-    start: int  # `NO_START`, `LAST_START` or `START`
-    enabling: bool = False
+    start: int  # time in which a pressed START can still take effect: `NO_START`, `LAST_START` or `START`
+    enabling: bool = False  # whether drives are being enabled (`SafetyMonitor.enabling`)
     lowered: bool = False  # whether the HAL keeps the left frontal hip drive off, so that its joint sinks
 
 
@@ -107,8 +107,8 @@ class Environment(NamedTuple):
     """Inputs of the safety monitor that do not come from the pendant."""
 
     reaction: Reaction = Reaction.INFO  # reaction of the worst confirmed diagnostic
-    mine: bool = False  # whether the left frontal hip drive has this diagnostic; otherwise another drive has it
-    nodes_ready: bool = True
+    mine: bool = False  # whether the worst diagnostic belongs to the left frontal hip drive; False: to another drive
+    nodes_ready: bool = True  # whether all nodes except the pendant have sent a status message
     enabled: bool = True  # whether all drives are in OPERATION ENABLED
     walking: bool = False  # whether the robot walks on the ground
     finished: bool = True  # whether the walking step is finished
@@ -298,7 +298,7 @@ class HalSteps:
             yield Decision(after, monitor.start_prevented, after.supervisor is not before.supervisor)
 
     def command(self, state: Supervision, prevented: bool, drive: DriveState, controller: str) -> tuple[int, bool]:
-        """Return the controlword that the HAL sends to the drive, and the new value of `Supervision.enabling`.
+        """Return the controlword that the HAL sends to the drive, and whether drives are being enabled.
 
         Args:
             state: state of the safety monitor in this cycle.
@@ -329,8 +329,8 @@ class HalSteps:
         monitor._reports.clear()
         monitor.start_cycles_left, monitor.enabling, monitor.moving, monitor.walking = 0, False, False, False
         monitor.recalled = -RECALL_CYCLES  # skip the wait after QUICK_STOP, so that the search includes more STARTs
-        # `_stalled` counts cycles in which no drive changes its state. A high count ends a start. The search needs no count: in
-        # each cycle, it tries both that the start ends (`LAST_START`) and that the start continues (`START`).
+        # `_stalled` counts cycles in which no drive changes its state. A high count ends a start. The search needs no count:
+        # in each cycle, the search tries both that the start ends (`LAST_START`) and that the start continues (`START`).
         monitor._stalled = 0
         monitor._ending = monitor._duplicate_found = monitor._ramping = monitor._proof_begun = False
         monitor.lowered.clear()

@@ -1,4 +1,4 @@
-"""Bus of the HAL in the exhaustive searches: `receive` returns the frames that the search has stored in `arriving`."""
+"""Replacement for the CAN buses in the exhaustive searches. A search hands frames to the HAL without a network."""
 
 from __future__ import annotations
 
@@ -9,7 +9,10 @@ from atalante_hal.wire.frame import Frames, new_frames
 
 
 class NoBus:
-    """Bus that drops all sent frames. The next call of `receive` returns the frames in `arriving`."""
+    """Bus without a network. The HAL receives the frames that a search has stored in `arriving`.
+
+    Frames that the HAL sends are dropped.
+    """
 
     name = "none"
     dropped = 0

@@ -18,7 +18,7 @@ from atalante_tools.faults.reachability.explorations import (
 )
 from atalante_tools.faults.reachability.search import Exploration
 
-#: Name of each search -> properties that the search proves.
+#: Name of each search -> safety properties that the search checks in every reachable state.
 SEARCHES: Final = {
     "moves": (MOVE_PROPERTY, RESTART_PROPERTY),
     "stops": (STOP_PROPERTY,),

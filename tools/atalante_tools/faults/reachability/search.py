@@ -54,7 +54,7 @@ def explore(initial: Iterable[S], successors: Callable[[S], Iterable[Transition[
 
 
 def _trace(before: dict[S, tuple[L, S] | None], state: S) -> list[tuple[L, S]]:
-    """Return the cycles from an initial state to a given state: for each cycle, its inputs and the state after it."""
+    """Return one pair (inputs, state after the cycle) for each cycle from an initial state to the given state."""
     trace: list[tuple[L, S]] = []
     while (step := before[state]) is not None:
         label, origin = step
