@@ -199,6 +199,7 @@ def test_a_removed_adapter_does_not_cause_a_busy_loop(network: Network, monkeypa
     near, _ = lockstep_pair()
     slept: list[float] = []
     monkeypatch.setattr(resilient.time, "sleep", slept.append)
+    monkeypatch.setattr(resilient.time, "monotonic", lambda: 0.0)
     line = Line(near, network)
     near.close()
     for _ in range(3):
