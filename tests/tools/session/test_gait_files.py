@@ -234,7 +234,10 @@ def test_gait_file_that_states_no_patient_needs_one_on_the_ground(folder: Path) 
     write_gait(replace(gait, parameters={}), folder / "bare.json")
     done = atalante(*COMMANDS["walk"], "--gait", "bare.json", folder=folder)
     assert done.returncode == 1
-    assert "the parameters must contain patient_mass and patient_height, or add --mass and --height" in done.stderr
+    assert (
+        "the patient is unknown; add --mass and --height, or patient_mass and patient_height in the parameters"
+        in done.stderr
+    )
     done = atalante(*COMMANDS["walk"], "--gait", "bare.json", "--mass", "66", "--height", "168", folder=folder)
     assert done.returncode == 1
     assert "the parameters must contain step_length" in done.stderr

@@ -27,7 +27,7 @@ def test_can_log_and_fast_recording_need_a_core_for_telemetry(outputs: Outputs |
 @pytest.mark.parametrize(
     ("files", "missing", "sentence"),
     [
-        ((), 3, "the recording must be in a file, but no file was written"),
+        ((), 3, "the recording is missing: no file was written"),
         (("recording.mcap",), 3, "the recording is incomplete: 3 cycles are missing in recording.mcap"),
         (
             ("recording.mcap", "recording-1.mcap"),

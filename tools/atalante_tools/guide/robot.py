@@ -1,4 +1,7 @@
-"""Pushes on the emulated robot: `controller, pushes -> |e| / q_bound of each step`.
+"""Walk of the emulated robot under pushes: `controller, pushes -> largest |e| / q_bound of each step`.
+
+|e| / q_bound is the tracking error e of a joint, divided by the distance q_bound from the desired angle to the edge of the guide.
+A joint with a ratio above 1 is outside the guide.
 
 The robot walks in PyBullet, through the HAL in lock-step. A push is a real torque on the sagittal hip and knee of both legs.
 The push is added to the torque of the motor. The swing leg gets a push of a given list, for example a push that the
@@ -45,7 +48,7 @@ _STATES: Final = tuple(f"{joint.upper()}_STATE" for joint in JOINTS)
 class RobotStep(NamedTuple):
     """Recorded swing of one leg of the robot."""
 
-    ratio: float  # largest |e| / q_bound
+    ratio: float  # largest |e| / q_bound of the swing; above 1: a joint was outside the guide
     push: int  # index of the push in the list of pushes
     log: Vector  # values of each cycle, shape (cycles, n); the columns are `episode.LOG`
 
@@ -55,7 +58,7 @@ class RobotWalk:
     """Walk of the robot under pushes."""
 
     steps: tuple[RobotStep, ...]
-    stopped: str  # reason why the robot left ACTIVE before the last step; empty if all steps were walked
+    stopped: str  # state of the HAL, and reason why the walk ended too early; empty if all steps were walked
 
     @property
     def worst(self) -> RobotStep | None:

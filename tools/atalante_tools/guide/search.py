@@ -1,5 +1,8 @@
 """Search for the worst push on the ideal plant: `guide, limits of the push -> push with the largest |e| / q_bound`.
 
+|e| / q_bound is the tracking error e of a joint, divided by the distance q_bound from the desired angle to the edge of the guide.
+A joint with a ratio above 1 is outside the guide.
+
 The search uses the equation of motion, but not the control law. The search has three stages:
 
 1. *Guesses.* Constant pushes. Pushes that follow the sign of the error, or of the rate of the error (pumping). Pushes
@@ -30,24 +33,24 @@ from atalante_tools.guide.plant import Condition, Plant, dynamics
 Pair = tuple[float, float]
 _Choice = TypeVar("_Choice")
 
-#: Directions of a push: signs at hip and knee.
+#: The four directions of a push: (sign of the torque at the hip, sign of the torque at the knee).
 DIRECTIONS: Final = tuple(itertools.product((1.0, -1.0), repeat=2))
 #: A stage of the beam search has `_STAGE` cycles, and keeps the `_BEAM` pushes with the largest predicted deviation.
 _STAGE, _BEAM = 40, 6
 #: Time over which the beam search extrapolates a tracking error with its current rate [s].
 _AHEAD: Final = 0.03
-#: A search with at least this number of steps includes the beam search.
+#: Smallest budget of `search` with a beam search [simulated steps]. With a smaller budget, the beam search is left out.
 _WITH_BEAM: Final = 1000
-#: Stiffness and damping of the loop are identified from the samples whose |e| / q_bound is larger than this threshold.
+#: `_identified` uses only the cycles in which |e| / q_bound of hip or knee exceeds this value.
 _ACTING: Final = 0.5
-#: Number of pushes that the local search starts from.
+#: Number of worst steps from which the local search chooses the next step to change.
 _PARENTS: Final = 6
 
 
 class Tried(NamedTuple):
     """Walking step that the search has simulated on the plant: inputs and result."""
 
-    ratio: float  # largest |e| / q_bound
+    ratio: float  # largest |e| / q_bound of the step; above 1: a joint was outside the guide
     kind: str  # origin of the push
     start: Start
     push: Push
@@ -95,10 +98,11 @@ class Adversary:
         return self.tried[0]
 
     def leaving_factor(self, box: Pair, largest: float, budget: int) -> float | None:
-        """Return the smallest factor on the push limits with which the search finds a push that moves a joint out of the guide.
+        """Search for the smallest push limits that let a joint leave the guide, and return them as a factor on `box`.
 
-        The factor grows until the search finds such a push. A bisection then makes the factor accurate to 5 %. Return None if
-        the search finds no such push up to the limits `largest * box`.
+        Example: the factor is 1.5 if a push up to the limits `1.5 * box` moves a joint out of the guide. The factor grows until
+        the search finds such a push. A bisection then makes the factor accurate to 5 %. Return None if the search finds no such
+        push up to the limits `largest * box`.
 
         Args:
             box: push limits at hip and knee for the factor 1 [Nm].
@@ -123,7 +127,7 @@ class Adversary:
         return outside
 
     def _leaves(self, box: Pair, factor: float, budget: int) -> bool:
-        """Return whether the search finds a push within `factor * box` that moves a joint out of the guide.
+        """Return whether the search finds a push up to the limits `factor * box` that moves a joint out of the guide.
 
         The search begins with the worst pushes so far.
         """
@@ -202,7 +206,11 @@ class Adversary:
             yield "switching", Push(signs * self._generator.choice([-1.0, 1.0]), _no_feedback())
 
     def _bang_bang(self, cycles: int) -> Iterator[tuple[str, Push]]:
-        """Yield pushes that increase one tracking error at one cycle as much as possible."""
+        """Yield pushes that make the tracking error of a random joint as large as possible in a random cycle.
+
+        The effect of a push is predicted for a linear loop, see `_impulse_signs`. The loop has 0, 30, 60 or 100 % of the
+        identified stiffness and damping.
+        """
         while True:
             joint, sign = int(self._generator.integers(2)), float(self._generator.choice([-1.0, 1.0]))
             end, share = int(self._generator.integers(30, cycles)), float(self._generator.choice([0.0, 0.3, 0.6, 1.0]))
@@ -214,16 +222,17 @@ class Adversary:
             )
 
     def _impulse_signs(self, joint: int, end: int, stiffness: Vector, damping: Vector) -> Vector:
-        """Return for each cycle before `end` whether an impulse increases (1) or reduces (-1) the error of a joint at `end`.
+        """Predict for each cycle how a short torque changes the error of a joint in the later cycle `end`.
 
         Args:
             joint: joint with the error: 0 for the hip, 1 for the knee.
-            end: cycle of the error.
-            stiffness: stiffness of the loop, shape (2, 2) [1/s2].
-            damping: damping of the loop, shape (2, 2) [1/s].
+            end: cycle in which the error is predicted.
+            stiffness: stiffness of the linear loop, shape (2, 2) [1/s2].
+            damping: damping of the linear loop, shape (2, 2) [1/s].
 
         Returns:
-            Signs for an impulse at the hip and at the knee, shape (end, 2).
+            1 if a short positive torque increases the error, -1 if the torque reduces the error. Shape (end, 2): the row is the
+            cycle of the torque, the column is the joint on which the torque acts (hip, knee).
         """
         step = np.block([[np.eye(2), 1e-3 * np.eye(2)], [-1e-3 * stiffness, np.eye(2) - 1e-3 * damping]])
         gain, signs = np.zeros(4), np.empty((end, 2))
@@ -236,7 +245,13 @@ class Adversary:
         return np.where(signs >= 0.0, 1.0, -1.0)
 
     def _identified(self) -> tuple[Vector, Vector]:
-        """Identify stiffness [1/s2] and damping [1/s] of the closed loop from the worst step so far, each of shape (2, 2)."""
+        """Identify stiffness and damping of the controlled leg from the worst step so far.
+
+        Returns:
+            Stiffness [1/s2] and damping [1/s], each of shape (2, 2). The row is the joint that is accelerated, the column is the
+            joint with the error (hip, knee). All elements are zero before the first step, and if the worst step has fewer than
+            40 usable cycles.
+        """
         if not self.tried:
             return np.zeros((2, 2)), np.zeros((2, 2))
         one = self.tried[0]
@@ -285,7 +300,7 @@ class Adversary:
         elif feedback.any() and change < 0.7:
             feedback += 0.3 * generator.standard_normal(feedback.shape)
         else:
-            # The signs that the feedback produced in the parent step become a fixed sequence. The feedback becomes zero.
+            # Replace the feedback by the signs that it produced in the parent step. Single signs can then be changed.
             if feedback.any():
                 signs, feedback = np.where(parent.walked.log[:, 4:6] >= 0.0, 1.0, -1.0), _no_feedback()
             begin, length = int(generator.integers(cycles)), int(1 + generator.exponential(30.0))

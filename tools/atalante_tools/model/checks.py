@@ -15,7 +15,8 @@ from atalante_tools.session.body import engine_hint, no_banner
 
 #: Number of random states in which Pinocchio and PyBullet are compared.
 STATES = 100
-#: Largest accepted difference between Pinocchio and PyBullet, relative to the largest value.
+#: The model check fails if a torque or mass matrix from Pinocchio and from PyBullet differs by this fraction or more.
+#: The fraction is the largest difference between two elements, divided by the largest element.
 AGREEMENT = 1e-6
 
 

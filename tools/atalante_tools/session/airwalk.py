@@ -68,7 +68,7 @@ _Command = TypeVar("_Command", bound=Callable[..., Any])
 class Options:
     """Options of a walk in the air inside virtual guides."""
 
-    steps: int  # number of right-stance steps per guide shape
+    steps: int  # number of right-stance steps (the left leg swings) per guide shape
     xi: float  # assistance factor, 0 to 1
     seed: int  # seed of the sensor noise
     out: Path  # run folder
@@ -77,8 +77,8 @@ class Options:
     #: TOML file with endpoint, TLS certificate and users. If None, the run publishes on the loopback interface only.
     telemetry: Path | None
     law: Law  # control law of the assisted joints
-    #: Patient and step parameters. Without a gait file, they are the inputs of the gait network.
-    #: None means the patient of the gait file; without a gait file, None means the default gait.
+    #: Patient and step parameters. With a gait file, only the patient is used. Otherwise both are inputs of the gait network.
+    #: None with a gait file: the patient comes from the file. None without a gait file: the default gait is used.
     subject: Subject | None = None
     files: GaitFiles = field(default_factory=GaitFiles)  # files of the gait
 
@@ -268,14 +268,18 @@ class _Walk:
 def _controllers(
     options: Options, robot: Robot, shapes: Mapping[str, GuideShape]
 ) -> tuple[ExoskeletonParameters, Gait, dict[str, AirwalkController]]:
-    """Return the exoskeleton, the gait, and one controller per guide shape. Leg lengths and gait fit the patient."""
+    """Return the exoskeleton, the gait, and one controller per guide shape.
+
+    If the user or the gait file states a patient, the leg lengths of the exoskeleton are those of this patient. If the user
+    gives a patient and no gait file, the gait network computes the gait for this patient.
+    """
     from atalante_control.airwalk.controller import AirwalkController
     from atalante_tools.session.gait_source import gait_in_the_air
 
     config = options.law.config()
     exoskeleton, gait, source = gait_in_the_air(options.files, options.subject, robot)
     controllers = {name: AirwalkController(robot, gait, shape, config, exoskeleton) for name, shape in shapes.items()}
-    # `source` is printed only after the controllers have accepted the gait. For the default gait, `source` is empty.
+    # The text `source` names the origin of the gait (empty: default gait). Print it only after the controllers accept the gait.
     if source:
         print_message(f"{source}; the exoskeleton is empty")
     return exoskeleton, gait, controllers
@@ -318,8 +322,7 @@ def _close(telemetry: TelemetryProcess, walked: Walked) -> None:
 
 def _result(certificate: Certificate, controller: AirwalkController, hal: Hal, statistics: Statistics) -> Result:
     walking = controller.statistics
-    # The statistics begin in the cycle in which the first step ends. A run of one step also ends in this cycle, and statistics of
-    # a single cycle are not reported.
+    # After a single step, the statistics contain only the cycle in which this step ended. Such statistics are not reported.
     counted = walking.steps >= 2
     return Result(
         shape=certificate.shape,

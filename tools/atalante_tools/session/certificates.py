@@ -13,7 +13,9 @@ if TYPE_CHECKING:
 
 
 def weakest(certificates: Iterable[Certificate]) -> Certificate:
-    """Return the weakest certificate: one without certified torques, or else the one with the smallest certified hip torque.
+    """Return the certificate with the smallest certified hip torque.
+
+    A certificate without certified torques counts as smaller than every other certificate.
 
     Args:
         certificates: Certificates of one guide shape, for each assistance factor and each gait. At least one is needed.

@@ -26,7 +26,10 @@ class Dial:
         operator.assist(self._set)
 
     def turn(self, steps: int) -> None:
-        """Turn the dial to the assistance factor of the next step. The factor acts from the next stance change on.
+        """Turn the dial to the assistance factor of the next step.
+
+        The robot uses a new factor only after the next stance change. When `steps` steps are completed, step number `steps` + 1
+        is in progress. The next step is therefore step number `steps` + 2.
 
         Args:
             steps: Number of completed steps.

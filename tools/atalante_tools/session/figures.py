@@ -89,9 +89,10 @@ def _panel(axis: Any, run: str, walked: dict[int, _Step]) -> None:
 
 
 def _guide_samples(recording: Path) -> Iterator[tuple[str, Any, float, float]]:
-    """Yield run name, `Guide` message, and distances of upper and lower edge from the desired angle [rad].
+    """Yield run name, `Guide` message and guide width of each recorded cycle.
 
-    Cycles without a guide are left out.
+    The width is a pair [rad]: distances from the desired hip angle to the upper and to the lower edge of the guide. Cycles
+    without a guide are left out.
     """
     classes = {name: message_class(name) for name in ("SystemState", "Guide", "Controller")}
     run, edges = "", (0.0, 0.0)

@@ -42,7 +42,7 @@ def gait_in_the_air(files: GaitFiles, subject: Subject | None, robot: Robot) -> 
         patient = patient_in(gait, files.gait) if subject is None else subject.patient
         if patient is not None:
             exoskeleton = exoskeleton.fitted(patient)
-        # A gait on the ground has a feedforward that carries the patient. For a walk in the air, compute the feedforward again.
+        # In a gait for the ground, the feedforward torques carry the patient. Compute the torques for a walk in the air.
         if gait.feedforward is not None:
             gait = suspended_gait(gait, exoskeleton, robot)
         return exoskeleton, gait, f"gait of {files.gait}: {gait.name}"
@@ -54,7 +54,9 @@ def gait_in_the_air(files: GaitFiles, subject: Subject | None, robot: Robot) -> 
 
 
 def patient_of_files(files: GaitFiles, patient: Patient | None, robot: Robot) -> Patient | None:
-    """Return the patient for whom an emulated robot is adjusted, or None if neither the user nor the gait file states one.
+    """Return the patient for an emulated robot: the patient of the user, or else the patient in the gait file.
+
+    The robot gets the leg lengths of this patient. The result is None if neither the user nor the file states a patient.
 
     Args:
         files: Files of the gait. They are checked, and the network must cover the patient.
@@ -100,7 +102,7 @@ def gaits_of_file(path: Path, patient: Patient | None, robot: Robot) -> tuple[Pa
     patient = patient_in(gait, path) if patient is None else patient
     if patient is None:
         raise GaitError(
-            f"{path}: the parameters must contain patient_mass and patient_height, or add --mass and --height"
+            f"{path}: the patient is unknown; add --mass and --height, or patient_mass and patient_height in the parameters"
         )
     if not isinstance(loaded, Gait):
         return patient, loaded

@@ -20,11 +20,11 @@ _Command = TypeVar("_Command", bound=Callable[..., Any])
 class Law:
     """Control law of the assisted joints. The field names are keys of summary.json."""
 
-    #: share of gravity, friction, Coriolis and centrifugal torques that the exoskeleton compensates while the guide does not act,
-    #: 0 to 1 (factor of u_i)
+    #: Factor on the torque u_i, 0 to 1. The factor applies while the guide does not act.
+    #: The torque u_i of the exoskeleton cancels the gravity, friction, Coriolis and centrifugal torques of the leg.
     idealization: float = 1.0
-    #: The gait needs torques that accelerate the leg. Share of these torques that the exoskeleton produces while the guide does
-    #: not act, 0 to 1 (factor of u_f).
+    #: Factor on the torque u_f, 0 to 1. The factor applies while the guide does not act.
+    #: The torque u_f of the exoskeleton accelerates the leg as the gait requires.
     feedforward: float = 1.0
     literal: bool = False  # whether the law follows the paper literally; the guides are then not certified
 
@@ -45,15 +45,15 @@ def law_options() -> Callable[[_Command], _Command]:
             default=Law.idealization,
             show_default=True,
             metavar="X",
-            help="Share of gravity, friction, Coriolis and centrifugal torques of the leg that the exoskeleton compensates while "
-            "the guide does not act, 0 to 1. The patient must produce the rest.",
+            help="While the guide does not act, the exoskeleton compensates this share (0 to 1) of the gravity, friction, "
+            "Coriolis and centrifugal torques of the leg. The patient must produce the rest.",
         ),
         click.option(
             "--feedforward",
             type=Between(0.0, 1.0),
             metavar="X",
-            help="The gait needs torques that accelerate the leg. Share of these torques that the exoskeleton produces while the "
-            "guide does not act, 0 to 1. The patient must produce the rest.  [default: 1; 0 if --literal is given]",
+            help="While the guide does not act, the exoskeleton produces this share (0 to 1) of the torques that accelerate "
+            "the leg along the gait. The patient must produce the rest.  [default: 1; 0 if --literal is given]",
         ),
         click.option(
             "--literal",

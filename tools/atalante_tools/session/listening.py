@@ -15,9 +15,9 @@ POLL_TIMEOUT: Final = 0.02
 
 
 def received(bus: Bus, seconds: float, stop: StopRequest) -> Iterator[tuple[Frames, int]]:
-    """Call `receive` repeatedly, and yield after each call: the receive buffer, and the number of new frames in the buffer.
+    """Listen to a bus, and yield the receive buffer together with the number of new frames in the buffer.
 
-    A call ends after `POLL_TIMEOUT`, even if no frame was received.
+    Each call of `Bus.receive` yields one pair. A call ends after `POLL_TIMEOUT`, even if no frame was received.
 
     Args:
         bus: Bus to listen to.

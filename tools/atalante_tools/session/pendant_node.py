@@ -92,7 +92,7 @@ class PendantNode:
         return self._takeover.lost and not self._takeover.established
 
     def start_sending(self) -> None:
-        """Start sending: answer every SYNC from now on, unless the takeover rule forbids it."""
+        """Start sending: answer every SYNC from now on, except while this node must be silent because of another pendant."""
         self._sending = True
         self._takeover.start()
 

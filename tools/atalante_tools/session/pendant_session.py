@@ -36,7 +36,8 @@ PRESS_SYNCS: Final = 500
 STOP_SYNCS: Final = 20
 #: Number of SYNCs answered with a released dead-man switch at the end of `pendant start` and `pendant xi`.
 RELEASE_SYNCS: Final = 5
-#: Longest normal time from START to ACTIVE [cycles].
+#: Longest normal time from START to the state ACTIVE of the HAL [cycles].
+#: If the HAL has not changed its state within this time, the operator gets a message.
 START_TIMEOUT: Final = 400
 
 
@@ -63,14 +64,15 @@ class Session:
             losses: Function that returns how often the link to the bus was lost so far.
         """
         self.node, self.stop = node, stop
-        #: Whether to press START as soon as the HAL is in READY or HOLD, without a typed command.
+        #: Whether START is pressed automatically as soon as the HAL is in READY or HOLD, as in `atalante pendant start`.
         self.start_wanted = False
-        # Whether the operator typed start. START is then pressed in any state of the HAL, as soon as the HAL trusts this pendant.
+        # Whether the operator typed start, and START is not pressed yet.
+        # START is pressed in any state of the HAL, as soon as the HAL accepts requests of this pendant.
         self._start_typed = False
         self._target, self._keyboard, self._now = target, keyboard, now
         self._begun = self._synced_at = now()
         self._hal_present, self._hal_found = True, False
-        # Sum of all times without a HAL since the first SYNC [s]. A time is added when the HAL sends SYNC again.
+        # Total time without a HAL since the first SYNC [s]. If the HAL is absent now, the present absence is not included.
         self._absent = 0.0
         self._hal: object = None
         self._pressed_at: int | None = None
@@ -122,7 +124,7 @@ class Session:
                 return
 
     def run(self, seconds: float | None) -> None:
-        """Answer each SYNC until the time is over or a signal arrives, and then press STOP.
+        """Answer each SYNC until the time is over or a stop signal arrives, and then press STOP.
 
         The method returns without STOP if another pendant takes over.
 
@@ -134,7 +136,7 @@ class Session:
         """
         node = self.node
         self._begun = self._synced_at = self._now()
-        self._hal_found = node.answered > 0  # during a takeover, the node has already answered SYNCs
+        self._hal_found = node.answered > 0  # a node that answered SYNCs in its takeover has found a HAL
         while not self.stop.wanted and (seconds is None or self._elapsed() < seconds):
             if node.poll(POLL_TIMEOUT):
                 self._react_to_sync()
@@ -152,10 +154,10 @@ class Session:
         self.press_stop()
 
     def check_takeover(self) -> None:
-        """Raise an error if the takeover failed. The cause of this failure is a pendant that did not stop sending.
+        """Raise an error if another pendant did not stop sending during the takeover.
 
         Raises:
-            Failed: If the takeover failed.
+            Failed: If the other pendant did not stop.
         """
         if self.node.takeover_failed:
             raise Failed(
@@ -213,7 +215,10 @@ class Session:
             print_message(f"a command must be start, stop, hold or xi X with X from 0 to 1, got {line.strip()!r}")
 
     def _press_start(self) -> None:
-        """Press START if more than `REQUALIFY` SYNCs were answered in a row. Before that, the HAL accepts no request."""
+        """Press START if the HAL already accepts requests of this pendant.
+
+        The HAL accepts requests after `REQUALIFY` answers in a row. START is pressed after at least one more answer.
+        """
         if self.node.answered_in_row > REQUALIFY:
             self.start_wanted = self._start_typed = False
             self._pressed_at = self.node.cycles

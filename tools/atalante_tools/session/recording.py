@@ -72,7 +72,8 @@ class Outputs:
     recording: Path | None  # MCAP file. None: no recording
     record_rate: int  # recording rate [Hz]
     can_log: Path | None  # log file for all CAN frames. None: no CAN log
-    outlet: Mapping[str, Any]  # fields of `TelemetryConfig` from the telemetry file
+    #: settings from the telemetry file (robot name, Zenoh endpoint, TLS files, users): field name of `TelemetryConfig` -> value
+    outlet: Mapping[str, Any]
 
 
 #: Recording rate above which the telemetry process needs a processor core of its own [Hz].
@@ -136,7 +137,7 @@ def require_complete(recording: Recording | None) -> None:
         return
     files = ", ".join(recording.files)
     if not files:
-        raise Failed("the recording must be in a file, but no file was written")
+        raise Failed("the recording is missing: no file was written")
     if recording.missing_cycles:
         raise Failed(f"the recording is incomplete: {recording.missing_cycles} cycles are missing in {files}")
     if len(recording.files) > 1:
@@ -188,7 +189,7 @@ def start_telemetry(
         record_rate=outputs.record_rate,
         can_log=outputs.can_log,
         lock_step=target.lockstep,
-        slots=8192,  # buffer for 8192 cycles, because a run in lock-step is faster than real time and the recorder may pause
+        slots=8192,  # number of buffered cycles: a run in lock-step is faster than real time, and the telemetry may pause
         **outputs.outlet,
     )
     telemetry = TelemetryProcess(

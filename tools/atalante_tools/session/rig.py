@@ -154,7 +154,7 @@ def open_hal(
         Failed: If the physics engine of the embedded robot is not installed.
         Stopped: If a signal arrived before or during the start.
     """
-    # A stop signal during an import raises an exception, which the imported code may discard. So check the signal again.
+    # A stop signal raises `Stopped`, but an imported module may have caught this exception. Then raise `Stopped` again.
     check_stop()
     network = network or atalante_dbc.load()
     robot = robot or load_robot()
@@ -316,7 +316,9 @@ class Watch:
 
 
 def waiting_for(rig: Rig) -> str:
-    """Return the missing condition for ACTIVE as text, with the command that the user must type to fulfil it.
+    """Return a text that tells the user why the robot is not ACTIVE yet.
+
+    If the user can change this with a command, the text contains the command.
 
     Args:
         rig: Rig of the run.

@@ -35,10 +35,11 @@ class Result:
     #: Both joints stay in the guide under disturbances up to `promise_hip_nm` at the hip and `promise_knee_nm` at the knee.
     promise_hip_nm: float | None
     promise_knee_nm: float | None  # certified torque at the knee [Nm], see `promise_hip_nm`
-    steps: int  # number of completed right-stance steps
+    steps: int  # number of completed right-stance steps (the left leg swings)
     max_ratio: float | None  # largest ratio of tracking error to guide width, |e| / q_bound
     inside: float | None  # share of the time with both assisted joints inside the guide, 0 to 1
-    filter_active: float | None  # share of the time with an active guide filter, 0 to 1
+    #: share of the time in which the backup torque of the guide (spring and damper) acts, 0 to 1
+    filter_active: float | None
     cycles: int
     real_time_factor: float
     frames: int

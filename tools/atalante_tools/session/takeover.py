@@ -21,12 +21,12 @@ from atalante_hal.wire.e2e import COUNTER_BYTE, MAX_DELTA, Check
 from atalante_hal.wire.frame import Frames
 from atalante_hal.wire.process_image import ReceiveImage
 
-#: A new pendant sends for at least this time [cycles], so that the older pendant has time to fall silent. If the older pendant
-#: still sends after this time, the new pendant may fall silent instead.
+#: A new pendant sends for at least this time [cycles]. In this time, the older pendant can fall silent.
+#: If both pendants still send after this time, the new pendant may fall silent instead.
 TAKEOVER_CYCLES: Final = 50
 #: After a pendant has resumed sending, it must send for at least this time before it may stop again [cycles].
 RETRY_CYCLES: Final = 8
-#: Upper limit of the random time that is added to `TAKEOVER_CYCLES` or `RETRY_CYCLES` [cycles].
+#: A random time of 0 to `DRAW_CYCLES` - 1 is added to `TAKEOVER_CYCLES` and to `RETRY_CYCLES` [cycles].
 DRAW_CYCLES: Final = 50
 #: A sending pendant falls silent and listens after this number of consecutive frames of another pendant.
 #: The HAL tolerates two senders for three cycles.
@@ -36,7 +36,7 @@ LOST_FRAMES: Final = 3
 #: A silent pendant resumes sending if no frame of another pendant arrives for this time [cycles].
 #: The HAL reports a timeout after 5 cycles without a frame.
 QUIET_CYCLES: Final = 3
-#: E2E check results of a frame with a valid CRC, whether or not its counter is as expected.
+#: Results of the end-to-end check of a frame with a valid CRC. The counter of the frame may be unexpected.
 _INTACT: Final = (Check.OK, Check.SOME_LOST, Check.REPEATED, Check.CONFLICT, Check.WRONG_SEQUENCE)
 
 
@@ -63,9 +63,11 @@ class Takeover:
         self._tag = -1  # counter value that every answer to the last SYNC contains; -1 before the first SYNC
         self._cycle = 0  # number of SYNCs
         self._free_from = 0  # first cycle in which this pendant may stop sending
-        self._quiet_from = 0  # cycle from which the time without frames of other pendants is counted
+        self._quiet_from = 0  # first cycle of the current pause in the frames of other pendants
         self._received_at = -MAX_DELTA - 1  # cycle in which the newest frame of another pendant was received
-        self._received = 0  # number of frames of another pendant since the last gap of more than `MAX_DELTA` cycles
+        # Number of frames of another pendant in a row, with at most `MAX_DELTA` cycles from one frame to the next.
+        # The count restarts when this pendant falls silent.
+        self._received = 0
 
     @property
     def present(self) -> bool:

@@ -19,7 +19,8 @@ if TYPE_CHECKING:
 FALLEN: Final = math.radians(35.0)
 #: Period of the observation [cycles]. In this time, the pelvis of a falling robot turns by less than 2 degrees.
 PERIOD_CYCLES: Final = 10
-#: Time for which a robot that left ACTIVE is observed [cycles]. A HOLD within a step may end in a fall after more than 1.5 s.
+#: After the HAL has left the state ACTIVE, the robot is observed for this time [cycles].
+#: A robot that stops in the middle of a step may fall only after more than 1.5 s.
 AFTERMATH: Final = 5000
 
 
@@ -41,7 +42,7 @@ class Observation:
         self.fell = False
         self._rig, self._controller, self._push = rig, controller, push
         self._push_begun: int | None = None  # cycle in which the push began
-        self._squares, self._count = 0.0, 0  # sum [rad2] and number of the squared attitude errors
+        self._squares, self._count = 0.0, 0  # sum of the squared attitude errors [rad2], and number of these errors
         self._origin: Stance | None = None
         if push is not None and rig.access is not None:
             rig.access.push(self._wrench)

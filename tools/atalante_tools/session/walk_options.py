@@ -40,7 +40,7 @@ class Push:
 class SpeedChange:
     """Change of step length and step duration during a walk."""
 
-    steps: int  # number of steps after the change
+    steps: int  # number of periodic steps from this change to the next change or to the stop step
     subject: Subject  # patient of the walk, and the step parameters after the change
 
 
@@ -48,19 +48,19 @@ class SpeedChange:
 class WalkOptions:
     """Options of a walk."""
 
-    steps: int  # number of periodic steps before the first speed change; if there is none, before the stop step
+    steps: int  # number of periodic steps before the first speed change; without a change: before the stop step
     xi: float  # assistance factor, 0 to 1
     shape: str  # name or file of the guide shape
-    passive: bool  # whether the limbs of the emulated patient have the impedance of a passive wearer
+    passive: bool  # whether the emulated patient has the impedance of relaxed legs; False: the legs are masses only
     subject: Subject | None  # patient and step parameters; None means the values in the walk file
-    #: Files of the gait. Without a file, the default subject walks with the walk file of the package.
-    #: Without a file, the gaits of any other subject are computed with the gait network of the package.
+    #: Gait file or network file of the user. Without either file, the default subject uses the walk file of the package.
+    #: Without either file, the gaits of every subject except the default subject come from the gait network of the package.
     files: GaitFiles
     seed: int  # seed of the sensor noise
     friction: float  # coefficient of friction between soles and floor
     push: Push | None  # push at the pelvis; None means no push
     law: Law  # control law of the periodic steps
-    #: Three numbers of steps: with full assistance, then in the transition to `xi`, then with `xi`. None: `xi` in all steps.
+    #: Numbers of steps of the three parts of the walk: full assistance, transition to `xi`, and `xi`. None: `xi` in all steps.
     protocol: tuple[int, int, int] | None = None
     #: Options of recording, CAN log and telemetry. If none of these outputs is requested, no telemetry process is started.
     recording: RecordingOptions = field(default_factory=RecordingOptions)
@@ -102,7 +102,9 @@ def gaits_of(options: WalkOptions, robot: Robot) -> tuple[Patient, WalkGaits]:
 
 
 def sections_of(options: WalkOptions, robot: Robot) -> list[Section]:
-    """Return one section of the walk for each speed change, in walking order. The section begins at the speed change.
+    """Return one section of the walk for each speed change, in walking order.
+
+    A section is a group of successive steps with the same gait. It begins at the speed change.
 
     Args:
         options: Options of the user.
@@ -134,7 +136,7 @@ def solved_gaits(subject: Subject, network: Path | None = None) -> WalkGaits:
     from atalante_tools.console.stop_request import check_stop
 
     gaits = gaits_of_subject(subject, load_robot(), network)
-    check_stop()  # the optimiser discards the exception that a stop signal raises, so check the signal again
+    check_stop()  # a stop signal raises `Stopped`, but the optimiser catches this exception: raise `Stopped` again
     return gaits
 
 

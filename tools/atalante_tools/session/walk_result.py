@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
 @dataclass
 class WalkResult:
-    """Result of a walk. The JSON object has the same fields."""
+    """Result of a walk. The field names are the keys of the `--json` object, and of the object `result` in summary.json."""
 
     steps: int  # number of completed periodic steps
     #: step length of each gait, in walking order [m]; None if the gait file does not state it
@@ -37,17 +37,18 @@ class WalkResult:
     xi: float
     shape: str | None  # guide shape; None at Xi = 1, where there is no guide
     certified: bool | None  # whether the guide is certified; None at Xi = 1, where there is no guide
-    #: Certified torque at SH [Nm]; None without certificate.
-    #: Both joints stay in the guide under disturbances up to `promise_hip_nm` at SH and `promise_knee_nm` at SK.
+    #: Certified disturbance torque at the sagittal hip [Nm]; None if no torques are certified.
+    #: Hip and knee stay in the guide under disturbances up to `promise_hip_nm` at the hip and `promise_knee_nm` at the knee.
     promise_hip_nm: float | None
-    #: certified torque at SK [Nm], see `promise_hip_nm`; None without certificate
+    #: Certified disturbance torque at the sagittal knee [Nm], see `promise_hip_nm`; None if no torques are certified.
     promise_knee_nm: float | None
     max_ratio: float | None  # largest tracking error as a fraction of the guide width; None if no step was guided
     inside: float | None  # fraction of the guided time with both joints inside the guide; None if no step was guided
     outside_cycles: int  # number of guided cycles with a joint outside the guide
-    filter_active: float | None  # fraction of the guided time with the guide filter active; None if no step was guided
+    #: fraction of the guided time in which the backup torque of the guide (spring and damper) acts; None if no step was guided
+    filter_active: float | None
     hand_overs_exceeded: int  # number of guided steps that started with a larger deviation than the certificate assumes
-    full_assist: bool  # whether the HAL changed to full assistance
+    full_assist: bool  # whether a diagnostic made the HAL ramp the assistance factor to 1 (state FULL_ASSIST)
     lateral_m: float  # sideways deviation from the walking line at the last landing, positive to the left
     yaw_deg: float  # heading of the soles relative to the walking line at the last landing, positive to the left
     #: true value of `lateral_m` at the end of the walk; None if the robot is real or fell

@@ -68,7 +68,7 @@ class EmbeddedRobot(Closing):
     """
 
     _open: ClassVar[list[EmbeddedRobot]] = []
-    _cores: ClassVar[set[int]] = set()  # processor cores of this thread before the first robot was opened
+    _cores: ClassVar[set[int]] = set()  # cores on which this thread was allowed to run before the first child started
 
     def __init__(self, engine: str = PYBULLET) -> None:
         """Start the child process.
@@ -80,19 +80,27 @@ class EmbeddedRobot(Closing):
             Failed: If the engine is not installed.
         """
         require_engine(engine)
-        memory, parent_bell, child_bell = descriptors()
+        memory, parent_socket, child_socket = descriptors()
         access = access_memory()
         self._child = subprocess.Popen(
-            [sys.executable, "-P", "-m", "atalante_tools.session.embedded", str(memory), str(child_bell), str(access)],
+            [
+                sys.executable,
+                "-P",
+                "-m",
+                "atalante_tools.session.embedded",
+                str(memory),
+                str(child_socket),
+                str(access),
+            ],
             stdin=subprocess.PIPE,
             stdout=subprocess.DEVNULL,
-            pass_fds=(memory, child_bell, access),
+            pass_fds=(memory, child_socket, access),
             process_group=0,
         )
         self._begun = False
-        # The parent detects the end of the child only if the child holds the only copy of `child_bell`.
-        os.close(child_bell)
-        self.bus = SharedBus("embedded", memory, parent_bell, 0)
+        # Close the copy of the child's socket in this process. Otherwise the parent does not notice the end of the child.
+        os.close(child_socket)
+        self.bus = SharedBus("embedded", memory, parent_socket, 0)
         self.bus.patience = _PATIENCE
         self.access = RemoteAccess(self.bus, access)
         self._part_from_child()

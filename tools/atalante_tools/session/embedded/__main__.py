@@ -1,6 +1,6 @@
 """Main program of the subprocess with the embedded robot. `EmbeddedRobot` starts this subprocess.
 
-Command line: `python -m atalante_tools.session.embedded MEMORY BELL ACCESS`. The program reads the `SpawnConfig` from stdin.
+Command line: `python -m atalante_tools.session.embedded MEMORY SOCKET ACCESS`. The program reads the `SpawnConfig` from stdin.
 All other communication uses the bus and the shared memory of `ServedAccess`. The program ends when the HAL closes the bus.
 """
 
@@ -43,15 +43,15 @@ def emulate(bus: SharedBus, access: int, config: SpawnConfig) -> None:
         bus.serve(served.step)
 
 
-def main(memory: str, bell: str, access: str) -> None:
+def main(memory: str, wake_socket: str, access: str) -> None:
     """Read the description of the robot from stdin, and emulate the robot. Send the reason of a failure to the parent.
 
     Args:
         memory: File descriptor of the shared memory, as text.
-        bell: File descriptor of the notification socket, as text.
+        wake_socket: File descriptor of the socket through which the HAL process wakes this process, as text.
         access: File descriptor of the memory of the access, as text.
     """
-    bus = SharedBus("the embedded robot's bus", int(memory), int(bell), 1)
+    bus = SharedBus("the embedded robot's bus", int(memory), int(wake_socket), 1)
     reason = ""
     try:
         emulate(bus, int(access), pickle.load(sys.stdin.buffer))

@@ -37,8 +37,8 @@ class Stance(NamedTuple):
     """True position of the robot on the ground."""
 
     x: float  # x of the point midway between the feet, in world axes [m]
-    y: float  # y of this point [m]
-    yaw: float  # mean heading of both feet [rad]
+    y: float  # y of the point midway between the feet, in world axes [m]
+    yaw: float  # mean heading of both feet: angle from the world x axis, positive to the left [rad]
 
 
 class Access(Protocol):
@@ -114,7 +114,8 @@ class _Shared(NamedTuple):
     """
 
     question: Vector  # request to the emulator: `_CYCLE`, `_ATTITUDE` or `_STANCE`, shape (1,)
-    dial: Vector  # [number of calls of `assist` so far, last assistance factor (NaN means None)], shape (2,)
+    #: two values: number of calls of `assist` so far, and factor of the last call (NaN: the HAL keeps its own factor); shape (2,)
+    dial: Vector
     pushes: Vector  # 1 if the pelvis is pushed, otherwise 0, shape (1,)
     wrench: Vector  # force [N] and moment [Nm] on the pelvis, shape (6,)
     #: answer to `_ATTITUDE`: quaternion xyzw of the pelvis; answer to `_STANCE`: x [m], y [m], yaw [rad], unused; shape (4,)
@@ -181,7 +182,7 @@ class RemoteAccess:
 
 
 class ServedAccess:
-    """Other end of a `RemoteAccess`, in the process of the emulator."""
+    """Server in the process of the emulator: executes the requests of the `RemoteAccess` in the HAL process."""
 
     def __init__(self, memory: int, emulator: Emulator, operator: Operator) -> None:
         """Attach to the memory that both processes share.
