@@ -246,6 +246,11 @@ class WalkController:
         """Return the number of periodic steps between the start step and the stop step."""
         return self._sections[-1].end
 
+    @property
+    def steps_begun(self) -> int:
+        """Return the number of periodic steps that have begun. The step in progress is included."""
+        return self.statistics.steps + (self.phase is Phase.STEP)
+
     def reached(self, step: int, phase: float) -> bool:
         """Return whether the walk has reached an instant of a periodic step. The result remains True after this instant.
 
@@ -399,8 +404,8 @@ class WalkController:
             swing = 1 - self._stance
             contact = contact_force(load[swing], float(self._twist[swing]))
             landed = self._landed = self._impact.update(contact, elapsed / nominal)
-        steps = self.statistics.steps + (phase is Phase.STEP)
-        loaded, stopping = self._loaded >= self._settled, self._stopping or steps >= self.steps_wanted
+        loaded = self._loaded >= self._settled
+        stopping = self._stopping or self.steps_begun >= self.steps_wanted
         return Facts(elapsed, nominal, self._rest, self._timeout, landed, loaded, stopping)
 
     def _begin(self, phase: Phase, cycle: int, xi: float) -> None:

@@ -157,14 +157,16 @@ def test_walk_with_push_and_dial_has_the_same_result_and_frames_in_two_processes
     assert results[0]["true_lateral_m"] is not None
 
 
-def test_dial_falls_linearly_from_full_assistance() -> None:
+@pytest.mark.parametrize("full", [1, 2, 3])
+def test_dial_falls_linearly_from_full_assistance(full: int) -> None:
     operator = Operator()
-    dial = Dial(operator, (3, 3, 2), 0.2)
+    dial = Dial(operator, (full, 3, 2), 0.2)
+    dial.turn(0)  # in the start step
     factors = []
-    for steps in range(8):
-        factors.append(operator.signals.assistance_factor)  # of the step with this index
-        dial.turn(steps)
-    assert factors == [1.0, 1.0, 1.0, 0.8, 0.6, 0.4, 0.2, 0.2]
+    for begun in range(1, 9):
+        factors.append(operator.signals.assistance_factor)  # of the step that begins now
+        dial.turn(begun)
+    assert factors == ([1.0] * full + [0.8, 0.6, 0.4, 0.2, 0.2, 0.2, 0.2])[:8]
 
 
 @pytest.mark.parametrize("xi", ["1", "0.5"])

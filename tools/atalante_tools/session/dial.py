@@ -25,16 +25,14 @@ class Dial:
         self._xi = xi
         operator.assist(self._set)
 
-    def turn(self, steps: int) -> None:
-        """Turn the dial to the assistance factor of the next step.
-
-        The robot uses a new factor only after the next stance change. When `steps` steps are completed, step number `steps` + 1
-        is in progress. The next step is therefore step number `steps` + 2.
+    def turn(self, begun: int) -> None:
+        """Turn the dial to the assistance factor of the next step. The robot uses a new factor only after the next stance change.
 
         Args:
-            steps: Number of completed steps.
+            begun: Number of periodic steps that have begun, see `WalkController.steps_begun`. So the next step has the
+                number `begun` + 1.
         """
-        share = min(1.0, max(0.0, (steps + 2 - self._full) / (self._transition + 1)))
+        share = min(1.0, max(0.0, (begun + 1 - self._full) / (self._transition + 1)))
         factor = round(1.0 + share * (self._xi - 1.0), 4)
         if factor != self._set:
             self._set = factor

@@ -161,7 +161,7 @@ def _walk(
             if recorder is not None:
                 recorder.write()
             if dial is not None:
-                dial.turn(controller.statistics.steps)
+                dial.turn(controller.steps_begun)
 
         with stop_requested() as stop:
             watch = WalkWatch(rig, controller, observation, stop, controller.steps_wanted)

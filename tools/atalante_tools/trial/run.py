@@ -172,7 +172,7 @@ def _walk(trial: WalkTrial) -> dict[str, Any]:
         motion, effort = Motion(rig, controller), Effort(rig, controller, trial.protocol)
 
         def record() -> None:
-            dial.turn(controller.statistics.steps)
+            dial.turn(controller.steps_begun)
             motion.sample()
             effort.sample()
 
