@@ -14,6 +14,7 @@ import numpy as np
 import numpy.typing as npt
 
 from atalante_dbc import Message, Signal
+from atalante_dbc.network import LONGEST_SIGNAL
 from atalante_hal.compiled import compiled
 from atalante_hal.types import Vector
 from atalante_hal.wire.frame import FLAG_BRS, FLAG_FDF, WORDS, Frames, new_frames
@@ -31,9 +32,8 @@ NO_CODE = -1
 # Results of `read_row`. INSIDE: all signals are in range. OUTSIDE: a signal is out of range, and no signal is marked as invalid.
 # MARKED_INVALID: a signal is out of range, and the sender marked at least one signal as invalid (with its invalid code).
 INSIDE, OUTSIDE, MARKED_INVALID = range(3)
-#: Adding and then subtracting this number rounds a float64 to an integer.
+#: Adding and then subtracting this number rounds a float64 to an integer of at most 51 bits (`LONGEST_SIGNAL`).
 _ROUND = 1.5 * 2.0**52
-_LONGEST = 51  # largest signal length that rounding with `_ROUND` supports [bits]
 
 
 class SignalTable(NamedTuple):
@@ -69,10 +69,10 @@ class Codec:
         self.rows = {message.name: row for row, message in enumerate(self.messages)}
         entries = [(row, m, s) for row, m in enumerate(self.messages) for s in m.signals]
         for _, message, signal in entries:
-            if signal.length > _LONGEST or signal.start // 64 != (signal.start + signal.length - 1) // 64:
+            if signal.length > LONGEST_SIGNAL or signal.start // 64 != (signal.start + signal.length - 1) // 64:
                 raise ValueError(
-                    f"{message.name}.{signal.name} must have at most {_LONGEST} bits and must not cross a 64-bit boundary of the "
-                    f"payload, got {signal.length} bits starting at bit {signal.start}"
+                    f"{message.name}.{signal.name} must have at most {LONGEST_SIGNAL} bits and must not cross a 64-bit boundary "
+                    f"of the payload, got {signal.length} bits starting at bit {signal.start}"
                 )
         groups = dict.fromkeys((not s.signed, group_of(s.name)) for _, _, s in entries)
         order = {key: index for index, key in enumerate(sorted(groups, key=lambda key: key[0]))}

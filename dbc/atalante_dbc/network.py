@@ -7,6 +7,9 @@ from dataclasses import dataclass
 from functools import cached_property
 from typing import TypeVar
 
+#: Largest signal length [bit]. A decoded value is a float64, which represents integers of this length exactly.
+LONGEST_SIGNAL = 51
+
 
 class DbcError(ValueError):
     """Error of an invalid DBC. Each line of the error text states one problem with its line number in the file."""

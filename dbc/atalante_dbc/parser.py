@@ -20,13 +20,13 @@ from cantools.database.can import Signal as RawSignal
 from cantools.database.errors import Error as CantoolsError
 
 from atalante_dbc.attributes import missing, wrong_values
-from atalante_dbc.network import DbcError, Message, Network, Node, Signal
+from atalante_dbc.network import LONGEST_SIGNAL, DbcError, Message, Network, Node, Signal
 
 #: Valid payload lengths of CAN FD [byte] (ISO 11898-1).
 _LENGTHS = (*range(9), 12, 16, 20, 24, 32, 48, 64)
 #: Signals of the E2E Profile 5 header at the start of every frame: start bit and number of bits.
 _HEADER = {"Crc": (0, 16), "Counter": (16, 8)}
-_FD_FORMATS = ("StandardCAN_FD", "ExtendedCAN_FD")
+_FD_FORMAT = "StandardCAN_FD"
 _BO = re.compile(r"BO_\s+(\d+)\s+(\w+)\s*:\s*(\d+)\s+(\w+)")
 _SG = re.compile(r"SG_\s+(\w+)\s*(\w*)\s*:")
 
@@ -135,8 +135,10 @@ def _duplicates(lines: _Lines) -> Iterator[tuple[int, str]]:
 def _message_problems(message: RawMessage, nodes: set[str]) -> Iterator[str]:
     if message.length not in _LENGTHS:
         yield f"must have a length of {', '.join(map(str, _LENGTHS))} bytes, got {message.length} bytes"
-    if _attribute(message, "VFrameFormat") not in _FD_FORMATS:
-        yield "must be a CAN FD frame; set VFrameFormat to StandardCAN_FD"
+    if message.is_extended_frame:
+        yield f"must have an 11-bit identifier, got the 29-bit identifier {message.frame_id:#x}"
+    if _attribute(message, "VFrameFormat") != _FD_FORMAT:
+        yield f"must be a CAN FD frame; set VFrameFormat to {_FD_FORMAT}"
     if not set(message.senders) <= nodes or len(message.senders) != 1:
         yield f"must have one sender from BU_, got {', '.join(message.senders) or 'none'}"
     for name, (start, length) in _HEADER.items():
@@ -160,6 +162,8 @@ def _signal_problems(message: RawMessage, signal: RawSignal, nodes: set[str]) ->
         return
     if signal.is_float:
         yield "must be a scaled integer, got a float"
+    if signal.length > LONGEST_SIGNAL:
+        yield f"must have at most {LONGEST_SIGNAL} bits, got {signal.length} bits"
     end = signal.start + signal.length
     if end > 8 * message.length:
         yield f"must end within the {8 * message.length} bits of the message, got end bit {end}"
@@ -169,8 +173,8 @@ def _signal_problems(message: RawMessage, signal: RawSignal, nodes: set[str]) ->
         yield 'must have a unit; write "1" for a number without unit'
     if not signal.receivers or not set(signal.receivers) <= nodes:
         yield f"must have receivers from BU_, got {', '.join(signal.receivers) or 'none'}"
-    if signal.scale == 0 or not math.isfinite(signal.scale) or not math.isfinite(signal.offset):
-        yield f"must have a finite offset and a finite factor other than 0, got factor {signal.scale} and offset {signal.offset}"
+    if not 0 < signal.scale < math.inf or not math.isfinite(signal.offset):
+        yield f"must have a finite offset and a finite factor above 0, got factor {signal.scale} and offset {signal.offset}"
         return
     yield from _range_problems(signal)
 

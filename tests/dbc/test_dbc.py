@@ -85,6 +85,8 @@ MUTATIONS = {
     "does not fit": (*_signal("Torque", '90|16@1- (0.0125,0) [-400|400] "Nm" HAL'), "got end bit 106"),
     "endless factor": (*_signal("Torque", '80|16@1- (1e999,0) [-400|400] "Nm" HAL'), "factor inf"),
     "factor 0": (*_signal("Torque", '80|16@1- (0,0) [-400|400] "Nm" HAL'), "factor 0"),
+    "negative factor": (*_signal("Torque", '80|16@1- (-0.0125,0) [-400|400] "Nm" HAL'), "factor -0.0125"),
+    "too long": (*_signal("Torque", '64|52@1- (1,0) [-400|400] "Nm" HAL'), "at most 51 bits, got 52 bits"),
     "range too wide": (*_signal("Torque", '80|16@1- (0.0125,0) [-500|400] "Nm" HAL'), "range that fits 16 bits"),
     "empty range": (*_signal("Torque", '80|16@1- (0.0125,0) [0|0] "Nm" HAL'), "min < max"),
     "word boundary": (*_signal("Temperature", '60|8@1+ (1,-40) [-40|214] "degC" HAL'), "64-bit word"),
@@ -120,6 +122,13 @@ MUTATIONS = {
     "invalid code too long": (
         'BA_ "InvalidRaw" SG_ 385 Torque "0x8000";', 'BA_ "InvalidRaw" SG_ 385 Torque "0x18000";', "at most 16 bits"),
 }  # fmt: skip
+
+
+def test_29_bit_identifier_is_rejected(tmp_path: Path):
+    path = tmp_path / "bad.dbc"
+    path.write_text(TEXT.replace(" 385 ", f" {1 << 31 | 385} "), "cp1252")
+    with pytest.raises(DbcError, match="LEFT_FH_STATE must have an 11-bit identifier, got the 29-bit identifier 0x181"):
+        load(path)
 
 
 @pytest.mark.parametrize("name", MUTATIONS)

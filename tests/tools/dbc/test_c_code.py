@@ -40,6 +40,18 @@ def whole(tmp_path_factory: pytest.TempPathFactory) -> tuple[Build, Path, Path]:
     return build, folder, compile_host_test(build, folder)
 
 
+def test_makefile_of_the_user_is_kept(tmp_path: Path):
+    (tmp_path / "Makefile").write_text("all:\n")
+    arguments = ["dbc", "c-code", "-o", str(tmp_path)]
+    done = CliRunner().invoke(cli, arguments)
+    assert done.exit_code == 1
+    assert "Makefile must be absent or generated, got another Makefile" in done.stderr
+    assert [path.name for path in tmp_path.iterdir()] == ["Makefile"]
+    (tmp_path / "Makefile").unlink()
+    for _ in range(2):  # a generated Makefile is written again
+        assert CliRunner().invoke(cli, arguments).exit_code == 0
+
+
 @pytest.mark.long
 def test_c_and_python_agree_on_random_images_of_the_whole_network(whole):
     build, _, program = whole

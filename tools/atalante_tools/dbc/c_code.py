@@ -14,6 +14,7 @@ import cantools
 from cantools.database.can import Database
 from cantools.database.can.c_source import generate
 
+from atalante_tools.console.outcome import Failed
 from atalante_tools.dbc.build import Build
 from atalante_tools.dbc.e2e_c import e2e_header, e2e_source
 from atalante_tools.dbc.host_test import makefile, source
@@ -31,8 +32,13 @@ def write(build: Build, folder: Path, seed: int) -> list[Path]:
         build: messages for which code is generated.
         folder: folder of the files; created if it does not exist.
         seed: seed of the random images of the test vectors.
+
+    Raises:
+        Failed: If the folder contains another Makefile, which would be lost.
     """
     folder.mkdir(parents=True, exist_ok=True)
+    makefile_text = makefile(build)
+    _check_makefile(folder / _MAKEFILE, makefile_text.partition("\n")[0])
     name = build.name
     header, code = _cantools(build)
     vectors = Vectors(build, seed)
@@ -45,11 +51,17 @@ def write(build: Build, folder: Path, seed: int) -> list[Path]:
         _HOST_TEST: source(build).encode(),
         _VECTORS: binary,
         _EXAMPLES: (json.dumps(list(Vectors(build, seed).examples()), indent=1) + "\n").encode(),
-        _MAKEFILE: makefile(build).encode(),
+        _MAKEFILE: makefile_text.encode(),
     }
     for file, content in files.items():
         (folder / file).write_bytes(content)
     return [folder / file for file in files]
+
+
+def _check_makefile(path: Path, first_line: str) -> None:
+    """Raise `Failed` if the file exists and does not begin with the first line of a generated Makefile."""
+    if path.exists() and not path.read_bytes().startswith(first_line.encode()):
+        raise Failed(f"{path} must be absent or generated, got another Makefile: choose another folder with --output")
 
 
 def _cantools(build: Build) -> tuple[str, str]:
