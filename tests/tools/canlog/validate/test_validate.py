@@ -318,11 +318,40 @@ def test_json_objects_have_exactly_the_documented_keys(good: Path) -> None:
     lines = [json.loads(line) for line in result.stdout.splitlines()]
     assert lines
     for line in lines:
-        assert set(line) == {"rule", "message", "node", "count", "first_s", "last_s", "worst"}
+        assert set(line) == {"log", "rule", "message", "signal", "node", "count", "first_s", "last_s", "worst"}
         assert line["rule"] == "never-seen"
+        assert (line["log"], line["signal"]) == (str(good), None)
         assert line["first_s"] == pytest.approx(BEGIN, abs=1.0)
     # The only channel has frames of left_leg, so the other messages of left_leg are missing.
     assert {line["node"] for line in lines} == {"HAL", *(f"LEFT_{j}" for j in ("TH", "SH", "SK", "SA", "HA"))}
+
+
+def test_json_objects_name_the_log_and_the_signal(tmp_path: Path) -> None:
+    dbc = tmp_path / "foreign.dbc"
+    dbc.write_text(FOREIGN)
+    logs = []
+    for name, wheel, gear in (("night.log", 40_000, 3), ("day.log", 12_000, 4)):
+        payload = wheel.to_bytes(2, "big") + bytes([gear]) + bytes(5)
+        messages = [
+            can.Message(timestamp=BEGIN + 0.01 * k, arbitration_id=256, is_extended_id=False, data=payload)
+            for k in range(20)
+        ]
+        logs.append(write(tmp_path / name, messages))
+    result = run("validate", *logs, "--dbc", dbc, "--json")
+    lines = [json.loads(line) for line in result.stdout.splitlines()]
+    assert [(line["log"], line["rule"], line["signal"]) for line in lines] == [
+        (str(logs[0]), "range", "Wheel"),
+        (str(logs[1]), "value-table", "Gear"),
+    ]
+
+
+@pytest.mark.parametrize("stamp", ["1700000000.267459", "1700000000.467022"])
+def test_json_times_are_the_times_of_the_log(stamp: str, tmp_path: Path) -> None:
+    path = tmp_path / "night.log"
+    path.write_text(f"({stamp}) vcan0 7FF#00\n")
+    result = run("validate", path, "--node", "LEFT_FH", "--json")
+    (line,) = [line for line in result.stdout.splitlines() if '"unknown-id"' in line]
+    assert f'"first_s": {stamp}, "last_s": {stamp}' in line
 
 
 def test_junit_has_one_case_per_rule(good: Path, tmp_path: Path) -> None:
@@ -337,6 +366,51 @@ def test_junit_has_one_case_per_rule(good: Path, tmp_path: Path) -> None:
     assert cases["crc"].find("failure") is None
     assert cases["sender"].find("skipped") is not None
     assert (suite.get("failures"), suite.get("tests")) == ("1", str(len(RULES)))
+
+
+def test_junit_has_an_error_for_each_log_that_was_not_read(good: Path, tmp_path: Path) -> None:
+    path = tmp_path / "result.xml"
+    missing, wrong = tmp_path / "none.log", tmp_path / "none.txt"
+    result = run("validate", missing, good, wrong, "--node", "LEFT_FH", "--junit", path)
+    assert result.exit_code == 1
+    suites = list(ET.parse(path).getroot())
+    assert [suite.get("name") for suite in suites] == [str(missing), str(good), str(wrong)]
+    counts = [[suite.get(key) for key in ("tests", "errors", "failures")] for suite in suites]
+    assert counts == [["1", "1", "0"], [str(len(RULES)), "0", "0"], ["1", "1", "0"]]
+    assert [error.text for error in ET.parse(path).iter("error")] == [
+        line.removeprefix("atalante: ") for line in result.stderr.splitlines()
+    ]
+
+
+def test_junit_escapes_the_characters_that_xml_does_not_allow(tmp_path: Path) -> None:
+    path, strange = tmp_path / "result.xml", tmp_path / "strange.trc"
+    strange.write_bytes(bytes(range(256)) * 20)
+    run("validate", strange, tmp_path / "no\x1bne.log", "--junit", path)
+    suites = ET.parse(path).getroot()
+    assert any("\\x00\\x01" in (failure.text or "") for failure in suites.iter("failure"))
+    (error,) = suites.iter("error")
+    assert error.text == f"the log {tmp_path}/no\\x1bne.log does not exist"
+    assert suites[1].get("name") == f"{tmp_path}/no\\x1bne.log"
+
+
+@pytest.mark.parametrize(
+    ("option", "name", "suffixes"),
+    [
+        ("--html", "night.log", ".html or .htm"),
+        ("--html", "result.xml", ".html or .htm"),
+        ("--junit", "vehicle.dbc", ".xml"),
+        ("--junit", "night.html", ".xml"),
+    ],
+)
+def test_report_does_not_overwrite_a_file_of_another_type(
+    option: str, name: str, suffixes: str, good: Path, tmp_path: Path
+) -> None:
+    path = tmp_path / name
+    path.write_text("content")
+    result = run("validate", good, option, path)
+    assert result.exit_code == 2
+    assert f"must end in {suffixes}, got {path}" in result.stderr
+    assert path.read_text() == "content"
 
 
 class _Outside(HTMLParser):
@@ -369,10 +443,12 @@ def test_html_has_the_plots_and_no_external_resources(good: Path, tmp_path: Path
     assert "url(" not in page
 
 
-def test_report_to_a_full_device_fails_with_one_line(good: Path) -> None:
-    result = run("validate", good, "--node", "LEFT_FH", "--html", "/dev/full")
+def test_report_to_a_full_device_fails_with_one_line(good: Path, tmp_path: Path) -> None:
+    path = tmp_path / "full.html"
+    path.symlink_to("/dev/full")
+    result = run("validate", good, "--node", "LEFT_FH", "--html", path)
     assert result.exit_code == 1
-    assert result.stderr == "atalante: /dev/full cannot be written: No space left on device\n"
+    assert result.stderr == f"atalante: {path} cannot be written: No space left on device\n"
 
 
 def test_text_report_explains_the_violated_rules(good: Path) -> None:

@@ -8,6 +8,7 @@ from __future__ import annotations
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -21,7 +22,7 @@ from atalante_tools.console.terminal import Progress, print_message, show_json
 if TYPE_CHECKING:
     from atalante_tools.canlog.plan import Plan
     from atalante_tools.canlog.validate.project import Project
-    from atalante_tools.canlog.validate.report import Report
+    from atalante_tools.canlog.validate.report import Report, Unread
 
 _FILE = click.Path(exists=True, dir_okay=False, path_type=Path)
 
@@ -91,15 +92,19 @@ _options = options_as(
         ),
         click.option("--list-rules", is_flag=True, help="Print every rule with its source and thresholds, then exit."),
         click.option(
-            "--junit", type=OutputFile(), default=None, metavar="FILE", help="Write the results as JUnit XML."
+            "--junit",
+            type=OutputFile(".xml"),
+            default=None,
+            metavar="FILE",
+            help="Write the results as JUnit XML to this .xml file.",
         ),
         click.option(
             "--html",
             "html_file",
-            type=OutputFile(),
+            type=OutputFile(".html", ".htm"),
             default=None,
             metavar="FILE",
-            help="Write the report with plots as HTML.",
+            help="Write the report with plots to this .html file.",
         ),
         json_option,
     ],
@@ -122,7 +127,7 @@ def command(logs: tuple[Path, ...], options: Options) -> None:
              atalante validate -i socketcan -c can0 --node LEFT_FH --for 10
              atalante validate drive.blf --dbc vehicle.dbc --rules vehicle.toml --junit result.xml
     """
-    from atalante_tools.canlog.validate.report import rules_json, rules_text
+    from atalante_tools.canlog.validate.report import Report, rules_json, rules_text
 
     if options.list_rules:
         if options.as_json:
@@ -141,11 +146,13 @@ def command(logs: tuple[Path, ...], options: Options) -> None:
         if given and not options.interface:
             raise click.UsageError(f"{option} needs a live bus: -i socketcan -c can0")
     plan, project = _prepare(options)
+    results: Sequence[Report | Unread]
     results, code = _listen(options, plan, project) if options.interface else _read(logs, plan, project, options.node)
-    for result in results:
+    reports = [result for result in results if isinstance(result, Report)]
+    for result in reports:
         _show(result, options.as_json)
-    _write(results, options.junit, options.html_file)
-    if any(result.findings or not result.validator.frames for result in results):
+    _write(results, reports, options.junit, options.html_file)
+    if any(result.findings or not result.validator.frames for result in reports):
         raise SystemExit(FAILED)
     if code:
         raise SystemExit(code)
@@ -176,16 +183,19 @@ def _prepare(options: Options) -> tuple[Plan, Project]:
     return plan, project
 
 
-def _read(logs: Sequence[Path], plan: Plan, project: Project, node: str | None) -> tuple[list[Report], int]:
-    """Check the logs one after another. A log that cannot be opened is reported on stderr and skipped.
+def _read(logs: Sequence[Path], plan: Plan, project: Project, node: str | None) -> tuple[list[Report | Unread], int]:
+    """Check the logs one after another. A log that cannot be read is reported on stderr, and the next log is checked.
 
     Returns:
-        The reports of all logs that could be opened, and the exit code.
+        One result for each log, in the order of `logs`, and the exit code. The result of a log that cannot be read is
+        `Unread`.
     """
     from atalante_tools.canlog.reader.log_file import LogError
+    from atalante_tools.canlog.validate.report import Unread
     from atalante_tools.canlog.validate.run import validate_log
 
-    results, code = [], 0
+    results: list[Report | Unread] = []
+    code = 0
     for path in logs:
         progress = Progress()
 
@@ -197,6 +207,7 @@ def _read(logs: Sequence[Path], plan: Plan, project: Project, node: str | None) 
             results.append(validate_log(path, plan, project, node=node, progress=show))
         except LogError as error:
             print_message(f"atalante: {error}")
+            results.append(Unread(str(path), str(error)))
             code = FAILED
         progress.clear()
     return results, code
@@ -252,21 +263,23 @@ def _show(result: Report, as_json: bool) -> None:
 
     if as_json:
         for finding in result.findings:
-            show_json(finding.as_json())
+            show_json({"log": result.name, **finding.as_json()})
         print_message(text(result))
     else:
         click.echo(text(result))
 
 
-def _write(results: Sequence[Report], junit: Path | None, html_file: Path | None) -> None:
-    """Write the JUnit and HTML reports that were requested."""
+def _write(
+    results: Sequence[Report | Unread], reports: Sequence[Report], junit: Path | None, html_file: Path | None
+) -> None:
+    """Write the JUnit and HTML reports that were requested. Only the JUnit report contains the logs that were not read."""
     from atalante_tools.canlog.validate.html import write_html
     from atalante_tools.canlog.validate.report import write_junit
 
-    for path, write in ((junit, write_junit), (html_file, write_html)):
+    for path, write in ((junit, partial(write_junit, results)), (html_file, partial(write_html, reports))):
         if path is None:
             continue
         try:
-            write(results, path)
+            write(path)
         except OSError as error:
             raise Failed(f"{path} cannot be written: {error.strerror}") from error

@@ -37,18 +37,22 @@ class Finding:
     @property
     def first_s(self) -> float:
         """Return the time stamp of the first violation in the log [s]."""
-        return self.first * 1e-9
+        return self.first / 10**9  # the division of two integers is rounded only once
 
     @property
     def last_s(self) -> float:
         """Return the time stamp of the last violation in the log [s]."""
-        return self.last * 1e-9
+        return self.last / 10**9
 
     def as_json(self) -> dict[str, Any]:
-        """Return the finding as a JSON object with the keys rule, message, node, count, first_s, last_s and worst."""
+        """Return the finding as a JSON object with the keys rule, message, signal, node, count, first_s, last_s and worst.
+
+        The signal is None in a finding about a whole frame, a bus or the log.
+        """
         return {
             "rule": self.rule,
             "message": self.message,
+            "signal": self.signal or None,
             "node": self.node,
             "count": self.count,
             "first_s": self.first_s,

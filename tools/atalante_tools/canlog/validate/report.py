@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import xml.etree.ElementTree as ET
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -16,6 +17,8 @@ from atalante_tools.console.terminal import table
 
 #: Maximum number of unchecked items that the text report lists per reason. The HTML report lists all unchecked items.
 _NAMES = 12
+#: Characters that XML 1.0 does not allow. They can be in the name of a log and in a text that quotes the log.
+_NOT_IN_XML = re.compile(r"[^\t\n\r\x20-\ud7ff\ue000-\ufffd\U00010000-\U0010ffff]")
 
 
 @dataclass(frozen=True)
@@ -32,6 +35,14 @@ class Report:
     def duration_s(self) -> float:
         """Return the time from the first to the last frame of the log [s]."""
         return 0.0 if self.validator.begin is None else (self.validator.end - self.validator.begin) * 1e-9
+
+
+@dataclass(frozen=True)
+class Unread:
+    """Log that could not be read."""
+
+    name: str  # name of the log
+    reason: str  # reason and remedy, for the user
 
 
 def report(name: str, validator: Validator, *, live: bool = False) -> Report:
@@ -118,13 +129,17 @@ def _short(item: Unchecked) -> str:
 # -- JUnit -----------------------------------------------------------------------------------------------------------------
 
 
-def write_junit(results: Sequence[Report], path: Path) -> None:
+def write_junit(results: Sequence[Report | Unread], path: Path) -> None:
     """Write JUnit XML with one test suite per log and one test case per rule.
 
-    A test case is skipped if the rule is silenced or was not checked.
+    A test case is skipped if the rule is silenced or was not checked. The test suite of a log that could not be read has
+    one test case, which contains the error.
     """
     suites = ET.Element("testsuites", name="atalante validate")
     for result in results:
+        if isinstance(result, Unread):
+            _add_unread(suites, result)
+            continue
         suite = ET.SubElement(
             suites, "testsuite", name=result.name, tests=str(len(RULES)), time=f"{result.duration_s:.3f}"
         )
@@ -144,10 +159,28 @@ def write_junit(results: Sequence[Report], path: Path) -> None:
             elif reason:
                 skipped += 1
                 ET.SubElement(case, "skipped", message=reason)
+        suite.set("errors", "0")
         suite.set("failures", str(failures))
         suite.set("skipped", str(skipped))
+    for element in suites.iter():
+        element.attrib = {key: _xml_text(value) for key, value in element.attrib.items()}
+        element.text = element.text and _xml_text(element.text)
     ET.indent(suites)
     ET.ElementTree(suites).write(path, encoding="utf-8", xml_declaration=True)
+
+
+def _xml_text(text: str) -> str:
+    r"""Return the text with each character that XML does not allow as an escape sequence, such as \x00."""
+    return _NOT_IN_XML.sub(lambda found: ascii(found[0])[1:-1], text)
+
+
+def _add_unread(suites: ET.Element, log: Unread) -> None:
+    """Add the test suite of a log that could not be read."""
+    suite = ET.SubElement(
+        suites, "testsuite", name=log.name, tests="1", time="0.000", errors="1", failures="0", skipped="0"
+    )
+    case = ET.SubElement(suite, "testcase", classname="atalante.validate", name="read")
+    ET.SubElement(case, "error", message=log.reason).text = log.reason
 
 
 def _skipped(result: Report, rule: str) -> str:
