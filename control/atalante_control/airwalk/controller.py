@@ -269,7 +269,8 @@ class AirwalkController:
         ratio, h, active = self._run(cycle, level, row, measured, self.guide.tables, self._parts)
         self.statistics.count(cycle, ratio, h, active)
         self._command.outside = self._assisting and h < 0.0
-        self._outside = self._outside + 1 if self._command.outside else max(0, self._outside - 1)
+        counted = self._command.outside and self._promised  # a guide without a promise may be left
+        self._outside = self._outside + 1 if counted else max(0, self._outside - 1)
         self._command.guide_left = self._promised and self._outside > self.config.outside_cycles
         self._command.hand_over_exceeded = cycle == 0 and self._exceeded
         return self._command

@@ -32,7 +32,8 @@ from atalante_hal.types import Vector
 
 Pair = tuple[float, float]
 
-_POSTURES = 3  # number of knee angles for which the mass matrix is evaluated in each cycle
+#: In each cycle, the mass matrix is evaluated at knee angles that are at most about this far apart [rad].
+_SPACING = math.radians(7.5)
 
 
 @dataclass(frozen=True)
@@ -150,8 +151,9 @@ class Leg(NamedTuple):
         Returns:
             Inverse mass matrices of SH and SK, shape (n, postures, 2, 2) [1/(kg m2)]. Axis 0: cycle. Axis 1: knee angle.
         """
+        postures = 2 * math.ceil(round(width / _SPACING, 6)) + 1
         moved = width + hand_over.largest(self.deadbeat.basis(self.time)[0])
-        knee = self.q[:, 1, None] + moved[:, None] * np.linspace(-1.0, 1.0, _POSTURES)
+        knee = self.q[:, 1, None] + moved[:, None] * np.linspace(-1.0, 1.0, postures)
         inverse: Vector = np.linalg.inv(self.masses(knee)).astype(np.float64)
         return inverse
 

@@ -18,7 +18,7 @@ from atalante_control.guide.config import StepGuideConfig
 from atalante_control.guide.disturbance import Leg
 from atalante_control.guide.filter import GuideConfig, GuideFilter
 from atalante_control.guide.prediction import Assumptions, prediction_of
-from atalante_control.guide.shapes import GuideShape
+from atalante_control.guide.shapes import GuideShape, half_width
 from atalante_control.joint.idealization import AssistedInertia
 from atalante_hal.robot import LEG_JOINTS, Robot
 from atalante_hal.types import Vector
@@ -28,8 +28,6 @@ from atalante_hal.types import Vector
 _MIDDLE = math.radians(30.0)
 #: Indices of SH and SK of the left leg. SH and SK have the same limits in both legs.
 _ASSISTED = [LEG_JOINTS.index("SH"), LEG_JOINTS.index("SK")]
-#: Largest half-width of a guide [rad]. This width applies at assistance factor 0, see `half_width`.
-_WIDEST = math.radians(7.5)
 #: Fraction of the largest certifiable disturbance torques that a filter assumes if the requested torques cannot be certified.
 #: With 1, a prediction would reach its limit even if nobody pushes, and the filter would apply the full backup torque.
 _MARGIN = 0.95
@@ -68,8 +66,11 @@ class StepGuides:
             promise=config.promise, mismatch=config.mismatch, hand_over=config.hand_over, overlap=overlap
         )
         limits = filter_config(config, robot)
+        phases = leg.time / leg.time[len(leg.time) - 1 - overlap]
+        # All shapes of the package are at most as wide as `half_width(0)`, so they share their predictions.
+        widest = max(half_width(0.0), float(shape.bounds(phases, 0.0).max()))
         self.filters = [
-            GuideFilter(limits, shape, prediction_of(policy, leg, assumptions, blend, _WIDEST), blend)
+            GuideFilter(limits, shape, prediction_of(policy, leg, assumptions, blend, widest), blend)
             for policy in policies(config, leg.inertia)
         ]
         self._limits = [PromiseLimits(guide) for guide in self.filters]

@@ -478,14 +478,14 @@ class WalkController:
         command, guide = self._command, self.config.guide
         guided = self._assisted and cycle < len(self._section.assistance.unmodelled)
         command.hand_over_exceeded = guided and cycle == 0 and self._exceeded
-        if not guided:
-            command.outside = False
-        else:
+        command.outside = False
+        if guided:
             hip, knee, hip_bound, knee_bound, h, gate = self._guarded.tolist()
             command.outside = h < 0.0
             ratio = max(_ratio(hip, hip_bound), _ratio(knee, knee_bound))
             self.statistics.guide.count(cycle, ratio, h, gate > guide.active)
-            self._outside = self._outside + 1 if command.outside else max(0, self._outside - 1)
+        counted = command.outside and self._promised  # a guide without a promise may be left
+        self._outside = self._outside + 1 if counted else max(0, self._outside - 1)
         command.guide_left = self._promised and self._outside > guide.outside_cycles
 
 

@@ -422,6 +422,24 @@ def test_leaving_the_guide_is_reported_after_outside_cycles():
     assert not any(left for _, left in pushed_out(replace(CONFIG, outside_cycles=50), "snap"))
 
 
+def test_cycles_outside_a_guide_without_a_promise_are_not_counted():
+    """In the first step, which has no promise, the hip is outside. In the second step, a promise holds and nothing is outside."""
+    controller = airwalk("widening", replace(CONFIG, outside_cycles=50))
+    controller.reset(walked()[0])
+    outside, left = [], []
+    for cycle, state in enumerate(walked()[: STARTUP + 2 * STEP - 10]):
+        position = state.position.copy()
+        position[SH] += 0.3 * (STARTUP + 200 < cycle < STARTUP + STEP - 50)
+        xi = 0.95 if cycle < STARTUP + STEP - 100 else 0.85
+        command = controller.update(replace(state, assistance_factor=xi, position=position))
+        outside.append(command.outside)
+        left.append(command.guide_left)
+    assert controller.certificate(0.85).certified
+    assert not controller.certificate(0.95).certified
+    assert sum(outside[: STARTUP + STEP]) > 300
+    assert not any(left)
+
+
 @pytest.mark.parametrize("silent", [("left_tibia", "right_tibia"), ("left_tibia", "right_tibia", "pelvis")])
 def test_flat_foot_ignores_imus_that_timed_out(silent: tuple[str, ...]):
     def ankles(quaternion: float, age: int) -> np.ndarray:

@@ -13,7 +13,7 @@ from atalante_control.airwalk.swing_leg import OVERLAP, swing_leg
 from atalante_control.dynamics.gravity import Gravity
 from atalante_control.gait.gait import AIRWALK_GAIT, load_gait
 from atalante_control.guide.certificate import PromiseLimits
-from atalante_control.guide.shapes import CONSTANT, SHAPES
+from atalante_control.guide.shapes import CONSTANT, SHAPES, GuideShape
 from atalante_control.guide.step_guides import StepGuides, filter_config, policies
 from atalante_control.joint.idealization import AssistedInertia
 from atalante_control.model import ExoskeletonParameters, pinocchio_model, urdf
@@ -81,3 +81,16 @@ def test_guide_of_any_assistance_factor_is_certified_like_that_of_the_next_hundr
         rounded = math.ceil(xi * 100) / 100
         assert guides.at(xi) == guides.at(rounded)
         assert guides.certificate(xi).certified >= guides.certificate(rounded).certified
+
+
+def test_a_wider_guide_than_those_of_the_package_promises_less():
+    """In a wider guide, the knee can reach angles at which the leg accelerates faster."""
+    promises = []
+    for degrees in (7.5, 10.0, 15.0, 30.0, 60.0):
+        share = degrees / 7.5
+        shape = GuideShape("wide", "", lambda phase, _, share=share: (np.full(phase.shape, share),) * 2)
+        guides = StepGuides(CONFIG, ROBOT, shape, LEG, np.linspace(1.0, 0.0, 20), OVERLAP)
+        assert guides.certificate(0.5).certified
+        promises.append(guides.at(0.5).promise)
+    assert promises[0] == 1.0
+    assert (np.diff(promises) < 0.0).all()
