@@ -204,14 +204,15 @@ class Hal:
                 Dtc.TORQUE_SATURATED, "the limiter cuts the torque", cycles > SATURATED_CYCLES, cycles
             )
         safety_monitor.step, safety_monitor.walking = command.step, command.walking
-        self._errors = 0
         if command.outside:
             safety_monitor.report(Dtc.GUIDE_OUTSIDE, "a joint is outside the virtual guide", command.guide_left)
         if command.hand_over_exceeded:
             text = "a step started with a larger deviation than the certificate of its guide assumes (hand-over box)"
             safety_monitor.report(Dtc.GUIDE_OUTSIDE, text, False)
         self._commands.drive(self._limiter.last, command.vibration)
-        return self._send_command()
+        sent = self._send_command()
+        self._errors = 0  # last, because each statement above can raise an exception
+        return sent
 
     def hold(self) -> Vector:
         """Send HOLD. During a start, send the next CiA 402 controlword on the path to OPERATION ENABLED instead.

@@ -116,8 +116,9 @@ class Pendant:
         self.hold_requested = present and demand.hold
         if not further_frames:
             edge = new and request == _START and self._press is not None and press != self._press
-            self.started = present and (edge or self._pressed)
-            self._pressed = not present and (edge or self._pressed) and request == _START and demand.dead_man
+            stored = (edge or self._pressed) and request == _START and demand.dead_man
+            self.started = present and (edge or stored)
+            self._pressed = not present and stored
             self._press = press if new else self._press
         elif not demand.dead_man or demand.stop:
             self._pressed = False

@@ -344,6 +344,12 @@ def _field(signal: RawSignal, selectors: tuple[tuple[str, frozenset[int]], ...])
 
 
 def _invalid_raw(signal: RawSignal) -> int | None:
+    """Return the raw code that means "no value"; None if there is none.
+
+    The default of the attribute is ignored: a default of 0 would make the value 0 of every signal invalid.
+    """
+    if signal.dbc is None or "InvalidRaw" not in (signal.dbc.attributes or {}):
+        return None
     try:
         value = int(_text(_of(signal, "InvalidRaw")), 0)
     except ValueError:

@@ -126,6 +126,12 @@ def test_data_id_needs_attribute_and_header(tmp_path: Path) -> None:
     assert layout_of(header, tmp_path).data_id is None
 
 
+def test_default_of_the_invalid_code_is_ignored(tmp_path: Path) -> None:
+    attribute = 'BA_DEF_ SG_ "InvalidRaw" INT 0 255;\nBA_DEF_DEF_ "InvalidRaw" 0;\n'
+    assert layout_of(ONE + attribute, tmp_path).field("S").invalid_raw is None
+    assert layout_of(ONE + attribute + 'BA_ "InvalidRaw" SG_ 256 S 255;\n', tmp_path).field("S").invalid_raw == 255
+
+
 def test_dbc_lines_in_a_comment_are_ignored(tmp_path: Path) -> None:
     """The comment contains lines of a message and a signal."""
     layout = layout_of(ONE + 'CM_ BO_ 256 "as in BO_ 256 M: 8 A and SG_ S m0 : 0|8";\n', tmp_path)

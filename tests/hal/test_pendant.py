@@ -211,6 +211,18 @@ def test_press_released_before_qualification_does_not_count(pendant: Pendant, ta
     assert not pendant.started
 
 
+@pytest.mark.parametrize("released", [(0, START, 7), (1, STOP, 7), (1, 0, 7), (0, 0, 7)])
+def test_press_released_in_the_first_frame_of_a_qualified_pendant_does_not_count(
+    pendant: Pendant, released: tuple[int, int, int]
+):
+    qualify(pendant, press=6)
+    qualify(pendant, request=START, press=7)
+    send(pendant, *released)
+    assert not pendant.started
+    send(pendant, request=START, press=7)
+    assert not pendant.started
+
+
 def test_press_without_dead_man_is_not_kept(pendant: Pendant):
     qualify(pendant, dead_man=0, press=6)
     qualify(pendant, dead_man=0, request=START, press=7)

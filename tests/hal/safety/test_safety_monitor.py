@@ -334,6 +334,21 @@ def test_silent_drive_ends_a_walk_and_after_ten_cycles_the_motion(rig, drive: st
     assert states == [S.ACTIVE] * 7 + [S.FINISH_STEP] * 2 + [S.HOLD]
 
 
+def test_five_consecutive_exceptions_of_write_in_a_walk_lead_to_hold(rig):
+    walking_on_the_ground(rig)
+    rig.walk(1, step=7, walking=True)
+    for number in range(BRIDGED_ERRORS + 1):
+        rig.hal.read()
+        wrong = replace(rig.hold_torque(step=7, walking=True), vibration=np.zeros(3))
+        with pytest.raises(ValueError, match="broadcast") as mistake:
+            rig.hal.write(wrong)
+        rig.hal.fail(mistake.value)
+        last = number == BRIDGED_ERRORS
+        assert rig.controlwords() == {Controlword.QUICK_STOP if last else Controlword.ENABLE_OPERATION}
+    assert rig.hal.read().supervisor is S.HOLD
+    assert "CONTROLLER_LOST" in rig.codes()
+
+
 def test_exception_of_the_controller_in_a_walk_is_bridged_with_the_last_torques(rig):
     walking_on_the_ground(rig)
     rig.hal.read()

@@ -136,6 +136,21 @@ def test_parquet_integer_is_exact_with_a_large_offset(tmp_path: Path) -> None:
     assert [int(row["integer"]) for row in pq.read_table(out).to_pylist()] == [2**60 + 1]
 
 
+def test_parquet_names_64_bit_codes(tmp_path: Path) -> None:
+    dbc, log, out = (tmp_path / name for name in ("wide.dbc", "wide.log", "out.parquet"))
+    dbc.write_text(
+        'VERSION ""\nBU_: A\nBO_ 256 M: 8 A\n SG_ S : 0|64@1+ (1,0) [0|1000] "" A\n'
+        f'VAL_ 256 S {2**64 - 1} "SNA" {2**63} "HALF" 1 "ONE" ;\n'
+    )
+    codes = (2**64 - 1, 2**63, 1, 2**63 - 1)
+    log.write_text("".join(f"(1.000000) can0 100#{code.to_bytes(8, 'little').hex()}\n" for code in codes))
+    assert run("decode", log, "--dbc", dbc, "-o", out).exit_code == 0
+    rows = pq.read_table(out).to_pylist()
+    assert [(int(row["integer"]), row["text"]) for row in rows] == list(
+        zip(codes, ("SNA", "HALF", "ONE", None), strict=True)
+    )
+
+
 def test_parquet_has_the_documented_columns(tmp_path: Path) -> None:
     log, _ = random_log(atalante_dbc.DBC_FILE, tmp_path / "random.log", 200)
     run("decode", log, "-o", tmp_path / "out.parquet")

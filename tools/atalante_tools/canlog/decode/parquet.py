@@ -124,18 +124,30 @@ class ParquetSink:
         """Return for each raw code the index of its name in `_texts`; -1 if the raw code has no name.
 
         Returns:
-            The indices, shape (n,); None if the field has no value table.
+            The indices, shape (n,); None if no raw code of the field has a name.
         """
-        if not field.choices:
+        names = _names(field)
+        if not names:
             return None
-        known = np.array(sorted(field.choices), np.int64)
-        numbers = np.array([self._text_number[field.choices[code]] for code in known.tolist()], np.int32)
+        known = np.array(sorted(names), np.int64)
+        numbers = np.array([self._text_number[names[code]] for code in known.tolist()], np.int32)
         at = np.minimum(np.searchsorted(known, codes), len(known) - 1)
         return np.where(known[at] == codes, numbers[at], np.int32(-1))
 
     def close(self) -> None:
         """Write the file footer and close the file."""
         self._writer.close()
+
+
+def _names(field: Field) -> dict[int, str]:
+    """Return the value table of a field, with each raw code as the int64 that has the same bits.
+
+    The raw codes from 2**63 of an unsigned 64-bit field become negative. Raw codes that the field cannot have are omitted.
+    """
+    codes = raw_range(field)
+    return {
+        code - (1 << 64) if code >= 1 << 63 else code: text for code, text in field.choices.items() if code in codes
+    }
 
 
 def _exact(field: Field, values: npt.NDArray[Any]) -> Any:

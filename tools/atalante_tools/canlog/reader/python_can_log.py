@@ -2,7 +2,7 @@
 
 If the readers of python-can cannot parse an entry, they log a warning and skip this entry. They return a truncated
 record as a shorter frame, and they leave files open. This module counts the skipped entries, detects truncated records
-and closes the files.
+and closes the files. It rejects .asc logs with relative time stamps, because python-can returns these stamps as times.
 """
 
 from __future__ import annotations
@@ -102,7 +102,26 @@ def _messages(log: LogFile) -> Iterator[tuple[Iterator[Any], Callable[[], int]]]
         file: Any = stack.enter_context(gzip.GzipFile(fileobj=raw)) if log.compressed else raw
         if not issubclass(reader_type, BinaryIOMessageReader):
             file = stack.enter_context(io.TextIOWrapper(file, encoding="utf-8", errors="replace"))
-        yield iter(stack.enter_context(reader_type(file))), raw.tell
+        reader = stack.enter_context(reader_type(file))
+        yield _with_absolute_times(reader) if log.suffix == ".asc" else iter(reader), raw.tell
+
+
+def _with_absolute_times(reader: Any) -> Iterator[Any]:
+    """Yield the messages of an .asc log.
+
+    A relative time stamp counts from the previous line of the log. python-can does not add up relative time stamps, and it
+    skips the lines without a CAN frame. Therefore the times of such a log cannot be computed from the messages.
+
+    Raises:
+        ValueError: If the time stamps of the log are relative. The error is raised before the first message.
+    """
+    messages = iter(reader)
+    for first in messages:  # the reader reads the header of the log together with the first message
+        if (reader.timestamps_format or "").lower() == "relative":
+            raise ValueError('the time stamps must be absolute, got "timestamps relative"')
+        yield first
+        break
+    yield from messages
 
 
 def _remark(log: LogFile, count: int, broken: str, ends_within: bool, warnings: _Warnings) -> None:

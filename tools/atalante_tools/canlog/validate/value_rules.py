@@ -106,45 +106,48 @@ class ValueRules:
                 self._report("multiplexer", decoded, stream, undefined, index, shown=decoded.codes[index])
 
     def _check_limits(self, checks: _FamilyChecks, decoded: Decoded, stream: Stream) -> None:
+        suspects = {index for index, code in checks.coded.items() if bool((decoded.codes[index] == code).any())}
         if len(checks.limited):
             codes = decoded.codes[checks.limited] if len(checks.limited) < len(decoded.raw) else decoded.codes
             outside = (codes.min(axis=1) < checks.low) | (codes.max(axis=1) > checks.high)
-            for at in np.flatnonzero(outside).tolist():
-                self._check_limit(checks, decoded, stream, int(checks.limited[at]))
+            suspects.update(checks.limited[outside].tolist())
+        for index in sorted(suspects):
+            self._check_limit(checks, decoded, stream, index)
         for index in checks.special:
-            self._check_special(decoded, stream, index)
-        for index, code in checks.coded.items():
-            outside = decoded.codes[index] == code
-            if bool(outside.any()):
-                self._check_outside(decoded, stream, index, outside, decoded.codes[index].astype(np.float64))
+            self._check_special(checks, decoded, stream, index)
 
     def _check_limit(self, checks: _FamilyChecks, decoded: Decoded, stream: Stream, index: int) -> None:
-        """Report the frames in which the raw code of a signal is outside its range."""
+        """Report the frames in which the raw code of a signal is outside its range or means "no value"."""
         codec, codes = decoded.family.codec, decoded.codes[index]
-        low, high = checks.bounds[index]
-        outside = (codes < low) | (codes > high)
+        outside = np.zeros(len(codes), np.bool_)
+        if index in checks.bounds:
+            low, high = checks.bounds[index]
+            outside = (codes < low) | (codes > high)
         self._check_outside(decoded, stream, index, outside, codec.values(decoded.raw, index).astype(np.float64))
 
-    def _check_special(self, decoded: Decoded, stream: Stream, index: int) -> None:
-        """Check the physical values of a float or 64-bit field.
+    def _check_special(self, checks: _FamilyChecks, decoded: Decoded, stream: Stream, index: int) -> None:
+        """Check the values of a float or 64-bit field.
 
-        The raw codes of such a field are not ordered like the values, so the codes cannot be compared with the range.
+        The signed raw codes of such a field are not ordered like the values, so they cannot be compared with the range. The
+        physical values of a float field and the unsigned or signed raw codes of a 64-bit field are compared instead.
         """
         values = decoded.family.codec.values(decoded.raw, index).astype(np.float64)
-        limits = decoded.family.codec.fields[index]
-        low = -math.inf if limits.minimum is None else limits.minimum
-        high = math.inf if limits.maximum is None else limits.maximum
-        margin = 1e-9 * max(abs(x) for x in (low, high, 1.0) if math.isfinite(x))
-        outside = ~((values >= low - margin) & (values <= high + margin))
+        kind = decoded.family.codec.fields[index].kind
+        low, high = checks.special[index]
+        if kind == "float":
+            outside = ~((values >= low) & (values <= high))
+        else:
+            codes = decoded.codes[index] if kind == "signed" else decoded.raw[index]
+            outside = (codes < low) | (codes > high)
         self._check_outside(decoded, stream, index, outside, values)
 
     def _check_outside(
         self, decoded: Decoded, stream: Stream, index: int, outside: Mask, values: npt.NDArray[np.float64]
     ) -> None:
-        """Report all values outside the range of a field.
+        """Report all values outside the range of a field, and all codes for "no value".
 
-        The code for "no value" is reported under the rule invalid-code instead of the rule range. A value in the value
-        table is valid, even outside the range.
+        The code for "no value" is reported under the rule invalid-code instead of the rule range, inside and outside the
+        range. Any other value in the value table is valid, even outside the range.
 
         Args:
             decoded: decoded frames of a message family, in which this method marks the invalid values.
@@ -156,16 +159,16 @@ class ValueRules:
         codec, codes = decoded.family.codec, decoded.codes[index]
         limits = codec.fields[index]
         present = codec.present(decoded.raw, index)
-        if present is not None:
-            outside = outside & present
         invalid = np.zeros(len(codes), np.bool_)
         if limits.invalid_raw is not None:
-            invalid = outside & (codes == _as_signed(limits, limits.invalid_raw))
-            if bool(invalid.any()):
-                self._report("invalid-code", decoded, stream, invalid, index, shown=codes)
+            invalid = codes == _as_signed(limits, limits.invalid_raw)
+        if present is not None:
+            outside, invalid = outside & present, invalid & present
+        if bool(invalid.any()):
+            self._report("invalid-code", decoded, stream, invalid, index, shown=codes)
         wrong = outside & ~invalid
         if limits.choices and bool(wrong.any()):
-            wrong &= ~np.isin(codes, list(limits.choices))
+            wrong &= ~np.isin(codes, _named_codes(limits))
         if bool(wrong.any()):
             low, high = limits.minimum or 0.0, limits.maximum or 0.0
             distance = np.maximum(low - values, values - high)
@@ -212,14 +215,24 @@ class _FamilyChecks:
     def __init__(self, codec: ColumnCodec, pattern: float, hash_signal: str) -> None:
         fields = list(enumerate(codec.fields))
         ranged = [(p, f) for p, f in fields if is_limited(f)]
-        self.special = [p for p, f in ranged if f.kind == "float" or f.length == _WORD]
+        #: Field index -> smallest and largest valid value (float field) or raw code (64-bit field).
+        self.special = {
+            p: _float_limits(f) if f.kind == "float" else raw_bounds(f)
+            for p, f in ranged
+            if f.kind == "float" or f.length == _WORD
+        }
         self.bounds = {p: raw_bounds(f) for p, f in ranged if p not in self.special}
         self.limited = np.array(list(self.bounds), np.intp)
         self.low = np.array([low for low, _ in self.bounds.values()], np.int64)
         self.high = np.array([high for _, high in self.bounds.values()], np.int64)
-        #: Field index -> raw code that means "no value", for all fields with such a code but without a limited range.
+        #: Field index -> raw code that means "no value", for all fields whose limits do not exclude this code. All values of
+        #: the other fields are checked if the code occurs: it is outside the limits, or the field is in `special`.
         self.coded = {
-            p: _as_signed(f, f.invalid_raw) for p, f in fields if f.invalid_raw is not None and (p, f) not in ranged
+            p: code
+            for p, f in fields
+            if f.invalid_raw is not None and p not in self.special
+            for code in [_as_signed(f, f.invalid_raw)]
+            if p not in self.bounds or self.bounds[p][0] <= code <= self.bounds[p][1]
         }
         self.tables = {p: _table(f) for p, f in fields if is_enumeration(f)}
         self.hashes = [p for p, f in fields if is_hash(f, hash_signal)]
@@ -252,7 +265,8 @@ def is_limited(limits: Field) -> bool:
 def raw_bounds(limits: Field) -> tuple[int, int]:
     """Return the smallest and the largest raw code inside the DBC range.
 
-    A tolerance of 1e-6 of a raw code is added, because the DBC limits are rounded decimals.
+    A tolerance of 1e-6 of a raw code is added, because the DBC limits are rounded decimals. The tolerance of large raw codes is
+    the rounding error of float64.
     """
     assert limits.minimum is not None
     assert limits.maximum is not None
@@ -262,8 +276,37 @@ def raw_bounds(limits: Field) -> tuple[int, int]:
 @lru_cache(maxsize=4096)  # cached, because many signals of a DBC have equal limits
 def _codes_within(minimum: float, maximum: float, factor: float, offset: float, codes: range) -> tuple[int, int]:
     raw = sorted((x - offset) / factor for x in (minimum, maximum))
-    low, high = math.ceil(raw[0] - 1e-6), math.floor(raw[1] + 1e-6)
+    margins = [max(1e-6, 1e-15 * abs(x)) for x in raw]
+    low, high = math.ceil(raw[0] - margins[0]), math.floor(raw[1] + margins[1])
     return max(low, codes[0]), min(high, codes[-1])
+
+
+def _float_limits(limits: Field) -> tuple[float, float]:
+    """Return the smallest and the largest physical value inside the DBC range of a float field.
+
+    The raw value of each limit is rounded to the float format of the field. Therefore a limit that the format cannot
+    represent, such as 0.1, is valid. For float64, a tolerance of 1e-9 of each limit is added, because the DBC limits are
+    rounded decimals, and at least the rounding error of the offset.
+    """
+    assert limits.minimum is not None
+    assert limits.maximum is not None
+    low, high = (_as_sent(limits, x) for x in (limits.minimum, limits.maximum))
+    if limits.length < _WORD:
+        return low, high
+    rounding = 1e-15 * abs(limits.offset)
+    return low - max(1e-9 * abs(low), rounding), high + max(1e-9 * abs(high), rounding)
+
+
+def _as_sent(limits: Field, value: float) -> float:
+    """Return the physical value in a frame after a sender rounded it to the float format of the field.
+
+    A value that is too large for the format is returned unchanged.
+    """
+    factor, offset = float(limits.factor), float(limits.offset)
+    raw = np.float64((value - offset) / factor)
+    with np.errstate(over="ignore"):
+        sent = float(raw.astype(np.dtype(f"f{limits.length // 8}"))) * factor + offset
+    return sent if math.isfinite(sent) else value
 
 
 def is_enumeration(named: Field) -> bool:
@@ -295,12 +338,18 @@ def is_hash(field: Field, signal: str) -> bool:
 
 def _table(named: Field) -> npt.NDArray[np.bool_] | Sequence[int]:
     if named.length > _TABLE_BITS:
-        return list(named.choices)
+        return _named_codes(named)
     table = np.zeros(1 << named.length, np.bool_)
     for code in named.choices:
         if -len(table) <= code < len(table):
             table[code] = True
     return table
+
+
+def _named_codes(named: Field) -> list[int]:
+    """Return the raw codes in the value table of a field, in the form of the raw codes in `Decoded.codes`."""
+    codes = raw_range(named)
+    return [code - (1 << _WORD) if code >= 1 << _WORD - 1 else code for code in named.choices if code in codes]
 
 
 def _as_signed(limits: Field, raw: int) -> int:
