@@ -16,7 +16,7 @@ demo: .venv/installed-all ## walk in the air inside each guide shape, then on th
 
 # Two short runs compile the numeric functions while `lint` runs, so the tests do not compile them in every process.
 # With worksteal, the tests of a file mostly run in one worker, so their shared fixtures are created only once.
-test: .venv/installed-dev ## run `lint` and every kind of test once: all tests except the long ones and those that need SocketCAN
+test: .venv/installed-dev ## run `lint` and all tests except the long ones and those that need SocketCAN
 	$(MAKE) --no-print-directory -j 2 lint compile
 	$(BIN)/python -m pytest -n 2 --dist worksteal -m "not (long or exhaustive)"
 

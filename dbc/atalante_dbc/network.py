@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from functools import cached_property
 from typing import TypeVar
 
-#: Largest signal length [bit]. A decoded value is a float64, which represents integers of this length exactly.
+#: Largest signal length [bit]. The codec rounds integers of at most this length exactly.
 LONGEST_SIGNAL = 51
 
 

@@ -2,7 +2,7 @@
 
 `leg, backup policy, mismatch -> matrices from state to predicted errors, largest effect of the disturbances`. The mismatch is
 the largest model errors. The guide filter and the certificate use the tables. The tables are valid for one gait and one set of
-backup gains. They do not depend on the guide shape.
+backup gains. They depend on the guide shape only through the width of a very wide guide.
 """
 
 from __future__ import annotations
@@ -183,7 +183,7 @@ _MOST_KEPT = 8
 def prediction_of(policy: BackupPolicy, leg: Leg, assumptions: Assumptions, blend: Vector, width: float) -> Prediction:
     """Return the prediction for a leg, from a cache if possible.
 
-    The last `_MOST_KEPT` predictions are cached, because all guide shapes of a gait use the same prediction.
+    The last `_MOST_KEPT` predictions are cached, because guide shapes with the same largest width share the prediction of a gait.
 
     Args:
         policy: gains of the backup policy.

@@ -25,6 +25,8 @@ JOINTS = ("SH", "SK")  # joints with a guide, in the order of the bounds
 #: Phases and assistance factors at which a shape is checked on construction.
 _CHECKED_PHASES = np.linspace(0.0, 1.0, 2001)
 _CHECKED_FACTORS = np.linspace(0.0, 1.0, 21).tolist()
+#: Increase of a bound [rad] that counts as rounding error.
+_ROUNDING = 1e-9
 
 
 def half_width(xi: float) -> float:
@@ -75,10 +77,18 @@ class GuideShape:
             phase: (t - t_i) / T, shape (n,).
 
         Raises:
-            ValueError: If a bound is invalid, as for `bounds`.
+            ValueError: If a bound is invalid, as for `bounds`, or larger at a larger assistance factor. The guide of a step is
+                certified for the next larger hundredth, see `StepGuides.at`.
         """
+        before: Vector | float = math.inf
         for xi in _CHECKED_FACTORS:
-            self.bounds(phase, xi)
+            bounds = self.bounds(phase, xi)
+            if (bounds > before + _ROUNDING).any():
+                raise ValueError(
+                    f"bounds of the guide shape {self.name!r} must not become larger with the assistance factor, "
+                    f"got larger bounds at Xi {xi:g}"
+                )
+            before = bounds
 
     def bounds(self, phase: Vector, xi: float) -> Vector:
         """Return the distances from the desired trajectory to the guide.

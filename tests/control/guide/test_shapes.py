@@ -115,6 +115,15 @@ def test_shape_that_closes_in_narrow_guides_is_rejected():
         GuideShape("narrow", "", lambda phase, width: ((width - 0.03) * np.ones_like(phase), np.ones_like(phase)))
 
 
+def test_shape_that_becomes_wider_with_the_assistance_factor_is_rejected():
+    def wider(phase: np.ndarray, width: float) -> tuple[np.ndarray, np.ndarray]:
+        share = np.full_like(phase, 2.5 if width < half_width(0.45) else 1.0)
+        return share, share
+
+    with pytest.raises(ValueError, match=r"'wider' must not become larger .*, got larger bounds at Xi 0\.5"):
+        GuideShape("wider", "", wider)
+
+
 def test_invalid_bound_between_the_checked_phases_is_rejected_on_use():
     between = GuideShape("between", "", at(-1.0, 0, lambda phase, width: np.abs(phase - 0.41625) < 1e-5))
     with pytest.raises(ValueError, match=r"'between' must be .* at phase 0\.4163"):

@@ -11,7 +11,7 @@ from atalante_control.walking.phases import Phase
 from atalante_emulator.bodies import Body, hang, make_body
 from atalante_emulator.imu import ImuParameters, Imus, ImuSignals
 from atalante_hal.robot import load_robot
-from atalante_hal.types import State, SupervisorState
+from atalante_hal.types import Command, State, SupervisorState
 
 ROBOT = load_robot()
 PATIENT = Patient(75.0, 1.75)
@@ -47,8 +47,9 @@ class Ideal:
             foot_rows=(0, 1),
         )
         self._torque = zero.copy()
+        self.push = zero.copy()  # torques on the joints, besides those of the motors [Nm]
 
-    def cycle(self, controller: WalkController) -> None:
+    def cycle(self, controller: WalkController) -> Command:
         body, state = self.body, self.state
         self._imus.sample(body.imu)
         state.position[:], state.velocity[:] = body.position, body.velocity
@@ -56,10 +57,12 @@ class Ideal:
         state.foot_force[received] = body.sole_force[received]
         if state.cycle == 0:
             controller.reset(state)
-        torque = controller.update(state).torque.copy()
-        body.step(self._torque.tolist())
+        command = controller.update(state)
+        torque = command.torque.copy()
+        body.step((self._torque + self.push).tolist())
         self._torque = np.clip(torque, -ROBOT.torque_max, ROBOT.torque_max)
         state.cycle += 1
+        return command
 
     def upright(self) -> bool:
         x, y, _, _ = self.body.motion("pelvis").attitude

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 import pytest
 
+from atalante_control.guide.shapes import CONSTANT
 from atalante_control.model import ExoskeletonParameters, urdf
 from atalante_control.walking.config import WalkConfig
 from atalante_control.walking.controller import WalkController
@@ -17,7 +18,7 @@ from atalante_control.walking.phases import Phase
 from atalante_control.walking.placement import PlacementConfig
 from atalante_control.walking.telemetry import TELEMETRY_FIELDS
 from atalante_emulator.bodies import hang, make_body
-from atalante_hal.robot import MOTORS
+from atalante_hal.robot import JOINTS, MOTORS
 from atalante_hal.types import Command, State
 from tests.control.walking.ideal_robot import PATIENT, ROBOT, WALK, Ideal, walk_with
 
@@ -104,9 +105,14 @@ def test_heading_follows_a_pelvis_imu_with_a_heading_reference(reference: bool, 
 
 def elapsed_of(controller: WalkController) -> float:
     """Return the time since the start of the phase, from the telemetry [s]."""
+    return field_of(controller, "elapsed")
+
+
+def field_of(controller: WalkController, name: str) -> float:
+    """Return the first value of a telemetry field."""
     widths = dict(TELEMETRY_FIELDS)
     names = [*widths]
-    return float(controller.telemetry[sum(widths[name] for name in names[: names.index("elapsed")])])
+    return float(controller.telemetry[sum(widths[name] for name in names[: names.index(name)])])
 
 
 def pushed(
@@ -216,6 +222,31 @@ class RecordingController(WalkController):
         shares = (fields["error"] / fields["q_bound"]).tolist() if guided else []
         self.felt.append(Felt(guided, 1 - int(fields["stance"][0]), shares, command.vibration.tolist()))
         return command
+
+
+def test_count_of_the_cycles_outside_falls_in_a_step_without_a_guide() -> None:
+    """In step 1, a torque beyond the promise moves the swing leg out of its guide. Step 2 has full assistance, step 3 a guide."""
+    controller = WalkController(ROBOT, PATIENT, WALK, 4, WalkConfig(), CONSTANT)
+    body = make_body("mujoco", urdf(ExoskeletonParameters(), ROBOT, PATIENT), free=True, ground=0.0)
+    left: dict[int, list[bool]] = {step: [] for step in range(5)}
+    try:
+        hang(body, controller.standing_pose.tolist(), 0.0005)
+        robot = Ideal(body)
+        while controller.phase is not Phase.REST:
+            step = controller.statistics.steps
+            robot.state.assistance_factor = 1.0 if step == 1 and any(left[1]) else 0.85
+            command = robot.cycle(controller)
+            if controller.phase is Phase.STEP:
+                left[step].append(command.guide_left)
+                swing = ("right", "left")[int(field_of(controller, "stance"))]
+                pushed = step == 1 and 0.25 < elapsed_of(controller) < 0.72
+                for joint in ("SH", "SK"):
+                    robot.push[JOINTS.index(f"{swing}_{joint}")] = 100.0 * pushed
+            assert robot.upright()
+    finally:
+        body.close()
+    assert any(left[1])
+    assert not any(left[3])
 
 
 def test_vibration_shows_the_tracking_errors_of_the_guided_leg() -> None:

@@ -926,7 +926,7 @@ OTHER_SIGNAL = {"drive": "Temperature", "imu": "Temperature", "foot": "Temperatu
 CYCLIC = [m for m in load().received_by("HAL") if m.cycle_ms == 1]
 
 
-@pytest.mark.sample(10)
+@pytest.mark.sample(9)
 @pytest.mark.parametrize("order", ORDERS)
 @pytest.mark.parametrize("message", CYCLIC, ids=lambda message: message.name)
 def test_f58_second_sender_of_any_node_leads_to_hold_within_five_cycles(make_rig, message: Message, order: str):

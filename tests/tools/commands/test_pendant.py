@@ -363,7 +363,7 @@ def test_garbage_in_every_cycle_does_not_stop_a_pendant(world: World) -> None:
     assert node.answered == world.hal.state.cycle
 
 
-@pytest.mark.sample(8)
+@pytest.mark.sample(7)
 @pytest.mark.parametrize("older", [False, True])
 @pytest.mark.parametrize("offset", [0, 1, 2, 5, 30, 49, 77, 120])
 def test_one_pendant_is_left_and_motion_requires_its_dead_man(world: World, offset: int, older: bool) -> None:

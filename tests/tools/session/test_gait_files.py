@@ -168,7 +168,7 @@ def test_wrong_gait_file_is_rejected_before_the_robot_moves(
     assert done.stderr.count("\n") == 1
 
 
-@pytest.mark.sample(4)
+@pytest.mark.sample(3)
 @pytest.mark.parametrize("command", COMMANDS)
 @pytest.mark.parametrize(
     ("options", "message"),
