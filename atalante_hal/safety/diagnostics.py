@@ -43,7 +43,7 @@ class Dtc(StrEnum):
     severity: Severity
     #: Short description for the operator.
     meaning: str
-    #: Integer in which only the bit of this code is set. Sums of these integers are bit sets of codes.
+    #: Power of two that belongs to this code only. An integer represents a set of codes: the bits of its codes are set.
     bit: int
 
     def __new__(cls, code: str, reaction: Reaction, severity: Severity, meaning: str) -> Dtc:

@@ -337,7 +337,7 @@ class RingReader(_Ring, Closing):
         return self._next
 
     def notes(self) -> list[dict[str, Any]]:
-        """Return the notes written since the last call. The key "from" is the number of the record that follows the note.
+        """Return the notes written since the last call. In each note, "from" is the number of the first record after it.
 
         Call this method after `read`. Then the result contains every note that belongs to the records read.
         """

@@ -78,7 +78,8 @@ class Record(NamedTuple):
     samples: Vector
     force: Vector  # (4, 3) mean difference between specific force and gravity, in world axes [m/s2]
     #: Mean square difference between two angular velocities that must be equal, about three axes, shape (5, 3) [rad2/s2].
-    #: Rows 0 to 3: gyroscope minus change of attitude of each IMU; row 4: gyroscope of the torso minus gyroscope of the pelvis.
+    #: Rows 0 to 3, one for each IMU: gyroscope minus rate of change of its attitude. Row 4: gyroscope of the torso minus that
+    #: of the pelvis.
     rate_error: Vector
     rate: Vector  # (5, 3) mean square of the angular velocity [rad2/s2]; rows and columns as in `rate_error`
     tilt: Vector  # (3,) mean of the unit vector upwards in torso axes minus the same vector in pelvis axes

@@ -15,8 +15,8 @@ points open. This controller decides them as follows:
 - *Gains.* A narrow guide requires a stiff backup policy, but a stiff policy reaches the torque limit in a wide guide. There are
   a few sets of gains. Each step uses the softest set whose certificate includes the requested promise at the Xi of the step. The
   promise is a disturbance torque that does not move the joints out of the guide.
-- *Leaving the guide.* A counter rises in each cycle with h below 0 (outside the safe backward image) and falls in each other
-  cycle. If the counter exceeds `outside_cycles` although the guide has a promise, the disturbance is larger than promised. The
+- *Leaving the guide.* In a guide with a promise, a counter rises in each cycle with h below 0 (outside the safe backward
+  image). It falls in every other cycle. If the counter exceeds `outside_cycles`, the disturbance is larger than promised. The
   HAL then moves Xi to 1.
 - *Carry-over.* At a stance change the torque jumps for three reasons: the re-centring sets the tracking error to zero, the
   control law of each leg changes, and the prediction of the guide filter, which is shorter near the end of a step, returns to
@@ -41,6 +41,7 @@ from atalante_control.gait.recentering import Deadbeat
 from atalante_control.guide.certificate import Certificate
 from atalante_control.guide.filter import GuideFilter
 from atalante_control.guide.literal import LiteralConfig, LiteralGuide, no_promise
+from atalante_control.guide.outside_count import OutsideCount
 from atalante_control.guide.shapes import GuideShape
 from atalante_control.guide.step_guides import Choice, StepGuides
 from atalante_control.joint.flat_foot import LevelFeet
@@ -230,7 +231,8 @@ class AirwalkController:
         self.pid.start_step(RIGHT, self._share)
         self._command.vibration.fill(0.0)
         self._command.outside = self._command.guide_left = self._command.hand_over_exceeded = False
-        self._outside, self._promised, self._exceeded = 0, False, False
+        self._outside = OutsideCount(self.config.outside_cycles)
+        self._promised, self._exceeded = False, False
         self.telemetry.fill(0.0)
         self.statistics = AirwalkStatistics()
 
@@ -269,9 +271,7 @@ class AirwalkController:
         ratio, h, active = self._run(cycle, level, row, measured, self.guide.tables, self._parts)
         self.statistics.count(cycle, ratio, h, active)
         self._command.outside = self._assisting and h < 0.0
-        counted = self._command.outside and self._promised  # a guide without a promise may be left
-        self._outside = self._outside + 1 if counted else max(0, self._outside - 1)
-        self._command.guide_left = self._promised and self._outside > self.config.outside_cycles
+        self._command.guide_left = self._outside.update(self._command.outside, self._promised)
         self._command.hand_over_exceeded = cycle == 0 and self._exceeded
         return self._command
 

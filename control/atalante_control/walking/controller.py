@@ -22,6 +22,7 @@ from atalante_control.dynamics.gravity import Gravity
 from atalante_control.gait.gait import PERIOD
 from atalante_control.gait.walk import WalkGaits
 from atalante_control.guide.certificate import Certificate
+from atalante_control.guide.outside_count import OutsideCount
 from atalante_control.guide.shapes import PINCHED, GuideShape
 from atalante_control.joint.flat_foot import ankle_records, flat_feet
 from atalante_control.joint.haptics import intensity
@@ -213,7 +214,8 @@ class WalkController:
         self.phase, self._since, self._loaded, self._stopping, self._landed = Phase.POSTURE, cycle, 0, False, False
         self._stance, self._finishing = RIGHT, False
         self._stage.stance, self._stage.double, self._stage.steering = RIGHT, True, 0.0
-        self._assisted, self._outside, self._promised, self._exceeded = False, 0, False, False
+        self._assisted, self._promised, self._exceeded = False, False, False
+        self._outside = OutsideCount(self.config.guide.outside_cycles)
         self._stage.assisted = self._stage.literal = self._stage.placed = False
         self._command.walking = False
         self._command.vibration.fill(0.0)
@@ -484,9 +486,7 @@ class WalkController:
             command.outside = h < 0.0
             ratio = max(_ratio(hip, hip_bound), _ratio(knee, knee_bound))
             self.statistics.guide.count(cycle, ratio, h, gate > guide.active)
-        counted = command.outside and self._promised  # a guide without a promise may be left
-        self._outside = self._outside + 1 if counted else max(0, self._outside - 1)
-        command.guide_left = self._promised and self._outside > guide.outside_cycles
+        command.guide_left = self._outside.update(command.outside, self._promised)
 
 
 def _ratio(error: float, bound: float) -> float:

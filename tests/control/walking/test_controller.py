@@ -105,14 +105,14 @@ def test_heading_follows_a_pelvis_imu_with_a_heading_reference(reference: bool, 
 
 def elapsed_of(controller: WalkController) -> float:
     """Return the time since the start of the phase, from the telemetry [s]."""
-    return field_of(controller, "elapsed")
+    return float(fields_of(controller)["elapsed"][0])
 
 
-def field_of(controller: WalkController, name: str) -> float:
-    """Return the first value of a telemetry field."""
-    widths = dict(TELEMETRY_FIELDS)
-    names = [*widths]
-    return float(controller.telemetry[sum(widths[name] for name in names[: names.index(name)])])
+def fields_of(controller: WalkController) -> dict[str, np.ndarray]:
+    """Return a copy of the values of each telemetry field."""
+    ends = np.cumsum([width for _, width in TELEMETRY_FIELDS])
+    values = np.split(controller.telemetry.copy(), ends[:-1])
+    return dict(zip((name for name, _ in TELEMETRY_FIELDS), values, strict=True))
 
 
 def pushed(
@@ -213,11 +213,7 @@ class RecordingController(WalkController):
     felt: list[Felt]
 
     def update(self, state: State) -> Command:
-        command, fields = super().update(state), {}
-        first = 0
-        for name, width in TELEMETRY_FIELDS:
-            fields[name] = self.telemetry[first : first + width].copy()
-            first += width
+        command, fields = super().update(state), fields_of(self)
         guided = self.phase is Phase.STEP and fields["elapsed"][0] <= 0.8 and state.assistance_factor < 1.0
         shares = (fields["error"] / fields["q_bound"]).tolist() if guided else []
         self.felt.append(Felt(guided, 1 - int(fields["stance"][0]), shares, command.vibration.tolist()))
@@ -238,7 +234,7 @@ def test_count_of_the_cycles_outside_falls_in_a_step_without_a_guide() -> None:
             command = robot.cycle(controller)
             if controller.phase is Phase.STEP:
                 left[step].append(command.guide_left)
-                swing = ("right", "left")[int(field_of(controller, "stance"))]
+                swing = ("right", "left")[int(fields_of(controller)["stance"][0])]
                 pushed = step == 1 and 0.25 < elapsed_of(controller) < 0.72
                 for joint in ("SH", "SK"):
                     robot.push[JOINTS.index(f"{swing}_{joint}")] = 100.0 * pushed

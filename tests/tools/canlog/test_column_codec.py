@@ -219,6 +219,15 @@ def test_unsupported_message_does_not_affect_the_others(tmp_path: Path) -> None:
         found.layout("Ugly")
 
 
+def test_named_code_of_a_64_bit_multiplexer_is_defined(tmp_path: Path) -> None:
+    path = tmp_path / "foreign.dbc"
+    signals = ' SG_ Mux M : 0|64@1+ (1,0) [0|0] "" B\n SG_ S m3 : 64|8@1+ (1,0) [0|0] "" B\n'
+    path.write_text(f'{HEAD}BO_ 256 M: 16 A\n{signals}\nVAL_ 256 Mux {2**64 - 1} "SNA" ;\n')
+    codec = ColumnCodec(catalogue(path).layout("M"))
+    words = np.array([[2**64 - 1, 3, 2**64 - 2], [0, 0, 0]], np.uint64)
+    assert codec.undefined(codec.extract(words), "Mux").tolist() == [False, False, True]
+
+
 @pytest.mark.parametrize("text", ["", "\x00\x01", "BO_ what"])
 def test_file_that_is_no_dbc_is_rejected(text: str, tmp_path: Path) -> None:
     path = tmp_path / "foreign.dbc"

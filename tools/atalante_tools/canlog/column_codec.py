@@ -178,7 +178,7 @@ class ColumnCodec:
         """
         mask: Mask | None = None
         for multiplexer, allowed in self.fields[index].selectors:
-            selected = np.isin(raw[self._index[multiplexer]].view(np.int64), list(allowed))
+            selected = np.isin(raw[self._index[multiplexer]].view(np.int64), [as_int64(code) for code in allowed])
             mask = selected if mask is None else mask & selected
         return mask
 
@@ -190,7 +190,8 @@ class ColumnCodec:
             multiplexer: name of the multiplexer signal.
         """
         index = self._index[multiplexer]
-        unknown = ~np.isin(raw[index].view(np.int64), list(self.layout.multiplexers[multiplexer]))
+        defined = [as_int64(code) for code in self.layout.multiplexers[multiplexer]]
+        unknown = ~np.isin(raw[index].view(np.int64), defined)
         present = self.present(raw, index)
         return unknown if present is None else unknown & present
 
@@ -218,6 +219,20 @@ def raw_range(field: Field) -> range:
     if field.kind == "signed":
         return range(-(1 << field.length - 1), 1 << field.length - 1)
     return range(1 << field.length)
+
+
+def as_int64(code: int) -> int:
+    """Return the int64 with the same 64 bits as a raw code. Raw codes from 2**63 on become negative."""
+    return code - (1 << 64) if code >= 1 << 63 else code
+
+
+def named_codes(field: Field) -> dict[int, str]:
+    """Return the value table of an integer field, with each raw code as in `as_int64`.
+
+    Raw codes that the field cannot have are omitted.
+    """
+    codes = raw_range(field)
+    return {as_int64(code): text for code, text in field.choices.items() if code in codes}
 
 
 def _integer_type(field: Field) -> Any:

@@ -24,7 +24,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from atalante_dbc.foreign import Field
-from atalante_tools.canlog.column_codec import Column, raw_range
+from atalante_tools.canlog.column_codec import Column, named_codes, raw_range
 from atalante_tools.canlog.decode.signals import DecodedFrames
 from atalante_tools.canlog.plan import Plan
 
@@ -126,7 +126,7 @@ class ParquetSink:
         Returns:
             The indices, shape (n,); None if no raw code of the field has a name.
         """
-        names = _names(field)
+        names = named_codes(field)
         if not names:
             return None
         known = np.array(sorted(names), np.int64)
@@ -137,17 +137,6 @@ class ParquetSink:
     def close(self) -> None:
         """Write the file footer and close the file."""
         self._writer.close()
-
-
-def _names(field: Field) -> dict[int, str]:
-    """Return the value table of a field, with each raw code as the int64 that has the same bits.
-
-    The raw codes from 2**63 of an unsigned 64-bit field become negative. Raw codes that the field cannot have are omitted.
-    """
-    codes = raw_range(field)
-    return {
-        code - (1 << 64) if code >= 1 << 63 else code: text for code, text in field.choices.items() if code in codes
-    }
 
 
 def _exact(field: Field, values: npt.NDArray[Any]) -> Any:

@@ -15,7 +15,7 @@ import numpy as np
 import numpy.typing as npt
 
 from atalante_dbc.foreign import Field, Layout
-from atalante_tools.canlog.column_codec import ColumnCodec, Mask, Words, payload_words, raw_range
+from atalante_tools.canlog.column_codec import ColumnCodec, Mask, Words, as_int64, named_codes, payload_words, raw_range
 from atalante_tools.canlog.plan import Family, Plan
 from atalante_tools.canlog.stream import Stream
 from atalante_tools.canlog.validate.findings import Findings
@@ -168,7 +168,7 @@ class ValueRules:
             self._report("invalid-code", decoded, stream, invalid, index, shown=codes)
         wrong = outside & ~invalid
         if limits.choices and bool(wrong.any()):
-            wrong &= ~np.isin(codes, _named_codes(limits))
+            wrong &= ~np.isin(codes, list(named_codes(limits)))
         if bool(wrong.any()):
             low, high = limits.minimum or 0.0, limits.maximum or 0.0
             distance = np.maximum(low - values, values - high)
@@ -338,18 +338,12 @@ def is_hash(field: Field, signal: str) -> bool:
 
 def _table(named: Field) -> npt.NDArray[np.bool_] | Sequence[int]:
     if named.length > _TABLE_BITS:
-        return _named_codes(named)
+        return list(named_codes(named))
     table = np.zeros(1 << named.length, np.bool_)
     for code in named.choices:
         if -len(table) <= code < len(table):
             table[code] = True
     return table
-
-
-def _named_codes(named: Field) -> list[int]:
-    """Return the raw codes in the value table of a field, in the form of the raw codes in `Decoded.codes`."""
-    codes = raw_range(named)
-    return [code - (1 << _WORD) if code >= 1 << _WORD - 1 else code for code in named.choices if code in codes]
 
 
 def _as_signed(limits: Field, raw: int) -> int:
@@ -359,4 +353,4 @@ def _as_signed(limits: Field, raw: int) -> int:
     """
     if limits.kind == "signed" and raw >> limits.length - 1:
         return raw - (1 << limits.length)
-    return raw - (1 << _WORD) if raw >= 1 << _WORD - 1 else raw
+    return as_int64(raw)
