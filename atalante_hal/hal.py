@@ -28,6 +28,7 @@ from atalante_hal.safety.state_machine import Conditions
 from atalante_hal.transceiver import FrameTap, Transceiver
 from atalante_hal.types import PERIOD, Command, State, SupervisorState, Vector
 from atalante_hal.wire.cia402 import Controlword, DriveState
+from atalante_hal.wire.frame import Frames
 from atalante_hal.wire.process_image import NEVER, ReceiveImage
 
 #: If the limiter reduces a torque in more than this number of consecutive cycles, the reaction of TORQUE_SATURATED follows.
@@ -116,6 +117,7 @@ class Hal:
         self._header = parts.header
         self._header[3] = assistance_factor
         self._image = ReceiveImage(fast, parts.signals)
+        self._answer_ids = np.array([m.frame_id for m in fast])
         self._plausibility = Plausibility(self.robot, self._image, PERIOD)
         self.state = parts.state(assistance_factor, len(fast))
         per_turn = self.robot.polarity / self.robot.gear
@@ -151,10 +153,7 @@ class Hal:
         foreign = image.accept(transceiver.scratch, count, cycle & 0xFF)
         if foreign:
             in_row = isinstance(foreign, range)
-            rows = slice(foreign[0], foreign[-1] + 1) if in_row else list(foreign)
-            others = transceiver.scratch[rows]
-            if unknown := self._safety_monitor.accept(others):
-                transceiver.foreign(others[unknown])
+            self._accept_slow(transceiver.scratch[slice(foreign[0], foreign[-1] + 1) if in_row else list(foreign)])
         self._plausibility.check()
         parts = self._parts
         np.multiply(parts.motor_side, self._to_joint, parts.joint_side)
@@ -167,6 +166,19 @@ class Hal:
         header[7] += count
         header[9] = transceiver.bus.dropped
         return state
+
+    def _accept_slow(self, frames: Frames) -> None:
+        """Process received frames that are not in the process image: slow messages of the nodes, error frames, unknown frames."""
+        if unknown := self._safety_monitor.accept(frames):
+            self._transceiver.foreign(frames[unknown])
+
+    def _skip_old_answers(self) -> None:
+        """Drop the queued answers to SYNCs before a gap between cycles.
+
+        All other queued frames are processed. For example, an emergency is sent only once, so it must not be lost.
+        """
+        for frames in self._transceiver.receive_queued():
+            self._accept_slow(frames[~np.isin(frames["can_id"], self._answer_ids)])
 
     def _apply(self, verdict: Verdict) -> None:
         """Apply the safety monitor's verdict on this cycle: set HalState, MaxTorque and the header of the record.
@@ -311,7 +323,7 @@ class Hal:
         """
         self._safety_monitor.report(dtc, text, confirmed, value, cycle=self.state.cycle + 1)
         if dtc is Dtc.CYCLE_GAP and confirmed:
-            self._transceiver.discard()
+            self._skip_old_answers()
 
     def end(self) -> None:
         """Request HOLD, starting with the next cycle, and ignore every later START.

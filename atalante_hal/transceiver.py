@@ -9,6 +9,7 @@ A failing bus raises no exception. `faults` returns the faults, and the safety m
 from __future__ import annotations
 
 import time
+from collections.abc import Iterator
 from typing import Protocol
 
 from atalante_dbc import Message, Network
@@ -223,11 +224,21 @@ class Transceiver:
                     f"another HAL is active on {self.bus.name} (received id 0x{min(duplicates):X}): stop it first"
                 )
 
-    def discard(self) -> None:
-        """Drop all queued frames. Call this after a gap between cycles, because the queued frames answer old SYNCs."""
+    def receive_queued(self) -> Iterator[Frames]:
+        """Receive all queued frames, at most `RECEIVE_BUDGET` batches. Call this after a gap between cycles.
+
+        The frames are logged, but they do not count for `RECEIVE_BUDGET` or BUS_FLOOD.
+
+        Yields:
+            One batch of frames, shape (n,), valid until the next batch.
+        """
         try:
             for _ in range(RECEIVE_BUDGET):
-                if self.bus.receive(self.scratch) < RECEIVE_BUDGET:
+                count = self.bus.receive(self.scratch)
+                if self.tap is not None:
+                    self.tap.received(self.scratch, count)
+                yield self.scratch[:count]
+                if count < RECEIVE_BUDGET:
                     return
         except BusError as error:
             self._find(Dtc.BUS_DOWN, True, 0.0, f"the bus {self.bus.name} cannot receive: {error}")

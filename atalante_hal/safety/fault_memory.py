@@ -119,6 +119,8 @@ class FaultMemory:
     ) -> None:
         """Mark a diagnostic as active in this cycle, and log an event if it is new or newly confirmed.
 
+        A pending fault does not change the value and text of a fault that is already confirmed in this cycle.
+
         Args:
             cycle: number of the current cycle.
             dtc: diagnostic trouble code.
@@ -128,10 +130,12 @@ class FaultMemory:
             text: one sentence for the operator; default: node name and meaning of the code.
         """
         entry = self.active.get((dtc, node))
+        if entry is not None and entry.confirmed and entry.cycle == cycle and not confirmed:
+            return
         before = entry is not None and (entry.confirmed or not confirmed)
         if entry is None:
             entry = self.active[dtc, node] = Entry(confirmed, "", value, cycle)
-        entry.confirmed = confirmed or (entry.confirmed and entry.cycle == cycle)
+        entry.confirmed = confirmed
         entry.value, entry.cycle = value, cycle
         if not before or not entry.text:
             entry.text = text or f"{node}: {dtc.meaning}"

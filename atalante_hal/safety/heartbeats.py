@@ -22,7 +22,8 @@ from atalante_hal.wire.e2e import FULL, Check, suspect
 from atalante_hal.wire.frame import Frames
 from atalante_hal.wire.process_image import NEVER, ReceiveImage
 
-#: Values of the signal NodeState (CiA 301): 0 after the node has started, 5 in normal operation.
+#: Values of the signal NodeState (CiA 301): 0 once after the node has started, 5 in normal operation. All others mean that the
+#: node does not work, for example 4 (STOPPED) and 127 (PRE-OPERATIONAL).
 BOOT_UP, OPERATIONAL = 0, 5
 #: A frame has new data if its check result is `Check.OK` (0) or `Check.SOME_LOST` (1), so at most this value.
 #: The constant is an integer, because numpy compares enum members ten times slower.
@@ -252,17 +253,20 @@ class Heartbeats:
         if age >= NEVER:
             return
         lost = age >= status.timeout
+        stopped = values[status.state] not in (BOOT_UP, OPERATIONAL)
         mismatch = values[status.dbc_hash] != self._hash
         supply = float(values[status.supply]) if status.drive else self._low
         if lost:
             memory.raise_dtc(cycle, Dtc.HEARTBEAT_LOST, node, value=age)
+        if stopped:
+            memory.raise_dtc(cycle, Dtc.NODE_RESET, node)
         if mismatch:
             memory.raise_dtc(cycle, Dtc.DBC_MISMATCH, node, value=values[status.dbc_hash])
         if supply < self._under:
             memory.raise_dtc(cycle, Dtc.UNDER_VOLTAGE, node, value=supply)
         elif supply < self._low:
             memory.raise_dtc(cycle, Dtc.SUPPLY_LOW, node, value=supply)
-        if lost or mismatch or supply < self._low:
+        if lost or stopped or mismatch or supply < self._low:
             self.quiet = False
 
 

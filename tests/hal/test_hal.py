@@ -14,6 +14,8 @@ from atalante_hal.robot import JOINTS
 from atalante_hal.safety.diagnostics import Dtc, dtcs_of, number_of
 from atalante_hal.types import Command, SupervisorState
 from atalante_hal.wire.cia402 import Controlword, DriveState
+from atalante_hal.wire.frame import new_frames
+from atalante_hal.wire.process_image import TransmitImage
 
 S = SupervisorState
 
@@ -278,6 +280,26 @@ def test_long_cycle_gap_leads_to_hold(rig):
     assert rig.cycle().supervisor is S.HOLD
     event = next(e for e in rig.hal.events if e.code == "CYCLE_GAP")
     assert (event.cycle, event.value, event.severity) == (rig.hal.state.cycle, 2.0, "error")
+
+
+def test_emergency_and_unknown_frame_in_a_long_cycle_gap_are_processed_and_old_answers_are_dropped(rig):
+    messages = [rig.hal.network.message(name) for name in ("LEFT_SK_STATE", "LEFT_SK_EMCY")]
+    image = TransmitImage(messages)
+    image.values[image.codec.index("LEFT_SK_EMCY", "ErrorCode")] = 0x2310
+    queued = np.concatenate([image.seal().copy(), new_frames(1)])
+    queued["can_id"][2] = 0x7FF
+    rig.until(S.ACTIVE)
+    rig.bus.to_hal = lambda frames: queued
+    rig.hal.report(Dtc.CYCLE_GAP, "no cycle began for 2000 ms", value=2.0)
+    rig.bus.to_hal = lambda frames: frames
+    assert rig.cycle().supervisor is S.FAULT
+    assert sorted(rig.events_of("EMCY_2310", "FRAME_UNKNOWN", "CYCLE_GAP")) == [
+        ("CYCLE_GAP", "error"),
+        ("EMCY_2310", "error"),
+        ("FRAME_UNKNOWN", "warning"),
+    ]
+    assert not [code for code in rig.codes() if code.startswith("E2E")]
+    assert rig.hal.state.valid.all()
 
 
 def test_short_cycle_gap_is_reported_as_warning(rig):

@@ -402,7 +402,7 @@ def test_several_foreign_frames_raise_all_diagnostics(desk: Desk):
     }
 
 
-# -- listening before the start, and discarding after a pause ----------------------------------------------------------
+# -- listening before the start, and queued frames after a pause ---------------------------------------------------------
 
 
 def test_listen_detects_another_hal_before_sending(desk: Desk):
@@ -433,22 +433,24 @@ def test_bus_down_ends_listen(desk: Desk):
         desk.transceiver.listen(60.0)
 
 
-def test_discard_drops_all_queued_frames(desk: Desk):
+def test_queued_frames_are_received_in_batches_until_the_bus_is_silent(desk: Desk):
     desk.bus.arrivals = [ids(*range(RECEIVE_BUDGET)), ids(*range(RECEIVE_BUDGET)), ids(1), ids(2)]
-    desk.transceiver.discard()
+    received = [frames["can_id"].tolist() for frames in desk.transceiver.receive_queued()]
+    assert received == [list(range(RECEIVE_BUDGET)), list(range(RECEIVE_BUDGET)), [1]]
+    assert desk.tap.received_ids == received
     assert len(desk.bus.arrivals) == 1
-    assert desk.evaluate() == {}
+    assert desk.evaluate() == {}, "queued frames are no flood"
 
 
-def test_discard_is_bounded_under_a_flood(desk: Desk):
+def test_number_of_queued_frames_is_bounded_under_a_flood(desk: Desk):
     desk.bus.arrivals = [ids(*range(RECEIVE_BUDGET))] * (RECEIVE_BUDGET + 5)
-    desk.transceiver.discard()
+    assert sum(1 for _ in desk.transceiver.receive_queued()) == RECEIVE_BUDGET
     assert len(desk.bus.arrivals) == 5
 
 
-def test_bus_down_during_discard_is_reported_and_not_raised(desk: Desk):
+def test_bus_down_while_queued_frames_are_received_is_reported_and_not_raised(desk: Desk):
     desk.bus.arrivals = [BusDown("gone")]
-    desk.transceiver.discard()
+    assert list(desk.transceiver.receive_queued()) == []
     assert desk.evaluate() == {"BUS_DOWN": True}
     event = desk.memory.events[0]
     assert (event.text, event.value) == ("the bus bench cannot receive: gone", 0.0)

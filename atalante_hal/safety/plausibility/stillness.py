@@ -135,6 +135,7 @@ class Stillness:
         self.constant_samples, self._gyros, self._cells = (
             self._repeats[codec.slice(quantity)] for quantity in ("Position", "Gyro", "Force")
         )
+        self._gyro, self._force = codec.slice("Gyro"), codec.slice("Force")
         self._encoders_same, self._no_encoder = self._same[codec.slice("Position")], bytes(len(JOINTS))
         self._breakaway = robot.breakaway
         self._loaded = 2.0 * robot.sensors.cell_free  # a foot with more than this vertical force [N] is on the ground
@@ -182,7 +183,7 @@ class Stillness:
         else:
             np.copyto(repeats, (repeats + 1) * same, where=newer)
         if self._encoders_same.tobytes() != self._no_encoder:
-            self._follow_shanks()
+            self._follow_shanks(newer)
         if newer is None:
             self._sampled[:] = self._values
         else:
@@ -199,14 +200,22 @@ class Stillness:
         np.copyto(self._sampled_age, self._age, where=newer)
         return newer[self._row_of]
 
-    def _follow_shanks(self) -> None:
+    def _follow_shanks(self, newer: npt.NDArray[np.bool_] | None) -> None:
         """Integrate how far each shank rotates while the encoder reading of its ankle joint is constant.
 
-        A row of `_turn` is reset to 0 if the encoder reading has changed, or if the foot is not on the ground.
+        A row of `_turn` is reset to 0 if the encoder reading has changed, if the foot is not on the ground, or if the foot has
+        sent no new forces. Without new values of its gyro, a shank is assumed to be at rest.
+
+        Args:
+            newer: for each signal, whether it has a newer value than its last sample; None if all signals have one.
         """
-        on_ground = (self._now.force[:, :, 2].sum(axis=1) > self._loaded)[_FOOT_OF]
-        self._turn += self._now.gyro[_SHANK_OF] * self._interval
-        self._turn[~on_ground | (self.constant_samples[_ANKLES] <= 1)] = 0.0
+        on_ground = self._now.force[:, :, 2].sum(axis=1) > self._loaded
+        rate = self._now.gyro
+        if newer is not None:
+            on_ground &= newer[self._force].reshape(len(FEET), -1).all(axis=1)
+            rate = rate * newer[self._gyro].reshape(len(IMUS), -1)
+        self._turn += rate[_SHANK_OF] * self._interval
+        self._turn[~on_ground[_FOOT_OF] | (self.constant_samples[_ANKLES] <= 1)] = 0.0
 
     def follow(self) -> bool:
         """Update the `Drive` record of all joints. All joints must have good values of this and the last cycle.

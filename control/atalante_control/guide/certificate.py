@@ -273,7 +273,7 @@ class _Horizon:
             """
             added = self._reach[:, min(lag, self.cycles)]
             widths = width if lag < self.cycles else narrowest if lag == self.cycles else following
-            return widths[self._starts + lag] - added[:, :2], added[:, 2:]
+            return widths[np.minimum(self._starts + lag, len(widths) - 1)] - added[:, :2], added[:, 2:]
 
         (last_free, last_used), (next_free, next_used) = parts(self.cycles), parts(self.cycles + 1)
         found = []

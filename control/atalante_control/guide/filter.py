@@ -15,25 +15,23 @@ import numpy as np
 
 from atalante_control.gait.gait import PERIOD
 from atalante_control.guide.kernel import (
-    BASE,
     COLUMNS,
     FLOOR,
     INVERSE,
     MASS,
     NEAR,
-    REFERENCE,
     SLACK_CYCLES,
-    SPEED,
     TAIL,
     TAIL_CYCLES,
-    VELOCITY,
     Block,
     Few,
     Guard,
     GuideTables,
     Lag,
     LegState,
+    Motion,
     tick,
+    write_motion,
 )
 from atalante_control.guide.prediction import FEW, Prediction
 from atalante_control.guide.shapes import GuideShape
@@ -117,7 +115,7 @@ class GuideFilter:
         self.cycles, self.time = prediction.cycles, leg.time
         self._phase = np.minimum(np.arange(len(leg.time)) / self.cycles, 1.0)
         shape.check(self._phase)
-        self._nominal, self._bases = _reference(prediction)
+        self._motion = _motion(prediction)
         step = np.zeros((len(leg.time), COLUMNS))
         step[:, MASS : MASS + 3] = prediction.mass.reshape(-1, 4)[:, [0, 1, 3]]
         step[: len(blend), FLOOR] = blend
@@ -132,6 +130,7 @@ class GuideFilter:
             few_reach=prediction.few_reach,
             step=step,
         )
+        self._write_motion = specialised(write_motion, step, self._motion, (0.0, 0.0), (0.0, 0.0))
         self.start_step(0.0, (0.0, 0.0), (0.0, 0.0))
         discarded = self.tables._replace(guards=self.tables.guards.copy())  # type: ignore[attr-defined]
         self._tick = specialised(tick, discarded, 0, LegState(*[0.0] * 10))
@@ -151,12 +150,7 @@ class GuideFilter:
             inverse = 1.0 / sides.transpose(1, 0, 2).reshape(-1, 4)
             step[:, INVERSE : INVERSE + 4], step[:, TAIL : TAIL + 4] = inverse, tail(inverse)
             step[:, NEAR : NEAR + 4] = narrowest(inverse, SLACK_CYCLES)
-        moved = self._bases[0] * np.array(deviation) + self._bases[1] * np.array(rate)
-        for column, values in ((REFERENCE, moved[0]), (VELOCITY, moved[1]), (SPEED, moved[2])):
-            step[:, column : column + 2] = values
-        step[:, BASE : BASE + 2] = (self.prediction.mass @ moved[3, :, :, None])[:, :, 0]
-        for column, values in zip((REFERENCE, VELOCITY, SPEED, BASE), self._nominal, strict=True):
-            step[:, column : column + 2] += values
+        self._write_motion(step, self._motion, deviation, rate)
         guard.xi, guard.promise, guard.fresh = xi, promise, True
 
     def widths(self, xi: float) -> Vector:
@@ -272,27 +266,20 @@ def _guards(config: GuideConfig, prediction: Prediction) -> Records[Guard]:
     return guards
 
 
-def _reference(prediction: Prediction) -> tuple[list[Vector], Vector]:
-    """Compute the two parts of the desired motion of a step: nominal motion and re-centring offset.
-
-    The re-centring adds an offset s(t) to the nominal motion. The offset is linear in the deviations s(0) and s'(0) at the
-    stance change, so `start_step` multiplies the offset array by these deviations.
-
-    Returns:
-        Nominal motion: four arrays of shape (n, 2). They are the acceleration (ahead by the command lag), the velocity after the
-            low-pass of the drives, the velocity, and the torque.
-        Offset: array of shape (2, 4, n, 1). Axis 0: offset for s(0) = 1 rad, offset for s'(0) = 1 rad/s. Axis 1: acceleration
-            (ahead by the command lag), velocity after the low-pass, velocity, acceleration. Axis 2: cycles.
-    """
+def _motion(prediction: Prediction) -> Motion:
+    """Compute the two parts of the desired motion of a step: nominal motion, and offset of the re-centring."""
     leg, loop = prediction.leg, prediction.assumptions.loop
     time, lag = leg.time, loop.command_lag
     values, slopes, curvatures = leg.deadbeat.basis(time)
     # The acceleration of the re-centring ends with a jump. The moving mean prevents a jump of the torque.
     ahead = [_smoothed(row) for row in leg.deadbeat.basis(time + lag)[2]]
-    bases = np.stack([[ahead[i], _measured(values[i], slopes[i], loop.keep), slopes[i], curvatures[i]] for i in (0, 1)])
+    of_deviation, of_rate = (
+        np.column_stack([accelerations, _measured(value, slope, loop.keep), slope, curvature])
+        for accelerations, value, slope, curvature in zip(ahead, values, slopes, curvatures, strict=True)
+    )
     acceleration = np.stack([np.interp(time + lag, time, leg.qdd[:, i]) for i in (0, 1)], axis=1)
     velocity = np.stack([_measured(leg.q[:, i], leg.qd[:, i], loop.keep) for i in (0, 1)], axis=1)
-    return [acceleration, velocity, leg.qd, prediction.torque], bases[:, :, :, None]
+    return Motion(np.hstack([acceleration, velocity, leg.qd, prediction.torque]), of_deviation, of_rate)
 
 
 def _smoothed(row: Vector) -> Vector:

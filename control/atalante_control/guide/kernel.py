@@ -162,6 +162,47 @@ COLUMNS = 24
 TAIL_CYCLES = 60
 
 
+class Motion(NamedTuple):
+    """Desired motion of every step, from which `write_motion` computes the desired motion of one step.
+
+    Rows are cycles since the stance change. The columns are four values of hip and knee: acceleration (ahead by the command
+    lag), velocity after the low-pass of the drives, velocity, and torque.
+
+    The re-centring adds an offset s(t) to the nominal motion. The offset is linear in the deviations s(0) and s'(0) at the stance
+    change. SH and SK have the same factors. The last factor is the acceleration s'', from which the torque follows.
+    """
+
+    nominal: Vector  # (n, 8) motion without the offset, columns in pairs of hip and knee [rad/s2, rad/s, rad/s, Nm]
+    #: (n, 4) offset for s(0) = 1 rad: acceleration ahead by the command lag, velocity after the low-pass, velocity, acceleration
+    of_deviation: Vector
+    of_rate: Vector  # (n, 4) offset for s'(0) = 1 rad/s, same columns
+
+
+def write_motion(step: Vector, motion: Motion, deviation: Pair, rate: Pair) -> None:
+    """Write the desired motion of a step to the columns `REFERENCE`, `VELOCITY`, `SPEED` and `BASE`.
+
+    This runs within the cycle of the stance change, so it is compiled.
+
+    Args:
+        step: table of the step, shape (n, COLUMNS). The columns `MASS` must be set.
+        motion: desired motion of every step.
+        deviation: deviations s(0) of SH and SK at the stance change [rad].
+        rate: deviations s'(0) of SH and SK at the stance change [rad/s].
+    """
+    for cycle in range(len(step)):
+        row, nominal = step[cycle], motion.nominal[cycle]
+        by_deviation, by_rate = motion.of_deviation[cycle], motion.of_rate[cycle]
+        hip = by_deviation[3] * deviation[0] + by_rate[3] * rate[0]
+        knee = by_deviation[3] * deviation[1] + by_rate[3] * rate[1]
+        row[BASE] = row[MASS] * hip + row[MASS + 1] * knee + nominal[6]
+        row[BASE + 1] = row[MASS + 1] * hip + row[MASS + 2] * knee + nominal[7]
+        for joint in range(2):
+            s, s_rate = deviation[joint], rate[joint]
+            row[REFERENCE + joint] = by_deviation[0] * s + by_rate[0] * s_rate + nominal[joint]
+            row[VELOCITY + joint] = by_deviation[1] * s + by_rate[1] * s_rate + nominal[2 + joint]
+            row[SPEED + joint] = by_deviation[2] * s + by_rate[2] * s_rate + nominal[4 + joint]
+
+
 class LegState(NamedTuple):
     """Measurements, q_des, sent torques and gravity torques of sagittal hip and knee (SH, SK) of the swing leg in one cycle."""
 

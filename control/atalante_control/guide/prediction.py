@@ -110,7 +110,8 @@ class Prediction:
         last = len(leg.time) - 1
         self.cycles = last - assumptions.overlap
         horizon, hand_over = assumptions.horizon, assumptions.hand_over
-        self.nominal = nominal = responses(policy, assumptions.loop, 1.0, last)
+        longest = max(last, horizon + 1)  # `beyond` is one cycle after the horizon, also if the gait is shorter
+        self.nominal = nominal = responses(policy, assumptions.loop, 1.0, longest)
         rows = nominal.error[: horizon + 1]
         _, _, basis = np.linalg.svd((rows * SIZES).reshape(-1, STATES), full_matrices=False)
         self.compress: Vector = np.ascontiguousarray(basis[:COMPRESSED] / SIZES)
@@ -119,7 +120,7 @@ class Prediction:
         self.beyond: Vector = nominal.error[horizon + 1]
         deviation = assumptions.mismatch.inertia
         family = [
-            responses(policy, assumptions.loop, 1.0 / (1.0 + sign * deviation), last, delay)
+            responses(policy, assumptions.loop, 1.0 / (1.0 + sign * deviation), longest, delay)
             for delay in sorted({*assumptions.delays})
             for sign in (-1.0, 1.0)
         ]
@@ -153,7 +154,7 @@ class Prediction:
         for one in family:
             late, late_rate = (np.ascontiguousarray(rows[:, :, 2:4]) for rows in (one.error, one.rate))
             first.append(run(Effect(one.pushed_error, lag * late, same), mobilities, bounds, whole, self.reach))
-            first[-1][:, :2] += np.abs(late).sum(axis=2) * lag * hand_over.acceleration
+            first[-1][:, :2] += np.abs(late[: last + 1]).sum(axis=2) * lag * hand_over.acceleration
             rate = Effect(one.pushed_rate, lag * late_rate, same)
             first_rates.append(run(rate, mobilities, bounds, few, few_ahead[2]))
         torque, speed = Effect(nominal.pushed_feedback, nothing, self.mass), Effect(nominal.pushed_rate, nothing, same)

@@ -13,7 +13,7 @@ from typing import NamedTuple
 
 from atalante_control.gait.gait import PERIOD
 from atalante_control.guide.backup_policy import BackupPolicy
-from atalante_control.guide.certificate import Certificate, PromiseLimits
+from atalante_control.guide.certificate import SMALLEST, Certificate, PromiseLimits
 from atalante_control.guide.config import StepGuideConfig
 from atalante_control.guide.disturbance import Leg
 from atalante_control.guide.filter import GuideConfig, GuideFilter
@@ -39,7 +39,9 @@ class Choice(NamedTuple):
     """Guide filter that is used in a step, and its certified disturbance torques."""
 
     guide: GuideFilter
-    promise: float  # certified torques as a fraction of the torques that the configuration requests, in [0, 1]
+    #: Certified torques as a fraction of the torques that the configuration requests, in [0, 1]. It is 0 if the certified torque
+    #: at the hip is below `certificate.SMALLEST`.
+    promise: float
 
 
 class StepGuides:
@@ -107,10 +109,13 @@ class StepGuides:
         for guide, promise_limits in zip(self.filters, self._limits, strict=True):
             scale = promise_limits.largest(xi)
             if scale >= 1.0:
-                return Choice(guide, 1.0)
+                return self._choice(guide, 1.0)
             if scale > most:
                 best, most = guide, scale
-        return Choice(best, min(1.0, max(0.0, _MARGIN * most)))
+        return self._choice(best, min(1.0, _MARGIN * most))
+
+    def _choice(self, guide: GuideFilter, promise: float) -> Choice:
+        return Choice(guide, promise if promise * guide.prediction.assumptions.promise[0] >= SMALLEST else 0.0)
 
     def certificate(self, xi: float) -> Certificate:
         """Return the certificate of the filter used at an assistance factor.

@@ -221,6 +221,7 @@ class WalkController:
         self._command.vibration.fill(0.0)
         self._command.outside = self._command.guide_left = self._command.hand_over_exceeded = False
         self._load[:] = self._twist[:] = 0.0
+        self.steering.reset()
         self._pid.reset()
         self._section = self._sections[0]
         self._table = self._section.tables[Phase.POSTURE, RIGHT]
@@ -304,6 +305,7 @@ class WalkController:
         self._observer.reset(state.imu_quaternion[_PELVIS].tolist())
         self._bind(state)
         self._measure(state)
+        self._load[:] = self._measured.force[:, :, 2].sum(axis=1)  # start value of the low-pass
         self._sense(self._measured, self._table, self._constants, self._stabiliser, self._parts)
         self._start(self._measured, self._table, self._parts)
         self._pid.store_request(state.torque if state.torque_sent is None else state.torque_sent)

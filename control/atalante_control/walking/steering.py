@@ -35,6 +35,11 @@ class Steering:
         """
         self._gains, self._turn = gains, turn
         self.feet: Vector = np.zeros((2, 2))
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget the last walk: both feet at the origin, no heading error."""
+        self.feet.fill(0.0)
         self.yaw = self._origin = 0.0
 
     @property

@@ -84,6 +84,14 @@ def test_guide_of_any_assistance_factor_is_certified_like_that_of_the_next_hundr
             assert guides.certificate(xi).promise == guides.certificate(rounded).promise
 
 
+@pytest.mark.parametrize(("hip", "certified"), [(0.9, False), (1.1, True)])
+def test_filter_makes_a_promise_only_if_its_certificate_does(hip: float, certified: bool):
+    config = replace(CONFIG, promise=(hip, 0.6 * hip))
+    guides = StepGuides(config, ROBOT, CONSTANT, LEG, np.linspace(1.0, 0.0, 20), OVERLAP)
+    assert guides.certificate(0.5).certified is certified
+    assert guides.at(0.5).promise == float(certified)
+
+
 def test_a_wider_guide_than_those_of_the_package_promises_less():
     """In a wider guide, the knee can reach angles at which the leg accelerates faster."""
     promises = []

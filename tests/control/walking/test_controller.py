@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
@@ -52,6 +52,36 @@ def test_patient_walks_from_standing_to_standing(engine: str) -> None:
     assert controller.steering.distance == pytest.approx(4 * 0.16, abs=0.12)
     assert abs(controller.steering.lateral) < 0.05
     assert controller.max_dcm_error < 0.03
+
+
+def test_second_walk_starts_without_the_footprints_of_the_first_and_with_the_load_that_the_feet_carry() -> None:
+    controller = WalkController(ROBOT, PATIENT, WALK, 1)
+    body = make_body("mujoco", urdf(ExoskeletonParameters(), ROBOT, PATIENT), free=True, ground=0.0)
+    try:
+        hang(body, controller.standing_pose.tolist(), 0.0005)
+        robot = Ideal(body)
+        while controller.phase is not Phase.REST:
+            robot.cycle(controller)
+        walked = controller.steering.distance
+        controller.reset(robot.state)
+    finally:
+        body.close()
+    assert walked > 0.2
+    assert not controller.steering.feet.any()
+    assert (controller.steering.yaw, controller.steering.lateral) == (0.0, 0.0)
+    weight = robot.state.foot_force[:, :, 2].sum()
+    assert weight > 500.0
+    robot.state.cycle += 1
+    controller.update(robot.state)
+    assert fields_of(controller)["load"].sum() == pytest.approx(weight, rel=1e-6)
+
+
+@pytest.mark.parametrize("duration", [0.3, 0.301, 0.302])
+def test_gait_as_short_as_the_prediction_of_the_guide_has_a_certificate(duration: float) -> None:
+    gaits = WALK._replace(step=replace(WALK.step, duration=duration))
+    (certificate,) = WalkController(ROBOT, PATIENT, gaits, 3).certificates(0.5)
+    assert certificate.promise is None
+    assert "the backup torque reaches" in certificate.reason
 
 
 @pytest.mark.parametrize("delay", [0, 3])

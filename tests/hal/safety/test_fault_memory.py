@@ -211,6 +211,21 @@ def test_diagnostic_without_a_value_has_value_zero(memory: FaultMemory):
     assert logged(memory) == [(3, "NODE_RESET", "LEFT_SK", "error", 0.0)]
 
 
+@pytest.mark.parametrize("before", [False, True])
+def test_pending_fault_does_not_hide_the_text_of_the_same_fault_confirmed_in_this_cycle(
+    memory: FaultMemory, before: bool
+):
+    if before:
+        memory.raise_dtc(3, Dtc.GUIDE_OUTSIDE, "HAL", value=7.0, text="outside")
+        memory.close_cycle(3)
+    memory.raise_dtc(4, Dtc.GUIDE_OUTSIDE, "HAL", value=8.0, text="outside")
+    memory.raise_dtc(4, Dtc.GUIDE_OUTSIDE, "HAL", value=1.0, confirmed=False, text="hand-over")
+    memory.close_cycle(4)
+    entry = memory.active[Dtc.GUIDE_OUTSIDE, "HAL"]
+    assert (entry.confirmed, entry.text, entry.value) == (True, "outside", 8.0)
+    assert memory.text_of(frozenset({Dtc.GUIDE_OUTSIDE})) == "outside"
+
+
 def test_event_log_is_bounded_and_counts_dropped_events(memory: FaultMemory):
     total = EVENTS_KEPT + 100
     for number in range(total):

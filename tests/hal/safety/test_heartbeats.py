@@ -98,6 +98,29 @@ def test_boot_up_with_any_counter_is_reported_as_reset(running: Nodes):
     assert running.evaluate() == {("NODE_RESET", "LEFT_SK"): True}
 
 
+@pytest.mark.parametrize("state", [4, 127, 1])
+@pytest.mark.parametrize("known", [True, False])
+def test_node_that_is_not_operational_is_reported_until_its_state_changes(nodes: Nodes, state: int, known: bool):
+    if known:
+        nodes.send_every_status()
+        assert nodes.evaluate() == {}
+    nodes.receive(nodes.frame("LEFT_SK", NodeState=state))
+    for _ in range(3):
+        assert nodes.heartbeats.quiet is False
+        assert nodes.evaluate() == {("NODE_RESET", "LEFT_SK"): True}
+        nodes.now += 1
+    nodes.receive(nodes.frame("LEFT_SK", NodeState=5))
+    assert nodes.evaluate() == {}
+    assert nodes.heartbeats.quiet
+
+
+def test_node_that_was_not_operational_for_a_moment_is_reported_once(running: Nodes):
+    running.receive(running.frame("LEFT_SK", NodeState=4), running.frame("LEFT_SK", NodeState=5))
+    assert running.evaluate() == {("NODE_RESET", "LEFT_SK"): True}
+    running.now += 1
+    assert running.evaluate() == {}
+
+
 def test_other_dbc_hash_is_reported_until_it_changes(nodes: Nodes):
     nodes.receive(nodes.frame("IMU_TORSO", DbcHash=NETWORK.hash32 ^ 1))
     assert nodes.heartbeats.quiet is False

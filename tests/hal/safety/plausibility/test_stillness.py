@@ -246,6 +246,30 @@ class TestStuckEncoder:
         assert f"{JOINTS[joint]} has a constant reading while the shank turns by 0.6 degrees" in finding.text
 
     @pytest.mark.parametrize("joint", ANKLES, ids=lambda joint: JOINTS[joint])
+    @pytest.mark.parametrize(
+        ("silent", "rate"),
+        [
+            pytest.param("IMU_{}_tibia", 0.0, id="IMU is silent, shank stops"),
+            pytest.param("FOOT_{}", 1.0, id="foot is silent, foot leaves the ground and turns with the shank"),
+        ],
+    )
+    def test_last_values_before_a_loss_of_frames_are_not_continued(self, joint: int, silent: str, rate: float):
+        robot = SimulatedRobot(amplitude=1e-3, standing=True)
+        side = JOINTS[joint].split("_")[0]
+        at, shank = float(robot.now.position[joint]), IMUS.index(f"{side}_tibia")
+
+        def turn(now: Signals) -> None:
+            now.gyro[shank, 1] += 1.0
+
+        def rest(now: Signals) -> None:
+            now.position[joint] = at
+            now.gyro[shank, 1] += rate
+
+        robot.run(16, turn)
+        robot.missing = {row(silent.format(side))}
+        assert not [finding for finding in robot.run(400, rest) if finding.dtc is Dtc.ENC_STUCK]
+
+    @pytest.mark.parametrize("joint", ANKLES, ids=lambda joint: JOINTS[joint])
     def test_turn_and_torque_in_the_swing_do_not_count_on_the_ground(self, joint: int):
         robot, rate = SimulatedRobot(amplitude=1e-3), 1.5
         side = JOINTS[joint].split("_")[0]
