@@ -17,12 +17,10 @@ from atalante_control.gait.gait import PERIOD
 from atalante_control.guide.kernel import (
     COLUMNS,
     FLOOR,
-    INVERSE,
     MASS,
-    NEAR,
     SLACK_CYCLES,
-    TAIL,
     TAIL_CYCLES,
+    TAIL_MARGIN,
     Block,
     Few,
     Guard,
@@ -30,22 +28,21 @@ from atalante_control.guide.kernel import (
     Lag,
     LegState,
     Motion,
+    slide_maximum,
     tick,
+    write_bounds,
     write_motion,
 )
 from atalante_control.guide.prediction import FEW, Prediction
 from atalante_control.guide.shapes import GuideShape
 from atalante_control.joint.idealization import law_of
 from atalante_control.structured import Records, zeros
-from atalante_hal.compiled import specialised
+from atalante_hal.compiled import compiled, specialised
 from atalante_hal.types import Vector
 
 Pair = tuple[float, float]
 
 _SMOOTHED = 11  # number of cycles of the moving mean in `_smoothed`
-#: Fraction of the guide width that must remain free in the last predicted cycle, so that the error is inside the guide in the
-#: cycles after the prediction, too.
-_TAIL_MARGIN = 0.03
 
 
 @dataclass(frozen=True)
@@ -130,6 +127,7 @@ class GuideFilter:
             few_reach=prediction.few_reach,
             step=step,
         )
+        self._write_bounds = specialised(write_bounds, step, self._bounds(0.0))
         self._write_motion = specialised(write_motion, step, self._motion, (0.0, 0.0), (0.0, 0.0))
         self.start_step(0.0, (0.0, 0.0), (0.0, 0.0))
         discarded = self.tables._replace(guards=self.tables.guards.copy())  # type: ignore[attr-defined]
@@ -146,12 +144,13 @@ class GuideFilter:
         """
         guard, step = self.tables.guards[0], self.tables.step
         if xi != guard.xi:
-            sides = self.shape.bounds(self._phase, xi)
-            inverse = 1.0 / sides.transpose(1, 0, 2).reshape(-1, 4)
-            step[:, INVERSE : INVERSE + 4], step[:, TAIL : TAIL + 4] = inverse, tail(inverse)
-            step[:, NEAR : NEAR + 4] = narrowest(inverse, SLACK_CYCLES)
+            self._write_bounds(step, self._bounds(xi))
         self._write_motion(step, self._motion, deviation, rate)
         guard.xi, guard.promise, guard.fresh = xi, promise, True
+
+    def _bounds(self, xi: float) -> Vector:
+        """Return the bounds of the guide in each cycle, shape (2, n, 2) [rad], always in C order, see `specialised`."""
+        return np.ascontiguousarray(self.shape.bounds(self._phase, xi))
 
     def widths(self, xi: float) -> Vector:
         """Return the distance from q_des to the nearer bound of the guide, for hip and knee in each cycle, shape (n, 2) [rad].
@@ -199,31 +198,15 @@ class GuideFilter:
 def tail(inverse: Vector) -> Vector:
     """Return 1 / (smallest width of the guide in a cycle and the next `TAIL_CYCLES` cycles), plus a margin of 3 % [1/rad].
 
-    Row k of the result, shape (n, m), is for the cycles k to k + `TAIL_CYCLES`. The margin is `_TAIL_MARGIN`.
-
-    Args:
-        inverse: 1 / width, shape (n, m) [1/rad]. Row k is cycle k. A width is the distance from q_des to a bound of the guide.
-    """
-    return (1.0 + _TAIL_MARGIN) * narrowest(inverse, TAIL_CYCLES + 1)
-
-
-def narrowest(inverse: Vector, cycles: int) -> Vector:
-    """Return the sliding maximum of 1 / width, shape (n, m) [1/rad]: row k is the maximum of rows k to k + cycles - 1.
-
-    The maximum of 1 / width is at the narrowest place of the guide in these rows.
+    Row k of the result, shape (n, m), is for the cycles k to k + `TAIL_CYCLES`. The margin is `TAIL_MARGIN`.
 
     Args:
         inverse: 1 / width, shape (n, m) [1/rad]. Row k is cycle k. A width is the distance from q_des to a bound of the guide.
             The last row applies to all later cycles.
-        cycles: number of rows over which each maximum is taken.
     """
-    largest = np.concatenate([inverse, np.repeat(inverse[-1:], cycles - 1, axis=0)])
-    covered = 1  # row k of `largest` is the maximum of the rows k to k + covered - 1 of the input
-    while covered < cycles:
-        shift = min(covered, cycles - covered)
-        largest = np.maximum(largest[:-shift], largest[shift:])
-        covered += shift
-    return largest
+    largest = np.array(inverse, order="C")
+    compiled(slide_maximum)(largest, 0, largest.shape[1], TAIL_CYCLES + 1)
+    return (1.0 + TAIL_MARGIN) * largest
 
 
 def _lags(prediction: Prediction) -> Records[Lag]:

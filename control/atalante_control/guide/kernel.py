@@ -153,13 +153,54 @@ SPEED = 13  # columns 13 and 14 of `step`: velocity of q_des [rad/s]
 #: step, while the filter takes over the joints.
 FLOOR = 15
 #: Columns 16 to 19 of `step`: 1.03 * maximum of columns 0 to 3 over this cycle and the next `TAIL_CYCLES` cycles [1/rad].
-#: The function `filter.tail` computes the columns.
 TAIL = 16
 #: Columns 20 to 23 of `step`: maximum of columns 0 to 3 over `SLACK_CYCLES` cycles from this cycle on [1/rad].
 NEAR = 20
 COLUMNS = 24
 #: Number of cycles after the last predicted cycle. The last predicted error must be smaller than the guide width in these cycles.
 TAIL_CYCLES = 60
+#: Fraction of the guide width that must remain free in the last predicted cycle, so that the error is inside the guide in the
+#: cycles after the prediction, too.
+TAIL_MARGIN = 0.03
+
+
+def write_bounds(step: Vector, bounds: Vector) -> None:
+    """Write the guide of a step to the columns `INVERSE`, `TAIL` and `NEAR`.
+
+    Args:
+        step: table of the step, shape (n, COLUMNS).
+        bounds: distances from q_des to the upper and lower bound for hip and knee, shape (2, n, 2) [rad].
+    """
+    for cycle in range(len(step)):
+        row = step[cycle]
+        for joint in range(2):
+            for side in range(2):
+                column, inverse = 2 * joint + side, 1.0 / bounds[joint, cycle, side]
+                row[INVERSE + column] = row[TAIL + column] = row[NEAR + column] = inverse
+    slide_maximum(step, TAIL, TAIL + 4, TAIL_CYCLES + 1)
+    slide_maximum(step, NEAR, NEAR + 4, SLACK_CYCLES)
+    for cycle in range(len(step)):
+        for column in range(TAIL, TAIL + 4):
+            step[cycle, column] *= 1.0 + TAIL_MARGIN
+
+
+def slide_maximum(table: Vector, first: int, end: int, cycles: int) -> None:
+    """Replace each value by the maximum of this row and the following rows, `cycles` rows in total.
+
+    Args:
+        table: values, shape (n, m), changed in place. The last row also stands for all rows after it.
+        first: first column that is changed.
+        end: column after the last column that is changed.
+        cycles: number of rows of each maximum.
+    """
+    last, covered = len(table) - 1, 1  # each value is the maximum of `covered` rows of the original table
+    while covered < cycles:
+        shift = min(covered, cycles - covered)
+        for row in range(last):  # in ascending order, so the later row is not changed yet
+            later = min(row + shift, last)
+            for column in range(first, end):
+                table[row, column] = max(table[row, column], table[later, column])
+        covered += shift
 
 
 class Motion(NamedTuple):
@@ -180,8 +221,6 @@ class Motion(NamedTuple):
 
 def write_motion(step: Vector, motion: Motion, deviation: Pair, rate: Pair) -> None:
     """Write the desired motion of a step to the columns `REFERENCE`, `VELOCITY`, `SPEED` and `BASE`.
-
-    This runs within the cycle of the stance change, so it is compiled.
 
     Args:
         step: table of the step, shape (n, COLUMNS). The columns `MASS` must be set.

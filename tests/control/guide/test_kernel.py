@@ -12,16 +12,23 @@ from hypothesis import strategies as st
 from atalante_control.guide.filter import GuideFilter
 from atalante_control.guide.kernel import (
     BASE,
+    COLUMNS,
+    INVERSE,
     MASS,
+    NEAR,
     SPEED,
     STEEPNESS,
+    TAIL,
+    TAIL_CYCLES,
     LegState,
     bound_blocks,
     damped_gate,
     gate,
     largest_ratio,
     leg_state,
+    slide_maximum,
     tick,
+    write_bounds,
 )
 from atalante_control.guide.prediction import FEW
 from atalante_hal.compiled import compiled
@@ -226,3 +233,26 @@ def test_lag_of_the_measured_velocity_is_estimated_from_the_sent_torque():
     lag = guide.tables.guards[0].lag
     np.testing.assert_allclose(lag, (acceleration - reference) * loop.velocity_lag, rtol=0.1, atol=2e-3)
     assert math.isfinite(guide.h)
+
+
+@pytest.mark.parametrize("cycles", [1, 2, 3, 10, 50, 61])
+def test_sliding_maximum_is_that_of_each_row_and_the_following_rows(cycles: int):
+    values = np.random.default_rng(cycles).uniform(size=(50, 3))
+    found = values.copy()
+    compiled(slide_maximum)(found, 1, 3, cycles)
+    np.testing.assert_array_equal(found[:, 0], values[:, 0])
+    expected = [values[row : row + cycles, 1:].max(axis=0) for row in range(len(values))]
+    np.testing.assert_array_equal(found[:, 1:], expected)
+
+
+def test_bounds_are_written_with_their_narrowest_places_ahead():
+    bounds = np.random.default_rng(0).uniform(0.01, 0.1, size=(2, 100, 2))
+    step = np.zeros((100, COLUMNS))
+    compiled(write_bounds)(step, bounds)
+    inverse = 1.0 / bounds.transpose(1, 0, 2).reshape(100, 4)
+    np.testing.assert_array_equal(step[:, INVERSE : INVERSE + 4], inverse)
+    for row in range(100):
+        np.testing.assert_array_equal(step[row, NEAR : NEAR + 4], inverse[row : row + 10].max(axis=0))
+        np.testing.assert_array_equal(
+            step[row, TAIL : TAIL + 4], 1.03 * inverse[row : row + TAIL_CYCLES + 1].max(axis=0)
+        )
