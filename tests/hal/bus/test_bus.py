@@ -527,6 +527,9 @@ def broken_logs(folder: Path) -> dict[str, tuple[Path, str]]:
         cases[f"cut {suffix}"] = (cut, "cut.* is truncated")
         cases[f"empty {suffix}"] = (empty, "empty")
         cases[f"noise {suffix}"] = (noise, "cannot be read beyond frame 0|not a .blf log")
+    relative = folder / "relative.asc"
+    relative.write_text(whole[".asc"].read_text().replace("timestamps absolute", "timestamps relative"))
+    cases["relative .asc"] = (relative, 'relative.asc: the time stamps must be absolute, got "timestamps relative"')
     return cases
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import shutil
 import subprocess
 from binascii import crc_hqx
@@ -50,6 +51,38 @@ def test_makefile_of_the_user_is_kept(tmp_path: Path):
     (tmp_path / "Makefile").unlink()
     for _ in range(2):  # a generated Makefile is written again
         assert CliRunner().invoke(cli, arguments).exit_code == 0
+
+
+@pytest.mark.parametrize(
+    ("file", "changes", "error"),
+    [
+        ("3robot.dbc", {}, "must begin with a letter .*, got 3robot.c: rename the DBC file"),
+        ("Host_Test.dbc", {}, "another C file than host_test.c"),
+        (
+            "robot.dbc",
+            {"DriveState": "Default"},
+            "signals of LEFT_FH_STATE must not be named like C keywords, got Default",
+        ),
+        (
+            "robot.dbc",
+            {"DriveState": "POSITION"},
+            "signals of LEFT_FH_STATE must have different names in C, got POSITION and Position: both are 'position'",
+        ),
+        (
+            "robot.dbc",
+            {"LEFT_FH_EMCY": "LeftFhState"},
+            "messages must have different names in C, got LeftFhState and LEFT_FH_STATE",
+        ),
+    ],
+)
+def test_names_that_are_no_names_in_c_are_rejected(file: str, changes: dict[str, str], error: str, tmp_path: Path):
+    text = DBC_FILE.read_text("cp1252")
+    for old, new in changes.items():
+        text = re.sub(rf"\b{old}\b", new, text)
+    (tmp_path / file).write_text(text, "cp1252")
+    with pytest.raises(Failed, match=error):
+        write(Build.of(tmp_path / file, None), tmp_path / "out", 0)
+    assert not (tmp_path / "out").exists()
 
 
 @pytest.mark.long

@@ -12,7 +12,7 @@ from typing import Final
 
 import cantools
 from cantools.database.can import Database
-from cantools.database.can.c_source import generate
+from cantools.database.can.c_source import camel_to_snake_case, generate
 
 from atalante_tools.console.outcome import Failed
 from atalante_tools.dbc.build import Build
@@ -22,6 +22,12 @@ from atalante_tools.dbc.vectors import Vectors
 
 #: Number of images in the file of test vectors. An image is a set of payloads, one payload per message.
 _IMAGES: Final = 100
+#: Keywords of C11 in lower case. A signal with such a name would be a struct member that no compiler accepts.
+_KEYWORDS: Final = frozenset({
+    "auto", "break", "case", "char", "const", "continue", "default", "do", "double", "else", "enum", "extern",
+    "float", "for", "goto", "if", "inline", "int", "long", "register", "restrict", "return", "short", "signed",
+    "sizeof", "static", "struct", "switch", "typedef", "union", "unsigned", "void", "volatile", "while",
+})  # fmt: skip
 _HOST_TEST, _VECTORS, _EXAMPLES, _MAKEFILE = "host_test.c", "vectors.bin", "vectors.json", "Makefile"
 
 
@@ -34,8 +40,9 @@ def write(build: Build, folder: Path, seed: int) -> list[Path]:
         seed: seed of the random images of the test vectors.
 
     Raises:
-        Failed: If the folder contains another Makefile, which would be lost.
+        Failed: If the folder contains another Makefile, which would be lost, or if a name of the DBC is no name in C.
     """
+    _check_names(build)
     folder.mkdir(parents=True, exist_ok=True)
     makefile_text = makefile(build)
     _check_makefile(folder / _MAKEFILE, makefile_text.partition("\n")[0])
@@ -56,6 +63,38 @@ def write(build: Build, folder: Path, seed: int) -> list[Path]:
     for file, content in files.items():
         (folder / file).write_bytes(content)
     return [folder / file for file in files]
+
+
+def _check_names(build: Build) -> None:
+    """Raise `Failed` if a name is a C keyword or begins with a digit, or if two names are equal in snake case."""
+    file = f"{build.name}.c"
+    if not build.name[0].isalpha() or file == _HOST_TEST:
+        raise Failed(
+            f"name of the DBC file must begin with a letter and give another C file than {_HOST_TEST}, because it is the prefix "
+            f"of all names in C, got {file}: rename the DBC file"
+        )
+    _check_distinct("messages", [m.name for m in build.messages])
+    for message in build.messages:
+        names = [s.name for s in message.signals]
+        _check_distinct(f"signals of {message.name}", names)
+        if keywords := [name for name in names if camel_to_snake_case(name) in _KEYWORDS]:
+            raise Failed(f"signals of {message.name} must not be named like C keywords, got {', '.join(keywords)}")
+
+
+def _check_distinct(what: str, names: list[str]) -> None:
+    """Raise `Failed` if two names are the same name in C.
+
+    Args:
+        what: what the names belong to, for the error message.
+        names: names in the DBC.
+    """
+    first: dict[str, str] = {}
+    for name in names:
+        other = first.setdefault(camel_to_snake_case(name), name)
+        if other != name:
+            raise Failed(
+                f"{what} must have different names in C, got {other} and {name}: both are {camel_to_snake_case(name)!r}"
+            )
 
 
 def _check_makefile(path: Path, first_line: str) -> None:

@@ -382,6 +382,13 @@ def test_junit_has_an_error_for_each_log_that_was_not_read(good: Path, tmp_path:
     ]
 
 
+def test_html_names_each_log_that_was_not_read(good: Path, tmp_path: Path) -> None:
+    missing, path = tmp_path / "<missing>.log", tmp_path / "night.html"
+    run("validate", missing, good, "--node", "LEFT_FH", "--html", path)
+    page = path.read_text()
+    assert page.index("&lt;missing&gt;.log does not exist") < page.index(f"<h2>{good}</h2>")
+
+
 def test_junit_escapes_the_characters_that_xml_does_not_allow(tmp_path: Path) -> None:
     path, strange = tmp_path / "result.xml", tmp_path / "strange.trc"
     strange.write_bytes(bytes(range(256)) * 20)

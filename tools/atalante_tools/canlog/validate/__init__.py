@@ -151,7 +151,7 @@ def command(logs: tuple[Path, ...], options: Options) -> None:
     reports = [result for result in results if isinstance(result, Report)]
     for result in reports:
         _show(result, options.as_json)
-    _write(results, reports, options.junit, options.html_file)
+    _write(results, options.junit, options.html_file)
     if any(result.findings or not result.validator.frames for result in reports):
         raise SystemExit(FAILED)
     if code:
@@ -269,14 +269,12 @@ def _show(result: Report, as_json: bool) -> None:
         click.echo(text(result))
 
 
-def _write(
-    results: Sequence[Report | Unread], reports: Sequence[Report], junit: Path | None, html_file: Path | None
-) -> None:
-    """Write the JUnit and HTML reports that were requested. Only the JUnit report contains the logs that were not read."""
+def _write(results: Sequence[Report | Unread], junit: Path | None, html_file: Path | None) -> None:
+    """Write the JUnit and HTML reports that were requested."""
     from atalante_tools.canlog.validate.html import write_html
     from atalante_tools.canlog.validate.report import write_junit
 
-    for path, write in ((junit, partial(write_junit, results)), (html_file, partial(write_html, reports))):
+    for path, write in ((junit, partial(write_junit, results)), (html_file, partial(write_html, results))):
         if path is None:
             continue
         try:

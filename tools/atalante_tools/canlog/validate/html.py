@@ -11,7 +11,7 @@ import numpy as np
 import numpy.typing as npt
 
 from atalante_hal.types import Vector
-from atalante_tools.canlog.validate.report import Report, verdict
+from atalante_tools.canlog.validate.report import Report, Unread, verdict
 from atalante_tools.canlog.validate.rules import RULES
 from atalante_tools.canlog.validate.timing_rules import BINS, BINS_A_CYCLE
 from atalante_tools.console.html import html_table, page
@@ -25,9 +25,9 @@ _HISTOGRAMS = 12  # maximum number of interval histograms in the report of a log
 _TIMING = ("cycle-mean", "cycle-jitter", "cycle-gap", "cycle-fast", "timeout", "recovered", "state-late")
 
 
-def write_html(results: Sequence[Report], path: Path) -> None:
-    """Write the reports of all logs into one HTML file."""
-    parts = [part for result in results for part in _log(result)]
+def write_html(results: Sequence[Report | Unread], path: Path) -> None:
+    """Write the reports of all logs into one HTML file. A log that was not read has only its reason."""
+    parts = [part for result in results for part in (_unread(result) if isinstance(result, Unread) else _log(result))]
     parts += ["<h2>Rules</h2>", _rules()]
     path.write_text(page("atalante validate", "CAN log against DBC", parts), encoding="utf-8")
 
@@ -60,6 +60,10 @@ def _log(result: Report) -> list[str]:
         parts += ["<h3>Counter gaps over time</h3>", _gap_plot(result)]
         parts += ["<h3>Cycle times</h3>", *_histograms(result)]
     return parts
+
+
+def _unread(log: Unread) -> list[str]:
+    return [f"<h2>{escape(log.name)}</h2><p><span class='bad'>{escape(log.reason)}</span></p>"]
 
 
 def _rules() -> str:
