@@ -135,8 +135,8 @@ class FaultMemory:
         before = entry is not None and (entry.confirmed or not confirmed)
         if entry is None:
             entry = self.active[dtc, node] = Entry(confirmed, "", value, cycle)
-        entry.confirmed = confirmed
-        entry.value, entry.cycle = value, cycle
+        else:
+            entry.confirmed, entry.value, entry.cycle = confirmed, value, cycle
         if not before or not entry.text:
             entry.text = text or f"{node}: {dtc.meaning}"
             self._log(cycle, dtc, node, entry)
