@@ -52,7 +52,7 @@ class Commands:
         #: Encoded HOLD frames: quick stop, zero torque, vibration motors off.
         #: HOLD frames are encoded now, so that HOLD can be sent even if later command values are invalid (NaN).
         self._prepared_hold = self._image.prepare()
-        self._sealed = False  # True: the SYNC of the next cycle is already encoded
+        self._sealed = False  # whether the SYNC of the next cycle is already encoded
 
     def announce(self, state: SupervisorState) -> None:
         """Set the signal HalState in the SYNC frames.

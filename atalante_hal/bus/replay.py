@@ -82,7 +82,7 @@ class ReplayBus:
         if self._next is None:
             self.close()
             raise LogUnreadable(f"{path} contains no CAN frame: it is empty, or it is not a {Path(path).suffix} log")
-        # python-can reads the header of an .asc log together with the first frame, and does not add up relative time stamps.
+        # python-can does not add up relative time stamps. It reads the header with their kind only before the first frame.
         if (getattr(self._reader, "timestamps_format", "") or "").lower() == "relative":
             self.close()
             raise LogUnreadable(f'{path}: the time stamps must be absolute, got "timestamps relative"')

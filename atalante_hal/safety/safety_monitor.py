@@ -406,7 +406,7 @@ class SafetyMonitor:
             if not self.start_cycles_left:  # another press of START during a start does not restart the direction test
                 self._proof_begun = False
                 if state.supervisor is _S.READY:
-                    # These drives are off and not tested yet. If the start fails, they are switched off again.
+                    # A drive that is off now is not tested yet. If the start fails, it is switched off again.
                     on = powered(state.drive_state).tolist()
                     self._kept_off.update(node for node, is_on in zip(DRIVE_NODES, on, strict=True) if not is_on)
             self.start_cycles_left = ENABLE_CYCLES if state.supervisor in _STARTABLE else 0

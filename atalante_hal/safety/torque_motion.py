@@ -44,8 +44,8 @@ from atalante_hal.types import State, Vector
 
 #: Interval between two checks of a leg [cycles]. The legs are checked alternately.
 INTERVAL: Final = 4
-#: A faulty motor produces s times the sent torque, with a share s in one of these ranges: reversed (s < 0), dead (s = 0) and weak
-#: motors are in the first range, and motors that are too strong are in the second range.
+#: A faulty motor produces s times the sent torque. The share s is in one of these two ranges. The first range is for reversed
+#: (s < 0), dead (s = 0) and weak motors. The second range is for motors that are too strong.
 SHARES: Final = ((-1.5, 0.6), (1.4, 2.2))
 #: A motor is suspected if the explanation "faulty motor" fits the torques better than "external torque" by more than this factor.
 #: The factor compares mean square errors: E > `RATIO` * (F + error^2), see the module docstring.

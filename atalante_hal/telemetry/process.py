@@ -66,10 +66,10 @@ class TelemetryConfig:
     robot: str = "exo"  # name of the robot in the Zenoh keys atalante/<robot>/...
     publish: bool = True  # whether messages are published on Zenoh
     listen: str | None = None  # Zenoh endpoint; None means the first free port from tcp/127.0.0.1:7447 on
-    stream_rate: int = 100  # Hz, publishing rate of each stream; 100 publishes every tenth cycle
-    loop_rate: int = 10  # Hz, rate of the loop statistics; 10 sends the statistics every hundredth cycle
+    stream_rate: int = 100  # publishing rate of each stream [Hz], for example 100 for every tenth cycle
+    loop_rate: int = 10  # rate of the loop statistics [Hz], for example 10 for every hundredth cycle
     recording: Path | None = None  # MCAP file; None if nothing is recorded
-    record_rate: int = 100  # Hz, recording rate of each stream; 100 records every tenth cycle, 1000 records every cycle
+    record_rate: int = 100  # recording rate of each stream [Hz], for example 1000 for every cycle
     can_log: Path | None = None  # log file of all CAN frames; the file suffix determines the format; None for no log
     lock_step: bool = False  # True in virtual time (lock-step): the loop waits if recorder or CAN log are too slow
     #: Number of slots of the ring of cycle records: at one record per cycle, 1024 slots store the last 1023 cycles.

@@ -202,7 +202,7 @@ class ReceiveImage:
         return self.accept_each(frames, count, tag)
 
     def refuse(self, row: int) -> None:
-        """Reject the implausible values of a row that `accept` has committed: restore the previous values and age.
+        """Reject the implausible values of a row that `accept` has committed: restore the previous values.
 
         Args:
             row: row of the message; its age becomes one cycle more than before `accept`.
@@ -566,7 +566,7 @@ class TransmitImage:
         rows = len(self.codec.messages)
         self._counters: Words = np.zeros(rows, np.int64)
         self._singles = [self.frames[row : row + 1] for row in range(rows)]
-        # `specialised` runs `seal` once with the counter 0xFF. So the first frame that is sent has the counter 0.
+        # `specialised` runs `seal` once with the counter 0xFF. The next counter is 0, so the first frame that is sent has 0.
         self._protect = specialised(protect, self._octets, self._spans, self._counters)
         self._seal = specialised(seal, self.values, self.codec.table, self._words, self._spans, self._counters, 0xFF)
 

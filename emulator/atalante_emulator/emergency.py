@@ -171,7 +171,7 @@ class Errors:
             self._warnings[node, code] = 0
 
     def advance(self) -> None:
-        """Add 1 to the age of all warnings, and report the end of warnings by emergencies with code 0.
+        """Add 1 to the age of all warnings. If a warning ends, send an emergency message with code 0.
 
         A node that still has an active error or another active warning does not report the end.
         """

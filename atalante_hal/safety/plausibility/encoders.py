@@ -53,7 +53,7 @@ class Lost(NamedTuple):
     """Data of an encoder whose reading jumped. All positions are on the motor side."""
 
     last: float  # newest received position [rad]
-    cycles: int  # time from the encoder's last good position until `last` was received [cycles]
+    cycles: int  # time between the newest good position (before the jump) and `last` [cycles]
     expected: float  # position that the encoder would have without the jump [rad]
 
 

@@ -39,7 +39,8 @@ PELVIS_IMU = (-0.164, -0.015, 0.191)
 #: Position y of joint FH of the left leg in the pelvis frame [m]. Its x and z are 0.
 FRONTAL_HIP = 0.089
 #: Position (x, y) of joint TH of the left leg relative to joint FH, in the axes of the frontal hip [m].
-#: Joint SH is 0.135 m in front of joint TH in the axes of the transverse hip, so `motion` uses -x as this distance.
+#: The distance from joint TH to joint SH in the axes of the transverse hip is also 0.135 m. So `motion` computes this distance as
+#: -x of this constant.
 TRANSVERSE_HIP = (-0.135, 0.169)
 #: Position (x, y, z) of the left tibia IMU in the axes of the tibia [m].
 #: Each coordinate has its own origin: x is relative to joint SK, y to joint SH, and z to joint SA.

@@ -212,8 +212,8 @@ class Legs:
                 continue
             change = comparison.errors[axis] - moved.errors[axis]
             turned = max(abs(angle - moved.angles[i]) for i, angle in enumerate(comparison.angles))
-            # A stuck encoder changes the error (encoder minus IMU) while the leg turns: change and turn must exceed `allowed`.
-            # If the error changes while the leg is at rest, the encoder has jumped or drifts.
+            # If an encoder is stuck while the leg turns, the error (encoder minus IMU) changes. So an encoder counts as stuck
+            # only if both the change and the turn exceed `allowed`. If only the error changes, the encoder has jumped or drifts.
             allowed = self._attitude_change + self._misalignment * turned + comparison.uncertainty + moved.uncertainty
             if min(abs(change), turned) <= allowed:
                 self._turned[joint] = 0

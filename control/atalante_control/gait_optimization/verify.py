@@ -72,7 +72,7 @@ class _Motion(NamedTuple):
 
 
 class Verifier:
-    """Verifier of gaits for the exoskeleton with one patient, modelled with a floating base."""
+    """Verifier of gaits for the exoskeleton with one patient. The model has a floating base."""
 
     def __init__(self, robot: Robot, patient: Patient) -> None:
         """Build the Pinocchio model from the URDF.

@@ -160,8 +160,8 @@ class Prediction:
         torque, speed = Effect(nominal.pushed_feedback, nothing, self.mass), Effect(nominal.pushed_rate, nothing, same)
         first_torque = run(torque, mobilities, bounds, few, few_ahead[0])
         first_speed = run(speed, mobilities, bounds, few, few_ahead[1])
-        # Axes 0 and 1 of `by_bound` are axes 1 and 2 of `few_ahead`. Axis 2: 0 model errors, 1 disturbance torques.
-        # Axis 3: 0 torque, 1 speed. Axis 4: 0 sagittal hip, 1 sagittal knee.
+        # Axes of `by_bound`: 0 and 1 are axes 1 and 2 of `few_ahead`; 2 is model errors (0) or disturbance torques (1); 3 is
+        # torque (0) or speed (1); 4 is sagittal hip (0) or sagittal knee (1).
         by_bound = few_ahead[:2].reshape(2, blocks, len(FEW), 2, 2).transpose(1, 2, 3, 0, 4)
         self.few_reach: Vector = np.concatenate([by_bound.reshape(blocks, len(FEW), 8), few_ahead[2]], axis=2)
         self.few_ahead: Vector = np.concatenate([nominal.feedback[FEW], nominal.rate[FEW]], axis=1)

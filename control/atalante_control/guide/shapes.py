@@ -109,8 +109,8 @@ class GuideShape:
         of_both, of_each = phase.shape, (len(JOINTS), *phase.shape)
         if len(sides) != 2 or any(side.shape not in (of_both, of_each) for side in sides):
             raise ValueError(
-                f"function `fractions` of the guide shape {self.name!r} must return 2 arrays of the shape {of_both} "
-                f"(both joints have the same width) or {of_each} (one row for each joint), "
+                f"function `fractions` of the guide shape {self.name!r} must return 2 arrays, the upper and the lower side, "
+                f"each of the shape {of_both} (the same for both joints) or {of_each} (one row for each joint), "
                 f"got {[side.shape for side in sides]}"
             )
         bounds: Vector = width * np.stack([np.broadcast_to(side, of_each) for side in sides], axis=2)

@@ -426,8 +426,8 @@ class WalkController:
             self._stance = swing
         if phase in STEPPING:
             self._impact.start_step()
-        # In FINISH_STEP, a new step number makes the HAL hold all joints at their positions (HOLD). In a step, the robot would
-        # fall. So the controller keeps the step number until the robot stands on both feet.
+        # In FINISH_STEP, a new step number makes the HAL hold all joints at their positions (HOLD). If the robot stood on one
+        # foot then, it would fall. So the controller keeps the step number until the robot stands on both feet.
         if phase is Phase.REST or (phase in STEPPING and not self._finishing):
             self._command.step = (self._command.step or 0) + 1
         self._command.walking = phase in WALKING

@@ -318,7 +318,7 @@ def _all(
         unexpected = tester.unexpected if with_unexpected else []
         count = len(tester.received) + len(unexpected)
         if not count:
-            raise NotTested("no frame of the node received")
+            raise NotTested("no frame of the node was received")
         defects = unexpected + defects_of(tester.received)
         named = ", ".join(defects[:_LISTED]) + ", ..." * (len(defects) > _LISTED)
         frames = f"{count} frames"

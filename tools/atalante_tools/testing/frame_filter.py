@@ -176,7 +176,7 @@ class FrameFilter(WrappedBus):
         try:
             self.bus.send(frames)
         except BusError as error:
-            # Faults drop or change frames of the caller. So the error must contain the frames that the bus really accepted.
+            # Faults may have dropped or changed frames of the caller. So the error gets the frames that the bus accepted.
             error.accepted = accepted = error.accepted_of(frames)
             if self.tap is not None and error.sent:
                 self.tap.sent(accepted)
