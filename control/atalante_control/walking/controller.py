@@ -205,7 +205,7 @@ class WalkController:
     def _compile(self) -> None:
         """Compile the kernels by one call, and discard the results."""
         measured, table, constants, stabiliser = self._measured, self._table, self._constants, self._stabiliser
-        self._sense = specialised(sense, measured, table, constants, stabiliser, self._parts)
+        self._sense = specialised(sense, measured, constants, stabiliser, self._parts)
         self._start = specialised(start, measured, table, self._parts)
         self._act = specialised(act, 0, measured, table, constants, stabiliser, self._section.assistance, self._parts)
 
@@ -306,7 +306,7 @@ class WalkController:
         self._bind(state)
         self._measure(state)
         self._load[:] = self._measured.force[:, :, 2].sum(axis=1)  # start value of the low-pass
-        self._sense(self._measured, self._table, self._constants, self._stabiliser, self._parts)
+        self._sense(self._measured, self._constants, self._stabiliser, self._parts)
         self._start(self._measured, self._table, self._parts)
         self._pid.store_request(state.torque if state.torque_sent is None else state.torque_sent)
 
@@ -322,7 +322,7 @@ class WalkController:
             The command. The next call overwrites the same object.
         """
         self._measure(state)
-        self._sense(self._measured, self._table, self._constants, self._stabiliser, self._parts)
+        self._sense(self._measured, self._constants, self._stabiliser, self._parts)
         if state.supervisor is SupervisorState.FINISH_STEP:
             self._finishing = True
             self.stop()

@@ -1,7 +1,8 @@
 """Compiled control cycle of the walk: `sense` evaluates the measurements, `act` computes the torque command u.
 
-    sense: foot forces -> loads; joints -> kinematics; gyro, accelerometer, sole at rest -> attitude; all -> DCM, headings
-    act:   q_nom + s, steering, lowering of the swing foot, flat foot -> PID, gravity, feedforward, ankle stabiliser, guide -> u
+    sense: foot forces -> loads; joints -> kinematics; gyro, accelerometer, sole at rest -> attitude; all -> headings
+    act:   all -> DCM; q_nom + s, steering, lowering of the swing foot, flat foot -> q_des
+           q_des -> PID, gravity, feedforward, ankle stabiliser, guide -> u
 
 DCM is the divergent component of motion (`walking.dcm`). The controller calls `sense`, selects the phase, and calls `act`. Each
 part is documented in its own module.
@@ -148,18 +149,17 @@ class Outputs:
     vibration: Annotated[Vector, len(MOTORS)]  # levels of the vibration motors, 0 to 1
 
 
-def sense(measured: Measured, table: PhaseTable, constants: Constants, stabiliser: Stabiliser, parts: Parts) -> None:
-    """Update loads, kinematics, attitude, headings and DCM from the measurements.
+def sense(measured: Measured, constants: Constants, stabiliser: Stabiliser, parts: Parts) -> None:
+    """Update loads, kinematics, attitude and headings from the measurements.
 
     Args:
         measured: measurements of the cycle.
-        table: table of the current phase.
         constants: constants of the kernel.
         stabiliser: geometry of the feet.
         parts: arrays of the parts; updated.
     """
-    stage, sensed, balance = parts.stages[0], parts.sensed[0], parts.balances[0]
-    soles, centre, load = parts.chain.soles, parts.chain.centre[0], sensed.load
+    stage, sensed, soles = parts.stages[0], parts.sensed[0], parts.chain.soles
+    load = sensed.load
     for side in range(len(SIDES)):
         cells, force = measured.force[side], 0.0
         for cell in range(len(cells)):
@@ -170,12 +170,7 @@ def sense(measured: Measured, table: PhaseTable, constants: Constants, stabilise
         sensed.bearing[side] = min(force, load[side])
     move(parts.chain, measured.q, measured.qd)
 
-    # The sole of the foot `base` is assumed to be at rest. A foot that has just landed may bounce and is therefore unsuitable.
-    # So `base` is the stance foot, unless both feet are down and the stance foot carries less than 10 % of the load.
-    base = stage.stance
-    if stage.double and load[base] < 0.1 * (load[0] + load[1]):
-        base = 1 - base
-    sole, gyro = soles[base], measured.gyro
+    sole, gyro = soles[_resting_foot(stage, load)], measured.gyro
     suspended = stage.double and load[0] + load[1] < 0.1 * constants.weight
     velocity = (0.0, 0.0, 0.0) if suspended else _velocity(measured.imu, sole.position, sole.linear, gyro)
     observe(parts.attitudes, gyro, measured.accel, velocity)
@@ -192,6 +187,33 @@ def sense(measured: Measured, table: PhaseTable, constants: Constants, stabilise
     for k in range(3):
         sensed.step[k] = step[k]
 
+
+def _resting_foot(stage: Stage, load: Vector) -> int:
+    """Return the foot whose sole is assumed to be at rest.
+
+    A foot that has just landed may bounce and is therefore unsuitable. So the result is the stance foot, unless both feet are
+    down and the stance foot carries less than 10 % of the load.
+
+    Args:
+        stage: current phase.
+        load: filtered vertical forces on both feet, shape (2,) [N].
+    """
+    foot = stage.stance
+    return 1 - foot if stage.double and load[foot] < 0.1 * (load[0] + load[1]) else foot
+
+
+def _locate_dcm(measured: Measured, table: PhaseTable, parts: Parts) -> None:
+    """Compute the DCM relative to the stance foot, or to the middle between the feet while no foot swings.
+
+    Args:
+        measured: measurements of the cycle.
+        table: table of the phase.
+        parts: arrays of the parts; `balances` is updated.
+    """
+    stage, sensed, balance = parts.stages[0], parts.sensed[0], parts.balances[0]
+    centre, gyro, rotation = parts.chain.centre[0], measured.gyro, parts.attitudes[0].rotation
+    base = _resting_foot(stage, sensed.load)
+    sole, step = parts.chain.soles[base], sensed.step
     about = sole.position
     lever = rotated(
         rotation, (centre.position[0] - about[0], centre.position[1] - about[1], centre.position[2] - about[2])
@@ -284,6 +306,7 @@ def act(
     if cycle > 0:
         placement.clock += placement.pace
     row = _desired(cycle, placement, table, stage, desired)
+    _locate_dcm(measured, table, parts)
     for k in range(2):
         balance.error[k] = balance.dcm[k] - table.dcm[row, k]
     swing = 1 - stage.stance
@@ -385,8 +408,7 @@ def _place(cycle: int, table: PhaseTable, constants: Constants, gain: float, par
         motion = Motion(error, nominal, final, table.frequency * remaining, side)
         placement.target[0], placement.target[1], rate = landing(config, gain, motion)
     outward = leg_target(constants.lean, balance.dcm[1], side)
-    # In the first cycle of a step, the DCM is still relative to the previous stance foot, so `outward` is not used.
-    if outward != 0.0 and cycle > 0:
+    if outward != 0.0:
         placement.target[1] = outward
     follow(config, placement, rate)
     lean, target = parts.leans[0], lean_target(constants.lean, error[1], balance.dcm[1], side)

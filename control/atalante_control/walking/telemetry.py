@@ -22,10 +22,7 @@ from atalante_hal.types import Vector
 class Telemetry:
     """Telemetry of one cycle of a walk.
 
-    The DCM is relative to the stance foot, or to the middle between the feet while no foot swings. In the first cycle of a phase
-    (`elapsed` is 0), `dcm` is still relative to the point of the phase before, but the nominal DCM is already relative to the
-    point of the new phase. So in this cycle `dcm_error` contains the distance between both points, and `pressure_shift` follows
-    from this error.
+    The DCM is relative to the stance foot, or to the middle between the feet while no foot swings.
     """
 
     q_des: Annotated[Vector, len(JOINTS)]  # rad

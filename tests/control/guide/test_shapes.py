@@ -141,7 +141,7 @@ def test_invalid_bound_between_the_checked_phases_is_rejected_on_use():
 def test_fractions_of_another_array_shape_are_rejected(fractions):
     with pytest.raises(
         ValueError,
-        match=r"`fractions` of the guide shape 'own' must return 2 arrays, .* each of the shape \(2001,\) .* or \(2, 2001\) .* got",
+        match=r"`fractions` of the guide shape 'own' must return 2 arrays, .* of the shape \(2001,\) .* or \(2, 2001\) .* got",
     ):
         GuideShape("own", "", fractions)
 

@@ -137,8 +137,7 @@ def _draw_ground(axis: Any, columns: Mapping[str, Vector]) -> None:
 def _dcm_on_ground(columns: Mapping[str, Vector]) -> Vector:
     """Return the path of the divergent component of motion (DCM) on the ground [m], shape (n, 2).
 
-    The columns are the distances along the walking line, and to the left of this line. A row is NaN if no foot swings, and in the
-    first cycle of a step.
+    The columns are the distances along the walking line, and to the left of this line. A row is NaN if no foot swings.
     """
     from atalante_control.walking.phases import STEPPING
 
@@ -147,9 +146,7 @@ def _dcm_on_ground(columns: Mapping[str, Vector]) -> Vector:
     c, s = np.cos(columns["yaw"][:, 0]), np.sin(columns["yaw"][:, 0])
     x, y = columns["dcm"].T
     dcm = feet + np.column_stack([c * x - s * y, s * x + c * y])
-    # In the first cycle of a step, the telemetry still contains the DCM relative to the previous stance foot.
-    valid = np.isin(columns["phase"][:, 0], list(STEPPING)) & (columns["elapsed"][:, 0] > 0.0)
-    dcm[~valid] = math.nan
+    dcm[~np.isin(columns["phase"][:, 0], list(STEPPING))] = math.nan
     return np.asarray(dcm)
 
 
