@@ -25,10 +25,9 @@ from atalante_hal.safety.plausibility import Plausibility
 from atalante_hal.safety.safety_monitor import DRIVE_NODES, SafetyMonitor, Verdict
 from atalante_hal.safety.start import powered, words_towards_operation
 from atalante_hal.safety.state_machine import Conditions
-from atalante_hal.transceiver import FrameTap, Transceiver
+from atalante_hal.transceiver import RECEIVE_BUDGET, FrameTap, Transceiver
 from atalante_hal.types import PERIOD, Command, State, SupervisorState, Vector
 from atalante_hal.wire.cia402 import Controlword, DriveState
-from atalante_hal.wire.frame import Frames
 from atalante_hal.wire.process_image import NEVER, ReceiveImage
 
 #: If the limiter reduces a torque in more than this number of consecutive cycles, the reaction of TORQUE_SATURATED follows.
@@ -117,7 +116,8 @@ class Hal:
         self._header = parts.header
         self._header[3] = assistance_factor
         self._image = ReceiveImage(fast, parts.signals)
-        self._answer_ids = np.array([m.frame_id for m in fast])
+        self._answer_ids = [m.frame_id for m in fast]
+        self._slow_ids = [m.frame_id for m in received if m.cycle_ms != 1]
         self._plausibility = Plausibility(self.robot, self._image, PERIOD)
         self.state = parts.state(assistance_factor, len(fast))
         per_turn = self.robot.polarity / self.robot.gear
@@ -153,7 +153,10 @@ class Hal:
         foreign = image.accept(transceiver.scratch, count, cycle & 0xFF)
         if foreign:
             in_row = isinstance(foreign, range)
-            self._accept_slow(transceiver.scratch[slice(foreign[0], foreign[-1] + 1) if in_row else list(foreign)])
+            rows = slice(foreign[0], foreign[-1] + 1) if in_row else list(foreign)
+            others = transceiver.scratch[rows]
+            if unknown := self._safety_monitor.accept(others):
+                transceiver.foreign(others[unknown])
         self._plausibility.check()
         parts = self._parts
         np.multiply(parts.motor_side, self._to_joint, parts.joint_side)
@@ -167,18 +170,17 @@ class Hal:
         header[9] = transceiver.bus.dropped
         return state
 
-    def _accept_slow(self, frames: Frames) -> None:
-        """Process received frames that are not in the process image: slow messages of the nodes, error frames, unknown frames."""
-        if unknown := self._safety_monitor.accept(frames):
-            self._transceiver.foreign(frames[unknown])
-
     def _skip_old_answers(self) -> None:
-        """Drop the queued answers to SYNCs before a gap between cycles.
+        """Drop the queued answers to SYNCs before a gap between cycles, and process the other queued frames.
 
-        All other queued frames are processed. For example, an emergency is sent only once, so it must not be lost.
+        For example, an emergency is sent only once, so it must not be lost. Many frames may have arrived in the gap. Of the
+        frames that are no messages to the HAL, only one of each identifier is processed, so that this takes at most a few cycles.
         """
-        for frames in self._transceiver.receive_queued():
-            self._accept_slow(frames[~np.isin(frames["can_id"], self._answer_ids)])
+        frames = self._transceiver.receive_queued(self._answer_ids)
+        slow = np.isin(frames["can_id"], self._slow_ids)
+        self._safety_monitor.accept_queued(frames[slow])
+        _, first = np.unique(frames["can_id"][~slow], return_index=True)
+        self._transceiver.foreign(frames[~slow][first[:RECEIVE_BUDGET]])
 
     def _apply(self, verdict: Verdict) -> None:
         """Apply the safety monitor's verdict on this cycle: set HalState, MaxTorque and the header of the record.

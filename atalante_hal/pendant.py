@@ -3,8 +3,9 @@
 `process image -> pendant -> state machine` is the only path for the operator's commands.
 
 START is edge-triggered: a press is a frame with the request START whose `RequestCounter` differs from the previous cycle.
-The first frame is never a press. If START is pressed while the pendant is not qualified yet, the press is stored until the
-pendant is qualified. A stored press is dropped if the dead-man switch or START is released, or if the supervisor state changes.
+The first frame, and the first frame after a gap between cycles, is never a press. If START is pressed while the pendant is
+not qualified yet, the press is stored until the pendant is qualified. A stored press is dropped if the dead-man switch or
+START is released, or if the supervisor state changes.
 """
 
 from __future__ import annotations
@@ -124,6 +125,13 @@ class Pendant:
             self._pressed = False
         if present:
             self.assistance_factor = factor if factor_set else None
+
+    def forget_start(self) -> None:
+        """Ignore a START that was pressed before now, also if its frame arrives later. Call this after a gap between cycles.
+
+        In the gap, the operator did not see the faults that the HAL reports now, so the START acknowledges nothing.
+        """
+        self._press, self._pressed = None, False
 
     def clear_press(self) -> None:
         """Drop a stored START. The safety monitor calls this method after each change of the supervisor state."""

@@ -9,8 +9,10 @@ A failing bus raises no exception. `faults` returns the faults, and the safety m
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator
+from collections.abc import Sequence
 from typing import Protocol
+
+import numpy as np
 
 from atalante_dbc import Message, Network
 from atalante_hal.bus import Bus, BusError, BusFull
@@ -224,24 +226,29 @@ class Transceiver:
                     f"another HAL is active on {self.bus.name} (received id 0x{min(duplicates):X}): stop it first"
                 )
 
-    def receive_queued(self) -> Iterator[Frames]:
+    def receive_queued(self, unneeded: Sequence[int]) -> Frames:
         """Receive all queued frames, at most `RECEIVE_BUDGET` batches. Call this after a gap between cycles.
 
-        The frames are logged, but they do not count for `RECEIVE_BUDGET` or BUS_FLOOD.
+        The frames are logged, but they do not count for BUS_FLOOD.
 
-        Yields:
-            One batch of frames, shape (n,), valid until the next batch.
+        Args:
+            unneeded: Identifiers of the frames to drop.
+
+        Returns:
+            Received frames with other identifiers, shape (n,), in order of arrival.
         """
+        kept = []
         try:
             for _ in range(RECEIVE_BUDGET):
                 count = self.bus.receive(self.scratch)
                 if self.tap is not None:
                     self.tap.received(self.scratch, count)
-                yield self.scratch[:count]
+                kept.append(self.scratch[:count][np.isin(self.scratch["can_id"][:count], unneeded, invert=True)])
                 if count < RECEIVE_BUDGET:
-                    return
+                    break
         except BusError as error:
             self._find(Dtc.BUS_DOWN, True, 0.0, f"the bus {self.bus.name} cannot receive: {error}")
+        return np.concatenate(kept) if kept else new_frames(0)
 
     def acknowledge(self) -> None:
         """Forget a bus-off that the operator has acknowledged, so that `faults` no longer returns it.

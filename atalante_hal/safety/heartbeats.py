@@ -12,6 +12,7 @@ from collections import defaultdict
 from typing import NamedTuple
 
 import numpy as np
+import numpy.typing as npt
 
 from atalante_dbc import Network
 from atalante_hal.robot import Thresholds
@@ -28,6 +29,8 @@ BOOT_UP, OPERATIONAL = 0, 5
 #: A frame has new data if its check result is `Check.OK` (0) or `Check.SOME_LOST` (1), so at most this value.
 #: The constant is an integer, because numpy compares enum members ten times slower.
 _FRESH = int(Check.SOME_LOST)
+#: Largest number of frames that `Heartbeats.essential` selects.
+_ESSENTIAL = 128
 
 
 class _Status(NamedTuple):
@@ -73,17 +76,27 @@ class Heartbeats:
             if m.name.endswith("_EMCY")
         }
         self._status_of = {codec.messages[s.row].frame_id: s for s in self._statuses}
+        self._emergency_ids, self._status_ids = list(self._emergency_of), list(self._status_of)
+        # All status messages have the same layout.
+        (self._state_byte,) = {codec.messages[s.row].signal("NodeState").start // 8 for s in self._statuses}
         self._amplitude, self._amplitude_row = codec.slice("Amplitude"), codec.rows["HAPTICS_STATE"]
         self._seen = 0  # cycle of the last call of `image.new_cycle`
         #: Node -> diagnostic and error code of its active emergency. A cleared emergency is removed.
         #: A new emergency replaces the entry, unless the new reaction is INFO or less severe than the old reaction.
         self.emergencies: dict[str, tuple[Dtc, int]] = {}
         self._cleared: set[str] = set()  # nodes whose emergency was cleared in this cycle
+        self._unreported: set[str] = set()  # nodes whose active emergency `evaluate` has not reported yet
+        #: Emergencies that were cleared before `evaluate` reported them, each as (node, diagnostic, error code).
+        #: The next `evaluate` reports them once.
+        self._brief: list[tuple[str, Dtc, int]] = []
         #: Events that the next `evaluate` raises only as pending diagnostics, each as (node, diagnostic, error code):
         #: - An emergency with the reaction INFO.
         #: - An emergency of a node that already has an active emergency with a more severe reaction.
         #: - A frame from an error passive node; the error code is 0.
         self._notices: list[tuple[str, Dtc, int]] = []
+        #: Nodes whose last status reports a state other than OPERATIONAL. A single BOOT_UP does not count.
+        self._stopped: set[str] = set()
+        self._booting: set[str] = set()  # nodes whose last status reports BOOT_UP
         #: Nodes that were reset: they reported a state other than OPERATIONAL at least once since the last `evaluate`.
         #: The first status message of a node does not count.
         self._reset: set[str] = set()
@@ -134,6 +147,22 @@ class Heartbeats:
             vibration[:] = image.values[self._amplitude]
         return unknown
 
+    def essential(self, frames: Frames) -> npt.NDArray[np.intp]:
+        """Return the indices of the frames that must be processed if many frames arrived at once, in order of arrival.
+
+        These are all emergencies, the newest frame of each other message, and the newest status of each node with each NodeState.
+        The number is limited to `_ESSENTIAL`, because processing takes about 20 us per frame.
+
+        Args:
+            frames: slow messages of the nodes, shape (n,).
+        """
+        ids = frames["can_id"].astype(np.int64)
+        state = np.where(np.isin(ids, self._status_ids), frames["data"][:, self._state_byte], 0)
+        _, newest = np.unique((ids * 256 + state)[::-1], return_index=True)
+        needed = np.isin(ids, self._emergency_ids)
+        needed[len(ids) - 1 - newest] = True
+        return np.flatnonzero(needed)[-_ESSENTIAL:]
+
     def evaluate(self, cycle: int, memory: FaultMemory) -> None:
         """Report the diagnostics of all nodes to the fault memory."""
         self._age(cycle)
@@ -154,9 +183,11 @@ class Heartbeats:
         for node, dtc, code in self._notices:
             memory.raise_dtc(cycle, dtc, node, value=code, confirmed=False)
         self._notices.clear()
-        for node, (dtc, code) in self.emergencies.items():
+        for node, dtc, code in [*self._brief, *((node, *active) for node, active in self.emergencies.items())]:
             text = f"{node}: {dtc.meaning} (emergency 0x{code:04X})"
             memory.raise_dtc(cycle, dtc, node, value=code, text=text)
+        self._brief.clear()
+        self._unreported.clear()
         self.quiet = not (self.emergencies or two_senders)
         for status in self._statuses:
             self._check_status(cycle, memory, status)
@@ -225,35 +256,46 @@ class Heartbeats:
         low = status.drive and values[status.supply] < self._low
         if low or values[status.dbc_hash] != self._hash or values[status.state] != OPERATIONAL:
             self.quiet = False
-        if values[status.state] == BOOT_UP:
+        state = values[status.state]
+        if state == OPERATIONAL:
+            self._stopped.discard(status.node)
+        elif state != BOOT_UP or status.node in self._booting:
+            self._stopped.add(status.node)
+        self._booting.discard(status.node)
+        if state == BOOT_UP:
             self.booted.add(status.node)
+            self._booting.add(status.node)
         if status.node not in self._reported:
             self._reported.add(status.node)
             self.all_reported = self._reported.issuperset(self._needed)
             if self.all_reported:
                 self.quiet = False  # all required nodes have reported, so the safety monitor must evaluate this cycle
-        elif values[status.state] != OPERATIONAL:
+        elif state != OPERATIONAL:
             self._reset.add(status.node)
 
     def _take_emergency(self, node: str, code: int) -> None:
         dtc = emergency(code)
         self.quiet = False
         if dtc is None:
-            if self.emergencies.pop(node, None) is not None:
+            active = self.emergencies.pop(node, None)
+            if active is not None:
                 self._cleared.add(node)
+            if active is not None and node in self._unreported:
+                self._brief.append((node, *active))
         elif dtc.reaction is Reaction.INFO:
             self._notices.append((node, dtc, code))
         elif node in self.emergencies and dtc.reaction < self.emergencies[node][0].reaction:
             self._notices.append((node, dtc, code))  # the active emergency is more severe, so it stays active
         else:
             self.emergencies[node] = dtc, code
+            self._unreported.add(node)
 
     def _check_status(self, cycle: int, memory: FaultMemory, status: _Status) -> None:
         age, values, node = int(self.image.age[status.row]), self.image.values, status.node
         if age >= NEVER:
             return
         lost = age >= status.timeout
-        stopped = values[status.state] not in (BOOT_UP, OPERATIONAL)
+        stopped = node in self._stopped
         mismatch = values[status.dbc_hash] != self._hash
         supply = float(values[status.supply]) if status.drive else self._low
         if lost:

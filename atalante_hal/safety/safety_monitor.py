@@ -222,6 +222,15 @@ class SafetyMonitor:
             self._steady = False
         return unknown
 
+    def accept_queued(self, frames: Frames) -> None:
+        """Process the slow messages that arrived in a gap between cycles, and ignore a START that was pressed in the gap.
+
+        Args:
+            frames: slow messages of the nodes, shape (n,), in order of arrival.
+        """
+        self._pendant.forget_start()
+        self.accept(frames[self._heartbeats.essential(frames)])
+
     def report(self, dtc: Dtc, text: str, confirmed: bool = True, value: float = 0.0, cycle: int | None = None) -> None:
         """Report a fault of the loop or the controller. The fault is logged immediately and evaluated in the next `evaluate`.
 

@@ -12,10 +12,11 @@ from atalante_hal.bus import BusDown, BusFull
 from atalante_hal.hal import Hal
 from atalante_hal.robot import JOINTS
 from atalante_hal.safety.diagnostics import Dtc, dtcs_of, number_of
+from atalante_hal.transceiver import RECEIVE_BUDGET
 from atalante_hal.types import Command, SupervisorState
 from atalante_hal.wire.cia402 import Controlword, DriveState
 from atalante_hal.wire.frame import new_frames
-from atalante_hal.wire.process_image import TransmitImage
+from atalante_hal.wire.process_image import ReceiveImage, TransmitImage
 
 S = SupervisorState
 
@@ -300,6 +301,49 @@ def test_emergency_and_unknown_frame_in_a_long_cycle_gap_are_processed_and_old_a
     ]
     assert not [code for code in rig.codes() if code.startswith("E2E")]
     assert rig.hal.state.valid.all()
+
+
+@pytest.mark.parametrize("code", [0, 0x3210], ids=["no fault", "emergency"])
+def test_start_that_is_pressed_in_a_long_cycle_gap_starts_nothing(rig, code: int):
+    """The operator could not see the faults of the gap yet. The next press counts."""
+    rig.until(S.ACTIVE)
+    rig.operator.hold()
+    rig.until(S.HOLD)
+    rig.run(50)
+    rig.operator.start()
+    image = TransmitImage([rig.hal.network.message("LEFT_SK_EMCY")])
+    image.values[image.codec.index("LEFT_SK_EMCY", "ErrorCode")] = code
+    queued = image.seal().copy()
+    rig.bus.to_hal = lambda frames: queued
+    rig.hal.report(Dtc.CYCLE_GAP, "no cycle began for 50 ms", value=0.05)
+    rig.bus.to_hal = lambda frames: frames
+    for _ in range(400):
+        assert rig.cycle().supervisor is S.HOLD
+    assert ("EMCY_3210" in rig.codes()) == (code != 0)
+    rig.operator.start()
+    rig.until(S.ACTIVE)
+
+
+def test_flood_in_a_long_cycle_gap_is_processed_in_bounded_work(rig, monkeypatch):
+    """Each unknown identifier is reported once, and only so many slow messages are processed as one cycle may receive."""
+    rig.until(S.ACTIVE)
+    image = TransmitImage([rig.hal.network.message("LEFT_SK_EMCY")])
+    flood = np.concatenate([image.seal().copy(), new_frames(1)] * (RECEIVE_BUDGET // 2))
+    flood["can_id"][1::2] = 0x7FF
+    accepted: list[int] = []
+    accept_each = ReceiveImage.accept_each
+
+    def count(image: ReceiveImage, frames, number, tag=None):
+        accepted.append(number)
+        return accept_each(image, frames, number, tag)
+
+    monkeypatch.setattr(ReceiveImage, "accept_each", count)
+    rig.bus.to_hal = lambda frames: flood
+    rig.hal.report(Dtc.CYCLE_GAP, "no cycle began for 50 ms", value=0.05)
+    rig.bus.to_hal = lambda frames: frames
+    assert sum(accepted) <= RECEIVE_BUDGET
+    rig.cycle()
+    assert rig.events_of("FRAME_UNKNOWN") == [("FRAME_UNKNOWN", "warning")]
 
 
 def test_short_cycle_gap_is_reported_as_warning(rig):

@@ -194,6 +194,23 @@ def test_press_before_qualification_counts_once_after_it(pendant: Pendant):
     assert not pendant.started
 
 
+def test_press_before_a_gap_between_cycles_ends_does_not_count(pendant: Pendant):
+    send(pendant, press=6)
+    pendant.forget_start()
+    send(pendant, request=START, press=7)
+    assert not pendant.started
+    send(pendant, request=START, press=8)
+    assert pendant.started
+
+
+def test_press_that_is_stored_before_a_gap_between_cycles_does_not_count(pendant: Pendant):
+    qualify(pendant, press=6)
+    qualify(pendant, request=START, press=7)
+    pendant.forget_start()
+    send(pendant, request=START, press=7)
+    assert not pendant.started
+
+
 def test_press_counter_of_the_first_frame_is_no_press(pendant: Pendant):
     for _ in range(20):
         qualify(pendant, request=START, press=7)

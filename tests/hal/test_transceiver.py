@@ -433,27 +433,39 @@ def test_bus_down_ends_listen(desk: Desk):
         desk.transceiver.listen(60.0)
 
 
-def test_queued_frames_are_received_in_batches_until_the_bus_is_silent(desk: Desk):
-    desk.bus.arrivals = [ids(*range(RECEIVE_BUDGET)), ids(*range(RECEIVE_BUDGET)), ids(1), ids(2)]
-    received = [frames["can_id"].tolist() for frames in desk.transceiver.receive_queued()]
-    assert received == [list(range(RECEIVE_BUDGET)), list(range(RECEIVE_BUDGET)), [1]]
-    assert desk.tap.received_ids == received
+def test_queued_frames_are_received_until_the_bus_is_silent(desk: Desk):
+    desk.bus.arrivals = [ids(*range(RECEIVE_BUDGET)), ids(*range(RECEIVE_BUDGET)), ids(1, 5), ids(2)]
+    frames = desk.transceiver.receive_queued(range(4, RECEIVE_BUDGET))
+    assert frames["can_id"].tolist() == [0, 1, 2, 3, 0, 1, 2, 3, 1]
+    assert desk.tap.received_ids == [list(range(RECEIVE_BUDGET))] * 2 + [[1, 5]]
     assert len(desk.bus.arrivals) == 1
     assert desk.evaluate() == {}, "queued frames are no flood"
 
 
+def test_queued_frames_are_received_without_a_tap(desk: Desk):
+    desk.transceiver.tap = None
+    desk.bus.arrivals = [ids(1)]
+    assert desk.transceiver.receive_queued([]).tobytes() == ids(1).tobytes()
+
+
 def test_number_of_queued_frames_is_bounded_under_a_flood(desk: Desk):
     desk.bus.arrivals = [ids(*range(RECEIVE_BUDGET))] * (RECEIVE_BUDGET + 5)
-    assert sum(1 for _ in desk.transceiver.receive_queued()) == RECEIVE_BUDGET
+    assert len(desk.transceiver.receive_queued([])) == RECEIVE_BUDGET**2
     assert len(desk.bus.arrivals) == 5
 
 
 def test_bus_down_while_queued_frames_are_received_is_reported_and_not_raised(desk: Desk):
     desk.bus.arrivals = [BusDown("gone")]
-    assert list(desk.transceiver.receive_queued()) == []
+    assert len(desk.transceiver.receive_queued([])) == 0
     assert desk.evaluate() == {"BUS_DOWN": True}
     event = desk.memory.events[0]
     assert (event.text, event.value) == ("the bus bench cannot receive: gone", 0.0)
+
+
+def test_queued_frames_before_a_bus_failure_are_kept(desk: Desk):
+    desk.bus.arrivals = [ids(*range(RECEIVE_BUDGET)), BusDown("gone")]
+    assert len(desk.transceiver.receive_queued([])) == RECEIVE_BUDGET
+    assert desk.evaluate() == {"BUS_DOWN": True}
 
 
 def test_transceiver_works_without_a_tap(desk: Desk):

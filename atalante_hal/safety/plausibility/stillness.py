@@ -13,7 +13,8 @@ detects some stuck encoders of joints without torque with the IMUs.
 *Ankles.* The ankles of a foot on the ground move the whole robot, whose inertia is some thousand times the inertia of
 the foot. A torque that varies fast then does not move the ankles. But the sole is at rest, so an ankle moves when its
 shank turns. For an ankle with a loaded foot, the first condition is therefore that the shank has turned by `_TURN` since
-the reading last changed.
+the reading last changed. While a foot sends no forces, it may be in the air or on the ground, so the encoders of its
+ankles are not checked here.
 
 *Large torque.* A controller that drives a joint with a stuck encoder accelerates the joint by a large torque within a few
 cycles. So the larger the torque, the sooner a constant reading is reported. A joint whose reading has been
@@ -58,6 +59,8 @@ _AT_REST = 3
 _DRIVEN = 1e-5
 #: A joint whose distance to a position limit is below this angle [rad] is regarded as being at its end stop.
 _AT_STOP = 0.005
+#: If the last forces of a foot are older than this number of cycles, the foot may have left the ground or landed since.
+_FORCES_VALID = 5
 _NEVER = 1 << 30
 #: Index of each ankle joint in JOINTS.
 _ANKLES = [JOINTS.index(f"{side}_{joint}") for side in SIDES for joint in ("SA", "HA")]
@@ -135,6 +138,7 @@ class Stillness:
         self.constant_samples, self._gyros, self._cells = (
             self._repeats[codec.slice(quantity)] for quantity in ("Position", "Gyro", "Force")
         )
+        self._foot_rows = [codec.rows[f"{node}_STATE"] for node in FOOT_NODES]
         self._gyro, self._force = codec.slice("Gyro"), codec.slice("Force")
         self._encoders_same, self._no_encoder = self._same[codec.slice("Position")], bytes(len(JOINTS))
         self._breakaway = robot.breakaway
@@ -232,7 +236,10 @@ class Stillness:
             joint: index of the joint in JOINTS.
             cycles: time from the joint's last good values to the new values [cycles].
         """
-        if cycles > 0:
+        foot = _FOOT_OF_JOINT[joint]
+        if foot >= 0 and self._age[self._foot_rows[foot]] > _FORCES_VALID:
+            release(self._drive, joint)
+        elif cycles > 0:
             readings, drive, breakaway, loaded, period = self._readings
             follow_one(joint, readings, drive, float(breakaway[joint]), (loaded, cycles * period))
 

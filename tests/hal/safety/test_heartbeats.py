@@ -121,6 +121,54 @@ def test_node_that_was_not_operational_for_a_moment_is_reported_once(running: No
     assert running.evaluate() == {}
 
 
+def test_node_that_reports_boot_up_again_and_again_is_reported_until_it_is_operational(nodes: Nodes):
+    for _ in range(2):
+        nodes.receive(nodes.frame("LEFT_SK", NodeState=0))
+    for _ in range(3):
+        assert nodes.evaluate() == {("NODE_RESET", "LEFT_SK"): True}
+        nodes.now += 1
+    nodes.receive(nodes.frame("LEFT_SK", NodeState=5))
+    assert nodes.evaluate() == {}
+    nodes.receive(nodes.frame("LEFT_SK", NodeState=0))
+    assert nodes.evaluate() == {("NODE_RESET", "LEFT_SK"): True}
+    nodes.now += 1
+    assert nodes.evaluate() == {}, "one boot-up is an event"
+
+
+def test_emergency_that_is_cleared_in_the_same_cycle_is_reported_once(running: Nodes):
+    running.receive(running.frame("LEFT_SK", "EMCY", ErrorCode=0x2310), running.frame("LEFT_SK", "EMCY", ErrorCode=0))
+    assert running.evaluate() == {("EMCY_2xxx", "LEFT_SK"): True}
+    assert running.memory.events[0].value == 0x2310
+    running.now += 1
+    assert running.evaluate() == {}
+    assert running.heartbeats.quiet
+
+
+def test_emergency_that_is_cleared_in_the_next_cycle_is_not_reported_again(running: Nodes):
+    running.receive(running.frame("LEFT_SK", "EMCY", ErrorCode=0x2310))
+    assert running.evaluate() == {("EMCY_2xxx", "LEFT_SK"): True}
+    running.receive(running.frame("LEFT_SK", "EMCY", ErrorCode=0))
+    assert running.evaluate() == {}
+
+
+def test_essential_frames_are_emergencies_and_the_newest_status_with_each_state(nodes: Nodes):
+    sent = [
+        nodes.frame("LEFT_SK", NodeState=5),
+        nodes.frame("LEFT_SK", NodeState=0),
+        nodes.frame("LEFT_SK", "EMCY", ErrorCode=0x2310),
+        nodes.frame("LEFT_SK", NodeState=5),
+        nodes.frame("RIGHT_SK", NodeState=5),
+        nodes.frame("LEFT_SK", "EMCY", ErrorCode=0x2310),
+        nodes.frame("LEFT_SK", NodeState=5),
+        nodes.frame("HAPTICS", "STATE", LeftThighFront_Amplitude=0.5),
+        nodes.frame("HAPTICS", "STATE", LeftThighFront_Amplitude=1.0),
+    ]
+    assert nodes.heartbeats.essential(np.concatenate(sent)).tolist() == [1, 2, 4, 5, 6, 8]
+    assert nodes.heartbeats.essential(new_frames(0)).tolist() == []
+    many = np.concatenate([nodes.frame("LEFT_SK", "EMCY", ErrorCode=0x2310)] * 300)
+    assert nodes.heartbeats.essential(many).tolist() == list(range(172, 300))
+
+
 def test_other_dbc_hash_is_reported_until_it_changes(nodes: Nodes):
     nodes.receive(nodes.frame("IMU_TORSO", DbcHash=NETWORK.hash32 ^ 1))
     assert nodes.heartbeats.quiet is False

@@ -270,6 +270,15 @@ class TestStuckEncoder:
         assert not [finding for finding in robot.run(400, rest) if finding.dtc is Dtc.ENC_STUCK]
 
     @pytest.mark.parametrize("joint", ANKLES, ids=lambda joint: JOINTS[joint])
+    def test_ankle_of_a_silent_foot_is_not_stuck_because_the_foot_may_have_landed(self, joint: int):
+        robot = SimulatedRobot(amplitude=1e-3)
+        robot.run(16)
+        at = float(robot.now.position[joint])
+        robot.missing = {row(f"FOOT_{JOINTS[joint].split('_')[0]}")}
+        found = [robot.run(1, lambda now: now.position.__setitem__(joint, at)) for _ in range(400)]
+        assert Dtc.ENC_STUCK not in {finding.dtc for findings in found for finding in findings}
+
+    @pytest.mark.parametrize("joint", ANKLES, ids=lambda joint: JOINTS[joint])
     def test_turn_and_torque_in_the_swing_do_not_count_on_the_ground(self, joint: int):
         robot, rate = SimulatedRobot(amplitude=1e-3), 1.5
         side = JOINTS[joint].split("_")[0]
