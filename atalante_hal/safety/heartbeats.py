@@ -76,7 +76,7 @@ class Heartbeats:
             if m.name.endswith("_EMCY")
         }
         self._status_of = {codec.messages[s.row].frame_id: s for s in self._statuses}
-        self._emergency_ids, self._status_ids = list(self._emergency_of), list(self._status_of)
+        self._emergency_ids = list(self._emergency_of)
         # All status messages have the same layout.
         (self._state_byte,) = {codec.messages[s.row].signal("NodeState").start // 8 for s in self._statuses}
         self._amplitude, self._amplitude_row = codec.slice("Amplitude"), codec.rows["HAPTICS_STATE"]
@@ -156,11 +156,11 @@ class Heartbeats:
         Args:
             frames: slow messages of the nodes, shape (n,).
         """
-        ids = frames["can_id"].astype(np.int64)
-        state = np.where(np.isin(ids, self._status_ids), frames["data"][:, self._state_byte], 0)
-        _, newest = np.unique((ids * 256 + state)[::-1], return_index=True)
-        needed = np.isin(ids, self._emergency_ids)
-        needed[len(ids) - 1 - newest] = True
+        # Only a status has a signal in the byte `_state_byte`. The byte is 0 in the other messages that are no emergencies.
+        kinds = np.column_stack([frames["can_id"], frames["data"][:, self._state_byte]])
+        _, newest = np.unique(kinds[::-1], axis=0, return_index=True)
+        needed = np.isin(frames["can_id"], self._emergency_ids)
+        needed[len(frames) - 1 - newest] = True
         return np.flatnonzero(needed)[-_ESSENTIAL:]
 
     def evaluate(self, cycle: int, memory: FaultMemory) -> None:

@@ -75,6 +75,16 @@ def test_the_list_of_commands_is_complete_and_in_order() -> None:
     assert "0 ok, 1 failed, 2 usage error, 3 no device, 4 fault latched, 130" in result.stdout
 
 
+@pytest.mark.parametrize("option", ["--help", "--version"])
+def test_output_of_the_group_to_a_full_device_fails_with_one_sentence(option: str) -> None:
+    with open("/dev/full", "w") as full:
+        done = subprocess.run(
+            atalante(option), stdout=full, stderr=subprocess.PIPE, text=True, timeout=120, check=False
+        )
+    assert done.returncode == 1
+    assert done.stderr == "atalante: the output file cannot be read or written: No space left on device\n"
+
+
 def test_help_and_version_import_no_slow_module() -> None:
     program = """
 import sys

@@ -58,6 +58,17 @@ class Commands(click.Group):
         with formatter.section("Commands"):
             formatter.write_dl([(name, line) for name, (_, line) in COMMANDS.items()])
 
+    def main(self, *args: Any, **kwargs: Any) -> Any:
+        """Run the command line. Replace an error of the output file of `--help` and `--version` by one sentence."""
+        try:
+            return super().main(*args, **kwargs)
+        except OSError as error:
+            failure = failure_of(error)
+            if failure is None:
+                raise
+            failure.show()
+            raise SystemExit(failure.exit_code) from error
+
     def invoke(self, ctx: click.Context) -> Any:
         """Run the command, and replace known errors by `Failed`.
 
@@ -95,7 +106,7 @@ def _version(ctx: click.Context, _parameter: click.Parameter, wanted: bool) -> N
 def cli() -> None:
     """Drive, emulate and monitor an Atalante-like exoskeleton on CAN FD.
 
-    All angles are in degrees. Start with `atalante demo`.
+    Angles in options and results are in degrees. Start with `atalante demo`.
 
     Exit codes: 0 ok, 1 failed, 2 usage error, 3 no device, 4 fault latched, 130 Ctrl-C, 143 SIGTERM.
     """

@@ -1,7 +1,8 @@
 """Phases of a walk from standing to standing, as a pure function: `phase, facts of the cycle -> next phase`.
 
 The order of the phases is POSTURE, STAND, SHIFT, START, STEP (repeated), STOP, BACK, REST. A step ends when the swing foot lands,
-or at a timeout after the nominal end of the step. STAND ends when both feet have carried load for some time. POSTURE, SHIFT and
+or at a timeout after the nominal end of the step. STAND ends when both feet have carried load for some
+time. If the walk must end before the weight shift, REST follows directly on STAND. POSTURE, SHIFT and
 BACK end by time. REST does not end.
 """
 
@@ -64,7 +65,7 @@ def next_phase(phase: Phase, facts: Facts) -> Phase | None:
     if phase is Phase.POSTURE:
         return Phase.STAND if facts.elapsed >= facts.nominal else None
     if phase is Phase.STAND:
-        return Phase.SHIFT if facts.loaded and not facts.stopping else None
+        return Phase.REST if facts.stopping else Phase.SHIFT if facts.loaded else None
     if phase is Phase.SHIFT and facts.elapsed >= facts.nominal + facts.rest:
         return Phase.BACK if facts.stopping else Phase.START
     if phase is Phase.BACK and facts.elapsed >= facts.nominal + facts.rest:

@@ -214,6 +214,26 @@ def test_finish_step_ends_the_walk_with_a_stop_step() -> None:
     assert controller.statistics.steps <= 2
 
 
+@pytest.mark.parametrize("phase", [Phase.POSTURE, Phase.STAND])
+def test_stop_before_the_weight_shift_ends_the_walk_without_a_step(phase: Phase) -> None:
+    controller, phases = WalkController(ROBOT, PATIENT, WALK, 3), [Phase.POSTURE]
+    body = make_body("mujoco", urdf(ExoskeletonParameters(), ROBOT, PATIENT), free=True, ground=0.0)
+    try:
+        hang(body, controller.standing_pose.tolist(), 0.0005)
+        robot = Ideal(body)
+        while not controller.done:
+            robot.cycle(controller)
+            if controller.phase is not phases[-1]:
+                phases.append(controller.phase)
+            if controller.phase is phase:
+                controller.stop()
+            assert robot.state.cycle < 10_000
+        assert robot.upright()
+    finally:
+        body.close()
+    assert phases == [Phase.POSTURE, Phase.STAND, Phase.REST]
+
+
 @pytest.mark.parametrize("xi", [0.0, 0.5])
 def test_swing_leg_stays_inside_the_certified_guide(xi: float) -> None:
     controller, phases = walked("mujoco", 3, xi=xi)

@@ -76,7 +76,9 @@ def test_compilation_notice_is_printed_once(capsys: pytest.CaptureFixture[str]) 
             logger.info("%s is compiled", name)
     finally:
         logger.handlers, logger.level = before
-    assert capsys.readouterr().err == ("compiling: takes some seconds, only once after an installation or an update\n")
+    assert capsys.readouterr().err == (
+        "compiling: takes up to some minutes, only in the first runs after an installation or an update\n"
+    )
 
 
 def test_bar_shows_the_finished_share_and_the_time_left_when_a_line_is_due() -> None:

@@ -42,7 +42,9 @@ class CompilationNotice(logging.Handler):
         """Print the message at the first log record. Every log record reports a compilation."""
         if not self._printed:
             self._printed = True
-            print_message("compiling: takes some seconds, only once after an installation or an update")
+            print_message(
+                "compiling: takes up to some minutes, only in the first runs after an installation or an update"
+            )
 
 
 def show_json(value: Mapping[str, Any]) -> None:

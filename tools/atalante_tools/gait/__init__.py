@@ -208,8 +208,8 @@ def fit(folder: Path, out: Path, as_json: bool) -> None:
         )
     if rejected := collection.rejected():
         print_message(f"{_rejected(rejected)}; solve these gaits again with `atalante gait library --out {folder}`")
-    if not gaits:
-        raise Failed(f"{folder} must contain at least one solved gait")
+    if len(gaits) < 2:
+        raise Failed(f"{folder} must contain at least two solved gaits, got {len(gaits)}")
     print_message(f"fitting {len(gaits)} gaits")
     start = time.monotonic()
     fitted = fit_network(list(gaits.values()), collection.grid)

@@ -135,9 +135,12 @@ def solved_gaits(subject: Subject, network: Path | None = None) -> WalkGaits:
     from atalante_hal.robot import load_robot
     from atalante_tools.console.stop_request import check_stop
 
-    gaits = gaits_of_subject(subject, load_robot(), network)
-    check_stop()  # a stop signal raises `Stopped`, but the optimiser catches this exception: raise `Stopped` again
-    return gaits
+    try:
+        return gaits_of_subject(subject, load_robot(), network)
+    finally:
+        # A stop signal raises `Stopped`, but the optimiser catches this exception and returns a wrong result or raises a
+        # `GaitError`. So raise `Stopped` again.
+        check_stop()
 
 
 def gaits_of_subject(subject: Subject, robot: Robot, network: Path | None = None) -> WalkGaits:

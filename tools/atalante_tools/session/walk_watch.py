@@ -66,7 +66,9 @@ class WalkWatch:
             over = self._halts(state)
         if over:
             self._progress.clear()
-            self._reason = self._reason or self._rig.hal.reason
+            # In ACTIVE, the reason is that of the start, which says nothing about the end of the walk.
+            if state.supervisor is not SupervisorState.ACTIVE:
+                self._reason = self._reason or self._rig.hal.reason
         elif self._progress.due():
             from atalante_tools.session.rig import waiting_for
 
@@ -75,6 +77,8 @@ class WalkWatch:
 
     def _walks(self, state: State) -> bool:
         """Process a cycle in which the torques of the controller are sent. Return whether the walk is over."""
+        if self._stop.wanted:
+            self._controller.stop()  # again, because `reset` forgets a stop request that came just before it
         over = self._controller.done
         finishing = state.supervisor is _FINISH_STEP
         if finishing and not self._reason:
@@ -118,7 +122,8 @@ class WalkWatch:
         from atalante_tools.console.outcome import FaultLatched
 
         if self.outcome == "fell":
-            raise Failed(f"the robot fell in step {self._controller.statistics.steps}: {self._reason}")
+            reason = f": {self._reason}" if self._reason else ""
+            raise Failed(f"the robot fell in step {self._controller.statistics.steps}{reason}")
         if self._stop.wanted:
             print_message("stopped, the robot is in HOLD")
             raise SystemExit(self._stop.exit_code)
