@@ -216,6 +216,9 @@ class TestCommand:
         assert result.exit_code == code
         assert result.stderr.splitlines()[-1] == "interrupted, 1 of 81 gaits solved; repeat the command to resume"
         assert Library(tmp_path).failures() == {}
+        fit = self.run("fit", "--library", str(tmp_path), "--out", str(tmp_path / "network.npz"))
+        assert fit.exit_code == 1
+        assert f"{tmp_path} must contain at least two solved gaits, got 1" in fit.stderr
         monkeypatch.setattr(library_module, "solve_subject", synthetic)
         assert self.run(*small).exit_code == 0
         assert len(list(tmp_path.glob("gaits/*.json"))) == 81
