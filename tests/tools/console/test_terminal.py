@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import errno
 import io
 import json
 import logging
 import math
+import sys
 
 import pytest
 
@@ -90,3 +92,23 @@ def test_bar_shows_the_finished_share_and_the_time_left_when_a_line_is_due() -> 
     now[0] = 2.0
     progress.bar(1, 4, "runs")
     assert log.getvalue() == f"[{'#' * 6}{'.' * 18}] 1 of 4 runs, 6 s left\n"
+
+
+class _Closed(io.StringIO):
+    """Stream whose reader has gone."""
+
+    def write(self, _text: str) -> int:
+        raise BrokenPipeError(errno.EPIPE, "Broken pipe")
+
+
+@pytest.mark.parametrize("live", [True, False])
+def test_output_to_a_closed_pipe_raises_nothing_because_the_robot_may_walk(
+    live: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    closed = _Closed()
+    monkeypatch.setattr(closed, "isatty", lambda: live)
+    monkeypatch.setattr(sys, "stderr", closed)
+    print_message("a message")
+    progress = Progress()
+    progress.show("a progress line")
+    progress.clear()

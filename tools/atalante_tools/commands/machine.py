@@ -116,8 +116,9 @@ class ThisMachine:
         return None
 
     def realtime_priority(self) -> int:
-        """Return the limit RLIMIT_RTPRIO, or 99 if the process has CAP_SYS_NICE."""
-        return 99 if _capable(_CAP_SYS_NICE) else resource.getrlimit(resource.RLIMIT_RTPRIO)[0]
+        """Return the limit RLIMIT_RTPRIO, or 99 if it is unlimited or the process has CAP_SYS_NICE."""
+        limit = resource.getrlimit(resource.RLIMIT_RTPRIO)[0]
+        return 99 if _capable(_CAP_SYS_NICE) or limit == resource.RLIM_INFINITY else limit
 
     def locked_memory(self) -> int | None:
         """Return the limit RLIMIT_MEMLOCK [bytes], or None if it is unlimited or the process has CAP_IPC_LOCK."""

@@ -221,6 +221,10 @@ def command(
     if then:
         _require_speed_changes(law, files)
     if protocol is not None:
+        if xi == 1.0:
+            raise click.UsageError(
+                "--protocol ends with the assistance factor --xi, which must be below 1, got 1: add --xi"
+            )
         steps = sum(protocol)
     subject = _subject(patient, step_length, step_duration)
     options = WalkOptions(

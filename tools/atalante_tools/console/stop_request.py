@@ -29,11 +29,12 @@ class Stopped(SystemExit):
 
 
 class StopRequest:
-    """Record of the first stop signal. After the signal, `wanted` is True and `exit_code` is the exit code to use."""
+    """Record of the stop signals. After the first signal, `wanted` is True and `exit_code` is the exit code to use."""
 
     def __init__(self) -> None:
         self.wanted = False
         self.exit_code = 0
+        self.signals = 0  # number of signals
 
     def ask(self, number: int) -> None:
         """Record that a stop signal arrived.
@@ -41,6 +42,7 @@ class StopRequest:
         Args:
             number: Signal number.
         """
+        self.signals += 1
         if not self.wanted:
             self.exit_code = SIGNALLED + number
             self.wanted = True
@@ -57,7 +59,7 @@ class StopRequest:
     def settle(self) -> None:
         """Clear the request, so that the command ends with exit code 0 even if a signal arrived."""
         self.wanted = False
-        self.exit_code = 0
+        self.exit_code = self.signals = 0
 
 
 #: Stop request of this process. None while no context manager of this module is active.

@@ -7,6 +7,7 @@ import logging
 import sys
 import time
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from typing import Any, Final, TextIO
 
 import click
@@ -20,8 +21,13 @@ _BAR: Final = 24
 
 
 def print_message(text: str) -> None:
-    """Print a message of one line on stderr."""
-    click.echo(text, err=True)
+    """Print a message of one line on stderr.
+
+    A failed output raises no exception, because messages are also printed while the robot walks. For example, Ctrl-C also ends a
+    program that reads stderr through a pipe.
+    """
+    with suppress(OSError):
+        click.echo(text, err=True)
 
 
 class CompilationNotice(logging.Handler):
@@ -99,11 +105,15 @@ class Progress:
         """Print a progress line and start the next period."""
         self._next = self._now() + self._period
         if self._live:
-            self._stream.write("\r" + text.ljust(self._width))
-            self._stream.flush()
+            self._write("\r" + text.ljust(self._width))
             self._width = len(text)
         else:
-            self._stream.write(text + "\n")
+            self._write(text + "\n")
+
+    def _write(self, text: str) -> None:
+        with suppress(OSError):  # see `print_message`
+            self._stream.write(text)
+            self._stream.flush()
 
     def bar(self, done: int, total: int, unit: str) -> None:
         """Print a progress bar and the estimated remaining time, if one period has passed since the last progress line.
@@ -121,8 +131,7 @@ class Progress:
     def clear(self) -> None:
         """Erase the progress line on a terminal, before other text is printed."""
         if self._live and self._width:
-            self._stream.write("\r" + " " * self._width + "\r")
-            self._stream.flush()
+            self._write("\r" + " " * self._width + "\r")
             self._width = 0
 
 

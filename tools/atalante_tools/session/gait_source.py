@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from atalante_tools.console.options import GaitFiles
+from atalante_tools.console.stop_request import check_stop
 from atalante_tools.console.terminal import print_message
 from atalante_tools.session.extra import extra
 
@@ -127,12 +128,18 @@ def with_start_and_stop(subject: Subject, step: Gait) -> WalkGaits:
     Raises:
         GaitError: If there is no start step or no stop step for the gait.
         Failed: If the gait optimisation is not installed.
+        Stopped: If a signal arrived during the optimisation.
     """
     print_message(f"solving start step and stop step for {subject}")
     with extra():
         from atalante_control.gait_optimization.walk import solve_walk
 
-        return solve_walk(subject, step)
+        try:
+            return solve_walk(subject, step)
+        finally:
+            # A stop signal raises `Stopped`, but the optimiser catches this exception and returns a wrong result or raises a
+            # `GaitError`. So raise `Stopped` again.
+            check_stop()
 
 
 def patient_in(gait: Gait, path: Path) -> Patient | None:

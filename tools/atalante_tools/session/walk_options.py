@@ -133,14 +133,8 @@ def solved_gaits(subject: Subject, network: Path | None = None) -> WalkGaits:
         Stopped: If a signal arrived during the optimisation.
     """
     from atalante_hal.robot import load_robot
-    from atalante_tools.console.stop_request import check_stop
 
-    try:
-        return gaits_of_subject(subject, load_robot(), network)
-    finally:
-        # A stop signal raises `Stopped`, but the optimiser catches this exception and returns a wrong result or raises a
-        # `GaitError`. So raise `Stopped` again.
-        check_stop()
+    return gaits_of_subject(subject, load_robot(), network)
 
 
 def gaits_of_subject(subject: Subject, robot: Robot, network: Path | None = None) -> WalkGaits:

@@ -5,6 +5,8 @@ from __future__ import annotations
 import math
 from typing import TYPE_CHECKING, Any
 
+from atalante_hal.safety.diagnostics import Dtc
+from atalante_hal.safety.start import WALK_ENDS, stop_text
 from atalante_hal.types import SupervisorState
 from atalante_tools.console.outcome import Failed
 from atalante_tools.console.terminal import print_message
@@ -42,6 +44,7 @@ class WalkWatch:
         self._rig, self._controller, self._observation, self._stop = rig, controller, observation, stop
         self._steps, self._progress, self._started = steps, Progress(), False
         self.outcome, self._reason, self._halted = "hold", "", 0
+        self._signals = 0  # number of stop signals at the end of the motion
         self.full_assist = False
 
     def __call__(self, state: State) -> bool:
@@ -90,15 +93,27 @@ class WalkWatch:
         return over
 
     def _halts(self, state: State) -> bool:
-        """Process a cycle before START or after the end of the motion. Return whether the walk is over."""
+        """Process a cycle before START or after the end of the motion. Return whether the walk is over.
+
+        After the motion, the robot is observed for `AFTERMATH` cycles, because it may still fall. A further stop signal ends
+        this time, and so does a bus that is down, which shows no fall.
+        """
+        hal = self._rig.hal
         fault = state.supervisor is _FAULT
         if fault:
             self.outcome = "fault"
         if not self._started:
             return bool(self._stop.wanted) or fault
+        if not self._halted:
+            hal.end()  # a START in this time must not begin a second walk
+            self._signals = self._stop.signals
+            self._reason = self._reason or hal.reason
+            if not self._controller.walking and self._reason == stop_text(stop_requested=True):
+                self.outcome = "stopped"  # before the weight shift or after the walk: the robot stands on both feet
+                return True
         self._halted += 1
-        self._reason = self._reason or self._rig.hal.reason
-        return self._halted > AFTERMATH
+        stopped = self._stop.signals > min(1, self._signals)
+        return stopped or self._halted > AFTERMATH or Dtc.BUS_DOWN in hal.conditions.diagnostics
 
     def _describe(self, state: State) -> str:
         controller = self._controller
@@ -118,7 +133,6 @@ class WalkWatch:
             FaultLatched: If the robot is in FAULT.
             Failed: If the robot fell, went to HOLD during the walk, or ended the walk early without a request to stop.
         """
-        from atalante_hal.safety.start import WALK_ENDS, stop_text
         from atalante_tools.console.outcome import FaultLatched
 
         if self.outcome == "fell":
@@ -130,7 +144,8 @@ class WalkWatch:
         if self.outcome == "fault":
             raise FaultLatched(f"the robot is in FAULT: {self._reason}")
         if self.outcome == "stopped":
-            if self._reason != stop_text(stop_requested=True) + WALK_ENDS:
+            stop = stop_text(stop_requested=True)
+            if self._reason not in (stop, stop + WALK_ENDS):
                 raise Failed(f"the robot ended the walk early and stands: {self._reason}")
             print_message("stopped by the operator, the robot stands in HOLD")
         elif self.outcome != "stood":

@@ -1,0 +1,110 @@
+"""End condition of a walk on the ground: what happens after the motion has ended."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+
+from atalante_hal.safety.diagnostics import Dtc
+from atalante_hal.safety.start import stop_text
+from atalante_hal.types import SupervisorState
+from atalante_tools.console.outcome import Failed
+from atalante_tools.console.stop_request import StopRequest
+from atalante_tools.session.walk_observation import AFTERMATH
+from atalante_tools.session.walk_watch import WalkWatch
+
+HOLD, ACTIVE = SimpleNamespace(supervisor=SupervisorState.HOLD), SimpleNamespace(supervisor=SupervisorState.ACTIVE)
+
+
+class Walk:
+    """Walk whose HAL and controller a test sets by hand."""
+
+    def __init__(self) -> None:
+        self.ended, self.stop, self.fallen = 0, StopRequest(), False
+        self.hal = SimpleNamespace(
+            moving=True, reason="READY -> ACTIVE", end=self._end, conditions=SimpleNamespace(diagnostics=frozenset())
+        )
+        self.controller = SimpleNamespace(
+            done=False, walking=True, stop=lambda: None, statistics=SimpleNamespace(steps=2)
+        )
+        rig: Any = SimpleNamespace(hal=self.hal, target="embedded")
+        observation: Any = SimpleNamespace(check=lambda: self.fallen)
+        controller: Any = self.controller
+        self.watch = WalkWatch(rig, controller, observation, self.stop, 5)
+
+    def _end(self) -> None:
+        self.ended += 1
+
+    def cycle(self, state: Any) -> bool:
+        return self.watch(state)
+
+    def halt(self, reason: str) -> None:
+        """Walk for a cycle, then leave ACTIVE for the reason."""
+        assert not self.cycle(ACTIVE)
+        self.hal.moving, self.hal.reason = False, reason
+
+
+@pytest.fixture
+def walk(monkeypatch: pytest.MonkeyPatch) -> Walk:
+    monkeypatch.setattr("atalante_tools.console.terminal.Progress.due", lambda _progress: False)
+    return Walk()
+
+
+def test_robot_in_hold_is_observed_for_some_time_without_a_second_walk(walk: Walk) -> None:
+    walk.halt("left_SK: implausible")
+    assert [walk.cycle(HOLD) for _ in range(AFTERMATH + 1)] == [False] * AFTERMATH + [True]
+    assert walk.ended == 1
+    with pytest.raises(Failed, match="the robot went to HOLD: left_SK: implausible"):
+        walk.watch.conclude()
+
+
+@pytest.mark.parametrize(("before", "after"), [(0, 1), (1, 1), (2, 0)])
+def test_stop_signal_ends_the_observation(walk: Walk, before: int, after: int) -> None:
+    for _ in range(before):
+        walk.stop.ask(2)
+    walk.halt("the program is ending")
+    if after:
+        assert not any(walk.cycle(HOLD) for _ in range(10))
+        walk.stop.ask(2)
+    assert walk.cycle(HOLD)
+
+
+def test_bus_that_is_down_ends_the_observation(walk: Walk) -> None:
+    walk.halt("the bus is down")
+    walk.hal.conditions.diagnostics = frozenset({Dtc.BUS_DOWN})
+    assert walk.cycle(HOLD)
+
+
+def test_stop_of_the_operator_before_the_weight_shift_is_no_failure(
+    walk: Walk, capsys: pytest.CaptureFixture[str]
+) -> None:
+    walk.controller.walking = False
+    walk.halt(stop_text(stop_requested=True))
+    assert walk.cycle(HOLD)
+    assert walk.watch.outcome == "stopped"
+    walk.watch.conclude()
+    assert "stopped by the operator, the robot stands in HOLD" in capsys.readouterr().err
+
+
+def test_stop_of_the_operator_in_a_step_is_observed(walk: Walk) -> None:
+    walk.halt(stop_text(stop_requested=True))
+    assert not walk.cycle(HOLD)
+
+
+def test_fall_in_active_has_no_reason(walk: Walk) -> None:
+    assert not walk.cycle(ACTIVE)
+    walk.fallen = True
+    assert walk.cycle(ACTIVE)
+    with pytest.raises(Failed, match=r"the robot fell in step 2$"):
+        walk.watch.conclude()
+
+
+def test_stop_request_that_came_before_the_start_of_the_walk_is_passed_on_again(walk: Walk) -> None:
+    stops: list[None] = []
+    walk.controller.stop = lambda: stops.append(None)
+    assert not walk.cycle(ACTIVE)
+    walk.stop.ask(2)
+    assert not walk.cycle(ACTIVE)
+    assert stops == [None]
