@@ -54,6 +54,8 @@ _REJECTED = (Check.CRC, Check.LENGTH, Check.RANGE, Check.INVALID)
 _HALF_TURN = 128
 #: The HAL sends one SYNC on each bus. After the first SYNC, the emulator waits at most this time for all other SYNCs [s].
 _SYNC_SKEW = 200e-6
+#: Largest number of missed cycles that the emulator without SYNC runs before it listens to the bus and to `stop` again.
+_CATCH_UP = 20
 
 
 @dataclass(frozen=True)
@@ -513,9 +515,11 @@ class Emulator:
         """Run the robot for a HAL in another process.
 
         After `WATCHDOG` milliseconds without SYNC, the drives start their local hold. Body and heartbeats continue in real time.
+        If this computer is too slow for that, or this process was stopped, the simulated time falls behind.
 
         Args:
-            stop: function that is called about once per millisecond and returns True to end the run.
+            stop: function that returns True to end the run. It is called about once per millisecond, and at least after every
+                `_CATCH_UP` simulated milliseconds.
         """
         alone_from = time.monotonic() + WATCHDOG * PERIOD
         while not stop():
@@ -524,9 +528,12 @@ class Emulator:
             if ran:
                 alone_from = now + WATCHDOG * PERIOD
                 continue
-            while alone_from <= now:
+            for _ in range(_CATCH_UP):
+                if alone_from > now:
+                    break
                 self.idle()
                 alone_from += PERIOD
+            alone_from = max(alone_from, now - _CATCH_UP * PERIOD)
 
     def idle(self) -> None:
         """Run one millisecond without a HAL. Enabled drives start their local hold.

@@ -2,10 +2,12 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from functools import partial
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
+import atalante_emulator.emulator as emulator_module
 from atalante_dbc import Network
 from atalante_emulator.bodies.pybullet_body import PyBulletBody
 from atalante_emulator.drive import WATCHDOG
@@ -570,6 +572,35 @@ class TestWallClock:
         assert not any(name.endswith("_STATE") and name != "HAPTICS_STATE" for name in names)
         assert sum(name.endswith("_STATUS") for name in names) == 19
         assert sum(name.endswith("_EMCY") for name in names) == 12
+
+    @pytest.mark.parametrize("pause", [0.0, 60.0])
+    def test_slow_computer_or_long_pause_does_not_delay_the_end_of_a_run_without_sync(
+        self, make: Callable[..., Setup], monkeypatch: pytest.MonkeyPatch, pause: float
+    ) -> None:
+        """Each simulated millisecond takes two, or the process is stopped for a minute at the start."""
+        _, emulator = make()
+        now, cycles, calls = [100.0], [0], [0]
+
+        def idle() -> None:
+            now[0] += 2e-3 if not pause else 1e-5
+            cycles[0] += 1
+
+        def poll(timeout: float = 0.0) -> int:
+            now[0] += timeout
+            return 0
+
+        def stop() -> bool:
+            assert cycles[0] <= 20 * calls[0]
+            calls[0] += 1
+            now[0] += pause if calls[0] == 2 else 0.0
+            return calls[0] > 50
+
+        monkeypatch.setattr(emulator_module, "time", SimpleNamespace(monotonic=lambda: now[0]))
+        monkeypatch.setattr(emulator, "idle", idle)
+        monkeypatch.setattr(emulator, "poll", poll)
+        emulator.run(stop)
+        assert calls[0] == 51
+        assert cycles[0] > 40
 
     def test_run_answers_every_sync_and_keeps_the_drives_enabled(self, make: Callable[..., Setup]) -> None:
         master, emulator = make()
