@@ -390,8 +390,10 @@ class Drives:
         return acknowledged or after is not state
 
     def _enter(self, drive: int, state: DriveState) -> None:
-        if state is DriveState.QUICK_STOP_ACTIVE:
+        if state is DriveState.QUICK_STOP_ACTIVE is not self.state[drive]:
             self._hold_at[drive] = self.encoders.angle[drive]
+            if abs(speed := self.encoders.speed[drive]) > self.parameters.jump_speed:
+                self._hold_at[drive] -= speed * PERIOD  # `_without_command` adds the jump of this cycle
         self.state[drive] = state
 
     def _states_changed(self) -> None:

@@ -157,6 +157,11 @@ SCENARIOS: Final = (
                 # 22.5 mrad is the largest joint motion that the HAL accepts within five cycles, and each jump is larger.
                 for by in (0.025, -0.025, 0.1, -1.0)
             ),
+            # The hold begins in the cycle in which the encoder jumps back.
+            *(
+                Case(f"{1e3 * by:g} mrad for 5 cycles", (Fault("encoder_jump", _STILL, 0, 5, by=by),), node=_STILL)
+                for by in (0.3, -0.3)
+            ),
             Case(
                 "25 mrad, permanent",
                 (Fault("encoder_jump", _STILL, by=0.025),),
