@@ -123,7 +123,9 @@ class Drives:
         #: The last controlwords of all drives, as bytes, if they changed no drive state and no error. Otherwise empty.
         #: When the HAL sends the same bytes again, the drives need not evaluate them.
         self._steady = b""
-        self._hold_at = np.zeros(len(JOINTS))  # joint position at which each drive holds its joint [rad]
+        #: Joint position at which each drive holds its joint [rad]; NaN from a change of the drive state to the next torque, and
+        #: before the first encoder sample.
+        self._hold_at = np.full(len(JOINTS), np.nan)
         self._target, self._limit = np.zeros((2, len(JOINTS)))
         self._own_limit = robot.torque_max.copy()  # torque limit of each drive at the current winding temperature [Nm]
         self._within = compiled(_within)
@@ -214,11 +216,14 @@ class Drives:
         if jumped.any():  # the encoder jumped, not the joint: move the hold position with it, so that the torque stays
             self._hold_at[jumped] += speed[jumped] * PERIOD
             speed[jumped] = 0.0
+        begins = np.isnan(self._hold_at)
+        if begins.any():  # after the line above, because a jump in this cycle is already in this position
+            self._hold_at[begins] = self.encoders.angle[begins]
         hold = robot.hold_kp * (self._hold_at - self.encoders.angle) - robot.hold_kd * speed
         np.clip(hold, -limit, limit, out=hold)
         unknown = np.isnan(hold)
-        if unknown.any():  # NaN: the hold began before the first encoder sample, so the hold position is still unknown
-            self._hold_at[unknown], hold[unknown] = self.encoders.angle[unknown], 0.0
+        if unknown.any():  # NaN: there is no encoder sample yet
+            hold[unknown] = 0.0
         wanted[:] = np.where(self._is_enabled, wanted, np.where(self._is_holding, hold, 0.0))
 
     # -- errors and local reactions ----------------------------------------------------------------------------------
@@ -390,10 +395,8 @@ class Drives:
         return acknowledged or after is not state
 
     def _enter(self, drive: int, state: DriveState) -> None:
-        if state is DriveState.QUICK_STOP_ACTIVE is not self.state[drive]:
-            self._hold_at[drive] = self.encoders.angle[drive]
-            if abs(speed := self.encoders.speed[drive]) > self.parameters.jump_speed:
-                self._hold_at[drive] -= speed * PERIOD  # `_without_command` adds the jump of this cycle
+        if state is not self.state[drive]:
+            self._hold_at[drive] = np.nan
         self.state[drive] = state
 
     def _states_changed(self) -> None:

@@ -298,6 +298,36 @@ def test_encoder_jump_during_a_hold_moves_the_setpoint_and_not_the_joint(jump: f
     np.testing.assert_allclose(before, -0.01 * ROBOT.hold_kp, rtol=0.02)
 
 
+@pytest.mark.parametrize("jump", [-0.3, 0.3])
+def test_hold_that_begins_with_an_encoder_jump_does_not_move_the_joint(jump: float) -> None:
+    """The encoder jumps away and back. The hold begins in the cycle of the second jump."""
+    bench = DriveBench(SMOOTH)
+    bench.enable()
+    bench.move(0.2)
+    bench.position[:] = 0.2 + jump
+    bench.cycle()
+    bench.position[:] = 0.2
+    bench.word[:] = Controlword.QUICK_STOP
+    torques = [bench.cycle() for _ in range(30)]
+    assert np.abs(torques).max() < 0.1  # the resolution of the encoder
+    bench.position[:] = 0.21
+    for _ in range(30):
+        torque = bench.cycle()
+    np.testing.assert_allclose(torque, -0.01 * ROBOT.hold_kp, rtol=0.02)
+
+
+def test_drive_that_enters_quick_stop_again_keeps_its_hold_position() -> None:
+    bench = DriveBench(SMOOTH)
+    bench.enable()
+    bench.word[:] = Controlword.QUICK_STOP
+    bench.cycle()
+    bench.position[:] = 0.01
+    for _ in range(30):
+        bench.drives.leave(3, DriveState.QUICK_STOP_ACTIVE)
+        torque = bench.cycle()
+    np.testing.assert_allclose(torque, -0.01 * ROBOT.hold_kp, rtol=0.02)
+
+
 def test_hold_torque_opposes_the_velocity() -> None:
     bench = DriveBench(SMOOTH)
     bench.enable()
