@@ -117,6 +117,12 @@ def test_hold_before_the_first_sample_of_the_encoder_begins_at_the_first_sample(
     assert not np.delete(torque, 3).any()
 
 
+def test_hold_without_any_encoder_sample_has_no_torque() -> None:
+    bench = DriveBench(SMOOTH)
+    bench.drives.leave(3, DriveState.QUICK_STOP_ACTIVE)
+    assert [bench.drives.drive(bench.velocity) for _ in range(5)] == [[0.0] * 12] * 5
+
+
 def test_hold_brakes_a_moving_joint_in_its_first_cycle() -> None:
     bench = DriveBench(SMOOTH)
     bench.enable()
