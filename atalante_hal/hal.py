@@ -116,7 +116,6 @@ class Hal:
         self._header = parts.header
         self._header[3] = assistance_factor
         self._image = ReceiveImage(fast, parts.signals)
-        self._answer_ids = [m.frame_id for m in fast]
         self._slow_ids = [m.frame_id for m in received if m.cycle_ms != 1]
         self._plausibility = Plausibility(self.robot, self._image, PERIOD)
         self.state = parts.state(assistance_factor, len(fast))
@@ -176,7 +175,7 @@ class Hal:
         For example, an emergency is sent only once, so it must not be lost. Many frames may have arrived in the gap. Of the
         frames that are no messages to the HAL, only one of each identifier is processed, so that this takes at most a few cycles.
         """
-        frames = self._transceiver.receive_queued(self._answer_ids)
+        frames = self._transceiver.receive_queued([*self._image.frame_ids])
         slow = np.isin(frames["can_id"], self._slow_ids)
         self._safety_monitor.accept_queued(frames[slow])
         _, first = np.unique(frames["can_id"][~slow], return_index=True)

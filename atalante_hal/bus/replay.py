@@ -13,6 +13,7 @@ import struct
 import zlib
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import can
 import numpy as np
@@ -28,6 +29,8 @@ WITHOUT_FD = (".csv", ".db")
 #: Text log formats with one frame per line. A complete log ends with a newline.
 LINE_LOGS = (".log", ".asc", ".trc")
 BLF_HEADER_BYTES = 144
+#: Error text of a log with relative time stamps, see `has_relative_times`.
+RELATIVE_TIMES = 'the time stamps must be absolute, got "timestamps relative"'
 #: Exceptions that python-can raises when it reads an invalid log.
 UNREADABLE = (
     ValueError,
@@ -82,10 +85,9 @@ class ReplayBus:
         if self._next is None:
             self.close()
             raise LogUnreadable(f"{path} contains no CAN frame: it is empty, or it is not a {Path(path).suffix} log")
-        # python-can does not add up relative time stamps. It reads the header with their kind only before the first frame.
-        if (getattr(self._reader, "timestamps_format", "") or "").lower() == "relative":
+        if has_relative_times(self._reader):
             self.close()
-            raise LogUnreadable(f'{path}: the time stamps must be absolute, got "timestamps relative"')
+            raise LogUnreadable(f"{path}: {RELATIVE_TIMES}")
 
     @property
     def ended(self) -> bool:
@@ -148,6 +150,19 @@ class ReplayBus:
             raise LogUnreadable(f"{self.name} cannot be read beyond frame {self._count}: {error}") from error
         self._count += 1
         return message
+
+
+def has_relative_times(reader: Any) -> bool:
+    """Return whether an .asc log has relative time stamps. Call this after the first message was read.
+
+    A relative time stamp counts from the previous line of the log. python-can does not add up relative time stamps, and it
+    skips the lines without a CAN frame. Therefore the times of such a log cannot be computed from the messages. python-can reads
+    the header of the log together with the first message.
+
+    Args:
+        reader: Reader of python-can. Readers of other formats have no relative time stamps.
+    """
+    return (getattr(reader, "timestamps_format", "") or "").lower() == "relative"
 
 
 def _open(path: Path) -> can.io.generic.MessageReader:

@@ -96,7 +96,6 @@ class Heartbeats:
         self._notices: list[tuple[str, Dtc, int]] = []
         #: Nodes whose last status reports a state other than OPERATIONAL. A single BOOT_UP does not count.
         self._stopped: set[str] = set()
-        self._booting: set[str] = set()  # nodes whose last status reports BOOT_UP
         #: Nodes that were reset: they reported a state other than OPERATIONAL at least once since the last `evaluate`.
         #: The first status message of a node does not count.
         self._reset: set[str] = set()
@@ -256,15 +255,13 @@ class Heartbeats:
         low = status.drive and values[status.supply] < self._low
         if low or values[status.dbc_hash] != self._hash or values[status.state] != OPERATIONAL:
             self.quiet = False
-        state = values[status.state]
+        state, before = values[status.state], self.image.values_before[status.state]
         if state == OPERATIONAL:
             self._stopped.discard(status.node)
-        elif state != BOOT_UP or status.node in self._booting:
+        elif state != BOOT_UP or before == BOOT_UP:
             self._stopped.add(status.node)
-        self._booting.discard(status.node)
         if state == BOOT_UP:
             self.booted.add(status.node)
-            self._booting.add(status.node)
         if status.node not in self._reported:
             self._reported.add(status.node)
             self.all_reported = self._reported.issuperset(self._needed)

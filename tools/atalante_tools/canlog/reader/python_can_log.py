@@ -109,16 +109,15 @@ def _messages(log: LogFile) -> Iterator[tuple[Iterator[Any], Callable[[], int]]]
 def _with_absolute_times(reader: Any) -> Iterator[Any]:
     """Yield the messages of an .asc log.
 
-    A relative time stamp counts from the previous line of the log. python-can does not add up relative time stamps, and it
-    skips the lines without a CAN frame. Therefore the times of such a log cannot be computed from the messages.
-
     Raises:
         ValueError: If the time stamps of the log are relative. The error is raised before the first message.
     """
+    from atalante_hal.bus.replay import RELATIVE_TIMES, has_relative_times
+
     messages = iter(reader)
-    for first in messages:  # the reader reads the header of the log together with the first message
-        if (reader.timestamps_format or "").lower() == "relative":
-            raise ValueError('the time stamps must be absolute, got "timestamps relative"')
+    for first in messages:
+        if has_relative_times(reader):
+            raise ValueError(RELATIVE_TIMES)
         yield first
         break
     yield from messages
