@@ -55,6 +55,7 @@ class JoinedBus:
         for name in network.buses:
             if buses[name] not in self._links:
                 self._links.append(buses[name])
+        self._channel_of = {name: buses[name] for name in network.buses}
         self._link_of = {m.frame_id: self._links.index(buses[m.bus]) for m in network.messages}
         self.name = " + ".join(link.name for link in self._links)
         self.stamps: Stamps = np.zeros(capacity, np.int64)
@@ -85,6 +86,17 @@ class JoinedBus:
         A lost channel is regarded as restored as soon as a frame was sent or received on it.
         """
         return next(iter(self._down.values()), "")
+
+    def channel(self, bus: str) -> Bus:
+        """Return the channel of a bus of the network. Use it for frames that are not messages of the network.
+
+        Args:
+            bus: Name of the bus.
+
+        Raises:
+            KeyError: If the network has no such bus.
+        """
+        return self._channel_of[bus]
 
     def send(self, frames: Frames) -> None:
         """Send each frame on the channel of its message.

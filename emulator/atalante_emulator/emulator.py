@@ -38,7 +38,7 @@ from atalante_emulator.virtual_operator import VirtualOperator
 from atalante_emulator.wearer import PassiveWearer
 from atalante_hal.bus import Bus, BusFull
 from atalante_hal.robot import CELLS, FEET, IMUS, JOINTS, SIDES, Robot
-from atalante_hal.types import PERIOD, Vector
+from atalante_hal.types import PERIOD, SupervisorState, Vector
 from atalante_hal.wire.codec import Codec
 from atalante_hal.wire.e2e import COUNTER_BYTE, Check
 from atalante_hal.wire.frame import FRAME_BYTES, Frames, new_frames
@@ -104,7 +104,7 @@ class Emulator:
             faults: faults to inject. The first cycle of the emulator has number 0.
 
         Raises:
-            FaultError: If the target or a signal of a fault is not in the network.
+            FaultError: If the target or a signal of a fault is not in the network, or this emulator does not run the target node.
         """
         parameters = parameters or EmulatorParameters()
         self.network, self.body, self.bus, self.operator = network, body, bus, operator
@@ -136,14 +136,15 @@ class Emulator:
             faults: faults to inject; each must begin at least two cycles later, because the next frames are already computed.
 
         Raises:
-            FaultError: If the target or a signal of a fault is not in the network.
+            FaultError: If the target or a signal of a fault is not in the network, or this emulator does not run the target node.
         """
         if any(fault.kind in LINK_KINDS for fault in faults):
             self.bus = self._link = FaultyBus(self.bus, self.network, faults, lambda: self.cycle, seed=self._seed)
         if any(fault.kind in NODE_KINDS or fault.kind in SENSOR_KINDS for fault in faults):
             self._node_faults = NodeFaults(
-                faults, self.network, self._robot, self._tx.codec, self.drives, self._heartbeats, self._emergencies
-            )
+                faults, self.network, self._robot, self._tx.codec,
+                self.drives, self._haptics, self._heartbeats, self._emergencies,
+            )  # fmt: skip
             if self._node_faults.rewrites:
                 self.before_send.append(self._node_faults.rewrite)
 
@@ -201,6 +202,7 @@ class Emulator:
         self._limit = values[codec.slice("MaxTorque")]
         self._level = values[codec.slice("Level")]
         self._hal_state_index = codec.index("SYNC_RIGHT_SENSE", "HalState")
+        self._hal_state_row = codec.rows["SYNC_RIGHT_SENSE"]
         self._sync_cycles = values[codec.slice("Cycle")]
         self._command_rows = [codec.rows[f"COMMAND_{side.upper()}_LEG"] for side in SIDES]
         self._senders = [Senders(self._rx.codec.messages[row]) for row in self._command_rows]
@@ -263,6 +265,8 @@ class Emulator:
         Returns:
             Whether a cycle was run.
         """
+        if self._link is not None:
+            self._link.synced = False
         count = self.bus.receive(self._scratch_from[self._waiting], timeout) + self._waiting
         if count < len(self._rx.frames):
             count = self._receive_rest(count)
@@ -284,16 +288,15 @@ class Emulator:
             count: number of frames already in the scratch buffer.
 
         Returns:
-            Number of frames in the scratch buffer; 0 if there is no SYNC yet. In this case the frames
-            are kept for the next call.
+            Number of frames in the scratch buffer; 0 if there is no SYNC. In this case the frames are kept for the next call.
         """
         ids = self._scratch["can_id"]
+        synced: set[int] = set()
         deadline = None
         while count < _RECEIVE_BUDGET:
             synced = self._sync_ids.intersection(ids[:count].tolist())
-            if not synced:
-                self._waiting = count
-                return 0
+            if not synced and not self._lost_sync:
+                break
             if len(synced) == len(self._sync_ids):
                 break
             now = time.monotonic()
@@ -302,7 +305,15 @@ class Emulator:
             if not got:
                 break
             count += got
+        if not synced:
+            self._waiting = count
+            return 0
         return count
+
+    @property
+    def _lost_sync(self) -> bool:
+        """Whether a SYNC of the HAL arrived in this call of `poll`, although a fault may have removed it for the nodes."""
+        return self._link is not None and self._link.synced
 
     def _imperfect_cycle(self, count: int) -> bool:
         """Process received frames when not all frames of the HAL are valid and on time.
@@ -390,7 +401,7 @@ class Emulator:
         Returns:
             Whether a cycle was run.
         """
-        lost = self._link is not None and self._link.synced
+        lost = self._lost_sync
         if lost:
             for leg in range(len(SIDES)):
                 self.drives.miss_sync(leg, self.cycle)
@@ -471,7 +482,7 @@ class Emulator:
     def _step_body(self) -> None:
         """Move the body by one millisecond, and sample the sensors."""
         if self.pelvis_forces:
-            hal_state = int(self._rx.values[self._hal_state_index])
+            hal_state = self._hal_state()
             first, *others = self.pelvis_forces
             wrench = first(hal_state)
             for force in others:
@@ -486,6 +497,11 @@ class Emulator:
         self.body.step(self.drives.drive(self.body.velocity))
         self.cycle += 1
         self._sample_next()
+
+    def _hal_state(self) -> int:
+        """Return the HAL state of the last SYNC; OFF if the last SYNC is `WATCHDOG` cycles old."""
+        heard = self._rx.age[self._hal_state_row] < WATCHDOG
+        return int(self._rx.values[self._hal_state_index]) if heard else SupervisorState.OFF
 
     def _with_slow(self, parts: list[Frames]) -> list[Frames]:
         """Return `parts` plus the status messages, the haptics message and the emergencies that are due in this cycle."""

@@ -25,6 +25,11 @@ class Haptics:
     def __init__(self, parameters: HapticsParameters, amplitude: Vector) -> None:
         self.amplitude = amplitude
         self._parameters = parameters
+        self._in_reset = False
+
+    def reset(self) -> None:
+        """Keep the node in reset until the end of the next `advance`: its motors get no power."""
+        self._in_reset = True
 
     def advance(self, level: Vector, silence: int, cycles: int) -> None:
         """Advance the amplitudes by a number of cycles.
@@ -38,5 +43,6 @@ class Haptics:
         """
         lag = math.exp(-cycles * PERIOD / self._parameters.rise_time)
         self.amplitude *= lag
-        if silence < WATCHDOG:
+        if silence < WATCHDOG and not self._in_reset:
             self.amplitude += (1.0 - lag) * level
+        self._in_reset = False

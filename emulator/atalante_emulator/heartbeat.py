@@ -47,6 +47,11 @@ class Heartbeats:
             self.set(message.sender, "FirmwareVersion", _FIRMWARE_VERSION)
             self.set(message.sender, "SupplyVoltage", _SUPPLY_VOLTAGE)
 
+    @property
+    def nodes(self) -> frozenset[str]:
+        """Names of the nodes that send status messages."""
+        return frozenset(self._of)
+
     def set(self, node: str, signal: str, value: float) -> None:
         """Set a signal in the status message of a node.
 

@@ -10,14 +10,16 @@ from __future__ import annotations
 
 import random
 from collections.abc import Callable, Iterable, Sequence
+from contextlib import suppress
 from typing import Final, NamedTuple
 
 import numpy as np
 
 from atalante_dbc import Message, Network
 from atalante_emulator.faults import LINK_KINDS, Fault, messages_of
-from atalante_emulator.wire import Babble, Wire
-from atalante_hal.bus import Bus
+from atalante_emulator.wire import AddedFrame, Babble, Wire
+from atalante_hal.bus import Bus, BusFull
+from atalante_hal.bus.joined import JoinedBus
 from atalante_hal.bus.wrapped import WrappedBus
 from atalante_hal.wire.e2e import COUNTER_BYTE, CRC_BYTES, crc, data_id_bytes
 from atalante_hal.wire.frame import FLAG_BRS, FLAG_FDF, ID_ERROR, ID_EXTENDED, Frames, joined, new_frames
@@ -87,8 +89,8 @@ class _Disturbance:
         self.late = self.late[len(due) :]
         return due
 
-    def added(self, cycle: int) -> Iterable[Frames]:
-        """Return the frames that the fault adds in a cycle, each of shape (1,).
+    def added(self, cycle: int) -> Iterable[AddedFrame]:
+        """Return the frames that the fault adds in a cycle, except the frames of a flood.
 
         Args:
             cycle: number of the cycle.
@@ -98,11 +100,11 @@ class _Disturbance:
             return ()
         match fault.kind:
             case "foreign":
-                return [_foreign(fault) for _ in range(fault["count"])]
+                return [AddedFrame(fault.target, _foreign(fault)) for _ in range(fault["count"])]
             case "error_frame":
-                return [_error_frame(fault["error"])]
+                return [AddedFrame(fault.target, _error_frame(fault["error"]))]
             case "bus_off" if cycle == fault.start:
-                return [_error_frame(BUS_OFF)]
+                return [AddedFrame(fault.target, _error_frame(BUS_OFF))]
             case "inject":
                 return self._injected()
         return ()
@@ -175,7 +177,7 @@ class _Disturbance:
             payload = payload & ~(mask << signal.start) | (round(code) & mask) << signal.start
         frame["data"][0] = np.frombuffer(payload.to_bytes(64, "little"), np.uint8)
 
-    def _injected(self) -> Iterable[Frames]:
+    def _injected(self) -> Iterable[AddedFrame]:
         (message,) = self.messages.values()
         if self._last is None:
             self._last = new_frames(1)
@@ -185,7 +187,8 @@ class _Disturbance:
         for number in range(int(self.fault["count"])):
             frame = self._last.copy()
             self._set_signals(frame, message)
-            yield _sealed(frame, message, counter=counter + int(self.fault["ahead"]) + number & 0xFF)
+            counted = _sealed(frame, message, counter=counter + int(self.fault["ahead"]) + number & 0xFF)
+            yield AddedFrame(message.bus, counted)
 
 
 _EFFECTS: Final[dict[str, Callable[[_Disturbance, Frames, Message, int], Sequence[Frames]]]] = {
@@ -236,7 +239,7 @@ class FaultyBus(WrappedBus):
             FaultError: If the target or a signal of a fault is not in the network.
         """
         super().__init__(bus)
-        #: Whether a SYNC of the HAL arrived in the last `receive`. A fault may then have removed this SYNC for the nodes.
+        #: Set to True when a SYNC of the HAL arrives, even if a fault removes this SYNC for the nodes. The emulator resets it.
         self.synced = False
         self._clock, self._cycle, self._begun = clock, -1, -1
         self._all = [
@@ -280,8 +283,8 @@ class FaultyBus(WrappedBus):
             BusError: If the wrapped bus raises this error.
         """
         count = self.bus.receive(frames, timeout)
-        self.synced = not self._syncs.isdisjoint(frames["can_id"][:count].tolist())
-        if self.synced:
+        if not self._syncs.isdisjoint(frames["can_id"][:count].tolist()):
+            self.synced = True
             self._begin_cycle()
         # Apply the faults even if no SYNC has arrived yet: a command can arrive before the SYNC of its cycle.
         if self._now() or not self.wire.idle:
@@ -344,9 +347,19 @@ class FaultyBus(WrappedBus):
         added = [frame for d in self._active for frame in d.added(self._cycle)]
         added += self.wire.begin([d.babble for d in self._active if d.babble is not None])
         self._for_nodes += [frame for frame in due if _id(frame) in self._from_hal]
-        self._for_nodes += [frame for frame in added if not _id(frame) & ID_ERROR]  # only the HAL gets error frames
-        if for_hal := [frame for frame in due if _id(frame) not in self._from_hal] + added:
-            self.bus.send(joined(for_hal))
+        self._for_nodes += [frame for _, frame in added if not _id(frame) & ID_ERROR]  # only the HAL gets error frames
+        for_hal: dict[Bus, list[Frames]] = {}
+        if late := [frame for frame in due if _id(frame) not in self._from_hal]:
+            for_hal[self.bus] = late
+        for bus, frame in added:
+            for_hal.setdefault(self._channel(bus), []).append(frame)
+        for channel, frames in for_hal.items():
+            with suppress(BusFull):  # frames that find no room in the transmit queue are lost
+                channel.send(joined(frames))
+
+    def _channel(self, bus: str) -> Bus:
+        """Return the channel of a bus. A `JoinedBus` cannot choose it, because an added frame may have any identifier."""
+        return self.bus.channel(bus) if isinstance(self.bus, JoinedBus) else self.bus
 
 
 def _id(frame: Frames) -> int:

@@ -69,8 +69,9 @@ class Motors:
         self.wanted, self._joint = self._motors[_WANTED], self._motors[_JOINT]
         #: Time until a new setpoint reaches the current loop of each motor [cycles].
         self._dead_time = np.full(len(JOINTS), parameters.dead_time)
-        self._late = parameters.dead_time > 0  # whether any setpoint is delayed
+        #: Past setpoints, the newest in row `_cycle % len(_setpoints)`. Recorded only if a motor has or had a delay.
         self._setpoints = np.zeros((parameters.dead_time + MOST_LATE + 1, len(JOINTS)))
+        self._records = parameters.dead_time > 0
         self._cycle = 0
         #: Torques of the wearer's limbs on the joints, shape (12,) [Nm]. The emulator writes into this array.
         self.limb = self._motors[_LIMB]
@@ -116,12 +117,16 @@ class Motors:
     def delay(self, motor: int, cycles: int) -> None:
         """Set the additional time until a setpoint reaches the current loop of a motor.
 
+        At the first call, no past setpoints may be recorded. Then the current setpoint counts as the setpoint of the past.
+
         Args:
             motor: index of the motor.
             cycles: additional time [cycles], from 0 to `MOST_LATE`.
         """
+        if not self._records:
+            self._setpoints[:] = self.wanted
+            self._records = True
         self._dead_time[motor] = self._parameters.dead_time + cycles
-        self._late = bool(self._dead_time.any())
 
     def push(self, joint: int, torque: float) -> None:
         """Set an external torque on a joint. The external torque is added to the motor torque.
@@ -145,7 +150,7 @@ class Motors:
             Joint torques, shape (12,) [Nm].
         """
         setpoint = self.wanted
-        if self._late:
+        if self._records:
             self._cycle += 1
             self._setpoints[self._cycle % len(self._setpoints)] = setpoint
             setpoint = self._setpoints[(self._cycle - self._dead_time) % len(self._setpoints), _MOTORS]

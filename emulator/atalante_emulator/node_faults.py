@@ -14,7 +14,8 @@ import numpy as np
 from atalante_dbc import Network
 from atalante_emulator.drive import NODES, Drives
 from atalante_emulator.emergency import ERROR_RESET, Emergency, register_of
-from atalante_emulator.faults import ALL_CELLS, NODE_KINDS, SENSOR_KINDS, Fault, nodes_of
+from atalante_emulator.faults import ALL_CELLS, NODE_KINDS, SENSOR_KINDS, Fault, FaultError, nodes_of
+from atalante_emulator.haptics import Haptics
 from atalante_emulator.heartbeat import Heartbeats
 from atalante_emulator.supply import HoldUp
 from atalante_hal.robot import CELLS, Robot
@@ -38,6 +39,7 @@ class NodeFaults:
         robot: Robot,
         codec: Codec,
         drives: Drives,
+        haptics: Haptics,
         heartbeats: Heartbeats,
         outbox: list[Emergency],
     ) -> None:
@@ -49,16 +51,21 @@ class NodeFaults:
             robot: torque limits of the joints, from which the energy consumption of the drives is computed.
             codec: codec of the 1 ms messages.
             drives: emulated drives.
+            haptics: emulated haptics node.
             heartbeats: status messages of all nodes.
             outbox: list to which the emergencies of nodes other than drives are appended.
 
         Raises:
-            FaultError: If a target does not exist, or the fault does not apply to this kind of node.
+            FaultError: If a target does not exist or is not emulated, or the fault does not apply to this kind of node.
         """
         self._network, self._robot, self._codec = network, robot, codec
-        self._drives, self._heartbeats, self._outbox = drives, heartbeats, outbox
+        self._haptics_nodes = [node.name for node in network.of_kind("haptics")]
+        self._drives, self._haptics, self._heartbeats, self._outbox = drives, haptics, heartbeats, outbox
         self._faults = [(fault, nodes_of(fault, network)) for fault in faults if fault.kind in NODE_KINDS]
         self._sensors = [(fault, nodes_of(fault, network)[0]) for fault in faults if fault.kind in SENSOR_KINDS]
+        for fault, nodes in self._faults:
+            if missing := set(nodes) - heartbeats.nodes:
+                raise FaultError(f"{fault.kind}: the target must be an emulated node, got {', '.join(sorted(missing))}")
         self.rewrites = bool(self._sensors)
         self._position: Vector = np.zeros(len(NODES))  # joint positions that the encoders measure [rad]
         self._stuck_at: dict[Fault, float] = {}
@@ -76,9 +83,11 @@ class NodeFaults:
             Joint positions that the encoders measure, including the encoder faults, shape (12,) [rad].
         """
         self._position = position.copy()
-        for fault, nodes in self._faults:
-            if fault.start <= cycle <= fault.end:
-                _EFFECTS[fault.kind](self, fault, nodes, cycle)
+        ending = [(fault, nodes) for fault, nodes in self._faults if cycle == fault.end]
+        active = [(fault, nodes) for fault, nodes in self._faults if fault.start <= cycle < fault.end]
+        # Faults end before others act, so the end of one fault does not cancel another fault of the same node.
+        for fault, nodes in ending + active:
+            _EFFECTS[fault.kind](self, fault, nodes, cycle)
         return self._position
 
     def rewrite(self, cycle: int, values: Vector) -> None:
@@ -96,15 +105,14 @@ class NodeFaults:
 
     def _emergency(self, fault: Fault, nodes: Nodes, cycle: int) -> None:
         (node,), code = nodes, fault["code"]
-        begins, ends = cycle == fault.start, cycle == fault.end
         if node in NODES:
-            if begins:
+            if cycle < fault.end:  # in each cycle, because a drive ends its own errors, for example when it is cool
                 self._drives.fail(NODES.index(node), code, persists=True)
-            elif ends:
+            else:
                 self._drives.recover(NODES.index(node), code)
-        elif begins:
+        elif cycle == fault.start:
             self._outbox.append(Emergency(node, register_of([code]), code))
-        elif ends:
+        elif cycle == fault.end:
             self._outbox.append(Emergency(node, register_of([]), ERROR_RESET))
 
     def _leave_operation(self, fault: Fault, nodes: Nodes, cycle: int) -> None:
@@ -118,31 +126,29 @@ class NodeFaults:
         self._drives.enable_delay[_drive(nodes)] = fault["by"] if cycle < fault.end else 0
 
     def _reset(self, fault: Fault, nodes: Nodes, cycle: int) -> None:
-        """Keep a drive in reset during the fault, and boot the node at the end of the fault.
+        """Keep a node in reset during the fault, and boot the node at the end of the fault.
 
-        During the fault, `link` drops the frames of the node.
+        During the fault, `link` drops the frames of the node. Only drives and the haptics node have an effect besides that.
         """
         (node,) = nodes
         if cycle == fault.end:
             self._heartbeats.boot(node, cycle)
         elif node in NODES:
             self._drives.reset(NODES.index(node))
+        elif node in self._haptics_nodes:
+            self._haptics.reset()
 
     def _push(self, fault: Fault, nodes: Nodes, cycle: int) -> None:
-        if cycle in (fault.start, fault.end):
-            self._drives.motors.push(_drive(nodes), fault["torque"] if cycle < fault.end else 0.0)
+        self._drives.motors.push(_drive(nodes), fault["torque"] if cycle < fault.end else 0.0)
 
     def _torque_weak(self, fault: Fault, nodes: Nodes, cycle: int) -> None:
-        if cycle in (fault.start, fault.end):
-            self._drives.motors.set_strength(_drive(nodes), fault["share"] if cycle < fault.end else 1.0)
+        self._drives.motors.set_strength(_drive(nodes), fault["share"] if cycle < fault.end else 1.0)
 
     def _torque_wrong(self, fault: Fault, nodes: Nodes, cycle: int) -> None:
-        if cycle in (fault.start, fault.end):
-            self._drives.motors.set_gain(_drive(nodes), fault["share"] if cycle < fault.end else 1.0)
+        self._drives.motors.set_gain(_drive(nodes), fault["share"] if cycle < fault.end else 1.0)
 
     def _torque_late(self, fault: Fault, nodes: Nodes, cycle: int) -> None:
-        if cycle in (fault.start, fault.end):
-            self._drives.motors.delay(_drive(nodes), fault["by"] if cycle < fault.end else 0)
+        self._drives.motors.delay(_drive(nodes), fault["by"] if cycle < fault.end else 0)
 
     def _over_temperature(self, fault: Fault, nodes: Nodes, cycle: int) -> None:
         if cycle < fault.end:

@@ -8,11 +8,19 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 from atalante_dbc import Network
 from atalante_dbc.network import wire_time
 from atalante_hal.types import PERIOD
 from atalante_hal.wire.frame import FLAG_BRS, FLAG_FDF, Frames, new_frames
+
+
+class AddedFrame(NamedTuple):
+    """Frame that a fault adds, and the name of the bus on which it is sent."""
+
+    bus: str
+    frame: Frames  # shape (1,)
 
 
 @dataclass
@@ -69,15 +77,15 @@ class Wire:
         """
         return (self._used.get(bus, 0.0) + sum(one.taken for one in self._babbles if one.bus == bus)) / PERIOD
 
-    def begin(self, babbles: Sequence[Babble]) -> list[Frames]:
-        """Begin a cycle. Return the flood frames that are transmitted in this cycle, each of shape (1,).
+    def begin(self, babbles: Sequence[Babble]) -> list[AddedFrame]:
+        """Begin a cycle. Return the flood frames that are transmitted in this cycle.
 
         Args:
             babbles: floods that are active in this cycle.
         """
         self._babbles = babbles
         self._used = {}
-        return [_babbled(one) for one in babbles for _ in range(one.frames(self._network))]
+        return [AddedFrame(one.bus, _babbled(one)) for one in babbles for _ in range(one.frames(self._network))]
 
     def carry(self, frames: Sequence[Frames], *, from_hal: bool) -> list[Frames]:
         """Return the frames that are transmitted in this cycle, in the order of arbitration. All other frames wait.

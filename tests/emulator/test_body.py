@@ -7,7 +7,17 @@ import pinocchio
 import pytest
 
 from atalante_control.model import ExoskeletonParameters, Patient, imu_link, pad_link, pinocchio_model, urdf
-from atalante_emulator.bodies import ENGINES, FRICTION, GRAVITY, Body, Pose, hang, lowest_corner, make_body
+from atalante_emulator.bodies import (
+    ENGINES,
+    FRICTION,
+    GRAVITY,
+    Body,
+    DivergedError,
+    Pose,
+    hang,
+    lowest_corner,
+    make_body,
+)
 from atalante_emulator.bodies.links import FOOT_LINKS
 from atalante_hal.robot import CELLS, FEET, IMUS, JOINTS, load_robot
 from atalante_hal.types import PERIOD
@@ -110,6 +120,16 @@ def test_joints_stop_at_their_position_limits(body: Body) -> None:
         limit = ROBOT.position_max if push > 0 else ROBOT.position_min
         henke = [JOINTS.index("left_HA"), JOINTS.index("right_HA")]
         assert body.position[henke] == pytest.approx(limit[henke], abs=0.02)
+
+
+def test_mujoco_reports_a_simulation_that_diverged() -> None:
+    pytest.importorskip("mujoco")
+    from atalante_emulator.bodies.mujoco_body import MuJoCoBody
+
+    body = MuJoCoBody(TEXT)
+    body.reset(STEPPING)
+    with pytest.raises(DivergedError, match="the simulation in MuJoCo diverged"):
+        body.step([1e15] * 12)
 
 
 def test_suspended_body_has_no_contact_forces(body: Body) -> None:

@@ -8,11 +8,16 @@ import numpy as np
 import pytest
 
 from atalante_control.model import ExoskeletonParameters, Patient, urdf
+from atalante_dbc import Network
 from atalante_emulator.bodies import ENGINES, GRAVITY, Body, Pose, lowest_corner
 from atalante_emulator.crane import DELAY, Crane
+from atalante_emulator.emulator import Emulator
 from atalante_emulator.mechanics import Ground, Mechanics
+from atalante_hal.bus.pair import lockstep_pair
 from atalante_hal.robot import load_robot
 from atalante_hal.types import PERIOD, SupervisorState
+from atalante_hal.wire.frame import new_frames
+from atalante_hal.wire.process_image import TransmitImage
 
 ROBOT = load_robot()
 STANDING = [0.0, 0.0, -0.2, 0.45, -0.25, 0.0] * 2
@@ -63,6 +68,26 @@ def test_robot_is_lowered_in_active_and_then_stands_alone(body: Body) -> None:
     assert crane.lowered
     assert run(body, crane, 0.1, SupervisorState.HOLD) == [0.0] * 100
     assert body.sole_force[:, :, 2].sum() == pytest.approx(body.mass * GRAVITY, rel=0.05)
+
+
+def test_crane_does_not_lower_the_robot_after_the_end_of_the_hal(network: Network) -> None:
+    body = Mechanics(urdf(ExoskeletonParameters(), ROBOT, None), ENGINES[0], Ground()).make_body(STANDING)
+    hal, nodes = lockstep_pair()
+    emulator = Emulator(network, ROBOT, body, nodes)
+    emulator.pelvis_forces.append(Crane(body))
+    syncs = TransmitImage([m for m in network.sent_by("HAL") if m.name.startswith("SYNC_")])
+    syncs.values[syncs.codec.slice("HalState")] = SupervisorState.ACTIVE
+    hal.step = emulator.poll
+    buffer = new_frames(128)
+    for cycle in range(round(0.5 * DELAY / PERIOD)):
+        syncs.values[syncs.codec.slice("Cycle")] = cycle
+        hal.send(syncs.seal())
+        hal.receive(buffer)
+    height = float(body.motion("pelvis").position[2])
+    for _ in range(round(2.0 * DELAY / PERIOD)):
+        emulator.idle()
+    assert body.motion("pelvis").position[2] > height - 0.02
+    body.close()
 
 
 def test_robot_is_lifted_at_its_current_position(body: Body) -> None:

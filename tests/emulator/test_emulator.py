@@ -17,6 +17,7 @@ from atalante_emulator.pendant import Operator
 from atalante_hal.bus import Bus
 from atalante_hal.bus.joined import JoinedBus
 from atalante_hal.bus.pair import lockstep_pair
+from atalante_hal.bus.wrapped import WrappedBus
 from atalante_hal.robot import JOINTS, Robot
 from atalante_hal.types import PERIOD
 from atalante_hal.wire.cia402 import Controlword, DriveState, controlword_towards_operation
@@ -95,6 +96,13 @@ class Master:
 
     def track(self, reference: np.ndarray) -> None:
         self.target[:] = self.robot.hold_kp * (reference - self.position) - 0.5 * self.robot.hold_kd * self.velocity
+
+
+class OneAtATime(WrappedBus):
+    """Bus that returns one frame in each call of `receive`."""
+
+    def receive(self, frames: Frames, timeout: float = 0.0) -> int:
+        return super().receive(frames[:1], timeout)
 
 
 Setup = tuple[Master, Emulator]
@@ -231,6 +239,22 @@ class TestCycle:
         assert {network.message(name).bus for name in master.trace[-1]} == {"right_leg"}
         assert len(master.trace[-1]) == 6
         assert emulator.cycle == cycle
+
+    @pytest.mark.parametrize("first", ["SYNC_LEFT_LEG", "SYNC_RIGHT_SENSE"])
+    def test_cycle_runs_once_if_a_lost_sync_arrives_before_the_others(
+        self, make: Callable[..., Setup], network: Network, first: str
+    ) -> None:
+        master, emulator = make(faults=[Fault("drop", first, 3)])
+        emulator.bus.bus = OneAtATime(emulator.bus.bus)
+        master.bus.step = lambda: [emulator.poll() for _ in range(20)]
+        row = master.syncs.codec.rows[first]
+        for cycle in range(8):
+            master.sync(only=lambda frames: np.concatenate([frames[[row]], np.delete(frames, row)]))
+            assert emulator.cycle == cycle + 1
+            lost = {network.message(first).bus} if cycle >= 3 else set()
+            buses = {network.message(name).bus for name in master.trace[-1] if name.endswith("_STATE")}
+            assert buses == set(network.buses) - lost
+            master.command()
 
     def test_commands_received_before_their_sync_take_effect_with_it(self, make: Callable[..., Setup]) -> None:
         """On a real bus, about a millisecond passes between a command and the next SYNC."""

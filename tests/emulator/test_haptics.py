@@ -37,6 +37,17 @@ def test_amplitude_stays_between_zero_and_one() -> None:
         assert (motors.amplitude <= 1.0).all()
 
 
+def test_motors_stop_while_the_node_is_in_reset() -> None:
+    motors = Haptics(HapticsParameters(), np.ones(8))
+    for _ in range(100):
+        motors.reset()
+        motors.advance(LEVEL, 0, 10)
+    np.testing.assert_allclose(motors.amplitude, 0.0, atol=1e-9)
+    for _ in range(100):
+        motors.advance(LEVEL, 0, 10)
+    np.testing.assert_allclose(motors.amplitude, LEVEL, atol=1e-9)
+
+
 def test_motors_stop_when_commands_time_out() -> None:
     motors = Haptics(HapticsParameters(), np.ones(8))
     motors.advance(LEVEL + 1.0, WATCHDOG - 1, 10)

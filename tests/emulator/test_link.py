@@ -8,7 +8,10 @@ import pytest
 from atalante_dbc import Network
 from atalante_emulator.faults import Fault, FaultError
 from atalante_emulator.link import BUS_OFF, FaultyBus
+from atalante_hal.bus import BusFull
+from atalante_hal.bus.joined import JoinedBus
 from atalante_hal.bus.pair import lockstep_pair
+from atalante_hal.bus.wrapped import WrappedBus
 from atalante_hal.wire.e2e import Check
 from atalante_hal.wire.frame import FLAG_BRS, FLAG_FDF, ID_ERROR, Frames, new_frames
 from atalante_hal.wire.process_image import ReceiveImage, TransmitImage
@@ -282,12 +285,48 @@ def test_several_faults_of_one_message_apply_together(line: Make) -> None:
     assert run.knee == [OK, Check.CRC, NOTHING, LOST]
 
 
-def test_synced_reports_whether_the_last_frames_contained_sync(line: Make) -> None:
+def test_synced_stays_true_after_a_sync_until_it_is_reset(line: Make) -> None:
     one = line(Fault("drop", SYNC, 0))
+    assert not one.nodes.synced
     one.run(1)
+    assert one.nodes.receive(new_frames(4)) == 0
     assert one.nodes.synced
+    one.nodes.synced = False
     assert one.nodes.receive(new_frames(4)) == 0
     assert not one.nodes.synced
+
+
+@pytest.mark.parametrize(
+    ("fault", "can_id"),
+    [
+        (Fault("foreign", "right_leg", 0, can_id=0x7F0), 0x7F0),
+        (Fault("flood", "right_leg", 0, can_id=5, load=0.2), 5),
+        (Fault("error_frame", "right_leg", 0, error=4), ID_ERROR | 4),
+        (Fault("bus_off", "right_leg", 0), ID_ERROR | BUS_OFF),
+    ],
+)
+def test_added_frames_are_sent_on_the_channel_of_their_bus(network: Network, fault: Fault, can_id: int) -> None:
+    pairs = {bus: lockstep_pair() for bus in network.buses}
+    nodes = FaultyBus(JoinedBus(network, {bus: pair[1] for bus, pair in pairs.items()}), network, [fault], lambda: 0)
+    pairs["left_leg"][0].send(TransmitImage([network.message(SYNC)]).seal())
+    nodes.receive(new_frames(64))
+    received = {}
+    for bus, (hal, _) in pairs.items():
+        buffer = new_frames(64)
+        received[bus] = set(ids(buffer[: hal.receive(buffer)]))
+    assert received == {bus: {can_id} if bus == "right_leg" else set() for bus in network.buses}
+
+
+def test_added_frames_are_lost_if_the_transmit_queue_is_full(network: Network) -> None:
+    class FullBus(WrappedBus):
+        def send(self, frames: Frames) -> None:
+            raise BusFull("the transmit queue is full")
+
+    hal, wire = lockstep_pair()
+    nodes = FaultyBus(FullBus(wire), network, [Fault("foreign", "left_leg", 0, can_id=0x7F0)], lambda: 0)
+    hal.send(TransmitImage([network.message(SYNC)]).seal())
+    buffer = new_frames(64)
+    assert ids(buffer[: nodes.receive(buffer)]) == [0x7F0, network.message(SYNC).frame_id]
 
 
 @pytest.mark.parametrize(

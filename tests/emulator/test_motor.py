@@ -26,6 +26,22 @@ def settle(motors: Motors, velocity: np.ndarray = AT_REST) -> np.ndarray:
     return np.array(torque)
 
 
+def test_delay_that_begins_keeps_the_torque_until_the_first_delayed_setpoint(motors: Motors) -> None:
+    motors.power(POWERED)
+    for setpoint in (20.0, -10.0):  # the second delay must not repeat setpoints from before the first one
+        motors.wanted[:] = setpoint
+        settle(motors)
+        motors.delay(3, 8)
+        for cycle in range(30):
+            motors.wanted[:] = setpoint + 5.0
+            torque = motors.advance(AT_REST)
+            assert torque[2] > setpoint
+            assert torque[3] == pytest.approx(setpoint) if cycle < 8 else torque[3] > setpoint
+        motors.delay(3, 0)
+        motors.wanted[:] = setpoint - 5.0
+        assert motors.advance(AT_REST)[3] < setpoint + 5.0
+
+
 def test_torque_follows_its_setpoint_as_a_first_order_lag(robot: Robot) -> None:
     measured = np.zeros(12)
     motors = Motors(robot, SMOOTH, measured, np.zeros(12))

@@ -238,6 +238,39 @@ class TestDrives:
         hal.run(100)
         assert hal.value("LEFT_SK_STATUS", "NodeState") == 5
 
+    def test_haptics_node_in_reset_does_not_vibrate(self, world: Make) -> None:
+        hal, emulator = world(Fault("reset", "HAPTICS", BEGIN, 300))
+        hal.tx.values[hal.tx.codec.slice("Level")] = 1.0
+        hal.run(BEGIN - 1)
+        assert emulator.vibration.min() > 0.3
+        hal.run(290)
+        assert emulator.vibration.max() < 0.01
+        hal.run(290)
+        assert emulator.vibration.min() > 0.9
+
+    def test_injected_over_temperature_lasts_although_the_drive_is_cool(self, world: Make) -> None:
+        hal, _ = world(Fault("emergency", "LEFT_SK", BEGIN, 400, code=0x4310), cycles=BEGIN + 399)
+        assert {states[KNEE] for states in hal.states[BEGIN + 1 :]} <= {
+            DriveState.FAULT_REACTION_ACTIVE,
+            DriveState.FAULT,
+        }
+        hal.run(1500)
+        assert hal.states[-1][KNEE] == ENABLED
+
+    @pytest.mark.parametrize("order", [1, -1])
+    def test_end_of_a_fault_does_not_end_another_fault_of_the_same_drive(self, world: Make, order: int) -> None:
+        faults = [Fault("push", "LEFT_SK", BEGIN, 50, torque=10.0), Fault("push", "LEFT_SK", BEGIN + 50, torque=30.0)]
+        weak = [
+            Fault("torque_weak", "LEFT_SK", BEGIN, 60, share=0.9),
+            Fault("torque_weak", "LEFT_SK", BEGIN, share=0.5),
+        ]
+        alone, _ = world(Fault("push", "LEFT_SK", BEGIN, 50, torque=10.0), cycles=BEGIN + 300)
+        both, _ = world(*faults[::order], cycles=BEGIN + 300)
+        weaker, _ = world(*weak[::order], cycles=BEGIN + 300)
+        at_alone, at_both, at_weaker = (hal.joints("Torque")[KNEE] for hal in (alone, both, weaker))
+        assert at_both == pytest.approx(at_alone - 30.0, abs=4.0)
+        assert abs(at_weaker) > 1.7 * abs(at_alone)
+
     def test_reset_sensor_is_silent_then_sends_bootup(self, world: Make) -> None:
         hal, _ = world(Fault("reset", "FOOT_LEFT", BEGIN, 5), cycles=BEGIN + 6)
         assert "FOOT_LEFT_STATE" not in hal.sent[BEGIN + 4]
@@ -605,6 +638,14 @@ def test_fault_with_a_wrong_target_type_is_rejected_with_the_valid_targets(
 def test_invalid_parameter_error_lists_the_valid_ones(kind: str, options: dict, expected: str) -> None:
     with pytest.raises(FaultError, match=expected):
         Fault(kind, "LEFT_SK", **options)
+
+
+def test_fault_inside_a_node_of_another_process_is_rejected(network: Network, robot: Robot, urdf_text: str) -> None:
+    body = PyBulletBody(urdf_text)
+    for kind, options in (("reset", {}), ("emergency", {"code": 0x8130}), ("dbc_hash", {})):
+        with pytest.raises(FaultError, match=f"{kind}: the target must be an emulated node, got PENDANT"):
+            Emulator(network, robot, body, lockstep_pair()[1], faults=[Fault(kind, "PENDANT", BEGIN, **options)])
+    body.close()
 
 
 def test_bytes_under_faults_are_reproducible_for_one_seed_and_differ_for_another(world: Make) -> None:

@@ -26,7 +26,7 @@ def run(wire: Wire, bus: str, *babbles: Babble) -> tuple[list[int], list[int], l
     babbled = wire.begin(babbles)
     hal = wire.carry(cyclic(wire._network, bus, hal=True), from_hal=True)
     nodes = wire.carry(cyclic(wire._network, bus, hal=False), from_hal=False)
-    return ids(babbled), ids(hal), ids(nodes)
+    return ids([frame for _, frame in babbled]), ids(hal), ids(nodes)
 
 
 @pytest.fixture
@@ -92,11 +92,12 @@ def test_babble_keeps_its_share_over_many_cycles(wire: Wire) -> None:
     babble = Babble("left_leg", 0, 64, 0.3)
     frames = sum(len(wire.begin([babble])) for _ in range(1000))
     assert frames == pytest.approx(0.3 * 1000 * PERIOD / wire_time(64), abs=1)
-    assert {frame["len"][0] for frame in wire.begin([babble])} == {64}
+    assert {frame["len"][0] for _, frame in wire.begin([babble])} == {64}
 
 
 def test_babble_frame_has_the_requested_identifier_length_and_fd_flags(wire: Wire) -> None:
-    frame = wire.begin([Babble("left_leg", 0x7F, 16, 0.1)])[0]
+    bus, frame = wire.begin([Babble("left_leg", 0x7F, 16, 0.1)])[0]
+    assert bus == "left_leg"
     assert (frame["can_id"][0], frame["len"][0], frame["flags"][0]) == (0x7F, 16, FLAG_FDF | FLAG_BRS)
 
 

@@ -27,6 +27,10 @@ FRICTION: Final = 0.6
 ENGINES: Final = ("pybullet", "mujoco")
 
 
+class DivergedError(FloatingPointError):
+    """Simulation that diverged: a position, velocity or acceleration became infinite or far too large."""
+
+
 class Pose(NamedTuple):
     """Position and attitude of a link in the world."""
 

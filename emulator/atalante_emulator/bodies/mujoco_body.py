@@ -8,7 +8,7 @@ from typing import Any, Final, NamedTuple
 import mujoco
 import numpy as np
 
-from atalante_emulator.bodies import FRICTION, GRAVITY, LINK_STATE, PELVIS, Motion, Pose
+from atalante_emulator.bodies import FRICTION, GRAVITY, LINK_STATE, PELVIS, DivergedError, Motion, Pose
 from atalante_emulator.bodies.links import FOOT_LINKS, IMU_LINKS, PAD_LINKS, find
 from atalante_emulator.bodies.soles import into_frame, read_soles, total_mass
 from atalante_hal.compiled import specialised
@@ -17,12 +17,9 @@ from atalante_hal.types import PERIOD, Vector
 
 #: MuJoCo's vector `qpos` starts with this number of elements for a free pelvis: position (3) and quaternion wxyz (4).
 _FREE: Final = 7
-#: Warnings after which MuJoCo resets the simulation.
-_DIVERGED: Final = (
-    mujoco.mjtWarning.mjWARN_BADQPOS,
-    mujoco.mjtWarning.mjWARN_BADQVEL,
-    mujoco.mjtWarning.mjWARN_BADQACC,
-)
+#: Time at which a simulation starts [s]. A smaller time shows that MuJoCo has reset a simulation that diverged, because this
+#: also resets the time to 0.
+_START: Final = 1.0
 
 
 class Contact(NamedTuple):
@@ -149,6 +146,7 @@ class MuJoCoBody:
         if not self._free and base is not None:
             raise ValueError(f"base must be None for a fixed pelvis, got {base}")
         mujoco.mj_resetData(self._model, self._data)
+        self._data.time = _START
         if self._free:
             pelvis, (x, y, z, w) = self._data.qpos[:_FREE], (base or Pose((0.0, 0.0, 0.0))).attitude
             pelvis[:3] = (0.0, 0.0, 0.0) if base is None else base.position
@@ -193,7 +191,7 @@ class MuJoCoBody:
             torque: joint torques, shape (12,) [Nm].
 
         Raises:
-            FloatingPointError: If the simulation diverged.
+            DivergedError: If the simulation diverged.
         """
         self.exchange(torque)
         self._read()
@@ -205,12 +203,17 @@ class MuJoCoBody:
 
         Args:
             torque: joint torques, shape (12,) [Nm].
+
+        Raises:
+            DivergedError: If the simulation diverged.
         """
         self._torque[:] = torque
         # `mj_step2` moves the robot by one time step. `mj_step1` computes the sensor data of the new position.
         # Without the last call, the sensor data would still belong to the position before the time step.
         mujoco.mj_step2(self._model, self._data)
         mujoco.mj_step1(self._model, self._data)
+        if self._data.time < _START:
+            raise DivergedError("the simulation in MuJoCo diverged: a position, velocity or acceleration is too large")
 
     def _read(self) -> None:
         self.touching = self._unpack(self._sensed, self._results)

@@ -60,6 +60,7 @@ KNOWN: Final[tuple[tuple[str, str, type[Failed]], ...]] = (
     ("atalante_hal.telemetry.process", "TelemetryError", Failed),
     ("atalante_hal.telemetry.ring", "RingError", Failed),
     ("atalante_hal.telemetry.sink", "SinkError", Failed),
+    ("atalante_emulator.bodies", "DivergedError", Failed),
     ("atalante_control.gait_optimization.parallel", "FanOutError", Failed),
     ("atalante_control.gait.gait", "GaitError", Failed),
     ("atalante_control.guide.shape_file", "ShapeError", Failed),
