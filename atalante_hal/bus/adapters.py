@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from typing import Final, Literal
 
 #: Entries of python-can's configuration file for 1 Mbit/s and 5 Mbit/s with a CAN clock of 80 MHz. The sample points are at 75 %.
-#: The Linux kernel also sets the sample point to 75 % above 800 kbit/s (drivers/net/can/dev/calc_bittiming.c).
+#: For bit rates above 800 kbit/s, the Linux kernel also chooses a sample point of 75 % (drivers/net/can/dev/calc_bittiming.c).
 SEGMENTS: Final = (
     ("f_clock", "80000000"),
     ("nom_brp", "1"),

@@ -17,7 +17,7 @@ from atalante_hal.wire.frame import FRAME_BYTES, Frames, new_frames
 
 
 class PairBus:
-    """One of the two ends of an embedded bus within one process. `send` and `receive` never wait.
+    """One end of an embedded bus within one process. `send` and `receive` never wait.
 
     Args:
         name: Name of this end.

@@ -95,7 +95,7 @@ class ReplayBus:
         return self._next is None
 
     def send(self, frames: Frames) -> None:
-        """Raise `BusError`, because a log is read only.
+        """Raise `BusError`, because a log is read-only.
 
         Args:
             frames: Ignored.

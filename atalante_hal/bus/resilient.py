@@ -78,14 +78,14 @@ class ResilientBus(WrappedBus):
             count = super().receive(frames, timeout)
         except BusDown as error:
             self._lost(str(error))
-            waited = time.monotonic() - begin  # a `JoinedBus` waits before it raises the error
+            waited = time.monotonic() - begin  # a `JoinedBus` has already waited, other buses have not
             time.sleep(max(min(timeout, RETRY_PERIOD) - waited, 0.0))
             return 0
         self._update_down(proven=count > 0)
         return count
 
     def _update_down(self, *, proven: bool) -> None:
-        """Update `down`, the error message of the lost link, after a call that raised no error.
+        """Update `down`, the error message of the lost link, after `send` or `receive` of the wrapped bus raised no error.
 
         Args:
             proven: True if a frame was sent or received, which proves that the link works.

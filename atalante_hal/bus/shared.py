@@ -40,7 +40,7 @@ _END_WORDS = 8
 _HEADER_BYTES = mmap.PAGESIZE
 #: A waiting bus end polls for this time [s] before it sleeps. The computing time of one control cycle is shorter.
 _POLL_TIME = 500e-6
-#: After a wait that took longer than `_POLL_TIME`, a bus end does not poll in this number of following waits, but sleeps at once.
+#: If a wait took longer than `_POLL_TIME`, the bus end sleeps at once, without polling, in this number of following waits.
 _WAITS_WITHOUT_POLLING = 32
 #: Longest sleep of a waiting bus end before it reads the shared memory again [ms].
 #: A sleep must be limited, because a wake-up byte may arrive before the new value in the shared memory is visible.
@@ -88,7 +88,7 @@ class SharedBus:
         self._outgoing, self._incoming = queues[end], queues[1 - end]
         self._size = size
         self._sent = self._received = 0
-        self._waits_without_polling = 0  # number of following waits in which this end sleeps at once, without polling
+        self._waits_without_polling = 0  # number of remaining waits in which this end sleeps at once, without polling
         self._closed = False
         self._close_reason = ""  # text that the other end sent when it closed; empty if it sent none
         self._stamps: Stamps = np.zeros(size // FRAME_BYTES, np.int64)
