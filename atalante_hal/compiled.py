@@ -35,7 +35,7 @@ Function = TypeVar("Function", bound=Callable[..., Any])
 P = ParamSpec("P")
 R = TypeVar("R")
 
-#: Name of an empty file, which is stored in the cache folder of each function that creates arrays.
+#: Name of an empty file. If it is in the cache folder of a function, the function creates arrays.
 #: `specialised` compiles a function that creates arrays with numba's reference counting, and any other function without it.
 _MARK = "creates-arrays"
 #: Function given to `specialised` -> True if the function creates arrays, so that numba must count references to arrays.
@@ -83,7 +83,7 @@ def specialised(function: Callable[P, R], *args: P.args, **kwargs: P.kwargs) -> 
     if not counted:
         try:
             return cast(Callable[P, R], _machine_code(function, args, False))
-        except _numba().core.errors.NumbaError:  # the function creates an array or contains an error
+        except _numba().core.errors.NumbaError:  # raised if the function creates an array or contains an error
             _CREATES_ARRAYS[function] = True
             _mark(function)
     return cast(Callable[P, R], _machine_code(function, args, True))
@@ -93,7 +93,7 @@ def _machine_code(function: Callable[..., Any], args: tuple[Any, ...], counted: 
     """Compile a function, call it once, and return its machine code for the types of the arguments."""
     dispatcher = _compiled(function, counted)
     dispatcher(*args)
-    if len(dispatcher.overloads) == 1:  # only one version is compiled, so no search by types is needed
+    if len(dispatcher.overloads) == 1:  # compiled for only one set of argument types, so take this version
         (only,) = dispatcher.overloads.values()
         return only.entry_point
     return dispatcher.get_overload(tuple(dispatcher.typeof_pyval(arg) for arg in args))
@@ -101,7 +101,7 @@ def _machine_code(function: Callable[..., Any], args: tuple[Any, ...], counted: 
 
 @cache
 def _numba() -> Any:
-    """Import numba without scipy.linalg.
+    """Import numba, but prevent it from importing scipy.linalg, which takes long.
 
     Importing scipy.linalg takes a tenth of the time from the start of the program to the first cycle of a walk. When numba loads
     its array functions, it imports scipy.linalg only to learn whether BLAS is available. An empty module in place of

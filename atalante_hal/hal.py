@@ -30,10 +30,12 @@ from atalante_hal.types import PERIOD, Command, State, SupervisorState, Vector
 from atalante_hal.wire.cia402 import Controlword, DriveState
 from atalante_hal.wire.process_image import NEVER, ReceiveImage
 
-#: If the limiter reduces a torque in more than this number of consecutive cycles, the reaction of TORQUE_SATURATED follows.
+#: TORQUE_SATURATED is confirmed if the limiter changes a torque in more than this number of consecutive cycles.
 SATURATED_CYCLES = 200
-#: While the robot walks on the ground, up to this number of consecutive controller exceptions only repeat the last torques.
-#: The next consecutive exception leads to HOLD. A drive bridges at most 4 lost commands in the same way.
+#: While the robot walks on the ground, the HAL sends the last torques again after a controller exception,
+#: for up to this number of exceptions in consecutive cycles.
+#: The next consecutive exception confirms CONTROLLER_LOST, which leads to HOLD.
+#: The number is equal to the number of lost commands in a row that a drive bridges.
 BRIDGED_ERRORS = 4
 #: Longest total wait for the nodes' answers while `Hal.stop` puts the robot into HOLD [s].
 STOP_PATIENCE = 1.0
@@ -105,7 +107,7 @@ class Hal:
 
     def _build_images(self, controller_fields: Sequence[tuple[str, int]], assistance_factor: float) -> None:
         received = self.network.received_by("HAL")
-        # `accept` is fast if the rows of the process image are in the order in which the buses deliver the messages.
+        # The rows of the process image have the order in which the buses deliver the messages, because `accept` is then fast.
         fast = [m for bus in self.network.buses for m in received if m.bus == bus and m.cycle_ms == 1]
         #: Names of the messages, in the order of the elements of `State.valid` and `State.age`.
         self.messages = tuple(m.name for m in fast)
@@ -170,7 +172,7 @@ class Hal:
         return state
 
     def _skip_old_answers(self) -> None:
-        """Drop the queued answers to SYNCs before a gap between cycles, and process the other queued frames.
+        """After a gap between cycles, drop the queued answers to earlier SYNCs, and process the other queued frames.
 
         For example, an emergency is sent only once, so it must not be lost. Many frames may have arrived in the gap. Of the
         frames that are no messages to the HAL, only one of each identifier is processed, so that this takes at most a few cycles.
@@ -224,7 +226,7 @@ class Hal:
             safety_monitor.report(Dtc.GUIDE_OUTSIDE, text, False)
         self._commands.drive(self._limiter.last, command.vibration)
         sent = self._send_command()
-        self._errors = 0  # last, because each statement above can raise an exception
+        self._errors = 0  # reset at the end, because each statement above can raise an exception
         return sent
 
     def hold(self) -> Vector:

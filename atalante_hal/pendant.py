@@ -83,8 +83,9 @@ class Pendant:
         self.started = False
         #: Assistance factor Xi in [0, 1]; None if the pendant sets no factor.
         self.assistance_factor: float | None = None
-        self._press: float | None = None  # RequestCounter of the last evaluated frame; None if there is none
-        self._pressed = False  # True while a START is stored, because the pendant is not qualified yet
+        #: RequestCounter of the last evaluated frame; None before the first frame and after a gap between cycles.
+        self._press: float | None = None
+        self._pressed = False  # True while a press of START is stored until the pendant is qualified
 
     def evaluate(
         self, present: bool, *, qualifying: bool = False, new: bool = True, further_frames: Sequence[Vector] = ()
@@ -127,9 +128,10 @@ class Pendant:
             self.assistance_factor = factor if factor_set else None
 
     def forget_start(self) -> None:
-        """Ignore a START that was pressed before now, also if its frame arrives later. Call this after a gap between cycles.
+        """Ignore a START that was pressed before this call, even if its frame arrives later.
 
-        In the gap, the operator did not see the faults that the HAL reports now, so the START acknowledges nothing.
+        Call this method after a gap between cycles. In the gap, the operator did not see the faults that the HAL reports now,
+        so the START acknowledges nothing.
         """
         self._press, self._pressed = None, False
 

@@ -45,7 +45,7 @@ class RobotError(ValueError):
 class Envelope:
     """Reduction of the torque near the limits of position and velocity, see `limiter`."""
 
-    look_ahead: float  # s, time for which the joint position is predicted, at constant velocity
+    look_ahead: float  # s, prediction time of the joint position, at constant velocity
     #: If the predicted position is outside a position limit by this angle [rad] or more, the outward torque is 0.
     position_margin: float
     velocity_margin: float  # rad/s, excess over the velocity limit at which the accelerating torque is 0
@@ -62,7 +62,7 @@ class Derating:
 
 @dataclass(frozen=True)
 class Sensors:
-    """Tolerances that sensors without a fault meet, and load thresholds of the force cells, see `plausibility`."""
+    """Largest errors of sensors without a fault, and load thresholds of the force cells, see `plausibility`."""
 
     #: Largest mean difference [rad/s at the joint] between a drive's reported velocity and the velocity of its encoder positions.
     #: The velocity of the encoder positions is filtered with the same low-pass as the reported velocity.
@@ -71,7 +71,7 @@ class Sensors:
     #: Largest difference [rad] about each axis between the tibia attitude from the encoders and the tibia attitude from the IMUs.
     attitude_error: float
     #: While an encoder reading is constant, encoder angle minus IMU angle may change by at most this angle [rad].
-    #: A larger change of this difference of angles is a sign that the joint moves although its encoder is stuck.
+    #: If this difference changes by more, the joint moves although its encoder reading is constant, so the encoder is stuck.
     attitude_change: float
     #: An IMU may be mounted askew. So this factor times the leg rotation [rad] is added to the limit `attitude_change`.
     #: Example: with a factor of 0.02, a leg rotation of 0.5 rad increases the limit by 0.01 rad.
@@ -97,7 +97,8 @@ class Thresholds:
     #: Largest plausible torque [Nm] that a drive reports while it is off.
     #: While a drive is on, a reported torque of up to `torque_max` plus this value is plausible.
     idle_torque: float
-    surplus_frames: float  # largest number of frames in a cycle beyond one of each cyclic message; more are a BUS_FLOOD
+    #: Largest number of frames in a cycle in addition to one of each cyclic message. A larger number raises BUS_FLOOD.
+    surplus_frames: float
 
 
 @dataclass(frozen=True)
@@ -117,7 +118,7 @@ class Robot:
     hold_kp: Vector  # Nm/rad, stiffness of the position control in the drive
     hold_kd: Vector  # Nm s/rad, damping of the position control in the drive
     encoder_noise: Vector  # rad rms
-    breakaway: Vector  # Nm, change of the drive torque that moves a joint at rest despite its dry friction
+    breakaway: Vector  # Nm, change of the drive torque that overcomes the dry friction and moves a joint at rest
     torque_error: Vector  # Nm rms, error of the torque that is computed from the motion of the leg
     envelope: Envelope
     derating: Derating
@@ -169,7 +170,7 @@ _KEYS = {
     "breakaway": _Key(1, 0.01, 400.0, "Nm"),
     "torque_error": _Key(1, 0.01, 100.0, "Nm"),
 }
-#: Table of the robot file -> key -> rule for the value of the key. The table [joints] is missing, because `_KEYS` has its keys.
+#: Table of the robot file -> key -> rule for the value of the key. `_KEYS` contains the keys of the table [joints].
 _TABLES = {
     "envelope": {
         "look_ahead": _Key(1, 1e-3, 1.0, "s"),

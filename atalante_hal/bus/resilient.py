@@ -78,7 +78,7 @@ class ResilientBus(WrappedBus):
             count = super().receive(frames, timeout)
         except BusDown as error:
             self._lost(str(error))
-            waited = time.monotonic() - begin  # a `JoinedBus` has already waited, other buses have not
+            waited = time.monotonic() - begin  # [s], not 0 for a `JoinedBus`, which waits before it raises the error
             time.sleep(max(min(timeout, RETRY_PERIOD) - waited, 0.0))
             return 0
         self._update_down(proven=count > 0)
