@@ -43,7 +43,7 @@ class Dtc(StrEnum):
     severity: Severity
     #: Short description for the operator.
     meaning: str
-    #: Power of two that belongs to this code only. An integer represents a set of codes: the bits of its codes are set.
+    #: Power of two, unique for each code. A set of codes is an integer, the sum of the values `bit` of its codes.
     bit: int
 
     def __new__(cls, code: str, reaction: Reaction, severity: Severity, meaning: str) -> Dtc:

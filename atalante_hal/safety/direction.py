@@ -50,8 +50,8 @@ _SHORT = min(duration for _, duration in GROUPS)
 #: Delay [cycles] from a torque command to the first position that shows its effect, if no frame and no motor is late.
 LATENCY = 2
 #: Delays from torque to motion that the test tries [cycles]: `LATENCY` plus 0 to 3, because frames and motors may be late.
-#: A reversed motor moves its joint almost like a correct motor that is 4 to 5 cycles late. So such long delays are not tried.
-#: The reason is the pulse of 16 cycles: its largest and its smallest torque are 4.6 cycles apart.
+#: Longer delays are not tried, because a reversed motor moves its joint almost like a correct motor that is 4 to 5 cycles late:
+#: in a pulse of 16 cycles, the largest and the smallest torque are 4.6 cycles apart.
 LATENCIES = tuple(range(LATENCY, LATENCY + 4))
 #: Largest torque of the pulse, as a multiple of the breakaway torque `Robot.breakaway`. One value for each joint in LEG_JOINTS.
 #: The peaks of FH and SH are larger, because these joints move a whole leg.
@@ -76,7 +76,8 @@ HIT = 2.0
 BOOST = 6.0
 #: A joint fails after this number of unsuccessful tests.
 TRIALS = 2
-#: A joint follows its torque if its mobility (acceleration per torque) is at least this [1/(kg m2)]. Order of LEG_JOINTS.
+#: A joint follows its torque if its mobility (acceleration per torque) is at least this [1/(kg m2)].
+#: One value for each joint in LEG_JOINTS.
 #: Each joint of a suspended robot has at least about twice this mobility: with straight legs and with bent legs,
 #: without a patient and with a patient of 110 kg.
 MOBILITY = (0.045, 0.23, 0.075, 0.56, 4.6, 6.8)
@@ -127,8 +128,9 @@ def mobilities_of(torque: Vector, position: Vector) -> tuple[Vector, Vector]:
     for row, latency in enumerate(LATENCIES):
         response[row, latency:] = torque[:-latency] - torque[0]
     response = response.cumsum(axis=1).cumsum(axis=1) * PERIOD**2
-    # `response` is the motion that the torques would cause with a mobility of 1. A joint may also move without a pulse,
-    # roughly like a cubic polynomial of time. So the cubic part is removed from `response` and `motion`.
+    # `response` is the motion that the torques would cause with a mobility of 1.
+    # A joint may also move without a pulse, roughly like a cubic polynomial of time.
+    # So the cubic polynomial that fits best is subtracted from `response` and from `motion`.
     free = np.linalg.qr(np.vander(np.linspace(-1.0, 1.0, count), 4))[0]
     response -= free @ (free.T @ response)
     motion = position - position[0]
@@ -175,12 +177,12 @@ class DirectionProof:
         #: Tests still to be done: indices in JOINTS of the tested joints, and duration of the pulse [cycles].
         self._tests: list[tuple[list[int], int]] = []
         self._trials = [0] * len(JOINTS)
-        # A test of one or two joints uses `late`, the extra delay that tests of more joints have measured [cycles].
+        # Extra delay [cycles], measured in tests of more than two joints and used in tests of one or two joints.
         # A delay that is fitted to one or two joints might make a motor with a wrong sign look like a late motor.
         self.late = 0
         #: Score of each delay in `LATENCIES`. The delay with the largest score explains the measured motions best.
-        #: Each joint that passed a test with a short pulse and more than two joints adds a share of 0 to 1:
-        #: the share of its motion that its torque explains with the delay.
+        #: A score is the sum over joints of the share of the motion (0 to 1) that the torque explains with this delay.
+        #: The sum contains the joints that passed a test of more than two joints with a short pulse.
         self._explained = np.zeros(len(LATENCIES))
         self._position: list[Vector] = []  # joint positions in each cycle of the current test
         self._force: list[Vector] = []  # vertical force of each foot in each cycle of the current test

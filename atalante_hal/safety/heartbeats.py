@@ -23,10 +23,10 @@ from atalante_hal.wire.e2e import FULL, Check, suspect
 from atalante_hal.wire.frame import Frames
 from atalante_hal.wire.process_image import NEVER, ReceiveImage
 
-#: Values of the signal NodeState (CiA 301): 0 once after the node has started, 5 in normal operation. All others mean that the
-#: node does not work, for example 4 (STOPPED) and 127 (PRE-OPERATIONAL).
+#: Values of the signal NodeState (CiA 301): 0 once after the node has started, 5 in normal operation.
+#: All other values mean that the node does not work, for example 4 (STOPPED) and 127 (PRE-OPERATIONAL).
 BOOT_UP, OPERATIONAL = 0, 5
-#: A frame has new data if its check result is `Check.OK` (0) or `Check.SOME_LOST` (1), so at most this value.
+#: A frame has new data if its check result is at most this value: `Check.OK` (0) or `Check.SOME_LOST` (1).
 #: The constant is an integer, because numpy compares enum members ten times slower.
 _FRESH = int(Check.SOME_LOST)
 #: Largest number of frames that `Heartbeats.essential` selects.
@@ -155,7 +155,7 @@ class Heartbeats:
         Args:
             frames: slow messages of the nodes, shape (n,).
         """
-        # Only a status has a signal in the byte `_state_byte`. The byte is 0 in the other messages that are no emergencies.
+        # The byte `_state_byte` is NodeState in a status message, and 0 in every other message except an emergency.
         kinds = np.column_stack([frames["can_id"], frames["data"][:, self._state_byte]])
         _, newest = np.unique(kinds[::-1], axis=0, return_index=True)
         needed = np.isin(frames["can_id"], self._emergency_ids)

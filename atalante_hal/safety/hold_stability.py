@@ -8,8 +8,8 @@ motor. A joint counts as oscillating if its velocity reverses `REVERSALS` times 
 pushed or carried reverses less often.
 
 *Overload.* For `OVERLOADED` cycles, a joint is at least `AWAY` from the position in which the hold began, and the drive reports
-about its torque limit (`SATURATED`), but the joint neither moves back nor slows down. Causes are a motor that turns in the
-wrong direction, a motor without torque, exchanged encoders, and a load that exceeds the torque limit. When a drive stops a
+a torque near its torque limit (`SATURATED`), but the joint neither moves back nor slows down. Causes are a motor that turns in
+the wrong direction, a motor without torque, exchanged encoders, and a load that exceeds the torque limit. When a drive stops a
 moving joint, its torque may reach the limit for a longer time, but the joint slows down.
 
 *Motor without torque.* For `OVERLOADED` cycles, a joint is at least `SUNK` from the position in which the hold began and neither
@@ -171,7 +171,7 @@ class HoldStability:
         self._loads.start[:] = math.nan
 
     def check(self, joints: Measured, limit: Vector) -> tuple[Finding, ...]:
-        """Check one cycle, and return one finding for each joint that its drive does not hold.
+        """Check one cycle, and return one finding for each joint whose drive does not hold it.
 
         Args:
             joints: measurements of the cycle.

@@ -36,7 +36,8 @@ MORE: Final = 3
 #: No torques are computed from a position that is older than this [cycles].
 #: The limit is not 0, because the positions of a node that always answers one cycle late have the age 1.
 LATE: Final = 1
-#: No torques are computed from a stuck sensor: the values of the pelvis IMU or of a foot do not change for more cycles than this.
+#: The pelvis IMU or a foot is stuck if its values have not changed for more than this number of cycles.
+#: No torques are computed from the values of a stuck sensor.
 REPEATED: Final = 2
 _LEG: Final = len(LEG_JOINTS)
 _PELVIS: Final = IMUS.index("pelvis")

@@ -66,7 +66,7 @@ DELAY: Final = 3
 #: Smallest effective inertia [kg m2] of each joint in LEG_JOINTS while all other joints are free to move.
 #: Each value is a lower bound for the empty exoskeleton in all poses, with a fixed pelvis and with a free pelvis.
 SMALLEST_INERTIA: Final = (0.12, 0.14, 0.17, 0.11, 0.038, 0.038)
-#: Results of `limit`: all torques are unchanged, at least one torque was reduced, an input is not finite.
+#: Results of `limit`: all torques are unchanged, at least one torque was changed, an input is not finite.
 _UNCHANGED, _CUT, _NOT_FINITE = range(3)
 
 
@@ -75,7 +75,7 @@ class Limited:
     """Result of limiting one command."""
 
     finite: bool  # whether all inputs were finite; if not, the whole command was ignored
-    clamped: bool  # the limiter reduced the torque of at least one joint
+    clamped: bool  # whether the limiter changed the torque of at least one joint
 
 
 class JointLimits(NamedTuple):
@@ -104,9 +104,9 @@ class Limiter:
     Attributes:
         last: torque sent last, shape (12,) [Nm]; the rate limit is relative to it.
         limit: current torque limit, shape (12,) [Nm].
-        cut: True for each joint whose torque was reduced in the last `apply`, shape (12,). Controllers use it for
+        cut: True for each joint whose torque was changed in the last `apply`, shape (12,). Controllers use it for
             anti-windup.
-        saturated: number of consecutive cycles, up to the last `apply`, in which the torque of any joint was reduced.
+        saturated: number of consecutive cycles, up to the last `apply`, in which the torque of any joint was changed.
     """
 
     def __init__(self, robot: Robot, period: float) -> None:

@@ -67,8 +67,8 @@ _RIVAL = (Check.CONFLICT, Check.WRONG_SEQUENCE)
 #: Results of the E2E check of a rejected frame whose format and CRC are correct.
 _INTACT = (*_RIVAL, Check.RANGE, Check.INVALID)
 _FRESH = int(Check.SOME_LOST)
-#: Check result of a rejected frame -> diagnostic. The frames with this check result fill a leaky bucket. When the bucket is full,
-#: the diagnostic is confirmed.
+#: Check result of a rejected frame -> diagnostic that is confirmed when the leaky bucket of this disturbance is full.
+#: Each cycle with such a frame fills the bucket.
 #: Exception: INVALID frames of an IMU confirm IMU_INVALID.
 _DISTURBANCES = {
     Check.REPEATED: Dtc.E2E_REPEAT_RATE,

@@ -38,11 +38,11 @@ from atalante_hal.wire.e2e import SETTLED, Check, Qualification, qualify
 from atalante_hal.wire.frame import Frames
 from atalante_hal.wire.process_image import ReceiveImage
 
-#: Maximum duration of FINISH_STEP [cycles]. In this state, a walking robot ends its current step, makes a stop step and shifts
-#: its weight back, which takes less time.
+#: Maximum duration of FINISH_STEP [cycles].
+#: A walking robot needs less time to end its current step, make a stop step and shift its weight back.
 FINISH_STEP_CYCLES = 6000
 
-#: If a drive does not report QUICK STOP within this time [cycles] after the command QUICK_STOP, the command was lost.
+#: If a drive does not report QUICK STOP ACTIVE within this time [cycles] after the command QUICK_STOP, the command was lost.
 #: The answer to a command takes two cycles, and frames may be late by four cycles.
 RECALL_CYCLES = 6
 
@@ -51,7 +51,8 @@ DRIVE_NODES = tuple(joint.upper() for joint in JOINTS)
 _ENABLED = np.full(len(JOINTS), float(DriveState.OPERATION_ENABLED)).tobytes()
 _FAULTY = (DriveState.FAULT, DriveState.FAULT_REACTION_ACTIVE)
 _S = SupervisorState
-#: States in which START can change the state. In all other states START only acknowledges faults.
+#: States in which START can change the state.
+#: In OFF and FINISH_STEP, START only acknowledges faults. In ACTIVE, START has no effect.
 _STARTABLE = (_S.READY, _S.FULL_ASSIST, _S.HOLD, _S.LOWER, _S.FAULT)
 
 
@@ -122,7 +123,7 @@ class SafetyMonitor:
         self.recalled = -RECALL_CYCLES
         self.proof = DirectionProof(robot)
         self._proof_begun = False  # True if the direction test has begun in the current start
-        self._stalled = 0  # during a start: number of cycles since the state of any drive changed
+        self._stalled = 0  # during a start: number of cycles since any drive last changed its state
         self._states_at_start = b""  # during a start: drive states in the previous cycle
         self.lowered: set[str] = set()
         self._hold_stability = HoldStability()
@@ -147,8 +148,8 @@ class SafetyMonitor:
         self._steady = False
         self._reports: list[Finding] = []  # faults that loop and controller reported since the last `evaluate`
         self._acknowledged = False  # True if START was pressed in this cycle
-        #: Leaky bucket (error counter) of each drive, by DBC name. It fills while the drive is far weaker than the same drive of
-        #: the other leg. No entry means an empty bucket.
+        #: Leaky bucket (error counter) of each drive, by DBC name. No entry means an empty bucket.
+        #: The bucket fills while the drive is far weaker than the same drive of the other leg.
         self._weak: dict[str, Qualification] = {}
         self._ending = False
         self._duplicate_found = False  # True if another HAL was detected while this HAL was in OFF or READY
@@ -412,10 +413,11 @@ class SafetyMonitor:
             }
             self._heartbeats.acknowledge(faulty)
             self._acknowledged = True
-            if not self.start_cycles_left:  # another press of START during a start does not restart the direction test
+            if not self.start_cycles_left:  # do not restart the direction test if START is pressed again during a start
                 self._proof_begun = False
                 if state.supervisor is _S.READY:
-                    # A drive that is off now is not tested yet. If the start fails, it is switched off again.
+                    # The direction of a drive that is off now is not tested yet.
+                    # So the drive is switched off again if the start fails.
                     on = powered(state.drive_state).tolist()
                     self._kept_off.update(node for node, is_on in zip(DRIVE_NODES, on, strict=True) if not is_on)
             self.start_cycles_left = ENABLE_CYCLES if state.supervisor in _STARTABLE else 0
@@ -447,8 +449,8 @@ class SafetyMonitor:
             return None
         self._stalled = 0
         if not self._proof_begun:
-            # The test starts from the torques sent last (`limiter.last`). Only while `enabling` is True, these torques follow the
-            # torques that the drives report, so wait for `enabling`.
+            # The test starts from the torques sent last (`limiter.last`). So wait until `enabling` is True:
+            # only then do these torques follow the torques that the drives report.
             if not self.enabling:
                 return None
             self._proof_begun = True
@@ -550,7 +552,7 @@ class SafetyMonitor:
             state.assistance_factor = target
 
     def _update_lowered(self) -> None:
-        """Update the set `lowered`.
+        """Update `lowered`, the set of drives that are switched off so that their joints sink slowly.
 
         A drive belongs to `lowered` if it has a confirmed diagnostic that demands LOWER. In LOWER and FAULT, drives are only
         added. In all other states, `lowered` also contains the drives in `_kept_off`. A START enables the drives in `_kept_off`,
