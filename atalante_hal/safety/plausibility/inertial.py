@@ -51,8 +51,8 @@ _FORCE_CLIP = 5.0
 #: If an IMU turns faster than this [rad/s], its specific force is not compared with gravity.
 #: Fast motions cause large accelerations, for example when the drives are switched off and the legs fall to their end stops.
 _MOVING_RATE = 0.5
-#: Gyroscope and change of attitude must show the same angular velocity: at rest, with an rms difference of at most this [rad/s].
-#: The same limit applies to the gyroscopes of torso and pelvis.
+#: Largest rms difference between gyroscope and rate of change of the attitude while the IMU is at rest [rad/s].
+#: The same limit applies to the difference between the gyroscopes of torso and pelvis.
 _RATE_ERROR = 0.1
 #: While an IMU turns, its rms difference may be larger: the limit is sqrt(_RATE_ERROR^2 + _RATE_SHARE * mean square of its rate).
 _RATE_SHARE = 0.25
@@ -78,11 +78,12 @@ class Record(NamedTuple):
     samples: Vector
     force: Vector  # (4, 3) mean difference between specific force and gravity, in world axes [m/s2]
     #: Mean square difference between two angular velocities that must be equal, about three axes, shape (5, 3) [rad2/s2].
-    #: Rows 0 to 3, one for each IMU: gyroscope minus rate of change of its attitude. Row 4: gyroscope of the torso minus that
-    #: of the pelvis.
+    #: Rows 0 to 3, one for each IMU: its gyroscope minus the rate of change of its attitude.
+    #: Row 4: gyroscope of the torso minus gyroscope of the pelvis.
     rate_error: Vector
     rate: Vector  # (5, 3) mean square of the angular velocity [rad2/s2]; rows and columns as in `rate_error`
-    tilt: Vector  # (3,) mean of the unit vector upwards in torso axes minus the same vector in pelvis axes
+    #: Mean of this difference, shape (3,): upward unit vector in torso axes minus upward unit vector in pelvis axes.
+    tilt: Vector
 
 
 class Excess(NamedTuple):
@@ -184,7 +185,7 @@ def follow(
                 record.tilt[:] = 0.0
                 record.rate_error[len(age)] = 0.0
         record.age[imu] = age[imu] if used else NEVER
-        # numba would create an array to copy a row, because source and target could overlap.
+        # Copy each element: for a copy of the whole row, numba would create an array, because source and target could overlap.
         for axis in range(4):
             record.quaternion[imu, axis] = now.quaternion[imu, axis]
         for axis in range(3):
@@ -342,8 +343,8 @@ def turn_rate(first: Vector, last: Vector, time: float) -> tuple[float, float, f
     """
     a, b, c, d = first[0], first[1], first[2], first[3]
     e, f, g, h = last[0], last[1], last[2], last[3]
-    # (x, y, z) is the vector part of the quaternion conj(first) * last, the turn between the attitudes. `factor` has the sign of
-    # the scalar part, because a quaternion and its negative are the same attitude.
+    # (x, y, z) is the vector part of the quaternion conj(first) * last, which is the turn between the attitudes.
+    # `factor` has the sign of the scalar part, because a quaternion and its negative are the same attitude.
     factor = math.copysign(2.0 / time, a * e + b * f + c * g + d * h)
     x = a * f - b * e - c * h + d * g
     y = a * g + b * h - c * e - d * f

@@ -39,8 +39,8 @@ PELVIS_IMU = (-0.164, -0.015, 0.191)
 #: Position y of joint FH of the left leg in the pelvis frame [m]. Its x and z are 0.
 FRONTAL_HIP = 0.089
 #: Position (x, y) of joint TH of the left leg relative to joint FH, in the axes of the frontal hip [m].
-#: The distance from joint TH to joint SH in the axes of the transverse hip is also 0.135 m. So `motion` computes this distance as
-#: -x of this constant.
+#: Joint SH lies 0.135 m in front of joint TH, along the axis x of the transverse hip.
+#: This distance is equal to -x of this constant, so `motion` uses x for both.
 TRANSVERSE_HIP = (-0.135, 0.169)
 #: Position (x, y, z) of the left tibia IMU in the axes of the tibia [m].
 #: Each coordinate has its own origin: x is relative to joint SK, y to joint SH, and z to joint SA.
@@ -121,7 +121,7 @@ class Knees:
             values.fill(0.0)
 
     def reference(self, leg: int) -> None:
-        """Forget the finding of a leg, after the drive of joint SH or SK has restarted.
+        """Discard the finding of a leg. Call it when the drive of joint SH or SK has restarted.
 
         A restarted drive references its encoder again, so the old finding no longer applies.
 

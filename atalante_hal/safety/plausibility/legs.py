@@ -52,7 +52,8 @@ STANDSTILL_SAMPLES = 2
 EXCHANGE_SAMPLES = 2
 #: The encoders of a joint can be recognised as exchanged only if the left and the right reading differ by more than this [rad].
 _APART = math.radians(1.2)
-#: Largest mismatch at which encoders count as exchanged, as a fraction of the difference between the left and the right reading.
+#: Encoders count as exchanged if the error of each leg agrees with the difference between the left and the right reading.
+#: The constant is the largest deviation from this agreement, as a fraction of the difference.
 #: Example: readings of 5 and 2 degrees must cause the errors (encoder minus IMU) 3 and -3 degrees, each within 0.35 * 3 degrees.
 _AGREEMENT = 0.35
 #: Drift of the angle between pelvis IMU and tibia IMU that the standstill check tolerates in each sample [rad].

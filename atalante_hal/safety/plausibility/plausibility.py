@@ -42,8 +42,9 @@ FEET = 4
 SLOW = 16
 #: Period of the schedule of all slow checks [cycles]. Each leg, each sole and the support are checked once per period.
 _PERIOD = 32
-#: Intervals between the inertial checks [cycles], used alternately. Both are odd, so the checks run alternately in even and in
-#: odd cycles. A vibration of half the sampling rate of the IMUs then has no effect.
+#: Intervals between the inertial checks [cycles], used alternately.
+#: Both are odd, so the checks run alternately in even and in odd cycles.
+#: A vibration of half the sampling rate of the IMUs then has no effect.
 _INERTIAL_INTERVALS = (15, 17)
 #: Largest age of values that the trunk check uses [cycles].
 #: If a node always answers one cycle late, its values have the age 1 in every cycle.
@@ -92,7 +93,7 @@ class Plausibility:
         self._joint_rows, self._imu_rows = self._rows.joint.tolist(), self._rows.imu.tolist()
         self._foot_ages = [NEVER] * len(self._rows.foot)  # age of the values of each foot at its last check [cycles]
         #: Cycle in which the last good values of each joint and IMU were measured, by row in the process image.
-        #: Not updated while `_settled` is True, because the cycle is then the previous cycle for all rows.
+        #: Not updated while `_settled` is True, because the last good values of all rows are then from the previous cycle.
         self._measured = dict.fromkeys((*self._joint_rows, *self._imu_rows), -NEVER)
         #: Measured force of each faulty cell, by (foot, cell), shape (3,) [N]. In the process image, this force is set to 0.
         self._measured_forces: dict[tuple[int, int], Vector] = {}

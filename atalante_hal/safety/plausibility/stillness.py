@@ -52,14 +52,15 @@ FROZEN_CYCLES = 100
 _TURN = 0.01
 #: Upper bound of the inertia about any joint [kg m2], including the knee of a leg that carries robot and patient.
 _INERTIA = 100.0
-#: A joint is at rest after this number of cycles with a constant reading. Within this time, an unbalanced torque would have
-#: moved the joint.
+#: A joint is at rest after this number of cycles with a constant reading.
+#: Within this time, an unbalanced torque would have moved the joint.
 _AT_REST = 3
 #: When a joint has turned by this angle [rad], its encoder reading must have changed. The angle is 20 encoder counts.
 _DRIVEN = 1e-5
 #: A joint whose distance to a position limit is below this angle [rad] is regarded as being at its end stop.
 _AT_STOP = 0.005
-#: If the last forces of a foot are older than this number of cycles, the foot may have left the ground or landed since.
+#: If the last forces of a foot are older than this number of cycles, the foot may have left the ground or landed since then.
+#: So the records of its ankle joints are cleared.
 _FORCES_VALID = 5
 _NEVER = 1 << 30
 #: Index of each ankle joint in JOINTS.
@@ -84,10 +85,10 @@ class Readings(NamedTuple):
 class Drive(NamedTuple):
     """Torques and simulated motion of each joint since its encoder reading last changed, shape (12,) each.
 
-    The simulation computes how far the torques turn a joint at least. The simulated joint starts at rest. If the torque changes
-    by more than `breakaway`, the part of the change above `breakaway` accelerates the joint. If the torque changes by less, the
-    missing part brakes the joint, at most to rest. The inertia of the simulated joint is `_INERTIA`, an upper bound, so a real
-    joint turns further.
+    The simulation computes the smallest angle by which the torques turn a joint. The simulated joint starts at rest. If the
+    torque changes by more than `breakaway`, the part of the change above `breakaway` accelerates the joint. If the torque
+    changes by less, the missing part brakes the joint, at most to rest. The inertia of the simulated joint is `_INERTIA`, an
+    upper bound, so a real joint turns further.
     """
 
     cycles: Vector  # number of cycles since the encoder reading last changed
