@@ -121,7 +121,7 @@ class Dtc(StrEnum):
     TORQUE_MOTION = "TORQUE_MOTION", _R.LOWER, _S.ERROR, "the motion of a joint contradicts the torque that was sent"
     HOLD_UNSTABLE = "HOLD_UNSTABLE", _R.LOWER, _S.ERROR, "a drive holds its position, but does not hold its joint"
     # Bus.
-    BUS_FLOOD = "BUS_FLOOD", _R.HOLD, _S.ERROR, "more frames arrived than the HAL reads in a cycle"
+    BUS_FLOOD = "BUS_FLOOD", _R.HOLD, _S.ERROR, "too many frames arrived in a cycle"
     BUS_OFF = "BUS_OFF", _R.HOLD, _S.ERROR, "the CAN controller is bus-off"
     BUS_ERROR = "BUS_ERROR", _R.HOLD, _S.WARNING, "the CAN controller of the HAL reports errors on the bus"
     BUS_DOWN = "BUS_DOWN", _R.HOLD, _S.ERROR, "the bus interface is down"
