@@ -108,7 +108,7 @@ class Transceiver:
         self._errors = SETTLED  # error counter: +4 in a cycle with error frames, otherwise -1, see `e2e.qualify`
         #: Number of error frames since the start, except frames that report bus-off.
         self.error_frames = 0
-        self._bus_off = 0  # error bits of the last frame that reported bus-off; 0 before it or after `acknowledge`
+        self._bus_off = 0  # error bits of the last frame that reported bus-off; 0 if there was none since `acknowledge`
         #: True if the bus has no fault, so that `faults` need not be called.
         self.quiet = True
 
@@ -251,7 +251,7 @@ class Transceiver:
         return np.concatenate(kept) if kept else new_frames(0)
 
     def acknowledge(self) -> None:
-        """Forget a bus-off that the operator has acknowledged, so that `faults` no longer returns it.
+        """Clear a bus-off that the operator has acknowledged, so that `faults` no longer returns it.
 
         A later bus-off is returned again.
         """

@@ -25,7 +25,7 @@ class Conditions:
     dead_man: bool = False  # the pendant has not timed out and its dead-man switch is pressed
     #: True if HOLD is requested, if STOP is requested outside a walk on the ground, or if the program is ending.
     stop_requested: bool = False
-    start_wanted: bool = False  # START was pressed, and this start has not ended yet
+    start_wanted: bool = False  # START was pressed, and this press can still change the state
     step_finished: bool = False  # the walking step has ended, the robot does not walk, or FINISH_STEP took too long
     #: True during a walk on the ground if STOP is requested, the dead-man is released, or the pendant has timed out.
     #: False if HOLD is requested.
@@ -40,8 +40,8 @@ _HOLD, _LOWER, _FAULT = SupervisorState.HOLD, SupervisorState.LOWER, SupervisorS
 
 #: States in which the HAL sends the controller's torques to the drives.
 MOVING = frozenset({_ACTIVE, _FULL_ASSIST, _FINISH_STEP})
-#: State that a moving robot enters because of the reaction of a diagnostic. If the robot is already in a worse state (a later one
-#: in this table), the state does not change.
+#: Reaction of a diagnostic -> state that the reaction demands from a moving robot.
+#: If the robot is already in a worse state (further down in this table), the state does not change.
 _STATE_OF = {
     Reaction.INFO: _ACTIVE,
     Reaction.NOT_READY: _ACTIVE,

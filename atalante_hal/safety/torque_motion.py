@@ -47,8 +47,8 @@ INTERVAL: Final = 4
 #: A faulty motor produces s times the sent torque. The share s is in one of these two ranges. The first range is for reversed
 #: (s < 0), dead (s = 0) and weak motors. The second range is for motors that are too strong.
 SHARES: Final = ((-1.5, 0.6), (1.4, 2.2))
-#: A motor is suspected if the explanation "faulty motor" fits the torques better than "external torque" by more than this factor.
-#: The factor compares mean square errors: E > `RATIO` * (F + error^2), see the module docstring.
+#: A motor is suspected if E > `RATIO` * (F + error^2), see the module docstring.
+#: E is the mean square error of the explanation "external torque", F of the explanation "faulty motor".
 RATIO: Final = 2.5
 #: Number of consecutive checks that must suspect the motor before the drive is reported.
 CONFIRM: Final = 2
@@ -56,12 +56,13 @@ CONFIRM: Final = 2
 #: Here, error is the rms error of the produced torque [Nm], `Robot.torque_error`.
 BAND: Final = 2.0
 _BAND_SHARE: Final = 0.2
-#: Wider limits in the formula of `BAND`. While another joint of the leg exceeds these limits, a deviation is discarded: a wrong
-#: sensor or an unmeasured load on the leg changes the produced torques of several joints.
+#: Values of `BAND` and `_BAND_SHARE` for the other joints of the leg. They give a wider limit.
+#: While another joint exceeds this limit, the deviation of a joint is discarded,
+#: because a wrong sensor or an unmeasured load on the leg changes the produced torques of several joints.
 OTHER_BAND: Final = 4.5
 _OTHER_SHARE: Final = 0.25
-#: Each check multiplies the old `Deviations.sums` by this factor, and then adds its own torques. Each factor has its own sums:
-#: with 0.8 they cover about the last 5 checks (20 cycles), with 0.96 about the last 25 checks (100 cycles).
+#: Decay factors of the two sets of `Deviations.sums`. Each check multiplies a set by its factor, and then adds the new torques.
+#: The set with 0.8 covers about the last 5 checks (20 cycles), the set with 0.96 about the last 25 checks (100 cycles).
 DECAY: Final = (0.8, 0.96)
 #: Number of checks at the start of a deviation that are not added to `Deviations.sums`. The torques of these checks are averages
 #: that also contain cycles before the deviation.
@@ -171,7 +172,7 @@ def _deviates(
 
 
 def _forget(joint: int, deviations: Deviations) -> None:
-    """Forget the deviation of a joint.
+    """Clear the stored deviation of a joint.
 
     Args:
         joint: index in `JOINTS`.

@@ -25,8 +25,8 @@ from atalante_hal.robot import JOINTS
 from atalante_hal.safety.diagnostics import Dtc, Finding
 from atalante_hal.types import Vector
 
-#: A drive reports a sent torque at most this time later [cycles]: four commands may be lost, the frame of the drive may be four
-#: cycles late, and the answer takes four cycles.
+#: Longest time from sending a torque to the report of this torque by the drive [cycles].
+#: Four commands may be lost, the frame of the drive may be four cycles late, and the answer takes four cycles.
 SPAN: Final = 12
 #: A reported torque may lie outside the range of the last sent torques (smallest to largest) by this tolerance.
 #: The tolerance is a fraction of the breakaway torque of the joint.

@@ -45,7 +45,7 @@ class TelemetryChild(Closing):
         self._files: dict[str, int] = {}  # files of the ring buffers, until `take_files` passes them to a session
         if files is None:
             files = self._files = {name: anonymous_file("atalante-telemetry", 0) for name in RINGS}
-        self._unread = b""  # output of the subprocess after the last line that was read
+        self._unread = b""  # output that was read, but that `report` has not returned yet
         self._process = subprocess.Popen(
             [sys.executable, "-P", "-m", "atalante_hal.telemetry"],
             stdin=subprocess.PIPE,

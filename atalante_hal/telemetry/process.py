@@ -131,9 +131,9 @@ class Recording:
 
     files: tuple[str, ...]  # file names in order; each restart of the subprocess begins a new file
     complete: bool  # True if there is one file, with an index and with all cycles
-    missing_cycles: (
-        int  # number of cycles that are not in the files; after a killed subprocess at most one MCAP chunk too high
-    )
+    #: Number of cycles that are not in the files. If a subprocess was killed, this number can be too high,
+    #: by at most the cycles of one MCAP chunk.
+    missing_cycles: int
 
 
 @dataclass(frozen=True)

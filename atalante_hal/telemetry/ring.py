@@ -85,7 +85,7 @@ class _Ring:
 
     @property
     def kept(self) -> int:
-        """Return the number of records that all readers together have saved to disk, see `RingReader.keep`."""
+        """Return the number of records saved to disk by this reader and all earlier readers, see `RingReader.keep`."""
         return self._header[_KEPT]
 
     @property
@@ -337,8 +337,9 @@ class RingReader(_Ring, Closing):
         return self._next
 
     def notes(self) -> list[dict[str, Any]]:
-        """Return the notes written since the last call. In each note, "from" is the number of the first record after it.
+        """Return the notes written since the last call.
 
+        The value of the key "from" of a note is the number of the first record that was written after the note.
         Call this method after `read`. Then the result contains every note that belongs to the records read.
         """
         start, length = self._notes_start, self._header[_NOTES_LENGTH]

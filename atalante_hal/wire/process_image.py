@@ -52,9 +52,11 @@ from atalante_hal.wire.frame import (
     new_frames,
 )
 
-#: Bits in the header word of a frame. `_ESI`: the sender is error passive. `_PASSIVE`: `_ESI` and the bit of a CAN FD frame.
+#: Bits in the header word of a frame. `_ESI`: flag ESI, the sender is error passive.
+#: `_PASSIVE`: flags ESI and FDF, a CAN FD frame from an error passive sender.
 _PASSIVE, _ESI = header_word(0, 0, FLAG_ESI | FLAG_FDF), header_word(0, 0, FLAG_ESI)
-#: Value of the argument `tag` (expected alive counter in this cycle) if each node counts only its own frames.
+#: Value of the argument `tag` if the senders do not answer a SYNC, so that each sender counts its own frames.
+#: Otherwise `tag` is the alive counter expected in this cycle.
 _NO_TAG = -1
 #: Values of `Check` as plain integers. A value of at most `_FRESH` means new, usable data.
 _FRESH = _SOME_LOST = int(Check.SOME_LOST)
@@ -125,6 +127,7 @@ class ReceiveImage:
         self.age: npt.NDArray[np.int64] = np.full(count, NEVER)
         self.crc_errors = 0
         #: Row and `Check` of each frame that was rejected in this cycle.
+        #: With `restarts`, each frame that was committed with the result CONFLICT is also listed.
         self.refused: list[tuple[int, Check]] = []
         #: Row of each frame of this cycle in which the sender set the flag ESI (error passive). Damaged frames are included.
         self.error_passive: list[int] = []
@@ -496,8 +499,9 @@ def classify_frame(words: Words, row: int, offset: int, e2e: E2EState, tag: int,
         return _CRC
     counter = int(octets[begin + COUNTER_BYTE])
     in_time = tag == _NO_TAG or tag - counter & 0xFF < _TOO_OLD
-    # `back`: the last accepted frame is at least 128 cycles old, and this frame answers one of the last 16 SYNCs (`_TOO_OLD`).
-    # Then every counter is accepted, because after 128 cycles the last counter does not show whether this frame is new or old.
+    # `back` is True if the sender is back after at least 128 cycles without an accepted frame, and this frame answers one of the
+    # last 16 SYNCs (`_TOO_OLD`). Then every counter is accepted, because after 128 cycles a comparison with the last counter
+    # does not show whether this frame is new or old.
     back = tag != _NO_TAG and in_time and expected[row] != NOTHING and silent[row] >= _HALF_TURN
     result = classify_counter(expected[row], counter)
     if back and result == _REPEATED:

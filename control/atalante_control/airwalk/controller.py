@@ -191,9 +191,9 @@ class AirwalkController:
 
     @property
     def blend(self) -> Vector:
-        """Return the fade-out of the torque that is added after a stance change (carry-over), shape (n,).
+        """Return the fade-out factors of the carry-over, one for each cycle after a stance change, shape (n,).
 
-        Element i is the fraction of this torque that is still added in cycle i after the stance change.
+        Element i is the fraction of the carry-over torque that is still added in cycle i after the stance change.
         """
         return self._carry.blend
 

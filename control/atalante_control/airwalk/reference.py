@@ -105,7 +105,7 @@ class StartMotion:
     """
 
     #: Largest speed of a joint on the way to the first pose, as a fraction of the velocity limit of the joint.
-    #: The speed that a joint needs in addition to arrive with the speed of the gait is not limited by `SPEED_SHARE`.
+    #: A second part of the motion brings the joint to the speed of the gait. `SPEED_SHARE` does not limit the speed of this part.
     SPEED_SHARE = 0.5
     #: Largest slope of the quintic 10 x^3 - 15 x^4 + 6 x^5 for x from 0 to 1.
     _STEEPEST = 1.875

@@ -37,7 +37,7 @@ OUTPUTS = len(JOINTS) * (DEGREE + 1)
 LAYERS_MAX = 4
 WIDTH_MAX = 128  # largest number of neurons of a layer
 #: rad, a network file is rejected if a joint angle jumps by more than this value at the stance change (rounding tolerance).
-#: The check regards the bias and each weight row of the last layer as the control points of one gait.
+#: The check computes the jump for the bias and for each weight row of the last layer, each taken as the control points of a gait.
 _PERIODICITY_DEFECT = 1e-9
 _ANGLE_MAX = 2.0 * np.pi  # rad, largest accepted absolute value of a control point
 #: An input may be beyond its range by this fraction of the bound, because the ratios `thigh` and `shank` have rounding errors.
@@ -169,9 +169,9 @@ def subject_of(inputs: Sequence[float]) -> Subject:
 
 
 def periodicity() -> Vector:
-    """Return the matrix A for which A c = 0 means that a gait is continuous at the stance change, shape (24, 96).
+    """Return the matrix A, shape (24, 96). A gait with the control points c is continuous at the stance change if A c = 0.
 
-    c is the vector of the control points of all joints, shape (96,). The first 12 elements of A c are the jumps of the joint
+    c contains the control points of all joints, shape (96,). The first 12 elements of A c are the jumps of the joint
     angles [rad]. The last 12 elements are the jumps of the joint speeds, multiplied by T / 7 [rad] (T is the step duration).
     """
     points = np.arange(OUTPUTS).reshape(len(JOINTS), DEGREE + 1)
@@ -288,8 +288,8 @@ def _network(arrays: Mapping[str, npt.NDArray[Any]]) -> GaitNetwork:
         width = columns
     if width != OUTPUTS:
         raise ArrayFileError(f"the last layer must have {OUTPUTS} columns, got {width}")
-    # The last layer adds multiples of its weight rows to its bias. If the bias and each row, as control points of a gait, give
-    # angles without a jump at the stance change, the angles of every gait of the network are continuous.
+    # The control points of every gait of the network are the bias of the last layer plus multiples of its weight rows.
+    # So the angles of every gait are continuous at the stance change if the bias and each weight row have this property.
     defect = np.abs(periodicity()[: len(JOINTS)] @ np.vstack([layers[-1].weights, layers[-1].bias]).T).max()
     if not defect <= _PERIODICITY_DEFECT:
         raise ArrayFileError(

@@ -24,8 +24,8 @@ from atalante_hal.robot import JOINTS, load_robot
 from atalante_hal.types import Vector
 
 MODERATE: Final = (0.15, 0.9)  # step length [m] and duration [s] of the gait from which the second start begins
-#: With 1e-3, an angle is at a limit if the distance to the limit is at most 0.1 % of the joint range. A speed or a torque is at
-#: a limit if the value is at least 99.9 % of the limit.
+#: Relative tolerance: an angle is at a limit if its distance to the limit is at most 0.1 % of the joint range.
+#: A speed or a torque is at a limit if it is at least 99.9 % of the largest value that a gait may use.
 _AT_LIMIT: Final = 1e-3
 
 #: Function that solves a gait. Its second argument is the gait for a warm start, or None for the usual initial guess.
