@@ -88,8 +88,9 @@ class BackupPolicy:
 
     stiffness: Pair  # Nm/rad, k of SH and SK
     damping: Pair  # damping ratios of the two coupled modes of motion, the slower mode first
-    #: kg m2, elements M11, M12 and M22 of the mass matrix of SH and SK at one knee angle in the middle of the swing. The joints
-    #: have the stiffness `stiffness` only at this knee angle, because the gains Kv, computed from `mass`, are constant.
+    #: kg m2, elements M11, M12 and M22 of the mass matrix of SH and SK at one knee angle in the middle of the swing.
+    #: The gains Kv are computed from `mass` and are constant.
+    #: The joints therefore have the stiffness `stiffness` only at this knee angle.
     mass: tuple[float, float, float]
 
     def __post_init__(self) -> None:
@@ -126,7 +127,7 @@ class Responses(NamedTuple):
 
     error: Vector  # (n + 1, 2, 10) matrix from the state to the predicted error e [rad]
     rate: Vector  # (n + 1, 2, 10) matrix from the state to the predicted rate e' [rad/s]
-    feedback: Vector  # (n + 1, 2, 10) matrix from the state to the predicted -Kv e - Dv e' [rad/s2]
+    feedback: Vector  # (n + 1, 2, 10) matrix from the state to the predicted feedback -Kv e - Dv e' [rad/s2]
     pushed_error: Vector  # (n + 1, 2, 2) matrix from the acceleration in the first cycle to the error e [rad]
     pushed_rate: Vector  # (n + 1, 2, 2) matrix from the acceleration in the first cycle to the rate e' [rad/s]
     #: (n + 1, 2, 2) matrix from the acceleration in the first cycle to the feedback -Kv e - Dv e' [rad/s2]

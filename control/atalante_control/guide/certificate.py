@@ -230,8 +230,9 @@ class _Horizon:
         # Split the error one cycle after the prediction: factor * (error in the last predicted cycle) + remainder.
         self._factor = (beyond * rows[-1]).sum(axis=1) / (rows[-1] ** 2).sum(axis=1)
         remainder = beyond - self._factor[:, None] * rows[-1]
-        #: Upper bounds of the remainder, each as (two predicted cycles, weights of shape (4, 2)). `errors @ weights` bounds the
-        #: remainder of hip and knee. `errors`: |hip|, |knee| in the first of the two cycles, then |hip|, |knee| in the second.
+        #: Three upper bounds of the remainder. Each bound is a tuple: (two predicted cycles, weights of shape (4, 2)).
+        #: The remainder of hip and knee is at most `errors @ weights`.
+        #: `errors` has four elements: |hip|, |knee| in the first of the two cycles, then |hip|, |knee| in the second cycle.
         self._remainders: list[tuple[tuple[int, int], Vector]] = []
         for near, far in ((0.1, 0.3), (0.25, 0.5), (0.4, 0.7)):
             lags = round(near * self.cycles), round(far * self.cycles)
@@ -265,7 +266,7 @@ class _Horizon:
         """
 
         def parts(lag: int) -> tuple[Vector, Vector]:
-            """Return the arrays `free` and `used` for the time `lag` cycles after the start of a prediction.
+            """Return the errors `free` (allowed) and `used` (due to disturbance torques), `lag` cycles after a prediction starts.
 
             `free`: largest allowed error minus the tracking error that the model errors can cause.
             `used`: tracking error that the requested disturbance torques can cause.

@@ -32,14 +32,14 @@ class StepGuideConfig:
     torque_reserve: float = 14.0
     #: rad/s, smallest allowed distance of a predicted speed from the velocity limit of the robot
     speed_reserve: float = 0.2
-    #: s, gain on the fall of the safety value h (h < 0: a joint may leave the guide). A falling h raises the weight of the
-    #: backup torque. Example: with a gain of 0.01 s, dh/dt = -50 1/s raises the weight from 0 to 0.5.
+    #: s, gain zeta: a falling safety value h raises the weight of the backup torque (h < 0: a joint may leave the guide).
+    #: Example: with zeta = 0.01 s, dh/dt = -50 1/s raises the weight from 0 to 0.5.
     zeta: float = 0.01
-    #: Factor in [0, 1] on the torque u_i, which cancels friction, gravity, centrifugal and Coriolis torques. The factor applies
-    #: while the backup torque has weight 0.
+    #: Factor in [0, 1] on the torque u_i, which cancels friction, gravity, centrifugal and Coriolis torques.
+    #: The factor applies while the backup torque has weight 0.
     idealization: float = 1.0
-    #: Factor in [0, 1] on the feedforward torque u_f, which accelerates the leg along q_des. The factor applies while the backup
-    #: torque has weight 0.
+    #: Factor in [0, 1] on the feedforward torque u_f, which accelerates the leg along q_des.
+    #: The factor applies while the backup torque has weight 0.
     feedforward: float = 1.0
     #: Counter value above which the controller reports that the leg has left a guide with a promise.
     #: The counter rises by 1 in each cycle with h < 0 in such a guide. In every other cycle it falls by 1, but not below 0.

@@ -71,8 +71,8 @@ class HandOver:
     deviation: float = math.radians(2.7)  # rad, largest angle deviation |s(0)| of sagittal hip and knee
     rate: float = 0.25  # rad/s, largest speed deviation |s'(0)| of sagittal hip and knee
     torque: Pair = (25.0, 13.0)  # Nm, largest jump of the torques of sagittal hip and knee at a stance change
-    #: rad/s2, largest joint acceleration before the stance change. The acceleration distorts the velocity measured
-    #: after the change.
+    #: rad/s2, largest joint acceleration before the stance change.
+    #: This acceleration causes an error of the velocity that is measured after the stance change.
     acceleration: float = 20.0
 
     def __post_init__(self) -> None:
@@ -194,13 +194,15 @@ class Effect(NamedTuple):
     joint (hip, knee).
     """
 
-    #: (n, 2, 2) pushed[i]: error or speed i cycles after a disturbance of 1 rad/s2 that lasts one cycle. If the quantity is a
-    #: torque or a torque change: acceleration or change of the acceleration, to be multiplied by `left`.
+    #: (n, 2, 2) pushed[i]: effect, i cycles later, of a disturbance of 1 rad/s2 that lasts one cycle.
+    #: For an error or a speed, the effect is the change of this quantity.
+    #: For a torque or a torque change, the effect is an acceleration or a change of the acceleration, which `left` converts.
     pushed: Vector
-    #: (n, 2, 2) hidden[i]: change of a prediction i cycles ahead, if an acceleration of 1 rad/s2 falsifies the start velocity.
-    #: An empty array of shape (0, 2, 2) means that the start velocity is taken as exact.
+    #: (n, 2, 2) hidden[i]: change of a prediction i cycles ahead, if an acceleration of 1 rad/s2 causes a wrong start velocity.
+    #: An empty array of shape (0, 2, 2) means that the start velocity is assumed to be exact.
     hidden: Vector
-    #: (n, 2, 2) left[k]: mass matrix in cycle k of the step for a torque or a torque change, unit matrix for an error or a speed
+    #: (n, 2, 2) left[k]: factor in cycle k of the step. For a torque or a torque change, the factor is the mass matrix.
+    #: For an error or a speed, the factor is the unit matrix.
     left: Vector
 
 

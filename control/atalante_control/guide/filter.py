@@ -57,8 +57,8 @@ class GuideConfig:
     rate_limit: float  # Nm, largest allowed change of the backup torque within one cycle
     speed_limit: float  # rad/s, largest allowed speed of SH and SK, predicted with the inertia and delay of the model
     worst_speed_limit: float  # rad/s, largest allowed speed of SH and SK, predicted with the worst inertia and delay
-    #: s, gain on the fall of the safety value h (h < 0: a joint may leave the guide). A falling h raises the weight of the
-    #: backup torque. Example: with a gain of 0.01 s, dh/dt = -50 1/s raises the weight from 0 to 0.5.
+    #: s, gain zeta: a falling safety value h raises the weight of the backup torque (h < 0: a joint may leave the guide).
+    #: Example: with zeta = 0.01 s, dh/dt = -50 1/s raises the weight from 0 to 0.5.
     zeta: float = 0.01
     derivative_time: float = 0.005  # s, time constant of the low-pass filter on dh/dt
     release: float = 0.03  # s, shortest time in which the weight of the backup torque falls from 1 to 0
@@ -149,7 +149,7 @@ class GuideFilter:
         guard.xi, guard.promise, guard.fresh = xi, promise, True
 
     def _bounds(self, xi: float) -> Vector:
-        """Return the bounds of the guide in each cycle, shape (2, n, 2) [rad], always in C order, see `specialised`."""
+        """Return the bounds of the guide in each cycle, shape (2, n, 2) [rad]. `specialised` requires an array in C order."""
         return np.ascontiguousarray(self.shape.bounds(self._phase, xi))
 
     def widths(self, xi: float) -> Vector:
@@ -196,9 +196,9 @@ class GuideFilter:
 
 
 def tail(inverse: Vector) -> Vector:
-    """Return 1 / (smallest width of the guide in a cycle and the next `TAIL_CYCLES` cycles), plus a margin of 3 % [1/rad].
+    """Return 1.03 / (smallest width of the guide in a cycle and the next `TAIL_CYCLES` cycles), shape (n, m) [1/rad].
 
-    Row k of the result, shape (n, m), is for the cycles k to k + `TAIL_CYCLES`. The margin is `TAIL_MARGIN`.
+    Row k of the result is for the cycles k to k + `TAIL_CYCLES`. The factor 1.03 is 1 + `TAIL_MARGIN`.
 
     Args:
         inverse: 1 / width, shape (n, m) [1/rad]. Row k is cycle k. A width is the distance from q_des to a bound of the guide.

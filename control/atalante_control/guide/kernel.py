@@ -21,14 +21,15 @@ from atalante_hal.types import Vector
 
 Pair = tuple[float, float]
 
-#: Normal walking already uses most of the allowed torque and speed. The backup torque must rise only close to these limits.
-#: So a ratio x (torque / limit or speed / limit) is replaced by 1 - STEEPNESS * (1 - x). Example: 0.9 becomes 0.6, 1 stays 1.
+#: Slope of the conversion of a ratio x (torque / limit or speed / limit) to 1 - STEEPNESS * (1 - x): 0.9 becomes 0.6, 1 stays 1.
+#: Normal walking already uses most of the allowed torque and speed.
+#: With the converted ratio, the weight of the backup torque rises later, only close to the limit.
 STEEPNESS = 4.0
-#: Number of elements of the compressed state, a short form of the state of the leg. The tracking errors are predicted from the
-#: compressed state, because this is faster.
+#: Number of elements of the compressed state, a short form of the state of the leg.
+#: The tracking errors are predicted from the compressed state, because this is faster.
 COMPRESSED = 5
-#: Number of consecutive predicted cycles in a `Block`. `Block.slack` bounds the effect of model errors in all these
-#: cycles.
+#: Number of consecutive predicted cycles in a `Block`.
+#: `Block.slack` bounds the effect of model errors in all these cycles.
 SLACK_CYCLES = 10
 #: Number of start cycles that share one row of `GuideTables.reach`. Example: predictions that start in cycle 8 to 11 use row 2.
 START_CYCLES = 4
@@ -45,12 +46,12 @@ class Guard:
     worst_speed_limit: float  # rad/s, largest allowed speed of SH and SK, predicted with the worst inertia and delay
     tracking: float  # share of a commanded torque change that a motor reaches within one cycle
     keep: float  # weight of the old value in the low-pass of the measured velocity
-    #: s, gain on the fall of the safety value h (h < 0: a joint may leave the guide). A falling h raises the weight of the
-    #: backup torque. Example: with a gain of 0.01 s, dh/dt = -50 1/s raises the weight from 0 to 0.5.
+    #: s, gain zeta: a falling safety value h raises the weight of the backup torque (h < 0: a joint may leave the guide).
+    #: Example: with zeta = 0.01 s, dh/dt = -50 1/s raises the weight from 0 to 0.5.
     zeta: float
     smoothing: float  # weight of the new value in the low-pass filter of dh/dt (h: safety value)
-    #: largest decrease of the gate (weight of the backup torque) per cycle; this limit prevents oscillations of the
-    #: gate
+    #: Largest decrease of the gate (weight of the backup torque) per cycle.
+    #: This limit prevents oscillations of the gate.
     release: float
     #: factor in [0, 1] on the torque u_i, which cancels friction, gravity, centrifugal and Coriolis torques (joint idealization)
     idealization: float
@@ -149,18 +150,18 @@ VELOCITY = 6  # columns 6 and 7 of `step`: velocity of q_des after the low-pass 
 BASE = 8  # columns 8 and 9 of `step`: torque that moves the leg along q_des [Nm]
 MASS = 10  # columns 10 to 12 of `step`: mass matrix M11, M12 and M22 along q_des [kg m2]
 SPEED = 13  # columns 13 and 14 of `step`: velocity of q_des [rad/s]
-#: Column 15 of `step`: smallest allowed weight of the backup torque. This minimum falls from 1 to 0 in the first cycles of a
-#: step, while the filter takes over the joints.
+#: Column 15 of `step`: smallest allowed weight of the backup torque.
+#: This minimum falls from 1 to 0 in the first cycles of a step, while the filter takes over the joints.
 FLOOR = 15
 #: Columns 16 to 19 of `step`: 1.03 * maximum of columns 0 to 3 over this cycle and the next `TAIL_CYCLES` cycles [1/rad].
 TAIL = 16
 #: Columns 20 to 23 of `step`: maximum of columns 0 to 3 over `SLACK_CYCLES` cycles from this cycle on [1/rad].
 NEAR = 20
 COLUMNS = 24
-#: Number of cycles after the last predicted cycle. The last predicted error must be smaller than the guide width in these cycles.
+#: Number of cycles after the prediction in which the guide must still be wider than the last predicted error.
 TAIL_CYCLES = 60
-#: Fraction of the guide width that must remain free in the last predicted cycle, so that the error is inside the guide in the
-#: cycles after the prediction, too.
+#: Fraction of the guide width that must remain free in the last predicted cycle.
+#: Then the error is also inside the guide in the cycles after the prediction.
 TAIL_MARGIN = 0.03
 
 
@@ -185,7 +186,7 @@ def write_bounds(step: Vector, bounds: Vector) -> None:
 
 
 def slide_maximum(table: Vector, first: int, end: int, cycles: int) -> None:
-    """Replace each value by the maximum of this row and the following rows, `cycles` rows in total.
+    """Replace each value by the maximum of its column over `cycles` rows: its own row and the rows after it.
 
     Args:
         table: values, shape (n, m), changed in place. The last row also stands for all rows after it.
@@ -196,7 +197,7 @@ def slide_maximum(table: Vector, first: int, end: int, cycles: int) -> None:
     last, covered = len(table) - 1, 1  # each value is the maximum of `covered` rows of the original table
     while covered < cycles:
         shift = min(covered, cycles - covered)
-        for row in range(last):  # in ascending order, so the later row is not changed yet
+        for row in range(last):  # ascending, so `table[later]` still contains its old values
             later = min(row + shift, last)
             for column in range(first, end):
                 table[row, column] = max(table[row, column], table[later, column])
@@ -206,17 +207,18 @@ def slide_maximum(table: Vector, first: int, end: int, cycles: int) -> None:
 class Motion(NamedTuple):
     """Desired motion of every step, from which `write_motion` computes the desired motion of one step.
 
-    Rows are cycles since the stance change. The columns are four values of hip and knee: acceleration (ahead by the command
-    lag), velocity after the low-pass of the drives, velocity, and torque.
+    Rows are cycles since the stance change. The columns are four values of hip and knee: acceleration (one command lag
+    later), velocity after the low-pass of the drives, velocity, and torque.
 
     The re-centring adds an offset s(t) to the nominal motion. The offset is linear in the deviations s(0) and s'(0) at the stance
     change. SH and SK have the same factors. The last factor is the acceleration s'', from which the torque follows.
     """
 
     nominal: Vector  # (n, 8) motion without the offset, columns in pairs of hip and knee [rad/s2, rad/s, rad/s, Nm]
-    #: (n, 4) offset for s(0) = 1 rad: acceleration ahead by the command lag, velocity after the low-pass, velocity, acceleration
+    #: (n, 4) offset of the re-centring for s(0) = 1 rad.
+    #: Columns: acceleration one command lag later, velocity after the low-pass of the drives, velocity, acceleration.
     of_deviation: Vector
-    of_rate: Vector  # (n, 4) offset for s'(0) = 1 rad/s, same columns
+    of_rate: Vector  # (n, 4) offset of the re-centring for s'(0) = 1 rad/s; columns as in `of_deviation`
 
 
 def write_motion(step: Vector, motion: Motion, deviation: Pair, rate: Pair) -> None:

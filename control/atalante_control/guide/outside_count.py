@@ -4,18 +4,18 @@ from __future__ import annotations
 
 
 class OutsideCount:
-    """Count of the cycles outside a guide with a promise. A guide without a promise may be left, so it is not counted."""
+    """Count of the cycles outside a guide with a promise. In a guide without a promise, cycles outside are not counted."""
 
     def __init__(self, largest: int) -> None:
         """Start with the count 0.
 
         Args:
-            largest: largest count at which the guide does not count as left, see `StepGuideConfig.outside_cycles`.
+            largest: largest count that is not yet reported, see `StepGuideConfig.outside_cycles`.
         """
         self._largest, self._cycles = largest, 0
 
     def update(self, outside: bool, promised: bool) -> bool:
-        """Count one cycle and return whether the guide counts as left.
+        """Count one cycle. Return whether the joints have been outside the guide for too many cycles.
 
         The count rises in a cycle outside a guide with a promise, and falls in every other cycle.
 

@@ -110,7 +110,7 @@ class Prediction:
         last = len(leg.time) - 1
         self.cycles = last - assumptions.overlap
         horizon, hand_over = assumptions.horizon, assumptions.hand_over
-        longest = max(last, horizon + 1)  # `beyond` is one cycle after the horizon, also if the gait is shorter
+        longest = max(last, horizon + 1)  # `beyond` needs the cycle after the horizon, even if `last` is smaller
         self.nominal = nominal = responses(policy, assumptions.loop, 1.0, longest)
         rows = nominal.error[: horizon + 1]
         _, _, basis = np.linalg.svd((rows * SIZES).reshape(-1, STATES), full_matrices=False)
@@ -160,8 +160,8 @@ class Prediction:
         torque, speed = Effect(nominal.pushed_feedback, nothing, self.mass), Effect(nominal.pushed_rate, nothing, same)
         first_torque = run(torque, mobilities, bounds, few, few_ahead[0])
         first_speed = run(speed, mobilities, bounds, few, few_ahead[1])
-        # Axes of `by_bound`: 0 and 1 are axes 1 and 2 of `few_ahead`; 2 is model errors (0) or disturbance torques (1); 3 is
-        # torque (0) or speed (1); 4 is sagittal hip (0) or sagittal knee (1).
+        # Axes 0 and 1 of `by_bound` are axes 1 and 2 of `few_ahead`.
+        # Axis 2: 0 model errors, 1 disturbance torques. Axis 3: 0 torque, 1 speed. Axis 4: 0 sagittal hip, 1 sagittal knee.
         by_bound = few_ahead[:2].reshape(2, blocks, len(FEW), 2, 2).transpose(1, 2, 3, 0, 4)
         self.few_reach: Vector = np.concatenate([by_bound.reshape(blocks, len(FEW), 8), few_ahead[2]], axis=2)
         self.few_ahead: Vector = np.concatenate([nominal.feedback[FEW], nominal.rate[FEW]], axis=1)
@@ -206,7 +206,7 @@ def prediction_of(policy: BackupPolicy, leg: Leg, assumptions: Assumptions, blen
 
 
 def _for_rate_difference(rows: Vector) -> Vector:
-    """Return prediction matrices that take the differences (true - measured error rate) in place of the true error rates.
+    """Convert prediction matrices to a state with rate differences (true - measured error rate) in place of true error rates.
 
     The given matrices multiply a state in which elements 2 and 3 are the true error rates of SH and SK. Elements 4 and 5 are the
     measured error rates. The returned matrices multiply a state in which elements 2 and 3 are the differences true - measured.

@@ -14,8 +14,8 @@ class GuideStatistics:
     #: number of counted cycles in which the weight of the backup torque was above `StepGuideConfig.active`
     active: int = 0
     max_ratio: float = 0.0  # largest |e| / q_bound
-    #: Smallest safety value h among the first cycles of all steps. If h >= 0, the backup policy (spring and damper) can keep
-    #: both joints inside the guide.
+    #: Smallest safety value h among the first cycles of all steps.
+    #: If h >= 0, the backup policy (spring and damper) can keep both joints inside the guide.
     min_h_at_start: float = 1.0
     hand_overs_exceeded: int = 0  # number of steps that start with a larger deviation than the certificate permits
     factors: set[float] = field(default_factory=set)  # assistance factors of all steps so far

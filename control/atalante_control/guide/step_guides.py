@@ -28,10 +28,10 @@ from atalante_hal.types import Vector
 _MIDDLE = math.radians(30.0)
 #: Indices of SH and SK of the left leg. SH and SK have the same limits in both legs.
 _ASSISTED = [LEG_JOINTS.index("SH"), LEG_JOINTS.index("SK")]
-#: Fraction of the largest certifiable disturbance torques that a filter assumes if the requested torques cannot be certified.
-#: With 1, a prediction would reach its limit even if nobody pushes, and the filter would apply the full backup torque.
+#: If the requested torques cannot be certified, a filter assumes this fraction of the largest certifiable disturbance torques.
+#: With 1, a prediction would reach its limit even without a push, and the filter would apply the full backup torque.
 _MARGIN = 0.95
-#: Filters are chosen for this many assistance factors from 0 to 1, without 0: 0.01, 0.02 and so on.
+#: Number of intervals from 0 to 1. A filter is chosen for the assistance factor at each end of an interval: 0, 0.01, ..., 1.
 _FACTORS = 100
 
 
@@ -39,8 +39,8 @@ class Choice(NamedTuple):
     """Guide filter that is used in a step, and its certified disturbance torques."""
 
     guide: GuideFilter
-    #: Certified torques as a fraction of the torques that the configuration requests, in [0, 1]. It is 0 if the certified torque
-    #: at the hip is below `certificate.SMALLEST`.
+    #: Certified torques as a fraction of the torques that the configuration requests, in [0, 1].
+    #: The fraction is 0 if the certified torque at the hip is below `certificate.SMALLEST`.
     promise: float
 
 
@@ -99,7 +99,7 @@ class StepGuides:
         Args:
             xi: assistance factor in [0, 1].
         """
-        number = math.ceil(round(xi * _FACTORS, 6))  # rounded first, because 0.07 * 100 is above 7
+        number = math.ceil(round(xi * _FACTORS, 6))  # `round` first: in floating point, 0.07 * 100 is above 7
         if number not in self._choices:
             self._choices[number] = self._choose(number / _FACTORS)
         return self._choices[number]
