@@ -25,7 +25,8 @@ _SAMPLES = 201  # number of samples of a step
 _LOCAL = pinocchio.ReferenceFrame.LOCAL
 _CLEARANCE = 0.05  # m, intended height of the swing sole at mid-swing
 _FRICTION = 0.5  # largest friction coefficient between sole and ground that a verified gait may need
-#: Ns, accepted part of the horizontal impact impulse that friction cannot transmit. 1 Ns changes the robot speed by some mm/s.
+#: Ns, largest accepted difference: horizontal impact impulse minus the largest impulse that friction can transmit.
+#: An impulse of 1 Ns changes the speed of the robot by some mm/s.
 _SLIDING = 1.0
 _SLIDE = 0.04  # m/s, accepted horizontal speed of a corner of the sole at the landing
 _DROP = 0.035  # m/s, accepted downward speed of a corner of the sole at the landing
@@ -233,7 +234,7 @@ class Verifier:
         """Return the checks of a periodic step: landing pose, periodicity, impact map."""
         after, impulse, leaving = self.impact(motion.q[-1], motion.qd[-1])
         mirrored_q, mirrored_qd = SIGN * motion.q[0][SWAP], SIGN * motion.qd[0][SWAP]
-        # Horizontal impulse minus the largest impulse that friction can transmit. `_SLIDING` Ns are accepted.
+        # Ns, horizontal impulse minus the largest impulse that friction can transmit; at most `_SLIDING` is accepted.
         sliding = math.hypot(impulse[0], impulse[1]) - _FRICTION * impulse[2]
         sinking = -min(leaving[2] + np.cross(leaving[3:], corner)[2] for corner in self._corners())
         return [
