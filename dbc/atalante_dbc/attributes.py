@@ -35,7 +35,7 @@ def wrong_values(text: str) -> Iterator[tuple[int, str]]:
 
 
 def missing(text: str) -> Iterator[tuple[int, str]]:
-    """Yield (1, problem) for each required attribute without a definition or a default. The 1 stands for line 1."""
+    """Yield (line number, problem) for each required attribute without a definition or a default. The line number is always 1."""
     for name in _REQUIRED:
         for keyword, part in (("BA_DEF_", "definition"), ("BA_DEF_DEF_", "default")):
             if not re.search(rf'^{keyword}\s+[^"]*"{name}"', text, re.MULTILINE):

@@ -93,8 +93,8 @@ class Layout:
     timeout_ms: float | None
     inhibit_ms: float | None  # minimum time between two frames of an event message [ms]
     data_id: int | None  # Data ID of AUTOSAR E2E Profile 5; None if the message is not protected
-    #: Mask of the identifier bits that identify the message. The parameter group identifies a J1939 message.
-    #: The complete identifier identifies a message that is not J1939.
+    #: Mask of the identifier bits that distinguish the message from other messages.
+    #: J1939 message: bits of the parameter group. Any other message: all bits of the identifier.
     pgn_mask: int
     #: Known raw values of each multiplexer: values that select a signal, and values with a name. Key: name of the multiplexer.
     multiplexers: Mapping[str, frozenset[int]]

@@ -198,7 +198,7 @@ class LevelFeet:
         self.cubics = recentring_rows(deadbeat, len(nominal[0]))
 
     def start_step(self, state: State, side: int) -> None:
-        """Store the deviation of the swing ankle from its targets at the stance change, which the re-centring fades out.
+        """Store how far the swing ankle is from its targets at the stance change. The re-centring fades out this deviation.
 
         Args:
             state: measured state of the robot at the stance change.
@@ -243,7 +243,7 @@ class LevelFeet:
 
 
 def start_level_ankle(ankle: Ankle, tibia: Vector | Quaternion, gyro: Vector | Vector3, q: Vector, qd: Vector) -> None:
-    """Store the deviation of a swing ankle from its targets at the stance change, which the re-centring fades out.
+    """Store how far a swing ankle is from its targets at the stance change. The re-centring fades out this deviation.
 
     Args:
         ankle: record of the swing ankle.
@@ -284,7 +284,7 @@ def write_level_ankle(
 
 
 def _write_targets(ankle: Ankle, cubics: Vector, cycle: int, target: tuple[Pair, Pair], desired: Vector) -> None:
-    """Add what remains of the deviation at the stance change to the targets, and write the sums into `desired`."""
+    """Add the faded deviation of the stance change to the flat-foot targets, and write the sums into `desired`."""
     (angles, rates), n = target, len(desired) // 2
     for i in range(2):
         angle, rate, joint = angles[i], rates[i], ankle.joints[i]

@@ -82,7 +82,7 @@ class PidRecord:
     gains: Annotated[Vector, (3, len(JOINTS))]  # Kp [Nm/rad], Kd [Nm s/rad], and Ki times the cycle time [Nm/rad]
     limit: float  # Nm, largest absolute value of the integral torque
     integral: Annotated[Vector, len(JOINTS)]  # Nm, integral torque
-    requested: Annotated[Vector, len(JOINTS)]  # Nm, torque command with all parts, before the HAL limits it
+    requested: Annotated[Vector, len(JOINTS)]  # Nm, last torque command, with all contributions, before the limiter
 
 
 class Pid:
@@ -96,7 +96,7 @@ class Pid:
 
     def __init__(self, gains: PidGains) -> None:
         stance, swing = gains.stance, gains.swing
-        # stance leg -> gains of the left leg, gains of the right leg
+        # stance leg -> (gains of the left leg, gains of the right leg)
         roles = {LEFT: (stance, swing), RIGHT: (swing, stance)}
         #: Stance leg -> gains, shape (3, 12). The rows are Kp, Kd and Ki * PERIOD, with one column for each joint.
         self._gains_of = {

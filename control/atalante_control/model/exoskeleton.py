@@ -55,7 +55,8 @@ class ExoskeletonParameters:
 
     torso_imu: Vector3 = (-0.14, 0.0, 0.50)  # m, position of the torso IMU in the pelvis frame
     pelvis_imu: Vector3 = (-0.164, -0.015, 0.191)  # m, position of the pelvis IMU in the pelvis frame
-    tibia_imu: Vector3 = (-0.13, -0.074, 0.018)  # m, left tibia IMU: x and y from joint SK, z from joint SA
+    #: m, position of the left tibia IMU: x and y relative to joint SK, z relative to joint SA
+    tibia_imu: Vector3 = (-0.13, -0.074, 0.018)
 
     def __post_init__(self) -> None:
         for name in ("thigh_length", "shank_length"):

@@ -19,20 +19,21 @@ from atalante_hal.types import Vector
 
 Pair = tuple[float, float]
 
-#: Default of `WalkConfig.steering`: the transverse hip turns by 0.5 rad per rad of heading error, plus 0.15 rad per metre of
-#: sideways deviation from the path, but by at most 3 degrees.
+#: Default of `WalkConfig.steering`. The transverse hip turns by at most 3 degrees: by 0.5 rad per rad of heading error,
+#: plus 0.15 rad per metre of sideways deviation from the path.
 STEERING = 0.5, 0.15, math.radians(3.0)
 
 _NO_INTEGRAL = (0.0,) * 6
-#: Largest absolute value of `WalkConfig.turn` [rad]. `turn` is the angle by which the straight path of the robot turns before
-#: each periodic step. Larger angles were not tried.
+#: Largest absolute value of `WalkConfig.turn` [rad]. Larger angles were not tried.
+#: `turn` is the angle by which the straight path of the robot turns before each periodic step.
 TURN_MAX = math.radians(5.0)
 #: Gains without integral terms. With integral terms, the robot began to limp after about 120 steps in MuJoCo.
 #: The PIDs act against the ankle stabiliser, so the integral terms of the two legs drifted apart.
 WALK_GAINS = PidGains(
     stance=replace(PidGains().stance, ki=_NO_INTEGRAL), swing=replace(PidGains().swing, ki=_NO_INTEGRAL)
 )
-#: Parameters of the guide on the ground. `stiffness` is larger than in the air, because the leg carries the patient's leg.
+#: Parameters of the guide on the ground.
+#: `stiffness` is larger than in the air, because the leg of the exoskeleton also carries the leg of the patient.
 #: `hand_over` (largest deviations at the start of a step for which the guide is certified) covers the deviations after a landing.
 WALK_GUIDE = StepGuideConfig(stiffness=(4500.0, 3300.0), hand_over=HandOver(deviation=math.radians(1.0), rate=0.3))
 
@@ -51,8 +52,8 @@ class WalkConfig:
     #: With full gains and 3 cycles, the stance leg of a light patient oscillates with 50 Hz after a landing.
     damping_loss: float = 1.0 / 12.0
     impact: ImpactConfig = field(default_factory=ImpactConfig)
-    #: Each step and each weight shift begins at the measured pose, and returns to the nominal motion within this fraction of its
-    #: duration (re-centring).
+    #: Duration of the re-centring, as a fraction of the duration of the step or weight shift.
+    #: In this time, the desired motion returns from the measured pose to the nominal motion.
     alpha: float = 0.3
     #: True: the periodic steps use the control law exactly as Gurriet et al., 2019, print it, see `WalkConfig.literal`.
     #: The guide is then not certified.
@@ -67,7 +68,7 @@ class WalkConfig:
     placement: PlacementConfig = field(default_factory=PlacementConfig)  # parameters of foot placement and step timing
     lean: LeanConfig = field(default_factory=LeanConfig)  # parameters of the lean of the trunk
     flat_foot: bool = True  # whether the ankle of the swing leg holds the sole level
-    #: m/s, downward speed of a late swing foot, which has not landed at the nominal end of a step.
+    #: m/s, downward speed of a late swing foot (a swing foot that has not landed at the nominal end of the step).
     #: Value 0: start step and periodic step. Value 1: stop step.
     reach_speed: Pair = (0.3, 0.03)
     #: s, longest time for which a late swing foot moves down. Hip and knee stop earlier if the knee angle falls to `reach_knee`.
@@ -76,8 +77,9 @@ class WalkConfig:
     #: With an almost straight leg, even a slow foot needs high joint speeds. The foot is then slower than `reach_speed`.
     reach_rate: float = 2.5
     reach_knee: float = 0.05  # rad, smallest knee angle while a late swing foot moves down
-    #: Steering adds an offset to the transverse hip. Value 0: offset per heading error [rad/rad]. Value 1: offset per sideways
-    #: deviation from the path [rad/m]. Value 2: largest offset [rad]; a turn increases it by abs(`turn`).
+    #: Steering adds an offset to the transverse hip.
+    #: Value 0: offset per heading error [rad/rad]. Value 1: offset per sideways deviation from the path [rad/m].
+    #: Value 2: largest offset [rad], without a turn. A turn increases the largest offset by abs(`turn`).
     steering: tuple[float, float, float] = STEERING
     #: rad, angle by which the straight path of the robot turns before each periodic step, positive to the left
     turn: float = 0.0
@@ -85,11 +87,13 @@ class WalkConfig:
     landing_timeout: float = 0.4
     load_bandwidth: float = 35.0  # Hz, cut-off frequency of the low-pass of the vertical foot forces
     observer_bandwidth: float = 2.0  # rad/s, natural frequency of the attitude observer
-    #: True: the heading of the pelvis IMU corrects the drift of the gyro, see `walking.heading`. The IMU must have a heading
-    #: reference, such as a magnetometer. False: the estimated heading is the integral of the gyro.
+    #: True: the heading of the pelvis IMU corrects the drift of the gyro, see `walking.heading`.
+    #: For this, the IMU must have a heading reference, such as a magnetometer.
+    #: False: the estimated heading is the integral of the gyro.
     heading_reference: bool = False
     loaded: float = 0.3  # smallest load with which a standing foot counts as loaded, as a fraction of the weight
-    #: Fraction of the weight that a foot must carry so that its leg has the full stance gains. Without load, it has swing gains.
+    #: Smallest load on a foot with which the full stance gains apply, as a fraction of the weight.
+    #: With less load, the gains are between the swing gains (no load) and the stance gains.
     #: Value 0: for each leg while the robot stands. Value 1: for the ankle of the stance leg during a step.
     full_gains: Pair = (0.25, 0.5)
     settle: float = 1.0  # s, time for which both feet must be loaded before the robot walks
@@ -97,8 +101,8 @@ class WalkConfig:
     shift: float = 1.5  # s, duration of a weight shift, onto one foot or back to both feet
     rest: float = 0.3  # s, wait after each weight shift
     guide: StepGuideConfig = WALK_GUIDE
-    #: As `alpha`, but for sagittal hip and knee in a guided step. With `alpha`, their drives would reach the torque limit.
-    #: All other joints return with `alpha`. With `guided_alpha` for all joints, the robot would fall.
+    #: As `alpha`, but only for sagittal hip and knee in a guided step. With `alpha`, their drives would reach the torque limit.
+    #: For all other joints, `alpha` applies. With `guided_alpha` for all joints, the robot would fall.
     guided_alpha: float = 0.5
     #: s; at the start of a guided step, the smallest permitted weight of the backup torque falls from 1 to 0 during this time.
     #: The backup torque holds the leg inside the guide.

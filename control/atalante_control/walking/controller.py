@@ -62,8 +62,8 @@ _PELVIS, _TORSO = IMUS.index("pelvis"), IMUS.index("torso")
 _MARGIN = math.radians(1.0)
 #: Largest valid age of the message of an IMU or a foot [cycles], equal to the timeout of these messages in the DBC.
 _SENSOR_AGE = 10
-#: While one foot swings, the load on the stance foot is expected to differ from the weight by at most this fraction of the
-#: weight, because the robot accelerates.
+#: Largest expected difference between the weight and the load on the stance foot, as a fraction of the weight.
+#: While one foot swings, the two differ because the robot accelerates.
 _LOAD_ERROR = 0.15
 
 
@@ -142,7 +142,7 @@ class WalkController:
         self._forces = force.copy()
         #: Copy of the torque that the controller requested last, used if the `State` does not contain the sent torque.
         self._sent = np.zeros(_N)
-        #: `State` object whose arrays the tuples in `_measured_by` contain. None before the first `reset` or `update`.
+        #: `State` object that owns the arrays in `_measured_by`. None before the first `reset` or `update`.
         self._state: State | None = None
         self._measured = Measured(np.zeros(_N), np.zeros(_N), np.zeros(3), np.zeros(3), np.zeros(3), force, self._sent)
         #: Index of the IMU in use (pelvis or torso) -> sensor arrays that the kernels read.
@@ -255,7 +255,7 @@ class WalkController:
         return self.statistics.steps + (self.phase is Phase.STEP)
 
     def reached(self, step: int, phase: float) -> bool:
-        """Return whether the walk has reached an instant of a periodic step. The result remains True after this instant.
+        """Return whether the walk has reached a given phase of a given periodic step. The result remains True afterwards.
 
         Args:
             step: index of the step, from 0.
@@ -402,8 +402,8 @@ class WalkController:
         load = self._load.tolist()
         self._loaded = self._loaded + 1 if min(load) >= self._carrying else 0
         if phase in STEPPING:
-            # In a step, `elapsed` counts rows of the table of the desired motion. Step timing can use more or less than 1 row per
-            # cycle.
+            # In a step, `elapsed` counts rows of the table of the desired motion.
+            # The number of rows per cycle can be above or below 1, because step timing changes the speed of the step.
             elapsed = int(self._clock[0] + self._pace[0])
             swing = 1 - self._stance
             contact = contact_force(load[swing], float(self._twist[swing]))
@@ -426,8 +426,8 @@ class WalkController:
             self._stance = swing
         if phase in STEPPING:
             self._impact.start_step()
-        # In FINISH_STEP, a new step number makes the HAL hold all joints at their positions (HOLD). If the robot stood on one
-        # foot then, it would fall. So the controller keeps the step number until the robot stands on both feet.
+        # In FINISH_STEP, a new step number makes the HAL hold all joints at their positions (HOLD).
+        # A robot on one foot would then fall. So the controller keeps the step number until the robot stands on both feet.
         if phase is Phase.REST or (phase in STEPPING and not self._finishing):
             self._command.step = (self._command.step or 0) + 1
         self._command.walking = phase in WALKING

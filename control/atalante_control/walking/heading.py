@@ -33,12 +33,15 @@ class HeadingConfig(NamedTuple):
     """Parameters of the heading filter."""
 
     reference: float = 0.004  # rad, standard deviation of the error of the heading reference (magnetometer)
-    reference_time: float = 10.0  # s, the error of the heading reference changes with this correlation time
-    #: rad/sqrt(s), standard deviation of the integrated gyro noise after 1 s. The value is a noise of 0.01 deg/s/sqrt(Hz).
+    reference_time: float = 10.0  # s, correlation time of the error of the heading reference
+    #: rad/sqrt(s), standard deviation of the integrated gyro noise after 1 s.
+    #: The default corresponds to a noise density of 0.01 deg/s/sqrt(Hz).
     gyro_noise: float = 1.7e-4
     gyro_bias: float = 5.2e-5  # rad/s, standard deviation of the gyro bias at the start (0.003 deg/s)
     bias_walk: float = 1e-6  # rad/s/sqrt(s), standard deviation of the change of the gyro bias within 1 s
-    outlier: float = 5.0  # standard deviations; a measured heading is not used if its prediction is further away
+    #: Largest accepted difference between measured and predicted heading, in standard deviations.
+    #: With a larger difference, the measured heading is ignored.
+    outlier: float = 5.0
     interval: int = 100  # cycles between two updates
 
 
@@ -59,7 +62,7 @@ class HeadingFilter:
         self.reset()
 
     def reset(self) -> None:
-        """Restart the filter. The present heading counts as 0, so the estimated heading has no error at the start."""
+        """Restart the filter. The present heading is defined as 0, so the estimated heading has no error at the start."""
         config = self._config
         self._state = np.zeros(3)
         self._covariance = np.diag([0.0, config.gyro_bias**2, config.reference**2])

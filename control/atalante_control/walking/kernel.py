@@ -337,7 +337,7 @@ def act(
     if stage.assisted:
         _assist(cycle, measured, assistance, parts)
     requested = parts.pids[0].requested
-    for joint in range(len(requested)):  # `requested[:] = torque` would create an array
+    for joint in range(len(requested)):  # no `requested[:] = torque`, which would allocate an array
         requested[joint] = torque[joint]
     write_telemetry(parts.telemetry, cycle * PERIOD, not stage.double, desired, sensed.load, balance, up)
 
@@ -502,14 +502,17 @@ def _lowered(cycles: float, longest: int) -> tuple[float, float]:
         cycles: cycles since the nominal end of the step, above 0.
         longest: number of cycles after which the motion ends.
     """
-    # The downward speed rises slowly. A sudden rise would turn a foot that already touches the ground with one corner.
+    # The downward speed rises slowly. A sudden rise would tilt a foot that already touches the ground with one corner.
     time = min(cycles, float(longest)) * PERIOD
     moving = 1.0 - math.exp(-time / _REACH_RISE)
     return time - _REACH_RISE * moving, moving if cycles < longest else 0.0
 
 
 def _set_gains(constants: Constants, stage: Stage, load: Vector, pids: Records[PidRecord]) -> None:
-    """Set the PID gains of both legs. A leg with little load gets the gains of a swing leg.
+    """Set the PID gains of both legs: the more load a foot carries, the closer the gains are to the full stance gains.
+
+    While no foot swings, the rule applies to all joints of both legs. In a step, the rule applies only to the ankle of the
+    stance leg. The other joints of the stance leg have the full stance gains, and the swing leg has the swing gains.
 
     Args:
         constants: gains of swing leg and stance leg, and loads at which the full stance gains are applied.

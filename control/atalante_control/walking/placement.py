@@ -43,8 +43,8 @@ _FH, _SH, _SK = (LEG_JOINTS.index(name) for name in ("FH", "SH", "SK"))
 _SHIFTING = (_FH, _SH, _SK)
 #: Number of joints from the pelvis to the ankle.
 _LINKS = LEG_JOINTS.index("SA") + 1
-#: m3, lower limit of the absolute determinant of the ankle Jacobian. Below this limit, the leg is almost straight (singular).
-#: With an almost straight leg, the foot is not shifted further.
+#: m3, smallest absolute determinant of the ankle Jacobian with which the foot is shifted.
+#: Below this limit, the leg is almost straight (singular), and the foot is not shifted further.
 _SINGULAR = 1e-3
 #: `landing` compares `_RATES` + 1 phase rates from `slowest` to `fastest`, with a constant ratio between neighbouring rates.
 _RATES = 32
@@ -72,7 +72,7 @@ class PlacementConfig(NamedTuple):
     #: s, duration of the last part of a step, up to the nominal landing. In this part, the phase rate returns to 1.
     #: In the last part, the landing offset follows from the present DCM error, not from the predicted error (`late_landing`).
     frozen: float = 0.05
-    #: m, largest DCM error (forwards, sideways) that ankle and trunk can stop. A larger error grows until the landing.
+    #: m, largest DCM error (forwards, sideways) whose growth ankle and trunk can stop. A larger error grows until the landing.
     capacity: Pair = (0.10, 0.08)
     bandwidth: float = 25.0  # rad/s, natural frequency of the critically damped motion of the landing offset
     speed: float = 1.2  # m/s, largest speed at which the landing offset changes
@@ -129,7 +129,7 @@ def predicted(error: float, gain: float, limit: float, exponent: float) -> float
         exponent: w t, natural frequency times time to the landing.
     """
     size = abs(error)
-    linear = limit / gain if gain > 0.0 else math.inf  # error at which the shift reaches its limit
+    linear = limit / gain if gain > 0.0 else math.inf  # m, DCM error e at which k e reaches the limit L
     if size > linear:
         if size >= limit:
             return math.copysign(limit + (size - limit) * math.exp(exponent), error)

@@ -45,7 +45,7 @@ class Shift(NamedTuple):
     """
 
     q: Vector  # (12, 8) rad, joint angles
-    feedforward: Vector  # (12, 8) Nm, static torques on the ground minus the gravity torques u_g (see above)
+    feedforward: Vector  # (12, 8) Nm, static torques on the ground minus the gravity torques u_g
     centre: Vector  # (3, 8) m, centre of mass relative to the middle between the soles, in the walking frame
 
 

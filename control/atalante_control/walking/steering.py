@@ -38,7 +38,7 @@ class Steering:
         self.reset()
 
     def reset(self) -> None:
-        """Forget the last walk: both feet at the origin, no heading error."""
+        """Set the positions of both feet to the origin, and the heading error to 0."""
         self.feet.fill(0.0)
         self.yaw = self._origin = 0.0
 
@@ -93,7 +93,7 @@ class Steering:
         """
         per_yaw, per_metre, largest = self._gains
         limit = largest + abs(self._turn)
-        lag = 1.5 * self._turn  # angle by which the mean heading is behind the line in a steady turn
+        lag = 1.5 * self._turn  # rad, lag of the mean heading behind the line in a steady turn
         error = self.yaw + lag
         return -min(max(per_yaw * error + per_metre * self.lateral - self._turn, -limit), limit)
 

@@ -36,9 +36,9 @@ _SH, _SK = LEG_JOINTS.index("SH"), LEG_JOINTS.index("SK")
 
 
 class SwingLeg(NamedTuple):
-    """Model of the swing leg in one step with a fixed pelvis, and the torque w that the model leaves out."""
+    """Model of the swing leg in one step, and the torque w that a model with a fixed pelvis does not contain."""
 
-    leg: Leg  # model of sagittal hip and knee for the guide filter; its gravity torque `leg.gravity` includes w
+    leg: Leg  # model of sagittal hip and knee for the guide filter; `leg.gravity` is u_g + w
     #: (n + 1, 2) Nm, torque w of hip and knee. w carries the patient's leg and compensates the pelvis motion. Row: cycle.
     #: The controller adds w to the gravity torque of the exoskeleton in the measured pose.
     unmodelled: Vector

@@ -42,7 +42,7 @@ class Telemetry:
     # The controller reads the fields from `error` to `gate` as one vector.
     error: Annotated[Vector, 2]  # rad, q - q_des of sagittal hip and knee in the last cycle with a guide (swing leg)
     q_bound: Annotated[Vector, 2]  # rad, largest tracking error inside the guide, in the direction of `error`
-    h: float  # safety value h of the paper: at least 0 if the stiff backup torque can keep both joints inside the guide
+    h: float  # safety value h of the paper: at least 0 if the backup policy can keep both joints inside the guide
     gate: float  # weight of the backup torque, 0 (free motion) to 1 (full backup torque); published as `lambda`
 
 
