@@ -106,9 +106,7 @@ class Constants(NamedTuple):
     weight: float  # N, weight of robot and patient
     keep: float  # weight of the previous value in the low-pass of the foot forces, 0 to 1
     standing_gains: float  # N, while standing: smallest load on a foot with which its leg has the full stance gains
-    walking_gains: (
-        float  # N, in a step: smallest load on the stance foot with which its ankle has the full stance gains
-    )
+    walking_gains: float  # N, in a step: smallest load with which the stance ankle has the full stance gains
     gains: Vector  # (2, 3, 12) gains of swing leg and stance leg: Kp [Nm/rad], Kd [Nm s/rad], Ki times the cycle time [Nm/rad]
     placement: PlacementConfig  # parameters of foot placement and step timing
     lean: LeanConfig  # parameters of the lean
