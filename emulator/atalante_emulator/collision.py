@@ -14,7 +14,7 @@ from atalante_hal.wire.frame import Frames
 
 
 class Senders:
-    """Detector of two senders of one message.
+    """Detector of a message that two nodes send.
 
     The emulator runs the detector only in cycles with missing, rejected, late or extra frames.
     """
@@ -25,7 +25,7 @@ class Senders:
         self._last_cycle = -1
 
     def are_two(self, frames: Frames, cycle: int) -> bool:
-        """Return whether frames received in a cycle show two senders of the message.
+        """Return whether the frames received in a cycle show that two nodes send the message.
 
         Args:
             frames: all frames received in the cycle, in the order of reception, shape (n,). Other messages are ignored.

@@ -53,7 +53,7 @@ class DriveParameters:
     #: The HAL can acknowledge an over-temperature error at this winding temperature or below [degC].
     cool_enough: float = 100.0
     supply: float = 48.0  # nominal supply voltage [V]
-    hold_below: float = 40.0  # a drive with less supply voltage stops following commands and holds its joint [V]
+    hold_below: float = 40.0  # below this supply voltage [V], a drive stops following commands and holds its joint
     #: If two successive encoder samples show a higher joint speed [rad/s], a drive that holds its joint assumes an encoder jump.
     jump_speed: float = 20.0
     off_below: float = 20.0  # lowest supply voltage at which the power stage works [V]
@@ -123,8 +123,8 @@ class Drives:
         #: The last controlwords of all drives, as bytes, if they changed no drive state and no error. Otherwise empty.
         #: When the HAL sends the same bytes again, the drives need not evaluate them.
         self._steady = b""
-        #: Joint position at which each drive holds its joint [rad]; NaN from a change of the drive state to the next torque, and
-        #: before the first encoder sample.
+        #: Joint position at which each drive holds its joint [rad]; NaN before the first encoder sample.
+        #: A change of the drive state sets the position to NaN. The next torque computation sets it to the measured position.
         self._hold_at = np.full(len(JOINTS), np.nan)
         self._target, self._limit = np.zeros((2, len(JOINTS)))
         self._own_limit = robot.torque_max.copy()  # torque limit of each drive at the current winding temperature [Nm]
@@ -213,11 +213,14 @@ class Drives:
         # Use the encoder velocity without low-pass: the delay of a low-pass would reduce the damping of the hold.
         speed = self.encoders.speed
         jumped = np.abs(speed) > self.parameters.jump_speed
-        if jumped.any():  # the encoder jumped, not the joint: move the hold position with it, so that the torque stays
+        # A joint speed above `jump_speed` means that the encoder jumped, not the joint.
+        # The hold position is then shifted by the jump, so that the torque does not change.
+        if jumped.any():
             self._hold_at[jumped] += speed[jumped] * PERIOD
             speed[jumped] = 0.0
+        # The measured position already contains a jump of this cycle, so a new hold position is set after the shift above.
         begins = np.isnan(self._hold_at)
-        if begins.any():  # after the line above, because a jump in this cycle is already in this position
+        if begins.any():
             self._hold_at[begins] = self.encoders.angle[begins]
         hold = robot.hold_kp * (self._hold_at - self.encoders.angle) - robot.hold_kd * speed
         np.clip(hold, -limit, limit, out=hold)
@@ -306,7 +309,7 @@ class Drives:
         self.errors.end(drive, code)
         if not self.latched[drive] and self.state[drive] not in _FAULTY:
             self.errors.acknowledge(drive)
-        # Forget the stored controlwords: the same controlwords had no effect before, but can now acknowledge the error.
+        # Delete the stored controlwords. They had no effect before, but the same controlwords can now acknowledge the error.
         self._steady = b""
 
     def leave(self, drive: int, state: DriveState) -> None:
@@ -382,7 +385,7 @@ class Drives:
             return False  # the cause of an error persists, so the HAL cannot acknowledge the error
         if after is DriveState.OPERATION_ENABLED is not state and self._enabling[drive] < self.enable_delay[drive]:
             self._enabling[drive] += 1
-            return True  # counting is an effect: the caller must evaluate the same controlword again in the next cycle
+            return True  # True: the caller must evaluate the same controlword again in the next cycle
         self._enabling[drive] = 0
         acknowledged = after is not state and state is DriveState.FAULT
         if latched and (after is not state or word == Controlword.QUICK_STOP):

@@ -22,8 +22,9 @@ TWO_SENDERS: Final = 0x8150  # identifier collision: two nodes send the same com
 COMMAND_REJECTED: Final = 0x8200  # protocol error: command with wrong CRC, length or value range
 COMMAND_TIMEOUT: Final = 0x8250  # command timed out
 
-#: First hex digit of an error code (its class) -> error register of CiA 301. Bit 0 means "any error".
-#: One more bit names the class: 1 current, 2 voltage, 3 temperature, 4 communication (0x8), 5 device profile (0x7).
+#: Class of an error code (its first hex digit) -> value of the CiA 301 error register.
+#: In each value, bit 0 means "any error". A second bit stands for the class:
+#: bit 1 current (0x2), bit 2 voltage (0x3), bit 3 temperature (0x4), bit 4 communication (0x8), bit 5 device profile (0x7).
 _REGISTER: Final = {0x2: 0x03, 0x3: 0x05, 0x4: 0x09, 0x7: 0x21, 0x8: 0x11}
 _GENERIC: Final = 0x01
 

@@ -50,11 +50,11 @@ _RECEIVE_BUDGET = 128
 _BATCH = 128
 #: The nodes reject a command frame if `ReceiveImage` found one of these errors in the frame.
 _REJECTED = (Check.CRC, Check.LENGTH, Check.RANGE, Check.INVALID)
-#: Half of the 256 values of the alive counter. The difference of two counters is known only in the range -128 to 127.
+#: Half of the 256 values of the alive counter. Differences of two alive counters are mapped to the range -128 to 127.
 _HALF_TURN = 128
 #: The HAL sends one SYNC on each bus. After the first SYNC, the emulator waits at most this time for all other SYNCs [s].
 _SYNC_SKEW = 200e-6
-#: Largest number of missed cycles that the emulator without SYNC runs before it listens to the bus and to `stop` again.
+#: Without SYNC, `run` catches up with real time by at most this number of cycles before it polls the bus and `stop` again.
 _CATCH_UP = 20
 
 
@@ -150,7 +150,7 @@ class Emulator:
 
     @property
     def signals(self) -> Codec:
-        """Codec of the 1 ms messages of the nodes, with the index of each signal in `values` of a `before_send` callable."""
+        """Codec of the 1 ms messages of the nodes. Its signal indices apply to `values` in a `before_send` callable."""
         return self._tx.codec
 
     # -- construction ------------------------------------------------------------------------------------------------
@@ -173,7 +173,7 @@ class Emulator:
         syncs = [m for m in received if m.name.startswith("SYNC_")]
         # List the commands before the SYNCs: a HAL in the same process delivers its frames in this order.
         self._rx = ReceiveImage([m for m in received if m not in syncs] + syncs)
-        self._rx.values.fill(0.0)  # before the first command, 0 means no torque, no vibration and HAL state OFF
+        self._rx.values.fill(0.0)  # initial values: no torque, no vibration, HAL state OFF
         self._scratch = new_frames(_RECEIVE_BUDGET)
         self._scratch_from = [self._scratch[offset:] for offset in range(_RECEIVE_BUDGET)]
         #: Number of frames at the start of `_scratch` that arrived before a SYNC. The next `poll` processes these frames.
@@ -387,7 +387,7 @@ class Emulator:
         for leg, row in enumerate(self._command_rows):
             check = checks[row]
             self._commanded[leg] |= check <= Check.SOME_LOST
-            # `_check_delays` gives a command that is too late the check result IMPLAUSIBLE.
+            # If a command is too late, `_check_delays` sets its check result to IMPLAUSIBLE.
             if check in (Check.SOME_LOST, Check.IMPLAUSIBLE):
                 self.drives.warn(leg, COMMAND_LOST)
             elif check in _REJECTED:

@@ -39,7 +39,7 @@ class Kind:
     """Definition of a kind of fault: its effect, its valid targets and its parameters."""
 
     does: str  # effect of the fault as text of one line
-    targets: str  # what the fault can affect, for example "message, node or bus", or kinds of nodes: "imu or foot"
+    targets: str  # valid targets as text: types of target such as "message, node or bus", or kinds of nodes such as "imu or foot"
     parameters: Mapping[str, Parameter] = field(default_factory=dict)  # name of each parameter -> definition
     #: Whether a fault of this kind can set signals of the target message by parameters such as Position=0.3.
     signals: bool = False
@@ -306,7 +306,7 @@ class Fault:
 
 
 def _checked(kind: str, given: Mapping[str, Value]) -> tuple[tuple[str, Value], ...]:
-    """Check the given parameters of a fault. Return all its parameters as (name, value), where omitted ones have defaults."""
+    """Check the given parameters of a fault. Return all parameters as (name, value), with defaults for omitted parameters."""
     rule = KINDS[kind]
     known = rule.parameters
     for name, value in given.items():

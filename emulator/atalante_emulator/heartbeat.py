@@ -24,7 +24,7 @@ class _Status:
 
     tx: TransmitImage  # encoder of the status message: `tx.values` contains its signal values
     at: dict[str, int]  # name of each signal -> index of its value in `tx.values`
-    booted: int = 0  # cycle number at the last start of the node, the zero of the signal Uptime
+    booted: int = 0  # cycle number at the last start of the node; the signal Uptime counts from this cycle
 
 
 class Heartbeats:

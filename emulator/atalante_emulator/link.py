@@ -42,13 +42,14 @@ class _Disturbance:
 
     def __init__(self, fault: Fault, network: Network, seed: str) -> None:
         self.fault = fault
-        # A fault of kind `inject` sends copies of the last real frame. So it stores frames from one cycle before its start.
+        # A fault of kind `inject` sends copies of the last real frame.
+        # So it also receives the frames of the cycle before its start.
         self.from_cycle = fault.start - (fault.kind == "inject")
         self.messages = {message.frame_id: message for message in messages_of(fault, network)}
         self.random = random.Random(seed)
         self.late: list[_Late] = []
         self._network = network
-        self._counters: dict[int, int] = {}  # for kind `freeze_counter`: frame identifier -> alive counter that stays
+        self._counters: dict[int, int] = {}  # for kind `freeze_counter`: frame identifier -> frozen alive counter
         self._held: dict[int, Frames] = {}  # for kind `reorder`: frame identifier -> frame to send after the next frame
         self._last: Frames | None = None  # for kind `inject`: last real frame of the target message
         self._effect = _EFFECTS[fault.kind]
@@ -58,7 +59,7 @@ class _Disturbance:
         self._chance = float(dict(fault.parameters).get("p", 1.0))
 
     def frames(self, frame: Frames, cycle: int) -> Sequence[Frames]:
-        """Apply the fault to a frame, if a random draw says so. Return the frames to send instead, each of shape (1,).
+        """Apply the fault to a frame with the probability `p`. Return the frames to send instead, each of shape (1,).
 
         Args:
             frame: frame of a target message of the fault, shape (1,). The function may change this frame.
@@ -239,7 +240,8 @@ class FaultyBus(WrappedBus):
             FaultError: If the target or a signal of a fault is not in the network.
         """
         super().__init__(bus)
-        #: Set to True when a SYNC of the HAL arrives, even if a fault removes this SYNC for the nodes. The emulator resets it.
+        #: Set to True when a SYNC of the HAL arrives, even if a fault removes it before the nodes receive it. The
+        #: emulator sets it to False.
         self.synced = False
         self._clock, self._cycle, self._begun = clock, -1, -1
         self._all = [

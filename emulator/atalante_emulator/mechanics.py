@@ -31,7 +31,7 @@ class Ground:
     """Floor, crane and virtual operator of a robot with a free pelvis. The height of the floor is 0."""
 
     friction: float = FRICTION  # coefficient of friction between soles and floor
-    clearance: float = 0.03  # height of the lowest sole corner above the floor at the start, when the robot hangs [m]
+    clearance: float = 0.03  # height of the lowest sole corner above the floor at the start (robot suspended) [m]
     operator_force: float = 0.0  # largest force of the virtual operator [N]; 0 if there is no virtual operator
 
 

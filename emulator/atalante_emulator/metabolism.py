@@ -37,9 +37,10 @@ class MetabolismParameters:
     #: Metabolic rate of quiet standing [W/kg].
     #: Source: walking equation of Looney et al., Med. Sci. Sports Exerc. 51, 2019.
     standing: float = 1.44
-    #: Work of a shortening muscle per metabolic energy: 1 J of work takes 4 J (Margaria, Int. Z. Angew. Physiol. 25, 1968).
+    #: Work done by a shortening muscle per metabolic energy. The muscle uses 4 J to do 1 J of work.
+    #: Source: Margaria, Int. Z. Angew. Physiol. 25, 1968.
     positive: float = 0.25
-    #: Work absorbed by a lengthening muscle per metabolic energy: to absorb 1.2 J takes 1 J (Margaria 1968).
+    #: Work absorbed by a lengthening muscle per metabolic energy. The muscle uses 1 J to absorb 1.2 J (Margaria 1968).
     negative: float = 1.20
     #: Metabolic rate of a muscle that holds a torque of 1 Nm without motion [W/Nm]: 0.054 * 10 rad/s.
     #: The speed 10 rad/s is an assumption: the fastest possible motion of the joint.

@@ -146,10 +146,11 @@ class ActivePatient:
         # In the following arrays, index k of the dimension `cycles` is cycle k of a step. The last dimension is hip, knee.
         self._learned = np.zeros((len(SIDES), cycles, 2))  # learned torque of each leg [Nm]
         self._plan = np.zeros((cycles, 2))  # learned torque of the current swing leg [Nm]
-        self._wobble = np.ones((cycles, 2))  # factor with mean 1 on the wanted torque: 1 + noise
+        self._wobble = np.ones((cycles, 2))  # factor by which noise changes the wanted torque: 1 + noise, mean 1
         #: Nominal minus true joint angle [rad], and the rate of this error [rad/s].
         self._error, self._slope = np.zeros((cycles, 2)), np.zeros((cycles, 2))
-        #: Largest joint angle error that the patient does not perceive in each cycle [rad].
+        #: Perception threshold of the joint angle error in each cycle [rad].
+        #: It is 0 while the patient feels a vibration motor (hip: motors of the thigh, knee: motors of the shank).
         self._threshold = np.full((cycles, 2), parameters.threshold)
         self._amplitude = np.zeros(len(MOTORS)) if amplitude is None else amplitude
         # `_swing` is the swing leg (0 left, 1 right), or -1 before the first landing. With -1, no muscle acts.

@@ -54,7 +54,7 @@ class Operator:
         """
         self._starts = starts
         self._ready_for = 0
-        #: Signals that the pendant node sends. A change replaces the whole object, so the node finds a change with `is`.
+        #: Signals that the pendant node sends. Every change creates a new object, so the node detects changes with `is`.
         self.signals = PendantSignals()
         self.assist(assistance_factor)
 
@@ -76,12 +76,12 @@ class Operator:
         self._press(Request.START)
 
     def stop(self) -> None:
-        """Press the STOP button. After that, the operator no longer presses START without a call of `start()`."""
+        """Press the STOP button. From then on, the operator presses START only when `start()` is called."""
         self._starts = False
         self._press(Request.STOP)
 
     def hold(self) -> None:
-        """Press the HOLD button. After that, the operator no longer presses START without a call of `start()`."""
+        """Press the HOLD button. From then on, the operator presses START only when `start()` is called."""
         self._starts = False
         self._press(Request.HOLD)
 

@@ -32,7 +32,7 @@ class Babble:
     length: int  # payload length [bytes]
     load: float  # share of the bus time that the node tries to use, 0 to 1
     taken: float = 0.0  # wire time that the node takes in this cycle [s]
-    rest: float = 0.0  # unused part of `taken`, kept for later cycles: shorter than one frame [s]
+    rest: float = 0.0  # wire time carried over to the next cycle, because it is shorter than one frame [s]
 
     def frames(self, network: Network) -> int:
         """Return how many flood frames fit into this cycle. Messages with smaller identifiers have priority over the flood.

@@ -32,10 +32,10 @@ class Contact(NamedTuple):
 
     #: Time constant [s] and damping ratio of the spring that pushes the shapes apart.
     solref: tuple[float, float] = (0.02, 1.0)
-    #: Hardness of the contact from 0 (soft) to 1 (rigid), which MuJoCo calls impedance: first when the shapes begin to touch,
-    #: then when they are pressed deep into each other.
+    #: Hardness of the contact from 0 (soft) to 1 (rigid). MuJoCo calls this value impedance.
+    #: The first value applies when the shapes begin to touch, the second value when they are pressed deep into each other.
     solimp: tuple[float, float] = (0.99, 0.99)
-    impratio: float = 1.0  # hardness of the contact against sliding, divided by its hardness against sinking in
+    impratio: float = 1.0  # ratio of the hardness against sliding to the hardness against sinking in
 
 
 class _Sensed(NamedTuple):
@@ -59,7 +59,7 @@ class _Read(NamedTuple):
 
 
 def _unpack(sensed: _Sensed, read: _Read) -> bool:
-    """Convert the state and the sensor data of a time step. Return whether a corner touches the floor.
+    """Convert MuJoCo's data to the properties of the body. Return whether a sole corner touches the floor.
 
     Args:
         sensed: state and sensor data of MuJoCo.
@@ -232,7 +232,7 @@ def _prepare(spec: Any, free: bool, ground: float | None, friction: float, conta
         friction: coefficient of friction between soles and floor.
         contact: contact model.
     """
-    # By default, MuJoCo merges a link on a fixed joint into its parent link. IMU links would then be missing by name,
+    # By default, MuJoCo merges a link on a fixed joint into its parent link. The IMU links would then not exist as bodies,
     # and a fixed pelvis would become part of the world, without mass.
     spec.compiler.fusestatic = False
     option = spec.option
@@ -253,7 +253,7 @@ def _prepare(spec: Any, free: bool, ground: float | None, friction: float, conta
         floor.contype, floor.conaffinity = 0, 1
         shapes.append(("floor", floor))
     for _, shape in shapes:
-        shape.friction[0], shape.condim = friction, 3  # a contact has the larger friction of its two shapes
+        shape.friction[0], shape.condim = friction, 3  # MuJoCo uses the larger coefficient of the two shapes in contact
         shape.solref, shape.solimp[:2] = contact.solref, contact.solimp
     _add_sensors(spec, ground is not None)
 

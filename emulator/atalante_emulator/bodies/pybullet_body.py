@@ -78,8 +78,8 @@ class PyBulletBody:
         Raises:
             ValueError: If the text is not a URDF, or a required joint or link is missing.
         """
-        # Each body has its own PyBullet client, so that equal inputs give identical motions. Do not share a client and
-        # return to the start with `pybullet.restoreState`: the motion after this call can differ.
+        # Each body has its own PyBullet client, so that equal inputs give identical motions. A shared client would have
+        # to return to its start state by `pybullet.restoreState`, and the motion after this call can differ.
         self._client = pybullet.connect(pybullet.DIRECT)
         client = {"physicsClientId": self._client}
         pybullet.setPhysicsEngineParameter(
@@ -100,7 +100,7 @@ class PyBulletBody:
             raise
         for link in range(_BASE, self._links):
             pybullet.changeDynamics(self._body, link, linearDamping=0.0, angularDamping=0.0, jointDamping=0.0, **client)
-        # PyBullet starts with a motor in every joint that brakes the joint. A force limit of 0 turns these motors off.
+        # PyBullet gives every joint a motor, which brakes the joint by default. A force limit of 0 turns these motors off.
         pybullet.setJointMotorControlArray(
             self._body, self._joints, pybullet.VELOCITY_CONTROL, forces=[0.0] * len(JOINTS), **client
         )
@@ -254,7 +254,7 @@ class PyBulletBody:
         return pybullet.getJointStates(self._body, self._joints, self._client), self._link_states(links), contacts
 
     def _unpack(self, joints: Any, links: Any, contacts: Any) -> None:
-        # Write the twelve joints out: a loop over the joints would take twice as long.
+        # The twelve joints are unpacked without a loop, because a loop would take twice as long.
         a, b, c, d, e, f, g, h, i, j, k, m = joints
         position = a[0], b[0], c[0], d[0], e[0], f[0], g[0], h[0], i[0], j[0], k[0], m[0]
         velocity = a[1], b[1], c[1], d[1], e[1], f[1], g[1], h[1], i[1], j[1], k[1], m[1]
@@ -272,7 +272,7 @@ class PyBulletBody:
         left, right = feet
         _PACK_ATTITUDES(self._attitude_memory, 0, *left[_ATTITUDE], *right[_ATTITUDE])
         memory, pad_of, offset = self._contact_memory, self._pad_of, 0
-        # Write the components out (nx, ny, nz): unpacking the vectors with `*` would take almost twice as long.
+        # Each vector component has a name (nx, ny, nz), because unpacking with `*` would take almost twice as long.
         for _, _, _, pad, _, _, _, (nx, ny, nz), _, normal, first, (ax, ay, az), second, (bx, by, bz) in contacts:
             _PACK_CONTACT(memory, offset, pad_of[pad], nx, ny, nz, normal, first, ax, ay, az, second, bx, by, bz)
             offset += _CONTACT_BYTES
