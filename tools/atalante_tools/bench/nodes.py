@@ -39,10 +39,10 @@ TURN = 256
 #: Number of poses in the recording. The number has no common factor with 16: the HAL runs slow checks in every 16th cycle.
 #: With 16 poses, the slow checks would always read the same pose, and report constant sensor values as a fault.
 POSES = 15
-#: Largest constant part of recorded minus desired joint angle [rad].
+#: Largest constant tracking error (recorded minus desired joint angle) [rad].
 #: With such small errors, the guide filter does not saturate: its output is not at a limit.
 ERROR = 0.01
-#: Largest rate of recorded minus desired joint angle [rad/s].
+#: Largest rate of change of the tracking error [rad/s].
 ERROR_RATE = 0.05
 ASSISTANCE = 0.5
 _E2E = Struct("<HB")

@@ -227,7 +227,7 @@ def as_int64(code: int) -> int:
 
 
 def named_codes(field: Field) -> dict[int, str]:
-    """Return the value table of an integer field, with each raw code as in `as_int64`.
+    """Return the value table of an integer field as a dictionary from `as_int64(raw code)` to the name.
 
     Raw codes that the field cannot have are omitted.
     """
@@ -290,7 +290,7 @@ def crc_of_zeros(length: int, data_id: int) -> int:
 
 
 def crc_differences(frames: Frames, length: int) -> npt.NDArray[np.uint16]:
-    """Return a check value for each frame, which shows whether the CRC of the frame is right. Shape (n,).
+    """Return a check value for each frame, which equals `crc_of_zeros` if the CRC of the frame is right. Shape (n,).
 
     The check value is the received CRC, XORed with the contributions of all payload bytes to the CRC. The CRC is affine over
     GF(2), so a frame is intact if and only if the check value is `crc_of_zeros(length, data_id)`, with the Data ID of the

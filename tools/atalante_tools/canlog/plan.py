@@ -104,7 +104,8 @@ class Plan:
                 continue
             extended[frame_id] = row
             if mask != _ALL_BITS:
-                # Two messages of one J1939 parameter group are equal after masking. Such an identifier is treated as unknown.
+                # Two messages of one J1939 parameter group have the same masked identifier.
+                # This masked identifier is ambiguous, so it is treated as unknown.
                 known = groups.setdefault(mask, {})
                 known[frame_id & mask] = UNKNOWN if frame_id & mask in known else row
         self._standard = standard

@@ -13,7 +13,7 @@ from atalante_tools.canlog.plan import Plan
 from atalante_tools.canlog.validate.rules import RULE_OF
 
 Stamps = npt.NDArray[np.int64]
-#: Maximum number of findings about one unknown identifier each. The finding `OTHERS` counts all further unknown identifiers.
+#: Maximum number of unknown identifiers with their own finding. One finding `OTHERS` counts all further unknown identifiers.
 MAX_UNKNOWN_IDS = 100
 OTHERS = "(others)"
 #: Rules for which `MAX_UNKNOWN_IDS` limits the number of findings.
@@ -37,7 +37,8 @@ class Finding:
     @property
     def first_s(self) -> float:
         """Return the time stamp of the first violation in the log [s]."""
-        return self.first / 10**9  # the division of two integers is rounded only once
+        # Python rounds the quotient of two integers once. The divisor 1e9 would round the time stamp to float first.
+        return self.first / 10**9
 
     @property
     def last_s(self) -> float:

@@ -26,7 +26,7 @@ _TIMING = ("cycle-mean", "cycle-jitter", "cycle-gap", "cycle-fast", "timeout", "
 
 
 def write_html(results: Sequence[Report | Unread], path: Path) -> None:
-    """Write the reports of all logs into one HTML file. A log that was not read has only its reason."""
+    """Write the reports of all logs into one HTML file. For a log that was not read, write only the reason."""
     parts = [part for result in results for part in (_unread(result) if isinstance(result, Unread) else _log(result))]
     parts += ["<h2>Rules</h2>", _rules()]
     path.write_text(page("atalante validate", "CAN log against DBC", parts), encoding="utf-8")

@@ -61,7 +61,7 @@ class LoadRules:
         self._busy: list[npt.NDArray[np.float64]] = []
         #: Start time of each time window with at least one frame [s], set by `finish`. Shape (windows,).
         self.begins: npt.NDArray[np.float64] = np.zeros(0)
-        #: Bus load in each time window, set by `finish`. Frames that fill a whole window give 1.0. Shape (windows, buses).
+        #: Bus load in each time window, set by `finish`; 1.0 if frames fill the whole window. Shape (windows, buses).
         #: The first columns of `load` are the buses of the DBC. The further columns are log channels, for frames without a bus.
         self.load: npt.NDArray[np.float64] = np.zeros((0, len(plan.buses)))
 
@@ -86,7 +86,7 @@ class LoadRules:
         return wire_time(layout.extended, fd, switch, layout.length, self._nominal, self._data)
 
     def expected(self, bus: int) -> float | None:
-        """Return the largest bus load that the DBC allows. Frames without a pause give 1.0.
+        """Return the largest bus load that the DBC allows. A load of 1.0 means frames without a pause.
 
         A cyclic message is sent once per cycle time. Any other message is sent at most once per inhibit time.
 

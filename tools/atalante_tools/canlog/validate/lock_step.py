@@ -29,7 +29,7 @@ PAUSE_NS: Final = 200_000_000
 #: A restart of the HAL or a damaged SYNC frame makes the cycle number jump, so the increase is then not plausible.
 MOST_STEPS: Final = 1000
 #: The new stamps of consecutive frames in a cycle are `_SPACING_NS` apart [ns]: 0 for SYNC, then 1000, 2000 and so on.
-#: `_LAST` limits the new stamps: no frame is stamped later than `_LAST` (0 to 1) times the cycle time after SYNC.
+#: The largest new stamp in a cycle is `_LAST` times the cycle time, counted from SYNC.
 _SPACING_NS, _LAST = 1000, 0.7
 
 
