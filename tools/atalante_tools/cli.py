@@ -14,7 +14,7 @@ import click
 from atalante_tools.console.outcome import INTERRUPTED, InvalidUsage, failure_of
 from atalante_tools.entry import main as main
 
-#: Command name -> module in `atalante_tools` that defines the command, and line of the command in `atalante --help`.
+#: Command name -> module in `atalante_tools` that defines the command, and its one-line description in `atalante --help`.
 COMMANDS = {
     "demo": ("commands.demo", "Run all parts in one command: an emulated robot walks in virtual guides."),
     "airwalk": ("commands.airwalk", "Walk in the air inside one virtual guide, on any bus."),
@@ -59,7 +59,7 @@ class Commands(click.Group):
             formatter.write_dl([(name, line) for name, (_, line) in COMMANDS.items()])
 
     def main(self, *args: Any, **kwargs: Any) -> Any:
-        """Run the command line. Replace an error of the output file of `--help` and `--version` by one sentence."""
+        """Run the command line. If the output of `--help` or `--version` cannot be written, print one sentence and exit."""
         try:
             return super().main(*args, **kwargs)
         except OSError as error:

@@ -42,7 +42,7 @@ def main() -> NoReturn:
 
 
 def _made_from_stop(error: BaseException) -> bool:
-    """Return whether a library raised `error` because of `Stopped`."""
+    """Return whether `error` is `Stopped`, or was raised as a consequence of `Stopped`."""
     cause: BaseException | None = error
     while cause is not None:
         if isinstance(cause, Stopped):

@@ -244,10 +244,10 @@ def _python_can(machine: Machine, interface: str, channels: Sequence[str]) -> It
 
 
 def facts(adapter: Adapter) -> str:
-    """Return the known facts about an interface as text for the terminal.
+    """Return a description of a CAN interface as text for the terminal: CAN FD support, installation, channel, timestamps.
 
     Args:
-        adapter: Facts about the interface.
+        adapter: Properties of the interface.
     """
     rows = [
         ("CAN FD", "yes" if adapter.can_fd else "no: it cannot be used"),

@@ -18,8 +18,9 @@ from atalante_hal.wire.e2e import COUNTER_BYTE, check_counter
 from atalante_hal.wire.frame import Frames, new_frames
 from atalante_tools.session.takeover import PendantReader, Takeover
 
-#: The emulated pendant stops for another pendant. It sends again after 12 cycles without frames of another pendant.
-#: If both pendants are silent, the pendant in another process sends first, after only 3 cycles (`takeover.QUIET_CYCLES`).
+#: The emulated pendant stops sending when another pendant sends. As long as it has not given up (`takeover.LOST_FRAMES`),
+#: it resumes sending after this number of cycles without a frame of another pendant.
+#: A pendant in another process waits only 3 cycles (`takeover.QUIET_CYCLES`). So if both are silent, it resumes first.
 PENDANT_QUIET: Final = 12
 #: A second robot is reported if a message of an emulated node, such as LEFT_SH_STATE, is received 3 times in a row.
 #: The alive counters of these 3 frames must increase. Messages of a pendant do not count.

@@ -29,7 +29,7 @@ class NodeReport:
 
     node: str
     kind: str
-    #: Time since the last frame of a message that the node sends at its highest rate [ms]. None before the first such frame.
+    #: Time since the last frame of the node [ms]. Only its messages with the shortest period count. None before the first frame.
     age_ms: int | None
     late: bool  # whether `age_ms` exceeds the message timeout in the DBC
     state: str | None

@@ -15,8 +15,8 @@ from atalante_tools.console.terminal import print_message, show_json
 if TYPE_CHECKING:
     from atalante_hal.types import State
 
-#: A vibration shorter than this time [s] is not checked. In 0.1 s, the slowest accepted motor reaches 80 % of its level.
-#: `atalante conform` accepts motors with a time constant of up to 0.06 s.
+#: The measured level is checked only if the vibration lasts at least this time [s].
+#: The slowest motor that `atalante conform` accepts has a time constant of 0.06 s. In 0.1 s it reaches 80 % of its level.
 _CHECKED: Final = 0.1
 #: The command fails if the measured level stays below this share of the commanded level.
 _REACHED: Final = 0.5

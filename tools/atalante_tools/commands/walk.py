@@ -222,9 +222,7 @@ def command(
         _require_speed_changes(law, files)
     if protocol is not None:
         if xi == 1.0:
-            raise click.UsageError(
-                "--protocol ends with the assistance factor --xi, which must be below 1, got 1: add --xi"
-            )
+            raise click.UsageError("the assistance factor at the end of --protocol must be below 1, got 1: add --xi")
         steps = sum(protocol)
     subject = _subject(patient, step_length, step_duration)
     options = WalkOptions(

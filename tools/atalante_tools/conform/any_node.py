@@ -353,7 +353,7 @@ def _statuses(tester: NodeTester, received: list[ReceivedFrame] | None = None) -
 
 
 def _answered(tester: NodeTester, received: list[ReceivedFrame], cycles: int) -> Outcome:
-    """Return an outcome that passes if the node sent its state frame in every period.
+    """Return the outcome of a test of the state frames. The test passes if the node sent one state frame in each period.
 
     With a period of 1 ms, exactly one state frame must answer each SYNC. With a longer period, each gap between two state
     frames may deviate from the period by at most half a period, and at least `cycles // period - 1` state frames are required.

@@ -61,7 +61,8 @@ def ignores_invalid_codes(tester: NodeTester) -> Outcome:
     for quantity in ("Controlword", "TargetTorque", "MaxTorque"):
         code = message.signal(axis.signal(quantity)).invalid_raw
         assert code is not None
-        # The invalid code of MaxTorque is a large torque. A drive that uses it as limit produces the target torque and fails.
+        # The invalid code of MaxTorque, decoded as a number, is a large torque.
+        # A drive that uses this number as its torque limit produces the target torque, and fails the test.
         limit, target = tester.limits.torque / 3.0, tester.limits.torque
         received = axis.run(6, _C.ENABLE_OPERATION, 0.0, limit)[2 * SHOWN :]
         for _ in range(2):

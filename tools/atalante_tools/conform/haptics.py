@@ -17,8 +17,9 @@ from atalante_tools.conform.node_tester import NodeTester, NotTested
 from atalante_tools.conform.requirement import Outcome, Requirement
 
 E2E: Final = "AUTOSAR E2E Profile 5"
-#: Amplitudes and levels are 0 (off) to 1 (strongest). A motor fails if its time constant is larger than this time [s].
+#: A motor fails the test HAPTICS-02 if its time constant is larger than this time [s].
 TIME_CONSTANT = 0.06
+#: Amplitudes and levels are numbers from 0 (off) to 1 (strongest).
 #: In HAPTICS-02, -04 and -05, an amplitude may deviate from the expected amplitude by at most this number.
 #: In HAPTICS-02, the expected amplitudes are an exponential curve that is fitted to the measured amplitudes.
 LAG = 0.05
@@ -157,7 +158,7 @@ def moves_one_motor(tester: NodeTester) -> Outcome:
 
 
 def stays_in_range(tester: NodeTester) -> Outcome:
-    """Test HAPTICS-05: with a level above the DBC range, the amplitude of a motor stays at 0.5 or rises to at most 1."""
+    """Test HAPTICS-05: if the level rises from 0.5 to a code above the DBC range, the amplitude stays between 0.5 and 1."""
     found, passed = [], True
     for code in (201, 230, 254):
         _settle(tester, 0.5)

@@ -235,13 +235,13 @@ class NodeTester:
         return self.sync.frame(cycle, counter=counter, length=length, classic=classic, flip=flip)
 
     def _send(self, frames: Frames) -> None:
-        # `_outboxes[n]` is the only array in which n frames are sent, because a bus caches views of each array object.
+        # Reuse one array per number of frames: a bus caches every array object that it sends.
         outbox = self._outboxes.setdefault(len(frames), new_frames(len(frames)))
         as_words(outbox)[:] = as_words(frames)
         try:
             self._bus.send(outbox)
         except BusFull:
-            # Normal while the node is switched off: no node acknowledges frames, so the transmit queue is full.
+            # A full transmit queue is expected while the node is switched off, because no node acknowledges the frames.
             return
 
     def _listen(self, timeout: float) -> None:

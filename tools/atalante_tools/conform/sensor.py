@@ -19,7 +19,7 @@ _MEASURED: Final = 100
 NORM: Final = 1e-3  # the length of a quaternion may differ from 1 by at most this number
 #: Largest difference between the magnitude of the mean acceleration and `GRAVITY` [m/s2].
 SPECIFIC_FORCE: Final = 0.3
-#: Accelerometer and quaternion of a resting IMU both give the upward direction. Largest angle between them [rad].
+#: For an IMU at rest: largest angle between the upward directions that accelerometer and quaternion give [rad].
 TILT: Final = math.radians(3.0)
 #: Largest difference between the rate of the gyro and the angular rate computed from the quaternions [rad/s].
 RATE: Final = 0.05

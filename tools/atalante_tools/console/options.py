@@ -101,7 +101,7 @@ class OutputFile(click.Path):
         return path
 
 
-#: A length that the user types is in centimetres from this number on, and in metres below: 175 is 175 cm, 1.75 is 1.75 m.
+#: A length of at least this number is read as centimetres, a smaller length as metres: 175 is 175 cm, 1.75 is 1.75 m.
 _CENTIMETRES: Final = 5.0
 
 #: Default step length [m] and default step duration [s] of a patient.

@@ -70,8 +70,8 @@ def _check_names(build: Build) -> None:
     file = f"{build.name}.c"
     if not build.name[0].isalpha() or file == _HOST_TEST:
         raise Failed(
-            f"name of the DBC file must begin with a letter and give another C file than {_HOST_TEST}, because it is the prefix "
-            f"of all names in C, got {file}: rename the DBC file"
+            f"name of the C file must differ from {_HOST_TEST}, and must begin with a letter because all C names begin with it, "
+            f"got {file}: rename the DBC file"
         )
     _check_distinct("messages", [m.name for m in build.messages])
     for message in build.messages:
@@ -100,7 +100,9 @@ def _check_distinct(what: str, names: list[str]) -> None:
 def _check_makefile(path: Path, first_line: str) -> None:
     """Raise `Failed` if the file exists and does not begin with the first line of a generated Makefile."""
     if path.exists() and not path.read_bytes().startswith(first_line.encode()):
-        raise Failed(f"{path} must be absent or generated, got another Makefile: choose another folder with --output")
+        raise Failed(
+            f"{path} must be a generated file if it exists, got another Makefile: choose another folder with --output"
+        )
 
 
 def _cantools(build: Build) -> tuple[str, str]:

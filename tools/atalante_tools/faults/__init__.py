@@ -160,7 +160,7 @@ def _counts(counts: dict[str, int]) -> str:
     "--endurance/--no-endurance",
     default=True,
     show_default=True,
-    help="Also measure how long each fault that may be permanent can last before the robot stops walking.",
+    help="Also measure, for each fault that can be permanent, the longest fault duration that does not stop the walk.",
 )
 @click.option(
     "--out",
@@ -225,7 +225,7 @@ def _done(tasks: Sequence[Task], *, engine: str, jobs: int = 1, dask: str = "") 
     from atalante_tools.faults.campaign import results
     from atalante_tools.session.body import require_engine
 
-    if not dask:  # on a cluster, the engine is needed only on the workers
+    if not dask:  # with dask, only the workers need the physics engine
         require_engine(engine)
     progress = Progress()
     try:

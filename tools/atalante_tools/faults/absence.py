@@ -39,7 +39,7 @@ class Absence:
         late = self._clock.wait()
         if self._emulator.cycle > self._seen:
             self._alone = 0
-        # One nanosecond of tolerance, because the sum of the delays is rounded.
+        # Add 1 ns, because rounding may put the sum of the delays just below a whole number of periods.
         due = self._begun + int((self._skipped + late + 1e-9) / PERIOD)
         while self._emulator.cycle < due:
             if self._alone < WATCHDOG:

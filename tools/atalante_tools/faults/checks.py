@@ -138,7 +138,9 @@ def nothing_sags(run: Observation) -> str | None:
 
 
 def encoders_keep_their_reference(run: Observation) -> str | None:
-    """Check that no encoder jump is reported. After a jump, the HAL would not use the encoder until its drive restarts.
+    """Check that the HAL reports no encoder jump.
+
+    After a reported jump, the HAL does not use the encoder until the encoder jumps back or its drive restarts.
 
     Args:
         run: observation of the run.

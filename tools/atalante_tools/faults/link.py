@@ -302,8 +302,8 @@ SCENARIOS: Final = (
         ),
         permanent=Case("permanent", (Fault("flags", _STATE, flags=_ERROR_PASSIVE),)),
     ),
-    # A second sender repeats the last frame of a node, with other signals and with `ahead` added to the alive counter.
-    # If `ahead` is 1, the node's next frame has the same counter. If `ahead` is 0, the node's last frame has the same counter.
+    # A second sender copies the last frame of a node, changes signals of the copy, and adds `ahead` to its alive counter.
+    # If `ahead` is 1, the copy has the counter of the node's next frame. If `ahead` is 0, it has the counter of the last frame.
     Scenario(
         "F58",
         (

@@ -67,9 +67,10 @@ _PAUSE: Final = 50
 _STOPPED: Final = 60
 #: Number of cycles from the operator's STOP to the START that restarts the walk.
 _RESTART: Final = 200
-#: Longest wait for the end of a fault [cycles]. The run goes on after this wait, even if the fault is permanent.
+#: Longest wait for the end of a fault [cycles]. The run continues after this wait, even if the fault is permanent.
 _LONGEST: Final = 400
-#: Smallest number of cycles from the end of the wait for the fault to the next press of START.
+#: Number of cycles to the next press of START, from the end of the wait for the fault (`_LONGEST`), or from the last START of
+#: the schedule if that START is later.
 _REST: Final = 60
 #: Number of cycles from the second press of START after the fault to the end of the run.
 _END: Final = 300
@@ -130,7 +131,8 @@ class Extremes:
     speed: Extreme  # joint velocity divided by the velocity limit of the joint
     torque_step: Extreme  # change of the commanded torque in one cycle [Nm]
     sag: Extreme  # motion of a joint during a start [deg], measured as in `SAG_MAX`
-    lost: Extreme  # distance of a joint from its position in the first cycle after the walk [deg], until the robot walks again
+    #: distance of a joint from its position in the first cycle after the walk [deg], measured until the robot walks again
+    lost: Extreme
 
 
 @dataclass(frozen=True)
@@ -172,8 +174,8 @@ class MomentTask:
         starts = [cycle for cycle in presses if cycle >= min(begins, default=math.inf)]
         unlimited = [range(cycle, cycle + FOUND) for cycle in (*begins, *starts)]
         failures = [*limit_violations(run, unlimited, _strength(stimuli)), *_premature(run, plan.starts[0])]
-        # `automatic_improvements` requires that the HAL receives START before the fault begins. At BOOT and READY, the fault
-        # begins before the first START, and may delay the effect of START.
+        # `automatic_improvements` is valid only if the HAL receives START before the fault begins.
+        # At BOOT and READY, the fault begins before the first START, and may delay the effect of START.
         if self.moment not in (Moment.BOOT, Moment.READY):
             failures += automatic_improvements(run, before, plan.starts)
         failures += _sag_violations(_sag(run, plan.starts), _sag_limits(stimuli))
@@ -229,7 +231,7 @@ def _observe(case: Case, plan: Schedule) -> Observation:
 
 
 def _strength(stimuli: Sequence[Stimulus]) -> Vector:
-    """Return the largest torque of each motor, divided by the torque of a motor without fault, shape (12,).
+    """Return the factor by which motor faults can increase the torque of each motor, at least 1, shape (12,).
 
     Args:
         stimuli: faults and actions of the run.

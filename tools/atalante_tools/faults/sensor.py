@@ -18,9 +18,9 @@ _KNEE: Final = "LEFT_SK"
 _STILL: Final = "RIGHT_FH"
 _IMUS: Final = tuple(f"IMU_{name.upper()}" for name in IMUS)
 _FEET: Final = tuple(f"FOOT_{name.upper()}" for name in FEET)
-#: Probability that a frame arrives twice. The HAL tolerates this value permanently, but no value above 0.2.
+#: Probability that a frame arrives twice. The HAL tolerates this probability permanently. Above 0.2, it reports a fault (F63).
 _OFTEN: Final = 0.15
-#: Name for a test case -> permanent communication fault during which the HAL must still detect a drifting encoder.
+#: Part of a case name -> permanent communication fault during which the HAL must still detect a drifting encoder.
 #: Two of the delayed messages, from a joint drive and from the pelvis IMU, are inputs of the sensor checks.
 #: Frames are doubled at random, because the HAL stops the walk if a message arrives twice in every cycle (fault F63).
 _TOLERATED: Final = {
@@ -102,7 +102,7 @@ def _never_ready(name: str, fault: Fault, *, node: str) -> Case:
     )
 
 
-#: Raw value of the CAN signal Position with which a drive reports: the position is invalid.
+#: Raw value of the CAN signal Position with which a drive reports an invalid position.
 _INVALID_CODE: Final = 1 << 23
 
 SCENARIOS: Final = (
@@ -157,7 +157,7 @@ SCENARIOS: Final = (
                 # 22.5 mrad is the largest joint motion that the HAL accepts within five cycles, and each jump is larger.
                 for by in (0.025, -0.025, 0.1, -1.0)
             ),
-            # The hold begins in the cycle in which the encoder jumps back.
+            # The drives begin to hold their position in the cycle in which the encoder jumps back.
             *(
                 Case(f"{1e3 * by:g} mrad for 5 cycles", (Fault("encoder_jump", _STILL, 0, 5, by=by),), node=_STILL)
                 for by in (0.3, -0.3)
@@ -223,8 +223,9 @@ SCENARIOS: Final = (
             for cell, force in zip(CELLS, (400.0, 0.0, -50.0, 61.0), strict=True)
         ),
     ),
-    # The robot hangs in the air. Injected foot forces simulate that both feet stand. Fault F34 (no contact) begins when the
-    # injected forces end. After 140 cycles without contact, the HAL takes the robot as lifted on purpose, and F34 ends.
+    # The robot is suspended. Injected foot forces simulate that both feet are on the ground.
+    # Fault F34 (both feet report swing) begins when the injected forces end.
+    # After 140 cycles without ground contact, the HAL regards the robot as lifted on purpose, and F34 ends.
     Scenario(
         "F34",
         tuple(
@@ -286,9 +287,9 @@ SCENARIOS: Final = (
                 recovers=False,
                 checks=(start_is_rejected,),
             ),
-            # The controller compensates the drift of the encoder by moving the real joint the other way, to the end stop.
-            # POSITION_RANGE: the reported position leaves its range. TORQUE_MOTION: the joint does not follow its
-            # torque, as with a dead motor.
+            # The encoder drifts, so the controller moves the real joint the other way, to its end stop.
+            # POSITION_RANGE: the reported position leaves its range.
+            # TORQUE_MOTION: the torque does not move the joint, as with a dead motor.
             Case(
                 "RIGHT_SA at 2 rad/s",
                 (Fault("encoder_drift", "RIGHT_SA", rate=2.0),),

@@ -17,7 +17,7 @@ from atalante_tools.console.terminal import table
 
 #: Maximum number of unchecked items that the text report lists per reason. The HTML report lists all unchecked items.
 _NAMES = 12
-#: Characters that XML 1.0 does not allow. They can be in the name of a log and in a text that quotes the log.
+#: Characters that XML 1.0 does not allow. The name of a log, or text quoted from a log, may contain such characters.
 _NOT_IN_XML = re.compile(r"[^\t\n\r\x20-\ud7ff\ue000-\ufffd\U00010000-\U0010ffff]")
 
 

@@ -21,7 +21,8 @@ from atalante_tools.canlog.stream import Stream
 from atalante_tools.canlog.validate.findings import Findings
 from atalante_tools.canlog.validate.project import Project
 
-#: The value table of a field up to this length [bit] becomes a lookup array. A longer field has a list of valid codes.
+#: The value table of a field of at most this length [bit] is stored as a lookup array over all raw codes.
+#: The value table of a longer field is stored as a list of the valid codes.
 _TABLE_BITS = 16
 _WORD = 64
 _HASH_BITS = 32
@@ -225,8 +226,9 @@ class _FamilyChecks:
         self.limited = np.array(list(self.bounds), np.intp)
         self.low = np.array([low for low, _ in self.bounds.values()], np.int64)
         self.high = np.array([high for _, high in self.bounds.values()], np.int64)
-        #: Field index -> raw code that means "no value", for all fields whose limits do not exclude this code. All values of
-        #: the other fields are checked if the code occurs: it is outside the limits, or the field is in `special`.
+        #: Field index -> raw code that means "no value". `_check_limits` searches the frames for each of these codes.
+        #: A field is left out if its limits exclude the code, because the check of the limits then finds the code.
+        #: A field in `special` is also left out, because all its values are checked.
         self.coded = {
             p: code
             for p, f in fields
@@ -298,7 +300,7 @@ def _float_limits(limits: Field) -> tuple[float, float]:
 
 
 def _as_sent(limits: Field, value: float) -> float:
-    """Return the physical value in a frame after a sender rounded it to the float format of the field.
+    """Round a physical value to the precision of the field's float format, as a sender does, and return the result.
 
     A value that is too large for the format is returned unchanged.
     """

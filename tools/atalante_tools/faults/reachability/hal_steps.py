@@ -51,7 +51,7 @@ QUALIFICATIONS: Final = {
 #: Last frame that the HAL checked for a press of a button: no frame, the last accepted frame, an earlier frame, or a frame of a
 #: second sender. If the next frame has another RequestCounter than the checked frame, a button was pressed.
 _NONE, _LATEST, _OLDER, _ROGUE = range(4)
-#: `_NONE`, `_LATEST`, `_OLDER` or `_ROGUE` -> RequestCounter (counter of button presses) in that frame.
+#: `_NONE`, `_LATEST`, `_OLDER` or `_ROGUE` -> RequestCounter (counter of button presses) in the checked frame.
 _EVALUATED: Final = {_NONE: None, _LATEST: _PRESSES, _OLDER: _PRESSES - 1, _ROGUE: _ROGUE_PRESSES}
 
 
