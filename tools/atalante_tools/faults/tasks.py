@@ -35,7 +35,7 @@ from atalante_tools.faults.verdict import (
 HORIZON: Final = 1000
 #: Number of cycles between the first and the second fault of a pair.
 PAIR_DELAY: Final = 3
-#: Test cases of which a campaign runs every pair: (fault ID, name of a test case of this fault).
+#: Test cases for runs with two faults, as (fault ID, name of the test case). A campaign with pairs runs every pair of them.
 REPRESENTATIVES: Final = (
     ("F03", "4 frames"),
     ("F04", "LEFT_SK"),
@@ -223,7 +223,7 @@ def _case_of(id_: str, name: str) -> Case:
 
 
 def limited(stimulus: Stimulus, cycles: int) -> Stimulus:
-    """Return a fault or action that ends: a permanent fault or action is limited to `cycles` cycles."""
+    """Limit a permanent fault or action to `cycles` cycles. Return any other fault or action unchanged."""
     if stimulus.cycles is not None:
         return stimulus
     if isinstance(stimulus, Fault):

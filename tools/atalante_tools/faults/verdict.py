@@ -78,7 +78,8 @@ class Verdict:
     id: str
     case: str
     state: str  # state of the HAL just before the operator presses START
-    #: cycles from fault to reaction; without reaction: from fault to diagnostic; without both: None
+    #: Number of cycles from the fault to the reaction. If the HAL did not react, number of cycles to the diagnostic.
+    #: None if the HAL neither reacted nor reported the diagnostic.
     cycles: int | None
     bound: int  # time limit for `cycles`
     dtc: str  # first reported diagnostic code that matches the expected code

@@ -54,7 +54,7 @@ def levels_of(text: str) -> tuple[float, ...]:
 
 
 def lengths_of(text: str) -> tuple[float, ...]:
-    """Convert the text of a grid option to lengths [m], for example "0.15,20" to (0.15, 0.2).
+    """Convert the text of a grid option to lengths [m], for example "0.15,20" (0.15 m and 20 cm) to (0.15, 0.2).
 
     A number below 5 is in metres, any other number is in centimetres.
 

@@ -25,7 +25,8 @@ if TYPE_CHECKING:
     from atalante_control.gait.subject import Subject
     from atalante_tools.guide.promise_check import Checked, Effort, Verdict
 
-#: Names of the conditions, copied from `promise_check.CONDITIONS` because the help must not import the slow controller.
+#: Values of the option --condition. They are a copy of the keys of `promise_check.CONDITIONS`.
+#: The help text does not import that module, because the import of the controller is slow.
 CONDITION_NAMES = ("model", "friction", "mass", "both", "noise", "loss", "delay")
 #: Assistance factors Xi that are checked if the user gives no option --xi.
 FACTORS = (0.0, 0.25, 0.5, 0.75, 0.9, 0.95, 0.99)
@@ -134,7 +135,10 @@ def check(options: CheckOptions, as_json: bool, subject: Subject | None) -> None
              atalante guide check --patients --results all.jsonl --table all.md
     """
     if options.plot is not None and options.results is not None:
-        raise InvalidUsage("--plot draws the last guide checked, so it must not be combined with --results")
+        raise InvalidUsage(
+            "--plot must not be combined with --results: a guide whose result is read from the file is not simulated, "
+            "so it cannot be drawn"
+        )
     verdicts, last = [], None
     for verdict, checked in _all_checks(options, subject):
         verdicts.append(verdict)

@@ -61,7 +61,7 @@ class Push(NamedTuple):
     """
 
     signs: Vector  # planned direction, positive or negative, in each cycle (row) at hip and knee (columns); shape (cycles + 1, 2)
-    feedback: Vector  # reaction of the push at hip and knee (rows) to each of the four features (columns); shape (2, FEATURES)
+    feedback: Vector  # weight of each feature (columns) for the direction at hip and knee (rows); shape (2, FEATURES)
 
 
 class Start(NamedTuple):
@@ -225,7 +225,8 @@ class Episode(NamedTuple):
     box: Vector  # largest push at hip and knee [Nm], shape (2,)
     noise: Vector  # encoder noise, and random numbers that select lost frames, see `noise_of`; shape (cycles + 1, 4)
     before: Vector  # torque before the stance change [Nm], shape (2,)
-    #: 12 angles [rad], then 12 speeds [rad/s], shape (24,): values of the ten joints at rest. Values of hip and knee are ignored
+    #: Angles of the twelve joints [rad], then their speeds [rad/s], shape (24,).
+    #: All joints except SH and SK of the swing leg keep these values during the step. The values of SH and SK are not used.
     other: Vector
     log: Vector  # values of each cycle, overwritten by `walk_step`, shape (cycles + 1, len(LOG))
 

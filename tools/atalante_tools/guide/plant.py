@@ -46,7 +46,8 @@ class Condition:
     friction: float = 1.0  # real friction divided by the friction that the controller compensates
     mass: float = 1.0  # real mass divided by the mass in the model; scales inertia and weight
     noise: float = 0.0  # noise of the joint encoders [rad rms]
-    loss: float = 0.0  # probability that the measurements of a cycle are lost; same value for the commands of a cycle
+    #: Probability that the measurements of a cycle are lost. The commands of a cycle are lost with the same probability.
+    loss: float = 0.0
     delay: int = 0  # further delay of a command [cycles]; with 0, a command acts one cycle after it is computed
 
     def __str__(self) -> str:
@@ -80,7 +81,8 @@ class Plant(NamedTuple):
     #: width of the speed range above `velocity_max` in which the limiter reduces the torque to zero [rad/s]
     velocity_margin: float
     delay: int  # further delay of a command [cycles]; with 0, a command acts one cycle after it is computed
-    loss: float  # probability that the measurements of a cycle are lost; same value for the commands of a cycle
+    #: Probability that the measurements of a cycle are lost. The commands of a cycle are lost with the same probability.
+    loss: float
 
 
 def plant(
@@ -179,7 +181,7 @@ def inverse_dynamics(constants: Plant, q: Vector, qd: Vector, qdd: Vector) -> Ve
 def dynamics(
     constants: Plant, hip: float, knee: float, hip_rate: float, knee_rate: float
 ) -> tuple[float, float, float, float, float]:
-    """Return the mass matrix of hip and knee, and the torques at hip and knee without acceleration.
+    """Return the mass matrix of hip and knee, and the joint torques that give zero acceleration.
 
     Args:
         constants: constants of the plant.
@@ -244,7 +246,7 @@ def _acceleration(
 
 
 def limited(constants: Plant, joint: int, requested: float, last: float, velocity: float) -> float:
-    """Limit a requested torque by torque, speed and torque rate, and return the command [Nm].
+    """Apply the limits of torque, speed and torque rate to a requested torque, and return the command [Nm].
 
     Args:
         constants: constants of the plant.

@@ -56,9 +56,11 @@ PATIENTS: Final = (
 _CORNERS: Final = 64
 #: Lag of the measured velocity of a drive [s], caused by the low-pass filter and by the sampling (half a cycle).
 _VELOCITY_LAG: Final = 2.0e-3
-#: Largest factor on the push limits that is tried in the search for the smallest push that moves a joint out of the guide.
+#: The search for the smallest push that moves a joint out of the guide multiplies the push limits by increasing factors.
+#: No factor is larger than `LARGEST_FACTOR`.
 LARGEST_FACTOR: Final = 6.0
-#: Number of steps per tried factor on the push limits, divided by `Effort.steps`. With 1500 steps, each factor gets 150 steps.
+#: For each factor, the search simulates `_SHARE` times `Effort.steps` steps, but at least ten.
+#: If `Effort.steps` is 1500, each factor gets 150 steps.
 _SHARE: Final = 0.1
 
 

@@ -39,7 +39,7 @@ DIRECTIONS: Final = tuple(itertools.product((1.0, -1.0), repeat=2))
 _STAGE, _BEAM = 40, 6
 #: Time over which the beam search extrapolates a tracking error with its current rate [s].
 _AHEAD: Final = 0.03
-#: Smallest budget of `search` with a beam search [simulated steps]. With a smaller budget, the beam search is left out.
+#: `search` runs the beam search only if its budget is at least this number of simulated steps.
 _WITH_BEAM: Final = 1000
 #: `_identified` uses only the cycles in which |e| / q_bound of hip or knee exceeds this value.
 _ACTING: Final = 0.5
@@ -160,7 +160,7 @@ class Adversary:
     def _number(self) -> int:
         return int(self._generator.integers(1 << 32))
 
-    # -- guesses -----------------------------------------------------------------------------------------------------
+    # -- candidate pushes --------------------------------------------------------------------------------------------
 
     def _guesses(self) -> Iterator[tuple[str, Push]]:
         """Yield pushes of all kinds in turn."""
@@ -222,7 +222,7 @@ class Adversary:
             )
 
     def _impulse_signs(self, joint: int, end: int, stiffness: Vector, damping: Vector) -> Vector:
-        """Predict for each cycle how a short torque changes the error of a joint in the later cycle `end`.
+        """Predict how a short torque in each cycle before `end` changes the error of a joint in the cycle `end`.
 
         Args:
             joint: joint with the error: 0 for the hip, 1 for the knee.
@@ -300,7 +300,8 @@ class Adversary:
         elif feedback.any() and change < 0.7:
             feedback += 0.3 * generator.standard_normal(feedback.shape)
         else:
-            # Replace the feedback by the signs that it produced in the parent step. Single signs can then be changed.
+            # Replace the feedback of the push with the signs that the push had in the parent step.
+            # After this, single signs can be changed.
             if feedback.any():
                 signs, feedback = np.where(parent.walked.log[:, 4:6] >= 0.0, 1.0, -1.0), _no_feedback()
             begin, length = int(generator.integers(cycles)), int(1 + generator.exponential(30.0))

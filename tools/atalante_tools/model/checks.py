@@ -15,8 +15,9 @@ from atalante_tools.session.body import engine_hint, no_banner
 
 #: Number of random states in which Pinocchio and PyBullet are compared.
 STATES = 100
-#: The model check fails if a torque or mass matrix from Pinocchio and from PyBullet differs by this fraction or more.
-#: The fraction is the largest difference between two elements, divided by the largest element.
+#: Torques and mass matrices from Pinocchio and PyBullet are compared. The model check fails if the relative difference of an
+#: array is at least this fraction. The relative difference is the largest difference between corresponding elements,
+#: divided by the largest element.
 AGREEMENT = 1e-6
 
 
