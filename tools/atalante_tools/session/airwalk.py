@@ -77,8 +77,9 @@ class Options:
     #: TOML file with endpoint, TLS certificate and users. If None, the run publishes on the loopback interface only.
     telemetry: Path | None
     law: Law  # control law of the assisted joints
-    #: Patient and step parameters. With a gait file, only the patient is used. Otherwise both are inputs of the gait network.
-    #: None with a gait file: the patient comes from the file. None without a gait file: the default gait is used.
+    #: Patient and step parameters.
+    #: With a gait file, only the patient is used. None means that the patient comes from the file.
+    #: Without a gait file, patient and step parameters are inputs of the gait network. None means the default gait.
     subject: Subject | None = None
     files: GaitFiles = field(default_factory=GaitFiles)  # files of the gait
 

@@ -1,4 +1,4 @@
-"""Assistance factor that the emulated operator sets during a walk: `begun steps -> assistance factor`."""
+"""Assistance factor that the emulated operator sets during a walk: `number of steps begun so far -> assistance factor`."""
 
 from __future__ import annotations
 

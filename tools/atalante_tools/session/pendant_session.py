@@ -136,7 +136,8 @@ class Session:
         """
         node = self.node
         self._begun = self._synced_at = self._now()
-        self._hal_found = node.answered > 0  # a node that answered SYNCs in its takeover has found a HAL
+        # If the node answered SYNCs during its takeover, a HAL is already on the bus.
+        self._hal_found = node.answered > 0
         while not self.stop.wanted and (seconds is None or self._elapsed() < seconds):
             if node.poll(POLL_TIMEOUT):
                 self._react_to_sync()

@@ -189,7 +189,9 @@ def start_telemetry(
         record_rate=outputs.record_rate,
         can_log=outputs.can_log,
         lock_step=target.lockstep,
-        slots=8192,  # number of buffered cycles: a run in lock-step is faster than real time, and the telemetry may pause
+        # Number of cycles in the ring buffer. The telemetry process may pause while a run in lock-step continues faster than
+        # real time, so the buffer must hold several seconds of the run.
+        slots=8192,
         **outputs.outlet,
     )
     telemetry = TelemetryProcess(

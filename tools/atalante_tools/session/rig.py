@@ -43,8 +43,8 @@ if TYPE_CHECKING:
 
 #: Longest wait for the answers to a SYNC in real time: half a cycle [s].
 PATIENCE: Final = 0.5e-3
-#: Longest wait for the answers to a SYNC in lock-step [s]. This wait is long, because the process of the emulated robot may run
-#: on a slow computer.
+#: Longest wait for the answers to a SYNC in lock-step [s].
+#: This wait is long, because the process of the emulated robot may run on a slow computer.
 LOCKSTEP_PATIENCE: Final = 2.0
 
 
@@ -316,7 +316,7 @@ class Watch:
 
 
 def waiting_for(rig: Rig) -> str:
-    """Return a text that tells the user why the robot is not ACTIVE yet.
+    """Return a text for the user with the reason why the robot is not ACTIVE yet.
 
     If the user can change this with a command, the text contains the command.
 

@@ -36,7 +36,7 @@ LOST_FRAMES: Final = 3
 #: A silent pendant resumes sending if no frame of another pendant arrives for this time [cycles].
 #: The HAL reports a timeout after 5 cycles without a frame.
 QUIET_CYCLES: Final = 3
-#: Results of the end-to-end check of a frame with a valid CRC. The counter of the frame may be unexpected.
+#: Results of the E2E check that count as an intact frame: the CRC is valid. The alive counter may have any value.
 _INTACT: Final = (Check.OK, Check.SOME_LOST, Check.REPEATED, Check.CONFLICT, Check.WRONG_SEQUENCE)
 
 

@@ -1,4 +1,4 @@
-"""Observer of a walk on the ground: detects a fall, and measures how far the robot deviates from the start line."""
+"""Observer of a walk on the ground: detects a fall, and measures the deviation from the initial walking line."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ FALLEN: Final = math.radians(35.0)
 #: Period of the observation [cycles]. In this time, the pelvis of a falling robot turns by less than 2 degrees.
 PERIOD_CYCLES: Final = 10
 #: After the HAL has left the state ACTIVE, the robot is observed for this time [cycles].
-#: A robot that stops in the middle of a step may fall only after more than 1.5 s.
+#: If the robot stops in the middle of a step, more than 1.5 s can pass before it falls.
 AFTERMATH: Final = 5000
 
 
@@ -80,7 +80,7 @@ class Observation:
         return round(math.degrees(math.sqrt(self._squares / self._count)), 3) if self._count else None
 
     def true_deviation(self) -> dict[str, Any]:
-        """Return the fields of `WalkResult` for the true deviation from the start line. Unknown values are None."""
+        """Return the fields of `WalkResult` for the true deviation from the initial walking line. Unknown values are None."""
         access, lateral, yaw = self._rig.access, None, None
         if access is not None and self._origin is not None and not self.fell:
             with suppress(BusDown):

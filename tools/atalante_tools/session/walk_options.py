@@ -53,14 +53,15 @@ class WalkOptions:
     shape: str  # name or file of the guide shape
     passive: bool  # whether the emulated patient has the impedance of relaxed legs; False: the legs are masses only
     subject: Subject | None  # patient and step parameters; None means the values in the walk file
-    #: Gait file or network file of the user. Without either file, the default subject uses the walk file of the package.
-    #: Without either file, the gaits of every subject except the default subject come from the gait network of the package.
+    #: Gait file or network file of the user. If the user gives neither, the gaits come from the package:
+    #: from its walk file for the default subject, and from its gait network for every other subject.
     files: GaitFiles
     seed: int  # seed of the sensor noise
     friction: float  # coefficient of friction between soles and floor
     push: Push | None  # push at the pelvis; None means no push
     law: Law  # control law of the periodic steps
-    #: Numbers of steps of the three parts of the walk: full assistance, transition to `xi`, and `xi`. None: `xi` in all steps.
+    #: Numbers of steps in the three parts of the walk: with full assistance, in the transition to `xi`, and with `xi`.
+    #: None means that all steps have the assistance factor `xi`.
     protocol: tuple[int, int, int] | None = None
     #: Options of recording, CAN log and telemetry. If none of these outputs is requested, no telemetry process is started.
     recording: RecordingOptions = field(default_factory=RecordingOptions)

@@ -56,9 +56,9 @@ class WalkResult:
     true_yaw_deg: float | None  # true value of `yaw_deg` at the end of the walk; None if the robot is real or fell
     #: root mean square of the angle between the true and the estimated vertical during the walk; None if the robot is real
     attitude_rms_deg: float | None
-    distance_m: float  # distance along the walking line
+    distance_m: float  # distance that the robot walked along the walking line
     unnoticed: int  # number of steps in which no landing of the foot was detected
-    max_dcm_error_m: float  # largest error of the divergent component of motion
+    max_dcm_error_m: float  # largest distance between the measured and the nominal divergent component of motion (DCM)
     diagnostics: dict[str, int]  # number of occurrences of each diagnostic of the HAL
     real_time_factor: float
     robot_process: bool  # whether the emulated robot ran in a process of its own, in parallel with the HAL

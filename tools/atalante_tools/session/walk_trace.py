@@ -80,7 +80,7 @@ def foot_prints(columns: Mapping[str, Vector]) -> list[tuple[int, float, float, 
     """
     prints: list[tuple[int, float, float, float]] = []
     last = np.full((2, 2), math.nan)
-    walking = columns["feet"].any(axis=1)  # False before the walk, where all positions are zero
+    walking = columns["feet"].any(axis=1)  # False for the samples before the walk: their foot positions are all zero
     for feet, yaw in zip(columns["feet"][walking].reshape(-1, 2, 2), columns["yaw"][walking, 0], strict=True):
         landed = [side for side in (0, 1) if not np.array_equal(feet[side], last[side])]
         prints.extend((side, float(feet[side, 0]), float(feet[side, 1]), float(yaw)) for side in landed)

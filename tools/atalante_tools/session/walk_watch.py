@@ -44,7 +44,7 @@ class WalkWatch:
         self._rig, self._controller, self._observation, self._stop = rig, controller, observation, stop
         self._steps, self._progress, self._started = steps, Progress(), False
         self.outcome, self._reason, self._halted = "hold", "", 0
-        self._signals = 0  # number of stop signals at the end of the motion
+        self._signals = 0  # number of stop signals received by the end of the motion
         self.full_assist = False
 
     def __call__(self, state: State) -> bool:
@@ -69,7 +69,7 @@ class WalkWatch:
             over = self._halts(state)
         if over:
             self._progress.clear()
-            # In ACTIVE, the reason is that of the start, which says nothing about the end of the walk.
+            # In ACTIVE, `hal.reason` is the reason of the start. It does not explain the end of the walk.
             if state.supervisor is not SupervisorState.ACTIVE:
                 self._reason = self._reason or self._rig.hal.reason
         elif self._progress.due():
@@ -81,7 +81,8 @@ class WalkWatch:
     def _walks(self, state: State) -> bool:
         """Process a cycle in which the torques of the controller are sent. Return whether the walk is over."""
         if self._stop.wanted:
-            self._controller.stop()  # again, because `reset` forgets a stop request that came just before it
+            # Repeat the request in each cycle, because `reset` clears a stop request that arrived just before the start.
+            self._controller.stop()
         over = self._controller.done
         finishing = state.supervisor is _FINISH_STEP
         if finishing and not self._reason:
@@ -96,7 +97,7 @@ class WalkWatch:
         """Process a cycle before START or after the end of the motion. Return whether the walk is over.
 
         After the motion, the robot is observed for `AFTERMATH` cycles, because it may still fall. A further stop signal ends
-        this time, and so does a bus that is down, which shows no fall.
+        the observation early. The observation also ends if the bus is down, because a fall can then no longer be detected.
         """
         hal = self._rig.hal
         fault = state.supervisor is _FAULT
@@ -109,7 +110,8 @@ class WalkWatch:
             self._signals = self._stop.signals
             self._reason = self._reason or hal.reason
             if not self._controller.walking and self._reason == stop_text(stop_requested=True):
-                self.outcome = "stopped"  # before the weight shift or after the walk: the robot stands on both feet
+                # The robot stands on both feet, because the walk has not begun or is complete.
+                self.outcome = "stopped"
                 return True
         self._halted += 1
         stopped = self._stop.signals > min(1, self._signals)

@@ -176,7 +176,8 @@ class FrameFilter(WrappedBus):
         try:
             self.bus.send(frames)
         except BusError as error:
-            # Faults may have dropped or changed frames of the caller. So the error gets the frames that the bus accepted.
+            # Store in the error the frames that the bus accepted.
+            # They can differ from the frames of the caller, because faults drop, delay or change frames.
             error.accepted = accepted = error.accepted_of(frames)
             if self.tap is not None and error.sent:
                 self.tap.sent(accepted)

@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 
 #: Index of the pelvis IMU in `IMUS`.
 _PELVIS: Final = IMUS.index("pelvis")
-#: Values of `_Shared.question`: run a cycle, return the true attitude, or return the true stance.
+#: Requests to the emulator (values of `_Shared.question`): run a cycle, return the true attitude, or return the true stance.
 _CYCLE, _ATTITUDE, _STANCE = 0.0, 1.0, 2.0
 #: Number of values in the memory that both processes share.
 _SIZE: Final = 14
@@ -114,7 +114,8 @@ class _Shared(NamedTuple):
     """
 
     question: Vector  # request to the emulator: `_CYCLE`, `_ATTITUDE` or `_STANCE`, shape (1,)
-    #: two values: number of calls of `assist` so far, and factor of the last call (NaN: the HAL keeps its own factor); shape (2,)
+    #: Number of calls of `assist` so far, and assistance factor of the last call, shape (2,).
+    #: The factor NaN means that the HAL keeps its own factor.
     dial: Vector
     pushes: Vector  # 1 if the pelvis is pushed, otherwise 0, shape (1,)
     wrench: Vector  # force [N] and moment [Nm] on the pelvis, shape (6,)
@@ -197,7 +198,10 @@ class ServedAccess:
         self._turns, self._pushed, self._wrench = 0.0, False, np.zeros(6)
 
     def step(self) -> None:
-        """Answer a question of the HAL process. Without a question, apply the inputs of the HAL and run one cycle."""
+        """Process a request of the HAL process.
+
+        If the request is a question, answer with the true attitude or stance. Otherwise apply dial and wrench, and run one cycle.
+        """
         shared = self._shared
         question = shared.question[0]
         if question == _ATTITUDE:
