@@ -71,7 +71,7 @@ class Continuation:
 
 
 class _NoAnswer:
-    """Message of the waiting process: a process that continued the run has ended, but has sent no answer.
+    """Message of the waiting process to the run: the process that continued the run ended without an answer.
 
     Attributes:
         exit_code: exit code of the ended process; the negative number of the signal if a signal ended it.
@@ -82,7 +82,7 @@ class _NoAnswer:
 
 
 def branch() -> Branch | Continuation:
-    """Fork this process. The parent gets a `Branch` and goes on with the run. The child waits at this moment of the run.
+    """Fork this process. The parent gets a `Branch` and continues the run. The child waits at this moment of the run.
 
     For each request that the parent sends through the `Branch`, the waiting child forks a new process. In the new process, this
     function returns a `Continuation`, and the run continues from this moment.

@@ -11,14 +11,15 @@ from atalante_tools.faults.matrix import load_matrix
 from atalante_tools.trial.fault_plan import DOUBLE_SUPPORT, NO_FRAMES
 from atalante_tools.trial.findings import Finding, Result
 
-#: Cases in which the robot must not fall: fault ID -> regular expression for the case name. An empty expression matches all
-#: cases of the fault. The faults are:
+#: Cases in which the robot must not fall: fault ID -> regular expression for the case name.
+#: An empty expression matches all cases of the fault. The faults are:
 #: - lost, late and doubled frames, and errors on the bus;
 #: - a failed IMU, foot or force cell, and an exception of the controller;
 #: - a few late cycles, STOP, the release of the dead-man switch, and the loss of the pendant.
-#: In other cases of these faults, all drives hold at once, so the robot may fall. Such cases are not in the table, for example:
-#: - The loop stays much slower than 1 kHz. The joints then move too far in a cycle, which the HAL takes for a wrong velocity.
-#: - A drive is silent for ten cycles, so that the HAL does not know the angle of the joint.
+#: In other cases of these faults, all drives hold immediately, so the robot may fall.
+#: The table does not contain such cases, for example:
+#: - The loop stays much slower than 1 kHz. The joints then move too far in a cycle, and the HAL rejects their velocity.
+#: - A drive sends nothing for ten cycles. The HAL then does not know the angle of the joint.
 #: - The operator presses HOLD.
 NO_FALL: Final = {
     **dict.fromkeys(("F01", "F02", "F03", "F05", "F20", "F24", "F30", "F31", "F32", "F33"), ""),
@@ -72,7 +73,7 @@ def _claim(id_: str) -> str:
 
 
 def _wrong_fall(id_: str, case: str, run: dict[str, Any]) -> bool:
-    """Return whether a run ended in a fall for which the finding fails.
+    """Return whether a run ended in a fall that makes the finding fail.
 
     Each of the following is sufficient: the robot must not fall in this case (`NO_FALL`, `NO_FALL_IN_DOUBLE_SUPPORT`), the HAL
     reported no diagnostic, or the HAL ended in ACTIVE or FULL_ASSIST.

@@ -54,7 +54,7 @@ class FaultTrial:
 
     kind: ClassVar[str] = "fault"
     id: str  # fault ID, as in the fault matrix
-    index: int  # key of the case in the mapping `ground_cases(id)`: a number from 0 on, or `PERMANENT`
+    index: int  # key of the case in the mapping `ground_cases(id)`: 0 or more, or `PERMANENT`
     case: str  # name of the case
     moments: tuple[str, ...]  # keys of `MOMENTS` and `FURTHER_MOMENTS`
     mass: float  # mass of the wearer [kg]

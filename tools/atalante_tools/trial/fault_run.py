@@ -46,18 +46,18 @@ from atalante_tools.trial.plan import STEP
 if TYPE_CHECKING:
     from atalante_hal.safety.events import Event
 
-#: The walk is forked this number of cycles before the fault begins. A fork one cycle before the fault would be too late,
-#: because the emulated robot then already has the frames of the first faulty cycle.
+#: The walk is forked this number of cycles before the fault begins.
+#: One cycle would be too few, because the emulated robot then already has the frames of the first faulty cycle.
 _LEAD: Final = 5
 #: Number of cycles for which the HAL is observed after a fall.
 _FALLEN: Final = 300
 #: Number of cycles after which a walk ends at the latest. A walk without a fault lasts about 10000 cycles.
 _LONGEST: Final = 20_000
-#: The robot is at rest if its pelvis and its joints have been slower than `_STILL` [m/s, rad/s] for `_RESTED` cycles, and
-#: each foot carries a load of at least `_LOADED` [N].
+#: The robot is at rest if two conditions are true for `_RESTED` cycles: its pelvis and its joints are slower than `_STILL`
+#: [m/s, rad/s], and each foot carries a load of at least `_LOADED` [N].
 _STILL, _RESTED, _LOADED = 0.01, 500, 50.0
-#: A walk has the outcome "walked" if a foot lands `_LANDINGS` times after the end of the fault, and the robot then still walks
-#: for `_WALKED` cycles.
+#: A walk has the outcome "walked" if a foot lands `_LANDINGS` times after the end of the fault,
+#: and the robot then continues to walk for `_WALKED` cycles. A complete walk has this outcome, too.
 _WALKED: Final = 400
 _LANDINGS: Final = 2
 #: Phases of the walk that begin with the landing of a foot.
@@ -87,7 +87,7 @@ class _Request(NamedTuple):
     """Request to a branch (a waiting copy of the walk): continue the walk with these faults and actions."""
 
     stimuli: tuple[Stimulus, ...]  # injected faults, and actions of the operator
-    begins: int  # HAL cycle from which the times of the stimuli count
+    begins: int  # HAL cycle in which the case begins; `start` of the stimuli counts from this cycle
     ends: int | None  # first cycle after all faults and actions, counted from `begins`; None if a fault is permanent
 
 
@@ -139,7 +139,8 @@ def _longest(trial: FaultTrial, case: Case, permanent: FaultRun) -> int:
     fatal = permanent.fallen
 
     def falls(cycles: int) -> bool:
-        # With the permanent fault, the robot falls after `fatal` cycles. A fault of this duration has the same effect.
+        # With the permanent fault, the robot falls after `fatal` cycles.
+        # A fault of this duration or longer still acts when the robot falls, so the robot falls, too.
         if cycles >= fatal:
             return True
         stimuli = tuple(limited(stimulus, cycles) for stimulus in case.stimuli)

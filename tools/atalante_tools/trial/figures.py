@@ -182,7 +182,7 @@ def scenario(result: Result) -> bytes:
 
 
 def time_of(order: str) -> tuple[int, int]:
-    """Return day and position of a trial of the sweep, which sort the trials in time. The position of a treadmill trial is 0.
+    """Return day and position of a trial of the sweep, as a key to sort trials by time. A treadmill trial has the position 0.
 
     Args:
         order: field `order` of the trial, for example "day2-03", or "day2" of a treadmill trial.

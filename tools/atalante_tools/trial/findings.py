@@ -19,30 +19,33 @@ from atalante_tools.faults.false_alarms import EXPECTED
 
 Result = dict[str, Any]
 
-#: Phases of a step at which `step_variation` compares steps with each other. The last phase is 0.8, because an early landing
-#: ends a step at a phase of about 0.9.
+#: Phases of a step at which `step_variation` compares steps with each other.
+#: The last phase is 0.8, because a step with an early landing ends at a phase of about 0.9.
 _PHASES: Final = np.linspace(0.1, 0.8, 29)
 
 #: Two metabolic rates count as equal if their means differ by at most this fraction of the rate of quiet standing.
 SAME: Final = 0.02
 STANDING: Final = 1.44  # metabolic rate of quiet standing [W/kg]
 #: `TREND`: A value falls with the assistance factor if the rank correlation of both is between -1 and -`TREND`.
-#: `ASYMMETRY` concerns the pairs of walks with the same factor: on each day of the sweep, the factor falls from 1 to 0 and rises
-#: to 1. The mean absolute difference in a pair, divided by the range of all values, must be at most `ASYMMETRY`.
+#: `ASYMMETRY`: On each day of the sweep, the factor falls from 1 to 0 and then rises to 1, so each factor above 0 has two walks.
+#: The mean absolute difference between the two walks, divided by the range of all values, must be at most `ASYMMETRY`.
 TREND, ASYMMETRY = 0.8, 0.25
 #: Largest accepted coefficient of variation of the metabolic rates with full assistance in the walks of a sweep.
 VARIATION: Final = 0.05
 
 
-#: `CERTIFIED` is the smallest accepted share of guides with a promise: disturbance torques up to which the joints stay inside.
+#: `CERTIFIED` is the smallest accepted share of guides that have a promise.
+#: A promise states the disturbance torques up to which the joints stay inside the guide.
 #: `ROBUST` is the smallest accepted share of walks of `robustness` in which the robot completes all steps and stands at the end.
 CERTIFIED, ROBUST = 0.95, 0.98
-#: Largest accepted distance between robot and start line at the end of a walk of `protocol` [m]: if the heading comes from the
-#: gyro alone, and if the IMUs have a heading reference.
+#: Largest accepted sideways distance between the robot and its initial walking line at the end of a walk of `protocol` [m].
+#: `SIDEWAYS` applies if the heading comes from the gyro alone.
+#: `SIDEWAYS_WITH_REFERENCE` applies if the IMUs have a heading reference.
 SIDEWAYS, SIDEWAYS_WITH_REFERENCE = 1.5, 0.5
 #: The root mean square error of the estimated vertical must be below this angle in every walk [deg].
 ATTITUDE: Final = 0.5
-#: Force of a push of 0.2 s that the robot must withstand at every phase of a step [N]: in every direction, and forwards.
+#: The robot must withstand a push of 0.2 s at every phase of a step: with the force `PUSH_WORST` in every direction [N],
+#: and with the force `PUSH_FORWARD` forwards [N].
 PUSH_WORST, PUSH_FORWARD = 200.0, 300.0
 
 
@@ -308,7 +311,7 @@ def _complete(result: Result) -> bool:
 
 
 def _by_subject(results: Sequence[Result]) -> list[dict[str, Result]]:
-    """Return for each subject its four results by condition. A subject with a missing or failed trial is left out."""
+    """Return one mapping per subject: condition -> result. A subject with a missing or failed trial is left out."""
     subjects: dict[float, dict[str, Result]] = {}
     for result in results:
         if _complete(result):
@@ -335,7 +338,7 @@ def _paired(
     smaller: Callable[[dict[str, Result]], float],
     text: str,
 ) -> Finding:
-    """Return a finding that one quantity is larger than another, by a one-sided sign test over the subjects.
+    """Test whether one quantity is larger than another (one-sided sign test over the subjects), and return the finding.
 
     The significance level is 5 %. With fewer than five subjects no sign test reaches this level. Then the difference must have
     the claimed sign in every subject.

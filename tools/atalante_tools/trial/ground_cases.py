@@ -13,7 +13,7 @@ from atalante_tools.trial.fault_plan import PERMANENT
 
 
 def _no_load(*feet: str) -> tuple[Fault, ...]:
-    """Return faults with which the cells of feet report no vertical force."""
+    """Return faults that set the vertical force of all cells of the given feet to zero."""
     return tuple(Fault("value", f"{foot}_STATE", 0, None, **{f"{cell}_ForceZ": 0.0 for cell in CELLS}) for foot in feet)
 
 

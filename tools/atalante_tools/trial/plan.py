@@ -50,15 +50,16 @@ QUICK_MASSES: Final = (58.0, 75.0)
 MASS_SHARE: Final = (0.9, 1.1)
 #: Range of the random coefficient of friction between soles and floor in `robustness`.
 FRICTION: Final = (0.25, 0.8)
-#: Length of `RobustTrial.delay`: state messages, command messages and motor torques can each be one cycle late in `robustness`.
-#: Longer delays are not tried, because a drive times out when its last command is five cycles old. With commands one cycle late,
-#: the timeout needs four consecutive lost frames. With a longer delay, it needs fewer lost frames than the fault matrix intends.
+#: Length of `RobustTrial.delay`. In `robustness`, state messages, command messages and motor torques can each be one cycle late.
+#: Longer delays are not tried, because a drive times out when its last command is five cycles old.
+#: If commands are one cycle late, four consecutive lost frames cause this timeout.
+#: If commands are later, fewer lost frames cause it than the fault matrix intends.
 LATE_PARTS: Final = 3
 #: Probability with which a frame is lost in `robustness`.
 LOSS: Final = 0.01
 #: Force of a push in `robustness` [N].
 PUSH: Final = 100.0
-#: The robot is pushed once in this number of steps of `robustness`, at a random time in the first 70 % of these steps.
+#: In `robustness`, each group of this number of steps contains one push, at a random time in the first 70 % of the group.
 PUSH_STEPS: Final = 10
 #: Number of trials and number of steps per trial of `robustness`, in a normal run and with `--quick`.
 ROBUST, QUICK_ROBUST = (100, 60), (2, 4)
@@ -108,9 +109,9 @@ class WalkTrial:
     feedforward: float
     seed: int
     engine: str
-    order: str = ""  # place in the sweep, such as "day2-03" for the third walk of day 2; empty in other experiments
+    order: str = ""  # position in the sweep, such as "day2-03" for the third walk of day 2; empty in other experiments
     literal: bool = False  # whether the controller uses the control law exactly as the paper prints it
-    #: whether the IMUs have a heading reference, such as a magnetometer, and the controller corrects the gyro drift with it
+    #: whether the IMUs have a heading reference, such as a magnetometer; the controller uses it to correct the gyro drift
     heading_reference: bool = False
     #: path and SHA-256 of the file of the neural gait network; empty for the network of the package
     network: tuple[str, ...] = ()

@@ -279,9 +279,10 @@ def _position(ratio: Vector) -> dict[str, Any]:
         ratio: angle error e divided by the half-width q_bound, for hip (SH) and knee (SK), shape (n, 2).
     """
     return {
-        # share of the samples in which the absolute ratio of hip or knee is above 0.5
+        # share of the samples in which |e| / q_bound of hip or knee is above 0.5
         "outer": round(float(np.mean(np.abs(ratio).max(axis=1) > 0.5)), 4),
-        "spread": round(float(ratio.std(axis=0).mean()), 4),  # standard deviation, mean of hip and knee
+        # standard deviation of e / q_bound, averaged over hip and knee
+        "spread": round(float(ratio.std(axis=0).mean()), 4),
         "histogram": [np.histogram(ratio[:, k], EDGES)[0].tolist() for k in range(2)],
     }
 
@@ -368,7 +369,7 @@ def _treadmill(trial: TreadmillTrial) -> dict[str, Any]:
 
 
 def _columns(fields: Sequence[tuple[str, int]]) -> dict[str, slice]:
-    """Return the columns of each telemetry field by its name."""
+    """Return a mapping from the name of each telemetry field to its columns."""
     columns, first = {}, 0
     for name, width in fields:
         columns[name] = slice(first, first + width)
