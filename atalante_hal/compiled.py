@@ -35,7 +35,7 @@ Function = TypeVar("Function", bound=Callable[..., Any])
 P = ParamSpec("P")
 R = TypeVar("R")
 
-#: Name of an empty file. If it is in the cache folder of a function, the function creates arrays.
+#: Name of an empty file that marks the cache folder of a function that creates arrays.
 #: `specialised` compiles a function that creates arrays with numba's reference counting, and any other function without it.
 _MARK = "creates-arrays"
 #: Function given to `specialised` -> True if the function creates arrays, so that numba must count references to arrays.

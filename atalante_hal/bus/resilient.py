@@ -85,7 +85,9 @@ class ResilientBus(WrappedBus):
         return count
 
     def _update_down(self, *, proven: bool) -> None:
-        """Update `down`, the error message of the lost link, after `send` or `receive` of the wrapped bus raised no error.
+        """Store or clear the error message `down` after a call of the wrapped bus that raised no error.
+
+        `JoinedBus.receive` raises no error while one of its channels works, so check the attribute `down` of the `JoinedBus`.
 
         Args:
             proven: True if a frame was sent or received, which proves that the link works.

@@ -147,7 +147,7 @@ class Heartbeats:
         return unknown
 
     def essential(self, frames: Frames) -> npt.NDArray[np.intp]:
-        """Return the indices of the frames that must be processed if many frames arrived at once, in order of arrival.
+        """Choose the frames that must be processed when many frames arrived at once, and return their indices in ascending order.
 
         These are all emergencies, the newest frame of each other message, and the newest status of each node with each NodeState.
         The number is limited to `_ESSENTIAL`, because processing takes about 20 us per frame.

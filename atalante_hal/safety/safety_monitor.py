@@ -28,7 +28,16 @@ from atalante_hal.safety.limiter import Limiter
 from atalante_hal.safety.message_monitor import GROUND_TOLERANCE, NO_TOLERANCE, MessageMonitor, Tolerance
 from atalante_hal.safety.plausibility import Plausibility
 from atalante_hal.safety.plausibility.finding import JOINT_MESSAGES, rows_of
-from atalante_hal.safety.start import ENABLE_CYCLES, Refusal, StartRequest, entry_text, powered, refusal, stop_text
+from atalante_hal.safety.start import (
+    ENABLE_CYCLES,
+    PROGRAM_ENDS,
+    Refusal,
+    StartRequest,
+    entry_text,
+    powered,
+    refusal,
+    stop_text,
+)
 from atalante_hal.safety.state_machine import MOVING, Conditions, next_state
 from atalante_hal.safety.torque_motion import TorqueMotion
 from atalante_hal.safety.torque_tracking import TorqueTracking
@@ -515,7 +524,7 @@ class SafetyMonitor:
                 self.torque_motion.restart()
         self.walking = self.walking and self.moving
         if Dtc.OPERATOR_STOP in reasons:
-            text = "the program is ending" if self._ending else stop_text(self._pendant.stop_requested)
+            text = PROGRAM_ENDS if self._ending else stop_text(self._pendant.stop_requested)
             memory.raise_dtc(state.cycle, Dtc.OPERATOR_STOP, "PENDANT", text=text)
         if reasons:
             self.reason = memory.text_of(reasons) or self.reason

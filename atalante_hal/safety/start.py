@@ -32,6 +32,8 @@ AT_REST = 0.3
 #: Prefix of the event text for a refused START.
 REFUSED = "START refused: "
 #: End of the sentence that explains FINISH_STEP if the operator ends a walk on the ground. The next HOLD keeps this sentence.
+#: Reason of a HOLD that the program requests because it is ending.
+PROGRAM_ENDS = "the program is ending"
 WALK_ENDS = ", so the walk ends on both feet"
 _S = SupervisorState
 #: States in which START acknowledges faults, but enables no drive. In these states, an active diagnostic does not end the start,
@@ -169,7 +171,7 @@ def words_towards_operation(drive_state: Vector) -> list[Controlword]:
 def _stop_reason(request: StartRequest) -> str:
     """Return why the operator or the program forbids a start, or an empty text."""
     if request.ending:
-        return "the program is ending"
+        return PROGRAM_ENDS
     if request.stop_requested or not request.dead_man:
         return stop_text(request.stop_requested)
     return ""

@@ -52,8 +52,8 @@ SHARES: Final = ((-1.5, 0.6), (1.4, 2.2))
 RATIO: Final = 2.5
 #: Number of consecutive checks that must suspect the motor before the drive is reported.
 CONFIRM: Final = 2
-#: A joint deviates if |produced torque - sent torque| > `BAND` * error + `_BAND_SHARE` * |sent torque|.
-#: Here, error is the rms error of the produced torque [Nm], `Robot.torque_error`.
+#: A joint deviates if |produced torque - sent torque| > `BAND` * torque_error + `_BAND_SHARE` * |sent torque|.
+#: `Robot.torque_error` is the rms error with which the produced torque of a joint is known [Nm].
 BAND: Final = 2.0
 _BAND_SHARE: Final = 0.2
 #: Values of `BAND` and `_BAND_SHARE` for the other joints of the leg. They give a wider limit.
@@ -184,7 +184,7 @@ def _forget(joint: int, deviations: Deviations) -> None:
 
 
 def _compare(joint: int, sent: float, produced: float, tolerances: Tolerances, deviations: Deviations) -> bool:
-    """Evaluate one check in which a joint deviates, and return whether its motor is faulty.
+    """Explain why the produced torque of a joint deviates from the sent torque. Return whether the motor is faulty.
 
     The torques of the check are added to the sums of the joint. From these sums, the two explanations of the module docstring
     are fitted: external torque and faulty motor. At the start of a deviation, and while a deviation decreases, the check is left

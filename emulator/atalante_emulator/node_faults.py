@@ -106,7 +106,8 @@ class NodeFaults:
     def _emergency(self, fault: Fault, nodes: Nodes, cycle: int) -> None:
         (node,), code = nodes, fault["code"]
         if node in NODES:
-            if cycle < fault.end:  # in each cycle, because a drive ends its own errors, for example when it is cool
+            if cycle < fault.end:
+                # Repeat the error in each cycle, because the drive itself can end it, for example when its winding is cool.
                 self._drives.fail(NODES.index(node), code, persists=True)
             else:
                 self._drives.recover(NODES.index(node), code)

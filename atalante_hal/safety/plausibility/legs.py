@@ -54,7 +54,8 @@ EXCHANGE_SAMPLES = 2
 _APART = math.radians(1.2)
 #: Encoders count as exchanged if the error of each leg agrees with the difference between the left and the right reading.
 #: The constant is the largest deviation from this agreement, as a fraction of the difference.
-#: Example: readings of 5 and 2 degrees must cause the errors (encoder minus IMU) 3 and -3 degrees, each within 0.35 * 3 degrees.
+#: Example: the left encoder reads 5 degrees, the right encoder 2 degrees. If they are exchanged, the left error (encoder minus
+#: IMU) is 3 degrees and the right error is -3 degrees. Each error may deviate by 0.35 * 3 degrees.
 _AGREEMENT = 0.35
 #: Drift of the angle between pelvis IMU and tibia IMU that the standstill check tolerates in each sample [rad].
 #: The drift of intact IMUs is less than a tenth of this value.
@@ -103,7 +104,8 @@ class Legs:
         self._to_joint: Vector = robot.polarity / robot.gear
         self._attitude_error = robot.sensors.attitude_error
         self._attitude_change, self._misalignment = robot.sensors.attitude_change, robot.sensors.misalignment
-        #: For each leg: estimated heading drift between pelvis IMU and tibia IMU [rad], subtracted from the error of TH.
+        #: For each leg: estimated heading drift between pelvis IMU and tibia IMU [rad].
+        #: It is subtracted from the encoder error of joint TH, which turns the leg about its vertical axis.
         self._heading = [0.0 for _ in SIDES]
         self.encoder_error: Vector = np.full(len(JOINTS), math.inf)
         self._contradicts = [[0] * len(_AXES) for _ in SIDES]

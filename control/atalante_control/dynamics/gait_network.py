@@ -288,8 +288,8 @@ def _network(arrays: Mapping[str, npt.NDArray[Any]]) -> GaitNetwork:
         width = columns
     if width != OUTPUTS:
         raise ArrayFileError(f"the last layer must have {OUTPUTS} columns, got {width}")
-    # The control points of every gait of the network are the bias of the last layer plus multiples of its weight rows.
-    # So the angles of every gait are continuous at the stance change if the bias and each weight row have this property.
+    # The control points of a gait are the bias of the last layer plus a weighted sum of the rows of its weight matrix.
+    # So every gait is continuous at the stance change if the bias and each row of the weight matrix are continuous there.
     defect = np.abs(periodicity()[: len(JOINTS)] @ np.vstack([layers[-1].weights, layers[-1].bias]).T).max()
     if not defect <= _PERIODICITY_DEFECT:
         raise ArrayFileError(

@@ -63,7 +63,8 @@ class Guard:
     lag: Annotated[Vector, 2]  # rad/s, estimated error of the measured velocities of hip and knee: true minus measured
     state: Annotated[Vector, STATES]  # state of the last cycle, see `backup_policy`
     #: Absolute values of the elements of `state`. The effect of model errors is proportional to these values.
-    #: Instead of the true error rates, elements 2 and 3 contain abs(true error rate - measured error rate) of hip and knee.
+    #: Exception: elements 2 and 3 of `state` are the error rates of hip and knee. Elements 2 and 3 of this vector are
+    #: abs(true error rate - measured error rate).
     magnitude: Annotated[Vector, STATES]
     compression: Annotated[Vector, (COMPRESSED, STATES)]  # matrix from the state to the compressed state
     compressed: Annotated[Vector, COMPRESSED]  # compressed state of the last cycle

@@ -52,7 +52,9 @@ class Assumptions:
             ValueError: If a value is out of range.
         """
         if not all(0.0 < torque < np.inf for torque in self.promise):
-            raise ValueError(f"promise must be finite and above 0 Nm, got {self.promise!r}")
+            raise ValueError(
+                f"promise (certified disturbance torques) must be finite and above 0 Nm, got {self.promise!r}"
+            )
         if not 1 <= self.delays[0] <= self.delays[1]:
             raise ValueError(f"delays must be two numbers of at least 1 cycle, in ascending order, got {self.delays!r}")
 

@@ -99,9 +99,10 @@ class Verdict:
     xi: float
     gait: str
     certified: bool
-    #: push limit at the hip [Nm]: `Task.push`, or the certified torque if `Task.push` is None; None: no search was possible
+    #: Push limit at the hip [Nm]: `Task.push` if the task has one, otherwise the certified torque.
+    #: None if there is no limit, so that no search was possible.
     promise_hip_nm: float | None
-    #: push limit at the knee [Nm]: `Task.push`, or the certified torque if `Task.push` is None; None: no search was possible
+    #: Push limit at the knee [Nm], see `promise_hip_nm`.
     promise_knee_nm: float | None
     worst_ratio: float | None  # larger one of `plant_ratio` and `robot_ratio`; None if no step was simulated
     steps: int  # total number of steps on the ideal plant and on the emulated robot

@@ -267,7 +267,7 @@ class Watch:
         self._resumes = resumes
         self._progress = Progress()
         self._started = False
-        self._finished = False
+        self._finished = self._stopped = False
         self._state, self._reason = SupervisorState.OFF, ""
 
     def __call__(self, state: State) -> bool:
@@ -293,7 +293,7 @@ class Watch:
             over = self._started or state.supervisor is SupervisorState.FAULT
         if over:
             self._progress.clear()
-            self._state, self._reason = state.supervisor, self._rig.hal.reason
+            self._state, self._reason, self._stopped = state.supervisor, self._rig.hal.reason, self._stop.wanted
         elif self._progress.due():
             self._progress.show(self._describe(state) if active else waiting_for(self._rig))
         return over
@@ -302,17 +302,17 @@ class Watch:
         """Raise an error if the run ended before the function `done` returned True.
 
         Raises:
-            SystemExit: If a signal ended the run, with its exit code.
-            FaultLatched: If the robot is in FAULT.
-            Failed: If the robot left ACTIVE early.
+            SystemExit: If a signal ended the run, or arrived after its end, with the exit code of the signal.
+            FaultLatched: If the robot is in FAULT, also after a signal.
+            Failed: If the robot left ACTIVE early without a signal.
         """
-        if self._stop.wanted:
-            print_message("stopped, the robot is in HOLD")
-            raise SystemExit(self._stop.exit_code)
         if self._state is SupervisorState.FAULT:
             raise FaultLatched(f"the robot is in FAULT: {self._reason}")
-        if not self._finished:
+        if not (self._finished or self._stopped):
             raise Failed(f"the robot went to HOLD: {self._reason}")
+        if self._stop.wanted:
+            print_message(f"stopped, the robot is in {self._rig.hal.state.supervisor.name}")
+            raise SystemExit(self._stop.exit_code)
 
 
 def waiting_for(rig: Rig) -> str:

@@ -7,6 +7,7 @@ from contextlib import suppress
 from typing import TYPE_CHECKING, Any, Final
 
 from atalante_hal.bus import BusDown
+from atalante_hal.robot import IMUS
 
 if TYPE_CHECKING:
     from atalante_control.walking.controller import WalkController
@@ -44,6 +45,7 @@ class Observation:
         self._push_begun: int | None = None  # cycle in which the push began
         self._squares, self._count = 0.0, 0  # sum of the squared attitude errors [rad2], and number of these errors
         self._origin: Stance | None = None
+        self._moved = False  # whether the controller has moved the robot
         if push is not None and rig.access is not None:
             rig.access.push(self._wrench)
 
@@ -53,11 +55,27 @@ class Observation:
             return self.fell
         access = self._rig.access
         try:
-            upright = float(self._controller.vertical[2]) if access is None else self._compare(access)
+            upright = self._measured() if access is None else self._compare(access)
         except BusDown:  # the process of the robot has ended; the HAL reports this
             return self.fell
         self.fell = self.fell or upright < math.cos(FALLEN)
         return self.fell
+
+    def _measured(self) -> float:
+        """Return the cosine of the angle between the pelvis axis and the vertical, as far as the HAL can measure it.
+
+        The controller estimates the vertical only while it moves the robot. After that, the attitude of the pelvis IMU is used.
+        Before the start, a robot on a crane may lean, so the cosine is 1.
+        """
+        hal = self._rig.hal
+        if hal.moving:
+            self._moved = True
+            return float(self._controller.vertical[2])
+        if not self._moved:
+            return 1.0
+        _, x, y, _ = hal.state.imu_quaternion[IMUS.index("pelvis")].tolist()
+        upright: float = 1.0 - 2.0 * (x * x + y * y)
+        return upright
 
     def _compare(self, access: Access) -> float:
         """Return the cosine of the true angle between the pelvis axis and the vertical.

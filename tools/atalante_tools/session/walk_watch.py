@@ -6,7 +6,7 @@ import math
 from typing import TYPE_CHECKING, Any
 
 from atalante_hal.safety.diagnostics import Dtc
-from atalante_hal.safety.start import WALK_ENDS, stop_text
+from atalante_hal.safety.start import PROGRAM_ENDS, WALK_ENDS, stop_text
 from atalante_hal.types import SupervisorState
 from atalante_tools.console.outcome import Failed
 from atalante_tools.console.terminal import print_message
@@ -108,7 +108,7 @@ class WalkWatch:
         if not self._halted:
             hal.end()  # a START in this time must not begin a second walk
             self._signals = self._stop.signals
-            self._reason = self._reason or hal.reason
+            self._reason = hal.reason
             if not self._controller.walking and self._reason == stop_text(stop_requested=True):
                 # The robot stands on both feet, because the walk has not begun or is complete.
                 self.outcome = "stopped"
@@ -131,8 +131,8 @@ class WalkWatch:
         """End the command with an error, unless the robot stands after all steps or after STOP of the operator.
 
         Raises:
-            SystemExit: If a signal ended the walk, with its exit code.
-            FaultLatched: If the robot is in FAULT.
+            SystemExit: If a signal ended the walk, with the exit code of the signal.
+            FaultLatched: If the robot is in FAULT, also after a signal.
             Failed: If the robot fell, went to HOLD during the walk, or ended the walk early without a request to stop.
         """
         from atalante_tools.console.outcome import FaultLatched
@@ -140,15 +140,15 @@ class WalkWatch:
         if self.outcome == "fell":
             reason = f": {self._reason}" if self._reason else ""
             raise Failed(f"the robot fell in step {self._controller.statistics.steps}{reason}")
-        if self._stop.wanted:
-            print_message("stopped, the robot is in HOLD")
-            raise SystemExit(self._stop.exit_code)
         if self.outcome == "fault":
             raise FaultLatched(f"the robot is in FAULT: {self._reason}")
+        if self.outcome == "hold" and self._started and self._reason != PROGRAM_ENDS:
+            raise Failed(f"the robot went to HOLD: {self._reason}")
+        if self._stop.wanted:
+            print_message(f"stopped, the robot is in {self._rig.hal.state.supervisor.name}")
+            raise SystemExit(self._stop.exit_code)
         if self.outcome == "stopped":
             stop = stop_text(stop_requested=True)
             if self._reason not in (stop, stop + WALK_ENDS):
                 raise Failed(f"the robot ended the walk early and stands: {self._reason}")
             print_message("stopped by the operator, the robot stands in HOLD")
-        elif self.outcome != "stood":
-            raise Failed(f"the robot went to HOLD: {self._reason}")

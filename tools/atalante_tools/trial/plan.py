@@ -103,7 +103,9 @@ class WalkTrial:
     height: float  # height of the subject [m]
     active: bool  # whether the muscles of the subject track the gait
     xi: float  # assistance factor in the last part of the walk
-    protocol: tuple[int, int, int]  # numbers of steps: with full assistance, with changing assistance factor, with `xi`
+    protocol: tuple[
+        int, int, int
+    ]  # numbers of steps: with factor 1, while the factor falls from 1 to `xi`, and with factor `xi`
     shape: str  # guide shape
     idealization: float
     feedforward: float

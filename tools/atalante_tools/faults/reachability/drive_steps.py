@@ -29,7 +29,7 @@ _ERRORS: Final = (
     (emergency.UNDER_VOLTAGE, True),
     (emergency.COMMAND_REJECTED, False),
 )
-#: Cycle number of each step of the search. Its value does not affect the results.
+#: Cycle number used in all steps of the search. Any number gives the same results.
 _CYCLE: Final = 1000
 _POWERED: Final = (DriveState.OPERATION_ENABLED, DriveState.QUICK_STOP_ACTIVE)
 _OFF_WORDS: Final = (Controlword.DISABLE_VOLTAGE, Controlword.SHUTDOWN, Controlword.SWITCH_ON)

@@ -65,7 +65,7 @@ class Presses(NamedTuple):
     The search `moves` checks its properties with these values.
     """
 
-    received: int = 0  # number of received presses that have not begun a start yet; 2 means two or more
+    received: int = 0  # number of presses of START that were received but have not begun a start; 2 means two or more
     started: bool = False  # whether a start is in progress that has not changed the supervisor state yet
 
 
