@@ -162,7 +162,7 @@ def test_run_prints_a_table_or_one_json_object() -> None:
         (("run", "F52"), "run `pytest tests/faults/test_refusals.py"),
         (
             ("run", "F44", "--case", "nothing like it"),
-            "name that contains 'nothing like it'; valid cases: 2 cycles, 3 cycles",
+            "name that contains 'nothing like it'; valid cases: 2 cycles; 3 cycles",
         ),
         (("campaign", "F52"), "F52 has only tests and no scenario"),
         (("campaign", "--jobs", "0"), "--jobs"),

@@ -197,7 +197,9 @@ def test_robot_that_is_pushed_over_ends_with_code_1() -> None:
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (("--shape", "nonsense"), "guide shape (or a file that ends in .toml)"),
+        (("--shape", "snap"), "--shape requires a guide, but there is none at the assistance factor 1: add --xi"),
+        (("--protocol", "1,2,3"), "the assistance factor at the end of --protocol must be below 1, got 1: add --xi"),
+        (("--shape", "nonsense", "--xi", "0.5"), "guide shape (or a file that ends in .toml)"),
         (("--can-log", "walk.txt"), "walk.txt"),
         (("--record-rate", "3"), "must be a divisor of 1000"),
         (("--wearer", "passive", "-i", "socketcan", "-c", "vcan0"), "--wearer passive requires the emulated robot"),

@@ -36,6 +36,11 @@ PATIENT = ("--mass", "75", "--height", "175")
             ["jog", "LEFT_SK", "--to", "5", "--engine", "mujoco", "-i", "socketcan", "-c", "x"],
             "--engine requires the emulated robot",
         ),
+        (
+            ["jog", "LEFT_SK", "--to", "5", "--seed", "1", "-i", "socketcan", "-c", "x"],
+            "--seed requires the emulated robot",
+        ),
+        (["airwalk", "--seed", "1", "-i", "socketcan", "-c", "x"], "--seed requires the emulated robot"),
         (["gait", "check", "--seed", "-1"], "-1 is not in the range x>=0"),
         (["dbc", "c-code", "-o", "never", "--seed", "-1"], "-1 is not in the range x>=0"),
         (["demo", *PATIENT, "--step-length", "0"], "step length must be 0.05 to 0.4 m, got 0 m"),

@@ -205,13 +205,14 @@ def command(
         "--protocol": protocol is not None,
         "--robot-process": bool(robot_process),
         "--friction": typed("friction"),
-        "--seed": typed("seed"),
     }
     for option, given in emulated.items():
         if given and not target.embedded:
             raise click.UsageError(f"{option} requires the emulated robot of -i embedded")
     if push is None and typed("push_direction"):
         raise click.UsageError("--push-direction requires a push: add --push")
+    if target.embedded and xi == 1.0 and typed("shape"):
+        raise click.UsageError("--shape requires a guide, but there is none at the assistance factor 1: add --xi")
     if out is None and typed("record_rate"):
         raise click.UsageError("--record-rate requires a recording: add --out")
     if turn and law.literal:

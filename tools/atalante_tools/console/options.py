@@ -410,6 +410,6 @@ def _target(
         raise click.UsageError(refused)
     elif not channel:
         raise click.UsageError(f"{interface} requires a channel: -c vcan0, or a channel map of the four buses")
-    elif embedded and typed("engine"):
-        raise click.UsageError("--engine requires the emulated robot of -i embedded")
+    elif embedded and (name := next(filter(typed, ("engine", "seed")), None)):
+        raise click.UsageError(f"--{name} requires the emulated robot of -i embedded")
     return Target(interface, channel, interface == EMBEDDED if lockstep is None else lockstep, engine)

@@ -80,7 +80,7 @@ def run(id_: str, name: str, engine: str, as_json: bool) -> None:
     tasks = [CaseTask(row.id, index, engine) for index, case in enumerate(cases) if name in case.name]
     if not tasks:
         raise InvalidUsage(
-            f"no case of {row.id} has a name that contains {name!r}; valid cases: {', '.join(c.name for c in cases)}"
+            f"no case of {row.id} has a name that contains {name!r}; valid cases: {'; '.join(c.name for c in cases)}"
         )
     summary = Summary.of(verdicts := [v for v in _done(tasks, engine=engine) if isinstance(v, Verdict)])
     if as_json:
