@@ -301,7 +301,10 @@ class SafetyMonitor:
         self._check_drives(nodes_ready)
         if self._duplicate_found:
             memory.raise_dtc(
-                cycle, Dtc.HAL_DUPLICATE, "HAL", text="another HAL sends on this bus: end one, start again"
+                cycle,
+                Dtc.HAL_DUPLICATE,
+                "HAL",
+                text="another HAL sent on this bus: end the other one, then start this one again",
             )
         row = pendant.row
         pendant.evaluate(

@@ -670,7 +670,8 @@ def test_second_hal_leads_to_hold_and_prevents_ready(make_rig):
     assert "HAL_DUPLICATE" in new.codes()
     new.operator.start()
     new.run(3)
-    assert new.hal.events[-1].text == "START refused: another HAL sends on this bus: end one, start again"
+    reason = "another HAL sent on this bus: end the other one, then start this one again"
+    assert new.hal.events[-1].text == f"START refused: {reason}"
 
 
 def hot(rig, **degrees: float):
