@@ -269,7 +269,8 @@ class AirwalkController:
         measured.attitudes[:], measured.gyros[:] = state.imu_quaternion, state.imu_gyro
         measured.sent[:] = self.pid.requested if state.torque_sent is None else state.torque_sent
         ratio, h, active = self._run(cycle, level, row, measured, self.guide.tables, self._parts)
-        self.statistics.count(cycle, ratio, h, active)
+        if self._assisting:
+            self.statistics.count(cycle, ratio, h, active)
         self._command.outside = self._assisting and h < 0.0
         self._command.guide_left = self._outside.update(self._command.outside, self._promised)
         self._command.hand_over_exceeded = cycle == 0 and self._exceeded
@@ -314,7 +315,7 @@ class AirwalkController:
         """Start the guide of a step.
 
         If the deviation at the start of the step is larger than the certificate assumes, count the step in the statistics. Steps
-        before the end of the first right-stance step are not counted.
+        before the end of the first right-stance step are not counted, nor steps at the assistance factor 1, which use no guide.
         """
         hip, knee = joints
         angles = float(deviation.angle[hip]), float(deviation.angle[knee])
@@ -325,5 +326,5 @@ class AirwalkController:
             self._literal.start_step(xi, angles, rates)
         largest = self.config.hand_over
         exceeded = max(map(abs, angles)) > largest.deviation or max(map(abs, rates)) > largest.rate
-        self._promised, self._exceeded = promise > 0.0, exceeded and self.statistics.steps > 0
+        self._promised, self._exceeded = promise > 0.0, exceeded and self._assisting and self.statistics.steps > 0
         self.statistics.hand_overs_exceeded += self._exceeded

@@ -97,16 +97,21 @@ class GaitReference:
 
 
 class StartMotion:
-    """Quintic trajectory from rest at the measured pose to the first pose and speed of the gait.
+    """Trajectory from rest at the measured pose to the first pose and speed of the gait: the sum of two quintics.
+
+    The first quintic leads to the first pose, and ends at rest. The second quintic leads to the speed of the gait: in the last
+    `RUN_UP` seconds, it moves each joint back by up to 0.1 s times this speed, and forwards again.
 
     Attributes:
         cycles: duration in cycles. If a joint would move too fast in the configured duration, see `SPEED_SHARE`, the duration is
             longer than configured.
     """
 
-    #: Largest speed of a joint on the way to the first pose, as a fraction of the velocity limit of the joint.
-    #: A second part of the motion brings the joint to the speed of the gait. `SPEED_SHARE` does not limit the speed of this part.
+    #: Largest speed of a joint in the first quintic, as a fraction of the velocity limit of the joint.
     SPEED_SHARE = 0.5
+    #: Duration of the second quintic [s]. The joint moves back in proportion to this duration, so a long one would move joints
+    #: beyond their position limits.
+    RUN_UP = 0.5
     #: Largest slope of the quintic 10 x^3 - 15 x^4 + 6 x^5 for x from 0 to 1.
     _STEEPEST = 1.875
 
@@ -138,11 +143,14 @@ class StartMotion:
         Args:
             cycle: cycles since `start`, below `cycles`.
         """
-        x, duration, row = cycle / self.cycles, self.cycles * PERIOD, self._row
+        row, duration = self._row, self.cycles * PERIOD
         gap, speed = self._first[:_N] - self._pose, self._first[_N:]
+        x = cycle / self.cycles
         row[:_N] = self._pose + gap * (x**3 * (10.0 - 15.0 * x + 6.0 * x * x))
-        row[:_N] += speed * (duration * x**3 * (-4.0 + 7.0 * x - 3.0 * x * x))
-        row[_N:] = gap * (30.0 * x * x * (1.0 - x) ** 2 / duration) + speed * (
-            x * x * (-12.0 + 28.0 * x - 15.0 * x * x)
-        )
+        row[_N:] = gap * (30.0 * x * x * (1.0 - x) ** 2 / duration)
+        run_up = min(self.RUN_UP, duration)
+        y = 1.0 - (self.cycles - cycle) * PERIOD / run_up
+        if y > 0.0:
+            row[:_N] += speed * (run_up * y**3 * (-4.0 + 7.0 * y - 3.0 * y * y))
+            row[_N:] += speed * (y * y * (-12.0 + 28.0 * y - 15.0 * y * y))
         return row

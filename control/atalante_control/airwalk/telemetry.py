@@ -84,7 +84,7 @@ def write_telemetry(
         Three values: `q_bound` of SH and SK [rad], then the larger of the ratios |e| / q_bound of SH and SK, then whether the
         guide filter is active.
     """
-    record, active = telemetry[0], guard.gate > step.active
+    record, active = telemetry[0], step.assisted and guard.gate > step.active
     for i in range(len(record.q_des)):
         record.q_des[i] = desired[i]
     bounds = guard.bounds[0 if errors[0] > 0.0 else 1], guard.bounds[2 if errors[1] > 0.0 else 3]

@@ -250,6 +250,23 @@ def test_at_full_assistance_the_command_is_the_baseline_torque_to_the_last_bit()
     assert compared == 3 * (STEP - 30)
 
 
+def test_steps_without_guide_are_not_counted_in_the_statistics_of_the_guide():
+    controller, plant = airwalk(), Plant(xi=0.5)
+    controller.reset(plant.state)
+    for cycle in range(STARTUP + 5 * STEP):
+        if cycle == STARTUP + 3 * STEP - 1:
+            guided = replace(controller.statistics, factors=set(controller.statistics.factors))
+            plant.state.assistance_factor = 1.0
+        command = controller.update(plant.state)
+        assert not command.hand_over_exceeded
+        torque = command.torque.copy()
+        torque[SK] += 30.0 if cycle > STARTUP + 3 * STEP else 0.0  # larger than any guide permits
+        plant.step(torque)
+    counted = replace(controller.statistics, steps=guided.steps, factors=guided.factors)
+    assert counted == replace(guided, cycles=counted.cycles, inside=counted.inside, active=counted.active)
+    assert counted.cycles == counted.inside == guided.cycles + 1  # the last cycle of the guided step
+
+
 def test_guide_has_no_effect_at_full_assistance():
     """The guide torque u_v has no effect, also not directly after a stance change."""
     calm, wild = airwalk(), airwalk()

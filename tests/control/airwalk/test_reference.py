@@ -8,12 +8,14 @@ import numpy as np
 import pytest
 
 from atalante_control.airwalk.reference import GaitReference, StartMotion
-from atalante_control.gait.gait import AIRWALK_GAIT, SWAP, load_gait
+from atalante_control.gait.gait import AIRWALK_GAIT, SWAP, Gait, load_gait
 from atalante_control.gait.recentering import Deadbeat
+from atalante_control.gait.walk import DEFAULT_WALK, load_walk
 from atalante_control.joint.pid import LEFT, RIGHT
 from atalante_hal.robot import load_robot
 
-GAIT = load_gait(AIRWALK_GAIT, load_robot())
+ROBOT = load_robot()
+GAIT = load_gait(AIRWALK_GAIT, ROBOT)
 DEADBEAT = Deadbeat(GAIT.duration, 0.4)
 OFFSET = math.radians(1.0)
 RNG = np.random.default_rng(5)
@@ -70,6 +72,18 @@ def test_start_motion_leads_from_rest_to_the_first_pose_and_speed():
     rows = np.array([motion.row(cycle).copy() for cycle in range(501)])
     rates = (rows[2:, :12] - rows[:-2, :12]) / 2e-3
     np.testing.assert_allclose(rows[1:-1, 12:], rates, atol=1e-3)
+
+
+@pytest.mark.parametrize("gait", [GAIT, load_walk(DEFAULT_WALK, ROBOT).step], ids=["airwalk", "walk"])
+@pytest.mark.parametrize("duration", [0.5, 2.0, 10.0])
+def test_start_motion_stays_inside_the_position_limits(gait: Gait, duration: float):
+    first = GaitReference(gait, Deadbeat(gait.duration, 0.4), OFFSET).nominal[RIGHT][0]
+    motion = StartMotion(first, duration, ROBOT.velocity_max)
+    for pose in (np.zeros(12), first[:12]):
+        motion.start(pose)
+        angles = np.array([motion.row(cycle)[:12].copy() for cycle in range(motion.cycles + 1)])
+        assert (angles <= ROBOT.position_max).all()
+        assert (angles >= ROBOT.position_min).all()
 
 
 def test_start_motion_from_a_distant_pose_takes_longer_so_that_no_joint_exceeds_half_its_velocity_limit():

@@ -14,11 +14,14 @@ from atalante_control.structured import zeros
 ROW = np.arange(24.0)
 
 
-def write_one_row(errors: tuple[float, float], active: float = 0.1) -> tuple[np.ndarray, tuple[object, ...]]:
+def write_one_row(
+    errors: tuple[float, float], active: float = 0.1, *, assisted: bool = True
+) -> tuple[np.ndarray, tuple[object, ...]]:
     guards, telemetry, step = zeros(Guard, 1), zeros(Telemetry, 1), zeros(Step, 1)
     guards["bounds"] = 0.1, 0.05, 0.2, 0.08
     guards["h"], guards["gate"] = -0.2, 0.4
     step["stance"], step["completed"], step["cycles"], step["xi"], step["active"] = 1, 3, 800, 0.5, active
+    step["assisted"] = assisted
     ratios = write_telemetry(telemetry, step[0], guards[0], 200, ROW, errors)
     return telemetry[0], ratios
 
@@ -39,6 +42,12 @@ def test_ratio_is_that_of_the_joint_closest_to_its_bound():
     assert write_one_row((0.02, -0.01))[1] == ((0.1, 0.08), pytest.approx(0.2), True)
     assert write_one_row((-0.03, 0.01))[1] == ((0.05, 0.2), pytest.approx(0.6), True)
     assert write_one_row((0.0, 0.0), active=0.4)[1] == ((0.05, 0.08), 0.0, False)
+
+
+def test_guide_is_not_active_in_a_step_without_guide():
+    telemetry, (_, _, active) = write_one_row((0.02, -0.01), assisted=False)
+    assert not active
+    assert not telemetry["filter_active"].any()
 
 
 def test_statistics_begin_with_the_first_completed_step():

@@ -324,7 +324,8 @@ def _close(telemetry: TelemetryProcess, walked: Walked) -> None:
 def _result(certificate: Certificate, controller: AirwalkController, hal: Hal, statistics: Statistics) -> Result:
     walking = controller.statistics
     # After a single step, the statistics contain only the cycle in which this step ended. Such statistics are not reported.
-    counted = walking.steps >= 2
+    # Without a guide (at the assistance factor 1), no cycle is counted.
+    counted = walking.steps >= 2 and walking.cycles > 0
     return Result(
         shape=certificate.shape,
         **promise_fields(certificate),
