@@ -80,6 +80,15 @@ class AttitudeObserver:
         """Advance the attitude by one cycle, as `observe` does."""
         self._observe(self.records, gyro, accel, velocity)
 
+    def change_imu(self, gyro: Vector, offset: Vector) -> None:
+        """Convert the velocity to the position of another IMU on the pelvis.
+
+        Args:
+            gyro: angular velocity of the pelvis in the axes of the pelvis, shape (3,) [rad/s].
+            offset: position of the new IMU relative to the IMU before, in the axes of the pelvis, shape (3,) [m].
+        """
+        self.records[0].velocity[:] += cross(gyro, offset)
+
     def follow_heading(self, quaternion: Sequence[float]) -> None:
         """Correct the drift of the heading. Call this method once per cycle, if the IMU has a heading reference.
 

@@ -321,7 +321,10 @@ class WalkController:
         Returns:
             The command. The next call overwrites the same object.
         """
+        imu = self._measured.imu
         self._measure(state)
+        if self._measured.imu is not imu:
+            self._observer.change_imu(self._measured.gyro, self._measured.imu - imu)
         self._sense(self._measured, self._constants, self._stabiliser, self._parts)
         if state.supervisor is SupervisorState.FINISH_STEP:
             self._finishing = True

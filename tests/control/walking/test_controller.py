@@ -18,7 +18,7 @@ from atalante_control.walking.phases import Phase
 from atalante_control.walking.placement import PlacementConfig
 from atalante_control.walking.telemetry import TELEMETRY_FIELDS
 from atalante_emulator.bodies import hang, make_body
-from atalante_hal.robot import JOINTS, MOTORS
+from atalante_hal.robot import IMUS, JOINTS, MOTORS
 from atalante_hal.types import Command, State
 from tests.control.walking.ideal_robot import PATIENT, ROBOT, WALK, Ideal, walk_with
 
@@ -131,6 +131,30 @@ def test_heading_follows_a_pelvis_imu_with_a_heading_reference(reference: bool, 
     rotation = controller._observer.rotation
     turned = math.atan2(rotation[1, 0], rotation[0, 0]) - math.atan2(before[1, 0], before[0, 0])
     assert turned > 1e-7 if follows else abs(turned) < 1e-9
+
+
+def test_change_between_pelvis_imu_and_torso_imu_in_a_step_keeps_the_attitude() -> None:
+    """The pelvis IMU is lost in the middle of the first periodic step and returns in the next step."""
+    controller, errors = WalkController(ROBOT, PATIENT, WALK, 2), list[float]()
+    body = make_body("mujoco", urdf(ExoskeletonParameters(), ROBOT, PATIENT), free=True, ground=0.0)
+    try:
+        hang(body, controller.standing_pose.tolist(), 0.0005)
+        robot = Ideal(body)
+        robot.state.imu_rows = (2, 3, 4, 5)
+        while controller.statistics.steps < 2:
+            lost = controller.reached(0, 0.5) and not controller.reached(1, 0.5)
+            robot.state.age[robot.state.imu_rows[IMUS.index("pelvis")]] = 100 if lost else 0
+            robot.cycle(controller)
+            x, y, z, w = body.motion("pelvis").attitude
+            up = np.array([2.0 * (x * z - w * y), 2.0 * (y * z + w * x), 1.0 - 2.0 * (x * x + y * y)])
+            errors.append(
+                math.degrees(math.acos(min(1.0, float(up @ controller.vertical)))) if controller.steps_begun else 0.0
+            )
+            assert robot.upright()
+    finally:
+        body.close()
+    assert max(errors) < 0.05
+    assert controller.max_dcm_error < 0.01
 
 
 def elapsed_of(controller: WalkController) -> float:
