@@ -56,9 +56,9 @@ from atalante_hal.robot import CELLS, FEET, IMUS, JOINTS, LEG_JOINTS, Robot
 from atalante_hal.types import Command, State, SupervisorState, Vector
 
 _N, _LEG = len(JOINTS), len(LEG_JOINTS)
-_SH, _SK = LEG_JOINTS.index("SH"), LEG_JOINTS.index("SK")
+_TH, _SH, _SK = (LEG_JOINTS.index(name) for name in ("TH", "SH", "SK"))
 _PELVIS, _TORSO = IMUS.index("pelvis"), IMUS.index("torso")
-#: Foot placement requests only joint angles that are at least this far inside the position limits [rad].
+#: Lean and foot placement request only joint angles that are at least this far inside the position limits [rad].
 _MARGIN = math.radians(1.0)
 #: Largest valid age of the message of an IMU or a foot [cycles], equal to the timeout of these messages in the DBC.
 _SENSOR_AGE = 10
@@ -500,7 +500,14 @@ def _ratio(error: float, bound: float) -> float:
 
 
 def _range(robot: Robot, config: WalkConfig) -> tuple[Vector, Vector]:
-    """Return the smallest and the largest joint angles that foot placement may request, each of shape (12,) [rad]."""
+    """Return the smallest and the largest joint angles that lean, foot placement and steering may request [rad].
+
+    Returns:
+        Lower limits and upper limits, each of shape (12,).
+    """
     low, high = robot.position_min + _MARGIN, robot.position_max - _MARGIN
     low[[_SK, _LEG + _SK]] = config.reach_knee
+    # Steering without a turn comes within 0.4 degrees of the position limits of the transverse hip.
+    turning = [_TH, _LEG + _TH]
+    low[turning], high[turning] = robot.position_min[turning], robot.position_max[turning]
     return low, high

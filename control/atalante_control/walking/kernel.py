@@ -458,7 +458,7 @@ def _desired(cycle: int, placement: Placement, table: PhaseTable, stage: Stage, 
 
     Args:
         cycle: cycles since the start of the phase.
-        placement: position in the table, and phase rate.
+        placement: position in the table, phase rate, and limits of the transverse hip.
         table: table of the phase.
         stage: data of the phase.
         desired: q_des [rad], then q_des' [rad/s], shape (24,), overwritten.
@@ -482,8 +482,12 @@ def _desired(cycle: int, placement: Placement, table: PhaseTable, stage: Stage, 
     if stage.double:
         return row
     x = min(clock / last, 1.0)
-    desired[leg + _TH] += stage.steering * x**3 * (10.0 - 15.0 * x + 6.0 * x * x)
-    desired[n + leg + _TH] += stage.steering * pace * 30.0 * x * x * (1.0 - x) ** 2 / (last * PERIOD)
+    hip = leg + _TH
+    desired[hip] += stage.steering * x**3 * (10.0 - 15.0 * x + 6.0 * x * x)
+    desired[n + hip] += stage.steering * pace * 30.0 * x * x * (1.0 - x) ** 2 / (last * PERIOD)
+    limited = min(max(desired[hip], placement.low[hip]), placement.high[hip])
+    if limited != desired[hip]:
+        desired[hip], desired[n + hip] = limited, 0.0
     if clock > last:
         time, moving = _lowered(clock - last, table.reach_cycles)
         for joint, speed in ((_SH, table.reach[0]), (_SK, table.reach[1])):

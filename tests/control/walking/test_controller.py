@@ -11,10 +11,10 @@ import pytest
 
 from atalante_control.guide.shapes import CONSTANT
 from atalante_control.model import ExoskeletonParameters, urdf
-from atalante_control.walking.config import WalkConfig
+from atalante_control.walking.config import TURN_MAX, WalkConfig
 from atalante_control.walking.controller import WalkController
 from atalante_control.walking.lean import LeanConfig
-from atalante_control.walking.phases import Phase
+from atalante_control.walking.phases import STEPPING, Phase
 from atalante_control.walking.placement import PlacementConfig
 from atalante_control.walking.telemetry import TELEMETRY_FIELDS
 from atalante_emulator.bodies import hang, make_body
@@ -155,6 +155,24 @@ def test_change_between_pelvis_imu_and_torso_imu_in_a_step_keeps_the_attitude() 
         body.close()
     assert max(errors) < 0.05
     assert controller.max_dcm_error < 0.01
+
+
+def test_steering_in_a_turn_keeps_the_transverse_hips_within_their_limits() -> None:
+    """The joints do not move, so the heading error grows from step to step, and steering requests its largest offset."""
+    controller = WalkController(ROBOT, PATIENT, WALK, 4, WalkConfig(turn=TURN_MAX))
+    state, hips, desired = hung(controller), [JOINTS.index("left_TH"), JOINTS.index("right_TH")], list[np.ndarray]()
+    while controller.statistics.steps < 4:
+        stance = int(fields_of(controller)["stance"][0])
+        state.foot_force[:, :, 2] = 250.0
+        if controller.phase in STEPPING:
+            state.foot_force[1 - stance] = 0.0
+        controller.update(state)
+        state.cycle += 1
+        desired.append(fields_of(controller)["q_des"][hips])
+        assert state.cycle < 20_000
+    low, high = ROBOT.position_min[hips], ROBOT.position_max[hips]
+    assert np.all((low <= np.array(desired)) & (np.array(desired) <= high))
+    assert np.any(np.array(desired) == high)
 
 
 def elapsed_of(controller: WalkController) -> float:
