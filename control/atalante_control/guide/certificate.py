@@ -172,7 +172,8 @@ class PromiseLimits:
         largest = _pair(strictest.scale * chosen)
         made = _pair(min(promise, strictest.scale) * chosen)
         if made is None:
-            text = f"no promise of {SMALLEST:g} Nm or more at the hip: {strictest.what}; the robot may leave the guide"
+            why = strictest.what if chosen[0] >= SMALLEST else f"the requested torque is {chosen[0]:g} Nm"
+            text = f"no promise of {SMALLEST:g} Nm or more at the hip: {why}; the robot may leave the guide"
             return Certificate(guide.shape.name, xi, False, text, None, None, -math.inf)
         start, width = guide.prediction.start.error, guide.widths(xi)
         used = ((start[:, :2] + promise * start[:, 2:]) / width)[: guide.cycles + 1]

@@ -9,9 +9,12 @@ import numpy as np
 import pytest
 from scipy.optimize import linprog
 
+from atalante_control.airwalk.config import AirwalkConfig
+from atalante_control.airwalk.controller import AirwalkController
 from atalante_control.guide.certificate import PromiseLimits
 from atalante_control.guide.filter import GuideFilter, tail
-from tests.control.guide.ideal_leg import controller
+from atalante_control.guide.shapes import CONSTANT
+from tests.control.guide.ideal_leg import GAIT, ROBOT, controller
 
 SHAPES = ["constant", "widening", "narrowing", "pinched", "asymmetric"]
 
@@ -56,6 +59,12 @@ def test_guide_without_a_promise_states_the_reason():
     full = controller("constant").certificate(1.0)
     assert (full.certified, full.promise) == (False, None)
     assert "baseline" in full.reason
+
+
+def test_request_below_the_smallest_promise_is_the_reason_for_no_promise():
+    config = AirwalkConfig(promise=(0.5, 18.0))
+    reason = AirwalkController(ROBOT, GAIT, CONSTANT, config).certificate(0.5).reason
+    assert reason.startswith("no promise of 1 Nm or more at the hip: the requested torque is 0.5 Nm;")
 
 
 def test_promise_below_the_smallest_is_not_given():
