@@ -96,7 +96,12 @@ def solve(
 
     Returns:
         The gait. If the solver failed, the gait is the last iterate and the status names the violated constraint.
+
+    Raises:
+        ValueError: If `around` is given for a periodic step.
     """
+    if kind == "periodic" and around is not None:
+        raise ValueError("a periodic step must be solved without the argument `around`")
     if kind != "periodic" and around is None:
         periodic = solve(subject, machine_code=machine_code)
         if not periodic.solved:

@@ -8,7 +8,17 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from atalante_control.gait.gait import SIGN, SWAP, Gait, Kind, check_gait, load_gait, motion, write_gait
+from atalante_control.gait.gait import (
+    AIRWALK_GAIT,
+    SIGN,
+    SWAP,
+    Gait,
+    Kind,
+    check_gait,
+    load_gait,
+    motion,
+    write_gait,
+)
 from atalante_control.gait.subject import Subject
 from atalante_control.gait_optimization.requirements import Requirements
 from atalante_control.gait_optimization.result import SOLVED, SolvedGait
@@ -78,6 +88,11 @@ def test_start_and_stop_steps_join_the_periodic_gait(solved: SolvedGait, kind: K
     np.testing.assert_allclose(q[joined], periodic_q[joined], atol=1e-9)
     np.testing.assert_allclose(qd[joined], periodic_qd[joined], atol=1e-9)
     np.testing.assert_allclose(qd[resting], 0.0, atol=1e-9)
+
+
+def test_periodic_step_around_a_gait_is_rejected() -> None:
+    with pytest.raises(ValueError, match="a periodic step must be solved without the argument `around`"):
+        solve(SUBJECT, around=load_gait(AIRWALK_GAIT, ROBOT))
 
 
 def test_gait_continues_in_the_mirrored_step(solved: SolvedGait) -> None:
