@@ -22,7 +22,7 @@ import numpy.typing as npt
 from atalante_control.dynamics.stance import stance_dynamics
 from atalante_control.gait.array_file import ArrayFileError, read_arrays, write_arrays
 from atalante_control.gait.gait import DEGREE, SIGN, SWAP, Gait
-from atalante_control.gait.subject import Subject
+from atalante_control.gait.subject import STEP_DURATION_RANGE, STEP_LENGTH_RANGE, Subject
 from atalante_control.model import Patient
 from atalante_hal.robot import JOINTS, Robot
 from atalante_hal.types import Vector
@@ -274,6 +274,13 @@ def _network(arrays: Mapping[str, npt.NDArray[Any]]) -> GaitNetwork:
     if (wrong := np.flatnonzero(low >= high)).size:
         i = int(wrong[0])
         raise ArrayFileError(f"low[{i}] must be below high[{i}] ({high[i]:g}), got {low[i]:g}")
+    for name, (least, most) in (("step_length", STEP_LENGTH_RANGE), ("step_duration", STEP_DURATION_RANGE)):
+        i = list(INPUTS).index(name)
+        if low[i] < least or high[i] > most:
+            unit = INPUTS[name]
+            raise ArrayFileError(
+                f"the range of {name} must be within {least:g} to {most:g} {unit}, got {low[i]:g} to {high[i]:g} {unit}"
+            )
     if depth > LAYERS_MAX:
         raise ArrayFileError(f"the network must have at most {LAYERS_MAX} layers, got {depth}")
     for i, (weights, bias) in enumerate(layers):

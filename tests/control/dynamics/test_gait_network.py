@@ -178,6 +178,10 @@ def test_saved_network_is_loaded_bit_for_bit(tmp_path: Path) -> None:
         ({"bias_1": None}, "bias_1 is missing"),
         ({"weights_3": np.zeros((6, 5))}, "weights_2 is missing"),
         ({"low": np.full(6, 100.0)}, r"low\[0\] must be below high\[0\] \(.*\), got 100"),
+        (
+            {"low": np.array([50.0, 1.5, 0.1, 0.1, 0.9, 0.95]), "high": np.array([90.0, 1.9, 0.2, 0.2, 1.1, 1.05])},
+            "the range of step_duration must be within 0.4 to 2 s, got 0.1 to 0.2 s",
+        ),
         ({"low": np.zeros(3)}, r"low must have shape \(6,\), got shape \(3,\)"),
         ({"weights_0": np.full((6, 5), np.nan)}, "weights_0 must be an array of finite 64-bit floats"),
         ({"weights_0": np.full((6, 5), np.inf)}, "weights_0 must be an array of finite 64-bit floats"),
