@@ -25,7 +25,7 @@ import numpy as np
 from sklearn.exceptions import ConvergenceWarning
 from sklearn.neural_network import MLPRegressor
 
-from atalante_control.dynamics.gait_network import GaitNetwork, Layer, inputs_of, periodicity
+from atalante_control.dynamics.gait_network import INPUTS, GaitNetwork, Layer, inputs_of, periodicity
 from atalante_control.gait.gait import DEGREE, Gait, bezier, derivative
 from atalante_control.gait.subject import Subject, patient_of
 from atalante_control.gait_optimization.library import Grid
@@ -47,6 +47,10 @@ SEED = 1  # seed of the initial weights
 _SAMPLES = 41  # number of samples per step in the comparison of two gaits
 
 
+class FitError(ValueError):
+    """Error of gaits to which no network can be fitted."""
+
+
 class Fit(NamedTuple):
     """Fitted network with its errors on the gaits of the library."""
 
@@ -61,12 +65,25 @@ def fit(gaits: Sequence[Gait], grid: Grid, *, hidden: Sequence[int] = HIDDEN, it
 
     Args:
         gaits: gaits with the parameters of their subjects.
-        grid: grid of the library; the smallest and largest grid levels become the range of the network.
+        grid: grid of the library; its mean step duration is the time scale of the accelerations.
         hidden: number of neurons of each hidden layer.
         iterations: largest number of L-BFGS iterations.
+
+    Returns:
+        Network with its errors. The range of the network is the smallest box that contains the subjects of the gaits.
+
+    Raises:
+        FitError: If there are fewer than two gaits, if a parameter has the same value in all gaits, or if all gaits are equal.
     """
-    low, high = (np.array([axis[end] for axis in grid.axes()]) for end in (0, -1))
-    x = (np.array([inputs(gait) for gait in gaits]) - low) * (2.0 / (high - low)) - 1.0
+    if len(gaits) < 2:
+        raise FitError(f"a gait network must be fitted to at least two gaits, got {len(gaits)}")
+    subjects = np.array([inputs(gait) for gait in gaits])
+    # `round` removes the rounding errors of the ratios `thigh` and `shank`.
+    low, high = subjects.min(axis=0).round(12), subjects.max(axis=0).round(12)
+    for name, least, most in zip(INPUTS, low, high, strict=True):
+        if least == most:
+            raise FitError(f"{name} must have at least two values in the gaits, got only {least:g}")
+    x = (subjects - low) * (2.0 / (high - low)) - 1.0
     points = np.array([gait.coefficients.ravel() for gait in gaits])
     measure = _metric(float(np.mean(grid.step_duration)))
     periodic = _null_space(periodicity())
@@ -79,6 +96,8 @@ def fit(gaits: Sequence[Gait], grid: Grid, *, hidden: Sequence[int] = HIDDEN, it
     # Element k of `outside` is the rms error if only the first k directions are used.
     outside = np.sqrt(np.cumsum(spread[::-1] ** 2)[::-1] / len(gaits))
     directions = directions[: int((outside > RESOLUTION).sum())]
+    if not len(directions):
+        raise FitError(f"the gaits of different subjects must differ, got {len(gaits)} equal gaits")
     scores = deviations @ directions.T
     unit = float(np.sqrt((scores**2).sum(axis=1).mean())) / TARGET_SIZE
 

@@ -13,13 +13,13 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 
-from atalante_control.dynamics.gait_network import inputs_of, load_network, periodicity
+from atalante_control.dynamics.gait_network import inputs_of, load_network, periodicity, subject_of
 from atalante_control.dynamics.stance import stance_dynamics
 from atalante_control.gait.gait import AIRWALK_GAIT, Gait, load_gait
 from atalante_control.gait.subject import Subject
 from atalante_control.gait_optimization import fit as fit_module
 from atalante_control.gait_optimization import library as library_module
-from atalante_control.gait_optimization.fit import fit, inputs
+from atalante_control.gait_optimization.fit import FitError, fit, inputs
 from atalante_control.gait_optimization.library import Grid, Library
 from atalante_control.gait_optimization.network_error import Deviation, deviation, findings, random_subjects
 from atalante_control.gait_optimization.result import SOLVED, SolvedGait
@@ -82,6 +82,30 @@ def test_same_library_gives_the_same_network(gaits: list[Gait]) -> None:
         np.testing.assert_array_equal(one.bias, other.bias)
     np.testing.assert_array_equal(first.low, LOW)
     np.testing.assert_array_equal(first.high, HIGH)
+
+
+def test_range_of_the_network_is_the_range_of_its_gaits() -> None:
+    low, high = [58.0, 1.62, 0.1, 0.7, 0.94, 0.94], [65.0, 1.69, 0.12, 0.74, 1.0, 1.06]
+    subjects = [Subject(Patient(58.0, 1.62), 0.1, 0.7), *map(subject_of, (low, high))]
+    network = fit([synthetic(subject).gait for subject in subjects], GRID, hidden=(2,), iterations=1).network
+    assert (network.low.tolist(), network.high.tolist()) == (low, high)
+
+
+@pytest.mark.parametrize(
+    ("inputs", "sentence"),
+    [
+        ([], "a gait network must be fitted to at least two gaits, got 0"),
+        (2 * [[58.0, 1.62, 0.1, 0.7, 1.0, 1.0]], "mass must have at least two values in the gaits, got only 58"),
+        (
+            [[58.0, 1.62, 0.1, 0.7, 0.95, 0.95], [65.0, 1.69, 0.12, 0.74, 1.0, 1.0]],
+            "the gaits of different subjects must differ, got 2 equal gaits",
+        ),
+    ],
+)
+def test_fit_to_too_few_or_equal_gaits_is_rejected(inputs: list[list[float]], sentence: str) -> None:
+    subjects = list(map(subject_of, inputs))
+    with pytest.raises(FitError, match=f"^{sentence}$"):
+        fit([replace(AIRWALK, parameters=subject.parameters()) for subject in subjects], GRID)
 
 
 def test_inputs_are_the_parameters_of_the_subject() -> None:

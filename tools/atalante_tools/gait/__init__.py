@@ -197,6 +197,7 @@ def fit(folder: Path, out: Path, as_json: bool) -> None:
     from atalante_hal.robot import load_robot
 
     with extra():
+        from atalante_control.gait_optimization.fit import FitError
         from atalante_control.gait_optimization.fit import fit as fit_network
         from atalante_control.gait_optimization.library import Library
     collection = Library(folder)
@@ -212,7 +213,10 @@ def fit(folder: Path, out: Path, as_json: bool) -> None:
         raise Failed(f"{folder} must contain at least two solved gaits, got {len(gaits)}")
     print_message(f"fitting {len(gaits)} gaits")
     start = time.monotonic()
-    fitted = fit_network(list(gaits.values()), collection.grid)
+    try:
+        fitted = fit_network(list(gaits.values()), collection.grid)
+    except FitError as error:
+        raise Failed(f"{folder}: {error}") from error
     save_network(fitted.network, out)
     summary = {
         "gaits": len(gaits),
