@@ -147,15 +147,14 @@ class Library:
             found = _read_grid(path) if path.exists() else None
         except OSError as error:
             raise LibraryError(f"{path} cannot be read: {error.strerror}") from error
-        except (TypeError, ValueError) as error:
+        except (TypeError, ValueError, OverflowError, RecursionError) as error:
             raise LibraryError(f"{path}: {error}") from error
         if found is None:
             if grid is None:
                 raise LibraryError(
                     f"{folder} contains no library: create it with `atalante gait library --out {folder}`"
                 )
-            for name in ("gaits", "failed"):
-                (folder / name).mkdir(parents=True, exist_ok=True)
+            self._make_folders()
             write_object({"format": FORMAT, **asdict(grid)}, path)
         elif grid is not None and grid != found:
             raise LibraryError(
@@ -244,6 +243,7 @@ class Library:
             FanOutError: If the calls cannot be distributed, see `fan_out`. If processes ended unexpectedly, the gaits without a
                 result are recorded as failures.
         """
+        self._make_folders()
         waiting = {index: self.grid.subject(index) for index in self.missing()}
         tasks = list(waiting.items())
         try:
@@ -254,6 +254,11 @@ class Library:
             for index, subject in waiting.items():
                 self._keep_failure(index, f"no result for {subject}: {error}", subject.parameters(), {})
             raise
+
+    def _make_folders(self) -> None:
+        """Create the folders `gaits/` and `failed/`. A copy of a library by git has no empty folders."""
+        for name in ("gaits", "failed"):
+            (self.folder / name).mkdir(parents=True, exist_ok=True)
 
     def _read(self) -> tuple[dict[Index, Gait], dict[Index, str]]:
         """Return the solved gaits, and for each rejected file the reason of the rejection."""

@@ -101,6 +101,14 @@ def test_failures_are_listed_and_retried(tmp_path: Path) -> None:
     assert not library.missing()
 
 
+def test_library_that_lost_its_empty_folders_keeps_gaits_and_failures(tmp_path: Path) -> None:
+    (tmp_path / "grid.json").write_bytes(files(Library(tmp_path / "made", GRID).folder)["grid.json"])
+    library = Library(tmp_path)
+    failed = [subject for subject, solved in library.generate(failing) if not solved.solved]
+    assert len(library.failures()) == len(failed) > 0
+    assert len(library.gaits(ROBOT)) == POINTS - len(failed)
+
+
 def test_exception_in_the_solver_is_raised(tmp_path: Path) -> None:
     def broken(subject: Subject) -> SolvedGait:
         raise ZeroDivisionError(str(subject))
@@ -128,6 +136,8 @@ def test_library_folder_rejects_another_grid(tmp_path: Path) -> None:
         json.dumps({"format": "atalante-library/2", "size": 100, "mass": 3}),
         json.dumps({"format": "atalante-library/2", "size": "all"}),
         json.dumps({"format": "atalante-library/2", "size": 100, "weight": [50, 60, 70]}),
+        json.dumps({"format": "atalante-library/2", "size": 100, "mass": [50, 60, 10**400]}),
+        "[" * 100_000,
     ],
 )
 def test_invalid_grid_file_is_rejected(tmp_path: Path, content: str) -> None:
