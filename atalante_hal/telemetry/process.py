@@ -36,7 +36,7 @@ CYCLE_NS = 1_000_000_000 // CYCLES_PER_SECOND
 RUN_GAP_NS = 1_000_000_000
 
 
-#: If the subprocess reads no record from a non-empty ring for this time [s], it is regarded as hung.
+#: If the subprocess reads no record for this time [s] although a ring contains records, it is regarded as hung.
 HANGS_AFTER = 2.0
 #: Largest number of restarts in a session.
 RESTARTS = 3
@@ -344,10 +344,19 @@ class TelemetryProcess(Closing):
         """Return the fault of the subprocess, "has ended" or "hangs"; empty if there is no fault."""
         if not self.alive:
             return "has ended"
-        taken = self.records.taken
-        if taken != self._progress[0] or taken == self.records.written or not self._progress[1]:
+        taken = self._taken
+        if taken != self._progress[0] or taken == sum(ring.written for ring in self._rings) or not self._progress[1]:
             self._progress = taken, now
         return "hangs" if now - self._progress[1] > HANGS_AFTER else ""
+
+    @property
+    def _rings(self) -> list[RingWriter]:
+        return [ring for ring in (self.frames, self.events, self.records) if ring is not None]
+
+    @property
+    def _taken(self) -> int:
+        """Return the number of records that the subprocess has read or lost so far, in all rings together."""
+        return sum(ring.taken for ring in self._rings)
 
     def _restart(self) -> None:
         assert self._child is not None
@@ -427,12 +436,12 @@ class TelemetryProcess(Closing):
         return self.records.lost
 
     def close(self, timeout: float = 10.0) -> TelemetrySummary:
-        """Let the subprocess close its files, then end the subprocess and release the rings.
+        """Let the subprocess read the rings and close its files, then end the subprocess and release the rings.
 
         Nothing can be written afterwards. A second call has no effect. A failed subprocess raises no exception here.
 
         Args:
-            timeout: Time after which the subprocess is killed [s].
+            timeout: The subprocess is killed if it reads no record for this time and does not end [s].
 
         Returns:
             Result of the session.
@@ -440,7 +449,7 @@ class TelemetryProcess(Closing):
         if self._closed:
             return TelemetrySummary()
         self._closed = True
-        rings = [ring for ring in (self.frames, self.events, self.records) if ring is not None]
+        rings = self._rings
         report: dict[str, Any] | None = None
         if self._tap is not None:
             self._tap.flush()
@@ -448,7 +457,7 @@ class TelemetryProcess(Closing):
             ring.finish()
         self._await_start(timeout)
         if self._child is not None:
-            report = self._child.report(timeout)
+            report = self._last_report(self._child, timeout)
             self._child.close(_SESSION_END if report is not None else 0.0)
             self._child = None
         if self._early is not None:
@@ -471,6 +480,19 @@ class TelemetryProcess(Closing):
             if self._child is not None:
                 self._child.kill()
             self._restarting.join(_KILLED)
+
+    def _last_report(self, child: TelemetryChild, timeout: float) -> dict[str, Any] | None:
+        """Return the summary of the subprocess. Return None if it has ended or has made no progress.
+
+        Args:
+            child: Subprocess.
+            timeout: Longest wait without progress [s]. Progress means that the subprocess reads a record.
+        """
+        while True:
+            before = self._taken
+            report = child.report(timeout)
+            if report is not None or self._taken == before:
+                return report
 
     def _summary(self, report: Mapping[str, Any] | None) -> TelemetrySummary:
         """Summarise the session after its last subprocess has ended.

@@ -305,8 +305,11 @@ class RingReader(_Ring, Closing):
         self._next = header[_READ]
         self._notes_read = 0
 
-    def read(self) -> npt.NDArray[np.uint8]:
-        """Read all records written since the last call; records that were overwritten are counted as lost.
+    def read(self, limit: int = sys.maxsize) -> npt.NDArray[np.uint8]:
+        """Read the records written since the last call; records that were overwritten are counted as lost.
+
+        Args:
+            limit: Largest number of records to read, at least 1. The next call continues after the last record of this call.
 
         Returns:
             Records, oldest first, shape (n, record_size) bytes; n may be 0. The next call reuses the array.
@@ -314,13 +317,14 @@ class RingReader(_Ring, Closing):
         header, slots = self._header, len(self._records)
         written = header[_WRITTEN]
         first = max(self._next, written - slots + 1)
-        count, at = written - first, first % slots
+        end = min(written, first + limit)
+        count, at = end - first, first % slots
         before_end = min(count, slots - at)
         self._batch[:before_end] = self._records[at : at + before_end]
         self._batch[before_end:count] = self._records[: count - before_end]
-        intact = min(max(first, header[_WRITTEN] - slots + 1), written)
+        intact = min(max(first, header[_WRITTEN] - slots + 1), end)
         header[_LOST] += intact - self._next
-        header[_READ] = self._next = written
+        header[_READ] = self._next = end
         return self._batch[intact - first : count, : self.record_size]
 
     def keep(self, records: int) -> None:

@@ -31,6 +31,10 @@ if TYPE_CHECKING:  # only for type checks, because protobuf and python-can may n
 _POLL = 0.005  # s, polling period of empty rings
 _WRITER_CHECK = 0.2  # s, shortest time between two checks whether the writer's process exists
 _DROPPED_EVERY = 1.0  # s, shortest time between two reports of lost cycles
+#: Largest number of records in one batch. 64 records of the frame ring contain the frames of about 128 cycles. After each batch,
+#: the control loop sees progress, and a writer that waits for a free slot continues. So a batch must take much less time than
+#: `process.HANGS_AFTER` and `TelemetryConfig.patience`.
+_RECORDS_PER_BATCH, _FRAME_RECORDS_PER_BATCH = 128, 64
 
 
 @dataclass(frozen=True)
@@ -108,11 +112,21 @@ class Service:
             self._mark_saved()
 
     def step(self) -> bool:
-        """Process all new records and events of the rings, and return whether there were any."""
+        """Process all records that the rings contain now, in batches, and return whether there were any."""
+        rings = [ring for ring in (self._records, self._events, self._frames) if ring is not None]
+        ends = [(ring, ring.written) for ring in rings]
+        found = any(ring.position < end for ring, end in ends)
+        self._handle_batch()  # without a new record, there may still be a new run
+        while any(ring.position < end for ring, end in ends):
+            self._handle_batch()
+        return found
+
+    def _handle_batch(self) -> None:
+        """Process the oldest records of each ring."""
         # Read the events before `_begin_runs` reads the notes, because the control loop announces each run in a note before it
         # writes events of the run. In the opposite order, an event could be read whose run is still unknown.
         events = [unpack(bytes(event)) for event in self._events.read()]
-        records = self._records.read()
+        records = self._records.read(_RECORDS_PER_BATCH)
         first = self._records.position - len(records)
         self._begin_runs()
         if len(records) and self._encoder is not None:
@@ -120,9 +134,9 @@ class Service:
         for event, number in events:
             run = next(run for run in reversed(self._runs) if run.number == number)
             self._put_event(event, run.start_ns + event.cycle * CYCLE_NS)
-        logged = self._frames is not None and self._handle_frames(self._frames.read())
+        if self._frames is not None:
+            self._handle_frames(self._frames.read(_FRAME_RECORDS_PER_BATCH))
         self._report_lost()
-        return bool(len(records) or events or logged)
 
     # -- records --
 
@@ -174,17 +188,16 @@ class Service:
         self._cycle = int(cycles[-1])
         self._timestamp = self._run_of(first + len(records) - 1).start_ns + round(records[-1, encoder.time_at] * 1e9)
 
-    def _handle_frames(self, records: npt.NDArray[np.uint8]) -> bool:
-        """Write the given records of the frame ring to the CAN log, and return whether there was any record."""
-        if self._can_log is None or not len(records):
-            return False
+    def _handle_frames(self, records: npt.NDArray[np.uint8]) -> None:
+        """Write the given records of the frame ring to the CAN log."""
+        if self._can_log is None:
+            return
         try:
             for frames, stamps, sent in batches(records):
                 self._can_log.write(frames, stamps, sent)
         except SinkError as error:
             self._can_log = None
             self.report(error.code, str(error), "error")
-        return True
 
     # -- sinks --
 

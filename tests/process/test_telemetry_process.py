@@ -27,9 +27,12 @@ from atalante_hal.hal import Hal
 from atalante_hal.record_layout import Layout
 from atalante_hal.robot import Robot
 from atalante_hal.safety.events import Event
-from atalante_hal.telemetry.child import TelemetryChild
+from atalante_hal.telemetry import process as process_module
+from atalante_hal.telemetry.child import FRAMES, RECORDS, TelemetryChild
 from atalante_hal.telemetry.process import Recording, TelemetryConfig, TelemetryError, TelemetryProcess
+from atalante_hal.telemetry.ring import RingReader
 from atalante_hal.telemetry.schema import DESCRIPTORS
+from atalante_hal.wire.frame import new_frames
 
 FOREVER = 3600.0  # patience [s]: a writer that waits blocks the test
 TRIES = 600  # number of waits of 50 ms each, for an action of another process
@@ -237,6 +240,79 @@ def write_until_received(telemetry: TelemetryProcess, child: subprocess.Popen[st
         write(telemetry, range(cycle, cycle + 10))
         cycle += 10
     raise AssertionError("the subscriber received nothing")
+
+
+class BusyChild:
+    """Replacement for `TelemetryChild` that runs in the test process and reads one record whenever the test wants it."""
+
+    alive, pid = True, 0
+
+    def __init__(self) -> None:
+        self.reports: list[Callable[[], dict[str, Any] | None]] = [lambda: {"endpoint": None, "notices": []}]
+        self.readers: dict[str, RingReader] = {}
+
+    def take_files(self) -> dict[str, int]:
+        return {}
+
+    def configure(self, arguments: dict[str, Any]) -> None:
+        self.readers = {name: RingReader(os.dup(fd)) for name, fd in arguments["rings"].items()}
+
+    def report(self, timeout: float) -> dict[str, Any] | None:
+        return self.reports.pop(0)() if self.reports else None
+
+    def close(self, patience: float = 0.0) -> None:
+        while self.readers:
+            self.readers.popitem()[1].close()
+
+
+class TestBusyTelemetry:
+    def test_telemetry_that_reads_only_frames_is_not_restarted(
+        self, layout: Layout, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        monkeypatch.setattr(process_module, "HANGS_AFTER", 0.0)
+        child: Any = BusyChild()
+        config = TelemetryConfig(publish=False, can_log=tmp_path / "run.log")
+        with TelemetryProcess(config, layout, child=child) as telemetry:
+            write(telemetry, range(5))
+            telemetry.tap().received(new_frames(64 * 5), 64 * 5)
+            for _ in range(4):
+                telemetry.tend()
+                child.readers[FRAMES].read(1)
+            assert telemetry.close().restarts == 0
+
+    def test_telemetry_that_reads_nothing_is_restarted(
+        self, layout: Layout, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        monkeypatch.setattr(process_module, "HANGS_AFTER", 0.0)
+        monkeypatch.setattr(process_module, "TelemetryChild", lambda _: BusyChild())
+        child: Any = BusyChild()
+        config = TelemetryConfig(publish=False, can_log=tmp_path / "run.log")
+        with TelemetryProcess(config, layout, child=child) as telemetry:
+            telemetry.tap().received(new_frames(64 * 5), 64 * 5)
+            telemetry.tend()
+            telemetry.tend()
+            assert telemetry.close().restarts == 1
+
+    def test_close_waits_while_telemetry_reads_records(self, layout: Layout) -> None:
+        child: Any = BusyChild()
+        with TelemetryProcess(TelemetryConfig(publish=False), layout, child=child) as telemetry:
+            write(telemetry, range(5))
+
+            def read_without_a_report() -> None:
+                child.readers[RECORDS].read(1)
+
+            child.reports = [read_without_a_report] * 5 + [lambda: {"published": 5, "notices": []}]
+            summary = telemetry.close(timeout=0.0)
+        assert summary.complete
+        assert summary.published == 5
+
+    def test_close_ends_telemetry_without_progress(self, layout: Layout) -> None:
+        child: Any = BusyChild()
+        with TelemetryProcess(TelemetryConfig(publish=False), layout, child=child) as telemetry:
+            write(telemetry, range(5))
+            child.reports = [lambda: None, lambda: {"published": 5, "notices": []}]
+            assert not telemetry.close(timeout=0.0).complete
+        assert child.readers == {}
 
 
 class TestEndOfTelemetry:

@@ -54,6 +54,18 @@ class TestOrder:
             got += numbers(reader.read())
         assert got == list(range(100))
 
+    def test_limited_read_returns_the_oldest_records_and_continues(self) -> None:
+        with ends(8) as (writer, reader):
+            for number in range(10):
+                writer.write(record(number))
+            assert numbers(reader.read(2)) == [3, 4]
+            assert (writer.taken, writer.lost, reader.position) == (5, 3, 5)
+            for number in range(10, 13):
+                writer.write(record(number))
+            assert numbers(reader.read(4)) == [6, 7, 8, 9]
+            assert numbers(reader.read(4)) == [10, 11, 12]
+            assert (writer.taken, writer.lost) == (13, 4)
+
     @pytest.mark.parametrize("size", [1, 7, 8, 20, 4096])
     def test_record_of_any_size_is_read_unchanged(self, size: int) -> None:
         rng = np.random.default_rng(size)

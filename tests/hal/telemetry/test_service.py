@@ -6,6 +6,7 @@ import os
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -17,11 +18,14 @@ from atalante_hal.hal import Hal
 from atalante_hal.record_layout import Layout
 from atalante_hal.robot import Robot
 from atalante_hal.safety.events import EVENT_BYTES, Event, pack
+from atalante_hal.telemetry.can_log import CanLog
+from atalante_hal.telemetry.frames import FRAME_RECORD, RingTap
 from atalante_hal.telemetry.messages import Encoder
 from atalante_hal.telemetry.ring import RingReader, RingWriter
 from atalante_hal.telemetry.schema import message_class
 from atalante_hal.telemetry.service import Service
 from atalante_hal.telemetry.sink import SinkError
+from atalante_hal.wire.frame import new_frames
 
 TYPES = {"joint_states": "JointStates", "system": "SystemState", "loop": "LoopStatistics", "events": "Event"}
 
@@ -133,6 +137,65 @@ class TestRates:
         with bench(layout, (sink, 10)) as at:
             assert not at.service.step()
         assert sink.got == []
+
+
+class TestBatches:
+    def test_full_rings_are_read_in_alternating_batches(
+        self, layout: Layout, network: atalante_dbc.Network, tmp_path: Path
+    ) -> None:
+        """The control loop sees progress and free slots in both rings long before the step ends."""
+        cycles, frames_per_cycle = 2000, 32
+        progress: list[
+            tuple[int, int]
+        ] = []  # number of records read from the ring of cycles and from the ring of frames
+
+        class Observer(Sink):
+            def put(self, key: str, payload: bytes, timestamp: int, cycle: int) -> None:
+                progress.append((records.taken, frames.taken))
+
+        with (
+            RingWriter(layout.size * 8, 4096, meta={"start_ns": 0}) as records,
+            RingWriter(EVENT_BYTES, 16) as events,
+            RingWriter(FRAME_RECORD.itemsize, 4096) as frames,
+            RingReader(os.dup(records.fd)) as records_out,
+            RingReader(os.dup(events.fd)) as events_out,
+            RingReader(os.dup(frames.fd)) as frames_out,
+            CanLog(tmp_path / "run.log", network.buses, {}) as can_log,
+        ):
+            service = Service(
+                records_out,
+                events_out,
+                frames_out,
+                encoder=Encoder(layout, ["NODES_WELL"]),
+                sinks=[(Observer(), 10)],
+                loop_every=100,
+                can_log=can_log,
+            )
+            tap = RingTap(frames, lambda: 0)
+            record = np.zeros(layout.size)
+            for cycle in range(cycles):
+                record[layout["cycle"]] = cycle
+                records.write(record)
+                tap.received(new_frames(frames_per_cycle), frames_per_cycle)
+            tap.flush()
+            assert service.step()
+            assert (records.taken, frames.taken) == (cycles, cycles * frames_per_cycle // 64)
+            assert can_log.frames == cycles * frames_per_cycle
+            assert not service.step()
+        steps = np.diff(np.array([(0, 0), *progress]), axis=0)
+        assert steps.max(axis=0).tolist() == [128, 64]
+
+    def test_records_written_after_a_stop_do_not_delay_the_end(self, layout: Layout) -> None:
+        class Refilling(Sink):
+            def put(self, key: str, payload: bytes, timestamp: int, cycle: int) -> None:
+                super().put(key, payload, timestamp, cycle)
+                at.write(range(cycle + 1000, cycle + 1020))  # faster than the service reads
+
+        sink = Refilling()
+        with bench(layout, (sink, 10)) as at:
+            at.write(range(1, 201))
+            at.service.run(stop=["SIGTERM"])
+        assert set(range(10, 201, 10)) <= set(sink.cycles("joint_states"))
 
 
 class TestRuns:
