@@ -11,6 +11,7 @@ if the first endpoint is in use.
 
 from __future__ import annotations
 
+import itertools
 import os
 import re
 import threading
@@ -318,7 +319,7 @@ class TelemetryProcess(Closing):
     def tend(self) -> None:
         """Restart the subprocess in the background if it has ended or hangs. Call this several times per second.
 
-        The new subprocess reads the records that the old subprocess has not read, and writes files with numbered names.
+        The new subprocess reads the records that the old subprocess has not read, and writes new files with numbered names.
         It listens on the same endpoint. If this endpoint is in use, the new subprocess listens on another endpoint
         (`endpoint` changes) or does not publish (`endpoint` is None).
         """
@@ -524,8 +525,14 @@ class TelemetryProcess(Closing):
 
 
 def _numbered(path: Path | None, number: int) -> Path | None:
-    """Return the file name for a restarted subprocess, such as recording-1.mcap for recording.mcap."""
+    """Return the file name for a restarted subprocess, such as recording-1.mcap for recording.mcap.
+
+    Args:
+        path: File of the first subprocess.
+        number: First number to use. Numbers of existing files are skipped, so that no file is overwritten.
+    """
     if path is None:
         return None
     stem, dot, suffixes = path.name.partition(".")
-    return path.with_name(f"{stem}-{number}{dot}{suffixes}")
+    names = (path.with_name(f"{stem}-{n}{dot}{suffixes}") for n in itertools.count(number))
+    return next(name for name in names if not name.exists())

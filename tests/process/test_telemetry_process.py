@@ -293,6 +293,30 @@ class TestBusyTelemetry:
             telemetry.tend()
             assert telemetry.close().restarts == 1
 
+    def test_restart_keeps_existing_files_with_numbered_names(
+        self, layout: Layout, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        configured: list[dict[str, Any]] = []
+
+        class Restarted(BusyChild):
+            def configure(self, arguments: dict[str, Any]) -> None:
+                super().configure(arguments)
+                configured.append(arguments["config"])
+
+        monkeypatch.setattr(process_module, "TelemetryChild", lambda _: Restarted())
+        (tmp_path / "run-1.log").touch()
+        (tmp_path / "run-2.log").touch()
+        (tmp_path / "run-1.mcap").touch()
+        child: Any = BusyChild()
+        config = TelemetryConfig(publish=False, can_log=tmp_path / "run.log", recording=tmp_path / "run.mcap")
+        with TelemetryProcess(config, layout, child=child) as telemetry:
+            child.alive = False
+            telemetry.tend()
+            recording = telemetry.close().recording
+        assert [Path(configured[0][name]).name for name in ("can_log", "recording")] == ["run-3.log", "run-2.mcap"]
+        assert recording is not None
+        assert recording.files == ("run.mcap", "run-2.mcap")
+
     def test_close_waits_while_telemetry_reads_records(self, layout: Layout) -> None:
         child: Any = BusyChild()
         with TelemetryProcess(TelemetryConfig(publish=False), layout, child=child) as telemetry:
