@@ -215,7 +215,8 @@ def _guide(layout: Layout) -> Callable[[Sample], bytes]:
             field[:] = values[columns]
         message.active[:] = [value > 0.5 for value in values[active]]
         message.phase = values[phase.start]
-        message.step, message.stance = max(0, int(values[step.start])), int(values[stance.start])
+        message.step = max(0, _int_or_zero(values[step.start]))
+        message.stance = _int_or_zero(values[stance.start])
         message.name[:] = ASSISTED[message.stance] if 0 <= message.stance < len(ASSISTED) else ()
         return bytes(message.SerializeToString())
 
@@ -305,6 +306,11 @@ class LoopWindow:
         message.telemetry_lost = lost
         self._clear()
         return bytes(message.SerializeToString())
+
+
+def _int_or_zero(value: float) -> int:
+    """Convert a value of a controller to an integer. Return 0 if it is not finite or does not fit into 32 bits."""
+    return int(value) if abs(value) < 1 << 31 else 0
 
 
 def _named(repeated: Any, names: Sequence[str]) -> list[Any]:

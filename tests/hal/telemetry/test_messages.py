@@ -158,6 +158,16 @@ class TestStreams:
         record[layout["controller.stance"]] = 0.0
         assert list(decoded(Encoder(layout), "guide", record).name) == ["right_SH", "right_SK"]
 
+    @pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf, 1e300, 2.0**32])
+    def test_guide_values_that_are_no_integers_become_zero(
+        self, layout: Layout, record: np.ndarray, value: float
+    ) -> None:
+        for name in ("step", "stance", "phase", "error", "filter_active", "q_des"):
+            record[layout[f"controller.{name}"]] = value
+        message = decoded(Encoder(layout), "guide", record)
+        assert (message.step, message.stance) == (0, 0)
+        assert list(message.name) == ["right_SH", "right_SK"]
+
     def test_other_controller_fields_are_in_the_controller_message(self, layout: Layout, record: np.ndarray) -> None:
         message = decoded(Encoder(layout), "controller", record)
         fields = {field.name: list(field.value) for field in message.field}
