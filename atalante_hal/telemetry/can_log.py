@@ -10,6 +10,7 @@ frame. A frame that is older than the first frame gets the time of the first fra
 from __future__ import annotations
 
 import contextlib
+import fcntl
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
@@ -50,7 +51,7 @@ def check_format(path: Path) -> str:
 
 
 class CanLog(Closing):
-    """Writer of a CAN log file.
+    """Writer of a CAN log file. The file is locked until it is closed, so that no second run writes it.
 
     Args:
         path: Path of the file; missing folders are created.
@@ -58,7 +59,7 @@ class CanLog(Closing):
         bus_of: Bus of each frame identifier.
 
     Raises:
-        SinkError: If the format is not valid or the file cannot be created.
+        SinkError: If the format is not valid, the file cannot be created, or another run writes it.
     """
 
     def __init__(self, path: Path, buses: Sequence[str], bus_of: Mapping[int, str]) -> None:
@@ -74,8 +75,18 @@ class CanLog(Closing):
         self._channel_of = {frame_id: self._channels[bus] for frame_id, bus in bus_of.items()}
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
-            self._logger = can.Logger(path)
+            with contextlib.ExitStack() as stack:
+                lock = stack.enter_context(
+                    path.open("ab")
+                )  # without truncation, because another run may be writing the file
+                fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                self._logger = can.Logger(path)
+                self._lock = stack.pop_all()  # `close` releases the lock
             self._open = True
+        except BlockingIOError as error:
+            raise SinkError(
+                f"another run writes {path}: give another file for the CAN log", "RECORD_STOPPED"
+            ) from error
         except OSError as error:
             raise SinkError(f"the CAN log {path} cannot be created: {error.strerror}", "RECORD_STOPPED") from error
 
@@ -134,10 +145,12 @@ class CanLog(Closing):
                 self._logger.stop()
             except OSError as error:
                 raise self._failed(error) from error
+            self._lock.close()
             self.finished = True
 
     def _failed(self, error: OSError) -> SinkError:
         self._open = False
         with contextlib.suppress(OSError):  # `stop` writes the buffered frames, which can fail again
             self._logger.stop()
+        self._lock.close()
         return SinkError(f"the CAN log {self.path} stopped: {error.strerror}", "RECORD_STOPPED")

@@ -126,6 +126,21 @@ class TestFormats:
         with pytest.raises(SinkError, match="cannot be created"):
             open_log(tmp_path / "file" / "run.log", network)
 
+    @pytest.mark.parametrize("suffix", FORMATS)
+    def test_file_that_another_run_writes_is_rejected_and_unchanged(
+        self, suffix: str, network: atalante_dbc.Network, tmp_path: Path
+    ) -> None:
+        path = tmp_path / f"run{suffix}"
+        frames, stamps, sent = random_frames(network, 100), np.arange(100), np.zeros(100, np.uint8)
+        with open_log(path, network) as log:
+            log.write(frames, stamps, sent)
+            with pytest.raises(SinkError, match="another run writes"):
+                open_log(path, network)
+        assert len(read(path)) == 100
+        with open_log(path, network) as log:  # the lock is released
+            log.write(frames[:5], stamps[:5], sent[:5])
+        assert len(read(path)) == 5
+
     def test_full_disk_gives_an_error_message(self, network: atalante_dbc.Network, tmp_path: Path) -> None:
         path = tmp_path / "full.log"
         path.symlink_to("/dev/full")
