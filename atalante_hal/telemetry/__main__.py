@@ -50,8 +50,8 @@ class Outlets:
         before: Endpoint of the telemetry process that this process replaces; None if there is none.
 
     Raises:
-        SinkError: If a requested file cannot be opened, or if the requested endpoint cannot be opened at the first start.
-            After a restart, or if no endpoint was requested, a missing publisher is only added to `notices`.
+        SinkError: If a requested file cannot be opened, or if nothing can be published at the first start although
+            `TelemetryConfig.requires_publisher`. Otherwise a missing publisher is only added to `notices`.
     """
 
     def __init__(
@@ -66,7 +66,8 @@ class Outlets:
         self.publisher: Publisher | None = None
         self.recorder: Recorder | None = None
         self.can_log = _open_can_log(config, frames)
-        self.encoder = self._make_encoder(config, records.meta)
+        publisher_required = config.requires_publisher and not restarts
+        self.encoder = self._make_encoder(config, records.meta, publisher_required)
         if self.encoder is None:
             return
         streams = self.encoder.keys
@@ -76,11 +77,11 @@ class Outlets:
             try:
                 self.publisher = _open_publisher(config, streams, before)
             except SinkError as error:
-                if config.listen is not None and not restarts:
+                if publisher_required:
                     raise
                 self.notices.append(f"nothing is published: {error}")
 
-    def _make_encoder(self, config: TelemetryConfig, meta: dict[str, Any]) -> Encoder | None:
+    def _make_encoder(self, config: TelemetryConfig, meta: dict[str, Any], publisher_required: bool) -> Encoder | None:
         if not config.publish and config.recording is None:
             return None
         try:
@@ -88,7 +89,10 @@ class Outlets:
         except ImportError as error:
             if config.recording is not None:
                 raise SinkError(f"a recording needs {error.name}: {_INSTALL}", "RECORD_STOPPED") from error
-            self.notices.append(f"nothing is published, because {error.name} is missing: {_INSTALL}")
+            text = f"nothing is published, because {error.name} is missing: {_INSTALL}"
+            if publisher_required:
+                raise SinkError(text, "TELEMETRY_DOWN") from error
+            self.notices.append(text)
             return None
         return Encoder(Layout.from_json(meta["layout"]), meta["diagnostics"])
 

@@ -53,11 +53,13 @@ class Access:
                 raise AccessError(f"{name} {path} must be readable only by its owner; type: chmod 600 {path}")
         if self.users is not None:
             try:
-                lines = self.users.read_text(encoding="utf-8").splitlines()
+                lines = self.user_lines()
             except (OSError, UnicodeDecodeError) as error:
                 raise AccessError(f"users {self.users} must be a readable file in UTF-8: {error}") from error
             if not lines or not all(name and password for name, _, password in (line.partition(":") for line in lines)):
-                raise AccessError(f"users {self.users} must contain only lines name:password, one for each user")
+                raise AccessError(
+                    f"users {self.users} must contain only lines name:password, one for each user, and comments that begin with #"
+                )
 
     @property
     def protocols(self) -> tuple[str, ...]:
@@ -83,14 +85,24 @@ class Access:
             valid += " unless certificate and private_key are given"
         raise AccessError(f"listen must be {valid}, got {listen!r}")
 
-    def transport(self) -> dict[str, Any]:
-        """Return the section `transport` of the Zenoh configuration."""
+    def user_lines(self) -> list[str]:
+        """Return the lines name:password of the file of users, without comments and without spaces at the ends of a line."""
+        lines = self.users.read_text(encoding="utf-8").splitlines() if self.users is not None else []
+        return [line for line in map(str.strip, lines) if not line.startswith("#")]
+
+    def transport(self, users: str) -> dict[str, Any]:
+        """Return the section `transport` of the Zenoh configuration.
+
+        Args:
+            users: Path of a file with the `user_lines`. The file of the operator may contain comments, and Zenoh would take a
+                comment as a user.
+        """
         link: dict[str, Any] = {}
         if self.certificate is not None:
             link["tls"] = {"listen_certificate": str(self.certificate), "listen_private_key": str(self.private_key)}
             if self.client_ca is not None:
                 link["tls"] |= {"root_ca_certificate": str(self.client_ca), "enable_mtls": True}
-        auth = {"auth": {"usrpwd": {"dictionary_file": str(self.users)}}} if self.users is not None else {}
+        auth = {"auth": {"usrpwd": {"dictionary_file": users}}} if self.users is not None else {}
         return {"link": link, **auth}
 
 

@@ -104,6 +104,11 @@ class TelemetryConfig:
         """Return the files that restrict access to the endpoint."""
         return Access(self.certificate, self.private_key, self.client_ca, self.users)
 
+    @property
+    def requires_publisher(self) -> bool:
+        """Return whether a session without a publisher is an error: an endpoint, TLS or users were requested."""
+        return self.publish and (self.listen is not None or self.access != Access())
+
     def to_json(self) -> dict[str, Any]:
         """Return the configuration as JSON types."""
         return {name: str(value) if isinstance(value, Path) else value for name, value in asdict(self).items()}

@@ -13,14 +13,16 @@ from __future__ import annotations
 
 import json
 import logging
-from collections.abc import Iterable, Mapping
-from contextlib import ExitStack
+import os
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import ExitStack, contextmanager
 from typing import Any
 
 import zenoh
 import zenoh.ext
 
 from atalante_hal.closing import Closing
+from atalante_hal.memory import anonymous_file
 from atalante_hal.telemetry.access import Access
 from atalante_hal.telemetry.schema import encoding
 from atalante_hal.telemetry.sink import EVENTS, SinkError
@@ -32,6 +34,8 @@ PORTS_TRIED = 16
 EVENTS_KEPT = 256
 #: Access without TLS and without users: every client that reaches the endpoint may subscribe.
 OPEN = Access()
+
+_IN_USE = "os error 98"  # part of a Zenoh error: the port is in use
 
 _log = logging.getLogger(__name__)
 
@@ -180,37 +184,43 @@ def configuration(robot: str, listen: str) -> dict[str, Any]:
 
 
 def _open(robot: str, listen: str | None, access: Access, before: str | None) -> tuple[zenoh.Session, str]:
-    """Open a session, and return the session and its endpoint."""
-    if listen is not None:
-        try:
-            return zenoh.open(_parsed(robot, listen, access)), listen
-        except zenoh.ZError as error:
-            raise SinkError(
-                f"Zenoh cannot listen on {listen}: {_reason(error)}; give another endpoint, such as tcp/127.0.0.1:7448",
-                "TELEMETRY_DOWN",
-            ) from error
-    refused = ""
+    """Open a session at the first endpoint that is not in use, and return the session and its endpoint."""
     ports = range(DEFAULT_PORT, DEFAULT_PORT + PORTS_TRIED)
-    defaults = [f"{access.protocols[0]}/{DEFAULT_HOST}:{port}" for port in ports]
-    for endpoint in dict.fromkeys([before, *defaults] if before is not None else defaults):
-        try:
-            return zenoh.open(_parsed(robot, endpoint, access)), endpoint
-        except zenoh.ZError as error:
-            refused = _reason(error)
-            _log.info("%s is not free, trying the next endpoint", endpoint)
-    raise SinkError(
-        f"Zenoh found no free port from {ports[0]} to {ports[-1]} on {DEFAULT_HOST}: {refused}", "TELEMETRY_DOWN"
-    )
+    endpoints = [f"{access.protocols[0]}/{DEFAULT_HOST}:{port}" for port in ports]
+    if listen is not None:
+        endpoints = [listen]
+    elif before is not None:
+        endpoints = [before, *(endpoint for endpoint in endpoints if endpoint != before)]
+    with _user_file(access) as users:
+        for endpoint in endpoints:
+            try:
+                return zenoh.open(_parsed(robot, endpoint, access.transport(users))), endpoint
+            except zenoh.ZError as error:
+                if _IN_USE not in str(error):
+                    reason = str(error).split(" at /")[0]  # without file name and line number of Zenoh's source code
+                    raise SinkError(f"Zenoh cannot listen on {endpoint}: {reason}", "TELEMETRY_DOWN") from error
+                _log.info("%s is not free", endpoint)
+    if listen is not None:
+        other = f"{access.protocols[0]}/{DEFAULT_HOST}:{DEFAULT_PORT + 1}"
+        raise SinkError(
+            f"Zenoh cannot listen on {listen}: the port is taken; give another endpoint, such as {other}",
+            "TELEMETRY_DOWN",
+        )
+    raise SinkError(f"Zenoh found no free port from {ports[0]} to {ports[-1]} on {DEFAULT_HOST}", "TELEMETRY_DOWN")
 
 
-def _parsed(robot: str, listen: str, access: Access) -> zenoh.Config:
+@contextmanager
+def _user_file(access: Access) -> Iterator[str]:
+    """Yield the path of a file in memory with the users, without the comments of the operator's file."""
+    descriptor = anonymous_file("atalante-users", 0)
+    try:
+        os.write(descriptor, "\n".join(access.user_lines()).encode())
+        yield f"/proc/self/fd/{descriptor}"
+    finally:
+        os.close(descriptor)
+
+
+def _parsed(robot: str, listen: str, restrictions: Mapping[str, Any]) -> zenoh.Config:
     config = configuration(robot, listen)
-    restrictions = access.transport()
-    config["transport"] |= restrictions | {"link": {**config["transport"]["link"], **restrictions["link"]}}
+    config["transport"] |= {**restrictions, "link": {**config["transport"]["link"], **restrictions["link"]}}
     return zenoh.Config.from_json5(json.dumps(config))
-
-
-def _reason(error: zenoh.ZError) -> str:
-    """Return the text of a Zenoh error, without the file name and the line number of Zenoh's source code."""
-    text = str(error)
-    return "the port is taken" if "os error 98" in text else text.split(" at /")[0]

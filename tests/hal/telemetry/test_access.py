@@ -22,9 +22,15 @@ from cryptography.hazmat.primitives.asymmetric import ec
 from cryptography.x509.oid import NameOID
 from mcap.reader import make_reader
 
+import atalante_dbc
+from atalante_hal.bus.pair import lockstep_pair
+from atalante_hal.hal import Hal
+from atalante_hal.record_layout import Layout
+from atalante_hal.robot import Robot
 from atalante_hal.telemetry.access import Access, AccessError, load_telemetry_file
 from atalante_hal.telemetry.process import TelemetryConfig, TelemetryError, TelemetryProcess
 from atalante_hal.telemetry.publisher import Publisher
+from atalante_hal.telemetry.sink import SinkError
 from atalante_tools.cli import cli
 
 TRIES = 100  # largest number of polls, one every 50 ms
@@ -75,6 +81,11 @@ def users(tmp_path: Path) -> Path:
     path.touch(0o600)
     path.write_text("lab:secret\n")
     return path
+
+
+@pytest.fixture
+def layout(network: atalante_dbc.Network, robot: Robot) -> Layout:
+    return Hal(network, robot, lockstep_pair()[0]).layout
 
 
 def endpoint(protocol: str) -> str:
@@ -166,6 +177,30 @@ class TestLoopback:
         with Publisher("exo", STREAMS, endpoint("tcp"), Access(users=users)) as publisher:
             assert receives(publisher, user("lab", "secret"))
             assert not receives(publisher, {})
+
+    def test_comment_in_the_user_file_is_no_user(self, users: Path) -> None:
+        users.write_text("# the users of the lab\nlab:secret\n  #old:secret\n#gone:secret\n")
+        with Publisher("exo", STREAMS, endpoint("tcp"), Access(users=users)) as publisher:
+            assert receives(publisher, user("lab", "secret"))
+            assert not any_receives(
+                publisher, *((user(name, "secret"), None) for name in ("old", "#old", "gone", "#gone"))
+            )
+
+    def test_default_endpoint_with_another_private_key_names_the_reason(self, authority: Authority) -> None:
+        certificate, _ = authority.issue("robot")
+        _, other_key = authority.issue("other")
+        with pytest.raises(SinkError, match=r"cannot listen on tls/127.*KeyMismatch") as refused:
+            Publisher("exo", STREAMS, None, Access(certificate, other_key))
+        assert "port" not in str(refused.value)
+
+    @pytest.mark.parametrize("protocol", ["tls", "quic"])
+    def test_requested_endpoint_with_another_private_key_names_the_reason(
+        self, authority: Authority, protocol: str
+    ) -> None:
+        certificate, _ = authority.issue("robot")
+        _, other_key = authority.issue("other")
+        with pytest.raises(SinkError, match=r"KeyMismatch$"):
+            Publisher("exo", STREAMS, endpoint(protocol), Access(certificate, other_key))
 
     def test_accepted_client_cannot_put(self, authority: Authority, users: Path) -> None:
         with (
@@ -293,7 +328,10 @@ class TestTelemetryFile:
         for protocol in protocols:
             access.check_endpoint(f"{protocol}/{host}:7447")
 
-    @pytest.mark.parametrize("content", ["lab", "lab:", ":secret", "lab:secret\n\nother:x"])
+    @pytest.mark.parametrize(
+        "content",
+        ["lab", "lab:", "lab: ", ":secret", "lab:secret\n\nother:x", "#lab:secret\n", "# note\n  # other:x\n"],
+    )
     def test_invalid_user_file_is_rejected(self, users: Path, content: str) -> None:
         users.write_text(content)
         with pytest.raises(AccessError, match="name:password"):
@@ -369,6 +407,31 @@ class TestCommand:
         with (out / "recording.mcap").open("rb") as file:
             counts = make_reader(file).get_summary().statistics.channel_message_counts
         assert min(counts.values()) > 0
+
+
+def test_session_with_another_private_key_and_no_endpoint_does_not_start(authority: Authority, layout: Layout) -> None:
+    certificate, _ = authority.issue("robot")
+    _, other_key = authority.issue("other")
+    config = TelemetryConfig(certificate=certificate, private_key=other_key, lock_step=True)
+    with pytest.raises(TelemetryError, match="KeyMismatch"), TelemetryProcess(config, layout):
+        pass
+
+
+@pytest.mark.parametrize("requested", ["listen", "users", "nothing"])
+def test_missing_package_is_an_error_only_if_an_endpoint_or_users_are_requested(
+    users: Path, layout: Layout, requested: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folder = users.parent
+    (folder / "sitecustomize.py").write_text("import sys\nsys.modules['google.protobuf'] = None\n")
+    monkeypatch.setenv("PYTHONPATH", str(folder))
+    options: dict[str, Any] = {"listen": {"listen": endpoint("tcp")}, "users": {"users": users}, "nothing": {}}
+    telemetry = TelemetryProcess(TelemetryConfig(lock_step=True, **options[requested]), layout)
+    if requested == "nothing":
+        with telemetry:
+            assert "is missing" in telemetry.notices[0]
+    else:
+        with pytest.raises(TelemetryError, match="nothing is published, because"):
+            telemetry.start()
 
 
 def test_configuration_from_code_is_checked() -> None:
