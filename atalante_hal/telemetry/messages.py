@@ -67,7 +67,13 @@ class Encoder:
         return [*((stream.key, stream.message) for stream in self.streams), (self.window.key, self.window.message)]
 
     def sample(
-        self, record: npt.NDArray[np.float64], cycle: int, start_ns: int, run: int = 0, run_name: str = ""
+        self,
+        record: npt.NDArray[np.float64],
+        cycle: int,
+        start_ns: int,
+        run: int = 0,
+        run_name: str = "",
+        time_ns: int = 0,
     ) -> Sample:
         """Create a `Sample` from the record of one cycle.
 
@@ -77,11 +83,13 @@ class Encoder:
             start_ns: Log time of cycle 0 of the run [ns].
             run: Number of the run in the session.
             run_name: Name of the run.
+            time_ns: Log time of the cycle [ns]. With 0, the log time is `start_ns` plus the robot time.
 
         Returns:
             Sample for the streams.
         """
-        return Sample(record.tolist(), cycle, start_ns + round(float(record[self.time_at]) * 1e9), run, run_name)
+        timestamp = time_ns or start_ns + round(float(record[self.time_at]) * 1e9)
+        return Sample(record.tolist(), cycle, timestamp, run, run_name)
 
     def event(self, event: Event, timestamp: int) -> bytes:
         """Encode an `Event` message.

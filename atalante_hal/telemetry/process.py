@@ -22,6 +22,7 @@ from pathlib import Path
 from typing import Any, Self
 
 import numpy as np
+import numpy.typing as npt
 
 from atalante_hal.closing import Closing
 from atalante_hal.record_layout import Layout
@@ -216,8 +217,6 @@ class TelemetryProcess(Closing):
             meta=meta,
             fd=files.get(RECORDS),
         )
-        #: Function that copies the record of a cycle, shape (layout.size,), to the ring. A memoryview is copied fastest.
-        self.write = self.records.write
         self.events = RingWriter(EVENT_BYTES, EVENT_SLOTS, fd=files.get(EVENTS))
         self.frames: RingWriter | None = None
         if config.can_log is not None:
@@ -423,13 +422,25 @@ class TelemetryProcess(Closing):
         self.records.add_note({"run": self._runs, "name": name, "start_ns": self._start_ns, "about": facts})
         self._runs += 1
 
+    def write(self, record: memoryview | npt.NDArray[np.float64]) -> None:
+        """Copy the record of a cycle to the ring, on the wall clock with the time of day.
+
+        Args:
+            record: Values of the record, shape (layout.size,). A memoryview is copied fastest.
+        """
+        self.records.write(record, self._time_ns())
+
+    def _time_ns(self) -> int:
+        """Return the time of day [ns]. Return 0 in lock-step, where the log time follows from the robot time."""
+        return 0 if self.config.lock_step else time.time_ns()
+
     def event(self, event: Event) -> None:
         """Publish and record an event.
 
         Args:
             event: Event of the current run.
         """
-        self.events.write(pack(event, max(0, self._runs - 1)))
+        self.events.write(pack(event, max(0, self._runs - 1)), self._time_ns())
 
     @property
     def alive(self) -> bool:

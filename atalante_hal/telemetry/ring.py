@@ -1,5 +1,7 @@
 """Ring buffer in shared memory. The control loop writes records of fixed size, and the telemetry process reads them.
 
+A slot contains a record, padding to 8 bytes, and the time of the record.
+
 A ring has one writer and one reader. `write` needs no lock and no system call: it copies the record and then stores the counter
 of written records. The writer may overwrite the oldest records while the reader copies them. So the reader copies a batch, reads
 the counter again and discards the records that may have been overwritten meanwhile (a seqlock for the whole batch). This requires
@@ -33,7 +35,7 @@ from atalante_hal.closing import Closing
 from atalante_hal.memory import anonymous_file
 
 MAGIC = int.from_bytes(b"ATLRING\0", "little")
-VERSION = 1
+VERSION = 2
 
 # Each name is the index of a 64-bit word in the header of a ring. Line 1: constants. Line 2: words that only the writer changes.
 # Line 3: words that only the reader changes. The words of each line are in a cache line of their own.
@@ -181,7 +183,7 @@ class RingWriter(_Ring, Closing):
                 f"a ring must have at least 2 slots of at least 1 byte, got {slots} slots of {record_size} bytes"
             )
         packed = json.dumps(dict(meta or {})).encode()
-        stride = -(-record_size // 8) * 8
+        stride = (-(-record_size // 8) + 1) * 8
         data = -(-(_HEADER_BYTES + len(packed) + NOTES_BYTES) // mmap.PAGESIZE) * mmap.PAGESIZE
         fd = anonymous_file("atalante-telemetry", 0) if fd is None else fd
         os.ftruncate(fd, data + stride * slots)
@@ -200,12 +202,14 @@ class RingWriter(_Ring, Closing):
         self._begin = self._offset = data  # offsets [bytes] in the file: first slot, next record
         self._end = data + stride * slots
         self._limit = slots - 1 if lossless else sys.maxsize
+        self._times = self._bytes[data:].cast("q")[stride // 8 - 1 :: stride // 8]  # last word of each slot
 
-    def write(self, record: memoryview | npt.NDArray[Any] | bytes) -> None:
+    def write(self, record: memoryview | npt.NDArray[Any] | bytes, time_ns: int = 0) -> None:
         """Copy one record into the ring buffer.
 
         Args:
             record: Contiguous buffer of `record_size` bytes.
+            time_ns: Time of the record [ns]; 0 if the record has no time of its own.
 
         Raises:
             IndexError: If the buffer has another size.
@@ -215,6 +219,7 @@ class RingWriter(_Ring, Closing):
             self._wait_for_reader()
         offset = self._offset
         self._map[offset : offset + self._size] = record  # type: ignore[assignment]
+        self._times[count % self._slots] = time_ns
         self._header[_WRITTEN] = self._count = count + 1
         offset += self._stride
         self._offset = offset if offset < self._end else self._begin
@@ -274,6 +279,7 @@ class RingWriter(_Ring, Closing):
         """Mark the ring as closed and release the memory. The kernel frees the memory when the reader has also released it."""
         if not self._map.closed:
             self.finish()
+            self._times.release()
             self._release()
 
 
@@ -302,6 +308,8 @@ class RingReader(_Ring, Closing):
         data, stride, slots = header[_DATA], header[_STRIDE], header[_SLOTS]
         self._records = np.frombuffer(self._map, np.uint8, stride * slots, data).reshape(slots, stride)
         self._batch = np.zeros_like(self._records)
+        #: Time of each record that the last `read` returned, shape (n,) [ns]; 0 for a record without a time of its own.
+        self.times: npt.NDArray[np.int64] = np.zeros(0, np.int64)
         self._next = header[_READ]
         self._notes_read = 0
 
@@ -312,7 +320,8 @@ class RingReader(_Ring, Closing):
             limit: Largest number of records to read, at least 1. The next call continues after the last record of this call.
 
         Returns:
-            Records, oldest first, shape (n, record_size) bytes; n may be 0. The next call reuses the array.
+            Records, oldest first, shape (n, record_size) bytes; n may be 0. Their times are in `times`. The next call reuses both
+            arrays.
         """
         header, slots = self._header, len(self._records)
         written = header[_WRITTEN]
@@ -325,7 +334,9 @@ class RingReader(_Ring, Closing):
         intact = min(max(first, header[_WRITTEN] - slots + 1), end)
         header[_LOST] += intact - self._next
         header[_READ] = self._next = end
-        return self._batch[intact - first : count, : self.record_size]
+        found = self._batch[intact - first : count]
+        self.times = found[:, -8:].view(np.int64)[:, 0]
+        return found[:, : self.record_size]
 
     def keep(self, records: int) -> None:
         """Increase the number of saved records, which `kept` returns.

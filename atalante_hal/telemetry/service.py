@@ -46,7 +46,9 @@ class Run:
 
     number: int
     name: str
-    start_ns: int  # log time of cycle 0 of the run [ns]
+    start_ns: (
+        int  # log time of cycle 0 of the run [ns]; on the wall clock, records and events have their own time of day
+    )
     first: int  # number of the first record of the run
 
 
@@ -126,14 +128,15 @@ class Service:
         # Read the events before `_begin_runs` reads the notes, because the control loop announces each run in a note before it
         # writes events of the run. In the opposite order, an event could be read whose run is still unknown.
         events = [unpack(bytes(event)) for event in self._events.read()]
+        event_times = self._events.times.tolist()
         records = self._records.read(_RECORDS_PER_BATCH)
         first = self._records.position - len(records)
         self._begin_runs()
         if len(records) and self._encoder is not None:
-            self._handle_records(self._encoder, records.view(np.float64), first)
-        for event, number in events:
+            self._handle_records(self._encoder, records.view(np.float64), self._records.times, first)
+        for (event, number), time_ns in zip(events, event_times, strict=True):
             run = next(run for run in reversed(self._runs) if run.number == number)
-            self._put_event(event, run.start_ns + event.cycle * CYCLE_NS)
+            self._put_event(event, time_ns or run.start_ns + event.cycle * CYCLE_NS)
         if self._frames is not None:
             self._handle_frames(self._frames.read(_FRAME_RECORDS_PER_BATCH))
         self._report_lost()
@@ -155,7 +158,9 @@ class Service:
         """Return the run to which the record with a given number belongs."""
         return next((run for run in reversed(self._runs) if run.first <= record), self._runs[0])
 
-    def _handle_records(self, encoder: Encoder, records: npt.NDArray[np.float64], first: int) -> None:
+    def _handle_records(
+        self, encoder: Encoder, records: npt.NDArray[np.float64], times: npt.NDArray[np.int64], first: int
+    ) -> None:
         """Pass the messages of every n-th cycle to each sink; each sink has its own n.
 
         Example: a sink with n = 10 gets the messages of the cycles 0, 10, 20 and so on. All sinks also get the loop statistics.
@@ -163,6 +168,7 @@ class Service:
         Args:
             encoder: Encoder for the layout of the records.
             records: Records with consecutive numbers, shape (n, layout.size).
+            times: Time of day of each record, shape (n,) [ns]; 0 in lock-step.
             first: Number of the first record.
         """
         cycles = np.rint(records[:, encoder.cycle_at]).astype(np.int64)
@@ -173,7 +179,7 @@ class Service:
         for row in np.flatnonzero(due).tolist():
             self._handled = before + row
             cycle, run = int(cycles[row]), self._run_of(first + row)
-            sample = encoder.sample(records[row], cycle, run.start_ns, run.number, run.name)
+            sample = encoder.sample(records[row], cycle, run.start_ns, run.number, run.name, int(times[row]))
             sinks = [sink for sink, every in self._sinks if cycle % every == 0]
             if sinks:
                 for stream in encoder.streams:
@@ -185,8 +191,9 @@ class Service:
                 self._put([sink for sink, _ in self._sinks], encoder.window.key, payload, sample.timestamp, cycle)
         self._handled = before + len(records)
         encoder.window.add(records[window_from:])
+        last = self._run_of(first + len(records) - 1)
         self._cycle = int(cycles[-1])
-        self._timestamp = self._run_of(first + len(records) - 1).start_ns + round(records[-1, encoder.time_at] * 1e9)
+        self._timestamp = int(times[-1]) or last.start_ns + round(records[-1, encoder.time_at] * 1e9)
 
     def _handle_frames(self, records: npt.NDArray[np.uint8]) -> None:
         """Write the given records of the frame ring to the CAN log."""

@@ -139,6 +139,23 @@ class TestSession:
             write(telemetry, range(10, 11))
         assert before + 10_000_000 <= recorded(path)[0].timestamp.ToNanoseconds() <= time.time_ns() + 10_000_000
 
+    def test_timestamps_have_the_time_of_day_after_a_late_cycle(
+        self, layout: Layout, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        """The robot time stands still while the loop is late, but the time of day does not."""
+        path, late = tmp_path / "recording.mcap", 3600 * 10**9
+        now = [time.time_ns()]
+        monkeypatch.setattr(time, "time_ns", lambda: now[0])
+        with TelemetryProcess(TelemetryConfig(recording=path, publish=False), layout) as telemetry:
+            telemetry.begin_run("constant")
+            now[0] += 10_000_000
+            write(telemetry, range(10, 11))
+            now[0] += late
+            write(telemetry, range(20, 21))
+            telemetry.event(Event(20, "CYCLE_GAP", "a cycle began late"))
+        stamps = [message.timestamp.ToNanoseconds() for message in (*recorded(path), *recorded(path, "/events"))]
+        assert stamps == [now[0] - late, now[0], now[0]]
+
     def test_close_without_start_or_twice_reports_an_incomplete_session(self, layout: Layout) -> None:
         telemetry = TelemetryProcess(TelemetryConfig(publish=False), layout)
         assert not telemetry.close().complete

@@ -75,6 +75,16 @@ class TestOrder:
                 writer.write(payload)
             np.testing.assert_array_equal(reader.read(), sent)
 
+    @pytest.mark.parametrize("size", [1, 8, 20])
+    def test_time_of_each_record_is_read_with_it(self, size: int) -> None:
+        with ends(4, size=size) as (writer, reader):
+            for number in range(6):
+                writer.write(bytes(size), number * 10**18)
+            writer.write(b"\xff" * size)
+            assert reader.read().tolist() == [[0] * size, [0] * size, [255] * size]
+            assert reader.times.tolist() == [4 * 10**18, 5 * 10**18, 0]
+            assert reader.read().tolist() == reader.times.tolist() == []
+
     def test_vector_of_floats_is_written_unchanged(self) -> None:
         with ends() as (writer, reader):
             writer.write(np.array([1.5, -2.0, np.inf]))
