@@ -7,6 +7,7 @@ code as on a real bus.
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable
 
 import numpy as np
@@ -26,7 +27,7 @@ class PairBus:
 
     Attributes:
         step: Function that `receive()` calls when no frame is queued. With None, `receive()` returns 0 instead.
-        now_ns: Current virtual time [ns], set by the owner of this end. Received frames get this time.
+        now_ns: Time that received frames get [ns], such as a virtual time. With None, they get the time of day of `receive()`.
         dropped: Always 0, because no frame is lost here.
     """
 
@@ -49,7 +50,7 @@ class PairBus:
     def __init__(self, name: str, capacity: int) -> None:
         self.name = name
         self.step: Callable[[], object] | None = None
-        self.now_ns = 0
+        self.now_ns: int | None = None
         self.dropped = 0
         self._peer = self
         self._closed = False
@@ -63,7 +64,7 @@ class PairBus:
 
     @property
     def stamps(self) -> Stamps:
-        """Return an array of receive times in virtual time, shape (capacity,), int64 [ns].
+        """Return an array of receive times, shape (capacity,), int64 [ns].
 
         All elements are equal: the time of the last `receive()` that returned frames.
         """
@@ -125,7 +126,7 @@ class PairBus:
         memory = self._batches.to_fill(frames)
         size = min(tail - head, memory.nbytes)
         memory[:size] = self._queue[head : head + size]
-        self._received_at = self.now_ns
+        self._received_at = time.time_ns() if self.now_ns is None else self.now_ns
         head += size
         if head == tail:
             self._head = self._tail = 0

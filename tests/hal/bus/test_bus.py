@@ -9,6 +9,7 @@ from __future__ import annotations
 import errno
 import gzip
 import threading
+import time
 from collections.abc import Iterator
 from pathlib import Path
 from typing import ClassVar
@@ -393,6 +394,15 @@ def test_pair_time_stamps_are_the_receivers_simulated_time() -> None:
     other.receive(new_frames(3))
     other.now_ns += 1_000_000
     assert other.stamps[:3].tolist() == [123_456_789_000] * 3
+
+
+def test_pair_without_simulated_time_stamps_frames_with_the_time_of_day() -> None:
+    one, other = lockstep_pair()
+    one.send(random_frames(3))
+    before = time.time_ns()
+    other.receive(new_frames(3))
+    assert before <= other.stamps[0] <= time.time_ns()
+    assert other.stamps[:3].tolist() == [other.stamps[0]] * 3
 
 
 def test_full_pair_rejects_whole_batches() -> None:
