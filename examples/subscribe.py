@@ -4,10 +4,13 @@ Run it:  atalante airwalk --steps 100                          in one terminal
          python examples/subscribe.py                       in another terminal, from the root of the project
          python examples/subscribe.py tcp/192.0.2.7:7447    for a HAL on another computer
 
-Prints the cycle number and the twelve joint angles [rad], 100 times per second of robot time. Stop it with Ctrl-C.
+Waits for the HAL. Prints the cycle number and the twelve joint angles [rad], 100 times per second of robot time.
+Stop it with Ctrl-C.
 """
 
 import json
+import os
+import signal
 import sys
 from pathlib import Path
 
@@ -16,13 +19,25 @@ from google.protobuf import descriptor_pb2, descriptor_pool, message_factory
 
 DESCRIPTORS = Path("atalante_hal/telemetry/messages.binpb")
 endpoint = sys.argv[1] if len(sys.argv) > 1 else "tcp/127.0.0.1:7447"
+settings = {
+    "mode": "client",
+    "connect": {"endpoints": [endpoint], "timeout_ms": -1},  # -1: try again until the HAL answers
+    "scouting": {"multicast": {"enabled": False}, "gossip": {"enabled": False}},  # connect to the endpoint only
+    "transport": {"shared_memory": {"enabled": False}},  # Ctrl-C would leave shared memory in /dev/shm
+}
 
+signal.signal(signal.SIGINT, signal.SIG_DFL)  # Ctrl-C ends the program, also while `zenoh.open` waits
 pool = descriptor_pool.DescriptorPool()
 for file in descriptor_pb2.FileDescriptorSet.FromString(DESCRIPTORS.read_bytes()).file:
     pool.Add(file)
-config = zenoh.Config.from_json5(json.dumps({"mode": "client", "connect": {"endpoints": [endpoint]}}))
+print(f"connecting to {endpoint}", file=sys.stderr)
+config = zenoh.Config.from_json5(json.dumps(settings))
 with zenoh.open(config) as session, session.declare_subscriber("atalante/*/joint_states") as subscriber:
     for sample in subscriber:
         message_type = pool.FindMessageTypeByName(str(sample.encoding).split(";")[1])
         states = message_factory.GetMessageClass(message_type).FromString(sample.payload.to_bytes())
-        print(states.cycle, dict(zip(states.name, states.position, strict=True)))
+        try:
+            print(states.cycle, dict(zip(states.name, states.position, strict=True)), flush=True)
+        except BrokenPipeError:  # the program that reads the output has ended, for example `head`
+            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # Python flushes stdout again at the exit
+            break

@@ -5,11 +5,20 @@ from __future__ import annotations
 import ast
 import itertools
 import re
+import select
+import signal
+import socket
 import subprocess
 import sys
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
+
+from atalante_hal.telemetry.publisher import Publisher
+from atalante_hal.telemetry.schema import message_class
 
 ROOT = Path(__file__).parents[2]
 EXAMPLES = sorted((ROOT / "examples").glob("*.py"))
@@ -87,3 +96,58 @@ def test_subscriber_example_receives_joint_states_without_atalante_packages(tmp_
     assert all(b - a == 10 for a, b in itertools.pairwise(cycles))
     assert "'left_SH'" in lines[0]
     assert lines[0].count(":") == 12
+
+
+@contextmanager
+def subscriber_example() -> Iterator[tuple[subprocess.Popen[str], Publisher]]:
+    """Start the subscriber, reject its first connection, and then publish on the same endpoint until it prints a line."""
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        endpoint = f"tcp/127.0.0.1:{server.getsockname()[1]}"
+        child = subprocess.Popen(
+            [sys.executable, "examples/subscribe.py", endpoint],
+            stdout=subprocess.PIPE, stderr=subprocess.PIPE, cwd=ROOT, text=True,
+        )  # fmt: skip
+        server.settimeout(60.0)
+        server.accept()[0].close()
+    with child:
+        try:
+            with Publisher("exo", [("joint_states", "JointStates")], endpoint) as publisher:
+                publish_until(publisher, lambda: select.select([child.stdout], [], [], 0.02)[0])
+                yield child, publisher
+        finally:
+            child.kill()
+
+
+def publish_until(publisher: Publisher, condition: Callable[[], object]) -> None:
+    """Publish joint states until the condition holds."""
+    states = message_class("JointStates")(cycle=10, name=["left_FH"], position=[0.5]).SerializeToString()
+    end = time.monotonic() + 60.0
+    while not condition():
+        assert time.monotonic() < end
+        publisher.put("joint_states", states, 0, 10)
+
+
+def test_subscriber_example_waits_for_the_hal_and_opens_no_udp_socket():
+    with subscriber_example() as (child, _):
+        assert child.stdout.readline() == "10 {'left_FH': 0.5}\n"
+        opened = {str(descriptor.readlink()) for descriptor in Path(f"/proc/{child.pid}/fd").iterdir()}
+        tables = [Path(f"/proc/net/{protocol}").read_text() for protocol in ("udp", "udp6")]
+        udp = {f"socket:[{line.split()[9]}]" for table in tables for line in table.splitlines()[1:]}
+        assert not opened & udp
+
+
+def test_subscriber_example_ends_quietly_on_ctrl_c():
+    with subscriber_example() as (child, _):
+        child.send_signal(signal.SIGINT)
+        _, errors = child.communicate(timeout=60)
+    assert child.returncode == -signal.SIGINT
+    assert errors == f"connecting to {child.args[-1]}\n"
+
+
+def test_subscriber_example_ends_quietly_when_its_output_is_closed():
+    with subscriber_example() as (child, publisher):
+        child.stdout.close()
+        publish_until(publisher, lambda: child.poll() is not None)
+        errors = child.stderr.read()
+    assert child.returncode == 0
+    assert errors == f"connecting to {child.args[-1]}\n"
