@@ -15,6 +15,7 @@ from atalante_hal.robot import JOINTS, Robot
 from atalante_hal.wire.cia402 import DriveState
 from atalante_hal.wire.frame import FRAME, Frames, new_frames
 from atalante_tools.cli import cli
+from atalante_tools.commands import observer as observer_module
 from atalante_tools.commands import status
 from atalante_tools.commands.observer import NodeReport, Observer, Report, as_json
 from atalante_tools.commands.status import render
@@ -234,19 +235,36 @@ class Recorded:
         self.closed = True
 
 
-def invoke(monkeypatch: pytest.MonkeyPatch, cycles: list[Frames], *arguments: str) -> Result:
-    now = [100.0]
+class Clock:
+    """Simulated clock."""
+
+    def __init__(self) -> None:
+        self.now = 100.0
+
+    def monotonic(self) -> float:
+        return self.now
+
+
+def invoke(
+    monkeypatch: pytest.MonkeyPatch,
+    cycles: list[Frames],
+    *arguments: str,
+    clock: Clock | None = None,
+    opens: Callable[[], None] = lambda: None,
+) -> Result:
+    clock = clock or Clock()
 
     def tick() -> None:
-        now[0] += 1e-3
+        clock.now += 1e-3
 
-    class Clock:
-        monotonic = staticmethod(lambda: now[0])
+    def open_buses(network: Network, target: Target) -> dict[str, Recorded]:
+        opens()
+        return dict.fromkeys(network.buses, bus)
 
     bus = Recorded(cycles, tick)
     for module in (status, listening):
-        monkeypatch.setattr(module, "time", Clock)
-    monkeypatch.setattr(rig_module, "open_buses", lambda network, target: dict.fromkeys(network.buses, bus))
+        monkeypatch.setattr(module, "time", clock)
+    monkeypatch.setattr(rig_module, "open_buses", open_buses)
     result = CliRunner().invoke(cli, ["status", "-i", "pcan", "-c", "test", *arguments])
     assert bus.closed
     return result
@@ -269,6 +287,28 @@ def test_json_output_is_one_object(monkeypatch: pytest.MonkeyPatch, traffic: lis
     assert result.exit_code == 0
     (line,) = result.stdout.splitlines()
     assert json.loads(line)["supervisor"] == "ACTIVE"
+
+
+def test_first_table_measures_only_the_time_of_listening(
+    monkeypatch: pytest.MonkeyPatch, traffic: list[Frames]
+) -> None:
+    clock = Clock()
+    order: list[str] = []
+
+    class SlowObserver(Observer):
+        def __init__(self, network: Network, robot: Robot, now: float) -> None:
+            super().__init__(network, robot, now)
+            order.append("observer created")
+            clock.now += 1.3
+
+    def open_slowly() -> None:
+        order.append("bus opened")
+        clock.now += 0.2
+
+    monkeypatch.setattr(observer_module, "Observer", SlowObserver)
+    result = invoke(monkeypatch, traffic, "--for", "0.5", "--json", clock=clock, opens=open_slowly)
+    assert json.loads(result.stdout)["seconds"] == pytest.approx(0.5)
+    assert order == ["observer created", "bus opened"]
 
 
 def test_a_bus_without_frames_fails_with_code_1(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -92,6 +92,14 @@ class Observer:
             for m in network.messages
         }
         self._worst = network.bus_load()
+        self.begin(now)
+
+    def begin(self, now: float) -> None:
+        """Begin the measurement of ages, bus load and counts. Call this as soon as the bus is open.
+
+        Args:
+            now: Current time [s].
+        """
         self._aged_to = now
         self._begin(now, 0)
 

@@ -54,9 +54,11 @@ def command(target: Target, seconds: float, watch: bool, as_json: bool) -> None:
 
     network, robot = atalante_dbc.load(), load_robot()
     with stop_requested() as stop:
+        # An observer takes about 1 s to create. An open bus would overflow meanwhile.
+        listener = observer.Observer(network, robot, time.monotonic())
         bus = ResilientBus(join(network, open_buses(network, target)), print_message)
         try:
-            listener = observer.Observer(network, robot, time.monotonic())
+            listener.begin(time.monotonic())
             while True:
                 report = listen(bus, listener, seconds, stop)
                 if stop.wanted:
