@@ -129,6 +129,28 @@ def test_the_age_of_a_lost_node_increases(network: Network, robot: Robot, traffi
     assert f"LEFT_SK          {lost.age_ms} ms ago" in render(report, TARGET)
 
 
+def test_node_that_sends_only_status_messages_is_not_shown_as_never_received(network: Network, robot: Robot) -> None:
+    from atalante_hal.wire.process_image import TransmitImage
+
+    image = TransmitImage([network.message("LEFT_SK_STATUS")])
+    observer = Observer(network, robot, 0.0)
+    observer.accept(image.seal(), 1, 0.001)
+    observer.accept(new_frames(0), 0, 0.101)
+    report = observer.report(0.101)
+    sk = node(report, "LEFT_SK")
+    assert (sk.age_ms, sk.status_late) == (None, False)
+    assert sk.status_age_ms == pytest.approx(100, abs=1)
+    assert [n.node for n in report.nodes if n.status_age_ms is not None] == ["LEFT_SK"]
+    table = render(report, TARGET)
+    assert "LEFT_SK          status only" in table
+    assert "LEFT_SA          never" in table
+    observer.accept(new_frames(0), 0, 1.001)
+    report = observer.report(1.001)
+    sk = node(report, "LEFT_SK")
+    assert sk.status_age_ms == pytest.approx(1000, abs=1)
+    assert f"LEFT_SK          status {sk.status_age_ms} ms ago" in render(report, TARGET)
+
+
 def test_a_lost_hal_is_reported_in_the_first_line(network: Network, robot: Robot, traffic: list[Frames]) -> None:
     observer, now = observe(network, robot, [*traffic, *[new_frames(0)] * 600])
     assert render(observer.report(now), TARGET).startswith(

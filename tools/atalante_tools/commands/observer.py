@@ -32,6 +32,10 @@ class NodeReport:
     #: Time since the last frame of the node [ms]. Only its messages with the shortest period count. None before the first frame.
     age_ms: int | None
     late: bool  # whether `age_ms` exceeds the message timeout in the DBC
+    status_age_ms: (
+        int | None
+    )  # time since the last status message of the node [ms]. None before the first status message.
+    status_late: bool  # whether `status_age_ms` exceeds the message timeout in the DBC
     state: str | None
     dbc_ok: bool | None
     supply_v: float | None
@@ -181,8 +185,8 @@ class Observer:
 
     def _node(self, node: Node) -> NodeReport:
         message = min(self._fast(node), key=self._age)
-        age = self._age(message)
         status = f"{node.name}_STATUS"
+        age, status_age = self._age(message), self._age(self._network.message(status))
         states = [self._choice(m, s) for s in _STATES for m in (message.name, status)]
         received_hash = self._value(status, "DbcHash")
         flags = self._value(status, "ErrorFlags")
@@ -191,6 +195,8 @@ class Observer:
             kind=node.kind,
             age_ms=None if age >= NEVER else age,
             late=self._late(message),
+            status_age_ms=None if status_age >= NEVER else status_age,
+            status_late=self._late(self._network.message(status)),
             state=next((state for state in states if state is not None), None),
             dbc_ok=None if received_hash is None else received_hash == self._network.hash32,
             supply_v=self._value(status, "SupplyVoltage"),

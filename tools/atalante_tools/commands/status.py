@@ -17,7 +17,7 @@ from atalante_tools.console.terminal import print_message, show_json, table
 
 if TYPE_CHECKING:
     from atalante_hal.bus import Bus
-    from atalante_tools.commands.observer import Observer, Report
+    from atalante_tools.commands.observer import NodeReport, Observer, Report
 
 _BLANK: Final = "-"
 
@@ -39,8 +39,9 @@ def command(target: Target, seconds: float, watch: bool, as_json: bool) -> None:
     """Listen to a bus and print its nodes, joints (degrees, Nm), supervisor state and bus load.
 
     The measured load counts each received frame with its longest possible wire time. The computed worst case counts every
-    message of the DBC at its shortest period. The command sends no frames. The exit code is 1 if no frame was received, and 4 if
-    a fault is latched.
+    message of the DBC at its shortest period. "status only" marks a node that runs without a HAL: it sends status messages, but
+    no states, which answer the SYNC of the HAL. The command sends no frames. The exit code is 1 if no frame was received, and 4
+    if a fault is latched.
 
     \b
     Example: atalante status -i socketcan -c vcan0
@@ -122,14 +123,13 @@ def render(report: Report, target: Target) -> str:
     """
     nodes = [("node", "received", "state", "DBC", "supply V", "degC", "errors", "emergency")]
     for n in report.nodes:
-        received = "never" if n.age_ms is None else f"{n.age_ms} ms ago" if n.late else "yes"
         dbc = _BLANK if n.dbc_ok is None else "same" if n.dbc_ok else "OTHER"
         flags = _BLANK if n.error_flags is None else f"0x{n.error_flags:04X}" if n.error_flags else "0"
         state = n.state or _BLANK
         nodes.append(
             (
                 n.node,
-                received,
+                _received(n),
                 state,
                 dbc,
                 _number(n.supply_v, 1),
@@ -166,6 +166,15 @@ def _headline(report: Report, target: Target) -> str:
     if report.dead_man is not None:
         parts.append(f"dead-man {'pressed' if report.dead_man else 'released'}")
     return ", ".join(parts) + (f"\ndiagnostic: {report.diagnostic}" if report.diagnostic else "")
+
+
+def _received(node: NodeReport) -> str:
+    """Return when the node was received. Without a HAL, a node sends no states, but its status messages show that it runs."""
+    if node.age_ms is not None:
+        return f"{node.age_ms} ms ago" if node.late else "yes"
+    if node.status_age_ms is None:
+        return "never"
+    return f"status {node.status_age_ms} ms ago" if node.status_late else "status only"
 
 
 def _number(value: float | None, digits: int) -> str:
