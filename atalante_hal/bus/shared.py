@@ -262,9 +262,18 @@ class SharedBus:
         return requested
 
     def _wait(self, timeout: float) -> bool:
-        """Wait up to `timeout` [s] for frames and return whether any arrived. Do not wait while this end runs `serve`."""
+        """Wait up to `timeout` [s] for frames and return whether any arrived. Do not wait while this end runs `serve`.
+
+        Raises:
+            BusDown: If the other end is closed. While this end runs `serve`, `serve` raises the error instead.
+        """
         peers, received = self._peers, self._received
-        return timeout > 0.0 and not self._own[_SERVING] and self._until(lambda: peers[_SENT] != received, timeout)
+        if self._own[_SERVING]:
+            return False
+        if timeout > 0.0:
+            return self._until(lambda: peers[_SENT] != received, timeout)
+        self._sleep(0.0)  # only detects a closed end
+        return peers[_SENT] != received
 
     def _until(self, ready: Callable[[], object], limit: float) -> bool:
         """Wait until `ready()` is true and return True; return False after `limit` [s].
