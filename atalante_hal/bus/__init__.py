@@ -50,7 +50,13 @@ class BusAbsent(BusError):  # noqa: N818
 
 
 class BusDown(BusError):  # noqa: N818
-    """Error of an open bus that can no longer be used: interface down, adapter unplugged, or bus closed."""
+    """Error of an open bus that can no longer be used: interface down, adapter unplugged, or bus closed.
+
+    Attributes:
+        reopens: Whether the bus opens the lost link again. If False, the program must be restarted.
+    """
+
+    reopens = True
 
 
 class BusFull(BusError):  # noqa: N818

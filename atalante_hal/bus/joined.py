@@ -69,7 +69,7 @@ class JoinedBus:
         self._turn = 0
         self._closed = False
         self._failure: BusError | None = None  # error that a channel raised in the current call of `receive`
-        self._down: dict[int, str] = {}  # error message of each lost channel, by index of the channel
+        self._down: dict[int, BusDown] = {}  # error of each lost channel, by index of the channel
         files = [_file_of(link) for link in self._links]
         self._files = [file for file in files if file is not None]
         self._all_have_files = len(self._files) == len(files)
@@ -81,11 +81,16 @@ class JoinedBus:
 
     @property
     def down(self) -> str:
-        """Return the error message of a lost channel; empty if no channel is lost.
+        """Return the error message of a lost channel; empty if no channel is lost."""
+        return str(self.loss or "")
+
+    @property
+    def loss(self) -> BusDown | None:
+        """Return the error of a lost channel; None if no channel is lost.
 
         A lost channel is regarded as restored as soon as a frame was sent or received on it.
         """
-        return next(iter(self._down.values()), "")
+        return next(iter(self._down.values()), None)
 
     def channel(self, bus: str) -> Bus:
         """Return the channel of a bus of the network. Use it for frames that are not messages of the network.
@@ -166,7 +171,7 @@ class JoinedBus:
 
     def _lost(self, channel: int, error: BusError) -> None:
         if isinstance(error, BusDown):
-            self._down[channel] = str(error)
+            self._down[channel] = error
 
     def _gather(self, tails: list[Frames]) -> int:
         size = len(tails[0])

@@ -39,6 +39,9 @@ _OPEN_ERRORS = (can.CanError, OSError, ValueError, TypeError, ImportError, NameE
 class PythonCanBus:
     """Bus on one channel of a python-can interface.
 
+    A lost link is not opened again. Some backends accept frames also on a lost link, so `send` raises `BusDown` after a loss
+    until a frame is received, which proves that the link works.
+
     Args:
         interface: Name of the interface in python-can.
         channel: Name of the channel.
@@ -61,6 +64,7 @@ class PythonCanBus:
         self._capacity = capacity
         self._batches = Batches()
         self._closed = False
+        self._loss = ""  # error message of the lost link; empty while the link works
         self._bus = _open(interface, channel, options)
         self._link_errors = _link_errors(interface)
 
@@ -72,7 +76,7 @@ class PythonCanBus:
 
         Raises:
             BusFull: If python-can accepted only a part of the frames.
-            BusDown: If the bus is closed or down.
+            BusDown: If the bus is closed or down, or if no frame was received since the link was lost.
             ValueError: If a frame is not a valid CAN frame.
         """
         self._require_open()
@@ -82,10 +86,12 @@ class PythonCanBus:
                 self._bus.send(message_of(can_id, length, flags, data), timeout=0.0)
             except can.CanOperationError as error:
                 if error.error_code in LINK_LOST:
-                    raise BusDown(f"{self.name} is down: {error}", sent) from error
+                    raise self._down(f"is down: {error}", sent) from error
                 raise BusFull(f"{self.name} accepted {sent} of {len(frames)} frames: {error}", sent) from error
             except self._link_errors as error:
-                raise BusDown(f"{self.name} is down: {error}", sent) from error
+                raise self._down(f"is down: {error}", sent) from error
+        if self._loss:
+            raise self._down(self._loss, len(frames))
 
     def receive(self, frames: Frames, timeout: float = 0.0) -> int:
         """Write the received messages to `frames[:n]` and return n, see `Bus.receive`.
@@ -108,7 +114,7 @@ class PythonCanBus:
             try:
                 message = self._bus.recv(0.0 if count else timeout)
             except self._link_errors as error:
-                raise BusDown(f"{self.name} cannot receive: {error}") from error
+                raise self._down(f"cannot receive: {error}") from error
             except (ValueError, LookupError):  # raised by the backend `slcan` for a damaged line
                 self.dropped += 1
                 continue
@@ -119,6 +125,8 @@ class PythonCanBus:
                 count += 1
             else:
                 self.dropped += 1
+        if count:
+            self._loss = ""
         return count
 
     def close(self) -> None:
@@ -130,6 +138,18 @@ class PythonCanBus:
                 self._bus.shutdown()
             except lost:  # the backend `remote` raises ValueError if its connection was lost
                 can.BusABC.shutdown(self._bus)
+
+    def _down(self, loss: str, sent: int = 0) -> BusDown:
+        """Store that the link is lost, and return the error to raise.
+
+        Args:
+            loss: Error message without the name of the bus.
+            sent: Number of frames that python-can accepted.
+        """
+        self._loss = loss
+        error = BusDown(f"{self.name} {loss}", sent)
+        error.reopens = False
+        return error
 
     def _require_open(self) -> None:
         if self._closed:

@@ -23,8 +23,8 @@ SETTLE_TIME = 0.1
 class ResilientBus(WrappedBus):
     """Bus that drops sent frames and receives no frames while its link is lost, as with a disconnected cable.
 
-    A lost link is regarded as restored as soon as a frame was sent or received. If one channel of a `JoinedBus` is lost, the
-    other channels continue.
+    A lost link is regarded as restored as soon as a frame was sent or received. `PythonCanBus.send` raises `BusDown` until a
+    frame was received. If one channel of a `JoinedBus` is lost, the other channels continue.
 
     Args:
         bus: Wrapped bus. `close` closes it, too.
@@ -40,6 +40,7 @@ class ResilientBus(WrappedBus):
         self._report = report
         self.down = ""
         self.losses = 0
+        self._reopens = True  # whether the bus opens the lost link again
         self._reported = ""  # error message that was reported for the current loss; empty if none was reported
         self._changed_at = 0.0  # time of the last change of `down` [s]
 
@@ -55,7 +56,7 @@ class ResilientBus(WrappedBus):
         try:
             super().send(frames)
         except BusDown as error:
-            self._lost(str(error))
+            self._lost(error)
             if error.full is not None:
                 raise error.full from error
         else:
@@ -77,7 +78,7 @@ class ResilientBus(WrappedBus):
         try:
             count = super().receive(frames, timeout)
         except BusDown as error:
-            self._lost(str(error))
+            self._lost(error)
             waited = time.monotonic() - begin  # [s], not 0 for a `JoinedBus`, which waits before it raises the error
             time.sleep(max(min(timeout, RETRY_PERIOD) - waited, 0.0))
             return 0
@@ -87,21 +88,22 @@ class ResilientBus(WrappedBus):
     def _update_down(self, *, proven: bool) -> None:
         """Store or clear the error message `down` after a call of the wrapped bus that raised no error.
 
-        `JoinedBus.receive` raises no error while one of its channels works, so check the attribute `down` of the `JoinedBus`.
+        `JoinedBus.receive` raises no error while one of its channels works, so check the attribute `loss` of the `JoinedBus`.
 
         Args:
             proven: True if a frame was sent or received, which proves that the link works.
         """
-        if isinstance(self.bus, JoinedBus) and self.bus.down:
-            self._lost(self.bus.down)
+        if isinstance(self.bus, JoinedBus) and self.bus.loss:
+            self._lost(self.bus.loss)
         elif proven and self.down:
             self._report(f"{self.name} is back" if self._reported else f"{self.name} was lost and is back")
             self.down = self._reported = ""
         elif self.down:
             self._report_settled()
 
-    def _lost(self, message: str) -> None:
+    def _lost(self, error: BusDown) -> None:
         self.losses += not self.down
+        self._reopens, message = error.reopens, str(error)
         if message != self.down:
             self.down, self._changed_at = message, time.monotonic()
         self._report_settled()
@@ -110,4 +112,5 @@ class ResilientBus(WrappedBus):
         """Report the error message if it was not reported yet and has not changed for `SETTLE_TIME`."""
         if self.down != self._reported and time.monotonic() - self._changed_at >= SETTLE_TIME:
             self._reported = self.down
-            self._report(f"{self.down}; waiting for the link")
+            remedy = "waiting for the link" if self._reopens else "restart this command when the link works again"
+            self._report(f"{self.down}; {remedy}")

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import pytest
+from can.interfaces.virtual import VirtualBus
 
 from atalante_hal.bus import BusDown, BusFull, resilient
 from atalante_hal.bus.joined import JoinedBus
 from atalante_hal.bus.pair import lockstep_pair
+from atalante_hal.bus.python_can import PythonCanBus
 from atalante_hal.bus.resilient import RETRY_PERIOD, SETTLE_TIME, ResilientBus
 from atalante_hal.bus.wrapped import WrappedBus
 from atalante_hal.wire.frame import Frames, new_frames
@@ -115,6 +117,38 @@ def test_other_channels_transfer_frames_while_one_is_lost(clock: Clock) -> None:
     bus.send(frames)
     assert bus.down == ""
     assert notices == ["can1 is down; waiting for the link", f"{bus.name} is back"]
+
+
+@pytest.mark.parametrize("joins", [False, True])
+def test_only_a_received_frame_ends_the_loss_of_a_python_can_link(
+    clock: Clock, monkeypatch: pytest.MonkeyPatch, joins: bool
+) -> None:
+    def lose(self: VirtualBus, timeout: float) -> None:
+        raise OSError("gone")
+
+    link, far = (PythonCanBus("virtual", f"lost link {joins}") for _ in range(2))
+    notices: list[str] = []
+    network = network_of(dict(enumerate(BUSES)))
+    bus = ResilientBus(JoinedBus(network, dict.fromkeys(BUSES, link)) if joins else link, notices.append)
+    frames = new_frames(2)
+    with monkeypatch.context() as patch:
+        patch.setattr(VirtualBus, "recv", lose)
+        for _ in range(3):
+            assert bus.receive(new_frames(4)) == 0
+            clock.sleep(SETTLE_TIME)
+    message = f"{link.name} cannot receive: gone"
+    assert notices == [f"{message}; restart this command when the link works again"]
+    bus.send(frames)
+    assert bus.receive(new_frames(4)) == 0
+    assert bus.down == message  # a link that accepts frames may still be lost
+    assert far.receive(new_frames(4)) == 2
+    far.send(frames)
+    assert bus.receive(new_frames(4)) == 2
+    bus.send(frames)
+    assert bus.down == ""
+    assert notices[1:] == [f"{bus.name} is back"]
+    bus.close()
+    far.close()
 
 
 def test_lost_link_is_tried_again_after_the_retry_period(clock: Clock) -> None:
