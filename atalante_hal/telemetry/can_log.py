@@ -76,9 +76,8 @@ class CanLog(Closing):
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
             with contextlib.ExitStack() as stack:
-                lock = stack.enter_context(
-                    path.open("ab")
-                )  # without truncation, because another run may be writing the file
+                # Do not truncate the file yet, because another run may be writing it.
+                lock = stack.enter_context(path.open("ab"))
                 fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
                 self._logger = can.Logger(path)
                 self._lock = stack.pop_all()  # `close` releases the lock

@@ -32,9 +32,8 @@ class NodeReport:
     #: Time since the last frame of the node [ms]. Only its messages with the shortest period count. None before the first frame.
     age_ms: int | None
     late: bool  # whether `age_ms` exceeds the message timeout in the DBC
-    status_age_ms: (
-        int | None
-    )  # time since the last status message of the node [ms]. None before the first status message.
+    #: Time since the last status message of the node [ms]. None before the first status message.
+    status_age_ms: int | None
     status_late: bool  # whether `status_age_ms` exceeds the message timeout in the DBC
     state: str | None
     dbc_ok: bool | None
