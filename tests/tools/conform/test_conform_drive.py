@@ -154,6 +154,12 @@ def _negated(code: int) -> int:
     return code if code == 0x8000 else -code & 0xFFFF
 
 
+def _overflowing(code: int) -> int:
+    """Invert the sign of a torque above 200 Nm."""
+    signed = code - 0x10000 if code & 0x8000 else code
+    return _negated(code) if abs(signed) > 16_000 else code
+
+
 # -- E2E ---------------------------------------------------------------------------------------------------------------
 
 
@@ -230,6 +236,7 @@ BROKEN: dict[str, tuple[Callable[[MakeSetup, Patch], NodeSetup], dict[str, Verdi
         _on_command(_reads("MaxTorque", lambda code: code if code == 0xFFFF else min(2 * code, 0xFFFE))),
         {"DRIVE-08": F},
     ),
+    "inverts a torque above 200 Nm": (_on_command(_reads("TargetTorque", _overflowing)), {"DRIVE-08": F}),
     "reads MaxTorque as signed": (
         _on_command(_reads("MaxTorque", lambda code: 0 if 0x7FFF < code < 0xFFFF else code)),
         {"DRIVE-09": F},

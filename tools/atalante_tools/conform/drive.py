@@ -72,7 +72,7 @@ def requirements(tester: NodeTester) -> list[Requirement]:
         ),
         Requirement(
             "DRIVE-08",
-            "Limits the torque to MaxTorque for any target.",
+            "Limits the torque to MaxTorque for any target and keeps the sign of the target.",
             f"targets at both ends of the DBC range, MaxTorque {torque:g} and 0 Nm",
             "DBC MaxTorque",
             torques.respects_the_limit,

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 from atalante_hal.wire.cia402 import Controlword, DriveState
 from atalante_tools.conform.axis import NOISE, SHOWN, Axis, all_in, mean_torque, names_of, torque_of
 from atalante_tools.conform.node_tester import NodeTester
@@ -38,15 +40,23 @@ def follows_torque(tester: NodeTester) -> Outcome:
 
 
 def respects_the_limit(tester: NodeTester) -> Outcome:
-    """Test DRIVE-08: the drive limits its torque to MaxTorque, even if TargetTorque is the largest or smallest DBC value."""
+    """Test DRIVE-08: the drive limits its torque to MaxTorque, even if TargetTorque is the largest or smallest DBC value.
+
+    The limited torque must have the sign of TargetTorque, and its mean must be at least half of MaxTorque.
+    """
     axis, found, passed = Axis(tester), [], True
     target = tester.command.message.signal(axis.signal("TargetTorque"))
     axis.enable()
     for limit in (tester.limits.torque, 0.0):
         for target_torque in (target.maximum, target.minimum):
-            most = torque_of(axis.run(12, _C.ENABLE_OPERATION, target_torque, limit)[2 * SHOWN :])
-            passed &= limit / 2.0 <= abs(most) <= limit + NOISE
-            found.append(f"{target_torque:+.0f} Nm with limit {limit:g} Nm: {most:+.2f} Nm")
+            received = axis.run(12, _C.ENABLE_OPERATION, target_torque, limit)[2 * SHOWN :]
+            sign, mean, most = math.copysign(1.0, target_torque), mean_torque(received), torque_of(received)
+            opposite = any(sign * frame.values["Torque"] < -NOISE for frame in received)
+            reached = limit == 0.0 or sign * mean >= limit / 2.0
+            passed &= reached and not opposite and abs(most) <= limit + NOISE
+            found.append(
+                f"{target_torque:+.0f} Nm with limit {limit:g} Nm: mean {mean:+.2f} Nm, largest {most:+.2f} Nm"
+            )
     return Outcome(passed, ", ".join(found))
 
 
