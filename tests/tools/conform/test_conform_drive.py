@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import itertools
 from collections.abc import Callable
 
 import numpy as np
@@ -18,6 +19,7 @@ from atalante_hal.wire.frame import Frames
 from atalante_tools.conform.axis import LEGAL, ROUTES
 from atalante_tools.conform.examination import requirements_of
 from atalante_tools.conform.requirement import Verdict, examine
+from atalante_tools.conform.technician import Action
 
 from . import wire
 from .conftest import MakeSetup, NodeSetup, not_passed, receive_as
@@ -317,3 +319,23 @@ def test_transition_passes_within_ten_cycles_and_fails_above(
     tester = _with_rule(rule)(make_setup, monkeypatch).tester
     (result,) = examine(tester, [r for r in requirements_of(tester) if r.id == "DRIVE-02"])
     assert result.verdict is verdict, result.measured
+
+
+@pytest.mark.parametrize(("delay", "verdict"), [(100, Verdict.FAILED), (None, Verdict.NOT_TESTED)])
+def test_fault_is_examined_only_after_the_drive_has_cooled(
+    delay: int | None, verdict: Verdict, make_setup: MakeSetup, monkeypatch: Patch
+):
+    """A hot drive stays in FAULT. This drive leaves FAULT without a reset as soon as it is cool."""
+    setup = _with_rule(_switches_a_fault_off)(make_setup, monkeypatch)
+    tester = setup.tester
+    carry_out, cycles = tester.technician.request, itertools.count()
+
+    def carry_out_late(action: Action, node: str) -> None:
+        if action is not Action.COOL:
+            carry_out(action, node)
+            return
+        setup.emulator.before_send.append(lambda *_: carry_out(action, node) if next(cycles) == delay else None)
+
+    monkeypatch.setattr(tester.technician, "request", carry_out_late)
+    results = examine(tester, [r for r in requirements_of(tester) if r.id in ("DRIVE-22", "DRIVE-23")])
+    assert [result.verdict for result in results] == [Verdict.PASSED, verdict]

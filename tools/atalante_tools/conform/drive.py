@@ -178,7 +178,7 @@ def requirements(tester: NodeTester) -> list[Requirement]:
         Requirement(
             "DRIVE-23",
             "Leaves FAULT only on FAULT_RESET.",
-            "all other commands, then FAULT_RESET",
+            f"cooled below {tester.robot.derating.start:g} degC, then all other commands, then FAULT_RESET",
             f"{CIA402} transition 15",
             states.leaves_fault_when_reset,
         ),

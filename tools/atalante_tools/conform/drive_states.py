@@ -125,12 +125,24 @@ def trips_when_hot(tester: NodeTester) -> Outcome:
 
 
 def leaves_fault_when_reset(tester: NodeTester) -> Outcome:
-    """Test DRIVE-23: only FAULT_RESET leaves FAULT."""
+    """Test DRIVE-23: only FAULT_RESET leaves FAULT.
+
+    A hot drive stays in FAULT on every command, so the test waits until the drive has cooled.
+    """
     axis = Axis(tester)
     received = axis.run(SHOWN, _C.ENABLE_OPERATION)
     if not all_in(received[-1:], _S.FAULT):
         raise NotTested(f"the drive must be in FAULT, got {names_of(received[-1:])}; see DRIVE-22")
-    tester.technician.request(Action.COOL, tester.node.name)
+    cool = tester.robot.derating.start
+
+    def is_cool(received: list[ReceivedFrame]) -> bool:
+        return any(frame.values["Temperature"] < cool for frame in tester.states(received))
+
+    def enable() -> list[ReceivedFrame]:
+        return tester.cycle(axis.command(_C.ENABLE_OPERATION))
+
+    if not tester.request(Action.COOL, is_cool, enable):
+        raise NotTested(f"the drive must cool below {cool:g} degC, but it stayed hot")
     for controlword in Controlword:
         if controlword is not _C.FAULT_RESET:
             received = axis.run(STAY, controlword)
