@@ -382,6 +382,16 @@ def test_junit_has_an_error_for_each_log_that_was_not_read(good: Path, tmp_path:
     ]
 
 
+def test_junit_has_an_error_if_no_frame_was_checked(tmp_path: Path) -> None:
+    path = tmp_path / "live.xml"
+    result = run("validate", "-i", "virtual", "-c", "silent", "--for", "0.1", "--junit", path)
+    assert result.exit_code == 1
+    (suite,) = ET.parse(path).getroot()
+    assert [error.text for error in suite.iter("error")] == ["no frame was checked"]
+    counts = [suite.get(key) for key in ("tests", "errors", "failures", "skipped")]
+    assert counts == [str(len(RULES) + 1), "1", "0", str(len(RULES))]
+
+
 def test_html_names_each_log_that_was_not_read(good: Path, tmp_path: Path) -> None:
     missing, path = tmp_path / "<missing>.log", tmp_path / "night.html"
     run("validate", missing, good, "--node", "LEFT_FH", "--html", path)

@@ -17,6 +17,8 @@ from atalante_tools.console.terminal import table
 
 #: Maximum number of unchecked items that the text report lists per reason. The HTML report lists all unchecked items.
 _NAMES = 12
+#: Verdict on a log or bus without frames.
+_NO_FRAME = "no frame was checked"
 #: Characters that XML 1.0 does not allow. The name of a log, or text quoted from a log, may contain such characters.
 _NOT_IN_XML = re.compile(r"[^\t\n\r\x20-\ud7ff\ue000-\ufffd\U00010000-\U0010ffff]")
 
@@ -101,7 +103,7 @@ def verdict(result: Report) -> str:
         findings = "1 finding" if len(result.findings) == 1 else f"{len(result.findings)} findings"
         return f"{findings} ({count} {'occurrence' if count == 1 else 'occurrences'})"
     if not result.validator.frames:
-        return "no frame was checked"
+        return _NO_FRAME
     silenced = f", {len(result.silenced)} silenced" if result.silenced else ""
     return f"no findings{silenced}; see above for the items that were not checked"
 
@@ -133,17 +135,19 @@ def write_junit(results: Sequence[Report | Unread], path: Path) -> None:
     """Write JUnit XML with one test suite per log and one test case per rule.
 
     A test case is skipped if the rule is silenced or was not checked. The test suite of a log that could not be read has
-    one test case, which contains the error.
+    one test case, which contains the error. A test suite without any frame and any finding has an additional test case with
+    an error.
     """
     suites = ET.Element("testsuites", name="atalante validate")
     for result in results:
         if isinstance(result, Unread):
             _add_unread(suites, result)
             continue
-        suite = ET.SubElement(
-            suites, "testsuite", name=result.name, tests=str(len(RULES)), time=f"{result.duration_s:.3f}"
-        )
-        failures = skipped = 0
+        suite = ET.SubElement(suites, "testsuite", name=result.name, time=f"{result.duration_s:.3f}")
+        errors = failures = skipped = 0
+        if not (result.validator.frames or result.findings):
+            errors = 1
+            _add_error(suite, "frames", _NO_FRAME)
         for rule in RULES:
             case = ET.SubElement(suite, "testcase", classname="atalante.validate", name=rule.id)
             of_rule = [finding for finding in result.findings if finding.rule == rule.id]
@@ -159,7 +163,8 @@ def write_junit(results: Sequence[Report | Unread], path: Path) -> None:
             elif reason:
                 skipped += 1
                 ET.SubElement(case, "skipped", message=reason)
-        suite.set("errors", "0")
+        suite.set("tests", str(len(suite)))
+        suite.set("errors", str(errors))
         suite.set("failures", str(failures))
         suite.set("skipped", str(skipped))
     for element in suites.iter():
@@ -179,12 +184,19 @@ def _add_unread(suites: ET.Element, log: Unread) -> None:
     suite = ET.SubElement(
         suites, "testsuite", name=log.name, tests="1", time="0.000", errors="1", failures="0", skipped="0"
     )
-    case = ET.SubElement(suite, "testcase", classname="atalante.validate", name="read")
-    ET.SubElement(case, "error", message=log.reason).text = log.reason
+    _add_error(suite, "read", log.reason)
+
+
+def _add_error(suite: ET.Element, name: str, reason: str) -> None:
+    """Add a test case with an error to a test suite."""
+    case = ET.SubElement(suite, "testcase", classname="atalante.validate", name=name)
+    ET.SubElement(case, "error", message=reason).text = reason
 
 
 def _skipped(result: Report, rule: str) -> str:
     """Return the reason why a rule was silenced or not checked; empty if the rule was checked."""
+    if not result.validator.frames:
+        return _NO_FRAME
     reasons = [f"silenced for {_where(f)}: {s.reason}" for f, s in result.silenced if f.rule == rule]
     reasons += [f"not checked: {item.reason}" for item in result.unchecked if rule in item.rules and not item.items]
     return "; ".join(reasons)
