@@ -382,6 +382,42 @@ def test_junit_has_an_error_for_each_log_that_was_not_read(good: Path, tmp_path:
     ]
 
 
+def test_junit_skips_the_rules_that_checked_nothing(tmp_path: Path) -> None:
+    dbc, path = tmp_path / "foreign.dbc", tmp_path / "result.xml"
+    dbc.write_text(HEAD + 'BO_ 256 Speed: 1 A\n SG_ Raw : 0|8@1+ (1,0) [0|255] "" B\n')
+    messages = [can.Message(timestamp=BEGIN + k, arbitration_id=256, is_extended_id=False, data=[k]) for k in range(30)]
+    run("validate", write(tmp_path / "drive.log", messages), "--dbc", dbc, "--junit", path)
+    (suite,) = ET.parse(path).getroot()
+    skipped = {case.get("name") for case in suite if case.find("skipped") is not None}
+    e2e = {"crc", "crc-data-id", "counter-repeated", "counter-lost", "counter-sequence"}
+    values = {"range", "invalid-code", "value-table", "multiplexer", "dbc-hash"}
+    times = {"cycle-mean", "cycle-jitter", "cycle-gap", "cycle-fast", "timeout", "recovered", "inhibit"}
+    assert e2e | values | times <= skipped
+    assert not {"unknown-id", "length", "never-seen"} & skipped
+    assert suite.get("skipped") == str(len(skipped))
+
+
+def test_junit_skips_the_rules_for_messages_that_are_not_in_the_log(tmp_path: Path) -> None:
+    imu, path = NETWORK.message("IMU_TORSO_STATE"), tmp_path / "result.xml"
+    message = can.Message(
+        arbitration_id=imu.frame_id, is_extended_id=False, is_fd=True, bitrate_switch=True, data=bytes(imu.length)
+    )
+    log = write(tmp_path / "one.log", [message])
+    run("validate", log, "--node", "IMU_TORSO", "--junit", path)
+    skipped = {case.get("name") for case in ET.parse(path).iter("testcase") if case.find("skipped") is not None}
+    assert {"cia402-transition", "cia402-response", "sync-order", "state-late", "velocity"} <= skipped
+
+
+def test_junit_lists_the_messages_for_which_a_rule_was_not_checked(good: Path, tmp_path: Path) -> None:
+    path = tmp_path / "result.xml"
+    run("validate", good, "--node", "LEFT_FH", "--junit", path)
+    (case,) = (case for case in ET.parse(path).iter("testcase") if case.get("name") == "cycle-jitter")
+    assert case.find("skipped") is None
+    assert case.findtext("system-out") == (
+        "not checked: cycle-jitter: too few intervals in the log for the 99 % quantile (1): LEFT_FH_STATUS"
+    )
+
+
 def test_junit_has_an_error_if_no_frame_was_checked(tmp_path: Path) -> None:
     path = tmp_path / "live.xml"
     result = run("validate", "-i", "virtual", "-c", "silent", "--for", "0.1", "--junit", path)

@@ -16,6 +16,9 @@ from atalante_tools.canlog.validate.validator import Validator
 from atalante_tools.canlog.validate.value_rules import is_enumeration, is_hash, is_limited
 
 _E2E = ("Crc", "Counter")
+_ORDER = ("sync-order", "state-late")
+_DRIVES = ("cia402-transition", "cia402-response")
+_MOTION = ("velocity", "quaternion-norm", "stuck", "step")
 
 
 @dataclass(frozen=True)
@@ -38,12 +41,40 @@ def unchecked(validator: Validator, *, live: bool = False) -> list[Unchecked]:
         validator: finished validator of the log.
         live: whether the frames came from a live bus. Only a live bus reports how many frames were lost.
     """
-    found = [*_of_the_log(validator, live), *_of_the_network(validator), *_of_messages(validator)]
+    found = [
+        *_of_the_log(validator, live),
+        *_of_the_network(validator),
+        *_of_layouts(validator),
+        *_of_messages(validator),
+    ]
     signals = tuple(f"{layout.name}.{name}" for layout, name in unseen_signals(validator))
     if signals:
         reason = "every raw value is allowed, so no rule checked the values of these signals"
         found.append(Unchecked((), signals, reason))
     return found
+
+
+def applicable(validator: Validator, rule: str) -> set[str]:
+    """Return the names of the messages in the log to which a rule applies; for the rule wrong-bus the channels of the log.
+
+    Args:
+        validator: finished validator of the log.
+        rule: identifier of the rule.
+    """
+    if rule == "wrong-bus":
+        return set(validator.channels)
+    rows: set[int] = set(_seen(validator))
+    if rule in _DRIVES:
+        rows &= {drive.row for drives in validator.drives.drives.values() for drive in drives}
+    elif rule in _MOTION:
+        families = [family for family in validator.plan.families if rule in validator.motion.checked(family)]
+        rows &= {row for family in families for row in family.rows}
+    return {validator.plan.name(row) for row in rows}
+
+
+def _seen(validator: Validator) -> list[int]:
+    """Return the indices of the messages in the log, without the messages whose DBC layout is not supported."""
+    return [row for row in range(len(validator.plan.layouts)) if validator.counts[row]]
 
 
 def _of_the_log(validator: Validator, live: bool) -> Iterator[Unchecked]:
@@ -81,11 +112,13 @@ def _of_the_network(validator: Validator) -> Iterator[Unchecked]:
         window = validator.project.number("bus-load", "window_s")
         yield Unchecked(("bus-load",), (), f"the log has no complete time window of {window:g} s")
     if not validator.order.buses:
-        yield Unchecked(("sync-order", "state-late"), (), "the DBC has no cyclic message SYNC...")
+        yield Unchecked(_ORDER, (), "the DBC has no cyclic message SYNC...")
+    elif not any(validator.counts[bus.sync] for bus in validator.order.buses):
+        yield Unchecked(_ORDER, (), "no cyclic message SYNC... is in the log")
     if not validator.drives.drives:
-        yield Unchecked(
-            ("cia402-transition", "cia402-response"), (), f"no message has a signal {validator.drives.state}"
-        )
+        yield Unchecked(_DRIVES, (), f"no message has a signal {validator.drives.state}")
+    elif not applicable(validator, "cia402-transition"):
+        yield Unchecked(_DRIVES, (), f"no message with a signal {validator.drives.state} is in the log")
     else:
         uncommanded = tuple(
             plan.name(drive.row)
@@ -99,18 +132,41 @@ def _of_the_network(validator: Validator) -> Iterator[Unchecked]:
                 uncommanded,
                 f"no message of the DBC carries a {validator.drives.command} for the senders of these messages",
             )
-    looked = {rule for family in plan.families for rule in validator.motion.checked(family)}
-    absent = tuple(rule for rule in ("velocity", "quaternion-norm", "stuck", "step") if rule not in looked)
+    absent = tuple(rule for rule in _MOTION if not applicable(validator, rule))
     if absent:
-        yield Unchecked(absent, (), "no signal has a name that these rules use; set other names in a rules file")
+        yield Unchecked(
+            absent, (), "no signal in the log has a name that these rules use; set other names in a rules file"
+        )
     if plan.refused:
         reasons = tuple(f"{m.name} ({m.reason})" for m in plan.refused)
         yield Unchecked((), reasons, "the DBC layout of these messages is not supported")
 
 
+def _of_layouts(validator: Validator) -> Iterator[Unchecked]:
+    """Yield the rules that need a signal or an attribute which no message in the log has."""
+    seen = _seen(validator)
+    layouts = [validator.plan.layouts[row] for row in seen]
+    fields = [field for layout in layouts for field in layout.fields]
+    signal = validator.values.hash_signal
+    for rule, applies, reason in (
+        ("range", any(is_limited(f) for f in fields), "no signal in the log has a limited range"),
+        ("invalid-code", any(f.invalid_raw is not None for f in fields), "no signal in the log has an InvalidRaw code"),
+        ("value-table", any(is_enumeration(f) for f in fields), "no signal in the log has a complete value table"),
+        ("multiplexer", any(layout.multiplexers for layout in layouts), "no message in the log has a multiplexer"),
+        ("inhibit", any(validator.plan.inhibit_ns[seen]), "no message in the log has GenMsgDelayTime"),
+        (
+            "dbc-hash",
+            any(is_hash(f, signal) for f in fields),
+            f"no message in the log has a signal {signal} of 32 bits",
+        ),
+    ):
+        if seen and not applies:
+            yield Unchecked((rule,), (), reason)
+
+
 def _of_messages(validator: Validator) -> Iterator[Unchecked]:
     plan, counts = validator.plan, validator.counts
-    seen = [row for row in range(len(plan.layouts)) if counts[row]]
+    seen = _seen(validator)
     for_jitter = validator.project.number("cycle-jitter", "min_intervals")
     for_mean = validator.project.number("cycle-mean", "min_intervals")
     for rules, rows, reason in (
@@ -127,7 +183,7 @@ def _of_messages(validator: Validator) -> Iterator[Unchecked]:
          sorted(validator.shared),
          "parameter groups with several sender addresses"),
         (("cycle-jitter",),
-         [r for r in seen if 0 < validator.timing.intervals[r] < for_jitter and plan.cycle_ns[r]],
+         [r for r in seen if validator.timing.intervals[r] < for_jitter and plan.cycle_ns[r]],
          "too few intervals in the log for the 99 % quantile"),
         (("cycle-mean",),
          [r for r in seen if validator.timing.intervals[r] < for_mean and plan.cycle_ns[r]],

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from atalante_tools.canlog.validate.coverage import Unchecked, unchecked
+from atalante_tools.canlog.validate.coverage import Unchecked, applicable, unchecked
 from atalante_tools.canlog.validate.findings import Finding
 from atalante_tools.canlog.validate.project import Silence
 from atalante_tools.canlog.validate.rules import RULE_OF, RULES
@@ -134,9 +134,10 @@ def _short(item: Unchecked) -> str:
 def write_junit(results: Sequence[Report | Unread], path: Path) -> None:
     """Write JUnit XML with one test suite per log and one test case per rule.
 
-    A test case is skipped if the rule is silenced or was not checked. The test suite of a log that could not be read has
-    one test case, which contains the error. A test suite without any frame and any finding has an additional test case with
-    an error.
+    A test case is skipped if the rule is silenced or was not checked for any message. If the rule was not checked for some
+    messages, signals or channels, the `system-out` of the test case lists them. The test suite of a log that could not be
+    read has one test case, which contains the error. A test suite without any frame and any finding has an additional
+    test case with an error.
     """
     suites = ET.Element("testsuites", name="atalante validate")
     for result in results:
@@ -163,6 +164,9 @@ def write_junit(results: Sequence[Report | Unread], path: Path) -> None:
             elif reason:
                 skipped += 1
                 ET.SubElement(case, "skipped", message=reason)
+            partly = [item for item in result.unchecked if rule.id in item.rules and item.items]
+            if partly and not reason:
+                ET.SubElement(case, "system-out").text = "\n".join(f"not checked: {item}" for item in partly)
         suite.set("tests", str(len(suite)))
         suite.set("errors", str(errors))
         suite.set("failures", str(failures))
@@ -198,7 +202,9 @@ def _skipped(result: Report, rule: str) -> str:
     if not result.validator.frames:
         return _NO_FRAME
     reasons = [f"silenced for {_where(f)}: {s.reason}" for f, s in result.silenced if f.rule == rule]
-    reasons += [f"not checked: {item.reason}" for item in result.unchecked if rule in item.rules and not item.items]
+    of_rule = [item for item in result.unchecked if rule in item.rules]
+    uncovered = applicable(result.validator, rule) - {name for item in of_rule for name in item.items}
+    reasons += [f"not checked: {item.reason}" for item in of_rule if not (item.items and uncovered)]
     return "; ".join(reasons)
 
 
