@@ -318,6 +318,10 @@ def silent_for_a_while(log: Recording) -> None:
     log.remove(log.starting_at(log.at("LEFT_FH_STATE"))[:12])
 
 
+def silent_at_first(log: Recording) -> None:
+    log.remove(log.of("LEFT_FH_STATE")[:12])
+
+
 def never(log: Recording) -> None:
     log.remove(log.of("HAL_STATUS"))
 
@@ -425,6 +429,7 @@ MUTATIONS: dict[str, Callable[[Recording], None]] = {
     "inhibit": emergencies,
     "timeout": silent,
     "recovered": silent_for_a_while,
+    "late-start": silent_at_first,
     "never-seen": never,
     "sync-order": before_sync,
     "state-late": after_deadline,

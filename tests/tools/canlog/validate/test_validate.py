@@ -391,7 +391,7 @@ def test_junit_skips_the_rules_that_checked_nothing(tmp_path: Path) -> None:
     skipped = {case.get("name") for case in suite if case.find("skipped") is not None}
     e2e = {"crc", "crc-data-id", "counter-repeated", "counter-lost", "counter-sequence"}
     values = {"range", "invalid-code", "value-table", "multiplexer", "dbc-hash"}
-    times = {"cycle-mean", "cycle-jitter", "cycle-gap", "cycle-fast", "timeout", "recovered", "inhibit"}
+    times = {"cycle-mean", "cycle-jitter", "cycle-gap", "cycle-fast", "timeout", "recovered", "late-start", "inhibit"}
     assert e2e | values | times <= skipped
     assert not {"unknown-id", "length", "never-seen"} & skipped
     assert suite.get("skipped") == str(len(skipped))

@@ -22,7 +22,7 @@ _LETTER = 7.0  # width of a character in the legend [px]
 _COLOURS = ("#1b6ca8", "#c8553d", "#4f772d", "#7b4b94", "#b08900", "#3d5a6c", "#8d5524", "#555555")
 _POINTS = 720  # maximum number of points in a plotted curve, about one point per pixel of the plot width
 _HISTOGRAMS = 12  # maximum number of interval histograms in the report of a log
-_TIMING = ("cycle-mean", "cycle-jitter", "cycle-gap", "cycle-fast", "timeout", "recovered", "state-late")
+_TIMING = ("cycle-mean", "cycle-jitter", "cycle-gap", "cycle-fast", "timeout", "recovered", "late-start", "state-late")
 
 
 def write_html(results: Sequence[Report | Unread], path: Path) -> None:

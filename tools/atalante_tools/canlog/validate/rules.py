@@ -78,6 +78,8 @@ RULES = (
     Rule("timeout", "The message timed out and was not received again",
          "BA_ TimeoutTime", "ms", {"default_cycles": 10.0}),
     Rule("recovered", "The message timed out and was received again later", "BA_ TimeoutTime", "ms"),
+    Rule("late-start", "The first frame of the message came later than its timeout after the begin of the log",
+         "BA_ TimeoutTime", "ms"),
     Rule("never-seen", "A cyclic message is not in the log", "BA_ GenMsgCycleTime", "ms"),
     # -- order within the cycle --------------------------------------------------------------------------------------
     Rule("sync-order", "A state was received before the SYNC of its cycle", "SYNC message of the bus", "ms"),

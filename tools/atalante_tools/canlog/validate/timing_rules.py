@@ -44,7 +44,8 @@ class TimingRules:
         self._last = np.full(count, _NEVER, np.int64)  # for each message: time stamp of the last valid frame [ns]
         #: For each message: time stamp of the last frame, which may be valid or rejected [ns].
         self._arrived = np.full(count, _NEVER, np.int64)
-        self._first = np.full(count, _NEVER, np.int64)
+        #: For each message: time stamp of the first frame, which may be valid or rejected [ns].
+        self._first = np.full(count, -_NEVER, np.int64)
         self._last_share = np.full(count, np.inf)
         self._last_steps = np.zeros(count, np.int64)
         #: For each message: interval histogram, the number of intervals in each bin. Shape (messages, BINS).
@@ -78,6 +79,7 @@ class TimingRules:
             stamps: time stamp of each frame [ns], shape (k,).
         """
         np.maximum.at(self._arrived, rows, stamps)
+        np.minimum.at(self._first, rows, stamps)
 
     def check(self, stream: Stream, steps: Steps, rejected_before: Steps | None) -> None:
         """Check the intervals and alive counters in a chunk.
@@ -92,7 +94,7 @@ class TimingRules:
             return
         intervals = stream.stamps - stream.before(stream.stamps, self._last)
         new = stream.starts[self._last[stream.present] == _NEVER]
-        self._first[stream.rows[new]] = stream.stamps[new]
+        np.minimum.at(self._first, stream.rows[new], stream.stamps[new])
         cycle = self._cycle[stream.present]
         per_row = np.divide(1.0, cycle, out=np.zeros_like(cycle), where=cycle > 0)
         counts = stream.stops - stream.starts
@@ -250,14 +252,16 @@ class TimingRules:
         """
         for row in np.flatnonzero(self._cycle > 0).tolist():
             if self.seen(row):
-                self._finish_seen(row, end)
+                self._finish_seen(row, begin, end)
             elif expected[row] and end - begin > 2 * max(self._timeout[row], self._cycle[row]):
                 self._findings.add_whole("never-seen", row, begin, end, shown=(end - begin) * 1e-6)
         for row in np.flatnonzero(self.intervals > 0).tolist():
             self._finish_statistics(row)
 
-    def _finish_seen(self, row: int, end: int) -> None:
-        silence = end - int(self._arrived[row])
+    def _finish_seen(self, row: int, begin: int, end: int) -> None:
+        first, silence = int(self._first[row]), end - int(self._arrived[row])
+        if 0 < self._timeout[row] < first - begin:
+            self._findings.add_whole("late-start", row, begin, first, shown=(first - begin) * 1e-6)
         if 0 < self._timeout[row] < silence:
             self._findings.add_whole("timeout", row, int(self._arrived[row]), end, shown=silence * 1e-6)
 
