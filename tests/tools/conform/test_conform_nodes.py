@@ -13,7 +13,7 @@ import pytest
 
 from atalante_dbc import Message
 from atalante_emulator.emulator import EmulatorParameters
-from atalante_emulator.haptics import Haptics, HapticsParameters
+from atalante_emulator.haptics import WATCHDOG, Haptics, HapticsParameters
 from atalante_emulator.pendant import Operator
 from atalante_hal.wire.e2e import COUNTER_BYTE
 from atalante_hal.wire.frame import FLAG_FDF, ID_ERROR, ID_EXTENDED, ID_REMOTE, Frames, joined, new_frames
@@ -276,12 +276,17 @@ def _with_motors(advance: Callable[[Haptics, np.ndarray, int, int], None]) -> Br
 
 
 def _ramp(motors: Haptics, level: np.ndarray, silence: int, cycles: int) -> None:
-    wanted = level if silence < 50 else 0.0 * level
+    wanted = level if silence < WATCHDOG else 0.0 * level
     motors.amplitude += np.clip(wanted - motors.amplitude, -0.01 * cycles, 0.01 * cycles)
 
 
 def _never_stop(motors: Haptics, level: np.ndarray, _silence: int, cycles: int) -> None:
     Haptics.advance(motors, level, 0, cycles)
+
+
+def _stop_late(motors: Haptics, level: np.ndarray, silence: int, cycles: int) -> None:
+    """Stop 250 ms after the last command."""
+    Haptics.advance(motors, level, 0 if silence < 250 else silence, cycles)
 
 
 def _vibrate_at_rest(motors: Haptics, level: np.ndarray, silence: int, cycles: int) -> None:
@@ -399,6 +404,7 @@ BROKEN: dict[str, tuple[Break, str]] = {
         "HAPTICS-06",
     ),
     "keeps the level without commands": (_with_motors(_never_stop), "HAPTICS-07"),
+    "stops late without commands": (_with_motors(_stop_late), "HAPTICS-07"),
     "checks no CRC": (_receives("COMMAND", wire.no_crc, "HAPTICS"), "HAPTICS-08"),
     "checks no Data ID": (_receives("COMMAND", wire.no_data_id, "HAPTICS"), "HAPTICS-09"),
     "accepts repeated levels": (_receives("COMMAND", wire.no_repetition, "HAPTICS"), "HAPTICS-10"),

@@ -21,6 +21,7 @@ E2E: Final = "AUTOSAR E2E Profile 5"
 TIME_CONSTANT = 0.06
 #: Amplitudes and levels are numbers from 0 (off) to 1 (strongest).
 #: In HAPTICS-02, -04 and -05, an amplitude may deviate from the expected amplitude by at most this number.
+#: In HAPTICS-07, a fall of the amplitude by this number shows that a motor stops.
 #: In HAPTICS-02, the expected amplitudes are an exponential curve that is fitted to the measured amplitudes.
 LAG = 0.05
 #: A motor must reach its commanded level within this number of cycles.
@@ -33,6 +34,7 @@ _BAD: Final = 40
 
 def requirements(tester: NodeTester) -> list[Requirement]:
     """Return the requirements for the haptics node."""
+    timeout = tester.command.message.timeout_ms
     return [
         Requirement("HAPTICS-01", "Does not vibrate at rest.", "50 ms without command", "DBC Amplitude", is_still),
         Requirement(
@@ -59,7 +61,7 @@ def requirements(tester: NodeTester) -> list[Requirement]:
         Requirement(
             "HAPTICS-05",
             "Clamps or ignores a level above the DBC range.",
-            f"codes 201, 230 and 254 for {_BAD} ms at level 0.5",
+            f"codes 201, 230 and 254 in every second of {2 * _BAD} commands at level 0.5",
             "DBC Level range",
             stays_in_range,
         ),
@@ -72,8 +74,8 @@ def requirements(tester: NodeTester) -> list[Requirement]:
         ),
         Requirement(
             "HAPTICS-07",
-            "Stops on loss of commands.",
-            f"{2 * _SETTLED} ms without command after level 1",
+            f"Stops on loss of commands: the amplitude falls as soon as the last command is {timeout} ms old.",
+            f"{2 * _SETTLED} ms without command after level 1; amplitude after {_stop_bound(tester)} ms and at the end",
             "DBC HAPTICS_COMMAND TimeoutTime",
             stops_without_commands,
         ),
@@ -162,8 +164,12 @@ def stays_in_range(tester: NodeTester) -> Outcome:
     found, passed = [], True
     for code in (201, 230, 254):
         _settle(tester, 0.5)
+        # The valid commands between the codes prevent a timeout of a node that ignores the codes.
         received = [
-            frame for _ in range(_BAD) for frame in tester.cycle(_command(tester, 0.5, raw=_codes(tester, code)))
+            frame
+            for _ in range(_BAD)
+            for raw in (_codes(tester, code), None)
+            for frame in tester.cycle(_command(tester, 0.5, raw=raw))
         ]
         amplitudes = _amplitudes(tester, received)
         low, high = amplitudes.min(), amplitudes.max()
@@ -173,10 +179,22 @@ def stays_in_range(tester: NodeTester) -> Outcome:
 
 
 def stops_without_commands(tester: NodeTester) -> Outcome:
-    """Test HAPTICS-07: the motors stop on loss of commands."""
-    _settle(tester, 1.0)
-    last = _amplitudes(tester, tester.idle(2 * _SETTLED))[-1].max()
-    return Outcome(bool(last <= _STILL), f"amplitude {last:.3f} after {2 * _SETTLED} ms")
+    """Test HAPTICS-07: on loss of commands, the amplitude of every motor falls by `LAG` in time, and then reaches 0."""
+    bound = _stop_bound(tester)
+    before, last_command = _settle(tester, 1.0), tester.cycle_number
+    states = tester.states(tester.idle(2 * _SETTLED))
+    amplitudes = _amplitudes(tester, [frame for frame in states if frame.cycle - last_command >= bound])
+    fell, last = before - amplitudes[0], amplitudes[-1].max()
+    text = f"amplitude {amplitudes[0].max():.3f} after {bound} ms, {last:.3f} after {2 * _SETTLED} ms"
+    return Outcome(bool(fell.min() >= LAG and last <= _STILL), text)
+
+
+def _stop_bound(tester: NodeTester) -> int:
+    """Return the age of the last command from which the state must show that the motors stop [cycles].
+
+    The command times out after the TimeoutTime of the DBC, and the next state may be sampled one state period later.
+    """
+    return tester.command.message.timeout_ms + tester.state_message.cycle_ms
 
 
 def _ignores(bad: Callable[[NodeTester, int], Frames]) -> Callable[[NodeTester], Outcome]:
