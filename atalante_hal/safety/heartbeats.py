@@ -38,6 +38,7 @@ class _Status(NamedTuple):
     drive: bool  # True if the node is a drive; only drives measure the motor supply voltage
     row: int  # row of the status message in the process image
     timeout: int  # timeout of the status message [cycles]
+    emergency: int  # row of the emergency message of the node in the process image
     state: int  # index of NodeState in the values of the process image
     dbc_hash: int  # index of DbcHash in the values of the process image
     supply: int  # index of SupplyVoltage in the values of the process image
@@ -61,6 +62,7 @@ class Heartbeats:
                 network.node(m.sender).kind == "drive",
                 codec.rows[m.name],
                 m.timeout_ms,
+                codec.rows[f"{m.sender}_EMCY"],
                 *(codec.index(m.name, s) for s in _SIGNALS),
             )
             for m in messages
@@ -262,6 +264,7 @@ class Heartbeats:
             self._stopped.add(status.node)
         if state == BOOT_UP:
             self.booted.add(status.node)
+            self.image.restart(status.emergency)
         if status.node not in self._reported:
             self._reported.add(status.node)
             self.all_reported = self._reported.issuperset(self._needed)

@@ -216,6 +216,16 @@ class ReceiveImage:
         self.check[row] = Check.IMPLAUSIBLE
         self.all_fresh = False
 
+    def restart(self, row: int) -> None:
+        """Accept any alive counter in the next frame of a row, as in its first frame. Call this when its sender has restarted.
+
+        Otherwise the first frame of the restarted sender is rejected as REPEATED if it equals the last frame before the restart.
+
+        Args:
+            row: row of the message.
+        """
+        self._e2e.expected[row] = NOTHING
+
     def begins(self, frames: Frames, count: int) -> bool:
         """Return whether the buffer begins with one frame of each message, in the order of `messages`.
 

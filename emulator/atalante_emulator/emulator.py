@@ -165,9 +165,9 @@ class Emulator:
         self._sealed = False  # True if `_tx` already contains the finished frames for the next SYNC
         self._tag = 0  # alive counter in the frames for the next SYNC: low byte of the expected cycle number
         self._haptics_tx = TransmitImage([network.message("HAPTICS_STATE")])
-        self._heartbeats = Heartbeats(network, [m for m in sent if m.name.endswith("_STATUS")])
         self._emergencies: list[Emergency] = []  # emergencies to send in this cycle
         self._emergency_tx = TransmitImage([m for m in sent if m.name.endswith("_EMCY")])
+        self._heartbeats = Heartbeats(network, [m for m in sent if m.name.endswith("_STATUS")], self._emergency_tx)
 
         received = [m for m in network.sent_by("HAL") if m.cycle_ms == 1]
         syncs = [m for m in received if m.name.startswith("SYNC_")]

@@ -30,7 +30,15 @@ class _Status:
 class Heartbeats:
     """Sender of the status messages of all emulated nodes."""
 
-    def __init__(self, network: Network, messages: Sequence[Message]) -> None:
+    def __init__(self, network: Network, messages: Sequence[Message], emergencies: TransmitImage) -> None:
+        """Plan the status messages.
+
+        Args:
+            network: nodes and messages of the DBC.
+            messages: status messages of the emulated nodes.
+            emergencies: encoder of the emergencies of these nodes. A restart of a node resets the alive counter of its emergency.
+        """
+        self._emergencies = emergencies
         self._period = max(m.cycle_ms for m in messages)
         # Distribute the status messages over the period: node i sends its message `gap` cycles after node i - 1.
         # So each cycle contains at most one regular status message.
@@ -66,7 +74,8 @@ class Heartbeats:
     def boot(self, node: str, cycle: int) -> None:
         """Restart a node, so that its next status message reports BOOTUP.
 
-        The next call of `due` returns this message. Uptime and alive counter of the status message restart at 0.
+        The next call of `due` returns this message. Its uptime restarts at 0, and so do the alive counters of the status message
+        and of the emergency.
 
         Args:
             node: name of the node.
@@ -75,6 +84,7 @@ class Heartbeats:
         status = self._of[node]
         status.booted = cycle
         status.tx.resume(0, 0xFF)
+        self._emergencies.resume(self._emergencies.codec.rows[f"{node}_EMCY"], 0xFF)
         self.set(node, "NodeState", BOOTUP)
         self.set(node, "ErrorFlags", 0.0)
         self._booting.append(status)

@@ -6,6 +6,8 @@ import pytest
 from atalante_dbc import Network
 from atalante_emulator.heartbeat import BOOTUP, OPERATIONAL, Heartbeats
 from atalante_hal.wire.codec import Codec
+from atalante_hal.wire.e2e import COUNTER_BYTE
+from atalante_hal.wire.process_image import TransmitImage
 
 NODES = ("LEFT_SK", "IMU_TORSO", "PENDANT")
 
@@ -17,7 +19,8 @@ class Listener:
 
     def __init__(self, network: Network) -> None:
         messages = [network.message(f"{node}_STATUS") for node in NODES]
-        self.heartbeats, self.cycle = Heartbeats(network, messages), 0
+        self.emergencies = TransmitImage([network.message(f"{node}_EMCY") for node in NODES])
+        self.heartbeats, self.cycle = Heartbeats(network, messages, self.emergencies), 0
         self.codecs = {message.frame_id: Codec([message]) for message in messages}
         self.sent: dict[str, list[tuple[float, ...]]] = {node: [] for node in NODES}
 
@@ -79,3 +82,9 @@ def test_reboot_in_the_cycle_of_a_heartbeat_sends_one_bootup(listener: Listener)
     listener.heartbeats.boot("IMU_TORSO", listener.cycle)
     listener.run(1)
     assert [sent[:3] for sent in listener.sent["IMU_TORSO"]] == [(33, 0, BOOTUP), (133, 0, BOOTUP)]
+
+
+def test_reboot_restarts_the_emergency_counter_of_its_node_only(listener: Listener) -> None:
+    listener.emergencies.seal(7)
+    listener.heartbeats.boot("IMU_TORSO", listener.cycle)
+    assert listener.emergencies.seal()["data"][:, COUNTER_BYTE].tolist() == [8, 0, 8]

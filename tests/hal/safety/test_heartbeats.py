@@ -433,6 +433,25 @@ def test_booted_node_is_listed(running: Nodes):
     assert running.heartbeats.booted == {"LEFT_SK"}
 
 
+def test_same_emergency_after_a_restart_of_the_node_is_accepted(running: Nodes):
+    emergency = running.frame("LEFT_SK", "EMCY", ErrorCode=0x7305)
+    running.receive(emergency)
+    assert running.evaluate() == {("EMCY_7xxx", "LEFT_SK"): True}
+    running.heartbeats.acknowledge(set())
+    running.receive(running.frame("LEFT_SK", NodeState=BOOT_UP))
+    running.evaluate()
+    running.receive(emergency)
+    assert running.evaluate() == {("EMCY_7xxx", "LEFT_SK"): True}
+
+
+def test_restart_of_another_node_does_not_repeat_an_emergency(running: Nodes):
+    emergency = running.frame("LEFT_SK", "EMCY", ErrorCode=0x7305)
+    running.receive(emergency)
+    running.heartbeats.acknowledge(set())
+    running.receive(running.frame("LEFT_SA", NodeState=BOOT_UP), emergency)
+    assert running.evaluate() == {("NODE_RESET", "LEFT_SA"): True, ("E2E_REPEATED", "LEFT_SK"): False}
+
+
 def test_emergency_explains_a_fault_until_it_is_cleared(running: Nodes):
     assert not running.heartbeats.has_emergency("LEFT_SK")
     running.receive(running.frame("LEFT_SK", "EMCY", ErrorCode=0x7305))

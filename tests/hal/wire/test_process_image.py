@@ -250,6 +250,18 @@ def test_restarted_sender_with_the_last_counter_is_accepted_and_listed():
     assert rx.refused == [(0, Check.REPEATED)]
 
 
+def test_same_frame_after_a_known_restart_of_its_sender_is_accepted():
+    messages = [m for m in NETWORK.received_by("HAL") if m.name in ("LEFT_FH_EMCY", "LEFT_TH_EMCY")]
+    tx, rx, buffer = TransmitImage(messages), ReceiveImage(messages, restarts=True), new_frames(4)
+    frames = tx.seal(0).copy()
+    deliver_frames(rx, buffer, list(frames))
+    rx.restart(1)
+    deliver_frames(rx, buffer, list(frames))
+    assert rx.check.tolist() == [Check.REPEATED, Check.OK]
+    deliver_frames(rx, buffer, list(frames))
+    assert rx.check.tolist() == [Check.REPEATED] * 2
+
+
 def test_committed_frame_after_a_loss_is_not_a_further_frame():
     tx, rx, buffer = pair()
     deliver(tx, rx, buffer)

@@ -22,6 +22,7 @@ from atalante_tools.faults.scenario import Case, HostFault, OperatorAction, Scen
 _S = SupervisorState
 _KNEE: Final = "LEFT_SK"
 _HIP: Final = "LEFT_SH"
+_IMU: Final = "IMU_TORSO"
 _COMMAND: Final = "COMMAND_LEFT_LEG"
 #: Time from the end of the fault to START [cycles], if a knee sinks in LOWER or FAULT. After this time the knee is at rest, so
 #: its drive can be enabled again.
@@ -59,24 +60,38 @@ def _start_with(name: str, node: str, fault: Fault | float) -> Case:
 SCENARIOS: Final = (
     Scenario(
         "F21",
-        tuple(
+        (
+            *(
+                Case(
+                    f"{name}, {code:#06x}",
+                    (Fault("emergency", _KNEE, 0, 100, code=code),),
+                    state=state,
+                    dtc=dtc,
+                    node=_KNEE,
+                    recovers=recovers,
+                    observed=observed,
+                )
+                for name, code, state, dtc, observed, recovers in (
+                    ("current", 0x2310, _S.FAULT, "EMCY_2310", _LOWERED, True),
+                    ("voltage", 0x3210, _S.HOLD, "EMCY_3210", 60, True),
+                    ("temperature", 0x4210, _S.LOWER, "OVER_TEMP", 60, False),
+                    ("encoder", 0x7305, _S.LOWER, "EMCY_7305", _LOWERED, True),
+                    ("communication", 0x8100, _S.HOLD, "EMCY_8100", 60, True),
+                    ("software", 0x6100, _S.FAULT, "EMCY_6100", 60, True),
+                )
+            ),
             Case(
-                f"{name}, {code:#06x}",
-                (Fault("emergency", _KNEE, 0, 100, code=code),),
-                state=state,
-                dtc=dtc,
-                node=_KNEE,
-                recovers=recovers,
-                observed=observed,
-            )
-            for name, code, state, dtc, observed, recovers in (
-                ("current", 0x2310, _S.FAULT, "EMCY_2310", _LOWERED, True),
-                ("voltage", 0x3210, _S.HOLD, "EMCY_3210", 60, True),
-                ("temperature", 0x4210, _S.LOWER, "OVER_TEMP", 60, False),
-                ("encoder", 0x7305, _S.LOWER, "EMCY_7305", _LOWERED, True),
-                ("communication", 0x8100, _S.HOLD, "EMCY_8100", 60, True),
-                ("software", 0x6100, _S.FAULT, "EMCY_6100", 60, True),
-            )
+                "same emergency before and after a restart",
+                (
+                    Fault("emergency", _IMU, 0, 700, code=0x3210),
+                    Fault("reset", _IMU, 100, 30),
+                    OperatorAction("start", 200),
+                    Fault("emergency", _IMU, 600, 100, code=0x3210),
+                ),
+                first_faulty=600,
+                dtc="EMCY_3210",
+                node=_IMU,
+            ),
         ),
     ),
     Scenario(
