@@ -13,7 +13,8 @@ foot is on the ground, and a negative offset of all cells, as soon as the foot c
 *Contact.* Walking has no flight phase. So a robot that stood on the ground cannot swing both feet. The check is armed after
 both feet have carried load together for `STANDING_CYCLES`. A robot on a crane that touches the floor for a shorter time does
 not arm the check. The check is disarmed if the robot has been lifted for `LIFTED_CYCLES`. A lifted robot is in HOLD and requires
-a new START.
+a new START. While a foot sends no values, it may be on the ground although its last values show no load. So this time does not
+count as a swing of both feet. But the time counted before is kept, so a foot with frequent losses cannot prevent the detection.
 """
 
 from __future__ import annotations
@@ -51,7 +52,8 @@ class FootChecks:
         self._free_squared = self._free**2
         #: Index of the swing leg in FEET; None unless exactly one foot is on the ground.
         self.swing: int | None = None
-        self._swinging = LIFTED_CYCLES  # time for which no foot has been on the ground [cycles]
+        # Time for which no foot has been on the ground [cycles]. It does not grow while a foot has no new values.
+        self._swinging = LIFTED_CYCLES
         self._standing = 0  # time for which both feet have been on the ground [cycles]
         # True if the check for two swinging feet is active: after the robot stood on both feet, until the robot is lifted.
         self._armed = False
@@ -67,7 +69,7 @@ class FootChecks:
 
         Args:
             updated: whether each foot (left, right) has new values since the last call. The cells of a foot are checked
-                only if the foot has new values.
+                only if the foot has new values. A swing of both feet is counted only if both have new values.
 
         Returns:
             Whether a cell or the ground contact is implausible.
@@ -82,7 +84,10 @@ class FootChecks:
             if updated[foot]:
                 self._check_cells(foot, cells, carries)
         self.swing = None if on_ground[0] == on_ground[1] else on_ground.index(False)
-        self._swinging = 0 if any(on_ground) else self._swinging + self._every
+        if any(on_ground):
+            self._swinging = 0
+        elif all(updated):
+            self._swinging += self._every
         self._standing = self._standing + self._every if all(on_ground) else 0
         if self._standing >= STANDING_CYCLES:
             self._armed = True

@@ -242,6 +242,17 @@ class TestFeetAlone:
         assert not feet.evaluate(LOADED, UNLOADED)
         assert feet.checks.findings() == ()
 
+    @pytest.mark.parametrize("new", [(True, False), (False, True), (False, False)])
+    def test_time_without_values_of_a_foot_is_no_swing_of_both_feet(self, new: tuple[bool, bool]):
+        feet = TwoFeet()
+        self.stand(feet)
+        assert not any(feet.evaluate(UNLOADED, UNLOADED, new) for _ in range(300))
+        assert not any(feet.evaluate(UNLOADED, UNLOADED) for _ in range(40))
+        assert not any(feet.evaluate(UNLOADED, UNLOADED, new) for _ in range(300))
+        assert [feet.evaluate(UNLOADED, UNLOADED) for _ in range(20)] == [False] * 19 + [True]
+        assert all(feet.evaluate(UNLOADED, UNLOADED, new) for _ in range(300)), "the finding stays"
+        assert not feet.evaluate(LOADED, UNLOADED, new)
+
     def test_swing_of_both_feet_is_accepted_before_both_stood_for_500_cycles(self):
         feet = TwoFeet()
         for _ in range(2):  # the time with both feet on the ground is counted from 0 after each swing
