@@ -29,8 +29,9 @@ legs of a suspended robot whose drives are off sink onto their end stops within 
 joints onto the end stops. So the pulse of a repeated test is `BOOST` times larger for a joint within the position
 tolerance of its limit. If the foot of a leg carries load, the joints of the leg may be blocked. A foot that only touches
 the floor hits the floor during the pulse, and the impact stops the ankle. An impact lasts one or two cycles, so the
-impact hardly changes the mean force. A joint whose foot carried load or hit the floor stays untested. Each start tests all
-joints again, because motors and encoders may have been exchanged since the last one.
+impact hardly changes the mean force. A joint whose foot carried load or hit the floor stays untested. An offset of a single cell
+is no load and no impact, because load acts on at least two cells, and an impact is short. Each start tests all joints again,
+because motors and encoders may have been exchanged since the last one.
 """
 
 from __future__ import annotations
@@ -64,10 +65,11 @@ DAMPING = (0.5, 0.5, 0.6, 0.25, 0.25, 0.25)
 INTEGRAL = 0.03
 #: A joint that moves farther than this from its initial position ends the start [rad].
 TRAVEL = math.radians(1.5)
-#: A foot is loaded if its mean force during a test exceeds `LOAD * cell_free`.
-#: `LOAD * cell_free` is about four times the rms noise of the mean force.
+#: A foot is loaded if its mean force during a test exceeds `LOAD * cell_free`, and that of at least two cells half of this limit.
+#: `LOAD * cell_free` is about four times the rms noise of the mean force. The noise of a cell is half as large.
 LOAD = 1.0 / 3.0
-#: The forces on a foot in two consecutive cycles are added. If the sum exceeds `HIT * cell_free`, the foot hit the floor.
+#: The forces on a foot in two consecutive cycles are added. If the sum, and its change from the median force of the test, exceed
+#: `HIT * cell_free`, the foot hit the floor.
 #: `HIT * cell_free` is about four times the rms noise of the sum.
 #: If the floor stops a moving ankle, the sum is at least 1.5 times `HIT * cell_free`.
 HIT = 2.0
@@ -185,7 +187,9 @@ class DirectionProof:
         #: The sum contains the joints that passed a test of more than two joints with a short pulse.
         self._explained = np.zeros(len(LATENCIES))
         self._position: list[Vector] = []  # joint positions in each cycle of the current test
-        self._force: list[Vector] = []  # vertical force of each foot in each cycle of the current test
+        self._force: list[
+            Vector
+        ] = []  # vertical forces on the cells of each foot in each cycle of the current test, shape (2, 4)
         self._torque: list[Vector] = []  # sent torques in each cycle of the current test
 
     def begin(self, position: Vector, torque: Vector) -> None:
@@ -240,12 +244,12 @@ class DirectionProof:
 
         Args:
             position: joint positions, shape (12,) [rad].
-            force: vertical force of each foot, shape (2,) [N].
+            force: vertical force on each cell of each foot, shape (2, 4) [N].
 
         Returns:
             Reason why the start must end, as one sentence; empty if the start may continue.
         """
-        self._force.append(force)
+        self._force.append(force.copy())
         travel = np.abs(position - self._anchor)
         if not travel.max() <= TRAVEL:
             far = np.flatnonzero(travel > 0.5 * TRAVEL)
@@ -300,9 +304,13 @@ class DirectionProof:
 
     def _on_the_floor(self) -> npt.NDArray[np.bool_]:
         """Return whether each foot carried load or hit the floor during the test, shape (2,)."""
-        force = np.array(self._force)
-        loaded = np.abs(np.mean(force, axis=0)) > LOAD * self._free
-        hit = np.abs(force[1:] + force[:-1]).max(axis=0) > HIT * self._free
+        cells = np.array(self._force)
+        force, mean, least = cells.sum(axis=2), cells.mean(axis=0), LOAD * self._free
+        carries = np.abs(mean) > 0.5 * least
+        loaded = (np.abs(mean.sum(axis=1)) > least) & (carries.sum(axis=1) >= 2)
+        pairs = force[1:] + force[:-1]
+        change = pairs - 2.0 * np.median(force, axis=0)
+        hit = np.minimum(np.abs(pairs), np.abs(change)).max(axis=0) > HIT * self._free
         supported: npt.NDArray[np.bool_] = loaded | hit
         return supported
 

@@ -470,7 +470,7 @@ class SafetyMonitor:
             if not proof.running:
                 self._kept_off.clear()
         elif proof.running:
-            if failure := proof.evaluate(state.position, state.foot_force[..., 2].sum(axis=1)):
+            if failure := proof.evaluate(state.position, state.foot_force[..., 2]):
                 self._kept_off.update(DRIVE_NODES[joint] for joint in proof.failed)
                 for joint in proof.failed:
                     finding = Finding(Dtc.TORQUE_DIRECTION, DRIVE_NODES[joint], proof.mobility[joint], True, failure)

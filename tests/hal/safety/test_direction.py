@@ -26,7 +26,7 @@ ROBOT = load_robot()
 KNEE, ANKLE = JOINTS.index("left_SK"), JOINTS.index("left_SA")
 MIDDLE = 0.5 * (ROBOT.position_min + ROBOT.position_max)
 INERTIA = 0.4 / np.array(MOBILITY * 2)  # kg m2
-NO_FORCE, LOADED = np.zeros(2), np.array([200.0, 0.0])
+NO_FORCE, LOADED = np.zeros((2, 4)), np.array([[50.0] * 4, [0.0] * 4])  # vertical forces on the cells of both feet [N]
 #: Cycles of a test of 19 cycles in which a loaded foot reports its load.
 MOST = range(3, 19)
 #: Longest test of the directions if every joint passes at once [cycles].
@@ -154,7 +154,7 @@ def test_start_in_which_no_joint_passes_keeps_the_delay(joints: Joints):
     joints.delay(3)
     joints.run()
     joints.strength[:] = 0.0
-    joints.run(np.array([500.0, 500.0]), within=range(1000))
+    joints.run(np.full((2, 4), 125.0), within=range(1000))
     assert not joints.proof.proven.any()
     assert joints.proof.late == 3
 
@@ -185,7 +185,7 @@ def test_all_short_pulses_measure_the_delay(joints: Joints, monkeypatch: pytest.
     """Knee and ankle of the loaded left leg do not move, so fewer joints have the smaller delay."""
     delays(monkeypatch, joints, 2, 2, 1)
     joints.strength[[3, 5]] = 0.0
-    assert joints.run(np.array([500.0, 0.0]), within=range(19))[0] == ""
+    assert joints.run(on_foot(0, 500.0), within=range(19))[0] == ""
     assert joints.proof.late == 2
 
 
@@ -297,7 +297,39 @@ def test_dead_joint_at_its_end_stop_fails(joints: Joints):
 @pytest.mark.parametrize("force", [10.0, -10.0])
 def test_noise_of_the_feet_is_no_load(joints: Joints, force: float):
     joints.strength[KNEE] = 0.0
-    assert joints.run(np.full(2, force))[0].startswith("left_SK does not follow its torque")
+    assert joints.run(np.full((2, 4), force / 4.0))[0].startswith("left_SK does not follow its torque")
+
+
+def on_foot(foot: int, force: float) -> np.ndarray:
+    """Return the vertical forces on the cells of both feet if a foot carries a force that its cells share."""
+    return np.outer(np.eye(2)[foot], np.full(4, force / 4.0))
+
+
+@pytest.mark.parametrize("offset", [25.0, -25.0, 79.0])
+@pytest.mark.parametrize("foot", [0, 1])
+def test_offset_of_one_force_cell_does_not_hide_a_dead_motor(joints: Joints, foot: int, offset: float):
+    knee = KNEE + 6 * foot
+    joints.strength[knee] = 0.0
+    force = NO_FORCE.copy()
+    force[foot, 2] = offset
+    assert joints.run(force, within=range(19))[0].startswith(f"{JOINTS[knee]} does not follow its torque")
+
+
+@pytest.mark.parametrize(
+    ("cells", "tested"),
+    [
+        ([30.0, 30.0, 0.0, 0.0], False),
+        ([30.0, 10.1, 0.0, 0.0], False),
+        ([30.0, 9.9, 0.0, 0.0], True),
+        ([10.1, 9.8, 0.0, 0.0], True),
+        ([10.1, 10.1, -0.3, 0.0], True),
+        ([30.0, -30.0, 0.0, 0.0], True),
+    ],
+)
+def test_foot_is_loaded_if_the_sum_and_two_cells_are(joints: Joints, cells: list[float], tested: bool):
+    joints.strength[KNEE] = 0.0
+    failure = joints.run(np.array([cells, [0.0] * 4]), within=range(19))[0]
+    assert failure.startswith("left_SK does not follow its torque") if tested else failure == ""
 
 
 @pytest.mark.parametrize(
@@ -312,10 +344,10 @@ def test_joint_whose_foot_hits_the_floor_stays_untested(
     ankle = ANKLE + 6 * foot
     joints.strength[ankle] = 0.0
     within = range(10, 10 + cycles)
-    failure = joints.run(np.eye(2)[foot] * force, within=within)[0]
+    failure = joints.run(on_foot(foot, force), within=within)[0]
     assert failure.startswith(f"{JOINTS[ankle]} does not follow its torque") if tested else failure == ""
     assert not joints.proof.proven[ankle]
-    assert joints.run(np.eye(2)[1 - foot] * force, within=within)[0].startswith(f"{JOINTS[ankle]} does not follow")
+    assert joints.run(on_foot(1 - foot, force), within=within)[0].startswith(f"{JOINTS[ankle]} does not follow")
 
 
 def test_failure_names_every_joint_and_the_report_lists_them_in_order(joints: Joints):
