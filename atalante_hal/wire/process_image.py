@@ -405,13 +405,16 @@ def accept_exact(
 def begin_cycle(e2e: E2EState, status: RowStatus, elapsed: int) -> None:
     """Increase the age of every row, and set the check result of every row to NO_DATA.
 
+    The age of a row that has received a frame stays below `NEVER`.
+
     Args:
         e2e: `silent` of each row is increased.
         status: age and check result of each row; overwritten.
         elapsed: number of cycles since the last call.
     """
     for row in range(len(status.age)):
-        status.age[row] += elapsed
+        age = status.age[row]
+        status.age[row] = age + elapsed if age >= NEVER else min(age + elapsed, NEVER - 1)
         e2e.silent[row] += elapsed
         status.check[row] = _NO_DATA
 

@@ -250,6 +250,15 @@ def test_restarted_sender_with_the_last_counter_is_accepted_and_listed():
     assert rx.refused == [(0, Check.REPEATED)]
 
 
+def test_age_of_a_received_message_stays_below_never():
+    tx, rx, buffer = pair()
+    deliver_frames(rx, buffer, [tx.seal()[0].copy()])
+    for elapsed, age in ((NEVER - 2, NEVER - 2), (1, NEVER - 1), (1, NEVER - 1), (NEVER, NEVER - 1)):
+        rx.new_cycle(elapsed)
+        assert rx.age[0] == age
+        assert (rx.age[1:] >= NEVER).all()
+
+
 def test_same_frame_after_a_known_restart_of_its_sender_is_accepted():
     messages = [m for m in NETWORK.received_by("HAL") if m.name in ("LEFT_FH_EMCY", "LEFT_TH_EMCY")]
     tx, rx, buffer = TransmitImage(messages), ReceiveImage(messages, restarts=True), new_frames(4)
