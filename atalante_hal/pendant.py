@@ -5,7 +5,8 @@
 START is edge-triggered: a press is a frame with the request START whose `RequestCounter` differs from the previous cycle.
 The first frame, and the first frame after a gap between cycles, is never a press. If START is pressed while the pendant is
 not qualified yet, the press is stored until the pendant is qualified. A stored press is dropped if the dead-man switch or
-START is released, or if the supervisor state changes.
+START is released, or if the supervisor state changes. While two pendants may be sending, there is no press, and the next
+frame counts as a first frame.
 """
 
 from __future__ import annotations
@@ -83,12 +84,19 @@ class Pendant:
         self.started = False
         #: Assistance factor Xi in [0, 1]; None if the pendant sets no factor.
         self.assistance_factor: float | None = None
-        #: RequestCounter of the last evaluated frame; None before the first frame and after a gap between cycles.
+        #: RequestCounter of the last evaluated frame; None before the first frame, after a gap between cycles, and after a
+        #: cycle in which two pendants may have sent.
         self._press: float | None = None
         self._pressed = False  # True while a press of START is stored until the pendant is qualified
 
     def evaluate(
-        self, present: bool, *, qualifying: bool = False, new: bool = True, further_frames: Sequence[Vector] = ()
+        self,
+        present: bool,
+        *,
+        qualifying: bool = False,
+        new: bool = True,
+        further_frames: Sequence[Vector] = (),
+        two_senders: bool = False,
     ) -> None:
         """Evaluate the inputs of one cycle.
 
@@ -103,6 +111,8 @@ class Pendant:
             further_frames: Values of the process image for each further valid frame of this cycle, see
                 `ReceiveImage.decode_further_frames`. All frames of the cycle are combined as in `safest`. START is not
                 evaluated in a cycle with further frames.
+            two_senders: True if the frames may come from two pendants, see `MessageMonitor.may_have_two_senders`. Then START is
+                not evaluated, and a stored press is dropped.
         """
         self.started = False
         if not (present or qualifying):
@@ -116,7 +126,9 @@ class Pendant:
         demand = safest([demand_of(received), *others])
         self.dead_man, self.stop_requested = present and demand.dead_man, present and demand.stop
         self.hold_requested = present and demand.hold
-        if not further_frames:
+        if two_senders:
+            self._press, self._pressed = None, False
+        elif not further_frames:
             edge = new and request == _START and self._press is not None and press != self._press
             stored = (edge or self._pressed) and request == _START and demand.dead_man
             self.started = present and (edge or stored)

@@ -39,7 +39,7 @@ from atalante_dbc import Network
 from atalante_hal.robot import SIDES
 from atalante_hal.safety.diagnostics import Dtc
 from atalante_hal.safety.fault_memory import FaultMemory
-from atalante_hal.wire.e2e import FULL, SETTLED, Check, Qualification, qualify, suspect
+from atalante_hal.wire.e2e import FULL, REQUALIFY, SETTLED, Check, Qualification, qualify, suspect
 from atalante_hal.wire.process_image import NEVER, ReceiveImage
 
 #: Result of the E2E check of a rejected message -> diagnostic that becomes pending.
@@ -137,6 +137,14 @@ class MessageMonitor:
     def is_trusted(self, row: int) -> bool:
         """Return whether the sender of the message in a row is trusted."""
         return self.qualification[row].trusted
+
+    def may_have_two_senders(self, row: int) -> bool:
+        """Return whether accepted frames of a message may come from different senders.
+
+        This is True from a cycle with frames of two senders until `REQUALIFY` good cycles in a row. The diagnostic
+        NODE_DUPLICATE need not be confirmed.
+        """
+        return self._evidence[row] > 0 and self.qualification[row].good < REQUALIFY
 
     def in_time(self, row: int) -> bool:
         """Return whether the data of a row is younger than the timeout of its message."""

@@ -312,6 +312,7 @@ class SafetyMonitor:
             qualifying=message_monitor.in_time(row),
             new=bool(self._image.check[row] <= Check.SOME_LOST),
             further_frames=self._image.decode_further_frames(row),
+            two_senders=message_monitor.may_have_two_senders(row),
         )
         operator_stops = pendant.stop_requested or not pendant.dead_man
         walk_end_requested = self.walking and operator_stops and not pendant.hold_requested

@@ -261,6 +261,27 @@ def test_start_is_evaluated_only_in_a_cycle_with_a_new_frame(pendant: Pendant):
     assert pendant.started
 
 
+@pytest.mark.parametrize("further", [(), ((1, START, 5),)])
+def test_first_frame_after_two_senders_is_not_a_press(pendant: Pendant, further: tuple[tuple[int, int, int], ...]):
+    send(pendant, request=START, press=1)
+    pendant.signals[:3] = 1, START, 5
+    pendant.evaluate(True, further_frames=others(*further) if further else (), two_senders=True)
+    assert not pendant.started
+    send(pendant, request=START, press=5)
+    assert not pendant.started
+    send(pendant, request=START, press=6)
+    assert pendant.started
+
+
+def test_two_senders_clear_a_stored_press(pendant: Pendant):
+    qualify(pendant, press=6)
+    qualify(pendant, request=START, press=7)
+    pendant.evaluate(False, qualifying=True, two_senders=True)
+    qualify(pendant, request=START, press=7)
+    send(pendant, request=START, press=7)
+    assert not pendant.started
+
+
 @pytest.mark.parametrize("further", [(0, 0, 0), (1, STOP, 0)])
 def test_stop_of_a_second_sender_clears_a_kept_press(pendant: Pendant, further: tuple[int, int, int]):
     qualify(pendant, press=6)

@@ -537,6 +537,18 @@ class TestTwoSenders:
         bench.cycle()
         assert bench.message_monitor.settled
 
+    @pytest.mark.parametrize("cycles", [1, 4, 100])
+    def test_two_senders_are_possible_until_16_good_cycles(self, bench: MonitorBench, cycles: int):
+        bench.trust_all()
+        assert not bench.message_monitor.may_have_two_senders(PENDANT)
+        bench.cycle(self.rival(PENDANT), times=cycles)
+        assert bench.message_monitor.may_have_two_senders(PENDANT)
+        bench.cycle(times=15)
+        assert bench.message_monitor.may_have_two_senders(PENDANT)
+        assert not bench.message_monitor.may_have_two_senders(KNEE)
+        bench.cycle()
+        assert not bench.message_monitor.may_have_two_senders(PENDANT)
+
     def test_node_with_two_senders_is_never_trusted(self, bench: MonitorBench):
         bench.cycle()
         for _ in range(10):

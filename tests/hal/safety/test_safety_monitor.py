@@ -1010,6 +1010,32 @@ def test_f58_start_press_of_one_of_two_pendants_does_not_count(make_rig, order: 
     assert rig.run(ENABLE_CYCLES + 50).supervisor is S.READY
 
 
+@pytest.mark.parametrize("alternating", [0, 4])
+@pytest.mark.parametrize("overlap", [1, 3, 100])
+def test_f58_exchange_of_the_pendant_in_hold_starts_nothing(make_rig, overlap: int, alternating: int):
+    rig = make_rig(starts=False)
+    into(rig, S.HOLD)
+    other = TransmitImage([load().message("PENDANT_STATE")])
+    index = other.codec.index("PENDANT_STATE", "DeadMan")
+    other.values[index : index + 3] = 1, 1, 77  # dead-man, START, RequestCounter
+    present = "both"
+
+    def pendants(frames: Frames) -> Frames:
+        frames = frames if present != "other" else rig.drop(PENDANT_STATE)(frames)
+        second = other.seal(rig.hal.state.cycle & 0xFF)
+        return frames if present == "first" or not len(frames) else np.concatenate([frames, second])
+
+    rig.bus.to_hal = pendants
+    rig.run(overlap)
+    for cycle in range(alternating):  # each cycle loses the frame of one pendant
+        present = ("first", "other")[cycle % 2]
+        rig.cycle()
+    present = "other"
+    assert rig.run(ENABLE_CYCLES + 50).supervisor is S.HOLD
+    other.values[index + 2] = 78
+    assert rig.until(S.ACTIVE, 150).supervisor is S.ACTIVE
+
+
 @pytest.mark.parametrize("ahead", [-3, -1, 1, 3, 20])
 def test_f58_second_sender_with_its_own_counter_leads_to_hold(make_rig, ahead: int):
     message = load().message("LEFT_SK_STATE")

@@ -46,7 +46,7 @@ START_CYCLES: Final = {NO_START: 0, LAST_START: 1, START: 100}
 #: Whether the HAL trusts the pendant -> error counters of the pendant (`Qualification`) that the search tries.
 QUALIFICATIONS: Final = {
     False: (Qualification(0, 0, False), Qualification(0, REQUALIFY - 1, False)),
-    True: (SETTLED, Qualification(FULL - 4, REQUALIFY, True)),
+    True: (SETTLED, Qualification(FULL - 4, 0, True)),
 }
 #: Last frame that the HAL checked for a press of a button: no frame, the last accepted frame, an earlier frame, or a frame of a
 #: second sender. If the next frame has another RequestCounter than the checked frame, a button was pressed.
@@ -192,7 +192,9 @@ class HalSteps:
             frames: frames that arrive, in order.
         """
         ages = (before.age,) if before.age < LOST else (LOST, 200, NEVER)
-        evidences = (0, FULL - 16) if any(frame.sender == "rogue" for frame in frames) else (0,)
+        # While two senders are suspected, the HAL keeps no RequestCounter.
+        two_senders = before.evaluated == _NONE or any(frame.sender == "rogue" for frame in frames)
+        evidences = (0, FULL - 16) if two_senders else (0,)
         return tuple(
             dict.fromkeys(
                 self._received(before, frames, age, trust, evidence)
