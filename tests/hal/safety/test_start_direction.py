@@ -119,6 +119,22 @@ def test_reversed_motor_does_not_hold_if_the_first_start_is_stopped(make_rig, jo
     assert rig.hal.state.supervisor is S.READY
 
 
+@pytest.mark.parametrize("joint", [KNEE, ANKLE], ids=["left_SK", "left_SA"])
+def test_reversed_motor_does_not_hold_if_the_first_start_after_a_fault_is_stopped(make_rig, joint: int):
+    rig = make_rig(starts=False)
+    rig.emulator.drives.motors.set_strength(joint, -1.0)
+    rig.until(S.READY)
+    rig.emulator.drives.leave(7, D.FAULT)
+    rig.until(S.FAULT, 5)
+    rig.operator.start()
+    rig.until(S.HOLD, 20)
+    rig.run(50)
+    assert set(rig.hal.state.drive_state) == {D.SWITCH_ON_DISABLED}
+    stop_during_the_test(rig, joint)
+    assert rig.hal.state.supervisor is S.HOLD
+    assert set(rig.hal.state.drive_state) == {D.SWITCH_ON_DISABLED}
+
+
 def test_drives_hold_if_a_start_in_hold_is_stopped(rig):
     rig.until(S.ACTIVE)
     rig.operator.stop()
