@@ -88,6 +88,8 @@ class Heartbeats:
         self.emergencies: dict[str, tuple[Dtc, int]] = {}
         self._cleared: set[str] = set()  # nodes whose emergency was cleared in this cycle
         self._unreported: set[str] = set()  # nodes whose active emergency `evaluate` has not reported yet
+        #: Nodes whose active emergency the last `evaluate` reported for the first time.
+        self._just_reported: set[str] = set()
         #: Emergencies that were cleared before `evaluate` reported them, each as (node, diagnostic, error code).
         #: The next `evaluate` reports them once.
         self._brief: list[tuple[str, Dtc, int]] = []
@@ -188,7 +190,7 @@ class Heartbeats:
             text = f"{node}: {dtc.meaning} (emergency 0x{code:04X})"
             memory.raise_dtc(cycle, dtc, node, value=code, text=text)
         self._brief.clear()
-        self._unreported.clear()
+        self._just_reported, self._unreported = self._unreported, set()
         self.quiet = not (self.emergencies or two_senders)
         for status in self._statuses:
             self._check_status(cycle, memory, status)
@@ -203,14 +205,17 @@ class Heartbeats:
         return bool(((ages >= self._timeouts) & (ages < NEVER)).any())
 
     def acknowledge(self, still_faulty: set[str]) -> None:
-        """Remove the emergencies of all nodes except the drives that are still in FAULT.
+        """Remove the emergencies that the operator has acknowledged.
 
-        Call this function when START is pressed.
+        The emergencies of drives that are still in FAULT remain. The emergencies that the last `evaluate` reported for the
+        first time remain, too, because the operator pressed START before. Call this function when START is pressed, after the
+        `evaluate` of the same cycle.
 
         Args:
             still_faulty: DBC names of the drives that are still in FAULT.
         """
-        self.emergencies = {node: active for node, active in self.emergencies.items() if node in still_faulty}
+        kept = still_faulty | self._just_reported
+        self.emergencies = {node: active for node, active in self.emergencies.items() if node in kept}
 
     def has_emergency(self, node: str) -> bool:
         """Return whether a drive has an active emergency.

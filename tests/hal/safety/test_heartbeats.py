@@ -314,6 +314,19 @@ def test_acknowledge_keeps_emergencies_of_faulty_drives(running: Nodes):
     assert running.evaluate() == {("OVER_TEMP", "LEFT_SA"): True}
 
 
+def test_acknowledge_keeps_emergencies_of_the_same_cycle(running: Nodes):
+    running.receive(running.frame("LEFT_SK", "EMCY", ErrorCode=0x4310))
+    running.evaluate()
+    running.receive(running.frame("LEFT_SA", "EMCY", ErrorCode=0x4310))
+    running.evaluate()
+    running.heartbeats.acknowledge(set())
+    running.now += 1
+    assert running.evaluate() == {("OVER_TEMP", "LEFT_SA"): True}
+    running.heartbeats.acknowledge(set())
+    running.now += 1
+    assert running.evaluate() == {}
+
+
 def test_received_amplitudes_are_written_to_the_state(running: Nodes):
     level = running.tx.codec.slice("Amplitude")
     running.tx.values[level] = 0.5

@@ -879,6 +879,21 @@ def test_missing_node_refuses_the_start_in_hold_with_the_reason(make_rig):
     assert rig.until(S.ACTIVE, 150).supervisor is S.ACTIVE
 
 
+@pytest.mark.parametrize("cycle", range(4))
+def test_start_acknowledges_only_emergencies_of_earlier_cycles(make_rig, cycle: int):
+    rig = make_rig(starts=False)
+    into(rig, S.HOLD)
+    emergency = TransmitImage([load().message("FOOT_LEFT_EMCY")])
+    emergency.values[emergency.codec.index("FOOT_LEFT_EMCY", "ErrorCode")] = 0x8100
+    rig.operator.start()
+    started = []
+    for each in range(4):
+        rig.bus.to_hal = lambda frames, now=each == cycle: np.concatenate([frames, emergency.seal()]) if now else frames
+        rig.cycle()
+        started.append(rig.hal.conditions.start_wanted)
+    assert rig.run(150).supervisor is (S.ACTIVE if cycle < started.index(True) else S.HOLD)
+
+
 # -- two senders of one message ----------------------------------------------------------------------------------------
 
 
