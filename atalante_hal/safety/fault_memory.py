@@ -187,8 +187,8 @@ class FaultMemory:
         return [node for (dtc, node), entry in self.active.items() if dtc in dtcs and entry.confirmed]
 
     def text_of(self, dtcs: frozenset[Dtc]) -> str:
-        """Return the text of the first active diagnostic with one of the codes; empty if none is active."""
-        return next((entry.text for (dtc, _), entry in self.active.items() if dtc in dtcs), "")
+        """Return the text of the first confirmed diagnostic with one of the codes; empty if none is confirmed."""
+        return next((entry.text for (dtc, _), entry in self.active.items() if dtc in dtcs and entry.confirmed), "")
 
     def log(self, event: Event, *, confirmed: bool) -> None:
         """Log an event, or count it if an event with the same code and node was logged within `FOLD_CYCLES`.

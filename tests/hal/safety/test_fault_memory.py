@@ -182,6 +182,7 @@ def test_emergency_event_contains_the_error_code(memory: FaultMemory):
 
 def test_nodes_and_texts_of_confirmed_codes_are_returned(memory: FaultMemory):
     memory.raise_dtc(1, Dtc.ENC_STUCK, "LEFT_SK", text="stuck")
+    memory.raise_dtc(1, Dtc.OVER_TEMP, "LEFT_FH", confirmed=False, text="warm")
     memory.raise_dtc(1, Dtc.OVER_TEMP, "LEFT_SA", text="hot")
     memory.raise_dtc(1, Dtc.OVER_TEMP, "LEFT_HA", confirmed=False)
     both = frozenset({Dtc.ENC_STUCK, Dtc.OVER_TEMP})
