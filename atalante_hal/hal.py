@@ -7,6 +7,7 @@ The emulator and the robot differ only in the bus passed to the constructor.
 
 from __future__ import annotations
 
+import operator
 import time
 from collections.abc import Sequence
 
@@ -205,10 +206,17 @@ class Hal:
 
         Returns:
             Torques that were sent, after the limits. Shape (12,) [Nm], valid until the next call.
+
+        Raises:
+            ValueError: If the torques have another shape.
+            TypeError: If the step is neither an integer nor None.
         """
         safety_monitor = self._safety_monitor
         if not safety_monitor.moving:
             return self.hold()
+        if (shape := np.shape(command.torque)) != (len(JOINTS),):
+            raise ValueError(f"the torque must have shape ({len(JOINTS)},), got {shape}")
+        step = None if command.step is None else operator.index(command.step)
         limited = self._limiter.apply(command.torque, self._parts.motion)
         if not limited.finite:
             safety_monitor.report(Dtc.CMD_NONFINITE, "the commanded torque must be finite, got NaN or infinity")
@@ -218,7 +226,7 @@ class Hal:
             safety_monitor.report(
                 Dtc.TORQUE_SATURATED, "the limiter cuts the torque", cycles > SATURATED_CYCLES, cycles
             )
-        safety_monitor.step, safety_monitor.walking = command.step, command.walking
+        safety_monitor.step, safety_monitor.walking = step, command.walking
         if command.outside:
             safety_monitor.report(Dtc.GUIDE_OUTSIDE, "a joint is outside the virtual guide", command.guide_left)
         if command.hand_over_exceeded:

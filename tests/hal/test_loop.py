@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import gc
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -89,6 +90,29 @@ def test_controller_exception_leads_to_hold_and_the_loop_continues(make_rig):
     first_hold = next(e.cycle for e in rig.hal.events if e.code == "HOLD")
     failed = next(e.cycle for e in rig.hal.events if e.code == "CONTROLLER_ERROR")
     assert first_hold == failed + 1
+
+
+@pytest.mark.parametrize("walking", [False, True])
+@pytest.mark.parametrize(
+    ("torque", "step", "error"),
+    [
+        (np.zeros(1), None, "ValueError: the torque must have shape (12,), got (1,)"),
+        (np.zeros(()), 1, "ValueError: the torque must have shape (12,), got ()"),
+        (np.zeros(12), 2.0, "TypeError: 'float' object cannot be interpreted as an integer"),
+    ],
+)
+def test_wrong_command_is_a_controller_error_and_the_loop_continues(make_rig, torque, step, error: str, walking: bool):
+    class Wrong(Recorder):
+        def update(self, state):
+            right = super().update(state)
+            if self.telemetry[0] < 10:
+                return replace(right, step=1, walking=walking)
+            return replace(right, torque=torque, step=step, walking=walking)
+
+    rig = make_rig(controller_fields=Recorder.telemetry_fields)
+    assert run(rig.hal, Wrong(), LockStep(), until=after(600)).cycles == 600
+    assert {e.text for e in rig.hal.events if e.code == "CONTROLLER_ERROR"} == {f"the controller raised {error}"}
+    assert next(e.cycle for e in rig.hal.events if e.code == "HOLD") < 600
 
 
 @pytest.mark.parametrize(
