@@ -117,7 +117,7 @@ class FaultMemory:
     def raise_dtc(
         self, cycle: int, dtc: Dtc, node: str, *, value: float = 0.0, confirmed: bool = True, text: str = ""
     ) -> None:
-        """Mark a diagnostic as active in this cycle, and log an event if it is new or newly confirmed.
+        """Mark a diagnostic as active in this cycle, and log an event if it, its confirmation or its error code is new.
 
         A pending fault does not change the value and text of a fault that is already confirmed in this cycle.
 
@@ -132,7 +132,11 @@ class FaultMemory:
         entry = self.active.get((dtc, node))
         if entry is not None and entry.confirmed and entry.cycle == cycle and not confirmed:
             return
-        before = entry is not None and (entry.confirmed or not confirmed)
+        before = (
+            entry is not None
+            and (entry.confirmed or not confirmed)
+            and event_code(dtc, entry.value) == event_code(dtc, value)
+        )
         if entry is None:
             entry = self.active[dtc, node] = Entry(confirmed, "", value, cycle)
         else:

@@ -51,6 +51,17 @@ def test_active_diagnostic_has_the_latest_text(memory: FaultMemory):
     assert [event.text for event in memory.events] == ["can0 is down"]
 
 
+def test_each_error_code_of_an_emergency_is_logged(memory: FaultMemory):
+    for cycle, code in enumerate((0x2310, 0x2310, 0x2320, 0x2320, 0x2330)):
+        memory.raise_dtc(cycle, Dtc.EMCY_CURRENT, "LEFT_SK", value=code)
+        memory.close_cycle(cycle)
+    assert [(event.cycle, event.code) for event in memory.events] == [
+        (0, "EMCY_2310"),
+        (2, "EMCY_2320"),
+        (4, "EMCY_2330"),
+    ]
+
+
 def test_diagnostic_ends_when_it_is_not_raised_again(memory: FaultMemory):
     memory.raise_dtc(1, Dtc.NODE_TIMEOUT, "LEFT_SK")
     memory.raise_dtc(1, Dtc.E2E_CRC, "LEFT_SA", confirmed=False)
