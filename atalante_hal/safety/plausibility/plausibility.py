@@ -200,8 +200,8 @@ class Plausibility:
 
     def _check_feet(self, ages: Ages | None) -> bool:
         now = [0] * len(self._foot_ages) if ages is None else ages.foot.tolist()
-        # A foot is checked only if it has new values since its last check.
-        left, right = (age < before + FEET for age, before in zip(now, self._foot_ages, strict=True))
+        # A foot is checked only if it has new values since its last check. The age of values that are too old is `NEVER`.
+        left, right = (age < min(before + FEET, NEVER) for age, before in zip(now, self._foot_ages, strict=True))
         self._foot_ages = now
         return self._feet.evaluate((left, right))
 

@@ -297,6 +297,14 @@ class TestContact:
         assert robot.run(12) == ()
         assert robot.run(100) == ()
 
+    @pytest.mark.parametrize("foot", [0, 1])
+    def test_silent_foot_is_no_swing_of_both_feet(self, foot: int):
+        robot = SimulatedRobot()
+        self.stand_on_both(robot)
+        robot.run(8)
+        robot.missing = {row(f"FOOT_{FEET[foot]}")}
+        assert all(finding.dtc is not Dtc.CONTACT_IMPLAUSIBLE for _ in range(300) for finding in robot.cycle())
+
     def test_finding_ends_when_a_foot_is_on_the_ground_again(self):
         robot = SimulatedRobot()
         self.stand_on_both(robot)
