@@ -136,10 +136,12 @@ class Heartbeats:
                 self._notices.append((image.codec.messages[row].sender, Dtc.NODE_ERROR_PASSIVE, 0))
                 image.error_passive.clear()
                 self.quiet = False
-            self._suspect(row, rival=image.refused[refused:] == [(row, Check.CONFLICT)])
-            if len(image.refused) > refused:
+            rejected = image.refused[refused:]
+            conflict = rejected == [(row, Check.CONFLICT)]
+            self._suspect(row, rival=conflict)
+            if rejected:
                 self.quiet = False
-            if image.check[row] > _FRESH:
+            if rejected and not conflict:  # a frame with a conflict is committed
                 continue
             if frame_id in self._status_of:
                 self._take_status(self._status_of[frame_id])

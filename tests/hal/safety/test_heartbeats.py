@@ -508,6 +508,12 @@ def test_status_that_is_received_twice_in_a_cycle_is_reported(running: Nodes):
     assert running.heartbeats.quiet
 
 
+def test_boot_up_that_is_received_twice_in_a_cycle_is_no_reset(nodes: Nodes):
+    boot_up = nodes.frame("LEFT_SK", NodeState=BOOT_UP)
+    nodes.receive(boot_up, boot_up)
+    assert nodes.evaluate() == {("E2E_REPEATED", "LEFT_SK"): False}
+
+
 #: Signals of the status messages and emergencies of a random history: some are fault-free, the others have one fault.
 HISTORY = [
     ("STATUS", {"NodeState": 5, "DbcHash": NETWORK.hash32, "SupplyVoltage": 48.0}),
