@@ -18,6 +18,7 @@ from atalante_hal.wire.cia402 import Controlword, DriveState, next_state
 from atalante_hal.wire.frame import Frames
 from atalante_tools.conform.axis import LEGAL, ROUTES
 from atalante_tools.conform.examination import requirements_of
+from atalante_tools.conform.node_tester import Limits
 from atalante_tools.conform.requirement import Verdict, examine
 from atalante_tools.conform.technician import Action
 
@@ -339,3 +340,18 @@ def test_fault_is_examined_only_after_the_drive_has_cooled(
     monkeypatch.setattr(tester.technician, "request", carry_out_late)
     results = examine(tester, [r for r in requirements_of(tester) if r.id in ("DRIVE-22", "DRIVE-23")])
     assert [result.verdict for result in results] == [Verdict.PASSED, verdict]
+
+
+@pytest.mark.parametrize(
+    ("torque", "verdict"), [(0.5, Verdict.NOT_TESTED), (0.6, Verdict.FAILED), (3.0, Verdict.FAILED)]
+)
+def test_obeyed_invalid_controlword_does_not_pass_at_a_low_torque(
+    torque: float, verdict: Verdict, make_setup: MakeSetup
+):
+    quiet = EmulatorParameters(drive=DriveParameters(torque_noise=0.0))
+    setup = make_setup(NODE, limits=Limits(torque), parameters=quiet)
+    message = setup.tester.command.message
+    obeys = _reads("Controlword", lambda code: C.ENABLE_OPERATION if code == 0xFF else code)
+    receive_as(setup, message, message.data_id ^ 1, obeys)
+    (result,) = examine(setup.tester, [r for r in requirements_of(setup.tester) if r.id == "DRIVE-11"])
+    assert result.verdict is verdict, result.measured
