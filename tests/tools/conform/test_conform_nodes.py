@@ -430,6 +430,14 @@ def test_defective_node_fails_only_its_requirement(name: str, make_setup: MakeSe
     assert not_passed(setup.examine(without)) == {expected: Verdict.FAILED}
 
 
+@pytest.mark.filterwarnings("error::RuntimeWarning")
+def test_motor_without_lag_passes(make_setup: MakeSetup):
+    setup = make_setup("HAPTICS", parameters=EmulatorParameters(haptics=HapticsParameters(rise_time=0.0005)))
+    (result,) = examine(setup.tester, [r for r in requirements_of(setup.tester) if r.id == "HAPTICS-02"])
+    assert result.verdict is Verdict.PASSED
+    assert result.measured == "time constant 0 ms, largest deviation from a first-order lag 0.000"
+
+
 def test_every_requirement_has_a_defective_node(make_setup: MakeSetup):
     ids = {r.id for node in KINDS for r in requirements_of(make_setup(node).tester)}
     assert {expected for _, expected in BROKEN.values()} == ids

@@ -130,9 +130,13 @@ def follows_like_a_lag(tester: NodeTester) -> Outcome:
         rising = motor[start:]
         if len(rising) < 3:
             return Outcome(False, "a motor does not follow its level")
-        factor = float(rising[1:] @ rising[:-1] / (rising[:-1] @ rising[:-1]))  # least squares
+        squares = rising[:-1] @ rising[:-1]
+        factor = (
+            float(rising[1:] @ rising[:-1] / squares) if squares else 0.0
+        )  # least squares; 0 for a motor without lag
         model = rising[0] * factor ** np.arange(len(rising))
-        slowest = max(slowest, -period / np.log(factor) if 0.0 < factor < 1.0 else np.inf)
+        if factor:
+            slowest = max(slowest, -period / np.log(factor) if 0.0 < factor < 1.0 else np.inf)
         worst = max(worst, float(np.abs(rising - model).max()))
     text = f"time constant {slowest * 1e3:.0f} ms, largest deviation from a first-order lag {worst:.3f}"
     return Outcome(slowest <= TIME_CONSTANT and worst <= LAG, text)
