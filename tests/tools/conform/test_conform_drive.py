@@ -36,7 +36,7 @@ SK = 3  # index of its joint
 def test_emulated_drive_passes_every_requirement(node: str, make_setup: MakeSetup):
     results = make_setup(node).examine()
     assert not_passed(results) == {}
-    assert len(results) == 39
+    assert len(results) == 40
 
 
 def test_expected_transitions_cover_the_standard():

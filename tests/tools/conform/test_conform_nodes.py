@@ -27,7 +27,7 @@ Patch = pytest.MonkeyPatch
 Break = Callable[[MakeSetup, Patch], NodeSetup]
 
 IMU = "IMU_TORSO"
-KINDS = {IMU: 21, "IMU_LEFT_TIBIA": 21, "FOOT_LEFT": 18, "FOOT_RIGHT": 18, "HAPTICS": 22, "PENDANT": 21}
+KINDS = {IMU: 22, "IMU_LEFT_TIBIA": 22, "FOOT_LEFT": 19, "FOOT_RIGHT": 19, "HAPTICS": 23, "PENDANT": 22}
 
 
 @pytest.mark.parametrize("node", KINDS)
@@ -83,6 +83,14 @@ def _sends(kind: str, change: Callable[[Frames, Message, int], Frames | None], n
 
 def _never_booting(frame: Frames, message: Message, _: int) -> Frames:
     wire.put(frame, message, "NodeState", 5)
+    return wire.protect(frame, message)
+
+
+def _stopped_later(frame: Frames, message: Message, number: int) -> Frames | None:
+    """Report STOPPED from the fifth heartbeat on."""
+    if number < 4:
+        return None
+    wire.put(frame, message, "NodeState", 4)
     return wire.protect(frame, message)
 
 
@@ -379,6 +387,7 @@ BROKEN: dict[str, tuple[Break, str]] = {
     "remote frame": (_sends_unexpected(ID_REMOTE), "NODE-13"),
     "sends an invalid code": (_measures(_no_temperature_once), "NODE-14"),
     "sets reserved bits": (_sends("STATE", _reserved_bits), "NODE-15"),
+    "stops later": (_sends("STATUS", _stopped_later), "NODE-16"),
     "quaternion not of unit length": (_measures(_shrunk_quaternion), "IMU-01"),
     "wrong accelerometer scale": (_measures(_scaled_accel), "IMU-02"),
     "accelerometer axes swapped": (_measures(_swapped_accel), "IMU-03"),

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable
-from itertools import pairwise
+from itertools import dropwhile, pairwise
 from typing import Final
 
 import numpy as np
@@ -178,6 +178,13 @@ def requirements(tester: NodeTester) -> tuple[list[Requirement], list[Requiremen
                 ]
             ),
         ),
+        Requirement(
+            "NODE-16",
+            "Reports OPERATIONAL in every heartbeat after the boot-up.",
+            all_frames,
+            "CiA 301 heartbeat",
+            stays_operational,
+        ),
     ]
     return before, after
 
@@ -325,6 +332,21 @@ def _all(
         return Outcome(not defects, f"{len(defects)} of {frames}: {named}" if defects else f"{frames}, no defect")
 
     return test
+
+
+def stays_operational(tester: NodeTester) -> Outcome:
+    """Test NODE-16: all heartbeats after the boot-up report OPERATIONAL."""
+    states = [
+        (NMT.get(int(frame.values["NodeState"]), "unknown NMT state"), frame.cycle) for frame in _statuses(tester)
+    ]
+    after_boot = list(dropwhile(lambda state: state[0] == "BOOTUP", states))
+    if not after_boot:
+        raise NotTested("no heartbeat after the boot-up was received")
+    wrong = [f"{state} in cycle {cycle}" for state, cycle in after_boot if state != "OPERATIONAL"]
+    count = f"{len(after_boot)} heartbeats"
+    return Outcome(
+        not wrong, f"{len(wrong)} of {count}: {', '.join(wrong[:_LISTED])}" if wrong else f"{count}, no defect"
+    )
 
 
 def _counter_defects(received: list[ReceivedFrame]) -> list[str]:
