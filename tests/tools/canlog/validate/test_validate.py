@@ -162,6 +162,12 @@ def test_report_lists_the_flag_rules_as_unchecked_for_csv(tmp_path: Path) -> Non
     assert "frame-fdf, frame-brs, frame-esi: this log format does not keep CAN FD flags" in result.stdout
 
 
+@pytest.mark.parametrize(("suffix", "unchecked"), [(".trc", True), (".blf", True), (".asc", False)])
+def test_bus_errors_that_are_not_read_are_listed_as_unchecked(suffix: str, unchecked: bool, tmp_path: Path) -> None:
+    result = run("validate", write(tmp_path / f"walk{suffix}", MESSAGES[:10]), "--node", "LEFT_FH")
+    assert ("error-frame: not all bus errors of this log format are read" in result.stdout) is unchecked
+
+
 def test_trc_log_has_no_findings(tmp_path: Path) -> None:
     """Use a classic network, because python-can writes no CAN FD frames into .trc."""
     dbc = tmp_path / "foreign.dbc"

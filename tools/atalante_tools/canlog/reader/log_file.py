@@ -7,14 +7,15 @@ from pathlib import Path
 
 from atalante_tools.canlog.reader.chunk import Channels
 
-#: File suffix -> whether the format records the direction of frames, and whether the format records the CAN FD flags.
+#: File suffix -> whether the format records the direction of frames, whether the format records the CAN FD flags, and whether
+#: python-can reads all bus errors in the log. It skips the ER records of .trc and the CAN FD error objects of .blf.
 FORMATS = {
-    ".log": (True, True),
-    ".asc": (True, True),
-    ".blf": (True, True),
-    ".mf4": (True, True),
-    ".trc": (True, True),
-    ".csv": (False, False),
+    ".log": (True, True, True),
+    ".asc": (True, True, True),
+    ".blf": (True, True, False),
+    ".mf4": (True, True, True),
+    ".trc": (True, True, False),
+    ".csv": (False, False, True),
 }
 
 
@@ -52,6 +53,11 @@ class LogFile:
     def keeps_flags(self) -> bool:
         """Return whether the format records the flags of CAN FD frames."""
         return FORMATS[self.suffix][1]
+
+    @property
+    def keeps_errors(self) -> bool:
+        """Return whether all bus errors in the log are read."""
+        return FORMATS[self.suffix][2]
 
     @property
     def compressed(self) -> bool:

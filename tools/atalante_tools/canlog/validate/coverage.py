@@ -81,6 +81,8 @@ def _of_the_log(validator: Validator, live: bool) -> Iterator[Unchecked]:
     frames = validator.frame_rules
     if not validator.keeps_flags:
         yield Unchecked(("frame-fdf", "frame-brs", "frame-esi"), (), "this log format does not keep CAN FD flags")
+    if not validator.keeps_errors:
+        yield Unchecked(("error-frame",), (), "not all bus errors of this log format are read")
     if not frames.recorder:
         reason = "the log marks no frame as sent by the recording node"
         if frames.recorder == "":

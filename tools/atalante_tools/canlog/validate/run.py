@@ -48,7 +48,7 @@ def validate_log(
         LogError: If the file cannot be opened as a log.
     """
     log = open_log(path)
-    validator = Validator(plan, project, node=node, keeps_flags=log.keeps_flags)
+    validator = Validator(plan, project, node=node, keeps_flags=log.keeps_flags, keeps_errors=log.keeps_errors)
     for chunk, share in _read_ahead(log):
         validator.check(chunk, log.channels.names)
         progress(share, validator.frames)

@@ -33,7 +33,13 @@ class Validator:
     """Validator of one log against one DBC. The list of findings is complete after `finish`."""
 
     def __init__(
-        self, plan: Plan, project: Project | None = None, *, node: str | None = None, keeps_flags: bool = True
+        self,
+        plan: Plan,
+        project: Project | None = None,
+        *,
+        node: str | None = None,
+        keeps_flags: bool = True,
+        keeps_errors: bool = True,
     ) -> None:
         """Create a validator for a new log.
 
@@ -42,6 +48,7 @@ class Validator:
             project: thresholds, silenced rules and channel names; None means the default thresholds.
             node: report missing messages of this node only; None means all nodes.
             keeps_flags: whether the log format records the flags of CAN FD frames.
+            keeps_errors: whether all bus errors in the log are read.
         """
         self.project = project or Project()
         self.plan = plan
@@ -49,7 +56,7 @@ class Validator:
         self.findings = Findings(self.plan)
         self.channel_map = ChannelMap(self.plan, self.project.channels)
         self.frame_rules = FrameRules(self.plan, self.findings, self.channel_map, keeps_flags=keeps_flags)
-        self.keeps_flags = keeps_flags
+        self.keeps_flags, self.keeps_errors = keeps_flags, keeps_errors
         self._crc = CrcRules(self.plan, self.findings)
         self._counters = Counters(self.plan)
         self.timing = TimingRules(self.plan, self.findings, self.project)
