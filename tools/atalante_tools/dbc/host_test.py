@@ -8,6 +8,7 @@ from __future__ import annotations
 import os
 import shutil
 import subprocess
+from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
@@ -72,13 +73,12 @@ def run_host_test(build: Build, program: Path, images: int, seed: int) -> int:
     ) as process:
         assert process.stdin is not None
         assert process.stdout is not None
-        try:
-            process.stdin.write(vectors.header(images))
+        # The host test exits at the first difference, so the pipe to it breaks. Close the pipe inside `suppress`, because the
+        # rest of its buffer is written then.
+        with suppress(BrokenPipeError), process.stdin as pipe:
+            pipe.write(vectors.header(images))
             for image in vectors.images(images):
-                process.stdin.write(image)
-            process.stdin.close()
-        except BrokenPipeError:
-            pass  # the host test exits at the first difference, so the pipe to it breaks
+                pipe.write(image)
         output = process.stdout.read().decode(errors="replace").strip()
     if process.returncode:
         raise Failed(f"the generated C code differs from the Python codec: {output}")
