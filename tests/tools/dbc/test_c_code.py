@@ -167,6 +167,23 @@ def test_command_writes_and_checks_the_messages_of_one_node(tmp_path: Path):
     assert (made.returncode, made.stdout) == (0, "500 frames compared\n"), made.stderr
 
 
+def test_range_check_of_a_node_covers_only_the_signals_that_it_receives(tmp_path: Path):
+    torque = 'SG_ Torque : 80|16@1- (0.0125,0) [-409.58750000000003|409.58750000000003] "Nm" '
+    text = DBC_FILE.read_text("cp1252")
+    assert f"{torque}HAL" in text
+    (tmp_path / "robot.dbc").write_text(text.replace(f"{torque}HAL", f"{torque}PENDANT"), "cp1252")
+    build = Build.of(tmp_path / "robot.dbc", "PENDANT")
+    write(build, tmp_path / "out", 0)
+    run_host_test(build, compile_host_test(build, tmp_path / "out"), 100, seed=0)
+
+
+def test_node_without_messages_is_rejected(tmp_path: Path):
+    text = DBC_FILE.read_text("cp1252")
+    (tmp_path / "robot.dbc").write_text(text.replace("BU_: ", "BU_: SPARE ", 1), "cp1252")
+    with pytest.raises(Failed, match="SPARE must have at least one message for the C code, got none"):
+        Build.of(tmp_path / "robot.dbc", "SPARE")
+
+
 def test_same_network_gives_the_same_bytes(tmp_path: Path):
     build = Build.of(DBC_FILE, "HAPTICS")
     first, second = ([path.read_bytes() for path in write(build, tmp_path / name, 0)] for name in "ab")

@@ -10,6 +10,7 @@ from cantools.database.can.c_source import camel_to_snake_case
 import atalante_dbc
 from atalante_dbc import Message, Network, Signal
 from atalante_tools.console.names import find
+from atalante_tools.console.outcome import Failed
 
 
 @dataclass(frozen=True)
@@ -32,11 +33,15 @@ class Build:
         Raises:
             DbcError: If the strict loader rejects the file.
             click.UsageError: If there is no such node.
+            Failed: If there is no message for the C code.
         """
         network = atalante_dbc.load(path)
         names = [n.name for n in network.nodes]
         node = names[find(node, names, "node")] if node is not None else None
-        return cls(network, path.read_text("cp1252"), camel_to_snake_case(path.stem), node)
+        build = cls(network, path.read_text("cp1252"), camel_to_snake_case(path.stem), node)
+        if not build.messages:
+            raise Failed(f"{node or path} must have at least one message for the C code, got none")
+        return build
 
     @property
     def messages(self) -> tuple[Message, ...]:
