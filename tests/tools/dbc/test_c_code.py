@@ -73,6 +73,16 @@ def test_makefile_of_the_user_is_kept(tmp_path: Path):
             {"LEFT_FH_EMCY": "LeftFhState"},
             "messages must have different names in C, got LeftFhState and LEFT_FH_STATE",
         ),
+        (
+            "robot.dbc",
+            {"DriveState": "True"},
+            "signals of LEFT_FH_STATE must not be named like C keywords, got True",
+        ),
+        (
+            "robot.dbc",
+            {"LEFT_FH_EMCY": "LEFT_FH", "ErrorCode": "State_Torque"},
+            "messages and signals must have different names in C, got LEFT_FH.State_Torque and LEFT_FH_STATE.Torque",
+        ),
     ],
 )
 def test_names_that_are_no_names_in_c_are_rejected(file: str, changes: dict[str, str], error: str, tmp_path: Path):
@@ -175,6 +185,15 @@ def test_range_check_of_a_node_covers_only_the_signals_that_it_receives(tmp_path
     build = Build.of(tmp_path / "robot.dbc", "PENDANT")
     write(build, tmp_path / "out", 0)
     run_host_test(build, compile_host_test(build, tmp_path / "out"), 100, seed=0)
+
+
+def test_message_named_counters_compiles(tmp_path: Path):
+    text = DBC_FILE.read_text("cp1252")
+    (tmp_path / "robot.dbc").write_text(re.sub(r"\bPENDANT_STATUS\b", "COUNTERS", text), "cp1252")
+    build = Build.of(tmp_path / "robot.dbc", "PENDANT")
+    assert "COUNTERS" in [message.name for message in build.messages]
+    write(build, tmp_path / "out", 0)
+    compile_host_test(build, tmp_path / "out")
 
 
 def test_node_without_messages_is_rejected(tmp_path: Path):

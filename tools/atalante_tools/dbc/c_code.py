@@ -22,11 +22,11 @@ from atalante_tools.dbc.vectors import Vectors
 
 #: Number of images in the file of test vectors. An image is a set of payloads, one payload per message.
 _IMAGES: Final = 100
-#: Keywords of C11 in lower case. A signal with such a name would be a struct member that no compiler accepts.
+#: Keywords of C11 and macros of stdbool.h, in lower case. No compiler accepts a struct member with such a name.
 _KEYWORDS: Final = frozenset({
-    "auto", "break", "case", "char", "const", "continue", "default", "do", "double", "else", "enum", "extern",
-    "float", "for", "goto", "if", "inline", "int", "long", "register", "restrict", "return", "short", "signed",
-    "sizeof", "static", "struct", "switch", "typedef", "union", "unsigned", "void", "volatile", "while",
+    "auto", "bool", "break", "case", "char", "const", "continue", "default", "do", "double", "else", "enum", "extern",
+    "false", "float", "for", "goto", "if", "inline", "int", "long", "register", "restrict", "return", "short", "signed",
+    "sizeof", "static", "struct", "switch", "true", "typedef", "union", "unsigned", "void", "volatile", "while",
 })  # fmt: skip
 _HOST_TEST, _VECTORS, _EXAMPLES, _MAKEFILE = "host_test.c", "vectors.bin", "vectors.json", "Makefile"
 
@@ -79,6 +79,9 @@ def _check_names(build: Build) -> None:
         _check_distinct(f"signals of {message.name}", names)
         if keywords := [name for name in names if camel_to_snake_case(name) in _KEYWORDS]:
             raise Failed(f"signals of {message.name} must not be named like C keywords, got {', '.join(keywords)}")
+    # The C functions of a signal begin with the names of message and signal: A.B_C and A_B.C are both a_b_c.
+    signals = [f"{m.name}.{s.name}" for m in build.messages for s in m.signals]
+    _check_distinct("messages and signals", [*(m.name for m in build.messages), *signals])
 
 
 def _check_distinct(what: str, names: list[str]) -> None:
@@ -86,15 +89,14 @@ def _check_distinct(what: str, names: list[str]) -> None:
 
     Args:
         what: what the names belong to, for the error message.
-        names: names in the DBC.
+        names: names in the DBC; MESSAGE.SIGNAL is the name of a signal together with its message.
     """
     first: dict[str, str] = {}
     for name in names:
-        other = first.setdefault(camel_to_snake_case(name), name)
+        c_name = camel_to_snake_case(name.replace(".", "_"))
+        other = first.setdefault(c_name, name)
         if other != name:
-            raise Failed(
-                f"{what} must have different names in C, got {other} and {name}: both are {camel_to_snake_case(name)!r}"
-            )
+            raise Failed(f"{what} must have different names in C, got {other} and {name}: both are {c_name!r}")
 
 
 def _check_makefile(path: Path, first_line: str) -> None:

@@ -160,7 +160,7 @@ static double next(const uint8_t **in_pp)
 /* Result of the Python check for each counter that follows counter 0. */
 static const uint8_t after_zero[256] = {{ {counters} }};
 
-static void test_counters(void)
+static void check_counters(void)
 {{
     uint8_t payload[8] = {{ 0u }};
 
@@ -214,7 +214,7 @@ int main(int argc, char **argv)
         return (2);
     }}
 
-    test_counters();
+    check_counters();
 
     for (image = 0; image < images; image++) {{
         for (size_t i = 0; i < sizeof(tests) / sizeof(tests[0]); i++) {{
