@@ -148,6 +148,16 @@ def test_wrong_factor_in_c_fails_the_comparison(tmp_path: Path):
         run_host_test(build, program, IMAGES, seed=0)
 
 
+def test_half_steps_are_rounded_to_the_even_code(tmp_path: Path):
+    build = Build.of(DBC_FILE, "PENDANT")
+    write(build, tmp_path, 0)
+    run_host_test(build, compile_host_test(build, tmp_path), 4, seed=0)
+    code = tmp_path / "atalante.c"
+    code.write_text(code.read_text().replace("nearbyint(", "round("))
+    with pytest.raises(Failed, match="image 3"):
+        run_host_test(build, compile_host_test(build, tmp_path), 4, seed=0)
+
+
 def test_compiler_warning_is_an_error(tmp_path: Path):
     build = Build.of(DBC_FILE, "PENDANT")
     write(build, tmp_path, 0)

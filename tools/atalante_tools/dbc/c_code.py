@@ -122,4 +122,5 @@ def _cantools(build: Build) -> tuple[str, str]:
     )
     # Remove the date of generation, so that the files depend only on the DBC.
     header, code = (re.sub(r"(by cantools version \S+) .*", r"\1.", part) for part in (header, code))
-    return header, code
+    # In the default rounding mode (FE_TONEAREST), nearbyint rounds a half step to the even code, as the Python codec does.
+    return header, re.sub(r"\bround\(", "nearbyint(", code)

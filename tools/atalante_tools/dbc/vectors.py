@@ -7,6 +7,8 @@ contains the messages of the `Build` in DBC order:
 - message that the node receives: payload, u8 flag (1: every decoded signal is in range), f64 value of each decoded signal;
 - message that the node sends: f64 value of each signal after the E2E header (NaN: invalid code), encoded payload.
 
+In image 3, the value of each signal is half a step above an even code if float64 arithmetic is exact for this value. C and
+Python must round it in the same direction.
 In the images 5, 7, 9, ..., the payloads that the node receives have random bits. All other payloads are encoded from
 signal values.
 The alive counter is the low byte of the image number, which starts at 0.
@@ -24,7 +26,7 @@ import numpy.typing as npt
 
 from atalante_dbc import Message, Signal
 from atalante_hal.types import Vector
-from atalante_hal.wire.codec import Codec
+from atalante_hal.wire.codec import HIGH, LOW, Codec
 from atalante_hal.wire.e2e import COUNTER_BYTE, CRC_BYTES, crc, data_id_bytes
 from atalante_hal.wire.frame import FRAME_BYTES, HEADER_BYTES
 from atalante_hal.wire.process_image import TransmitImage
@@ -61,7 +63,21 @@ class Vectors:
         # NaN is encoded as the invalid code. For a signal without invalid code, the minimum of the signal is sent.
         no_code = [s.invalid_raw is None for _, s in codec.signals]
         self._invalid = np.where(no_code, self._minimum, np.nan)
+        self._half_step = self._half_steps()
         self._order = self._stream_order()
+
+    def _half_steps(self) -> Vector:
+        """Return for each signal the value half a step above an even code, shape (signals,).
+
+        The value is the minimum of the signal if its range has no such code or if float64 arithmetic is not exact.
+        """
+        plan = self._codec.table.plan
+        factor, offset = np.array([(s.factor, s.offset) for _, s in self._codec.signals]).T
+        code = np.maximum(plan[LOW] + plan[LOW] % 2, 0)
+        half = code + 0.5
+        value = half * factor + offset
+        exact = ((value - offset) / factor == half) & (value / factor == half + offset / factor)
+        return np.where(exact & (code < plan[HIGH]), value, self._minimum)
 
     def _stream_order(self) -> npt.NDArray[np.intp]:
         """Return an index array that reorders the bytes of an image (one payload per message) for the stream.
@@ -97,8 +113,8 @@ class Vectors:
     def images(self, count: int) -> Iterator[bytes]:
         """Yield images (one payload per message) as bytes of the binary stream.
 
-        Image 0 contains the minimum of each signal, image 1 the maximum, and image 2 the invalid code. All further images
-        contain random values.
+        Image 0 contains the minimum of each signal, image 1 the maximum, image 2 the invalid code, and image 3 a half step. All
+        further images contain random values.
 
         Call this method only once per instance, because a second call would continue the counters and the random numbers.
 
@@ -117,8 +133,8 @@ class Vectors:
 
         Call this method only once per instance, because a second call would continue the counters and the random numbers.
         """
-        for image, kind in enumerate(("minimum", "maximum", "invalid codes", "random")):
-            self._next(image)
+        for number, kind in ((0, "minimum"), (1, "maximum"), (2, "invalid codes"), (4, "random")):
+            self._next(number)
             for row, message in enumerate(self._build.messages):
                 values = {
                     s.name: float(self._decoded[self._codec.index(message.name, s.name)]) for s in message.signals
@@ -137,13 +153,14 @@ class Vectors:
         """Encode and decode one payload of each message. Return the signal values before encoding, shape (signals,).
 
         Args:
-            number: 0 encodes the minimum of each signal, 1 the maximum, 2 the invalid code, and a higher number random values.
+            number: 0 encodes the minimum of each signal, 1 the maximum, 2 the invalid code, 3 a half step, and a higher number
+                random values.
         """
-        limits = (self._minimum, self._maximum, self._invalid)
-        encoded = limits[number] if number < len(limits) else self._random.uniform(self._minimum, self._maximum)
+        fixed = (self._minimum, self._maximum, self._invalid, self._half_step)
+        encoded = fixed[number] if number < len(fixed) else self._random.uniform(self._minimum, self._maximum)
         self._sender.values[:] = encoded
         self._sender.seal()
-        if number % 2 and number > len(limits):
+        if number % 2 and number > len(fixed):
             data = self._received["data"]
             data[:] = self._random.integers(0, 256, data.shape, np.uint8)
             self._counters.fill(number & 0xFF)
