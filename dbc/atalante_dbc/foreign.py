@@ -168,7 +168,7 @@ def catalogue(path: Path) -> Catalogue:
     assert isinstance(database, Database)
     dbc_text = _DbcText(text)
     reasons = [(m, next(_unsupported(m, dbc_text), "")) for m in database.messages]
-    data_bitrate = _number(_of(database, "DataBitrate"))
+    data_bitrate = _number(_of(database, "DataBitrate")) or _number(_of(database, "BaudrateCANFD"))
     return Catalogue(
         path=path,
         layouts=tuple(_layout(m, data_bitrate) for m, reason in reasons if not reason),

@@ -612,6 +612,44 @@ def test_short_log_lists_the_rules_that_need_more_frames(cycles: int, unchecked:
         assert (sentence in result.stdout) is unchecked, result.stdout
 
 
+@pytest.mark.parametrize(
+    ("suffix", "rate", "unchecked"),
+    [
+        (".log", "DataBitrate", False),
+        (".csv", "DataBitrate", False),
+        (".log", "BaudrateCANFD", False),
+        (".log", "X", True),
+    ],
+)
+def test_bus_load_of_can_fd_frames_uses_the_data_bit_rate(
+    suffix: str, rate: str, unchecked: bool, tmp_path: Path
+) -> None:
+    """A frame of 64 bytes each ms is 41 % of 500 kbit/s with a data phase of 2 Mbit/s, and 142 % without."""
+    dbc = tmp_path / "fd.dbc"
+    dbc.write_text(
+        HEAD
+        + 'BO_ 256 M: 64 A\n SG_ S : 0|8@1+ (1,0) [0|0] "" B\n\n'
+        + f'BA_DEF_ "Baudrate" INT 0 1000000;\nBA_DEF_ "{rate}" INT 0 8000000;\n'
+        + f'BA_DEF_DEF_ "Baudrate" 500000;\nBA_DEF_DEF_ "{rate}" 2000000;\n'
+    )
+    messages = [
+        can.Message(
+            timestamp=BEGIN + k * 1e-3,
+            arbitration_id=256,
+            is_extended_id=False,
+            is_fd=True,
+            bitrate_switch=True,
+            data=bytes(64),
+        )
+        for k in range(400)
+    ]
+    path = write(tmp_path / f"fd{suffix}", messages)
+    result = run("validate", path, "--dbc", dbc)
+    reason = "bus-load: frames switch to the data bit rate, but the DBC has neither DataBitrate nor BaudrateCANFD"
+    assert (reason in result.stdout) is unchecked
+    assert "bus-load" not in rules_of(run("validate", path, "--dbc", dbc, "--json"))
+
+
 def test_j1939_groups_of_several_senders_have_no_timing_findings(tmp_path: Path) -> None:
     dbc = Path(__file__).parents[3] / "foreign" / "j1939.dbc"
     messages = [

@@ -110,6 +110,9 @@ def _of_the_network(validator: Validator) -> Iterator[Unchecked]:
         yield Unchecked(("wrong-bus",), mixed, reason)
     if not validator.load.checked:
         yield Unchecked(("bus-load",), (), "the DBC has neither NominalBitrate nor Baudrate")
+    elif validator.load.unknown_bitrate:
+        reason = "frames switch to the data bit rate, but the DBC has neither DataBitrate nor BaudrateCANFD"
+        yield Unchecked(("bus-load",), (), reason)
     elif not validator.load.windows:
         window = validator.project.number("bus-load", "window_s")
         yield Unchecked(("bus-load",), (), f"the log has no complete time window of {window:g} s")

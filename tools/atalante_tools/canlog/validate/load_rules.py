@@ -45,11 +45,15 @@ def wire_time(extended: bool, fd: bool, switch: bool, length: int, nominal: floa
 class LoadRules:
     """Rule for the bus load. The bus load is the fraction of a time window in which a frame is on the bus."""
 
-    def __init__(self, plan: Plan, findings: Findings, project: Project, channel_map: ChannelMap) -> None:
-        self._plan, self._findings, self._channel_map = plan, findings, channel_map
+    def __init__(
+        self, plan: Plan, findings: Findings, project: Project, channel_map: ChannelMap, *, keeps_flags: bool
+    ) -> None:
+        self._plan, self._findings, self._channel_map, self._keeps_flags = plan, findings, channel_map, keeps_flags
         catalogue = plan.catalogue
         self._nominal = catalogue.nominal_bitrate or 0.0
         self._data = catalogue.data_bitrate or self._nominal
+        #: Whether a frame switched to a data bit rate that the DBC does not define. Then the bus load is unknown.
+        self.unknown_bitrate = False
         self._window_ns = int(project.number("bus-load", "window_s") * 1e9)
         self._over, self._limit = project.number("bus-load", "over_nominal"), project.number("bus-load", "limit")
         self._of_row = np.array([self._layout_time(row) for row in range(len(plan.layouts))] + [0.0])
@@ -114,11 +118,16 @@ class LoadRules:
         """
         if not self.checked or not len(chunk):
             return
+        if self._plan.catalogue.data_bitrate is None and bool((chunk.frames["flags"] & FLAG_BRS).any()):
+            self.unknown_bitrate = True
         known = (rows >= 0) & (rows < len(self._plan.layouts))
         headers = as_words(chunk.frames)[:, 0]
         at = np.where(known, rows, 0)
         seconds = self._of_row[at]
-        usual = known & (headers == self._plan.headers[rows])
+        if self._keeps_flags:
+            usual = known & (headers == self._plan.headers[rows])
+        else:  # the header does not show whether the frame is CAN FD, so a known message has the time of its layout
+            usual = known & ((chunk.frames["can_id"] & np.uint32(ID_REMOTE)) == 0)
         if not bool(usual.all()):
             self._time_unusual(chunk, np.flatnonzero(~usual), seconds)
         bus = self._bus(chunk, known, at)
@@ -180,7 +189,7 @@ class LoadRules:
         Args:
             channels: names of the channels of the log.
         """
-        if not self._numbers:
+        if not self._numbers or self.unknown_bitrate:
             return
         width = max(busy.shape[1] for busy in self._busy)
         numbers, indices = np.unique(np.concatenate(self._numbers), return_inverse=True)

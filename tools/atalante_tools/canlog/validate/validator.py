@@ -61,7 +61,7 @@ class Validator:
         self._counters = Counters(self.plan)
         self.timing = TimingRules(self.plan, self.findings, self.project)
         self.order = OrderRules(self.plan, self.findings, self.project)
-        self.load = LoadRules(self.plan, self.findings, self.project, self.channel_map)
+        self.load = LoadRules(self.plan, self.findings, self.project, self.channel_map, keeps_flags=keeps_flags)
         self.values = ValueRules(self.plan, self.findings, self.project)
         self.motion = MotionRules(self.plan, self.findings, self.project)
         self.drives = DriveRules(self.plan, self.findings, self.project)
