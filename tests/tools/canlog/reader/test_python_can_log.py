@@ -80,3 +80,11 @@ def test_format_of_a_frame_on_a_can_fd_channel_comes_from_its_flags(
     )
     assert frames[["can_id", "len", "flags"]].tolist() == [(can_id, length, flags)]
     assert not remarks
+
+
+@pytest.mark.parametrize("end", [" 0.040000 1  104             Rx   d 2 00 04\n", " 0.040000 1  104      "])
+def test_all_frames_before_a_damaged_entry_are_read(end: str, tmp_path: Path) -> None:
+    damaged = " 0.035000 1  1G4             Rx   d 2 00 00\n"
+    frames, remarks = read(tmp_path / "a.asc", asc("  timestamps absolute", FRAMES + damaged + end))
+    assert frames["data"][:, 1].tolist() == [1, 2, 3]
+    assert remarks == ["log-truncated"]

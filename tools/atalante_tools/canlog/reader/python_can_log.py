@@ -62,11 +62,7 @@ def read(log: LogFile, chunk_frames: int) -> Iterator[Chunk]:
     with _quiet_asammdf(), warnings.captured():
         try:
             with _messages(log) as (messages, position):
-                held = next(messages, None)
-                while held is not None:
-                    message, held = held, next(messages, None)
-                    if held is None and ends_within:
-                        break
+                for message in _without_last(messages) if ends_within else messages:
                     batch.add(message, log.channels, log.keeps_direction)
                     count += 1
                     if batch.count == chunk_frames:
@@ -125,6 +121,20 @@ def _with_absolute_times(reader: Any) -> Iterator[Any]:
         yield first
         break
     yield from messages
+
+
+def _without_last(messages: Iterator[Any]) -> Iterator[Any]:
+    """Yield all messages except the last, whose line is truncated. Before a read error, yield every message."""
+    held: Any = None
+    try:
+        for message in messages:
+            if held is not None:
+                yield held
+            held = message
+    except Exception:
+        if held is not None:
+            yield held
+        raise
 
 
 def _asc_lines(file: Iterable[str]) -> Iterator[str]:
