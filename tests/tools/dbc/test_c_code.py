@@ -53,6 +53,17 @@ def test_makefile_of_the_user_is_kept(tmp_path: Path):
         assert CliRunner().invoke(cli, arguments).exit_code == 0
 
 
+@pytest.mark.parametrize("name", ["atalante.c", "atalante.h", "host_test.c", "vectors.bin", "vectors.json"])
+def test_file_of_the_user_is_kept(name: str, tmp_path: Path):
+    build = Build.of(DBC_FILE, "PENDANT")
+    for _ in range(2):
+        write(build, tmp_path, 0)  # a generated file is written again
+    (tmp_path / name).write_text("of the user")
+    with pytest.raises(Failed, match=f"{name} must be a generated file if it exists, got another {name}"):
+        write(build, tmp_path, 0)
+    assert (tmp_path / name).read_text() == "of the user"
+
+
 @pytest.mark.parametrize(
     ("file", "changes", "error"),
     [
