@@ -924,3 +924,13 @@ def test_random_records_are_checked_without_an_exception(plan: Plan) -> None:
         validator.finish()
         assert validator.frames == 3 * count
         assert len(validator.findings) > 0
+
+
+def test_unknown_identifiers_of_11_and_29_bits_are_separate_findings(tmp_path: Path) -> None:
+    messages = [
+        can.Message(timestamp=BEGIN + k, arbitration_id=0x7F0, is_extended_id=bool(k % 2), data=b"") for k in range(3)
+    ]
+    result = run("validate", write(tmp_path / "a.log", messages), "--json")
+    found = [json.loads(line) for line in result.stdout.splitlines()]
+    counts = {f["message"]: f["count"] for f in found if f["rule"] == "unknown-id"}
+    assert counts == {"0x7f0": 2, "0x000007f0": 1}

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from atalante_hal.wire.frame import FD_LENGTHS, FLAG_BRS, FLAG_ESI, FLAG_FDF, ID_ERROR, ID_REMOTE, as_words
+from atalante_hal.wire.frame import FD_LENGTHS, FLAG_BRS, FLAG_ESI, FLAG_FDF, ID_ERROR, ID_EXTENDED, ID_REMOTE, as_words
 from atalante_tools.canlog.plan import UNKNOWN, Plan, Rows
 from atalante_tools.canlog.reader.chunk import NO_DIRECTION, SENT, Chunk
 from atalante_tools.canlog.validate.buses import ChannelMap
@@ -199,11 +199,13 @@ class FrameRules:
         twins = found != UNKNOWN
         if bool(twins.any()):
             self._findings.add_rows("frame-ide", found[twins], part.stamps[twins])
-        strange, stamps = can_ids[~twins] & np.uint32(_NUMBER), part.stamps[~twins]
+        strange, stamps = can_ids[~twins], part.stamps[~twins]
         numbers, counts = np.unique(strange, return_counts=True)
         named = numbers[np.argsort(-counts, kind="stable")[:MAX_UNKNOWN_IDS]]
         for number in named.tolist():
-            self._add_unknown(f"{number:#x}", stamps[strange == number])
+            # A 29-bit identifier has eight digits: 0x7f0 and 0x000007f0 are different identifiers.
+            name = f"{number & _NUMBER:#010x}" if number & ID_EXTENDED else f"{number:#x}"
+            self._add_unknown(name, stamps[strange == number])
         if len(named) < len(numbers):
             self._add_unknown(OTHERS, stamps[~np.isin(strange, named)])
         return found
