@@ -24,6 +24,7 @@ def wrong_values(text: str) -> Iterator[tuple[int, str]]:
     """Yield (line number, problem) for each attribute value that is invalid or has no definition above its line."""
     definitions: dict[str, tuple[str, str]] = {}
     for number, line in enumerate(text.splitlines(), start=1):
+        line = line.lstrip()
         if match := _DEFINITION.match(line):
             definitions[match[1]] = match[2], match[3]
         elif match := _VALUE.match(line):
@@ -38,7 +39,7 @@ def missing(text: str) -> Iterator[tuple[int, str]]:
     """Yield (line number, problem) for each required attribute without a definition or a default. The line number is always 1."""
     for name in _REQUIRED:
         for keyword, part in (("BA_DEF_", "definition"), ("BA_DEF_DEF_", "default")):
-            if not re.search(rf'^{keyword}\s+[^"]*"{name}"', text, re.MULTILINE):
+            if not re.search(rf'^\s*{keyword}\s+[^"]*"{name}"', text, re.MULTILINE):
                 yield 1, f"the attribute {name} has no {part} ({keyword})"
 
 

@@ -30,6 +30,7 @@ _WORD = 64
 _FLOAT_BITS = (16, 32, 64)
 #: Signals of the E2E Profile 5 header: start bit and number of bits, as in `parser`.
 _E2E_HEADER = {"Crc": (0, 16), "Counter": (16, 8)}
+_LARGEST_DATA_ID = 0xFFFF
 #: Values of GenMsgSendType for cyclic messages, in lower case. The empty text stands for a missing GenMsgSendType.
 _CYCLIC = ("", "cyclic", "cyclicx", "periodic", "fixedperiodic", "fixed_periodic")
 # Masks of the parameter group in a J1939 identifier. The PDU format (bits 16 to 23) selects the mask.
@@ -310,11 +311,11 @@ def _layout(message: RawMessage, data_bitrate: float | None) -> Layout:
 
 
 def _data_id(message: RawMessage) -> int | None:
-    """Return the E2E Data ID of a message; None if the message has no Profile 5 header or no Data ID."""
+    """Return the E2E Data ID of a message; None if the message has no Profile 5 header or no Data ID of 16 bits."""
     data_id = _number(_of(message, "E2EDataId"))
     header = {s.name: (s.start, s.length) for s in message.signals if s.byte_order == "little_endian"}
     has_header = all(header.get(name) == bits for name, bits in _E2E_HEADER.items())
-    return int(data_id) if data_id and has_header else None
+    return int(data_id) if data_id and data_id <= _LARGEST_DATA_ID and has_header else None
 
 
 def _pgn_mask(message: RawMessage) -> int:

@@ -80,7 +80,7 @@ class _Lines:
         self.messages: list[tuple[int, int, str]] = []  # (line, frame id, name) of each message, with duplicates
         self.signals: list[tuple[int, str, str, str]] = []  # (line, message, signal, multiplexer mark) of each signal
         for number, line in enumerate(text.splitlines(), start=1):
-            if match := _BO.match(line):
+            if match := _BO.match(line.lstrip()):
                 self.messages.append((number, int(match[1]), match[2]))
             elif (match := _SG.match(line.lstrip())) and self.messages:
                 self.signals.append((number, self.messages[-1][2], match[1], match[2]))
@@ -88,10 +88,10 @@ class _Lines:
         self._message = {name: number for number, _, name in self.messages}
 
     def message(self, message: RawMessage) -> int:
-        return self._message[message.name]
+        return self._message.get(message.name, 1)  # 1 if the definition is not on one line
 
     def signal(self, message: RawMessage, signal: RawSignal) -> int:
-        return self._signal[message.name, signal.name]
+        return self._signal.get((message.name, signal.name), self.message(message))
 
 
 def _problems(database: Database, lines: _Lines) -> Iterator[tuple[int, str]]:
@@ -152,8 +152,8 @@ def _message_problems(message: RawMessage, nodes: set[str]) -> Iterator[str]:
         yield "is cyclic and must have a TimeoutTime above its cycle time"
     if not cyclic and not int(_attribute(message, "GenMsgDelayTime")):
         yield "is an event and must have a GenMsgDelayTime (inhibit time) above 0, which limits its bus load"
-    if not int(_attribute(message, "E2EDataId")):
-        yield "must have an E2EDataId above 0"
+    if not 1 <= (data_id := int(_attribute(message, "E2EDataId"))) <= 0xFFFF:
+        yield f"must have an E2EDataId from 1 to 65535, got {data_id}"
 
 
 def _signal_problems(message: RawMessage, signal: RawSignal, nodes: set[str]) -> Iterator[str]:

@@ -131,6 +131,20 @@ def test_29_bit_identifier_is_rejected(tmp_path: Path):
         load(path)
 
 
+def test_data_id_of_more_than_16_bits_is_rejected(tmp_path: Path):
+    path = tmp_path / "bad.dbc"
+    text = TEXT.replace('"E2EDataId" INT 0 65535;', '"E2EDataId" INT 0 100000;')
+    path.write_text(text.replace('"E2EDataId" BO_ 385 41345;', '"E2EDataId" BO_ 385 70000;'), "cp1252")
+    with pytest.raises(DbcError, match="LEFT_FH_STATE must have an E2EDataId from 1 to 65535, got 70000"):
+        load(path)
+
+
+def test_lines_may_begin_with_spaces(tmp_path: Path):
+    path = tmp_path / "spaces.dbc"
+    path.write_text(TEXT.replace("\nB", "\n B"), "cp1252")
+    assert load(path).messages == load().messages
+
+
 @pytest.mark.parametrize("name", MUTATIONS)
 def test_invalid_dbc_is_rejected_with_its_line(name: str, tmp_path: Path):
     old, new, message = MUTATIONS[name]

@@ -146,3 +146,10 @@ def test_selectors_of_nested_multiplexers() -> None:
     assert nested.field("Deep").selectors == (("Outer", frozenset({0})), ("Inner", frozenset({0, 1, 2, 3})))
     assert nested.multiplexers["Outer"] == frozenset({0, 1, 2, 3, 4, 5, 6, 7, 12})
     assert nested.field("Outer").selectors == ()
+
+
+def test_data_id_of_more_than_16_bits_is_ignored(tmp_path: Path) -> None:
+    message = 'BO_ 256 M: 8 A\n SG_ Crc : 0|16@1+ (1,0) [0|0] "" B\n SG_ Counter : 16|8@1+ (1,0) [0|0] "" B\n\n'
+    data_id = 'BA_DEF_ BO_ "E2EDataId" INT 0 1000000;\nBA_DEF_DEF_ "E2EDataId" 0;\nBA_ "E2EDataId" BO_ 256 {};\n'
+    assert layout_of(message + data_id.format(65535), tmp_path).data_id == 65535
+    assert layout_of(message + data_id.format(65536), tmp_path).data_id is None

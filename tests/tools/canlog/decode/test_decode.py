@@ -314,3 +314,23 @@ def test_failed_write_leaves_the_previous_file(
     assert result.stderr == (f"atalante: {out} cannot be written: No space left on device\n" if code == 1 else "")
     assert out.read_text() == "of yesterday"
     assert sorted(path.name for path in tmp_path.iterdir()) == [out.name, log.name]
+
+
+def test_parquet_has_only_rounded_values_beyond_38_digits(tmp_path: Path) -> None:
+    dbc = tmp_path / "large.dbc"
+    dbc.write_text('VERSION ""\nNS_ :\nBS_:\nBU_: A B\n\nBO_ 1 M: 8 A\n SG_ S : 0|64@1+ (1e30,0) [0|0] "" B\n')
+    log, _ = random_log(dbc, tmp_path / "large.log", 3)
+    out = tmp_path / "large.parquet"
+    assert run("decode", log, "--dbc", dbc, "-o", out).exit_code == 0
+    rows = pq.read_table(out).to_pylist()
+    assert [row["integer"] for row in rows] == [None] * 3
+    assert min(row["value"] for row in rows) > 1e38
+
+
+def test_decode_keeps_a_part_file_of_the_user(tmp_path: Path) -> None:
+    log, _ = random_log(atalante_dbc.DBC_FILE, tmp_path / "a.log", 3)
+    part = tmp_path / "o.parquet.part"
+    part.write_text("of the user")
+    assert run("decode", log, "-o", tmp_path / "o.parquet").exit_code == 0
+    assert part.read_text() == "of the user"
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["a.log", "o.parquet", "o.parquet.part"]

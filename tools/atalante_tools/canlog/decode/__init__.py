@@ -8,6 +8,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from contextlib import closing, contextmanager
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING
 
 import click
@@ -78,19 +79,19 @@ def command(logs: tuple[Path, ...], out: Path, dbc: Path | None) -> None:
 def _complete_file(out: Path) -> Iterator[Path]:
     """Yield the path of a temporary file, and rename this file to `out` after the `with` block.
 
-    If the block raises an exception, the temporary file is removed, and a file `out` that already exists is unchanged.
+    The temporary file is in its own folder next to `out`, so it replaces no file of the user. If the block raises an exception,
+    the temporary file is removed, and a file `out` that already exists is unchanged.
 
     Raises:
         Failed: If the file cannot be written.
     """
-    part = out.with_name(f"{out.name}.part")
     try:
-        yield part
-        part.replace(out)
+        with TemporaryDirectory(prefix=f"{out.name}.", dir=out.parent) as folder:
+            part = Path(folder) / out.name
+            yield part
+            part.replace(out)
     except OSError as error:
         raise Failed(f"{out} cannot be written: {error.strerror or error}") from error
-    finally:
-        part.unlink(missing_ok=True)
 
 
 def _sink(out: Path, suffix: str, plan: Plan) -> Sink:

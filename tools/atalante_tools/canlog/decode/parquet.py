@@ -143,13 +143,14 @@ def _exact(field: Field, values: npt.NDArray[Any]) -> Any:
     """Return the values of a signal for the column `integer`: decimals if float64 may round an integer value, otherwise nulls.
 
     float64 represents all integers only up to 2**53. An integer signal of more than 53 bits may have larger values. For such a
-    signal, the column `integer` has the exact values, and the column `value` has the rounded values.
+    signal, the column `integer` has the exact values, and the column `value` has the rounded values. A signal that can have
+    integers of more than 38 digits has only rounded values, because the column cannot store them.
     """
     codes = raw_range(field) if field.kind != "float" else range(0)
     largest = (
         max((abs(code * field.factor + field.offset) for code in (codes[0], codes[-1])), default=0) if codes else 0
     )
-    if values.dtype.kind == "f" or largest <= _EXACT:
+    if values.dtype.kind == "f" or not _EXACT < largest < 10**_DECIMAL.precision:
         return pa.nulls(len(values), _DECIMAL)
     if values.dtype.kind == "O":
         return pa.array(values.tolist(), _DECIMAL)
