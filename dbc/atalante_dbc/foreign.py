@@ -22,7 +22,7 @@ from cantools.database.can import Message as RawMessage
 from cantools.database.can import Signal as RawSignal
 from cantools.database.errors import Error as CantoolsError
 
-from atalante_dbc.network import DbcError
+from atalante_dbc.network import DbcError, decoded_text
 
 #: Longest payload of a CAN FD frame and of a classic CAN frame [byte].
 _FRAME_BYTES, _CLASSIC_BYTES = 64, 8
@@ -161,7 +161,7 @@ def catalogue(path: Path) -> Catalogue:
     """
     try:
         raw = path.read_bytes()
-        text = raw.decode("cp1252", errors="replace")
+        text = decoded_text(raw, errors="replace")
         database = cantools.database.load_string(text, database_format="dbc", strict=False)
     except (OSError, ValueError, KeyError, IndexError, CantoolsError) as error:
         reason = error.strerror if isinstance(error, OSError) else error

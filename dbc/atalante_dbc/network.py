@@ -17,6 +17,19 @@ class DbcError(ValueError):
     code = "DBC_INVALID"
 
 
+def decoded_text(content: bytes, errors: str = "strict") -> str:
+    """Return the text of a DBC file, which is UTF-8 (with or without byte order mark) or otherwise Windows-1252.
+
+    Args:
+        content: bytes of the file.
+        errors: treatment of bytes that are invalid in both encodings, see `bytes.decode`.
+    """
+    try:
+        return content.decode("utf-8-sig")
+    except UnicodeDecodeError:
+        return content.decode("cp1252", errors)
+
+
 @dataclass(frozen=True)
 class Signal:
     """Signal of a payload, little endian: physical = raw * factor + offset."""

@@ -20,7 +20,7 @@ from cantools.database.can import Signal as RawSignal
 from cantools.database.errors import Error as CantoolsError
 
 from atalante_dbc.attributes import missing, wrong_values
-from atalante_dbc.network import LONGEST_SIGNAL, DbcError, Message, Network, Node, Signal
+from atalante_dbc.network import LONGEST_SIGNAL, DbcError, Message, Network, Node, Signal, decoded_text
 
 #: Valid payload lengths of CAN FD [byte] (ISO 11898-1).
 _LENGTHS = (*range(9), 12, 16, 20, 24, 32, 48, 64)
@@ -42,7 +42,7 @@ def parse(path: Path) -> Network:
     """
     try:
         raw = path.read_bytes()
-        text = raw.decode("cp1252")
+        text = decoded_text(raw)
         lines = _Lines(text)
         # These checks come first, because cantools removes duplicates and reports invalid values without a line number.
         _require_no_problems(path, chain(_duplicates(lines), wrong_values(text)))

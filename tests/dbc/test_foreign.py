@@ -153,3 +153,19 @@ def test_data_id_of_more_than_16_bits_is_ignored(tmp_path: Path) -> None:
     data_id = 'BA_DEF_ BO_ "E2EDataId" INT 0 1000000;\nBA_DEF_DEF_ "E2EDataId" 0;\nBA_ "E2EDataId" BO_ 256 {};\n'
     assert layout_of(message + data_id.format(65535), tmp_path).data_id == 65535
     assert layout_of(message + data_id.format(65536), tmp_path).data_id is None
+
+
+@pytest.mark.parametrize("encoding", ["utf-8", "utf-8-sig", "cp1252"])
+def test_unit_is_read_in_utf_8_and_windows_1252(encoding: str, tmp_path: Path) -> None:
+    path = tmp_path / "foreign.dbc"
+    path.write_bytes((HEAD + ONE.replace('""', '"°C"')).encode(encoding))
+    assert catalogue(path).layout("M").field("S").unit == "°C"
+
+
+@pytest.mark.parametrize("encoding", ["utf-8", "utf-8-sig", "cp1252"])
+def test_strict_loader_reads_utf_8_and_windows_1252(encoding: str, tmp_path: Path) -> None:
+    path = tmp_path / "robot.dbc"
+    text = atalante_dbc.DBC_FILE.read_text("cp1252")
+    path.write_bytes(text.replace('"degC"', '"°C"').encode(encoding))
+    signal = atalante_dbc.load(path).message("LEFT_FH_STATE").signal("Temperature")
+    assert signal.unit == "°C"

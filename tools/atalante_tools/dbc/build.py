@@ -9,6 +9,7 @@ from cantools.database.can.c_source import camel_to_snake_case
 
 import atalante_dbc
 from atalante_dbc import Message, Network, Signal
+from atalante_dbc.network import decoded_text
 from atalante_tools.console.names import find
 from atalante_tools.console.outcome import Failed
 
@@ -38,7 +39,7 @@ class Build:
         network = atalante_dbc.load(path)
         names = [n.name for n in network.nodes]
         node = names[find(node, names, "node")] if node is not None else None
-        build = cls(network, path.read_text("cp1252"), camel_to_snake_case(path.stem), node)
+        build = cls(network, decoded_text(path.read_bytes()), camel_to_snake_case(path.stem), node)
         if not build.messages:
             raise Failed(f"{node or path} must have at least one message for the C code, got none")
         return build
