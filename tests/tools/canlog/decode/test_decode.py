@@ -334,3 +334,12 @@ def test_decode_keeps_a_part_file_of_the_user(tmp_path: Path) -> None:
     assert run("decode", log, "-o", tmp_path / "o.parquet").exit_code == 0
     assert part.read_text() == "of the user"
     assert sorted(path.name for path in tmp_path.iterdir()) == ["a.log", "o.parquet", "o.parquet.part"]
+
+
+def test_truncated_log_is_decoded_with_exit_code_1(tmp_path: Path) -> None:
+    log, _ = random_log(atalante_dbc.DBC_FILE, tmp_path / "a.log", 3)
+    log.write_bytes(log.read_bytes()[:-5])
+    out = tmp_path / "o.parquet"
+    result = run("decode", log, "-o", out)
+    assert (result.exit_code, "ends within a line" in result.stderr) == (1, True)
+    assert pq.read_table(out).num_rows

@@ -34,7 +34,8 @@ def command(logs: tuple[Path, ...], out: Path, dbc: Path | None) -> None:
     """Decode CAN logs (.log of candump, .asc, .blf, .mf4, .trc, .csv) to signals in physical units.
 
     The command checks no rules; for that, use `atalante validate`. Frames with an unknown identifier or a payload that
-    is too short are counted and skipped. If the logs have no frame, no file is written.
+    is too short are counted and skipped. If the logs have no frame, no file is written. If a log is truncated,
+    the file has the values of all readable frames, and the exit code is 1.
 
     \b
     Example: atalante decode night.log -o night.parquet
@@ -54,6 +55,7 @@ def command(logs: tuple[Path, ...], out: Path, dbc: Path | None) -> None:
     sources = [open_log(path) for path in logs]
     decoder = Decoder(plan)
     progress = Progress()
+    truncated = False
     with _complete_file(out) as part, closing(_sink(part, out.suffix.lower(), plan)) as sink:
         for source in sources:
             for chunk in source.chunks():
@@ -66,12 +68,13 @@ def command(logs: tuple[Path, ...], out: Path, dbc: Path | None) -> None:
             progress.clear()
             for remark in source.remarks:
                 print_message(remark.sentence)
+                truncated |= remark.rule == "log-truncated"
         if not decoder.frames:
             raise Failed(f"a log must have at least one frame to decode, got none; {out} was not written")
     print_message(f"{out}: {sink.values} values of {decoder.decoded} frames")
     if decoder.skipped:
         print_message(f"skipped: {decoder.skipped}")
-    if not decoder.decoded:
+    if truncated or not decoder.decoded:
         raise SystemExit(FAILED)
 
 
