@@ -149,9 +149,10 @@ class SafetyMonitor:
         self.torque_motion: TorqueMotion | None = None
         #: DBC names of the drives that stay off until a start passes its direction test (attribute `proof`).
         #: These are drives with a wrong torque, drives that did not hold their joints, drives whose joints failed the test, and
-        #: drives that were off when START was pressed in READY or HOLD.
+        #: drives that were off when START was pressed before any start had passed the test.
         #: A start enables these drives for the test. If the start fails, the drives are switched off again.
         self._kept_off: set[str] = set()
+        self._tested = False  # True after a start has passed the direction test
         #: True if `evaluate` may skip the next cycle. The cycle is skipped only if all data are fresh, there is no fault, and
         #: the values of pendant and drives are unchanged.
         self._steady = False
@@ -411,9 +412,9 @@ class SafetyMonitor:
     def _process_start(self, nodes_ready: bool) -> None:
         """Process a START until the state changes, the start is refused, or `ENABLE_CYCLES` cycles have passed.
 
-        If a start fails, the drives that were off before the start are switched off again, because their directions are not
-        tested. In HOLD, the drives that held their joints before the start hold them again, because they have already moved the
-        robot.
+        If a start fails before any start has passed the direction test, the drives that were off before the start are switched
+        off again, because their directions are not tested yet. If a later start fails, only the drives in `_kept_off` are
+        switched off again, because the other drives have already moved the robot.
 
         Args:
             nodes_ready: True if every required node is trusted and has sent a status message.
@@ -428,8 +429,8 @@ class SafetyMonitor:
             self._acknowledged = True
             if not self.start_cycles_left:  # do not restart the direction test if START is pressed again during a start
                 self._proof_begun = False
-                if state.supervisor in (_S.READY, _S.HOLD):
-                    # The direction of a drive that is off now is not tested yet, or not since it was switched off.
+                if not self._tested:
+                    # The direction of a drive that is off now is not tested yet.
                     # So the drive is switched off again if the start fails.
                     on = powered(state.drive_state).tolist()
                     self._kept_off.update(node for node, is_on in zip(DRIVE_NODES, on, strict=True) if not is_on)
@@ -469,7 +470,7 @@ class SafetyMonitor:
             self._proof_begun = True
             proof.begin(state.position, self._limiter.last)
             if not proof.running:
-                self._kept_off.clear()
+                self._pass_test()
         elif proof.running:
             if failure := proof.evaluate(state.position, state.foot_force[..., 2]):
                 self._kept_off.update(DRIVE_NODES[joint] for joint in proof.failed)
@@ -479,10 +480,14 @@ class SafetyMonitor:
                     self._reports.append(finding)
                 return Refusal("START_FAILED", "error", failure)
             if not proof.running:
-                self._kept_off.clear()
+                self._pass_test()
                 state.delay = proof.late
                 self.memory.events.append(Event(state.cycle, "DIRECTIONS_PROVEN", proof.report()))
         return None
+
+    def _pass_test(self) -> None:
+        self._kept_off.clear()
+        self._tested = True
 
     @property
     def start_prevented(self) -> bool:
