@@ -149,7 +149,7 @@ class SafetyMonitor:
         self.torque_motion: TorqueMotion | None = None
         #: DBC names of the drives that stay off until a start passes its direction test (attribute `proof`).
         #: These are drives with a wrong torque, drives that did not hold their joints, drives whose joints failed the test, and
-        #: drives that were off when START was pressed before any start had passed the test.
+        #: drives that were off when START was pressed in READY, or before any start had passed the test.
         #: A start enables these drives for the test. If the start fails, the drives are switched off again.
         self._kept_off: set[str] = set()
         self._tested = False  # True after a start has passed the direction test
@@ -412,9 +412,9 @@ class SafetyMonitor:
     def _process_start(self, nodes_ready: bool) -> None:
         """Process a START until the state changes, the start is refused, or `ENABLE_CYCLES` cycles have passed.
 
-        If a start fails before any start has passed the direction test, the drives that were off before the start are switched
-        off again, because their directions are not tested yet. If a later start fails, only the drives in `_kept_off` are
-        switched off again, because the other drives have already moved the robot.
+        If a start in READY fails, or a start before any start has passed the direction test, the drives that were off before the
+        start are switched off again, because their directions are not tested yet. If a later start in HOLD fails, only the
+        drives in `_kept_off` are switched off again, because the other drives have already moved the robot.
 
         Args:
             nodes_ready: True if every required node is trusted and has sent a status message.
@@ -429,8 +429,8 @@ class SafetyMonitor:
             self._acknowledged = True
             if not self.start_cycles_left:  # do not restart the direction test if START is pressed again during a start
                 self._proof_begun = False
-                if not self._tested:
-                    # The direction of a drive that is off now is not tested yet.
+                if state.supervisor is _S.READY or not self._tested:
+                    # The direction of a drive that is off now is not tested yet, or not since the robot was in READY.
                     # So the drive is switched off again if the start fails.
                     on = powered(state.drive_state).tolist()
                     self._kept_off.update(node for node, is_on in zip(DRIVE_NODES, on, strict=True) if not is_on)
