@@ -187,9 +187,8 @@ class DirectionProof:
         #: The sum contains the joints that passed a test of more than two joints with a short pulse.
         self._explained = np.zeros(len(LATENCIES))
         self._position: list[Vector] = []  # joint positions in each cycle of the current test
-        self._force: list[
-            Vector
-        ] = []  # vertical forces on the cells of each foot in each cycle of the current test, shape (2, 4)
+        #: Vertical forces on the cells of each foot in each cycle of the current test, shape (2, 4) [N].
+        self._force: list[Vector] = []
         self._torque: list[Vector] = []  # sent torques in each cycle of the current test
 
     def begin(self, position: Vector, torque: Vector) -> None:
