@@ -305,7 +305,7 @@ def on_foot(foot: int, force: float) -> np.ndarray:
     return np.outer(np.eye(2)[foot], np.full(4, force / 4.0))
 
 
-@pytest.mark.parametrize("offset", [25.0, -25.0, 79.0])
+@pytest.mark.parametrize("offset", [25.0, -25.0, 79.0, 130.0])
 @pytest.mark.parametrize("foot", [0, 1])
 def test_offset_of_one_force_cell_does_not_hide_a_dead_motor(joints: Joints, foot: int, offset: float):
     knee = KNEE + 6 * foot
@@ -329,6 +329,19 @@ def test_offset_of_one_force_cell_does_not_hide_a_dead_motor(joints: Joints, foo
 def test_foot_is_loaded_if_the_sum_and_two_cells_are(joints: Joints, cells: list[float], tested: bool):
     joints.strength[KNEE] = 0.0
     failure = joints.run(np.array([cells, [0.0] * 4]), within=range(19))[0]
+    assert failure.startswith("left_SK does not follow its torque") if tested else failure == ""
+
+
+@pytest.mark.parametrize(
+    ("cells", "tested"),
+    [
+        ([[30.0, 30.0, 0.0, 0.0], [-30.0, -30.0, 0.0, 0.0]], False),
+        ([[30.0, 0.0, 0.0, 0.0], [30.0, 0.0, 0.0, 0.0]], True),
+    ],
+)
+def test_load_of_a_foot_does_not_depend_on_the_other_foot(joints: Joints, cells: list[list[float]], tested: bool):
+    joints.strength[KNEE] = 0.0
+    failure = joints.run(np.array(cells), within=range(19))[0]
     assert failure.startswith("left_SK does not follow its torque") if tested else failure == ""
 
 

@@ -327,6 +327,12 @@ def test_acknowledge_keeps_emergencies_of_the_same_cycle(running: Nodes):
     assert running.evaluate() == {}
 
 
+def test_start_before_the_first_evaluation_acknowledges_the_emergencies(nodes: Nodes):
+    nodes.receive(nodes.frame("LEFT_SK", "EMCY", ErrorCode=0x4310))
+    nodes.heartbeats.acknowledge(set())
+    assert nodes.heartbeats.emergencies == {}
+
+
 def test_received_amplitudes_are_written_to_the_state(running: Nodes):
     level = running.tx.codec.slice("Amplitude")
     running.tx.values[level] = 0.5
