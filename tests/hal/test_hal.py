@@ -253,7 +253,7 @@ def test_exception_sends_the_prepared_hold_frame(rig):
     rig.cycle(np.full(12, 10.0))
     before = next(f for f in reversed(rig.sent) if f["can_id"][0] == 0x100)["data"][0, 2]
     rig.hal.read()
-    with pytest.raises(ValueError, match="broadcast") as mistake:
+    with pytest.raises(ValueError, match=r"the torque must have shape \(12,\), got \(3,\)") as mistake:
         rig.hal.write(Command(np.full(3, 10.0), np.zeros(8)))
     rig.hal._commands.torque.fill(np.nan)  # an exception may leave any values in the transmit buffer
     sent = rig.hal.fail(mistake.value)

@@ -234,7 +234,7 @@ BROKEN: dict[str, tuple[Callable[[MakeSetup, Patch], NodeSetup], dict[str, Verdi
     "needs 8 cycles to stop": (stops_late, {"DRIVE-04": F}),
     "holds with the wrong sign": (holds_with_the_wrong_sign, {"DRIVE-05": F}),
     "makes torque when SWITCHED ON": (makes_torque_when_switched_on, {"DRIVE-06": F}),
-    "makes torque with the wrong sign": (_on_command(_reads("TargetTorque", _negated)), {"DRIVE-07": F}),
+    "makes torque with the wrong sign": (_on_command(_reads("TargetTorque", _negated)), {"DRIVE-07": F, "DRIVE-08": F}),
     "doubles MaxTorque": (
         _on_command(_reads("MaxTorque", lambda code: code if code == 0xFFFF else min(2 * code, 0xFFFE))),
         {"DRIVE-08": F},
