@@ -218,9 +218,10 @@ class Session:
     def _press_start(self) -> None:
         """Press START if the HAL already accepts requests of this pendant.
 
-        The HAL accepts requests after `REQUALIFY` answers in a row. START is pressed after at least one more answer.
+        The HAL accepts requests after `REQUALIFY` answers in a row. If it also received a frame of another pendant, it counts
+        from the last of these frames on. So START is pressed after more than twice as many answers.
         """
-        if self.node.answered_in_row > REQUALIFY:
+        if self.node.answered_in_row > 2 * REQUALIFY:
             self.start_wanted = self._start_typed = False
             self._pressed_at = self.node.cycles
             self.node.press(Request.START)
