@@ -88,8 +88,11 @@ class Encoder:
         Returns:
             Sample for the streams.
         """
-        timestamp = time_ns or start_ns + round(float(record[self.time_at]) * 1e9)
-        return Sample(record.tolist(), cycle, timestamp, run, run_name)
+        return Sample(record.tolist(), cycle, self.log_time(record, start_ns, time_ns), run, run_name)
+
+    def log_time(self, record: npt.NDArray[np.float64], start_ns: int, time_ns: int) -> int:
+        """Return the log time of a cycle [ns], see `sample`."""
+        return time_ns or start_ns + round(float(record[self.time_at]) * 1e9)
 
     def event(self, event: Event, timestamp: int) -> bytes:
         """Encode an `Event` message.

@@ -46,9 +46,8 @@ class Run:
 
     number: int
     name: str
-    start_ns: (
-        int  # log time of cycle 0 of the run [ns]; on the wall clock, records and events have their own time of day
-    )
+    #: Log time of cycle 0 of the run [ns]. On the wall clock, each record and each event has a time of day of its own.
+    start_ns: int
     first: int  # number of the first record of the run
 
 
@@ -193,7 +192,7 @@ class Service:
         encoder.window.add(records[window_from:])
         last = self._run_of(first + len(records) - 1)
         self._cycle = int(cycles[-1])
-        self._timestamp = int(times[-1]) or last.start_ns + round(records[-1, encoder.time_at] * 1e9)
+        self._timestamp = encoder.log_time(records[-1], last.start_ns, int(times[-1]))
 
     def _handle_frames(self, records: npt.NDArray[np.uint8]) -> None:
         """Write the given records of the frame ring to the CAN log."""

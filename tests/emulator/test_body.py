@@ -123,10 +123,7 @@ def test_joints_stop_at_their_position_limits(body: Body) -> None:
 
 
 def test_mujoco_reports_a_simulation_that_diverged() -> None:
-    pytest.importorskip("mujoco")
-    from atalante_emulator.bodies.mujoco_body import MuJoCoBody
-
-    body = MuJoCoBody(TEXT)
+    body = make_body("mujoco", TEXT)
     body.reset(STEPPING)
     with pytest.raises(DivergedError, match="the simulation in MuJoCo diverged"):
         body.step([1e15] * 12)

@@ -77,18 +77,11 @@ def test_stop_signal_ends_the_observation(walk: Walk, before: int, after: int) -
     assert walk.cycle(HOLD)
 
 
-def test_signal_in_hold_does_not_replace_the_reason_of_the_hold(walk: Walk) -> None:
-    walk.halt("left_SK: implausible")
-    assert not walk.cycle(HOLD)
-    walk.stop.ask(2)
-    assert walk.cycle(HOLD)
-    with pytest.raises(Failed, match="the robot went to HOLD: left_SK: implausible"):
-        walk.watch.conclude()
-
-
-def test_fault_after_a_signal_is_reported(walk: Walk) -> None:
+@pytest.mark.parametrize("before", [0, 1])
+def test_signals_before_and_in_hold_do_not_replace_the_reason_of_the_hold(walk: Walk, before: int) -> None:
     assert not walk.cycle(ACTIVE)
-    walk.stop.ask(2)
+    for _ in range(before):
+        walk.stop.ask(2)
     walk.leave("left_SK: implausible")
     assert not walk.cycle(HOLD)
     walk.stop.ask(2)

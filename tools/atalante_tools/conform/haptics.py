@@ -131,9 +131,8 @@ def follows_like_a_lag(tester: NodeTester) -> Outcome:
         if len(rising) < 3:
             return Outcome(False, "a motor does not follow its level")
         squares = rising[:-1] @ rising[:-1]
-        factor = (
-            float(rising[1:] @ rising[:-1] / squares) if squares else 0.0
-        )  # least squares; 0 for a motor without lag
+        # Least squares. A motor without lag has the factor 0.
+        factor = float(rising[1:] @ rising[:-1] / squares) if squares else 0.0
         model = rising[0] * factor ** np.arange(len(rising))
         if factor:
             slowest = max(slowest, -period / np.log(factor) if 0.0 < factor < 1.0 else np.inf)

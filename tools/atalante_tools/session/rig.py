@@ -11,7 +11,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Final, NoReturn
 
 import atalante_dbc
 from atalante_dbc import Network
@@ -311,8 +311,21 @@ class Watch:
         if not (self._finished or self._stopped):
             raise Failed(f"the robot went to HOLD: {self._reason}")
         if self._stop.wanted:
-            print_message(f"stopped, the robot is in {self._rig.hal.state.supervisor.name}")
-            raise SystemExit(self._stop.exit_code)
+            exit_after_signal(self._rig, self._stop)
+
+
+def exit_after_signal(rig: Rig, stop: StopRequest) -> NoReturn:
+    """Print the state of the robot, and end the command with the exit code of the stop signal.
+
+    Args:
+        rig: Rig of the run.
+        stop: Stop request of the process.
+
+    Raises:
+        SystemExit: Always.
+    """
+    print_message(f"stopped, the robot is in {rig.hal.state.supervisor.name}")
+    raise SystemExit(stop.exit_code)
 
 
 def waiting_for(rig: Rig) -> str:

@@ -23,6 +23,7 @@ PERIOD_CYCLES: Final = 10
 #: After the HAL has left the state ACTIVE, the robot is observed for this time [cycles].
 #: If the robot stops in the middle of a step, more than 1.5 s can pass before it falls.
 AFTERMATH: Final = 5000
+_PELVIS: Final = IMUS.index("pelvis")
 
 
 class Observation:
@@ -73,9 +74,8 @@ class Observation:
             return float(self._controller.vertical[2])
         if not self._moved:
             return 1.0
-        _, x, y, _ = hal.state.imu_quaternion[IMUS.index("pelvis")].tolist()
-        upright: float = 1.0 - 2.0 * (x * x + y * y)
-        return upright
+        _, x, y, _ = hal.state.imu_quaternion[_PELVIS].tolist()
+        return _upright(x, y)
 
     def _compare(self, access: Access) -> float:
         """Return the cosine of the true angle between the pelvis axis and the vertical.
@@ -83,7 +83,7 @@ class Observation:
         While the controller walks, also add up the squared error of the vertical that the controller estimates.
         """
         x, y, z, w = access.attitude()
-        upright = 1.0 - 2.0 * (x * x + y * y)
+        upright = _upright(x, y)
         if self._controller.walking:
             if self._origin is None:
                 self._origin = access.stance()
@@ -125,3 +125,13 @@ class Observation:
             angle = math.radians(push.direction)
             wrench[:2] = push.force * math.cos(angle), push.force * math.sin(angle)
         return wrench
+
+
+def _upright(x: float, y: float) -> float:
+    """Return the cosine of the angle between the z axis of a link and the vertical.
+
+    Args:
+        x: Element x of the quaternion of the link in world axes.
+        y: Element y of this quaternion.
+    """
+    return 1.0 - 2.0 * (x * x + y * y)

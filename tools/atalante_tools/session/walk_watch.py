@@ -136,6 +136,7 @@ class WalkWatch:
             Failed: If the robot fell, went to HOLD during the walk, or ended the walk early without a request to stop.
         """
         from atalante_tools.console.outcome import FaultLatched
+        from atalante_tools.session.rig import exit_after_signal
 
         if self.outcome == "fell":
             reason = f": {self._reason}" if self._reason else ""
@@ -145,8 +146,7 @@ class WalkWatch:
         if self.outcome == "hold" and self._started and self._reason != PROGRAM_ENDS:
             raise Failed(f"the robot went to HOLD: {self._reason}")
         if self._stop.wanted:
-            print_message(f"stopped, the robot is in {self._rig.hal.state.supervisor.name}")
-            raise SystemExit(self._stop.exit_code)
+            exit_after_signal(self._rig, self._stop)
         if self.outcome == "stopped":
             stop = stop_text(stop_requested=True)
             if self._reason not in (stop, stop + WALK_ENDS):
