@@ -123,7 +123,7 @@ class ReceiveImage:
         self.values = np.full(self.codec.size, np.nan) if values is None else values
         #: `Check` of each row in this cycle, shape (rows,).
         self.check: npt.NDArray[np.uint8] = np.full(count, Check.NO_DATA, np.uint8)
-        #: Age of the values of each row [cycles], shape (rows,).
+        #: Age of the values of each row [cycles], shape (rows,). If `refuse` has restored signals, their age.
         self.age: npt.NDArray[np.int64] = np.full(count, NEVER)
         self.crc_errors = 0
         #: Row and `Check` of each frame that was rejected in this cycle.
@@ -204,14 +204,16 @@ class ReceiveImage:
         self.new_cycle()
         return self.accept_each(frames, count, tag)
 
-    def refuse(self, row: int) -> None:
-        """Reject the implausible values of a row that `accept` has committed: restore the previous values.
+    def refuse(self, row: int, signals: npt.NDArray[np.intp]) -> None:
+        """Reject implausible values of a row that `accept` has committed: restore the previous values of these signals.
+
+        The other signals of the message keep their new values.
 
         Args:
-            row: row of the message; its age becomes one cycle more than before `accept`.
+            row: row of the message. From now on, its age is the age of the restored values: one cycle more than before `accept`.
+            signals: indices of the implausible signals in `values`, shape (n,).
         """
-        mine = self.codec.row_of == row
-        self.values[mine] = self.values_before[mine]
+        self.values[signals] = self.values_before[signals]
         self.age[row] = 1 if self._was_fresh else self._age_before[row] + 1
         self.check[row] = Check.IMPLAUSIBLE
         self.all_fresh = False

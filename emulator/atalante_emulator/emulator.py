@@ -373,7 +373,7 @@ class Emulator:
                 if -WATCHDOG <= delay < WATCHDOG:
                     self._delay[leg] = max(delay, 0)
                 else:
-                    self._rx.refuse(command)
+                    self._rx.refuse(command, np.flatnonzero(self._rx.codec.row_of == command))
 
     def _check_commands(self, checks: list[int], count: int) -> None:
         """Inform the drives of each leg about lost and rejected commands.

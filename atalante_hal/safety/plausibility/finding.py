@@ -9,7 +9,7 @@ import numpy.typing as npt
 
 from atalante_hal.robot import CELLS, FEET, IMUS, JOINTS
 from atalante_hal.types import Vector
-from atalante_hal.wire.codec import Codec
+from atalante_hal.wire.codec import Codec, group_of
 from atalante_hal.wire.process_image import NEVER
 
 Cycles = npt.NDArray[np.int64]
@@ -23,6 +23,14 @@ JOINT_NODES, IMU_NODES, FOOT_NODES = (
     tuple(message.removesuffix("_STATE") for message in messages)
     for messages in (JOINT_MESSAGES, IMU_MESSAGES, FOOT_MESSAGES)
 )
+#: Quantities of a joint or IMU message that are rejected together if one of them is implausible, because checks and controllers
+#: need values of one time. Joints: position and velocity of one encoder, for the limiter, the velocity check and the controllers.
+#: IMUs: the inertial, trunk, knee and motion checks compare attitude, angular velocity and specific force with each other.
+#: All other signals of the frame are used, so a drive that fails or gets hot causes its reaction also while its encoder is wrong.
+#: No check needs a torque of the same time as a rejected position: `Stillness` uses only accepted values, and the other checks
+#: compare the torque with the commands, or with the drive state of the same frame. `HoldStability` accepts a position that is
+#: up to four cycles older than the torque.
+JUDGED = frozenset({"Position", "Velocity", "Quaternion", "Gyro", "Accel"})
 
 
 class Signals(NamedTuple):
@@ -104,6 +112,17 @@ def signals_of(codec: Codec, values: Vector) -> Signals:
         values[position.start : velocity.stop].reshape(2, len(JOINTS)),
         values[force],
     )
+
+
+def judged(codec: Codec, row: int) -> npt.NDArray[np.intp]:
+    """Return the indices of the signals in `JUDGED` of one message in the decoded values, shape (n,).
+
+    Args:
+        codec: codec of the process image.
+        row: row of the message.
+    """
+    own = np.flatnonzero(codec.row_of == row)
+    return own[[group_of(codec.signals[index][1].name) in JUDGED for index in own.tolist()]]
 
 
 def rows_of(codec: Codec, messages: tuple[str, ...]) -> list[int]:

@@ -4,7 +4,8 @@
     -> jump, range, IMUs, trunk, knees -> state
 
 Each cycle checks the encoders and the IMUs, and runs at most one slow check. If the new values of a joint or an IMU
-fail a check, they are rejected: the process image keeps the previous values, and the age of these values grows. The
+fail a check, they are rejected: the process image keeps the previous values, and the age of these values grows. Only the
+signals in `finding.JUDGED` are rejected, so the state, temperature and torque of a drive stay those of its last frame. The
 module `rejections` confirms the diagnostic if more than a fifth of the values of a sensor are rejected. Each check
 uses only the messages that it needs, and the ages of their values. So a fault of one message does not disable the
 checks of other messages.
@@ -20,7 +21,7 @@ from atalante_hal.robot import IMUS, JOINTS, LEG_JOINTS, Robot
 from atalante_hal.safety.diagnostics import Dtc, Finding
 from atalante_hal.safety.plausibility.encoders import EncoderChecks
 from atalante_hal.safety.plausibility.feet import FootChecks
-from atalante_hal.safety.plausibility.finding import JOINT_NODES, Ages, Rows, signals_of
+from atalante_hal.safety.plausibility.finding import JOINT_NODES, Ages, Rows, judged, signals_of
 from atalante_hal.safety.plausibility.imus import Imus
 from atalante_hal.safety.plausibility.inertial import Inertial
 from atalante_hal.safety.plausibility.knees import KNEE_IMUS, KNEE_JOINTS, Knees
@@ -91,6 +92,8 @@ class Plausibility:
         self._rejections = Rejections()
         self._unchecked = Unchecked(self._rows, image.check, SLOW)
         self._joint_rows, self._imu_rows = self._rows.joint.tolist(), self._rows.imu.tolist()
+        #: Indices of the signals that are rejected together, by row of a joint or an IMU in the process image.
+        self._judged = {row: judged(codec, row) for row in (*self._joint_rows, *self._imu_rows)}
         self._foot_ages = [NEVER] * len(self._rows.foot)  # age of the values of each foot at its last check [cycles]
         #: Cycle in which the last good values of each joint and IMU were measured, by row in the process image.
         #: Not updated while `_settled` is True, because the last good values of all rows are then from the previous cycle.
@@ -219,7 +222,7 @@ class Plausibility:
             if self._accept(sensor, at - measured[row]):
                 measured[row] = at
             else:
-                image.refuse(row)
+                image.refuse(row, self._judged[row])
                 imu = sensor - len(self._joint_rows)
                 dtc = self._encoders.tolerated(sensor) if imu < 0 else self._imus.tolerated(imu)
                 if dtc is not None:

@@ -278,7 +278,7 @@ def test_implausible_row_is_invalid_without_another_diagnostic(bench: MonitorBen
         frames = bench.tx.seal(bench.number & 0xFF)
         bench.buffer[: len(frames)] = frames
         bench.image.accept(bench.buffer, len(frames), bench.number & 0xFF)
-        bench.image.refuse(KNEE)
+        bench.image.refuse(KNEE, np.array([bench.image.codec.index("LEFT_SK_STATE", "Position")]))
         bench.message_monitor.evaluate(bench.number, bench.memory)
         bench.memory.close_cycle(bench.number)
         assert bench.image.check[KNEE] == Check.IMPLAUSIBLE

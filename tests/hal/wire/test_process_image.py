@@ -515,7 +515,7 @@ def test_rejected_row_keeps_its_values_and_ages():
         tx.values[own] = 2.0
         deliver(tx, rx, buffer)
         assert not np.array_equal(rx.values[own], kept[own])
-        rx.refuse(3)
+        rx.refuse(3, np.flatnonzero(own))
         assert not rx.all_fresh
         assert (rx.check[3], rx.age[3]) == (Check.IMPLAUSIBLE, age)
         assert np.array_equal(rx.values[own], kept[own])
@@ -525,7 +525,7 @@ def test_rejected_row_keeps_its_values_and_ages():
     deliver(tx, rx, buffer)
     assert (rx.check[3], rx.age[3]) == (Check.SOME_LOST, 0)
     deliver(tx, rx, buffer)
-    rx.refuse(3)
+    rx.refuse(3, np.flatnonzero(own))
     assert rx.age[3] == 1
 
 
@@ -636,23 +636,26 @@ def test_messages_of_64_bytes_are_protected():
     assert rx.all_fresh
 
 
-def test_refuse_affects_only_its_row():
+def test_refuse_affects_only_its_signals():
     tx, rx, buffer = pair()
+    position = rx.codec.index("LEFT_SK_STATE", "Position")
+    row = int(rx.codec.row_of[position])
     deliver(tx, rx, buffer)
     for _ in range(2):
         deliver(tx, rx, buffer)
-        rx.refuse(3)
-    assert rx.age[3] == 2
+        rx.refuse(row, np.array([position]))
+    assert rx.age[row] == 2
     deliver(tx, rx, buffer)
     assert rx.all_fresh
+    before = rx.values.copy()
     tx.values[:] = 1.0
     deliver(tx, rx, buffer)
     new = rx.values.copy()
-    rx.refuse(3)
-    assert (rx.age[3], rx.all_fresh) == (1, False)
-    own = rx.codec.row_of == 3
-    assert np.array_equal(rx.values[~own], new[~own])
-    assert not np.array_equal(rx.values[own], new[own])
+    assert new[position] != before[position]
+    rx.refuse(row, np.array([position]))
+    assert (rx.age[row], rx.all_fresh) == (1, False)
+    assert rx.values[position] == before[position]
+    assert np.array_equal(np.delete(rx.values, position), np.delete(new, position))
 
 
 def test_complete_cycle_in_any_order_is_fresh():
@@ -723,7 +726,7 @@ def test_frame_after_a_loss_can_be_accepted_and_refused():
         assert rx.values[signal] == pytest.approx(kept, abs=0.01)
         assert np.array_equal(rx.values_before, before, equal_nan=True)
         tx.values[signal] = 0.0
-    rx.refuse(row)
+    rx.refuse(row, np.array([signal]))
     assert rx.values[signal] == pytest.approx(2.0, abs=0.01)
 
 

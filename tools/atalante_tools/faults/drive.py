@@ -20,6 +20,8 @@ from atalante_tools.faults.checks import (
 from atalante_tools.faults.scenario import Case, HostFault, OperatorAction, Scenario
 
 _S = SupervisorState
+#: Joint that hardly moves while the left leg swings, so that each jump of its encoder is rejected.
+_STILL: Final = "RIGHT_FH"
 _KNEE: Final = "LEFT_SK"
 _HIP: Final = "LEFT_SH"
 _IMU: Final = "IMU_TORSO"
@@ -393,6 +395,43 @@ SCENARIOS: Final = (
                 checks=(encoders_keep_their_reference,),
             )
             for node, torque in ((_KNEE, 150.0), ("LEFT_HA", 25.0), ("LEFT_SA", 50.0))
+        ),
+    ),
+    # The encoder jumps in the first cycle, so the drive fails in a cycle whose position is rejected.
+    Scenario(
+        "F86",
+        (
+            Case(
+                "FAULT while the encoder jumps for 4 cycles",
+                (
+                    Fault("encoder_jump", _STILL, 0, 4, by=0.3),
+                    Fault("leave_operation", _STILL, 0, 1, state="FAULT"),
+                ),
+                node=_STILL,
+            ),
+            *(
+                Case(
+                    f"{name} after a permanent jump",
+                    (Fault("encoder_jump", _STILL, by=0.3), *stimuli),
+                    state=state,
+                    dtc=dtc,
+                    node=_STILL,
+                    detected=101,
+                    reacted=101,
+                    observed=300,
+                    recovers=False,
+                )
+                for name, stimuli, state, dtc in (
+                    ("FAULT", (Fault("leave_operation", _STILL, 100, 1, state="FAULT"),), _S.FAULT, "DRIVE_FAULT"),
+                    ("100 degC", (Fault("over_temperature", _STILL, 100, degrees=100.0),), _S.HOLD, "DERATED"),
+                    (
+                        "130 degC, with START,",
+                        (Fault("over_temperature", _STILL, 100, degrees=130.0), OperatorAction("start", 200)),
+                        _S.LOWER,
+                        "OVER_TEMP",
+                    ),
+                )
+            ),
         ),
     ),
 )

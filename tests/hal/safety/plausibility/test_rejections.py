@@ -6,13 +6,14 @@ import math
 
 import numpy as np
 import pytest
-from simulated_robot import GEAR, Change, SimulatedRobot, must_not_be_called, only
+from simulated_robot import CODEC, GEAR, Change, SimulatedRobot, must_not_be_called, only
 
 from atalante_hal.robot import IMUS, JOINTS
 from atalante_hal.safety.diagnostics import Dtc
 from atalante_hal.safety.plausibility.encoders import EncoderChecks
 from atalante_hal.safety.plausibility.finding import Signals
 from atalante_hal.safety.plausibility.rejections import Rejections
+from atalante_hal.wire.codec import group_of
 
 PELVIS = IMUS.index("pelvis")
 
@@ -31,6 +32,35 @@ def without_attitude(now: Signals) -> None:
 
 def unchanged(now: Signals) -> None:
     del now
+
+
+@pytest.mark.parametrize(
+    ("change", "message", "restored"),
+    [
+        (jumped, "LEFT_SA_STATE", {"Position", "Velocity"}),
+        (saturated, "IMU_PELVIS_STATE", {"Quaternion", "Gyro", "Accel"}),
+        (without_attitude, "IMU_PELVIS_STATE", {"Quaternion", "Gyro", "Accel"}),
+    ],
+)
+@pytest.mark.parametrize("cycles", [1, 4, 20])
+def test_rejection_keeps_the_other_signals_of_the_frame(change: Change, message: str, restored: set[str], cycles: int):
+    robot = SimulatedRobot()
+    codec, values = CODEC, robot.image.values
+    own = np.flatnonzero(codec.row_of == codec.rows[message])
+    groups = [group_of(codec.signals[index][1].name) for index in own.tolist()]
+    before = values[own].copy()
+    for cycle in range(cycles):
+
+        def send(now: Signals, cycle: int = cycle) -> None:
+            values[own] = 50.0 + cycle + np.arange(len(own))
+            change(now)
+
+        robot.cycle(send)
+        assert robot.rejected == {codec.rows[message]: cycle + 1}
+        sent = 50.0 + cycle + np.arange(len(own))
+        expected = np.where([group in restored for group in groups], before, sent)
+        assert values[own].tolist() == expected.tolist()
+    assert restored < set(groups)
 
 
 def confirmed_after(robot: SimulatedRobot, change: Change, every: int, cycles: int) -> int | None:
