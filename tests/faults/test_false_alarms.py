@@ -7,9 +7,17 @@ import json
 import pytest
 from click.testing import CliRunner
 
+from atalante_control.airwalk.controller import AirwalkConfig, AirwalkController
+from atalante_control.gait.gait import AIRWALK_GAIT, load_gait
+from atalante_control.guide.shapes import SHAPES
+from atalante_emulator.faults import Fault
+from atalante_hal.robot import Robot
 from atalante_tools.cli import cli
+from atalante_tools.console.options import Target
 from atalante_tools.faults import campaign, false_alarms
-from atalante_tools.faults.false_alarms import Quiet, QuietTask, quiet_tasks
+from atalante_tools.faults.false_alarms import EXPECTED, Quiet, QuietTask, quiet_tasks
+from atalante_tools.session.rig import open_hal
+from atalante_tools.session.walk_result import diagnostics
 
 
 def test_walks_cover_the_requested_cycles_in_the_air_and_on_the_ground() -> None:
@@ -31,6 +39,20 @@ def test_walk_without_a_fault_has_no_false_alarm(number: int, name: str, monkeyp
     assert quiet.cycles > 5000
     monkeypatch.setattr(false_alarms, "_CYCLES", 1000)  # the walk on the ground cannot end within twice this time
     assert QuietTask(number, "pybullet")().failed is name.startswith("ground")
+
+
+@pytest.mark.parametrize("axis", ["X", "Y", "Z"])
+def test_walk_with_askew_tibia_imus_has_no_false_alarm(robot: Robot, axis: str) -> None:
+    """The IMUs are turned by -1 and 1 degree, so the errors of both legs are opposite. The walk begins slowly."""
+    askew = [Fault("imu_turned", f"IMU_{side}_TIBIA", axis=axis, degrees=d) for side, d in (("LEFT", -1), ("RIGHT", 1))]
+    controller = AirwalkController(robot, load_gait(AIRWALK_GAIT, robot), SHAPES["constant"], AirwalkConfig())
+    fields = controller.telemetry_fields
+    with open_hal(
+        Target("embedded", "", lockstep=True), assistance_factor=0.5, controller_fields=fields, faults=askew
+    ) as rig:
+        rig.run(controller, until=lambda state: state.cycle >= 2000)
+        assert "ACTIVE" in {event.code for event in rig.hal.events}
+        assert diagnostics(rig.hal).keys() <= EXPECTED
 
 
 @pytest.mark.parametrize(

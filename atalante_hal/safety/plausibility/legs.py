@@ -23,8 +23,9 @@ standstill check needs no torque, so it also covers a joint that other joints mo
 
 *Exchange.* If the encoders of a joint are exchanged between the legs, each encoder reports the angle of the other leg. So the
 errors of both legs are opposite, and their size is the difference between the two readings. The joint is reported when
-the errors agree with the difference within `_AGREEMENT`, and the difference is above `_APART`, in `EXCHANGE_SAMPLES` consecutive
-samples. Exchanged tibia IMUs have the same effect, about all axes.
+the errors agree with the difference within `_AGREEMENT`, and both errors exceed `attitude_error`, in `EXCHANGE_SAMPLES`
+consecutive samples. The errors of intact sensors are at most `attitude_error`, so they never switch off a drive. Exchanged
+tibia IMUs have the same effect, about all axes.
 
 *Age.* Values from earlier cycles are extrapolated to this cycle with the velocity that the same message contains. The
 thresholds are extended by `velocity_error` times the age of the values.
@@ -50,8 +51,6 @@ DRIFT_SAMPLES = 4
 STANDSTILL_SAMPLES = 2
 #: Number of consecutive samples after which exchanged encoders are reported. Both legs are compared in every sample.
 EXCHANGE_SAMPLES = 2
-#: The encoders of a joint can be recognised as exchanged only if the left and the right reading differ by more than this [rad].
-_APART = math.radians(1.2)
 #: Encoders count as exchanged if the error of each leg agrees with the difference between the left and the right reading.
 #: The constant is the largest deviation from this agreement, as a fraction of the difference.
 #: Example: the left encoder reads 5 degrees, the right encoder 2 degrees. If they are exchanged, the left error (encoder minus
@@ -163,7 +162,7 @@ class Legs:
             self._record_errors(leg, errors)
             self._check_drift(leg, errors, comparison.uncertainty)
             self._check_standstill(leg, comparison)
-            self._check_exchange(leg, errors, comparison.encoders, ages)
+            self._check_exchange(leg, errors, comparison, ages)
         other = 1 - leg
         if self._stuck[other] or self._constant_samples[other].any():
             comparison = self._compare(other, ages)
@@ -227,19 +226,22 @@ class Legs:
                 stuck.append(_stuck(joint, change))
         self._stuck[leg] = tuple(stuck)
 
-    def _check_exchange(self, leg: int, ours: list[float], encoders: tuple[float, ...], ages: Ages | None) -> None:
-        if max(map(abs, ours)) <= (1.0 - _AGREEMENT) * _APART:
+    def _check_exchange(self, leg: int, ours: list[float], comparison: _Comparison, ages: Ages | None) -> None:
+        allowed = self._attitude_error + comparison.uncertainty
+        if max(map(abs, ours)) <= allowed:
             self._exchanges = [0] * len(_AXIS_OF)
             return
         opposite = self._compare(1 - leg, ages)
         if opposite is None:
             return
         theirs = self._without_heading(1 - leg, opposite)
+        their_allowed = self._attitude_error + opposite.uncertainty
         for index, axis in enumerate(_AXIS_OF):
-            apart = encoders[index] - opposite.encoders[index]
-            allowed = _AGREEMENT * abs(apart)
-            agrees = abs(ours[axis] - apart) <= allowed and abs(theirs[axis] + apart) <= allowed
-            self._exchanges[index] = self._exchanges[index] + 1 if agrees and abs(apart) > _APART else 0
+            apart = comparison.encoders[index] - opposite.encoders[index]
+            deviation = max(abs(ours[axis] - apart), abs(theirs[axis] + apart))
+            beyond = abs(ours[axis]) > allowed and abs(theirs[axis]) > their_allowed
+            agrees = beyond and deviation <= _AGREEMENT * abs(apart)
+            self._exchanges[index] = self._exchanges[index] + 1 if agrees else 0
             if self._exchanges[index] >= EXCHANGE_SAMPLES and index not in self._exchanged:
                 errors = (ours[axis], theirs[axis]) if leg == 0 else (theirs[axis], ours[axis])
                 self._exchanged[index] = tuple(

@@ -303,7 +303,7 @@ class TestEncoderError:
 class TestExchange:
     """The encoders of a joint are exchanged between the legs, so each leg has the reading of the other leg."""
 
-    APART = math.radians(1.2)
+    ALLOWED = ROBOT.sensors.attitude_error
 
     @staticmethod
     def legs(
@@ -337,7 +337,7 @@ class TestExchange:
     @pytest.mark.parametrize("index", range(4), ids=["FH", "TH", "SH", "SK"])
     @signs
     def test_exchange_is_found_from_the_second_sample_on(self, index: int, sign: float):
-        for apart, expected in ((self.APART * (1.0 - 1e-6), False), (self.APART * (1.0 + 1e-6), True)):
+        for apart, expected in ((self.ALLOWED * (1.0 - 1e-6), False), (self.ALLOWED * (1.0 + 1e-6), True)):
             legs = self.exchanged(index, sign * apart)
             legs.compare()
             assert self.found(legs) == []
@@ -355,10 +355,63 @@ class TestExchange:
         assert [finding.value for finding in legs.legs.findings()] == pytest.approx([0.05, -0.05])
 
     @pytest.mark.parametrize(("share", "expected"), [(0.6, False), (0.7, True), (1.3, True), (1.4, False)])
-    def test_errors_must_agree_with_the_readings(self, share: float, expected: bool):
-        legs = self.exchanged(0, 0.05, share)
+    @signs
+    def test_errors_must_agree_with_the_readings(self, share: float, expected: bool, sign: float):
+        legs = self.exchanged(0, sign * 0.06, share)
         legs.compare(10)
         assert bool(self.found(legs)) is expected
+
+    @pytest.mark.parametrize("index", range(4), ids=["FH", "TH", "SH", "SK"])
+    @pytest.mark.parametrize("share", [0.5, 1.0])
+    @signs
+    def test_errors_that_intact_sensors_may_have_are_no_exchange(self, index: int, share: float, sign: float):
+        """The tibia IMUs are mounted askew in opposite directions, and the legs pass each other slowly."""
+        error = sign * share * self.ALLOWED * (1.0 - 1e-6)
+        for apart in np.linspace(-0.06, 0.06, 25).tolist():
+            readings = ([0.1, -0.05, 0.2, 0.3], [0.1, -0.05, 0.2, 0.3])
+            readings[0][index] += apart
+            angles = tuple(list(leg) for leg in readings)
+            angles[0][index] -= error
+            angles[1][index] += error
+            legs = self.legs((angles[0], angles[1]), readings)
+            legs.compare(3)
+            assert legs.legs.findings() == ()
+
+    @pytest.mark.parametrize("checked", [0, 1])
+    @pytest.mark.parametrize("leg", [0, 1])
+    def test_the_errors_of_both_legs_must_exceed_the_error_of_intact_sensors(self, checked: int, leg: int):
+        for error, expected in ((self.ALLOWED * (1.0 - 1e-6), False), (self.ALLOWED * (1.0 + 1e-6), True)):
+            errors = [0.04, 0.04]
+            errors[leg] = error
+            legs = self.legs(([0.05 - errors[0], 0.0, 0.0, 0.0], [0.01 + errors[1], 0.0, 0.0, 0.0]),
+                             ([0.05, 0.0, 0.0, 0.0], [0.01, 0.0, 0.0, 0.0]))  # fmt: skip
+            legs.leg = checked
+            legs.compare(2)
+            assert self.found(legs) == (["LEFT_FH", "RIGHT_FH"] if expected else [])
+
+    @pytest.mark.parametrize("checked", [0, 1])
+    @pytest.mark.parametrize("leg", [0, 1])
+    def test_values_of_different_ages_extend_the_errors_of_intact_sensors(self, checked: int, leg: int):
+        ages = Ages(np.zeros(12, np.int64), np.zeros(4, np.int64), np.zeros(2, np.int64))
+        ages.joint[6 * leg] = 4
+        allowed = self.ALLOWED + 4.0 * ROBOT.sensors.velocity_error * PERIOD
+        for apart, expected in ((allowed * (1.0 - 1e-6), False), (allowed * (1.0 + 1e-6), True)):
+            legs = self.exchanged(0, apart)
+            legs.leg = checked
+            legs.compare(2, ages)
+            assert bool(self.found(legs)) is expected
+
+    @pytest.mark.parametrize(("askew", "apart"), [(0.0, 1.72), (1.0, 2.86), (1.718, 4.91)])
+    @signs
+    def test_misaligned_imus_increase_the_difference_that_is_found(self, askew: float, apart: float, sign: float):
+        """The IMUs are misaligned so that the errors of both legs are smaller than the difference. All angles in degrees."""
+        for share, expected in ((0.995, False), (1.005, True)):
+            left, right = math.radians(sign * share * apart), 0.0
+            error = math.radians(sign * (share * apart - askew))
+            legs = self.legs(([left - error, 0.0, 0.0, 0.0], [right + error, 0.0, 0.0, 0.0]),
+                             ([left, 0.0, 0.0, 0.0], [right, 0.0, 0.0, 0.0]))  # fmt: skip
+            legs.compare(2)
+            assert bool(self.found(legs)) is expected
 
     @pytest.mark.parametrize("index", range(4), ids=["FH", "TH", "SH", "SK"])
     def test_drift_of_one_or_both_encoders_is_no_exchange(self, index: int):
