@@ -1,9 +1,10 @@
-"""Robot on crane and ground: faults of feet, ankle encoders and trunk IMUs are found; a healthy robot stands and starts again."""
+"""Robot on crane and ground: faults of feet, ankles and trunk IMUs, and a fall, are found; a healthy robot starts again."""
 
 from __future__ import annotations
 
 import math
 
+import numpy as np
 import pytest
 
 from atalante_control.gait.subject import Subject
@@ -44,7 +45,13 @@ class Run:
         cycles: int = 4000,
         presses: dict[int, str] | None = None,
         patient: Patient | None = PATIENT,
+        push: tuple[int, float] | None = None,
     ) -> None:
+        """Run the controller.
+
+        Args:
+            push: first cycle and force [N] of a push to the left at the pelvis, for 0.5 s.
+        """
         self.states: list[SupervisorState] = []
         #: Vertical force on each foot, and difference of the diagonals of its cells, in each cycle [N].
         self.forces: list[tuple[list[float], list[float]]] = []
@@ -56,6 +63,11 @@ class Run:
             mechanics=Mechanics(describe(robot, None, patient), engine, Ground()),
         ) as rig:  # fmt: skip
             seen = 0
+            if push is not None:
+                begin, force = push
+                rig.access.push(
+                    lambda: np.array([0.0, force * (0 <= rig.hal.state.cycle - begin < 500), 0.0, 0.0, 0.0, 0.0])
+                )
 
             def over(state: State) -> bool:
                 nonlocal seen
@@ -70,7 +82,8 @@ class Run:
                 return self.found is not None or state.cycle >= cycles
 
             rig.run(controller, until=over)
-            self.codes = {event.code for event in rig.hal.events}
+            self.events = list(rig.hal.events)
+            self.codes = {event.code for event in self.events}
 
 
 @pytest.mark.parametrize("cell", ["RL", "all"])
@@ -128,6 +141,22 @@ def test_f81_exchanged_imus_of_the_trunk_are_found(robot, engine: str, patient: 
     else:
         assert run.found.cycle <= 2800
         assert run.states[-1] is S.FULL_ASSIST
+
+
+@pytest.mark.parametrize("engine", ENGINES)
+def test_f86_robot_that_falls_goes_to_hold_and_cannot_start_again(robot, engine: str) -> None:
+    presses = dict.fromkeys(range(7000, 8000, 300), "start")
+    run = Run(
+        robot, PoseHold(robot), STANDING, (), "never", engine=engine, cycles=8000, presses=presses, push=(4600, 400.0)
+    )
+    pending, confirmed = [event for event in run.events if event.code == "FALLEN"][:2]
+    assert (pending.severity, confirmed.severity, confirmed.cycle - pending.cycle) == ("warning", "error", 16)
+    assert confirmed.text.startswith("the robot has fallen: its trunk leans by ")
+    hold = next(event for event in run.events if event.code == "HOLD")
+    assert (hold.cycle, hold.text) == (confirmed.cycle, f"ACTIVE -> HOLD: {confirmed.text}")
+    assert run.states[hold.cycle - 2] is S.ACTIVE
+    assert min(run.states[hold.cycle :]) >= S.HOLD
+    assert run.states[-1] >= S.HOLD
 
 
 @pytest.mark.parametrize("engine", ENGINES)

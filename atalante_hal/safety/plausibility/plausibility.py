@@ -1,6 +1,6 @@
 """Schedule of the plausibility checks in each cycle.
 
-    process image -> one slow check in turn (standstill, velocity, feet, legs, support, soles, inertial, `Unchecked`)
+    process image -> one slow check in turn (standstill, velocity, feet, legs, support, soles, inertial, fall, `Unchecked`)
     -> jump, range, IMUs, trunk, knees -> state
 
 Each cycle checks the encoders and the IMUs, and runs at most one slow check. If the new values of a joint or an IMU
@@ -20,6 +20,7 @@ import numpy as np
 from atalante_hal.robot import IMUS, JOINTS, LEG_JOINTS, Robot
 from atalante_hal.safety.diagnostics import Dtc, Finding
 from atalante_hal.safety.plausibility.encoders import EncoderChecks
+from atalante_hal.safety.plausibility.fall import Fall
 from atalante_hal.safety.plausibility.feet import FootChecks
 from atalante_hal.safety.plausibility.finding import JOINT_NODES, Ages, Rows, judged, signals_of
 from atalante_hal.safety.plausibility.imus import Imus
@@ -38,7 +39,7 @@ from atalante_hal.wire.process_image import NEVER, ReceiveImage
 
 #: Interval of the foot checks [cycles].
 FEET = 4
-#: Interval of the standstill check, of the velocity check and of the monitor `Unchecked` [cycles].
+#: Interval of the standstill check, of the velocity check, of the fall check and of the monitor `Unchecked` [cycles].
 #: `Unchecked` reports checks that could not run, because their messages contain no usable values.
 SLOW = 16
 #: Period of the schedule of all slow checks [cycles]. Each leg, each sole and the support are checked once per period.
@@ -85,6 +86,7 @@ class Plausibility:
         self._soles = Soles(robot, now)
         self._inertial = Inertial(robot, now, self._imus.limits, _INERTIAL_INTERVALS, period)
         self._trunk = Trunk(now, period)
+        self._fall = Fall(now)
         self._knees = Knees(robot, now, period)
         self._rows = Rows(codec)
         self._trunk_rows = self._rows.imu[[IMUS.index("torso"), IMUS.index("pelvis")]]
@@ -119,6 +121,7 @@ class Plausibility:
         turns[2::SLOW] = [self._check_velocity] * (_PERIOD // SLOW)
         turns[4::SLOW] = [self._check_unchecked] * (_PERIOD // SLOW)
         turns[6] = self._support.evaluate
+        turns[14::SLOW] = [self._fall.evaluate] * (_PERIOD // SLOW)
         turns[12] = turns[12 + _INERTIAL_INTERVALS[0]] = self._check_inertial
         turns[1::FEET] = [self._check_feet] * (_PERIOD // FEET)
         turns[8], turns[24] = self._legs.check_left, self._legs.check_right
@@ -257,6 +260,7 @@ class Plausibility:
             *self._soles.findings(),
             *self._inertial.findings(),
             *self._trunk.findings(),
+            *self._fall.findings(),
             *self._knees.findings(),
             *self._unchecked.findings(),
         )

@@ -76,7 +76,7 @@ def reaction(rig, code: str) -> tuple[int, float]:
     ],
     ids=["fault", "hot", "too hot", "over-current"],
 )
-def test_f86_fault_of_a_drive_has_its_reaction_despite_rejected_encoder_values(make_rig, rejection, cause, code, state):
+def test_f87_fault_of_a_drive_has_its_reaction_despite_rejected_encoder_values(make_rig, rejection, cause, code, state):
     found = []
     for jumps, before in (REJECTIONS[rejection], (lambda cycle: False, REJECTIONS[rejection][1])):
         rig = make_rig()

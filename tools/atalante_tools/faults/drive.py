@@ -399,7 +399,7 @@ SCENARIOS: Final = (
     ),
     # The encoder jumps in the first cycle, so the drive fails in a cycle whose position is rejected.
     Scenario(
-        "F86",
+        "F87",
         (
             Case(
                 "FAULT while the encoder jumps for 4 cycles",
