@@ -1,8 +1,12 @@
 """Haptic feedback: `tracking error, guide, assistance factor -> levels of the eight vibration motors`.
 
-Law of the paper for the level: |e / q_bound| (1 - exp(30 (Xi - 1))). The front motor of a limb vibrates if the joint angle is
-above the desired angle. The back motor vibrates if the joint angle is below the desired angle. In the swing leg, the thigh
-motors show the error of the hip, and the shank motors show the error of the knee. At Xi = 1 no motor vibrates.
+Law of the paper for the level: |e / q_bound| (1 - exp(30 (Xi - 1))). In the swing leg, the thigh motors show the error of the
+hip, and the shank motors show the error of the knee. At Xi = 1 no motor vibrates.
+
+The paper lets the motor vibrate "that is located on the side of the joint that matches direction of the tracking error". So the
+front motor vibrates if the segment is in front of its desired position, and the back motor if it is behind this position. In the
+example of the paper, the front motor shows a joint "above the desired target". Here, "above" is read as raised forwards. This is
+a negative tracking error, because a positive angle of SH or SK moves the segment backwards (`_FRONT_SIGN`).
 """
 
 from __future__ import annotations
@@ -16,6 +20,10 @@ from atalante_hal.types import Vector
 _FRONT = tuple(
     tuple(MOTORS.index(f"{side}_{segment}_front") for segment in ("thigh", "shank")) for side in ("left", "right")
 )
+
+#: Sign of the tracking error of SH and SK with which thigh and shank are in front of their desired positions. Both joints turn
+#: about the y axis, which points to the left, so a positive angle moves the segment backwards.
+_FRONT_SIGN = -1.0
 
 
 def intensity(xi: float) -> float:
@@ -43,5 +51,5 @@ def levels(leg: int, errors: tuple[float, float], bounds: tuple[float, float], i
     out[:] = 0.0
     for i in range(2):
         front, share = _FRONT[leg][i], abs(errors[i]) / bounds[i]
-        out[front if errors[i] > 0.0 else front + 1] = min(1.0, share * intensity)
+        out[front if _FRONT_SIGN * errors[i] > 0.0 else front + 1] = min(1.0, share * intensity)
     return out
