@@ -106,7 +106,7 @@ class Pid:
         }
         n = len(JOINTS)
         self.records: Records[PidRecord] = zeros(PidRecord, 1)
-        self.records[0].limit = gains.integral_limit
+        self.limit_integral(gains.integral_limit)
         self._torque = np.zeros(n)
         self.start_step(RIGHT, np.ones(n))
         self._kernel = compiled(control)
@@ -115,6 +115,16 @@ class Pid:
     def reset(self) -> None:
         """Set all integrals to zero."""
         self.records[0].integral[:] = 0.0
+
+    def limit_integral(self, limit: float) -> None:
+        """Set the limit of the integral torques, and limit the present integral torques.
+
+        Args:
+            limit: largest absolute value of the integral torque of a joint [Nm]; infinity for no limit.
+        """
+        record = self.records[0]
+        record.limit = limit
+        np.clip(record.integral, -limit, limit, out=record.integral)
 
     def start_step(self, stance: int, share: Vector) -> None:
         """Set the gains of each leg for its role as stance leg or swing leg.

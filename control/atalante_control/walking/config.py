@@ -117,8 +117,9 @@ class WalkConfig:
         In the periodic steps, the baseline controller is the PID with re-centring, impact detection and flat foot. This
         controller has no gravity torque, no feedforward, no ankle stabiliser and no steering. Below Xi = 1,
         `guide.literal` drives SH and SK of the swing leg. Standing, weight shifts, start step and stop step follow the default
-        law, because the paper does not define these phases. The PID gains with integral apply in all phases. The integral is at
-        most 10 Nm, because it also acts while the robot stands. The ankle has no offset of one degree, as in the default walk.
+        law, because the paper does not define these phases. The PID gains with integral apply in all phases. The integral is
+        not limited in the periodic steps, and at most 10 Nm in the other phases. The ankle has no offset of one degree, as in
+        the default walk.
         """
         return cls(literal_law=True, gains=PidGains(), steering=(0.0, 0.0, 0.0))
 

@@ -223,6 +223,7 @@ class WalkController:
         self._load[:] = self._twist[:] = 0.0
         self.steering.reset()
         self._pid.reset()
+        self._pid.limit_integral(self.config.gains.integral_limit)
         self._section = self._sections[0]
         self._table = self._section.tables[Phase.POSTURE, RIGHT]
         self.telemetry.fill(0.0)
@@ -443,6 +444,7 @@ class WalkController:
             self._section = self._sections[self._sections.index(self._section) + 1]
         self.phase, self._since, self._table = phase, cycle, self._section.tables[phase, self._stance]
         stage.literal = self.config.literal_law and phase is Phase.STEP
+        self._pid.limit_integral(math.inf if stage.literal else self.config.gains.integral_limit)
         self._assisted = stage.assisted = phase is Phase.STEP and xi < 1.0 and steps >= self._section.guided
         stage.placed = phase in (Phase.START, Phase.STEP) and not self._assisted and not stage.literal
         self._start(self._measured, self._table, self._parts)

@@ -516,7 +516,8 @@ def _set_gains(constants: Constants, stage: Stage, load: Vector, pids: Records[P
     """Set the PID gains of both legs: the more load a foot carries, the closer the gains are to the full stance gains.
 
     While no foot swings, the rule applies to all joints of both legs. In a step, the rule applies only to the ankle of the
-    stance leg. The other joints of the stance leg have the full stance gains, and the swing leg has the swing gains.
+    stance leg. The other joints of the stance leg have the full stance gains, and the swing leg has the swing gains. In a guided
+    step, hip and knee (SH, SK) of the swing leg have no integral gain, because the guide drives them.
 
     Args:
         constants: gains of swing leg and stance leg, and loads at which the full stance gains are applied.
@@ -538,3 +539,6 @@ def _set_gains(constants: Constants, stage: Stage, load: Vector, pids: Records[P
             i = side * _LEG + joint
             for k in range(3):
                 gains[k, i] = pair[0, k, i] + share * (pair[1, k, i] - pair[0, k, i])
+    if stage.assisted:
+        leg = _LEG * (1 - stage.stance)
+        gains[2, leg + _SH], gains[2, leg + _SK] = 0.0, 0.0

@@ -360,3 +360,34 @@ def test_guide_and_vibration_are_off_at_full_assistance() -> None:
     assert not any(any(felt.levels) for felt in controller.felt)
     assert controller.statistics.guide.cycles == 0
     assert not controller.certificates(1.0)[0].certified
+
+
+@pytest.mark.parametrize("assisted", [False, True])
+def test_literal_law_limits_the_integral_only_outside_the_periodic_steps(assisted: bool) -> None:
+    """In a guided step, the integrals of hip and knee of the swing leg stand still, because the guide drives them."""
+    controller = WalkController(ROBOT, PATIENT, WALK, 2, WalkConfig.literal(), CONSTANT)
+    state = hung(controller)
+    state.torque_sent = controller._pid.requested  # no torque is limited
+    controller.reset(state)
+    record, hip, swinging = controller._pid.records[0], JOINTS.index("left_SH"), (8, 9)  # the right leg swings
+
+    def follow(phase: Phase) -> np.ndarray:
+        """Start a phase; return the growth of the integrals in 100 cycles in which all joints are far below their targets."""
+        state.position[:] = 0.0
+        controller._begin(phase, state.cycle, 0.5 if assisted else 1.0)
+        before = record.integral.copy()
+        state.position[:] = -3.0
+        for _ in range(100):
+            controller.update(state)
+            state.cycle += 1
+        return record.integral - before
+
+    follow(Phase.SHIFT)
+    assert np.abs(record.integral).max() == 10.0
+    controller._begin(Phase.START, state.cycle, 1.0)
+    grown = follow(Phase.STEP)
+    assert abs(grown[hip]) > 20.0
+    assert [grown[joint] == 0.0 for joint in swinging] == [assisted, assisted]
+    assert np.abs(record.integral).max() > 20.0
+    follow(Phase.STOP)
+    assert np.abs(record.integral).max() == 10.0
