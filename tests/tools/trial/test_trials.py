@@ -25,6 +25,7 @@ from atalante_tools.console.outcome import Failed
 from atalante_tools.session.walk_options import Push
 from atalante_tools.trial import lockstep, plan, store
 from atalante_tools.trial.branch import Branch
+from atalante_tools.trial.fault_plan import fault_trials
 from atalante_tools.trial.plan import (
     PROTOCOL,
     PUSH_DIRECTIONS,
@@ -34,6 +35,8 @@ from atalante_tools.trial.plan import (
     SWEEP,
     PushTrial,
     RobustTrial,
+    ShapeTrial,
+    TreadmillTrial,
     Trial,
     WalkSetting,
     WalkTrial,
@@ -317,6 +320,33 @@ def test_network_that_does_not_cover_a_subject_starts_no_trial(tmp_path: Path) -
         assert done.exit_code == 1, done.output
         assert message in done.stderr
         assert not (tmp_path / "x").exists()
+
+
+@pytest.mark.parametrize("experiment", ["robustness", "pushes", "faults"])
+def test_experiments_without_subjects_of_the_paper_take_a_network(experiment: str, tmp_path: Path) -> None:
+    network, file = load_network(), tmp_path / "network.npz"
+    save_network(replace(network, low=np.maximum(network.low, [90.0, 0.0, 0.0, 0.0, 0.0, 0.0])), file)
+    arguments = ["trial", experiment, "--quick", "--out", str(tmp_path / "x"), "--network", str(file)]
+    done = CliRunner().invoke(cli, arguments)
+    assert done.exit_code == 1, done.output
+    assert "mass for the gait network must be 90 to 91 kg" in done.stderr
+    assert not (tmp_path / "x").exists()
+
+
+def test_trials_without_subjects_of_the_paper_load_their_network(tmp_path: Path) -> None:
+    file = tmp_path / "network.npz"
+    file.write_bytes(DEFAULT_NETWORK.read_bytes())
+    network = network_of(file)
+    trials = [
+        *robust_trials(1, 1, 0, "mujoco", network),
+        *push_trials((0.0,), (0.0,), (50.0,), 0, "mujoco", network),
+        *fault_trials(("F05",), True, 0, "mujoco", network),
+    ]
+    assert all(trial.network == network for trial in trials if not isinstance(trial, ShapeTrial | TreadmillTrial))
+    file.write_bytes(b"another network")
+    for trial in trials:
+        with pytest.raises(Failed, match=r"network\.npz must be unchanged until the end of the trials"):
+            store._run(trial)
 
 
 def test_protocol_has_a_trial_per_subject_condition_and_factor() -> None:

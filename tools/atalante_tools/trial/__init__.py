@@ -181,8 +181,9 @@ def sweep(days: int | None, walking: Walking, running: Running, as_json: bool) -
 
 @command.command(short_help="Inject the faults of the fault matrix into walks on the ground.")
 @click.argument("ids", metavar="[ID]...", nargs=-1)
+@network_option
 @_running("ground-faults")
-def faults(ids: tuple[str, ...], running: Running, as_json: bool) -> None:
+def faults(ids: tuple[str, ...], network: Path | None, running: Running, as_json: bool) -> None:
     """Inject each fault, or the faults with the given IDs, into walks on the ground with a passive wearer.
 
     Each case of the fault matrix begins at ten moments: at eight phases of a step, and in double support before and after the
@@ -198,7 +199,7 @@ def faults(ids: tuple[str, ...], running: Running, as_json: bool) -> None:
     chosen = [FAULT_IDS[find(id_, FAULT_IDS, "fault with a case")] for id_ in ids] or (
         QUICK_IDS if running.quick else ()
     )
-    trials = fault_trials(chosen, running.quick, running.seed, running.engine)
+    trials = fault_trials(chosen, running.quick, running.seed, running.engine, _network(network))
     if without := [id_ for id_ in chosen if id_ not in {trial.id for trial in trials}]:
         raise click.UsageError(
             f"a fault must be one that can begin during a walk, got {without[0]}, which is injected only at power-on"
@@ -277,8 +278,9 @@ def protocol(
 @click.option(
     "--steps", type=click.IntRange(1), metavar="N", help="Number of periodic steps of each trial.  [default: 60]"
 )
+@network_option
 @_running("robustness")
-def robustness(seeds: int | None, steps: int | None, running: Running, as_json: bool) -> None:
+def robustness(seeds: int | None, steps: int | None, network: Path | None, running: Running, as_json: bool) -> None:
     """Walk at full assistance, with random patients, model errors, friction, late motors, lost frames and pushes.
 
     If the robot does not complete all steps, or does not stand at the end, the trial is repeated, and its repetition is
@@ -288,7 +290,7 @@ def robustness(seeds: int | None, steps: int | None, running: Running, as_json: 
     from atalante_tools.trial.plan import QUICK_ROBUST, ROBUST, robust_trials
 
     count, length = QUICK_ROBUST if running.quick else ROBUST
-    trials = robust_trials(seeds or count, steps or length, running.seed, running.engine)
+    trials = robust_trials(seeds or count, steps or length, running.seed, running.engine, _network(network))
     try:
         _conduct("robustness", trials, robust_findings, running, as_json)
     finally:
@@ -296,8 +298,9 @@ def robustness(seeds: int | None, steps: int | None, running: Running, as_json: 
 
 
 @command.command(short_help="Find the largest push in each direction that the robot withstands.")
+@network_option
 @_running("pushes")
-def pushes(running: Running, as_json: bool) -> None:
+def pushes(network: Path | None, running: Running, as_json: bool) -> None:
     """Push the walking robot in 16 directions and at 8 phases of a step. The force rises until the robot falls.
 
     The report contains a polar figure of the largest push that the robot withstands.
@@ -306,7 +309,8 @@ def pushes(running: Running, as_json: bool) -> None:
     from atalante_tools.trial.plan import PUSH_DIRECTIONS, PUSH_FORCES, PUSH_PHASES, QUICK_PUSHES, push_trials
 
     grid = QUICK_PUSHES if running.quick else (PUSH_DIRECTIONS, PUSH_PHASES, PUSH_FORCES)
-    _conduct("pushes", push_trials(*grid, running.seed, running.engine), push_findings, running, as_json)
+    trials = push_trials(*grid, running.seed, running.engine, _network(network))
+    _conduct("pushes", trials, push_findings, running, as_json)
 
 
 def _record_failures(trials: Sequence[Trial], running: Running) -> None:
@@ -344,20 +348,23 @@ def _known(masses: tuple[float, ...]) -> tuple[float, ...]:
 def _setting(walking: Walking, running: Running, protocol: tuple[int, int, int]) -> WalkSetting:
     from atalante_tools.trial.plan import WalkSetting
 
-    setting = WalkSetting(
+    return WalkSetting(
         protocol,
         walking.shape,
         walking.idealization,
         walking.feedforward,
         running.seed,
         running.engine,
+        network=_network(walking.network),
         haptics=walking.haptics,
     )
-    if walking.network is None:
-        return setting
+
+
+def _network(file: Path | None) -> tuple[str, ...]:
+    """Return path and SHA-256 of a network file; an empty tuple if the user gave no file."""
     from atalante_tools.trial.plan import network_of
 
-    return replace(setting, network=network_of(walking.network))
+    return () if file is None else network_of(file)
 
 
 def _require_network(trials: Sequence[Trial]) -> None:
@@ -369,10 +376,10 @@ def _require_network(trials: Sequence[Trial]) -> None:
     from atalante_control.dynamics.gait_network import load_network
     from atalante_control.gait.subject import Subject
     from atalante_control.model import Patient
-    from atalante_tools.trial.plan import STEP, WalkTrial
+    from atalante_tools.trial.plan import STEP, ShapeTrial, TreadmillTrial
 
     for trial in trials:
-        if isinstance(trial, WalkTrial) and trial.network:
+        if not isinstance(trial, ShapeTrial | TreadmillTrial) and trial.network:
             load_network(Path(trial.network[0])).check(Subject(Patient(trial.mass, trial.height), *STEP))
 
 

@@ -62,6 +62,8 @@ class FaultTrial:
     seed: int
     engine: str
     sources: str  # hash of the files of `atalante_tools.faults`; if it changes, the stored result is not used again
+    #: path and SHA-256 of the file of the neural gait network; empty for the network of the package
+    network: tuple[str, ...] = ()
 
     @property
     def name(self) -> str:
@@ -69,7 +71,9 @@ class FaultTrial:
         return f"{self.id}-{'permanent' if self.index == PERMANENT else f'{self.index:02d}'}"
 
 
-def fault_trials(ids: Sequence[str], quick: bool, seed: int, engine: str) -> list[FaultTrial]:
+def fault_trials(
+    ids: Sequence[str], quick: bool, seed: int, engine: str, network: tuple[str, ...] = ()
+) -> list[FaultTrial]:
     """Return the trials of the given faults.
 
     Args:
@@ -77,6 +81,7 @@ def fault_trials(ids: Sequence[str], quick: bool, seed: int, engine: str) -> lis
         quick: whether only the first case of each fault is tried, at two moments.
         seed: seed of the experiment, which is added to the seed of each case.
         engine: physics engine of the emulated robot.
+        network: result of `plan.network_of`; empty for the network of the package.
     """
     import atalante_tools.faults
     from atalante_control.gait.subject import STUDY_PATIENTS
@@ -88,7 +93,7 @@ def fault_trials(ids: Sequence[str], quick: bool, seed: int, engine: str) -> lis
     return [
         FaultTrial(
             id_, index, case.name, QUICK_MOMENTS if quick else _moments(id_), patient.mass, patient.height,
-            seed + case.seed, engine, sources,
+            seed + case.seed, engine, sources, network,
         )
         for id_ in ids or FAULT_IDS
         for index, case in list(ground_cases(id_).items())[: 1 if quick else None]

@@ -15,7 +15,6 @@ from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 import numpy as np
 
-from atalante_control.gait.subject import Subject
 from atalante_control.model import Patient
 from atalante_control.walking.controller import WalkController
 from atalante_control.walking.phases import Phase
@@ -36,11 +35,10 @@ from atalante_tools.faults.verdict import WALKING, exception_sentence
 from atalante_tools.session.body import describe
 from atalante_tools.session.rig import Rig, open_hal
 from atalante_tools.session.walk_observation import AFTERMATH, Observation
-from atalante_tools.session.walk_options import solved_gaits
 from atalante_tools.trial.branch import Branch, Continuation, branch
 from atalante_tools.trial.fault_plan import FURTHER_MOMENTS, MOMENTS, PERMANENT, STEPS, FaultTrial
 from atalante_tools.trial.ground_cases import ground_cases
-from atalante_tools.trial.lockstep import target
+from atalante_tools.trial.lockstep import gaits_of_trial, target
 from atalante_tools.trial.plan import STEP
 
 if TYPE_CHECKING:
@@ -172,7 +170,7 @@ def longest_without(falls: Callable[[int], bool], horizon: int, resolution: int)
 def _run(trial: FaultTrial, case: Case, moment: str) -> FaultRun:
     """Run one walk in which the fault of `case` begins at the moment named `moment`, and return its result."""
     check_stop()
-    begins, walk = _branches(trial.mass, trial.height, trial.seed, trial.engine)[moment]
+    begins, walk = _branches(trial.mass, trial.height, trial.seed, trial.engine, trial.network)[moment]
     answer: _Answer = walk.ask(_Request(case.stimuli, begins, case.ends))
     first = begins + case.first_faulty
     events = [event for event in answer.events if event.cycle >= first]
@@ -200,7 +198,9 @@ def diagnosed(events: Sequence[Event], expected: str, first: int) -> tuple[tuple
 
 
 @cache
-def _branches(mass: float, height: float, seed: int, engine: str) -> dict[str, tuple[int, Branch]]:
+def _branches(
+    mass: float, height: float, seed: int, engine: str, network: tuple[str, ...]
+) -> dict[str, tuple[int, Branch]]:
     """Return for each moment the cycle in which the fault begins, and a forked process paused shortly before this cycle.
 
     The paused process is a copy of a walk without a fault. `Branch.ask` continues this walk from the pause, now with a fault.
@@ -210,12 +210,13 @@ def _branches(mass: float, height: float, seed: int, engine: str) -> dict[str, t
         height: height of the wearer [m].
         seed: seed of the sensor noise.
         engine: physics engine of the emulated robot.
+        network: network of the gaits, as in `FaultTrial.network`.
 
     Raises:
         RuntimeError: If the robot does not walk to the end although there is no fault.
     """
     walk = _Walk(())
-    walk.execute(mass, height, seed, engine)
+    walk.execute(mass, height, seed, engine, network)
     if walk.outcome != "walked":
         raise RuntimeError(
             f"the walk without a fault must reach its end, got the outcome {walk.outcome}: {walk.reason}"
@@ -225,7 +226,7 @@ def _branches(mass: float, height: float, seed: int, engine: str) -> dict[str, t
         for name, moment in (MOMENTS | FURTHER_MOMENTS).items()
     }
     trunk = _Walk(cycle - _LEAD for cycle in begins.values())
-    trunk.execute(mass, height, seed, engine)
+    trunk.execute(mass, height, seed, engine, network)
     return {name: (cycle, trunk.branches[cycle - _LEAD]) for name, cycle in begins.items()}
 
 
@@ -259,7 +260,7 @@ class _Walk:
         self._stimuli = TimedStimuli((), 1)
         self._ends: int | None = None  # first cycle after the faults; None: no fault, or a permanent fault
 
-    def execute(self, mass: float, height: float, seed: int, engine: str) -> None:
+    def execute(self, mass: float, height: float, seed: int, engine: str, network: tuple[str, ...] = ()) -> None:
         """Walk until the outcome is known: the robot stands, has fallen, has left ACTIVE, or walks on after the fault.
 
         The process of a `Continuation` ends in this call.
@@ -269,9 +270,10 @@ class _Walk:
             height: height of the wearer [m].
             seed: seed of the sensor noise.
             engine: physics engine of the emulated robot.
+            network: network of the gaits, as in `FaultTrial.network`.
         """
         robot, patient, operator = load_robot(), Patient(mass, height), Operator()
-        gaits = solved_gaits(Subject(patient, *STEP))
+        gaits = gaits_of_trial(mass, height, network)
         walk = WalkController(robot, patient, gaits, STEPS)
         with open_hal(
             target(engine),

@@ -1,15 +1,22 @@
-"""Parts that all trials share: the connection to an emulated robot in lock-step, and the end condition of a trial."""
+"""Parts that all trials share: connection to an emulated robot in lock-step, gaits of a subject, end condition of a trial."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
+from pathlib import Path
 from typing import Final
 
+from atalante_control.gait.subject import Subject
+from atalante_control.gait.walk import WalkGaits
+from atalante_control.model import Patient
 from atalante_hal.types import State, SupervisorState
 from atalante_tools.console.options import EMBEDDED, Target
+from atalante_tools.console.outcome import Failed
 from atalante_tools.console.stop_request import check_stop
 from atalante_tools.session.rig import Rig
 from atalante_tools.session.walk_observation import AFTERMATH, Observation
+from atalante_tools.session.walk_options import solved_gaits
+from atalante_tools.trial.plan import STEP, network_of
 
 #: If the robot is not ACTIVE after this time, the trial ends with the outcome "no start" [cycles].
 _START: Final = 30_000
@@ -22,6 +29,23 @@ def target(engine: str) -> Target:
         engine: name of the physics engine.
     """
     return Target(EMBEDDED, "", lockstep=True, engine=engine)
+
+
+def gaits_of_trial(mass: float, height: float, network: tuple[str, ...]) -> WalkGaits:
+    """Return the gaits of the subject of a trial.
+
+    Args:
+        mass: mass of the subject [kg].
+        height: height of the subject [m].
+        network: path and SHA-256 of the network file; empty for the network of the package.
+
+    Raises:
+        Failed: If the network file was changed after the trials were planned.
+    """
+    file = Path(network[0]) if network else None
+    if file is not None and network_of(file) != tuple(network):
+        raise Failed(f"{file} must be unchanged until the end of the trials: start the command again")
+    return solved_gaits(Subject(Patient(mass, height), *STEP), file)
 
 
 class Ending:

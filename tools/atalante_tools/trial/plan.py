@@ -143,6 +143,8 @@ class RobustTrial:
     steps: int
     seed: int
     engine: str
+    #: path and SHA-256 of the file of the neural gait network; empty for the network of the package
+    network: tuple[str, ...] = ()
 
     @property
     def name(self) -> str:
@@ -162,6 +164,8 @@ class PushTrial:
     height: float  # height of the wearer [m]
     seed: int
     engine: str
+    #: path and SHA-256 of the file of the neural gait network; empty for the network of the package
+    network: tuple[str, ...] = ()
 
     @property
     def name(self) -> str:
@@ -305,7 +309,7 @@ def protocol_trials(
     ]
 
 
-def robust_trials(count: int, steps: int, seed: int, engine: str) -> list[Trial]:
+def robust_trials(count: int, steps: int, seed: int, engine: str, network: tuple[str, ...] = ()) -> list[Trial]:
     """Return trials with random patients, mass errors, friction, delay and pushes.
 
     Args:
@@ -313,6 +317,7 @@ def robust_trials(count: int, steps: int, seed: int, engine: str) -> list[Trial]
         steps: number of periodic steps in each trial.
         seed: seed of the experiment.
         engine: name of the physics engine.
+        network: result of `network_of`; empty for the network of the package.
     """
     from atalante_control.gait.subject import STUDY_PATIENTS
 
@@ -328,7 +333,7 @@ def robust_trials(count: int, steps: int, seed: int, engine: str) -> list[Trial]
         trials.append(
             RobustTrial(
                 number, patient.mass, patient.height, round(draw.uniform(*MASS_SHARE), 4), round(draw.uniform(*FRICTION), 3),
-                _delay(draw), LOSS, pushes, PUSH, steps, 1000 * seed + number, engine,
+                _delay(draw), LOSS, pushes, PUSH, steps, 1000 * seed + number, engine, network,
             )
         )  # fmt: skip
     return trials
@@ -348,7 +353,12 @@ def _delay(draw: random.Random) -> tuple[int, int, int]:
 
 
 def push_trials(
-    directions: Sequence[float], phases: Sequence[float], forces: Sequence[float], seed: int, engine: str
+    directions: Sequence[float],
+    phases: Sequence[float],
+    forces: Sequence[float],
+    seed: int,
+    engine: str,
+    network: tuple[str, ...] = (),
 ) -> list[Trial]:
     """Return one trial for each direction and phase of a push.
 
@@ -358,9 +368,10 @@ def push_trials(
         forces: forces in rising order [N].
         seed: seed of the sensor noise.
         engine: name of the physics engine.
+        network: result of `network_of`; empty for the network of the package.
     """
     return [
-        PushTrial(direction, phase, tuple(forces), *SWEEP_SUBJECT, seed, engine)
+        PushTrial(direction, phase, tuple(forces), *SWEEP_SUBJECT, seed, engine, network)
         for direction in directions
         for phase in phases
     ]

@@ -9,7 +9,6 @@ from __future__ import annotations
 from functools import cache
 from typing import Any, Final
 
-from atalante_control.gait.subject import Subject
 from atalante_control.model import Patient
 from atalante_control.walking.controller import WalkController
 from atalante_emulator.mechanics import Ground, Mechanics
@@ -22,11 +21,11 @@ from atalante_tools.console.stop_request import check_stop, deferred
 from atalante_tools.session.body import describe
 from atalante_tools.session.rig import Rig, open_hal
 from atalante_tools.session.walk_observation import Observation
-from atalante_tools.session.walk_options import Push, solved_gaits
+from atalante_tools.session.walk_options import Push
 from atalante_tools.session.walk_result import diagnostics
 from atalante_tools.trial.branch import Branch, Continuation, branch
-from atalante_tools.trial.lockstep import Ending, target
-from atalante_tools.trial.plan import STEP, PushTrial
+from atalante_tools.trial.lockstep import Ending, gaits_of_trial, target
+from atalante_tools.trial.plan import PushTrial
 
 #: Index of the pushed step. In a step with an odd index, the right leg is the stance leg.
 _PUSHED: Final = 3
@@ -44,7 +43,7 @@ def largest_push(trial: PushTrial) -> dict[str, Any]:
     Args:
         trial: trial to run.
     """
-    walk = _branch(trial.mass, trial.height, trial.seed, trial.engine)
+    walk = _branch(trial.mass, trial.height, trial.seed, trial.engine, trial.network)
     largest, end, found = 0.0, "stood", dict[str, int]()
     for force in trial.forces:
         check_stop()
@@ -56,7 +55,7 @@ def largest_push(trial: PushTrial) -> dict[str, Any]:
 
 
 @cache
-def _branch(mass: float, height: float, seed: int, engine: str) -> Branch:
+def _branch(mass: float, height: float, seed: int, engine: str, network: tuple[str, ...]) -> Branch:
     """Walk until shortly before the pushed step, and return a branch: a forked copy of the walk that waits at this moment.
 
     Args:
@@ -64,12 +63,13 @@ def _branch(mass: float, height: float, seed: int, engine: str) -> Branch:
         height: height of the wearer [m].
         seed: seed of the sensor noise.
         engine: physics engine of the emulated robot.
+        network: network of the gaits, as in `PushTrial.network`.
 
     Raises:
         RuntimeError: If the robot does not reach this moment.
     """
     robot, patient = load_robot(), Patient(mass, height)
-    gaits = solved_gaits(Subject(patient, *STEP))
+    gaits = gaits_of_trial(mass, height, network)
     controller = WalkController(robot, patient, gaits, _PUSHED + 1 + _AFTER)
     with open_hal(
         target(engine),

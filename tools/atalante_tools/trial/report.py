@@ -209,6 +209,8 @@ def _provenance(results: Sequence[Result]) -> list[tuple[str, str]]:
         values = dict.fromkeys(str(r["trial"][name]) for r in results if name in r["trial"])
         if values:
             rows.append((meaning, ", ".join(values)))
+    if networks := dict.fromkeys(tuple(r["trial"]["network"]) for r in results if r["trial"].get("network")):
+        rows.append(("gait network", ", ".join(f"{file} (SHA-256 {digest})" for file, digest in networks)))
     rows.append(("mode", "emulated robot in lock-step (virtual time), HAL and bus in the loop, no virtual operator"))
     return rows
 

@@ -13,7 +13,6 @@ from typing import Any, Final
 
 import numpy as np
 
-from atalante_control.gait.subject import Subject
 from atalante_control.model import Patient
 from atalante_control.walking.controller import WalkController
 from atalante_control.walking.phases import Phase
@@ -30,10 +29,9 @@ from atalante_tools.session.body import describe
 from atalante_tools.session.recording import EndpointReport, Outputs, Recorder, close_telemetry, start_telemetry
 from atalante_tools.session.rig import Rig, open_hal
 from atalante_tools.session.walk_observation import Observation
-from atalante_tools.session.walk_options import solved_gaits
 from atalante_tools.session.walk_result import diagnostics
-from atalante_tools.trial.lockstep import Ending, target
-from atalante_tools.trial.plan import STEP, RobustTrial
+from atalante_tools.trial.lockstep import Ending, gaits_of_trial, target
+from atalante_tools.trial.plan import RobustTrial
 
 #: Duration of a push [s].
 _PUSH: Final = 0.2
@@ -53,7 +51,7 @@ def robust_walk(trial: RobustTrial, recording: Path | None = None) -> dict[str, 
     """
     robot, known = load_robot(), Patient(trial.mass, trial.height)
     true = Patient(trial.mass * trial.mass_share, trial.height)
-    gaits = solved_gaits(Subject(known, *STEP))
+    gaits = gaits_of_trial(trial.mass, trial.height, trial.network)
     controller = WalkController(robot, known, gaits, trial.steps)
     with open_hal(
         target(trial.engine),

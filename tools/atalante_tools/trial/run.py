@@ -9,7 +9,6 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import replace
-from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
@@ -17,7 +16,6 @@ import numpy as np
 from atalante_control.airwalk.config import AirwalkConfig
 from atalante_control.airwalk.controller import AirwalkController
 from atalante_control.gait.gait import AIRWALK_GAIT, load_gait
-from atalante_control.gait.subject import Subject
 from atalante_control.gait.walk import WalkGaits
 from atalante_control.guide.shapes import SHAPES
 from atalante_control.joint.leg_model import leg_model
@@ -40,16 +38,14 @@ from atalante_emulator.wearer import LimbParameters
 from atalante_hal.loop import LockStep, run
 from atalante_hal.robot import LEG_JOINTS, load_robot
 from atalante_hal.types import PERIOD, Vector
-from atalante_tools.console.outcome import Failed
 from atalante_tools.console.stop_request import deferred
 from atalante_tools.session.body import active_task, describe
 from atalante_tools.session.dial import Dial
 from atalante_tools.session.rig import Rig, open_hal
 from atalante_tools.session.walk_observation import Observation
-from atalante_tools.session.walk_options import solved_gaits
 from atalante_tools.session.walk_result import diagnostics
-from atalante_tools.trial.lockstep import Ending, target
-from atalante_tools.trial.plan import STEP, PushTrial, RobustTrial, ShapeTrial, TreadmillTrial, WalkTrial, network_of
+from atalante_tools.trial.lockstep import Ending, gaits_of_trial, target
+from atalante_tools.trial.plan import STEP, PushTrial, RobustTrial, ShapeTrial, TreadmillTrial, WalkTrial
 from atalante_tools.trial.pushes import largest_push
 from atalante_tools.trial.robustness import robust_walk
 
@@ -137,10 +133,7 @@ def _shape(trial: ShapeTrial) -> dict[str, Any]:
 
 def _walk(trial: WalkTrial) -> dict[str, Any]:
     robot, patient = load_robot(), Patient(trial.mass, trial.height)
-    network = Path(trial.network[0]) if trial.network else None
-    if network is not None and network_of(network) != tuple(trial.network):
-        raise Failed(f"{network} must be unchanged until the end of the trials: start the command again")
-    gaits = solved_gaits(Subject(patient, *STEP), network)
+    gaits = gaits_of_trial(trial.mass, trial.height, trial.network)
     guide = replace(WALK_GUIDE, idealization=trial.idealization, feedforward=trial.feedforward)
     steps = sum(trial.protocol)
     config = replace(
