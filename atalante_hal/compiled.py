@@ -83,10 +83,13 @@ def specialised(function: Callable[P, R], *args: P.args, **kwargs: P.kwargs) -> 
     if not counted:
         try:
             return cast(Callable[P, R], _machine_code(function, args, False))
-        except _numba().core.errors.NumbaError:  # raised if the function creates an array or contains an error
-            _CREATES_ARRAYS[function] = True
-            _mark(function)
-    return cast(Callable[P, R], _machine_code(function, args, True))
+        except _numba().core.errors.NumbaError:  # raised if the function creates an array, or if the call is wrong
+            pass
+    code = cast(Callable[P, R], _machine_code(function, args, True))
+    if not counted:  # compiled only with reference counts, so it creates an array
+        _CREATES_ARRAYS[function] = True
+        _mark(function)
+    return code
 
 
 def _machine_code(function: Callable[..., Any], args: tuple[Any, ...], counted: bool) -> Any:

@@ -129,6 +129,23 @@ def test_wrong_specialised_function_raises_the_error_of_numba() -> None:
         specialised(total, 1.0, 1.0)
 
 
+def test_function_with_a_wrong_call_is_not_marked_as_creating_arrays(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    from numba.core.errors import TypingError
+
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    function = _changed(_sum_of_first)
+    with pytest.raises(TypingError):
+        specialised(function, 1.0, 1)
+    assert not list(tmp_path.rglob(module._MARK))
+    values = np.arange(4.0)
+    assert specialised(function, values, 2)(values, 3) == GAIN * 3.0
+    assert "NRT_" not in "".join(module._compiled(function, False).inspect_llvm().values())
+    assert specialised(_changed(_doubled), values)(values).tolist() == (2.0 * values).tolist()
+    assert len(list(tmp_path.rglob(module._MARK))) == 1
+
+
 def test_function_is_compiled_only_once() -> None:
     assert compiled(total) is compiled(total)
     assert compiled(total) is not total
