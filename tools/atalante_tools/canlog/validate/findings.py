@@ -207,6 +207,6 @@ def _text(value: Any, unit: str, signal: str) -> str:
         text = value
     else:
         number = float(value)
-        text = str(int(number)) if number.is_integer() and abs(number) < 1e15 else f"{number:.6g}"
+        text = str(int(number)) if number.is_integer() and abs(number) <= 2**53 else f"{number:.6g}"
         text = f"{text} {unit}" if unit and unit != "1" else text
     return f"{signal} = {text}" if signal else text

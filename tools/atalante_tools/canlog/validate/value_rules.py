@@ -7,9 +7,12 @@ field are checked. If one of these codes is wrong, all values of the field are c
 from __future__ import annotations
 
 import math
+import sys
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from fractions import Fraction
 from functools import lru_cache
+from typing import Final
 
 import numpy as np
 import numpy.typing as npt
@@ -21,6 +24,8 @@ from atalante_tools.canlog.stream import Stream
 from atalante_tools.canlog.validate.findings import Findings
 from atalante_tools.canlog.validate.project import Project
 
+#: Smallest integer that float64 may have rounded.
+_EXACT: Final = 2**53
 #: The value table of a field of at most this length [bit] is stored as a lookup array over all raw codes.
 #: The value table of a longer field is stored as a list of the valid codes.
 _TABLE_BITS = 16
@@ -267,8 +272,8 @@ def is_limited(limits: Field) -> bool:
 def raw_bounds(limits: Field) -> tuple[int, int]:
     """Return the smallest and the largest raw code inside the DBC range.
 
-    A tolerance of 1e-6 of a raw code is added, because the DBC limits are rounded decimals. The tolerance of large raw codes is
-    the rounding error of float64.
+    A tolerance of 1e-6 of a raw code is added, because the DBC limits are rounded decimals. For a limit of 2^53 or more, which
+    float64 may have rounded, the rounding error is added, too.
     """
     assert limits.minimum is not None
     assert limits.maximum is not None
@@ -277,10 +282,15 @@ def raw_bounds(limits: Field) -> tuple[int, int]:
 
 @lru_cache(maxsize=4096)  # cached, because many signals of a DBC have equal limits
 def _codes_within(minimum: float, maximum: float, factor: float, offset: float, codes: range) -> tuple[int, int]:
-    raw = sorted((x - offset) / factor for x in (minimum, maximum))
-    margins = [max(1e-6, 1e-15 * abs(x)) for x in raw]
-    low, high = math.ceil(raw[0] - margins[0]), math.floor(raw[1] + margins[1])
-    return max(low, codes[0]), min(high, codes[-1])
+    # Fractions of the decimals, because the rounding errors of float64 would exceed a raw code in wide fields.
+    scale, zero = Fraction(str(factor)), Fraction(str(offset))
+    limits = []
+    for limit in (minimum, maximum):
+        x = min(max(limit, -sys.float_info.max), sys.float_info.max)  # a limit such as 1E999 is read as infinity
+        rounded = 0.5 * math.ulp(x) if abs(x) >= _EXACT else 0.0
+        limits.append(((Fraction(str(x)) - zero) / scale, Fraction("1e-6") + abs(Fraction(rounded) / scale)))
+    (low, below), (high, above) = sorted(limits)
+    return max(math.ceil(low - below), codes[0]), min(math.floor(high + above), codes[-1])
 
 
 def _float_limits(limits: Field) -> tuple[float, float]:
