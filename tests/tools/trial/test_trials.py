@@ -349,6 +349,19 @@ def test_trials_without_subjects_of_the_paper_load_their_network(tmp_path: Path)
             store._run(trial)
 
 
+@pytest.mark.parametrize("damaged", ["", "{", "[]", "1", '{"outcome": "stood"}', "another trial", "\0"])
+def test_damaged_result_is_computed_again(damaged: str, tmp_path: Path) -> None:
+    """The trials on the treadmill take no time, because no body is simulated."""
+    trial, other = (t for t in sweep_trials(SETTING, (), 2))
+    (result, different) = compute([trial, other], tmp_path)
+    path = path_of(trial, tmp_path)
+    assert stored(trial, tmp_path) == json.loads(json.dumps(result))
+    path.write_text(json.dumps(different) if damaged == "another trial" else damaged)
+    assert stored(trial, tmp_path) is None
+    assert list(compute([trial], tmp_path)) == [result]
+    assert stored(trial, tmp_path) is not None
+
+
 def test_protocol_has_a_trial_per_subject_condition_and_factor() -> None:
     trials = protocol_trials(replace(SETTING, literal=True), (0.5, 0.0))
     assert len({trial.name for trial in trials}) == len({trial.seed for trial in trials}) == len(trials) == 32

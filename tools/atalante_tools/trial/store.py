@@ -34,7 +34,7 @@ def stored(trial: Trial, folder: Path) -> Result | None:
     """Return the stored result of a trial; None if the trial must be run.
 
     The file name contains a hash of the parameters of the trial and of all software versions. So the trial must also be run again
-    after a change of a parameter or a version.
+    after a change of a parameter or a version, and if the file is damaged or contains the result of another trial.
 
     Args:
         trial: trial of the result.
@@ -43,8 +43,13 @@ def stored(trial: Trial, folder: Path) -> Result | None:
     path = path_of(trial, folder)
     if not path.exists():
         return None
-    result: Result = json.loads(path.read_text())
-    return result
+    try:
+        result: Result = json.loads(path.read_bytes())
+    except ValueError:  # no JSON, or no text
+        return None
+    expected = json.loads(json.dumps({"trial": fields(trial), "versions": versions()}))  # with lists in place of tuples
+    valid = isinstance(result, dict) and "outcome" in result and {name: result.get(name) for name in expected} == expected
+    return result if valid else None
 
 
 def compute(
