@@ -22,6 +22,7 @@ from atalante_control.model import Patient
 from atalante_emulator.metabolism import MetabolismParameters
 from atalante_tools.cli import cli
 from atalante_tools.console.outcome import Failed
+from atalante_tools.console.stop_request import Stopped
 from atalante_tools.session.walk_options import Push
 from atalante_tools.trial import lockstep, plan, store
 from atalante_tools.trial.branch import Branch
@@ -400,6 +401,32 @@ def test_robust_walk_is_pushed_and_its_recording_is_readable(tmp_path: Path) -> 
     assert (result["outcome"], result["steps"], result["safe"], result["pushes"]) == ("stood", 1, True, 1)
     assert result["max_dcm_error_m"] > 1.5 * robust_walk(replace(trial, force=0.0))["max_dcm_error_m"]
     assert (tmp_path / "walk.mcap").stat().st_size > 10_000
+
+
+def test_failed_robust_walk_is_recorded_again_after_an_interruption_or_with_another_seed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The walks are replaced by stubs. The first recording is interrupted."""
+    recorded: list[Path] = []
+    fallen = {"outcome": "fell", "steps": 0, "safe": True}
+    monkeypatch.setattr("atalante_tools.trial.run.robust_walk", lambda trial: fallen)
+
+    def record(trial: RobustTrial, file: Path) -> None:
+        recorded.append(file)
+        file.write_bytes(b"begun")
+        if len(recorded) == 1:
+            raise Stopped(signal.SIGINT)
+        file.write_bytes(b"complete")
+
+    monkeypatch.setattr("atalante_tools.trial.robustness.robust_walk", record)
+    arguments = ["trial", "robustness", "--quick", "--seeds", "1", "--jobs", "1", "--out", str(tmp_path)]
+    for _ in range(3):
+        CliRunner().invoke(cli, arguments)
+    CliRunner().invoke(cli, [*arguments, "--seed", "1"])
+    assert len(recorded) == 3
+    recordings = sorted((tmp_path / "recordings").iterdir())
+    assert [path.read_bytes() for path in recordings] == [b"complete"] * 2
+    assert {path.stem for path in recordings} == {path.stem for path in (tmp_path / "trials").iterdir()}
 
 
 def test_delay_of_a_robust_walk_applies_to_cyclic_states_and_commands() -> None:

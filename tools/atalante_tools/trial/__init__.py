@@ -314,21 +314,33 @@ def pushes(network: Path | None, running: Running, as_json: bool) -> None:
 
 
 def _record_failures(trials: Sequence[Trial], running: Running) -> None:
-    """Repeat and record each trial in which the robot did not complete all steps, or did not stand at the end."""
+    """Repeat and record each trial in which the robot did not complete all steps, or did not stand at the end.
+
+    The name of a recording contains the key of the trial, as the name of its result. While the recording is incomplete, its name
+    ends with `.part.mcap`.
+
+    Raises:
+        Failed: If another run uses the folder.
+        Stopped: If a signal arrived. The same command makes the missing recordings.
+    """
+    from atalante_tools.session.run_folder import run_folder
     from atalante_tools.trial.findings import walked_all_steps
     from atalante_tools.trial.plan import RobustTrial
-    from atalante_tools.trial.store import stored
+    from atalante_tools.trial.store import path_of, stored
 
     folder = running.out / "recordings"
-    for trial in trials:
-        result, file = stored(trial, running.out / "trials"), folder / f"{trial.name}.mcap"
-        if isinstance(trial, RobustTrial) and result and not walked_all_steps(result) and not file.exists():
-            from atalante_tools.trial.robustness import robust_walk
+    with run_folder(running.out):
+        for trial in trials:
+            result, file = stored(trial, running.out / "trials"), path_of(trial, folder).with_suffix(".mcap")
+            if isinstance(trial, RobustTrial) and result and not walked_all_steps(result) and not file.exists():
+                from atalante_tools.trial.robustness import robust_walk
 
-            check_stop()
-            folder.mkdir(parents=True, exist_ok=True)
-            robust_walk(trial, file)
-            print_message(f"{trial.name} ({result['outcome']}): recorded in {file}")
+                check_stop()
+                folder.mkdir(parents=True, exist_ok=True)
+                unfinished = file.with_suffix(".part.mcap")
+                robust_walk(trial, unfinished)
+                unfinished.replace(file)
+                print_message(f"{trial.name} ({result['outcome']}): recorded in {file}")
 
 
 def _known(masses: tuple[float, ...]) -> tuple[float, ...]:

@@ -48,7 +48,9 @@ def stored(trial: Trial, folder: Path) -> Result | None:
     except ValueError:  # no JSON, or no text
         return None
     expected = json.loads(json.dumps({"trial": fields(trial), "versions": versions()}))  # with lists in place of tuples
-    valid = isinstance(result, dict) and "outcome" in result and {name: result.get(name) for name in expected} == expected
+    valid = (
+        isinstance(result, dict) and "outcome" in result and {name: result.get(name) for name in expected} == expected
+    )
     return result if valid else None
 
 
