@@ -273,7 +273,7 @@ def test_stdout_contains_only_json_when_libraries_print() -> None:
     assert "pybullet" not in done.stderr
 
 
-@pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
+@pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143), (signal.SIGHUP, 129)])
 def test_a_signal_ends_a_running_command_in_hold(number: signal.Signals, code: int) -> None:
     process = subprocess.Popen(
         atalante("jog", "left_SK", "--to", "100", "--speed", "1", "--json"),

@@ -108,5 +108,6 @@ def cli() -> None:
 
     Angles in options and results are in degrees. Start with `atalante demo`.
 
-    Exit codes: 0 ok, 1 failed, 2 usage error, 3 no device, 4 fault latched, 130 Ctrl-C, 143 SIGTERM.
+    Exit codes: 0 ok, 1 failed, 2 usage error, 3 no device, 4 fault latched, 129 SIGHUP, 130 Ctrl-C,
+    143 SIGTERM.
     """

@@ -83,7 +83,7 @@ def fan_out(
             )
             results = None
             try:
-                with _without_ctrl_c():
+                with _without_terminal_signals():
                     results = pool(delayed(_numbered)(call, number, task) for number, task in calls)
                 for number, result in results:
                     del pending[number]
@@ -122,17 +122,18 @@ def _numbered(call: Callable[[_Task], _Result], number: int, task: _Task) -> tup
 
 
 @contextmanager
-def _without_ctrl_c() -> Iterator[None]:
-    """Ignore Ctrl-C inside the `with` block. Child processes that start inside the block ignore Ctrl-C too.
+def _without_terminal_signals() -> Iterator[None]:
+    """Ignore the signals of a terminal (SIGINT, SIGHUP) in the `with` block. Child processes that start in it ignore them, too.
 
-    The parent process ends the child processes. The signal is ignored and not blocked, because the resource tracker of
-    joblib unblocks the signal for later processes.
+    The parent process ends the child processes. The signals are ignored and not blocked, because the resource tracker of
+    joblib unblocks the signals for later processes.
     """
-    before = signal.signal(signal.SIGINT, signal.SIG_IGN)
+    before = {number: signal.signal(number, signal.SIG_IGN) for number in (signal.SIGINT, signal.SIGHUP)}
     try:
         yield
     finally:
-        signal.signal(signal.SIGINT, before)
+        for number, handler in before.items():
+            signal.signal(number, handler)
 
 
 @contextmanager

@@ -18,8 +18,8 @@ def doubled(number: int) -> tuple[int, int]:
     return 2 * number, os.getpid()
 
 
-def handles_ctrl_c(_: int) -> bool:
-    return signal.getsignal(signal.SIGINT) is not signal.SIG_IGN
+def handles_terminal_signals(_: int) -> bool:
+    return any(signal.getsignal(number) is not signal.SIG_IGN for number in (signal.SIGINT, signal.SIGHUP))
 
 
 def slow(seconds: float) -> int:
@@ -37,9 +37,9 @@ def test_two_jobs_run_in_other_processes_with_the_same_results() -> None:
     assert os.getpid() not in {process for _, process in found}
 
 
-def test_worker_processes_ignore_ctrl_c() -> None:
-    assert not any(fan_out(handles_ctrl_c, range(4), jobs=2))
-    assert handles_ctrl_c(0)
+def test_worker_processes_ignore_ctrl_c_and_a_closed_terminal() -> None:
+    assert not any(fan_out(handles_terminal_signals, range(4), jobs=2))
+    assert handles_terminal_signals(0)
 
 
 def test_closing_the_iteration_ends_its_processes_without_a_warning() -> None:

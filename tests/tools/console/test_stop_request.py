@@ -1,4 +1,4 @@
-"""Stop request: SIGINT and SIGTERM set a flag and an exit code."""
+"""Stop request: SIGINT, SIGTERM and SIGHUP set a flag and an exit code."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from atalante_tools.console.stop_request import (
 )
 
 
-@pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
+@pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143), (signal.SIGHUP, 129)])
 def test_a_signal_sets_the_stop_request_and_its_exit_code(number: signal.Signals, code: int) -> None:
     before = signal.getsignal(number)
     with stop_requested() as stop:
@@ -56,6 +56,32 @@ finally:
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=60, check=False)
     assert done.returncode == -signal.Signals[second]
     assert done.stdout == ""
+
+
+@pytest.mark.parametrize("first", [signal.SIGHUP, signal.SIGINT])
+def test_a_hangup_after_the_first_signal_has_no_effect(first: signal.Signals) -> None:
+    """A shell and the kernel may both send SIGHUP when a terminal closes."""
+    ends: list[bool] = []
+    with stop_requested() as stop:
+        signal.raise_signal(first)
+        signal.raise_signal(signal.SIGHUP)
+        assert (stop.signals, stop.exit_code) == (1, 128 + first)
+        stop.settle()
+        with ended_by(lambda: ends.append(stop.wanted)):
+            for number in (first, signal.SIGHUP, signal.SIGHUP):
+                signal.raise_signal(number)
+    assert ends == [True]
+
+
+def test_an_ignored_hangup_remains_ignored() -> None:
+    before = signal.signal(signal.SIGHUP, signal.SIG_IGN)  # as under nohup
+    try:
+        with interruptible(), stop_requested() as stop:
+            signal.raise_signal(signal.SIGHUP)
+            assert not stop.wanted
+        assert signal.getsignal(signal.SIGHUP) is signal.SIG_IGN
+    finally:
+        signal.signal(signal.SIGHUP, before)
 
 
 def test_in_another_thread_no_handler_is_installed_and_no_error_raised() -> None:

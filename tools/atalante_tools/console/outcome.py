@@ -2,7 +2,7 @@
 
     library error -> failure_of -> Failed -> one line on stderr, exit code
 
-0 ok, 1 failed, 2 usage error, 3 no device, 4 fault latched, 130 Ctrl-C, 143 SIGTERM.
+0 ok, 1 failed, 2 usage error, 3 no device, 4 fault latched, 129 SIGHUP, 130 Ctrl-C, 143 SIGTERM.
 """
 
 from __future__ import annotations

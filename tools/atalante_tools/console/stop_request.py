@@ -1,4 +1,6 @@
-"""Stop request of the process: stores that SIGINT (Ctrl-C) or SIGTERM arrived.
+"""Stop request of the process: stores that a stop signal arrived.
+
+The stop signals are SIGINT (Ctrl-C), SIGTERM and SIGHUP (the terminal was closed, or its connection was lost).
 
     signal -> handler -> StopRequest: the handler raises `Stopped`, or a loop reads `wanted`
 
@@ -21,6 +23,8 @@ if TYPE_CHECKING:
 
 #: The exit code after a signal is this number plus the signal number (shell convention).
 SIGNALLED = 128
+#: Stop signals whose repetition ends the process. A shell and the kernel may both send SIGHUP when a terminal closes, so a SIGHUP
+#: after another stop signal has no effect.
 _SIGNALS = (signal.SIGINT, signal.SIGTERM)
 
 
@@ -76,6 +80,12 @@ def check_stop() -> None:
         _request.check()
 
 
+def _stop_signals() -> tuple[signal.Signals, ...]:
+    """Return all stop signals. SIGHUP is left out if the process ignores it, as under `nohup`."""
+    ignored = signal.getsignal(signal.SIGHUP) is signal.SIG_IGN
+    return _SIGNALS if ignored else (*_SIGNALS, signal.SIGHUP)
+
+
 @contextmanager
 def _handled(react: Callable[[StopRequest, int, bool], None]) -> Iterator[StopRequest]:
     """Store every stop signal that arrives inside the `with` block in the `StopRequest` of this process.
@@ -92,11 +102,13 @@ def _handled(react: Callable[[StopRequest, int, bool], None]) -> Iterator[StopRe
 
     def arrive(number: int, _frame: FrameType | None) -> None:
         repeated = request.wanted
+        if number == signal.SIGHUP and repeated:
+            return
         request.ask(number)
         react(request, number, repeated)
 
     try:
-        before = {number: signal.signal(number, arrive) for number in _SIGNALS}
+        before = {number: signal.signal(number, arrive) for number in _stop_signals()}
     except ValueError:  # not the main thread
         yield StopRequest()
         return
@@ -111,7 +123,7 @@ def _handled(react: Callable[[StopRequest, int, bool], None]) -> Iterator[StopRe
 
 @contextmanager
 def interruptible() -> Iterator[StopRequest]:
-    """Raise `Stopped` at each SIGINT and SIGTERM inside the block. Use this block once, around the whole program.
+    """Raise `Stopped` at each stop signal inside the block. Use this block once, around the whole program.
 
     Python prints a warning if it ignores an exception, for example in `__del__`. Inside the block this warning is suppressed for
     `Stopped`, because the request is stored. After a signal it is also suppressed for every exception in `__del__`, because
@@ -142,7 +154,7 @@ def interruptible() -> Iterator[StopRequest]:
 
 @contextmanager
 def stop_requested() -> Iterator[StopRequest]:
-    """Set `wanted` at the first SIGINT or SIGTERM inside the block, and end the process at the second signal.
+    """Set `wanted` at the first stop signal inside the block, and end the process at a second SIGINT or SIGTERM.
 
     The signals raise no exception inside the block, so the block must read `wanted`. If the process ends, the drives hold the
     robot after their watchdog timeout.
@@ -163,7 +175,7 @@ def stop_requested() -> Iterator[StopRequest]:
 
 @contextmanager
 def ended_by(end: Callable[[], None]) -> Iterator[StopRequest]:
-    """Call `end` at each SIGINT and SIGTERM inside the block. The signals raise no exception.
+    """Call `end` at each stop signal inside the block. The signals raise no exception.
 
     Args:
         end: Function that requests the end of the block. It may be called at any time, so it must only set a flag.
@@ -178,7 +190,7 @@ def ended_by(end: Callable[[], None]) -> Iterator[StopRequest]:
 
 @contextmanager
 def deferred() -> Iterator[None]:
-    """Store each SIGINT and SIGTERM inside the block, and raise no exception. Only the next `check_stop` raises `Stopped`.
+    """Store each stop signal inside the block, and raise no exception. Only the next `check_stop` raises `Stopped`.
 
     Use this block around compiled code, which may replace `Stopped` by another exception. This block has no effect if no
     other block of this module is active, for example in a worker process, which ignores Ctrl-C.

@@ -261,10 +261,13 @@ class Keyboard:
         """Return the complete lines that the user typed since the last call."""
         if self._file is None or not select.select([self._file], (), (), 0.0)[0]:
             return []
-        # Linux would suspend a background process that reads from the terminal.
-        if os.isatty(self._file) and os.tcgetpgrp(self._file) != os.getpgrp():
-            return []
-        typed = os.read(self._file, 4096)
+        try:
+            # Linux would suspend a background process that reads from the terminal.
+            if os.isatty(self._file) and os.tcgetpgrp(self._file) != os.getpgrp():
+                return []
+            typed = os.read(self._file, 4096)
+        except OSError:  # the terminal was closed, or its shell has ended
+            typed = b""
         if not typed:
             self._file = None
         *lines, self._partial = (self._partial + typed).split(b"\n")

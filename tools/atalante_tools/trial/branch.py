@@ -92,7 +92,11 @@ def branch() -> Branch | Continuation:
         theirs.close()
         return Branch(ours)
     ours.close()
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # this process ignores Ctrl-C; it ends when the run closes the pipe
+    for number in (
+        signal.SIGINT,
+        signal.SIGHUP,
+    ):  # signals of the terminal; this process ends when the run closes the pipe
+        signal.signal(number, signal.SIG_IGN)
     signal.signal(signal.SIGTERM, signal.SIG_DFL)
     try:
         while True:
