@@ -97,14 +97,15 @@ class Observer:
         self._worst = network.bus_load()
         self.begin(now)
 
-    def begin(self, now: float) -> None:
+    def begin(self, now: float, dropped: int = 0) -> None:
         """Begin the measurement of ages, bus load and counts. Call this as soon as the bus is open.
 
         Args:
             now: Current time [s].
+            dropped: Number of frames that the bus has already dropped. The reports do not count them.
         """
         self._aged_to = now
-        self._begin(now, 0)
+        self._begin(now, dropped)
 
     def _begin(self, now: float, dropped: int) -> None:
         self._since, self._dropped, self._crc_errors = now, dropped, self._image.crc_errors

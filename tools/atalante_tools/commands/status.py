@@ -20,6 +20,9 @@ if TYPE_CHECKING:
     from atalante_tools.commands.observer import NodeReport, Observer, Report
 
 _BLANK: Final = "-"
+#: Listening time before the measurement begins [s]. Frames that were lost while the buses were opened are not counted: SocketCAN
+#: reports them with a later frame.
+WARM_UP: Final = 0.1
 
 
 @click.command()
@@ -51,6 +54,7 @@ def command(target: Target, seconds: float, watch: bool, as_json: bool) -> None:
     from atalante_hal.bus.resilient import ResilientBus
     from atalante_hal.robot import load_robot
     from atalante_tools.commands import observer
+    from atalante_tools.session.listening import received
     from atalante_tools.session.rig import join, open_buses
 
     network, robot = atalante_dbc.load(), load_robot()
@@ -59,7 +63,9 @@ def command(target: Target, seconds: float, watch: bool, as_json: bool) -> None:
         listener = observer.Observer(network, robot, time.monotonic())
         bus = ResilientBus(join(network, open_buses(network, target)), print_message)
         try:
-            listener.begin(time.monotonic())
+            for frames, count in received(bus, WARM_UP, stop):
+                listener.accept(frames, count, time.monotonic())
+            listener.begin(time.monotonic(), bus.dropped)
             while True:
                 report = listen(bus, listener, seconds, stop)
                 if stop.wanted:
