@@ -53,7 +53,7 @@ class BusDown(BusError):  # noqa: N818
     """Error of an open bus that can no longer be used: interface down, adapter unplugged, or bus closed.
 
     Attributes:
-        reopens: Whether the bus opens the lost link again. If False, the program must be restarted.
+        reopens: Whether the bus opens the lost link again. If False, the program must be restarted, and the message states this.
     """
 
     reopens = True

@@ -31,6 +31,8 @@ from atalante_hal.wire.frame import (
 #: Memory layout of one `FRAME`: identifier, length, flags, payload.
 RECORD = struct.Struct("<IBB2x64s")
 ID_NUMBER = 0x1FFF_FFFF
+#: Remedy of a lost link.
+RESTART = "restart this program when the link works again, because python-can does not open it again"
 LINK_LOST = (errno.ENETDOWN, errno.ENODEV, errno.ENXIO, errno.EBADF)
 #: Exceptions that `can.Bus` raises if it cannot open a channel. For example, kvaser without its driver library raises NameError.
 _OPEN_ERRORS = (can.CanError, OSError, ValueError, TypeError, ImportError, NameError, LookupError, AttributeError)
@@ -39,8 +41,8 @@ _OPEN_ERRORS = (can.CanError, OSError, ValueError, TypeError, ImportError, NameE
 class PythonCanBus:
     """Bus on one channel of a python-can interface.
 
-    A lost link is not opened again. Some backends accept frames also on a lost link, so `send` raises `BusDown` after a loss
-    until a frame is received, which proves that the link works.
+    A lost link is not opened again, so the program must be restarted. Some backends accept frames also on a lost link, so
+    `send` raises `BusDown` after a loss until a frame is received, which proves that the link works.
 
     Args:
         interface: Name of the interface in python-can.
@@ -140,14 +142,14 @@ class PythonCanBus:
                 can.BusABC.shutdown(self._bus)
 
     def _down(self, loss: str, sent: int = 0) -> BusDown:
-        """Store that the link is lost, and return the error to raise.
+        """Store that the link is lost, and return the error to raise. Its message ends with the remedy.
 
         Args:
             loss: Error message without the name of the bus.
             sent: Number of frames that python-can accepted.
         """
         self._loss = loss
-        error = BusDown(f"{self.name} {loss}", sent)
+        error = BusDown(f"{self.name} {loss}; {RESTART}", sent)
         error.reopens = False
         return error
 

@@ -112,5 +112,4 @@ class ResilientBus(WrappedBus):
         """Report the error message if it was not reported yet and has not changed for `SETTLE_TIME`."""
         if self.down != self._reported and time.monotonic() - self._changed_at >= SETTLE_TIME:
             self._reported = self.down
-            remedy = "waiting for the link" if self._reopens else "restart this command when the link works again"
-            self._report(f"{self.down}; {remedy}")
+            self._report(f"{self.down}; waiting for the link" if self._reopens else self.down)

@@ -257,7 +257,7 @@ def test_lost_server_raises_bus_down(server: RemoteServer) -> None:
     while not server.clients:
         time.sleep(0.001)
     server.clients[0].close()
-    with pytest.raises(BusDown):
+    with pytest.raises(BusDown, match="restart this program when the link works again"):
         bus.receive(new_frames(1), 5.0)
     bus.close()
 

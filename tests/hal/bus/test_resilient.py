@@ -136,8 +136,11 @@ def test_only_a_received_frame_ends_the_loss_of_a_python_can_link(
         for _ in range(3):
             assert bus.receive(new_frames(4)) == 0
             clock.sleep(SETTLE_TIME)
-    message = f"{link.name} cannot receive: gone"
-    assert notices == [f"{message}; restart this command when the link works again"]
+    message = (
+        f"{link.name} cannot receive: gone; restart this program when the link works again, because python-can does not open it "
+        "again"
+    )
+    assert notices == [message]
     bus.send(frames)
     assert bus.receive(new_frames(4)) == 0
     assert bus.down == message  # a link that accepts frames may still be lost

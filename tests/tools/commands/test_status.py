@@ -11,6 +11,7 @@ import pytest
 from click.testing import CliRunner, Result
 
 from atalante_dbc import Network, wire_time
+from atalante_hal.bus import BusDown
 from atalante_hal.robot import JOINTS, Robot
 from atalante_hal.wire.cia402 import DriveState
 from atalante_hal.wire.frame import FRAME, Frames, new_frames
@@ -311,6 +312,26 @@ def test_table_shows_hal_state_joints_and_bus_load(monkeypatch: pytest.MonkeyPat
     assert "left_SK" in result.stdout
     assert "measured load %  computed worst case %" in result.stdout
     assert result.stderr == ""
+
+
+@pytest.mark.parametrize(("lost_at", "code"), [(300, 0), (100, 1)])
+def test_lost_link_is_in_the_first_line_of_the_table(
+    monkeypatch: pytest.MonkeyPatch, traffic: list[Frames], lost_at: int, code: int
+) -> None:
+    def receive(self: Recorded, frames: Frames, timeout: float = 0.0) -> int:
+        if self._calls < lost_at:
+            return received(self, frames, timeout)
+        self._clock()
+        raise BusDown("test is down: plug the adapter in")
+
+    received = Recorded.receive
+    monkeypatch.setattr(Recorded, "receive", receive)
+    result = invoke(monkeypatch, traffic, "--for", "0.4")
+    assert result.stdout.startswith("the link is lost: test is down: plug the adapter in\n\npcan test: ")
+    assert result.exit_code == code
+    assert result.stderr.endswith("atalante: test is down: plug the adapter in\n") == (code == 1)
+    (line,) = invoke(monkeypatch, traffic, "--for", "0.4", "--json").stdout.splitlines()
+    assert json.loads(line)["link"] == "test is down: plug the adapter in"
 
 
 def test_json_output_is_one_object(monkeypatch: pytest.MonkeyPatch, traffic: list[Frames]) -> None:

@@ -75,6 +75,7 @@ class Report:
     foreign: int  # number of frames with an identifier that is not in the DBC
     crc_errors: int
     dropped: int
+    link: str = ""  # error message of the lost link to the bus; empty if the link works
 
 
 class Observer:

@@ -6,6 +6,7 @@ bus -> Observer -> Report -> tables, or one JSON object
 from __future__ import annotations
 
 import time
+from dataclasses import replace
 from typing import TYPE_CHECKING, Final
 
 import click
@@ -16,7 +17,7 @@ from atalante_tools.console.stop_request import StopRequest, stop_requested
 from atalante_tools.console.terminal import print_message, show_json, table
 
 if TYPE_CHECKING:
-    from atalante_hal.bus import Bus
+    from atalante_hal.bus.resilient import ResilientBus
     from atalante_tools.commands.observer import NodeReport, Observer, Report
 
 _BLANK: Final = "-"
@@ -83,7 +84,7 @@ def command(target: Target, seconds: float, watch: bool, as_json: bool) -> None:
     require_no_fault(report, target)
 
 
-def listen(bus: Bus, listener: Observer, seconds: float, stop: StopRequest) -> Report:
+def listen(bus: ResilientBus, listener: Observer, seconds: float, stop: StopRequest) -> Report:
     """Receive frames for some seconds and return the report.
 
     Args:
@@ -96,7 +97,7 @@ def listen(bus: Bus, listener: Observer, seconds: float, stop: StopRequest) -> R
 
     for frames, count in received(bus, seconds, stop):
         listener.accept(frames, count, time.monotonic())
-    return listener.report(time.monotonic(), bus.dropped)
+    return replace(listener.report(time.monotonic(), bus.dropped), link=bus.down)
 
 
 def require_no_fault(report: Report, target: Target) -> None:
@@ -107,10 +108,12 @@ def require_no_fault(report: Report, target: Target) -> None:
         target: Bus, for the error message.
 
     Raises:
-        Failed: If no frame was received.
+        Failed: If no frame was received. The message names the lost link, if there is one.
         FaultLatched: If the supervisor or a drive is in FAULT.
     """
     if not report.frames:
+        if report.link:
+            raise Failed(report.link)
         raise Failed(
             f"no frame received on {target} for {report.seconds:.1f} s: "
             f"start a robot (atalante emulator {target.arguments}) and a HAL"
@@ -154,7 +157,8 @@ def render(report: Report, target: Target) -> str:
     counts = f"{report.frames} frames in {report.seconds:.1f} s, {report.crc_errors} CRC errors, {report.dropped} lost"
     if report.foreign:
         counts += f", {report.foreign} with an identifier that is not in the DBC"
-    return "\n\n".join([_headline(report, target), table(nodes), table(joints), table(loads), counts])
+    lost = [f"the link is lost: {report.link}"] if report.link else []
+    return "\n\n".join([*lost, _headline(report, target), table(nodes), table(joints), table(loads), counts])
 
 
 def _headline(report: Report, target: Target) -> str:
