@@ -351,7 +351,8 @@ def require_channel(channel: str) -> None:
         BusAbsent: If the interface is missing, is down or has no CAN FD; the message contains the command that helps.
     """
     doctor = "run `atalante doctor`"
-    create = f"ip link add {channel} type vcan && ip link set {channel} mtu 72 txqueuelen 1000 up"
+    create = f"type `ip link add {channel} type vcan && ip link set {channel} mtu 72 txqueuelen 1000 up`"
+    remedy = create if channel.startswith("vcan") else "plug the adapter in and load its driver"
     try:
         raw = socket.socket(socket.AF_CAN, socket.SOCK_RAW, socket.CAN_RAW)
     except OSError as error:
@@ -361,7 +362,7 @@ def require_channel(channel: str) -> None:
         ) from error
     with raw:
         if not is_present(channel):
-            raise BusAbsent(f"there is no interface {channel}: plug the adapter in, or type `{create}`; {doctor}")
+            raise BusAbsent(f"there is no interface {channel}: {remedy}; {doctor}")
         (flags,) = struct.unpack_from("<H", _ioctl(raw, SIOCGIFFLAGS, channel))
         (mtu,) = struct.unpack_from("<i", _ioctl(raw, SIOCGIFMTU, channel))
         try:

@@ -7,11 +7,12 @@ import errno
 import os
 import socket
 from collections.abc import Callable
+from contextlib import nullcontext
 from types import SimpleNamespace
 
 import pytest
 
-from atalante_hal.bus import BusDown, BusError, socketcan
+from atalante_hal.bus import BusAbsent, BusDown, BusError, socketcan
 from atalante_hal.bus.resilient import ResilientBus
 from atalante_hal.bus.socketcan import SocketCanBus
 from atalante_hal.wire.frame import new_frames
@@ -130,3 +131,16 @@ def test_removal_right_after_a_link_down_is_detected_by_receive(
     assert bus.receive(new_frames(1)) == 0
     assert kernel.bound == CHANNEL
     bus.close()
+
+
+@pytest.mark.parametrize(
+    ("channel", "remedy"),
+    [("can0", "plug the adapter in and load its driver;"), ("vcan0", "type `ip link add vcan0 type vcan && ")],
+)
+def test_only_a_virtual_interface_that_is_missing_is_to_be_created(
+    monkeypatch: pytest.MonkeyPatch, channel: str, remedy: str
+) -> None:
+    monkeypatch.setattr(socket, "socket", lambda *_: nullcontext())
+    monkeypatch.setattr(socketcan, "is_present", lambda channel: False)
+    with pytest.raises(BusAbsent, match=f"there is no interface {channel}: {remedy}"):
+        socketcan.require_channel(channel)

@@ -70,6 +70,12 @@ def test_all_checks_pass_on_a_complete_machine(interface: str, channels: tuple[s
     assert missing(AnyMachine(), interface, *channels) == {}
 
 
+def test_an_absent_adapter_is_not_replaced_by_a_virtual_interface() -> None:
+    check = missing(AnyMachine(), "socketcan", "can0")["can0"]
+    assert check.text.startswith("this interface does not exist: plug the adapter in and load its driver")
+    assert check.fix == "ip -br link show type can"
+
+
 def test_a_kernel_without_can_fails_only_for_socketcan() -> None:
     bare = AnyMachine(refusal="Address family not supported by protocol", present=[])
     assert needed(bare, "embedded") == []

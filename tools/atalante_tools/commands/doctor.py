@@ -27,6 +27,8 @@ if TYPE_CHECKING:
 
 #: Recommended length of a transmit queue [frames]. An interface that carries all four buses sends at least 26 frames per cycle.
 QUEUE: Final = 1000
+#: Begin of the names of virtual CAN interfaces. `ip link add` creates such an interface. For other names, an adapter is expected.
+VIRTUAL: Final = "vcan"
 #: MTU of a CAN FD interface [bytes].
 FD_MTU: Final = 72
 #: SCHED_FIFO priority that the 1 kHz loop requests.
@@ -193,7 +195,7 @@ def _socketcan(machine: Machine, needed: bool, channels: Sequence[str]) -> Itera
     text = "the kernel has SocketCAN" if supported else f"no SocketCAN ({error})"
     yield CheckResult("AF_CAN", supported, needed, text, boot)
     loaded = supported and machine.vcan()
-    wants_virtual = any(channel.startswith("vcan") for channel in channels)
+    wants_virtual = any(channel.startswith(VIRTUAL) for channel in channels)
     text = "virtual CAN interfaces can be created" if loaded else "the vcan module is not loaded"
     yield CheckResult("vcan", loaded, needed and wants_virtual, text, "modprobe vcan")
     present = {interface.name: interface for interface in machine.interfaces()} if supported else {}
@@ -208,7 +210,11 @@ def _socketcan(machine: Machine, needed: bool, channels: Sequence[str]) -> Itera
 
 def _interface(name: str, interface: Interface | None, needed: bool) -> CheckResult:
     if interface is None:
-        return CheckResult(name, False, needed, "this interface does not exist", _create(name))
+        text = "this interface does not exist"
+        if name.startswith(VIRTUAL):
+            return CheckResult(name, False, needed, text, _create(name))
+        text += ": plug the adapter in and load its driver; the command below lists the present CAN interfaces"
+        return CheckResult(name, False, needed, text, "ip -br link show type can")
     size = f"mtu {FD_MTU}" if interface.virtual else "type can bitrate 1000000 dbitrate 5000000 fd on"
     if interface.mtu < FD_MTU:
         text, fix = f"classic CAN only (mtu {interface.mtu})", f"ip link set {name} down; ip link set {name} up {size}"
