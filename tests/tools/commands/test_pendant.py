@@ -14,7 +14,7 @@ from atalante_dbc import Network
 from atalante_emulator.bodies.pybullet_body import PyBulletBody
 from atalante_emulator.emulator import Emulator
 from atalante_emulator.pendant import Operator
-from atalante_hal.bus import BusDown
+from atalante_hal.bus import BusDown, BusFull
 from atalante_hal.hal import Hal
 from atalante_hal.robot import Robot
 from atalante_hal.safety.direction import pose_gains
@@ -59,11 +59,13 @@ class WireEnd:
     def __init__(self, wire: Wire, empty: Callable[[], object]) -> None:
         self.wire, self.empty = wire, empty
         self.queue = bytearray()
-        self.closed = False
+        self.closed = self.full = False
 
     def send(self, frames: Frames) -> None:
         if self.closed:
             raise BusDown("the wire is closed")
+        if self.full:
+            raise BusFull("the transmit queue is full")
         data = frames.tobytes()
         for end in self.wire.ends:
             if end is not self and not end.closed:
@@ -823,6 +825,32 @@ def test_a_lost_link_releases_the_dead_man_until_start_is_typed(
         "the dead-man switch is released; type start to press it again, with START",
         "the HAL is HOLD",
         "the dead-man switch is released; type start to press it again, with START",
+        "START pressed",
+        "the HAL is ACTIVE",
+        "STOP: the HAL is HOLD",
+    ]
+
+
+def test_start_typed_after_answers_without_room_is_pressed_once_and_accepted(
+    world: World, capsys: pytest.CaptureFixture[str]
+) -> None:
+    end = world.wire.end(world.cycle)
+    node = PendantNode(world.network, end)
+
+    class TypesWhenFull(Keyboard):
+        """Fills the transmit queue for 50 answers after 300 answers, and types start after 49 of them."""
+
+        def lines(self) -> list[str]:
+            end.full = 300 <= node.answered < 350
+            return ["start"] if node.answered == 349 else []
+
+    operator = Session(node, TARGET, StopRequest(), TypesWhenFull(None), now=lambda: world.now)
+    operator.take_over()
+    operator.start_wanted = True
+    operator.run(0.7)
+    assert capsys.readouterr().err.splitlines()[4:] == [
+        "the HAL is ACTIVE",
+        "the HAL is HOLD",
         "START pressed",
         "the HAL is ACTIVE",
         "STOP: the HAL is HOLD",

@@ -11,7 +11,6 @@ robot.
 
 from __future__ import annotations
 
-from contextlib import suppress
 from enum import IntEnum
 from typing import Final
 
@@ -44,10 +43,10 @@ class PendantNode:
         hal: State of the HAL in the last SYNC. None if no SYNC was received.
         cycles: Number of received SYNCs.
         answered_in_row: Number of SYNCs that this node answered since the last gap. A gap is a rejected SYNC, see
-            `PendantReader.gaps`, or a `poll` with several waiting SYNCs, of which only the last gets an answer. Silence in a
-            takeover is no gap. After a gap, the HAL may ignore requests of the pendant until enough consecutive answers were
-            received.
-        answered: Number of answered SYNCs.
+            `PendantReader.gaps`, an answer for which the transmit queue had no room, or a `poll` with several waiting SYNCs, of
+            which only the last gets an answer. Silence in a takeover is no gap. After a gap, the HAL may ignore requests of the
+            pendant until enough consecutive answers were received.
+        answered: Number of answered SYNCs. Answers for which the transmit queue had no room are included.
         found_another: Whether another pendant sent before `start_sending()`.
     """
 
@@ -167,13 +166,17 @@ class PendantNode:
             self._tx.values[self._at["Request"]] = Request.NONE
 
     def _answer(self) -> None:
-        self._send(self._tx.seal(self._reader.tag))
+        sent = self._send(self._tx.seal(self._reader.tag))
         if self.answered % self._status_cycles == 0:
             self._status.values[self._uptime_at] = self.answered * PERIOD
             self._send(self._status.seal())
         self.answered += 1
-        self.answered_in_row += 1
+        self.answered_in_row = self.answered_in_row + 1 if sent else 0
 
-    def _send(self, frames: Frames) -> None:
-        with suppress(BusFull):  # the HAL detects missing frames by a timeout
+    def _send(self, frames: Frames) -> bool:
+        """Send one frame, and return whether the transmit queue had room for it. The HAL detects a missing frame by a timeout."""
+        try:
             self._bus.send(frames)
+        except BusFull:
+            return False
+        return True
