@@ -41,6 +41,9 @@ BRIDGED_ERRORS = 4
 #: Longest total wait for the nodes' answers while `Hal.stop` puts the robot into HOLD [s].
 STOP_PATIENCE = 1.0
 
+#: Quantities of a drive that are used although another value of its frame is out of its range, for example an invalid position.
+_INDEPENDENT = ("DriveState", "Temperature", "Torque")
+
 _S = SupervisorState
 
 
@@ -118,7 +121,7 @@ class Hal:
         self.record, self.layout, self.controller_record = parts.values, parts.layout, parts.controller
         self._header = parts.header
         self._header[3] = assistance_factor
-        self._image = ReceiveImage(fast, parts.signals)
+        self._image = ReceiveImage(fast, parts.signals, independent=_INDEPENDENT)
         self._slow_ids = [m.frame_id for m in received if m.cycle_ms != 1]
         self._plausibility = Plausibility(self.robot, self._image, PERIOD)
         self.state = parts.state(assistance_factor, len(fast))

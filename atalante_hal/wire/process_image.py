@@ -2,12 +2,15 @@
 
 `ReceiveImage` processes the frames of a cycle in order of arrival. It commits a message only if identifier, length,
 CRC, alive counter and signal ranges are correct. Otherwise the message keeps its previous values, their age grows, and
-the check result of the message gives the reason. `TransmitImage` encodes values into protected frames to be sent.
+the check result of the message gives the reason. If only a signal range is wrong, the independent signals of the frame are
+committed, for example the state of a drive that marks its position as invalid.
+
+`TransmitImage` encodes values into protected frames to be sent.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -17,13 +20,16 @@ from atalante_dbc import Message
 from atalante_hal.compiled import specialised
 from atalante_hal.types import Vector
 from atalante_hal.wire.codec import (
+    HIGH,
     INSIDE,
+    LOW,
     MARKED_INVALID,
     NO_CODE,
     Codec,
     SignalTable,
     Words,
     encode,
+    group_of,
     read_codes,
     read_row,
     scale,
@@ -65,6 +71,8 @@ _NO_DATA = int(Check.NO_DATA)
 _CRC, _LENGTH, _RANGE, _INVALID = int(Check.CRC), int(Check.LENGTH), int(Check.RANGE), int(Check.INVALID)
 #: Check results of frames that contain no new values: damaged frames and repeats of the accepted frame.
 _NO_NEW_VALUES = frozenset({Check.CRC, Check.LENGTH, Check.REPEATED})
+#: Check results of frames that were rejected only because a signal is out of its range.
+_OUT_OF_RANGE = frozenset({Check.RANGE, Check.INVALID})
 #: Row number of a frame whose message is not in this process image.
 _FOREIGN = -1
 #: Age of a message that has never been received [cycles].
@@ -115,9 +123,18 @@ class ReceiveImage:
         restarts: True if a sender may restart at any counter (status, emergencies). In this case the counter leads to a
             rejection only if a frame repeats the last frame. A frame that has the counter of the last frame but
             other bytes is committed, and also listed in `refused` as CONFLICT.
+        independent: quantities (see `codec.group_of`) whose signals are committed even if another signal of the frame is out of
+            its range. The age and the check result of the message do not change.
     """
 
-    def __init__(self, messages: Sequence[Message], values: Vector | None = None, *, restarts: bool = False) -> None:
+    def __init__(
+        self,
+        messages: Sequence[Message],
+        values: Vector | None = None,
+        *,
+        restarts: bool = False,
+        independent: Collection[str] = (),
+    ) -> None:
         self.codec = Codec(messages)
         count = len(self.codec.messages)
         self.values = np.full(self.codec.size, np.nan) if values is None else values
@@ -132,6 +149,9 @@ class ReceiveImage:
         #: Row of each frame of this cycle in which the sender set the flag ESI (error passive). Damaged frames are included.
         self.error_passive: list[int] = []
         self._restarts = restarts
+        is_independent = np.array([group_of(signal.name) in independent for _, signal in self.codec.signals])
+        #: Indices of the independent signals of each row in `values`.
+        self._independent = [np.flatnonzero(is_independent & (self.codec.row_of == row)) for row in range(count)]
         #: For each row, the last frame with correct format and CRC whose counter was accepted, see `classify_frame`.
         self.frames = self.codec.template()
         self._e2e = E2EState(
@@ -303,6 +323,7 @@ class ReceiveImage:
         )
         self._offered = frames, found
         foreign = []
+        outside: dict[int, int] = {}  # row -> index of its last frame that was rejected only because of a range
         for index, (row, check, passive) in enumerate(found.tolist()):
             if row == _FOREIGN:
                 foreign.append(index)
@@ -312,7 +333,25 @@ class ReceiveImage:
             if check > _FRESH:
                 self.refused.append((row, Check(check)))
                 self.crc_errors += check == _CRC
+                if check in _OUT_OF_RANGE:
+                    outside[row] = index
+        for row, index in outside.items():
+            if self.check[row] > _FRESH:  # otherwise an accepted frame of this cycle has better values
+                self._commit_independent(frames, index, row)
         return foreign
+
+    def _commit_independent(self, frames: Frames, index: int, row: int) -> None:
+        """Commit the independent signals of a frame that are inside their ranges.
+
+        Args:
+            frames: receive buffer.
+            index: index of the frame in the receive buffer.
+            row: row of its message.
+        """
+        values, codes = self._decoded(frames, index, row)
+        own, plan = self._independent[row], self.codec.table.plan
+        inside = own[(plan[LOW, own] <= codes[own]) & (codes[own] <= plan[HIGH, own])]
+        self.values[inside] = values[inside]
 
     def decode_further_frames(self, row: int) -> list[Vector]:
         """Decode the intact frames of one message that arrived in this cycle but are not stored in `values`.
@@ -332,18 +371,22 @@ class ReceiveImage:
         mine = [(index, check) for index, (of, check, _) in enumerate(found.tolist()) if of == row]
         committed = max((index for index, check in mine if check <= _FRESH), default=None)
         return [
-            self._decoded(frames, index, row)
+            self._decoded(frames, index, row)[0]
             for index, check in mine
             if index != committed and check not in _NO_NEW_VALUES
         ]
 
-    def _decoded(self, frames: Frames, index: int, row: int) -> Vector:
-        """Return a copy of `values` in which the signals of one row come from frame `index` of the receive buffer."""
+    def _decoded(self, frames: Frames, index: int, row: int) -> tuple[Vector, Words]:
+        """Decode one row from frame `index` of the receive buffer.
+
+        Returns:
+            A copy of `values` with the signals of the row, and the raw codes of these signals. Shape (codec.size,) each.
+        """
         table = self.codec.table._replace(codes=np.zeros_like(self.codec.table.codes))
         values = self.values.copy()
         read_row(frames.view(np.int64), (index - row) * WORDS, row, table)
         scale_row(row, table, values)
-        return values
+        return values, table.codes
 
 
 class _Received:

@@ -40,14 +40,17 @@ def over_current(rig) -> None:
     rig.emulator.drives.fail(HIP, emergency.CURRENT, persists=True)
 
 
-def rejected(rig, jumps: Callable[[int], bool], before: int) -> None:
-    """Let the encoder of the hip jump in the given cycles. The next cycle but `before` is cycle 0."""
+def rejected(rig, jumps: Callable[[int], bool], before: int, *, marked: bool = False) -> None:
+    """Let the encoder of the hip jump in the given cycles. Cycle 0 follows after `before` cycles.
+
+    If `marked` is True, the drive marks its position as invalid instead.
+    """
     at = rig.emulator.signals.index(f"{NODE}_STATE", "Position")
     first = rig.hal.state.cycle + 1 + before
 
     def jump(cycle: int, values: np.ndarray) -> None:
         if jumps(cycle - first):
-            values[at] += 30.0
+            values[at] = np.nan if marked else values[at] + 30.0
 
     rig.emulator.before_send.append(jump)
     rig.run(before)
@@ -65,6 +68,7 @@ def reaction(rig, code: str) -> tuple[int, float]:
     return rig.hal.state.cycle - first, rig.last_commands()["right"]["FH_MaxTorque"]
 
 
+@pytest.mark.parametrize("marked", [False, True], ids=["jump", "invalid code"])
 @pytest.mark.parametrize("rejection", REJECTIONS)
 @pytest.mark.parametrize(
     ("cause", "code", "state"),
@@ -76,12 +80,14 @@ def reaction(rig, code: str) -> tuple[int, float]:
     ],
     ids=["fault", "hot", "too hot", "over-current"],
 )
-def test_f87_fault_of_a_drive_has_its_reaction_despite_rejected_encoder_values(make_rig, rejection, cause, code, state):
+def test_f87_fault_of_a_drive_has_its_reaction_despite_rejected_encoder_values(
+    make_rig, rejection, marked, cause, code, state
+):
     found = []
     for jumps, before in (REJECTIONS[rejection], (lambda cycle: False, REJECTIONS[rejection][1])):
         rig = make_rig()
         rig.until(S.ACTIVE)
-        rejected(rig, jumps, before)
+        rejected(rig, jumps, before, marked=marked)
         cause(rig)
         found.append(reaction(rig, code))
         if state is not None:

@@ -730,6 +730,61 @@ def test_frame_after_a_loss_can_be_accepted_and_refused():
     assert rx.values[signal] == pytest.approx(2.0, abs=0.01)
 
 
+def test_independent_signals_are_committed_although_another_signal_is_invalid():
+    tx, _, buffer = pair()
+    rx = ReceiveImage(CYCLIC, independent=("DriveState", "Temperature"))
+    row = rx.codec.rows["LEFT_SK_STATE"]
+    state, temperature, torque, position, other = (
+        rx.codec.index(message, signal)
+        for message, signal in (
+            ("LEFT_SK_STATE", "DriveState"),
+            ("LEFT_SK_STATE", "Temperature"),
+            ("LEFT_SK_STATE", "Torque"),
+            ("LEFT_SK_STATE", "Position"),
+            ("LEFT_FH_STATE", "Temperature"),
+        )
+    )
+    tx.values[[state, temperature, torque, other]] = 39.0, 25.0, 10.0, 30.0
+    deliver(tx, rx, buffer)
+    tx.values[[state, temperature, torque, position, other]] = 64.0, 214.0, 20.0, np.nan, 31.0
+    deliver(tx, rx, buffer)
+    assert (rx.check[row], rx.age[row]) == (Check.INVALID, 1)
+    assert rx.values[[state, temperature, torque, position, other]].tolist() == [64.0, 214.0, 10.0, 0.0, 31.0]
+    tx.values[[state, temperature]] = 0.0, np.nan
+    deliver(tx, rx, buffer)
+    assert rx.values[[state, temperature]].tolist() == [0.0, 214.0]
+    tx.values[[temperature]] = -40.0
+    deliver(tx, rx, buffer)
+    assert rx.values[temperature] == -40.0
+
+
+@pytest.mark.parametrize("first", ["invalid", "valid"])
+def test_accepted_frame_has_priority_over_an_invalid_frame_of_the_same_cycle(first: str):
+    tx, _, buffer = pair()
+    rx = ReceiveImage(CYCLIC, independent=("DriveState",))
+    row = rx.codec.rows["LEFT_SK_STATE"]
+    state, position = (rx.codec.index("LEFT_SK_STATE", signal) for signal in ("DriveState", "Position"))
+    deliver(tx, rx, buffer)
+    for index, kind in enumerate((first, "valid" if first == "invalid" else "invalid")):
+        tx.values[[state, position]] = (39.0, 1.0) if kind == "valid" else (8.0, np.nan)
+        buffer[index] = tx.seal()[row]
+    rx.accept(buffer, 2)
+    assert rx.values[state] == 39.0
+
+
+def test_newest_of_two_invalid_frames_gives_the_independent_signals():
+    tx, _, buffer = pair()
+    rx = ReceiveImage(CYCLIC, independent=("DriveState",))
+    row = rx.codec.rows["LEFT_SK_STATE"]
+    state, position = (rx.codec.index("LEFT_SK_STATE", signal) for signal in ("DriveState", "Position"))
+    deliver(tx, rx, buffer)
+    for index, value in enumerate((39.0, 8.0)):
+        tx.values[[state, position]] = value, np.nan
+        buffer[index] = tx.seal()[row]
+    rx.accept(buffer, 2)
+    assert rx.values[state] == 8.0
+
+
 def test_given_array_is_used_for_the_values():
     values = np.zeros(ReceiveImage(CYCLIC).codec.size)
     rx = ReceiveImage(CYCLIC, values)
