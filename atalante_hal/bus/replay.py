@@ -7,6 +7,7 @@ The frames are returned in the order and with the time stamps of the log. If `cy
 from __future__ import annotations
 
 import errno
+import gzip
 import os
 import sqlite3
 import struct
@@ -20,6 +21,7 @@ import numpy as np
 from can.io.blf import BLFParseError
 
 from atalante_hal.bus import BusDown, BusError, Stamps
+from atalante_hal.bus.asc import asc_lines
 from atalante_hal.bus.batch import Batches
 from atalante_hal.bus.python_can import pack
 from atalante_hal.wire.frame import FRAME_BYTES, Frames
@@ -184,7 +186,7 @@ def _open(path: Path) -> can.io.generic.MessageReader:
             raise LogUnreadable(f"{path} is truncated within its last line: remove that line, or copy the log again")
         if plain and kind == ".blf" and (size < BLF_HEADER_BYTES or _bytes(path, 4, os.SEEK_SET) != b"LOGG"):
             raise LogUnreadable(f"{path} is empty or not a .blf log: it has no BLF header")
-        reader = can.LogReader(path)
+        reader = can.ASCReader(_asc_text(path)) if kind == ".asc" else can.LogReader(path)
     except UNREADABLE as error:
         reason = os.strerror(errno.ENOENT) if isinstance(error, FileNotFoundError) else error
         raise LogUnreadable(f"{path} cannot be opened as a CAN log: {reason}") from error
@@ -192,6 +194,16 @@ def _open(path: Path) -> can.io.generic.MessageReader:
         reader.stop()
         raise LogUnreadable(f"{path} {defect}")
     return reader
+
+
+def _asc_text(path: Path) -> Any:
+    """Yield the lines of an .asc log, see `asc_lines`. The file is open until the last line, or until `close` of the generator.
+
+    Args:
+        path: Log file, also compressed as .gz.
+    """
+    with (gzip.open if path.suffix.lower() == ".gz" else open)(path, "rt", encoding="utf-8") as file:
+        yield from asc_lines(file)
 
 
 def _size_defect(path: Path, stated: int, size: int | None) -> str:

@@ -550,6 +550,28 @@ def test_invalid_log_is_rejected_with_one_sentence(tmp_path: Path) -> None:
         assert "\n" not in str(refusal.value), name
 
 
+@pytest.mark.parametrize("suffix", [".asc", ".asc.gz"])
+def test_asc_log_is_replayed_with_every_sent_frame_once_and_its_format(suffix: str, tmp_path: Path) -> None:
+    text = "".join(
+        (
+            "date Sat Nov 28 10:00:00.000 am 2026\n",
+            "base hex  timestamps absolute\n",
+            " 0.010000 1  101             Rx   d 2 00 01\n",
+            " 0.020000 1  102             TxRq d 2 00 02\n",
+            " 0.020000 1  102             Tx   d 2 00 02\n",
+            " 0.030000 CANFD   1 Rx  103   0 0 2  2 00 03  240000  130        0 0 0 0 0 0\n",
+            " 0.040000 CANFD   1 Rx  104   1 0 8  8 00 04 00 00 00 00 00 00  0 0 3000 0 0 0 0 0\n",
+        )
+    )
+    path = tmp_path / f"run{suffix}"
+    path.write_bytes(gzip.compress(text.encode()) if suffix == ".asc.gz" else text.encode())
+    bus, frames = ReplayBus(path), new_frames(8)
+    assert bus.receive(frames) == 4
+    assert frames["can_id"][:4].tolist() == [0x101, 0x102, 0x103, 0x104]
+    assert frames["flags"][:4].tolist() == [0, 0, 0, FLAG_FDF | FLAG_BRS]
+    bus.close()
+
+
 @pytest.mark.parametrize("suffix", [".blf", ".blf.gz"])
 def test_blf_log_that_was_not_closed_is_rejected(suffix: str, tmp_path: Path) -> None:
     """The recorder is killed: only full containers are in the file, and the header still states no data."""

@@ -14,13 +14,14 @@ import logging
 import os
 import struct
 import sys
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from atalante_hal.bus.asc import asc_lines
 from atalante_hal.wire.frame import (
     FLAG_BRS,
     FLAG_ESI,
@@ -39,8 +40,6 @@ _LINE_FORMATS = (".asc", ".trc", ".csv")
 _BLF_HEADER = struct.Struct("<4sLBBBBBBBBQQ")
 #: First bytes of an MDF file.
 _MDF = b"MDF     "
-#: Flags of a frame on a CAN FD channel in an .asc log: CAN FD format and remote frame.
-_ASC_FDF, _ASC_REMOTE = 0x1000, 0x10
 _RECORD = struct.Struct("<IBB2x64s")
 
 
@@ -101,7 +100,7 @@ def _messages(log: LogFile) -> Iterator[tuple[Iterator[Any], Callable[[], int]]]
         if not issubclass(reader_type, BinaryIOMessageReader):
             file = stack.enter_context(io.TextIOWrapper(file, encoding="utf-8", errors="replace"))
         if log.suffix == ".asc":
-            file = _asc_lines(file)
+            file = asc_lines(file)
         reader = stack.enter_context(reader_type(file))
         yield _with_absolute_times(reader) if log.suffix == ".asc" else iter(reader), raw.tell
 
@@ -135,46 +134,6 @@ def _without_last(messages: Iterator[Any]) -> Iterator[Any]:
         if held is not None:
             yield held
         raise
-
-
-def _asc_lines(file: Iterable[str]) -> Iterator[str]:
-    """Yield the lines of an .asc log such that the reader of python-can reads every frame once and with its format.
-
-    - This reader takes the first line after the header for a part of the header. If that is a frame, it would be lost, so a
-      header line is inserted.
-    - A line with the direction TxRq is a request to send. It is omitted, because the sent frame has its own line.
-    - A classic frame of a CAN FD channel is written as the line of a classic channel.
-
-    Args:
-        file: lines of the log.
-    """
-    in_header = True
-    for line in file:
-        words = line.split()
-        if in_header and words and words[0][0].isdigit():
-            in_header = False
-            yield "internal events logged\n"
-        if len(words) < 4 or words[3].lower() != "txrq":
-            yield _classic_line(words) or line
-
-
-def _classic_line(words: Sequence[str]) -> str:
-    """Return the line of a classic frame of a CAN FD channel in the form of a classic channel; empty for any other line.
-
-    The words are: time, "CANFD", channel, direction, identifier, name (optional), BRS, ESI, DLC, length, data, duration, length
-    in bits, flags (hexadecimal), and further numbers.
-    """
-    if len(words) < 5 or words[1].upper() != "CANFD":
-        return ""
-    time, _, channel, direction, identifier = words[:5]
-    try:
-        switch, error_passive, dlc, length, *rest = words[5 if words[5].isdigit() else 6 :]
-        data, flags = rest[: int(length)], int(rest[int(length) + 2], 16)
-    except (ValueError, IndexError):
-        return ""  # not a data frame, or a line without flags
-    if flags & _ASC_FDF or switch != "0" or error_passive != "0" or len(data) > 8:
-        return ""
-    return f"{time} {channel} {identifier} {direction} {'r' if flags & _ASC_REMOTE else 'd'} {dlc} {' '.join(data)}\n"
 
 
 def _remark(log: LogFile, count: int, broken: str, ends_within: bool, warnings: _Warnings) -> None:
