@@ -25,6 +25,7 @@ from __future__ import annotations
 
 import itertools
 import math
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -318,7 +319,7 @@ def upward(quaternion: Vector) -> tuple[float, float, float]:
     return 2.0 * (x * z - w * y), 2.0 * (y * z + w * x), 1.0 - 2.0 * (x * x + y * y)
 
 
-def to_world(quaternion: Vector, vector: Vector | tuple[float, float, float]) -> tuple[float, float, float]:
+def to_world(quaternion: Vector | Sequence[float], vector: Vector | Sequence[float]) -> tuple[float, float, float]:
     """Return a vector of the sensor frame in world axes.
 
     Args:
@@ -329,6 +330,20 @@ def to_world(quaternion: Vector, vector: Vector | tuple[float, float, float]) ->
     x, y, z = vector[0], vector[1], vector[2]
     p, q, r = 2.0 * (j * z - k * y), 2.0 * (k * x - i * z), 2.0 * (i * y - j * x)
     return x + w * p + j * r - k * q, y + w * q + k * p - i * r, z + w * r + i * q - j * p
+
+
+def turned_about_vertical(
+    quaternion: Vector | Sequence[float], half: Vector | Sequence[float]
+) -> tuple[float, float, float, float]:
+    """Return an attitude that is turned about the vertical axis of the world, as quaternion wxyz.
+
+    Args:
+        quaternion: attitude wxyz, sensor to world, shape (4,).
+        half: cosine and sine of half the angle of the turn, shape (2,).
+    """
+    w, x, y, z = quaternion[0], quaternion[1], quaternion[2], quaternion[3]
+    c, s = half[0], half[1]
+    return c * w - s * z, c * x - s * y, c * y + s * x, c * z + s * w
 
 
 def turn_rate(first: Vector, last: Vector, time: float) -> tuple[float, float, float]:

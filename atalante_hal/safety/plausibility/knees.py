@@ -9,8 +9,9 @@ position, because gravity cancels:
     difference of the accelerometers = second derivative of (r - lever * e), with lever = derivative of r with respect to SK
 
 Integration and a high-pass of third order give the measured position (from the accelerometers) and the computed position in
-metres, without the constant errors of accelerometers and attitudes. A regression over about a second explains the difference of
-the two positions by two unknowns: the error of the knee angle, and the deviation of the segment lengths from their mean value
+metres, without the constant errors of accelerometers and attitudes. The heading of the tibia IMU drifts relative to the pelvis
+IMU, so its attitude is corrected by the estimate of the module `legs`. A regression over about a second explains the difference
+of the two positions by two unknowns: the error of the knee angle, and the deviation of the segment lengths from their mean value
 `SEGMENT`, because both segments are adjusted to the patient.
 
 The check needs a thigh that turns, so it cannot decide while the robot stands. It decides in each walk, also in the air. If the
@@ -29,7 +30,7 @@ from atalante_hal.compiled import specialised
 from atalante_hal.robot import IMUS, JOINTS, LEG_JOINTS, SIDES, Robot
 from atalante_hal.safety.diagnostics import Dtc, Finding
 from atalante_hal.safety.plausibility.finding import JOINT_NODES, Signals
-from atalante_hal.safety.plausibility.inertial import to_world
+from atalante_hal.safety.plausibility.inertial import to_world, turned_about_vertical
 from atalante_hal.safety.plausibility.support import SEGMENT
 from atalante_hal.types import Vector
 from atalante_hal.vectors import Vector3
@@ -75,6 +76,7 @@ class Readings(NamedTuple):
     to_joint: Vector  # (12,) factor from motor side to joint side
     quaternion: Vector  # (4, 4) wxyz, sensor to world
     accel: Vector  # (4, 3) m/s2
+    heading: Vector  # (2, 2) correction of the heading of both tibiae, see `Legs.heading`
 
 
 class Filters(NamedTuple):
@@ -99,16 +101,18 @@ class Knees:
     Args:
         robot: sensor thresholds of the robot.
         now: signals decoded in this cycle.
+        heading: correction of the heading of both tibiae, shape (2, 2), see `Legs.heading`.
         period: cycle time [s].
     """
 
-    def __init__(self, robot: Robot, now: Signals, period: float) -> None:
+    def __init__(self, robot: Robot, now: Signals, heading: Vector, period: float) -> None:
         legs = len(SIDES)
         self._filters = Filters(np.zeros((legs, 3 * _FILTERS)), np.zeros(1), np.zeros((legs, 6)))
         self._error = np.zeros(legs)
         #: Arguments of the function `follow`. The array objects are the same in every call.
         self._arguments = (
-            Readings(now.position, robot.polarity / robot.gear, now.quaternion, now.accel), self._filters, self._error,
+            Readings(now.position, robot.polarity / robot.gear, now.quaternion, now.accel, heading),
+            self._filters, self._error,
             2.0 * robot.sensors.attitude_error, period,
         )  # fmt: skip
         self._follow = specialised(follow, *self._arguments)
@@ -241,7 +245,7 @@ def motion(leg: int, now: Readings) -> tuple[Vector3, Vector3, Vector3, Vector3]
     sine, cosine = math.sin(sk), math.cos(sk)
     x, z = sine, -1.0 - cosine
     hip_to_imu = SEGMENT * x + TIBIA_IMU[0], side * TIBIA_IMU[1], SEGMENT * z + TIBIA_IMU[2]
-    pelvis, shank = now.quaternion[_PELVIS], now.quaternion[tibia]
+    pelvis, shank = now.quaternion[_PELVIS], turned_about_vertical(now.quaternion[tibia], now.heading[leg])
     hx, hy, hz = to_world(pelvis, hip)
     tx, ty, tz = to_world(shank, hip_to_imu)
     px, py, pz = to_world(pelvis, now.accel[_PELVIS])

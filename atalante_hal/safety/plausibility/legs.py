@@ -10,9 +10,10 @@ Some drifts cannot be detected, and some drifting encoders cannot be distinguish
 SA or HA is detected only on the ground, by the module `soles`. Opposite drifts of SH and SK cancel, and are detected
 only while the leg moves, by the module `knees`. A drift of SH cannot be distinguished from a drift of SK. A drift of an
 IMU has the same effect as a drift of an encoder. The heading of an IMU without a fault also drifts without a limit. This
-heading drift affects only TH. The check of TH therefore subtracts an estimate of the heading drift. The estimate changes
-by at most `_HEADING_DRIFT` per sample. If the encoder of TH drifts more slowly than this limit, the estimate follows this drift.
-So such a drift of the encoder of TH is not detected.
+turns the attitude of the tibia relative to the pelvis about the vertical, so it affects all angles if the pelvis is tilted or
+FH is not 0. All checks therefore turn the attitude of the tibia back by an estimate of the heading drift. The estimate follows
+the error of TH by at most `_HEADING_DRIFT` per sample. If the encoder of TH drifts more slowly than this limit, the estimate
+follows this drift. So such a drift of the encoder of TH is not detected.
 
 *Standstill.* While the reading of an encoder is constant and its joint is at rest, the difference between encoders and
 IMUs about the axis of the joint is also constant. If the joint moves while its encoder is stuck, this difference changes by
@@ -34,6 +35,7 @@ thresholds are extended by `velocity_error` times the age of the values.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -42,6 +44,7 @@ import numpy.typing as npt
 from atalante_hal.robot import IMUS, JOINTS, LEG_JOINTS, SIDES, Robot
 from atalante_hal.safety.diagnostics import Dtc, Finding
 from atalante_hal.safety.plausibility.finding import JOINT_NODES, Ages, Signals
+from atalante_hal.safety.plausibility.inertial import turned_about_vertical
 from atalante_hal.types import Vector
 from atalante_hal.wire.process_image import NEVER
 
@@ -59,14 +62,14 @@ _AGREEMENT = 0.35
 #: Drift of the angle between pelvis IMU and tibia IMU that the standstill check tolerates in each sample [rad].
 #: The drift of intact IMUs is less than a tenth of this value.
 _IMU_DRIFT = 2e-5
-#: The headings of intact IMUs drift slowly. The check of TH follows this drift by at most this angle in each sample [rad].
+#: The headings of intact IMUs drift slowly. The estimate of this drift changes by at most this angle in each sample [rad].
 #: A leg is sampled every 32 cycles, so the check follows at most 3e-4 rad/s.
 _HEADING_DRIFT = 1e-5
 _PELVIS = IMUS.index("pelvis")
 _TIBIAE = tuple(IMUS.index(f"{side}_tibia") for side in SIDES)
 #: Angles of a leg that are compared with the IMUs: angle of FH, angle of TH, sum of the angles of SH and SK.
 _AXES = (("FH",), ("TH",), ("SH", "SK"))
-#: Index of TH in `_AXES`. A heading drift of the IMUs changes only the IMU angle of TH.
+#: Index of TH in `_AXES`. The error of TH shows the heading drift of the IMUs.
 _HEADING = _AXES.index(("TH",))
 #: For each of the first four joints of a leg: index of its axis in `_AXES`.
 _AXIS_OF = (0, 1, 2, 2)
@@ -74,12 +77,13 @@ _HIPS = tuple(JOINTS.index(f"{side}_FH") for side in SIDES)
 
 
 class _Comparison(NamedTuple):
-    """Comparison of the encoders and IMUs of a leg in one sample."""
+    """Comparison of the encoders and IMUs of a leg in one sample, corrected for the heading drift of the IMUs."""
 
     angles: tuple[float, float, float]  # leg angles from the IMUs: FH, TH and the sum SH + SK [rad]
     errors: tuple[float, float, float]  # encoder angles minus IMU angles [rad]
     encoders: tuple[float, float, float, float]  # encoder angles of FH, TH, SH and SK [rad]
     uncertainty: float  # largest error [rad] that arises if encoder and IMU values are from different cycles
+    upright: float  # cosine of the angle between the axis of TH and the vertical
 
 
 class Legs:
@@ -87,8 +91,10 @@ class Legs:
 
     Attributes:
         encoder_error: encoder angle of each joint minus its angle from the IMUs in the last sample of its leg, shape (12,) [rad].
-            The estimated heading drift is subtracted. SH and SK both have the error of their sum. The error is infinite
+            It is corrected for the heading drift. SH and SK both have the error of their sum. The error is infinite
             if a value is too old, and always for SA and HA.
+        heading: cosine and sine of half the angle by which the attitude of each tibia IMU must be turned about the vertical to
+            correct its heading drift relative to the pelvis IMU, shape (2, 2).
 
     Args:
         robot: sensor thresholds of the robot.
@@ -103,9 +109,9 @@ class Legs:
         self._to_joint: Vector = robot.polarity / robot.gear
         self._attitude_error = robot.sensors.attitude_error
         self._attitude_change, self._misalignment = robot.sensors.attitude_change, robot.sensors.misalignment
-        #: For each leg: estimated heading drift between pelvis IMU and tibia IMU [rad].
-        #: It is subtracted from the encoder error of joint TH, which turns the leg about its vertical axis.
-        self._heading = [0.0 for _ in SIDES]
+        #: For each leg: estimated heading of the pelvis IMU minus heading of the tibia IMU [rad].
+        self._heading_drift = [0.0 for _ in SIDES]
+        self.heading: Vector = np.tile([1.0, 0.0], (len(SIDES), 1))
         self.encoder_error: Vector = np.full(len(JOINTS), math.inf)
         self._contradicts = [[0] * len(_AXES) for _ in SIDES]
         self._constant_samples = [constant_samples[hip : hip + len(_AXIS_OF)] for hip in _HIPS]
@@ -156,13 +162,12 @@ class Legs:
     def _check(self, leg: int, ages: Ages | None) -> bool:
         comparison = self._compare(leg, ages)
         if comparison is None:
-            self._record_errors(leg, [math.inf] * len(_AXES))
+            self._record_errors(leg, (math.inf,) * len(_AXES))
         else:
-            errors = self._without_heading(leg, comparison)
-            self._record_errors(leg, errors)
-            self._check_drift(leg, errors, comparison.uncertainty)
+            self._record_errors(leg, comparison.errors)
+            self._check_drift(leg, comparison)
             self._check_standstill(leg, comparison)
-            self._check_exchange(leg, errors, comparison, ages)
+            self._check_exchange(leg, comparison, ages)
         other = 1 - leg
         if self._stuck[other] or self._constant_samples[other].any():
             comparison = self._compare(other, ages)
@@ -184,25 +189,37 @@ class Legs:
             pelvis = extrapolated(pelvis, now.gyro[_PELVIS].tolist(), self._period * cycles[-2])
             tibia = extrapolated(tibia, now.gyro[_TIBIAE[leg]].tolist(), self._period * cycles[-1])
         fh, th, sh, sk = angles.tolist()
-        x, z, y = hip_angles(pelvis, tibia)
+        x, z, y = hip_angles(pelvis, turned_about_vertical(tibia, self.heading[leg].tolist()))
         turn = 2.0 * math.pi
         errors = math.remainder(fh - x, turn), math.remainder(th - z, turn), math.remainder(sh + sk - y, turn)
-        return _Comparison((x, z, y), errors, (fh, th, sh, sk), uncertainty)
+        w, i, j, k = pelvis
+        upright = math.cos(x) * (1.0 - 2.0 * (i * i + j * j)) - 2.0 * math.sin(x) * (j * k + w * i)
+        return _Comparison((x, z, y), errors, (fh, th, sh, sk), uncertainty, upright)
 
-    def _record_errors(self, leg: int, errors: list[float]) -> None:
+    def _record_errors(self, leg: int, errors: Sequence[float]) -> None:
         first = _HIPS[leg]
         self.encoder_error[first : first + len(_AXIS_OF)] = [errors[axis] for axis in _AXIS_OF]
 
-    def _check_drift(self, leg: int, errors: list[float], uncertainty: float) -> None:
+    def _check_drift(self, leg: int, comparison: _Comparison) -> None:
         drifts = []
-        counts, allowed = self._contradicts[leg], self._attitude_error + uncertainty
-        for axis, error in enumerate(errors):
+        counts, allowed = self._contradicts[leg], self._attitude_error + comparison.uncertainty
+        for axis, error in enumerate(comparison.errors):
             counts[axis] = counts[axis] + 1 if abs(error) > allowed else 0
             if counts[axis] >= DRIFT_SAMPLES:
                 drifts.append(_drift(SIDES[leg], _AXES[axis], error))
         if not counts[_HEADING]:
-            self._heading[leg] += max(-_HEADING_DRIFT, min(_HEADING_DRIFT, errors[_HEADING]))
+            self._follow_heading(leg, comparison)
         self._drifts[leg] = tuple(drifts)
+
+    def _follow_heading(self, leg: int, comparison: _Comparison) -> None:
+        """Let the estimated heading drift of a leg follow the error of TH.
+
+        A heading drift changes the angle of TH by `upright` times the drift, so this factor also gives the direction.
+        """
+        change = comparison.errors[_HEADING] * comparison.upright
+        self._heading_drift[leg] += max(-_HEADING_DRIFT, min(_HEADING_DRIFT, change))
+        half = 0.5 * self._heading_drift[leg]
+        self.heading[leg] = math.cos(half), math.sin(half)
 
     def _check_standstill(self, leg: int, comparison: _Comparison) -> None:
         stuck = []
@@ -226,7 +243,8 @@ class Legs:
                 stuck.append(_stuck(joint, change))
         self._stuck[leg] = tuple(stuck)
 
-    def _check_exchange(self, leg: int, ours: list[float], comparison: _Comparison, ages: Ages | None) -> None:
+    def _check_exchange(self, leg: int, comparison: _Comparison, ages: Ages | None) -> None:
+        ours = comparison.errors
         allowed = self._attitude_error + comparison.uncertainty
         if max(map(abs, ours)) <= allowed:
             self._exchanges = [0] * len(_AXIS_OF)
@@ -234,7 +252,7 @@ class Legs:
         opposite = self._compare(1 - leg, ages)
         if opposite is None:
             return
-        theirs = self._without_heading(1 - leg, opposite)
+        theirs = opposite.errors
         their_allowed = self._attitude_error + opposite.uncertainty
         for index, axis in enumerate(_AXIS_OF):
             apart = comparison.encoders[index] - opposite.encoders[index]
@@ -248,22 +266,13 @@ class Legs:
                     _exchange(hip + index, error) for hip, error in zip(_HIPS, errors, strict=True)
                 )
 
-    def _without_heading(self, leg: int, comparison: _Comparison) -> list[float]:
-        """Return the encoder angles of a leg minus its IMU angles, corrected for the heading drift of the IMUs [rad].
-
-        The three values belong to FH, TH, and the sum of SH and SK.
-        """
-        errors = list(comparison.errors)
-        errors[_HEADING] -= self._heading[leg]
-        return errors
-
     def findings(self) -> tuple[Finding, ...]:
         """Return the current findings of the leg checks."""
         exchanged = (finding for pair in self._exchanged.values() for finding in pair)
         return (*self._drifts[0], *self._drifts[1], *self._stuck[0], *self._stuck[1], *exchanged)
 
 
-def hip_angles(pelvis: list[float], tibia: list[float]) -> tuple[float, float, float]:
+def hip_angles(pelvis: Sequence[float], tibia: Sequence[float]) -> tuple[float, float, float]:
     """Return the hip and knee angles FH, TH and SH + SK [rad].
 
     The rotation from the tibia frame to the pelvis frame is Rx(FH) Rz(TH) Ry(SH + SK).

@@ -99,7 +99,8 @@ class Walking:
         self.walk, self.drift, self.error = healthy or walk(), drift, np.zeros(2)
         self.now = signals()
         self.now.quaternion[:, 0] = 1.0
-        self.checks = Knees(ROBOT, self.now, PERIOD)
+        self.heading = np.tile([1.0, 0.0], (2, 1))
+        self.checks = Knees(ROBOT, self.now, self.heading, PERIOD)
         self.cycles = 0
 
     def change(self) -> None:
@@ -199,6 +200,28 @@ def test_wrong_accelerometer_is_not_reported_as_drift(imu: int, scale: float, of
     assert robot.run(5000) == []
 
 
+@pytest.mark.parametrize(("drift", "corrected", "found"), [(0.0, True, []), (6.0, True, [0, 1]), (6.0, False, [])])
+def test_drift_is_found_after_a_heading_drift_of_the_tibia_imus(drift: float, corrected: bool, found: list[int]):
+    """The pelvis sways by 3 cm. After 1.5 rad of heading drift, the tibia IMUs measure this motion in another direction."""
+    robot, healthy = Walking(drift=(drift, -drift)), walk()
+    turn = pinocchio.Quaternion(pinocchio.AngleAxis(1.5, np.array([0.0, 0.0, 1.0])))
+    frequency = 2.0 * math.pi / (STRIDE * PERIOD)
+    quaternion, accel = healthy.quaternion.copy(), healthy.accel.copy()
+    for cycle in range(STRIDE):
+        sway = np.array([0.03, 0.0, 0.0]) * frequency**2 * math.sin(frequency * cycle * PERIOD + 1.0)
+        for imu in (PELVIS, TIBIA, TIBIA + 1):
+            w, x, y, z = quaternion[cycle, imu]
+            attitude = pinocchio.Quaternion(w, x, y, z)
+            accel[cycle, imu] += attitude.inverse() * sway
+            if imu != PELVIS:
+                quaternion[cycle, imu] = (turn * attitude).coeffs()[[3, 0, 1, 2]]
+    robot.walk = Walk(healthy.position, quaternion, accel)
+    if corrected:
+        robot.heading[:] = turn.inverse().coeffs()[[3, 2]]
+    robot.run(5000)
+    assert [SIDES.index(finding.node.split("_")[0].lower()) for finding in robot.checks.findings()] == found
+
+
 class TestMotion:
     @pytest.mark.parametrize("leg", [0, 1])
     @pytest.mark.parametrize("cycle", range(0, STRIDE, 400))
@@ -221,7 +244,15 @@ class TestMotion:
         now = signals()
         robot.write(now, cycle)
         now.accel[:] = np.random.default_rng(cycle).standard_normal((4, 3))
-        position, lever, growth, accel = motion(leg, Readings(now.position, 1.0 / GEAR, now.quaternion, now.accel))
+        turn = pinocchio.Quaternion(pinocchio.AngleAxis(0.7, np.array([0.0, 0.0, 1.0])))
+        w, x, y, z = now.quaternion[TIBIA + leg]
+        x, y, z, w = (turn.inverse() * pinocchio.Quaternion(w, x, y, z)).coeffs()
+        now.quaternion[TIBIA + leg] = w, x, y, z
+        heading = np.zeros((2, 2))
+        heading[leg] = turn.coeffs()[[3, 2]]
+        readings = Readings(now.position, 1.0 / GEAR, now.quaternion, now.accel, heading)
+        position, lever, growth, accel = motion(leg, readings)
+        now.quaternion[TIBIA + leg] = robot.quaternion[cycle, TIBIA + leg]
         np.testing.assert_allclose(position, true(), atol=1e-9)
         np.testing.assert_allclose(lever, (true(step) - true(-step)) / (2.0 * step), atol=1e-8)
         np.testing.assert_allclose(growth, (true(length=SEGMENT + 1e-3) - true()) / 1e-3, atol=1e-8)
