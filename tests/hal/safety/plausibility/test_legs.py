@@ -380,6 +380,13 @@ class TestExchange:
         legs.compare(10)
         assert bool(self.found(legs)) is expected
 
+    @pytest.mark.parametrize("errors", [(0.05, 0.1), (0.1, 0.05)])
+    def test_the_errors_of_both_legs_must_agree_with_the_readings(self, errors: tuple[float, float]):
+        angles = ([0.05 - errors[0], 0.0, 0.0, 0.0], [errors[1], 0.0, 0.0, 0.0])
+        legs = self.legs(angles, ([0.05, 0.0, 0.0, 0.0], [0.0, 0.0, 0.0, 0.0]))
+        legs.compare(3)
+        assert self.found(legs) == []
+
     @pytest.mark.parametrize("index", range(4), ids=["FH", "TH", "SH", "SK"])
     @pytest.mark.parametrize("share", [0.5, 1.0])
     @signs
@@ -404,6 +411,7 @@ class TestExchange:
             errors[leg] = error
             legs = self.legs(([0.05 - errors[0], 0.0, 0.0, 0.0], [0.01 + errors[1], 0.0, 0.0, 0.0]),
                              ([0.05, 0.0, 0.0, 0.0], [0.01, 0.0, 0.0, 0.0]))  # fmt: skip
+            legs.now.position[6 * checked + 2] = 0.1  # a drift of another joint, which is no exchange
             legs.leg = checked
             legs.compare(2)
             assert self.found(legs) == (["LEFT_FH", "RIGHT_FH"] if expected else [])
