@@ -569,10 +569,13 @@ def test_good_frame_is_accepted_before_or_after_a_damaged_one():
 
 
 def test_out_of_range_and_invalid_codes_are_distinguished():
-    tx, rx, buffer = pair()
-    row, signal = rx.codec.rows["LEFT_FH_STATE"], tx.codec.index("LEFT_FH_STATE", "DriveState")
+    tx, _, buffer = pair()
+    row, signal = tx.codec.rows["LEFT_FH_STATE"], tx.codec.index("LEFT_FH_STATE", "DriveState")
     message, drive_state = tx.codec.signals[signal]
+    rx = ReceiveImage(CYCLIC, independent=("DriveState", "Temperature"))
+    temperature = tx.codec.index("LEFT_FH_STATE", "Temperature")
     for code, check in ((64, Check.OK), (65, Check.RANGE), (drive_state.invalid_raw, Check.INVALID)):
+        tx.values[temperature] = 30.0 + code
         frames = tx.seal()
         frames[row]["data"][drive_state.start // 8] = code
         payload = frames[row]["data"][: message.length].tobytes()
@@ -581,6 +584,7 @@ def test_out_of_range_and_invalid_codes_are_distinguished():
         buffer[:ROWS] = frames
         rx.accept(buffer, ROWS)
         assert rx.check[row] == check
+        assert rx.values[temperature] == min(30.0 + code, 214.0)
     assert rx.values[signal] == 64
 
 
@@ -765,6 +769,7 @@ def test_accepted_frame_has_priority_over_an_invalid_frame_of_the_same_cycle(fir
     row = rx.codec.rows["LEFT_SK_STATE"]
     state, position = (rx.codec.index("LEFT_SK_STATE", signal) for signal in ("DriveState", "Position"))
     deliver(tx, rx, buffer)
+    tx.seal()  # a lost frame, so the valid frame may have the result SOME_LOST
     for index, kind in enumerate((first, "valid" if first == "invalid" else "invalid")):
         tx.values[[state, position]] = (39.0, 1.0) if kind == "valid" else (8.0, np.nan)
         buffer[index] = tx.seal()[row]
