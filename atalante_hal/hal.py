@@ -233,7 +233,7 @@ class Hal:
         if command.outside:
             safety_monitor.report(Dtc.GUIDE_OUTSIDE, "a joint is outside the virtual guide", command.guide_left)
         if command.hand_over_exceeded:
-            text = "a step started with a larger deviation than the certificate of its guide assumes (hand-over box)"
+            text = "a step started outside the hand-over box: the certificate of its guide does not apply to this step"
             safety_monitor.report(Dtc.GUIDE_OUTSIDE, text, False)
         self._commands.drive(self._limiter.last, command.vibration)
         sent = self._send_command()

@@ -90,7 +90,8 @@ class Command:
     #: True if `outside` was True in too many cycles, although the guide is certified (calculated to keep the joints inside).
     #: While `outside` and `guide_left` are True, GUIDE_OUTSIDE is confirmed, and the state FULL_ASSIST follows.
     guide_left: bool = False
-    #: True if a step starts with a larger deviation (angle or speed) than the certificate of the guide was calculated for.
+    #: True if a step starts with a larger deviation (angle, speed, acceleration or torque jump) than the certificate of the guide
+    #: was calculated for.
     #: The HAL then reports GUIDE_OUTSIDE as a pending diagnostic, to which the robot does not react.
     hand_over_exceeded: bool = False
 

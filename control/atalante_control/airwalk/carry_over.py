@@ -3,12 +3,14 @@
 `torque before the stance change, torque of the new control law -> continuous torque`
 
 Example: the torque is 10 Nm before the stance change, and the new control law computes 14 Nm. The controller adds -4 Nm in the
-first cycle. The added torque then fades out to 0 Nm.
+first cycle. The added torque then fades out to 0 Nm. If the added torque of a joint is limited to 3 Nm, the controller adds
+-3 Nm, and the command jumps by 1 Nm.
 """
 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from typing import Annotated
 
 import numpy as np
@@ -24,12 +26,16 @@ class Carry:
 
     pending: bool  # true until the first torque after the stance change is computed
     before: Annotated[Vector, len(JOINTS)]  # Nm, torque before the stance change
-    #: Nm, torque to add in the first cycle after the stance change: `before` minus the computed torque of the first cycle
-    carried: Annotated[Vector, len(JOINTS)]
+    limit: Annotated[Vector, len(JOINTS)]  # Nm, largest absolute value of `carried`
+    #: Nm, torque jump at the stance change: `before` minus the computed torque of the first cycle
+    jump: Annotated[Vector, len(JOINTS)]
+    carried: Annotated[
+        Vector, len(JOINTS)
+    ]  # Nm, torque to add in the first cycle after the stance change: `jump`, limited
 
 
 class CarryOver:
-    """Carry-over: adds a torque after a stance change, so that the torque command does not jump.
+    """Carry-over: adds a torque after a stance change, so that the torque command does not jump, up to a limit.
 
     Attributes:
         records: record that `add_carried` reads and updates, shape (1,).
@@ -46,6 +52,7 @@ class CarryOver:
         cycles = round(duration / PERIOD)
         self.blend: Vector = 0.5 + 0.5 * np.cos(math.pi * np.arange(cycles) / max(1, cycles))
         self.records: Records[Carry] = zeros(Carry, 1)
+        self.limit((), ())
 
     @property
     def pending(self) -> bool:
@@ -61,6 +68,18 @@ class CarryOver:
         carry = self.records[0]
         carry.before[:], carry.pending = before, True
 
+    def limit(self, joints: Sequence[int], largest: Sequence[float]) -> None:
+        """Limit the added torques of some joints. The added torques of all other joints are not limited.
+
+        Args:
+            joints: indices of the joints in JOINTS.
+            largest: largest absolute value of the added torque of each of these joints [Nm].
+        """
+        limit = self.records[0].limit
+        limit[:] = math.inf
+        for joint, torque in zip(joints, largest, strict=True):
+            limit[joint] = torque
+
     def cancel(self) -> None:
         """Cancel the last `start`, if `add_carried` has not been called since.
 
@@ -72,8 +91,8 @@ class CarryOver:
 def add_carried(carries: Records[Carry], blend: Vector, cycle: int, torque: Vector) -> None:
     """Add a torque to the torque command, so that the command does not jump at a stance change.
 
-    The first call after a stance change computes the added torque: torque before the stance change minus `torque`. In later
-    calls, the added torque fades out.
+    The first call after a stance change computes the added torque: torque before the stance change minus `torque`, limited to
+    `Carry.limit`. In later calls, the added torque fades out.
 
     Args:
         carries: `CarryOver.records`; `pending` is set to False.
@@ -84,7 +103,9 @@ def add_carried(carries: Records[Carry], blend: Vector, cycle: int, torque: Vect
     carry = carries[0]
     if carry.pending:
         for joint in range(len(torque)):
-            carry.carried[joint] = carry.before[joint] - torque[joint]
+            jump, limit = carry.before[joint] - torque[joint], carry.limit[joint]
+            carry.jump[joint] = jump
+            carry.carried[joint] = min(max(jump, -limit), limit)
         carry.pending = False
     if cycle < len(blend):
         for joint in range(len(torque)):

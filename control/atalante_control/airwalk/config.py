@@ -28,7 +28,7 @@ class AirwalkConfig(StepGuideConfig):
     ankle_offset: float = math.radians(1.0)  # rad, offset added to the desired angles of both sagittal ankles
     startup: float = 2.0  # s, shortest duration of the motion from the measured pose to the first pose of the gait
     #: s, fade-out time of the torque that prevents a jump at a stance change (`carry_over`); with 0, the torque can jump
-    blend: float = 0.02
+    blend: float = 0.006
 
     def __post_init__(self) -> None:
         super().__post_init__()

@@ -21,7 +21,8 @@ points open. This controller decides them as follows:
 - *Carry-over.* At a stance change the torque jumps for three reasons: the re-centring sets the tracking error to zero, the
   control law of each leg changes, and the prediction of the guide filter, which is shorter near the end of a step, returns to
   its full length. The torque jump is compensated, and the compensation fades out within `blend`, so the command is continuous.
-  The carry-over is the same with and without assistance.
+  At hip and knee of a leg with a guide, the compensation is at most `HandOver.carried`, which the certificate assumes. A larger
+  jump remains in the command.
 """
 
 from __future__ import annotations
@@ -36,7 +37,7 @@ from atalante_control.airwalk.swing_leg import OVERLAP, swing_leg
 from atalante_control.airwalk.telemetry import TELEMETRY_FIELDS, AirwalkStatistics, Step, Telemetry
 from atalante_control.dynamics.gravity import Gravity
 from atalante_control.dynamics.suspended import check_suspended, suspended_gait
-from atalante_control.gait.gait import Gait, step_over
+from atalante_control.gait.gait import PERIOD, Gait, step_over
 from atalante_control.gait.recentering import Deadbeat
 from atalante_control.guide.certificate import Certificate
 from atalante_control.guide.filter import GuideFilter
@@ -55,6 +56,8 @@ from atalante_hal.robot import IMUS, JOINTS, LEG_JOINTS, Robot
 from atalante_hal.types import Command, State, Vector
 
 __all__ = ["AirwalkConfig", "AirwalkController"]
+
+Pair = tuple[float, float]
 
 _N, _LEG = len(JOINTS), len(LEG_JOINTS)
 _SH, _SK = LEG_JOINTS.index("SH"), LEG_JOINTS.index("SK")
@@ -232,7 +235,10 @@ class AirwalkController:
         self._command.vibration.fill(0.0)
         self._command.outside = self._command.guide_left = self._command.hand_over_exceeded = False
         self._outside = OutsideCount(self.config.outside_cycles)
-        self._promised, self._exceeded = False, False
+        self._promised = False
+        #: Angle deviations [rad] and speed deviations [rad/s] of hip and knee at the start of the step.
+        self._start: tuple[Pair, Pair] = (0.0, 0.0), (0.0, 0.0)
+        self._accelerations = np.zeros(2)  # rad/s2, of hip and knee before the stance change
         self.telemetry.fill(0.0)
         self.statistics = AirwalkStatistics()
 
@@ -273,11 +279,12 @@ class AirwalkController:
             self.statistics.count(cycle, ratio, h, active)
         self._command.outside = self._assisting and h < 0.0
         self._command.guide_left = self._outside.update(self._command.outside, self._promised)
-        self._command.hand_over_exceeded = cycle == 0 and self._exceeded
+        self._command.hand_over_exceeded = cycle == 0 and self._check_hand_over()
         return self._command
 
     def _move_to_start(self, state: State, cycle: int) -> Command:
         """Follow the start motion with the baseline controller only."""
+        self._measured.qd[:] = state.velocity
         row, torque = self._start_motion.row(cycle), self._command.torque
         tracking = self.pid.update(row, state.position, state.velocity, state.torque_sent)
         if self.config.literal_law:
@@ -303,20 +310,22 @@ class AirwalkController:
         self._share[[hip, knee]] = 0.0 if self._assisting else 1.0
         self.pid.start_step(stance, self._share)
         self._start_guide(xi, self.reference.start_step(stance, state.position, state.velocity), (hip, knee))
+        # `_measured` still contains the speeds of the last cycle.
+        self._accelerations[:] = (state.velocity[[hip, knee]] - self._measured.qd[[hip, knee]]) / PERIOD
         if self.config.flat_foot:
             self._feet.start_step(state, 1 - stance)
         if not self._carry.pending:
             self._carry.start(self.pid.requested)
+        if self._assisting and not self.config.literal_law:
+            self._carry.limit((hip, knee), self.config.hand_over.carried)
+        else:
+            self._carry.limit((), ())
         step = self._step
         step.stance, step.completed = stance, self.statistics.steps
         step.xi, step.assisted, step.intensity = xi, self._assisting, intensity(xi)
 
     def _start_guide(self, xi: float, deviation: Deviation, joints: tuple[int, int]) -> None:
-        """Start the guide of a step.
-
-        If the deviation at the start of the step is larger than the certificate assumes, count the step in the statistics. Steps
-        before the end of the first right-stance step are not counted, nor steps at the assistance factor 1, which use no guide.
-        """
+        """Start the guide of a step."""
         hip, knee = joints
         angles = float(deviation.angle[hip]), float(deviation.angle[knee])
         rates = float(deviation.rate[hip]), float(deviation.rate[knee])
@@ -324,7 +333,23 @@ class AirwalkController:
         self.guide.start_step(xi, angles, rates, promise)
         if self.config.literal_law:
             self._literal.start_step(xi, angles, rates)
-        largest = self.config.hand_over
-        exceeded = max(map(abs, angles)) > largest.deviation or max(map(abs, rates)) > largest.rate
-        self._promised, self._exceeded = promise > 0.0, exceeded and self._assisting and self.statistics.steps > 0
-        self.statistics.hand_overs_exceeded += self._exceeded
+        self._start, self._promised = (angles, rates), promise > 0.0
+
+    def _check_hand_over(self) -> bool:
+        """Return whether the step starts outside the hand-over box, and count the step in the statistics.
+
+        Only steps with a certified guide are checked, and only after the end of the first right-stance step. The torque jump is
+        known after the first cycle of the step.
+        """
+        if not (self._promised and self._assisting and self.statistics.steps):
+            return False
+        hip, knee = (_LEG * (1 - self._stance) + joint for joint in (_SH, _SK))
+        jump, accelerations = self._carry.records[0].jump, self._accelerations
+        inside = self.config.hand_over.contains(
+            *self._start,
+            (float(accelerations[0]), float(accelerations[1])),
+            (float(jump[hip]), float(jump[knee])),
+        )
+        self.statistics.hand_overs += 1
+        self.statistics.hand_overs_exceeded += not inside
+        return not inside

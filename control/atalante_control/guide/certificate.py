@@ -3,16 +3,18 @@ r"""Guide certificate: the disturbance torques that cannot move a joint out of a
 **The promise.** Both joints stay inside the guide while disturbance torques of at most `hip` Nm act on the sagittal hip (SH) and
 at most `knee` Nm on the sagittal knee (SK), at the same time and in any direction. The friction of the leg may differ from the
 model by 20 %, and the mass and inertia of the leg by 10 %. The loop may have one more cycle of delay than the model. The step may
-start with any deviation inside the hand-over box (`HandOver`). The running filter is built for exactly this promise.
+start with any deviation inside the hand-over box (`HandOver`). The promise does not cover a step that starts outside this box.
+The controller compares each start with the box and counts these steps. The running filter is built for exactly this promise.
 
 **Why the promise holds.** A prediction starts at the true state of the leg, under the backup policy and the worst of these
 disturbances. Let r be the largest ratio of error to width in this prediction, and h = 1 - r^2. Three conditions are
 sufficient.
 
 1. *Start.* Re-centring sets the error to zero at the start of a step. In every cycle, the error that can arise since the start
-   must be below the width. Disturbances, the torque carried over the stance change and the unknown part of the velocity cause
-   this error. So h is at least 0 at the start. The same condition bounds the predicted torque and speed, so the drives do not
-   saturate and the limiter does not act.
+   must be below the width. Disturbances, the torque jump at the stance change and the unknown part of the velocity cause this
+   error. So h is at least 0 at the start. The jump acts completely until the first new command arrives, up to two cycles later.
+   Then it decreases to the added torque as fast as the limiter permits. Apart from this decrease, the limiter does not act, and
+   the drives do not saturate, because the same condition bounds the predicted torque and speed.
 2. *Backup.* If the gate is 1, the leg follows the backup policy. Then h does not fall, because all disturbances in the
    prediction of the next cycle are already in the current prediction. Each new prediction adds one cycle at the end of
    the horizon. This cycle must not be the worst cycle. At the end of the horizon the free motion has decayed. The error
@@ -114,6 +116,9 @@ class PromiseLimits:
         _, slopes, curvatures = leg.deadbeat.basis(leg.time)
         torque = np.abs(prediction.torque) + np.abs(prediction.mass).sum(axis=2) * box.largest(curvatures)[:, None]
         speed = np.abs(leg.qd) + box.largest(slopes)[:, None]
+        fading = -np.diff(box.added(guide.blend), axis=0, append=0.0)[: len(speed) - 1]
+        room = np.full_like(speed, config.rate_limit)
+        room[1 : len(fading) + 1] -= fading
         self._of_drives = [
             _limit(
                 config.torque_limit - torque,
@@ -131,7 +136,10 @@ class PromiseLimits:
                 f"with errors of the model, the speed reaches {config.worst_speed_limit:g} rad/s at",
             ),
             _limit(
-                np.full_like(speed, config.rate_limit), start.change, steps, "the backup torque changes too fast at"
+                room,
+                start.change,
+                steps,
+                "the backup torque changes too fast at",
             ),
         ]
         self._horizon = _Horizon(guide)

@@ -5,7 +5,7 @@ bound is the sum of the promise (the disturbance torques of the certificate) and
 
 - a part of the friction torque, since the friction parameters may be wrong,
 - a part of the inertia, gravity, centrifugal and Coriolis torques along the desired trajectory, since the inertia may be wrong,
-- the torque that is carried over the stance change, while it fades out,
+- the torque jump at the stance change, until the new control law drives the leg,
 - a constant for errors that have no model: noise, lost frames, lag of the friction compensation, motion of the other joints.
 
 Each of these torques may have any sign in any cycle. The largest error that they cause is therefore a sum of absolute values,
@@ -60,9 +60,9 @@ class Mismatch:
 class HandOver:
     """Hand-over box: largest deviations at the start of a step for which the guide certificate holds.
 
-    At a stance change, the torques that the controller computes for hip and knee jump. In the air, the controller adds a torque
-    that cancels the jump and then fades out. On the ground, the controller adds no such torque. `Leg.budget` contains a part of
-    the jump that decreases to 0: in the air while the added torque fades out, on the ground during `WalkConfig.engage`.
+    At a stance change, the torques that the controller computes for hip and knee jump. The old torque acts until the first new
+    command arrives. In the air, the controller then adds a torque that cancels the jump and fades out, but at most `carried`. On
+    the ground, the controller adds no such torque. `Leg.budget` contains the part of the jump that still acts, see `remaining`.
 
     Raises:
         ValueError: If a value is negative or not finite.
@@ -70,7 +70,11 @@ class HandOver:
 
     deviation: float = math.radians(2.7)  # rad, largest angle deviation |s(0)| of sagittal hip and knee
     rate: float = 0.25  # rad/s, largest speed deviation |s'(0)| of sagittal hip and knee
-    torque: Pair = (25.0, 13.0)  # Nm, largest jump of the torques of sagittal hip and knee at a stance change
+    torque: Pair = (65.0, 35.0)  # Nm, largest jump of the torques of sagittal hip and knee at a stance change
+    carried: Pair = (
+        25.0,
+        13.0,
+    )  # Nm, largest torque that the controller adds to sagittal hip and knee after a stance change
     #: rad/s2, largest joint acceleration before the stance change.
     #: This acceleration causes an error of the velocity that is measured after the stance change.
     acceleration: float = 20.0
@@ -79,8 +83,49 @@ class HandOver:
         for name in ("deviation", "rate", "acceleration"):
             if not 0.0 <= getattr(self, name) < math.inf:
                 raise ValueError(f"{name} of the hand-over must be finite and at least 0, got {getattr(self, name)!r}")
-        if not all(0.0 <= value < math.inf for value in self.torque):
-            raise ValueError(f"torque of the hand-over must be finite and at least 0 Nm, got {self.torque!r}")
+        for name in ("torque", "carried"):
+            if not all(0.0 <= value < math.inf for value in getattr(self, name)):
+                raise ValueError(
+                    f"{name} of the hand-over must be finite and at least 0 Nm, got {getattr(self, name)!r}"
+                )
+
+    def contains(self, angles: Pair, rates: Pair, accelerations: Pair, jumps: Pair) -> bool:
+        """Return whether a stance change is inside the box. Each argument contains a value of sagittal hip and knee.
+
+        Args:
+            angles: angle deviations s(0) [rad].
+            rates: speed deviations s'(0) [rad/s].
+            accelerations: joint accelerations before the stance change [rad/s2].
+            jumps: torques before the stance change minus torques of the new control law [Nm].
+        """
+        return (
+            max(map(abs, angles)) <= self.deviation
+            and max(map(abs, rates)) <= self.rate
+            and max(map(abs, accelerations)) <= self.acceleration
+            and all(abs(jump) <= largest for jump, largest in zip(jumps, self.torque, strict=True))
+        )
+
+    def added(self, blend: Vector) -> Vector:
+        """Return the largest torque that the controller adds in each cycle after a stance change, shape (m, 2) [Nm].
+
+        Args:
+            blend: fraction of the added torque that remains in each cycle since the stance change, shape (m,).
+        """
+        return np.outer(blend, np.minimum(self.carried, self.torque))
+
+    def remaining(self, blend: Vector, decrease: Vector) -> Vector:
+        """Return how much of the largest torque jump the command still contains in each cycle, shape (n, 2) [Nm].
+
+        The command contains the added torque. The limiter of the robot lets a larger jump decrease only slowly.
+
+        Args:
+            blend: fraction of the added torque that remains in each cycle since the stance change, shape (m,).
+            decrease: largest decrease that the limiter permits in each cycle, shape (n, 2) [Nm].
+        """
+        falling: Vector = np.maximum(0.0, np.array(self.torque) - np.cumsum(np.maximum(0.0, decrease), axis=0))
+        added = self.added(blend)[: len(falling)]
+        falling[: len(added)] = np.maximum(falling[: len(added)], added)
+        return falling
 
     def largest(self, values: Vector) -> Vector:
         """Return the largest absolute value that the re-centring offset s(t) can have at each time, shape (n,).
@@ -157,19 +202,19 @@ class Leg(NamedTuple):
         inverse: Vector = np.linalg.inv(self.masses(knee)).astype(np.float64)
         return inverse
 
-    def budget(self, mismatch: Mismatch, hand_over: HandOver, blend: Vector) -> Vector:
+    def budget(self, mismatch: Mismatch, hand_over: HandOver, jump: Vector) -> Vector:
         """Return the largest torque error of the model in each cycle, shape (n, 2) [Nm], as the module docstring describes.
 
         Args:
             mismatch: errors of the model.
             hand_over: largest deviations at the start of a step.
-            blend: fraction of the carried-over torque that remains in each cycle since the stance change, shape (m,).
+            jump: part of the torque jump that still acts in each cycle since the stance change, shape (m, 2) [Nm].
         """
         moved = hand_over.largest(self.deadbeat.basis(self.time)[2])
         needed = np.abs(self.torque()) + np.abs(self.masses(self.q[:, 1])).sum(axis=2) * moved[:, None]
         friction = self.friction_torque(_SPEED_MARGIN)
         total: Vector = mismatch.inertia * needed + mismatch.friction * friction + mismatch.residual
-        total[: len(blend)] += np.outer(blend, hand_over.torque)
+        total[: len(jump)] += jump[: len(total)]
         return total
 
 

@@ -91,6 +91,7 @@ class GuideFilter:
         shape: shape of the guide.
         prediction: gains, gait and tables of the prediction.
         tables: tables of `kernel`; the results of the last tick are in `tables.guards`.
+        blend: smallest gate for each cycle since the stance change, shape (m,).
         cycles: number of cycles of a step.
         time: time since the stance change in each cycle, to the end of the prediction, shape (n,) [s].
     """
@@ -107,7 +108,7 @@ class GuideFilter:
         Raises:
             ValueError: If a bound of the shape is invalid in a cycle of the step, see `GuideShape.bounds`.
         """
-        self.config, self.shape, self.prediction = config, shape, prediction
+        self.config, self.shape, self.prediction, self.blend = config, shape, prediction, blend
         leg = prediction.leg
         self.cycles, self.time = prediction.cycles, leg.time
         self._phase = np.minimum(np.arange(len(leg.time)) / self.cycles, 1.0)

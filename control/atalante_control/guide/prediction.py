@@ -42,6 +42,7 @@ class Assumptions:
     hand_over: HandOver = field(default_factory=HandOver)  # largest deviations when a step starts
     #: Smallest and largest number of cycles between a measurement and the torque that is computed from it.
     delays: tuple[int, int] = (1, 2)
+    rate: float = 20.0  # Nm, largest change of the command within one cycle that the limiter of the robot permits
     horizon: int = 300  # number of predicted cycles
     overlap: int = 100  # number of cycles of the next step in the tables; predictions can reach into them
 
@@ -105,7 +106,7 @@ class Prediction:
             policy: gains of the backup policy.
             leg: swing leg along the nominal trajectory, to the end of the overlap.
             assumptions: assumptions of the promise for which the tables are computed.
-            blend: element i is the fraction of the torque jump at the stance change that remains i cycles later, shape (m,).
+            blend: element i is the fraction of the torque added at the stance change that remains i cycles later, shape (m,).
             width: largest width of the guides for which the tables are used [rad].
         """
         self.policy, self.leg, self.assumptions = policy, leg, assumptions
@@ -131,7 +132,7 @@ class Prediction:
         self.slack = _blocks(np.abs(changes).max(axis=0), SLACK_CYCLES)
 
         mobilities = leg.mobilities(hand_over, width)
-        budget = leg.budget(assumptions.mismatch, hand_over, blend)
+        budget = leg.budget(assumptions.mismatch, hand_over, np.zeros((0, 2)))
         bounds = np.stack([budget, np.broadcast_to(assumptions.promise, budget.shape)], axis=2)
         self.mass = leg.masses(leg.q[:, 1])
         self.torque = leg.torque() + leg.friction_torque()
@@ -141,6 +142,15 @@ class Prediction:
         starts, blocks = self.cycles + 1, -(-(self.cycles + 1) // START_CYCLES)
         whole = Grid(starts, START_CYCLES, np.arange(horizon + 1))
         few, none = whole._replace(lags=FEW), whole._replace(lags=FEW[:0])
+
+        # The largest change of the backup torque within one cycle, without the torque jump at the stance change.
+        # The limiter of the robot permits the rest for the decrease of the jump.
+        change = Effect(np.diff(lightest.pushed_feedback, axis=0, prepend=0.0), nothing, self.mass)
+        first_change = run(change, mobilities, bounds, none, np.zeros((blocks, 0, 4)))
+        remaining = hand_over.remaining(blend, assumptions.rate - first_change[:, :2] - first_change[:, 2:])
+        # The old torque acts until the first new command arrives, at the latest `delays[1]` cycles after the stance change.
+        before = np.tile(hand_over.torque, (assumptions.delays[1], 1))
+        bounds[:, :, 0] = leg.budget(assumptions.mismatch, hand_over, np.concatenate([before, remaining]))
 
         # Each loop in `family` has another inertia error or delay. `reach` and `few_ahead[2]` are maxima over all these loops.
         # Example: a joint moves faster if the leg is lighter than in the model, or if the command arrives later.
@@ -169,10 +179,6 @@ class Prediction:
         self.few_ahead: Vector = np.concatenate([nominal.feedback[FEW], nominal.rate[FEW]], axis=1)
         rates = [_for_rate_difference(one.rate[FEW] - nominal.rate[FEW]) for one in family]
         self.few_slack: Vector = np.abs(rates).max(axis=0)
-        # The torque jump at the stance change fades out slowly (`blend`), so its change within one cycle is neglected.
-        bounds[:, :, 0] = leg.budget(assumptions.mismatch, hand_over, np.zeros(0))
-        change = Effect(np.diff(lightest.pushed_feedback, axis=0, prepend=0.0), nothing, self.mass)
-        first_change = run(change, mobilities, bounds, none, few_ahead[0])
         self.start = StartReach(
             np.max(first, axis=0), first_torque, first_speed, np.max(first_rates, axis=0), first_change
         )
@@ -192,7 +198,7 @@ def prediction_of(policy: BackupPolicy, leg: Leg, assumptions: Assumptions, blen
         policy: gains of the backup policy.
         leg: swing leg along the nominal trajectory, to the end of the overlap.
         assumptions: assumptions of the promise for which the tables are computed.
-        blend: element i is the fraction of the torque jump at the stance change that remains i cycles later, shape (m,).
+        blend: element i is the fraction of the torque added at the stance change that remains i cycles later, shape (m,).
         width: largest width of the guides for which the tables are used [rad].
     """
     parts = [leg.time, leg.q, leg.qd, leg.qdd, leg.gravity, leg.inertia.fit, blend]

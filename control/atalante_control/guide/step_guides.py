@@ -64,10 +64,14 @@ class StepGuides:
             blend: smallest allowed weight of the backup torque in each cycle since the stance change, shape (m,).
             overlap: number of cycles of the leg after the end of the step.
         """
-        assumptions = Assumptions(
-            promise=config.promise, mismatch=config.mismatch, hand_over=config.hand_over, overlap=overlap
-        )
         limits = filter_config(config, robot)
+        assumptions = Assumptions(
+            promise=config.promise,
+            mismatch=config.mismatch,
+            hand_over=config.hand_over,
+            rate=limits.rate_limit,
+            overlap=overlap,
+        )
         phases = leg.time / leg.time[len(leg.time) - 1 - overlap]
         # All shapes of the package are at most as wide as `half_width(0)`, so they share their predictions.
         widest = max(half_width(0.0), float(shape.bounds(phases, 0.0).max()))

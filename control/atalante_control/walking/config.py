@@ -35,7 +35,11 @@ WALK_GAINS = PidGains(
 #: Parameters of the guide on the ground.
 #: `stiffness` is larger than in the air, because the leg of the exoskeleton also carries the leg of the patient.
 #: `hand_over` (largest deviations at the start of a step for which the guide is certified) covers the deviations after a landing.
-WALK_GUIDE = StepGuideConfig(stiffness=(4500.0, 3300.0), hand_over=HandOver(deviation=math.radians(1.0), rate=0.3))
+#: The controller adds no torque after a stance change, so the torque of the stance leg decreases with the rate of the limiter.
+WALK_GUIDE = StepGuideConfig(
+    stiffness=(4500.0, 3300.0),
+    hand_over=HandOver(deviation=math.radians(1.0), rate=0.3, torque=(95.0, 52.0), carried=(0.0, 0.0)),
+)
 
 
 @dataclass(frozen=True)

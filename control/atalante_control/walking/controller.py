@@ -55,6 +55,8 @@ from atalante_hal.compiled import specialised
 from atalante_hal.robot import CELLS, FEET, IMUS, JOINTS, LEG_JOINTS, Robot
 from atalante_hal.types import Command, State, SupervisorState, Vector
 
+Pair = tuple[float, float]
+
 _N, _LEG = len(JOINTS), len(LEG_JOINTS)
 _TH, _SH, _SK = (LEG_JOINTS.index(name) for name in ("TH", "SH", "SK"))
 _PELVIS, _TORSO = IMUS.index("pelvis"), IMUS.index("torso")
@@ -214,7 +216,10 @@ class WalkController:
         self.phase, self._since, self._loaded, self._stopping, self._landed = Phase.POSTURE, cycle, 0, False, False
         self._stance, self._finishing = RIGHT, False
         self._stage.stance, self._stage.double, self._stage.steering = RIGHT, True, 0.0
-        self._assisted, self._promised, self._exceeded = False, False, False
+        self._assisted, self._promised = False, False
+        #: Angle deviations [rad] and speed deviations [rad/s] of hip and knee at the start of the step.
+        self._start_deviation: tuple[Pair, Pair] = (0.0, 0.0), (0.0, 0.0)
+        self._velocity_before, self._torque_before = np.zeros(_N), np.zeros(_N)
         self._outside = OutsideCount(self.config.guide.outside_cycles)
         self._stage.assisted = self._stage.literal = self._stage.placed = False
         self._command.walking = False
@@ -335,10 +340,12 @@ class WalkController:
         if following is not None:
             self._begin(following, state.cycle, state.assistance_factor)
             cycle = 0
+            self._torque_before[:] = self._measured.sent
         self._act(
             cycle, self._measured, self._table, self._constants, self._stabiliser, self._section.assistance, self._parts
         )
         self._watch_guide(cycle)
+        self._velocity_before[:] = self._measured.qd
         return self._command
 
     def _bind(self, state: State) -> None:
@@ -453,25 +460,19 @@ class WalkController:
         record.phase, record.step, record.stance = phase, self.statistics.steps, self._stance
 
     def _start_guide(self, xi: float) -> None:
-        """Start the guide of a step.
-
-        Count the step in the statistics if its start deviates more than the certificate assumes.
-        """
+        """Start the guide of a step."""
         stage, record, statistics = self._stage, self._record, self.statistics.guide
         record.assistance_factor, record.gate, record.h = 1.0, 0.0, 1.0
         record.error[:], record.q_bound[:] = 0.0, 0.0
         self._command.vibration.fill(0.0)
-        self._promised = self._exceeded = False
+        self._promised = False
         if not self._assisted:
             return
         leg = _LEG * (1 - self._stance)
         angles = float(stage.deviation[leg + _SH]), float(stage.deviation[leg + _SK])
         rates = float(stage.rate[leg + _SH]), float(stage.rate[leg + _SK])
         promise = self._section.start_guide(xi, angles, rates)
-        largest = self.config.guide.hand_over
-        self._promised = promise > 0.0
-        self._exceeded = max(map(abs, angles)) > largest.deviation or max(map(abs, rates)) > largest.rate
-        statistics.hand_overs_exceeded += self._exceeded
+        self._start_deviation, self._promised = (angles, rates), promise > 0.0
         statistics.factors.add(xi)
         record.assistance_factor, stage.intensity = xi, intensity(xi)
 
@@ -486,7 +487,7 @@ class WalkController:
         """
         command, guide = self._command, self.config.guide
         guided = self._assisted and cycle < len(self._section.assistance.unmodelled)
-        command.hand_over_exceeded = guided and cycle == 0 and self._exceeded
+        command.hand_over_exceeded = guided and cycle == 0 and self._check_hand_over()
         command.outside = False
         if guided:
             hip, knee, hip_bound, knee_bound, h, gate = self._guarded.tolist()
@@ -494,6 +495,26 @@ class WalkController:
             ratio = max(_ratio(hip, hip_bound), _ratio(knee, knee_bound))
             self.statistics.guide.count(cycle, ratio, h, gate > guide.active)
         command.guide_left = self._outside.update(command.outside, self._promised)
+
+    def _check_hand_over(self) -> bool:
+        """Return whether a step starts outside the hand-over box, and count the step in the statistics.
+
+        Only steps with a certified guide are checked. The torque jump is known after the first cycle of the step.
+        """
+        if not self._promised:
+            return False
+        leg = _LEG * (1 - self._stance)
+        joints = [leg + _SH, leg + _SK]
+        accelerations = (self._measured.qd - self._velocity_before)[joints] / PERIOD
+        jumps = (self._torque_before - self._command.torque)[joints]
+        inside = self.config.guide.hand_over.contains(
+            *self._start_deviation,
+            (float(accelerations[0]), float(accelerations[1])),
+            (float(jumps[0]), float(jumps[1])),
+        )
+        self.statistics.guide.hand_overs += 1
+        self.statistics.guide.hand_overs_exceeded += not inside
+        return not inside
 
 
 def _ratio(error: float, bound: float) -> float:

@@ -18,6 +18,24 @@ def commands(carry: CarryOver, cycles: int, torque: float) -> list[float]:
     return sent
 
 
+def test_added_torque_of_a_limited_joint_is_at_most_its_limit():
+    carry = CarryOver(0.004)
+    carry.limit((2, 3), (3.0, 9.0))
+    carry.start(np.full(12, -7.0))
+    command = np.zeros(12)
+    add_carried(carry.records, carry.blend, 0, command)
+    assert command.tolist() == [-7.0, -7.0, -3.0, *[-7.0] * 9]
+    assert carry.records[0].jump.tolist() == [-7.0] * 12
+    command = np.zeros(12)
+    add_carried(carry.records, carry.blend, 2, command)
+    np.testing.assert_allclose(command, [-3.5, -3.5, -1.5, *[-3.5] * 9])
+    carry.limit((), ())
+    carry.start(np.full(12, 7.0))
+    command = np.zeros(12)
+    add_carried(carry.records, carry.blend, 0, command)
+    assert command.tolist() == [7.0] * 12
+
+
 def test_torque_continues_from_the_last_one_and_fades_to_the_new_one():
     carry = CarryOver(0.004)
     carry.start(np.full(12, 7.0))

@@ -192,6 +192,50 @@ def test_coupled_leg_stays_inside_a_certified_guide(shape: str):
     assert (np.abs(torques) <= ROBOT.torque_max).all()
 
 
+def pushed(factor: float) -> AirwalkController:
+    """Push hip and knee of both legs by a multiple of the promise, in an own constant direction in each step."""
+    controller, rng, step = airwalk(), np.random.default_rng(0), None
+    promise = controller.certificate(0.5).promise
+    assert promise is not None
+    plant, push = Plant(xi=0.5), np.zeros(12)
+    controller.reset(plant.state)
+    exceeded = 0
+    for _ in range(STARTUP + 6 * STEP + 1):
+        command = controller.update(plant.state)
+        exceeded += command.hand_over_exceeded
+        if command.step != step:
+            step = command.step
+            push[[SH, SH + 6]] = rng.choice([-promise.hip, promise.hip], 2)
+            push[[SK, SK + 6]] = rng.choice([-promise.knee, promise.knee], 2)
+        torque = command.torque.copy()
+        plant.step(torque)
+        plant.command += factor * push * (controller.statistics.steps > 0)
+    assert exceeded == controller.statistics.hand_overs_exceeded
+    return controller
+
+
+def test_pushes_of_exactly_the_promise_keep_the_guide_and_the_hand_over_box():
+    statistics = pushed(1.0).statistics
+    assert statistics.max_ratio <= 1.0
+    assert statistics.hand_overs == 6
+    assert statistics.hand_overs_exceeded == 0
+
+
+def test_hand_over_outside_the_box_is_counted_and_reported():
+    assert pushed(2.5).statistics.hand_overs_exceeded > 0
+
+
+def test_torque_added_to_a_guided_leg_is_at_most_the_carried_torque_of_the_box():
+    controller = pushed(2.5)  # ends with the first cycle of a step
+    leg = 6 * (1 - int(controller.telemetry[-2]))  # swing leg
+    joints, carry = [leg + SH, leg + SK], controller._carry.records[0]
+    limit = np.array(CONFIG.hand_over.carried)
+    assert (np.abs(carry.jump[joints]) > limit).any()
+    np.testing.assert_array_equal(carry.carried[joints], np.clip(carry.jump[joints], -limit, limit))
+    others = np.delete(np.arange(12), joints)
+    np.testing.assert_array_equal(carry.carried[others], carry.jump[others])
+
+
 @pytest.mark.parametrize("friction", [0.8, 1.2])
 @pytest.mark.parametrize("shape", ["constant", "pinched"])
 def test_joints_stay_inside_the_guide_with_20_percent_friction_error(shape: str, friction: float):

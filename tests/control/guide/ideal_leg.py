@@ -50,6 +50,7 @@ class Path(NamedTuple):
     qd: np.ndarray
     gravity: np.ndarray
     carried: np.ndarray  # Nm, torque that is carried over the stance change
+    jump: np.ndarray  # Nm, shape (2,), torque before the stance change minus torque of the new control law
 
 
 @dataclass(frozen=True)
@@ -58,7 +59,7 @@ class Start:
 
     deviation: tuple[float, float] = (0.0, 0.0)  # rad
     rate: tuple[float, float] = (0.0, 0.0)  # rad/s
-    carried: tuple[float, float] = (0.0, 0.0)  # Nm
+    jump: tuple[float, float] = (0.0, 0.0)  # Nm, torque before the stance change minus torque of the new control law
 
 
 def path_of(guide: GuideFilter, start: Start, blend: np.ndarray) -> Path:
@@ -67,8 +68,9 @@ def path_of(guide: GuideFilter, start: Start, blend: np.ndarray) -> Path:
     q = leg.q + np.outer(values[0], start.deviation) + np.outer(values[1], start.rate)
     qd = leg.qd + np.outer(slopes[0], start.deviation) + np.outer(slopes[1], start.rate)
     carried = np.zeros_like(q)
-    carried[: len(blend)] = np.outer(blend, start.carried)
-    return Path(q, qd, leg.gravity, carried)
+    limit, jump = guide.prediction.assumptions.hand_over.carried, np.array(start.jump)
+    carried[: len(blend)] = np.outer(blend, np.clip(jump, np.negative(limit), limit))
+    return Path(q, qd, leg.gravity, carried, jump)
 
 
 def swing(guide: GuideTables, path: Path, truth: Truth, pushes: np.ndarray, mode: int) -> tuple[float, float, float]:
@@ -101,7 +103,7 @@ def swing(guide: GuideTables, path: Path, truth: Truth, pushes: np.ndarray, mode
         if cycle == 0:
             first = tick(guide, 0, state)
             for i in range(2):
-                sent[i] = motor[i] = first[i] + path.carried[0, i]
+                sent[i] = motor[i] = first[i] + path.jump[i]
                 commands[:, i] = sent[i]
             guide.guards[0].fresh = True
             state = LegState(

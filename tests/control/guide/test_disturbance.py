@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import itertools
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from atalante_control.guide.disturbance import Effect, Grid, HandOver, Mismatch, spread
+from atalante_control.guide.prediction import Prediction
 from tests.control.guide.ideal_leg import controller
 
 LEG = controller("constant").guides[0].prediction.leg
@@ -60,15 +62,57 @@ def test_spread_takes_the_worst_posture_and_the_hidden_part():
     np.testing.assert_allclose(ahead[0, 0], 2 * 2 * 3.0 + 6.0 + 3.0)  # three lags add 6 each, the hidden part adds 3
 
 
-def test_budget_contains_friction_inertia_residual_and_the_carried_torque():
-    box, blend = HandOver(0.0, 0.0, (10.0, 5.0)), np.array([1.0, 0.5])
-    none = LEG.budget(Mismatch(0.0, 0.0, (0.0, 0.0)), box, blend)
-    np.testing.assert_array_equal(none[:2], [[10.0, 5.0], [5.0, 2.5]])
+def test_budget_contains_friction_inertia_residual_and_the_torque_jump():
+    box, jump = HandOver(0.0, 0.0), np.array([[10.0, 5.0], [5.0, 2.5]])
+    none = LEG.budget(Mismatch(0.0, 0.0, (0.0, 0.0)), box, jump)
+    np.testing.assert_array_equal(none[:2], jump)
     assert not none[2:].any()
-    light = LEG.budget(Mismatch(0.0, 0.1, (0.0, 0.0)), box, blend) - none
+    light = LEG.budget(Mismatch(0.0, 0.1, (0.0, 0.0)), box, jump) - none
     np.testing.assert_allclose(light, 0.1 * np.abs(LEG.torque()))
-    rough = LEG.budget(Mismatch(0.2, 0.0, (1.0, 2.0)), box, blend) - none
+    rough = LEG.budget(Mismatch(0.2, 0.0, (1.0, 2.0)), box, jump) - none
     assert (rough >= 0.2 * np.abs(LEG.friction_torque()) + [1.0, 2.0]).all()
+
+
+def test_jump_decreases_with_the_limiter_down_to_the_added_torque():
+    box, blend = HandOver(torque=(50.0, 9.0), carried=(25.0, 13.0)), np.array([1.0, 0.75, 0.25])
+    decrease = np.array([[20.0, 20.0], [18.0, 18.0], [10.0, 10.0], [5.0, 5.0], [-1.0, -1.0]])
+    expected = [[30.0, 9.0], [18.75, 6.75], [6.25, 2.25], [0.0, 0.0], [0.0, 0.0]]
+    np.testing.assert_allclose(box.remaining(blend, decrease), expected)
+    none = HandOver(torque=(50.0, 9.0), carried=(0.0, 0.0)).remaining(blend, decrease)
+    np.testing.assert_allclose(none[:, 0], [30.0, 12.0, 2.0, 0.0, 0.0])
+
+
+def test_budget_of_the_prediction_contains_the_whole_jump_until_the_first_command_can_act():
+    guide = controller("constant").guides[0]
+    leg, assumptions = guide.prediction.leg, guide.prediction.assumptions
+    box, late = assumptions.hand_over, assumptions.delays[1]
+    assert late == 2
+    small = replace(assumptions, hand_over=replace(box, torque=(0.0, 0.0)))
+    reach = [
+        Prediction(guide.prediction.policy, leg, one, guide.blend, 0.1).start.error[1 : late + 1, :2]
+        for one in (assumptions, small)
+    ]
+    inverse = np.linalg.inv(leg.masses(leg.q[:1, 1])[0])
+    whole = 0.5e-6 * np.abs(inverse) @ box.torque  # rad, a constant torque for 1 ms, and four times as much for 2 ms
+    moved = reach[0] - reach[1]
+    assert (moved[0] >= whole).all()
+    assert (moved[1] >= 3.9 * whole).all()
+
+
+INSIDE = (0.04, -0.04), (-0.2, 0.2), (-19.0, 19.0), (64.0, -34.0)
+
+
+@pytest.mark.parametrize("argument", range(4))
+@pytest.mark.parametrize("joint", range(2))
+@pytest.mark.parametrize("sign", [-1.0, 1.0])
+def test_box_contains_no_value_above_its_limit(argument: int, joint: int, sign: float):
+    box, values = HandOver(), [list(pair) for pair in INSIDE]
+    assert box.contains(*INSIDE)
+    limit = (box.deviation, box.rate, box.acceleration, box.torque[joint])[argument]
+    values[argument][joint] = sign * limit
+    assert box.contains(*values)  # type: ignore[arg-type]
+    values[argument][joint] = sign * limit * 1.001
+    assert not box.contains(*values)  # type: ignore[arg-type]
 
 
 def test_mobilities_cover_the_guide():
@@ -91,7 +135,9 @@ def test_an_invalid_mismatch_is_rejected(bad: dict[str, object]):
         Mismatch(**bad)  # type: ignore[arg-type]
 
 
-@pytest.mark.parametrize("bad", [{"deviation": -1.0}, {"rate": math.nan}, {"torque": (-1.0, 0.0)}])
+@pytest.mark.parametrize(
+    "bad", [{"deviation": -1.0}, {"rate": math.nan}, {"torque": (-1.0, 0.0)}, {"carried": (0.0, math.inf)}]
+)
 def test_an_invalid_hand_over_box_is_rejected(bad: dict[str, object]):
     with pytest.raises(ValueError, match="hand-over"):
         HandOver(**bad)  # type: ignore[arg-type]

@@ -47,6 +47,7 @@ def test_speed_changes_within_a_walk(first: tuple[float, float], second: tuple[f
     guided = 0.0 if xi == 1.0 else 4 * 1000.0 * first[1] + 2 * 1000.0 * second[1]
     assert guide.cycles == pytest.approx(guided, rel=0.03)
     assert guide.inside == guide.cycles
+    assert guide.hand_overs == (0 if xi == 1.0 else 4 + 2)
     assert guide.hand_overs_exceeded == 0
 
 

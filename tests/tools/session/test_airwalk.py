@@ -46,7 +46,7 @@ from tests.process.test_telemetry_faults import cycles_without_index
 ATALANTE = str(Path(sys.executable).with_name("atalante"))
 KEYS = [
     "shape", "certified", "promise_hip_nm", "promise_knee_nm", "steps", "max_ratio", "inside", "filter_active", "cycles",
-    "real_time_factor", "frames", "crc_errors", "hand_overs_exceeded",
+    "real_time_factor", "frames", "crc_errors", "hand_overs", "hand_overs_exceeded",
 ]  # fmt: skip
 
 
@@ -55,7 +55,7 @@ def atalante(*arguments: str) -> subprocess.CompletedProcess[str]:
 
 
 def test_the_table_shows_no_tracking_error_for_a_single_step() -> None:
-    walked = Result("pinched", True, 1.97, 1.18, 2, 0.934, 0.99876, 0.5, 4697, 6.25, 90000, 0, 0)
+    walked = Result("pinched", True, 1.97, 1.18, 2, 0.934, 0.99876, 0.5, 4697, 6.25, 90000, 0, 2, 0)
     head, two, one = results_table(
         [walked, replace(walked, steps=1, max_ratio=None, inside=None, filter_active=None)]
     ).splitlines()

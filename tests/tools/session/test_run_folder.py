@@ -12,7 +12,7 @@ from atalante_hal.telemetry.process import Recording
 from atalante_tools.console.outcome import Failed
 from atalante_tools.session.run_folder import Result, run_folder, write_summary
 
-WALKED = Result("pinched", True, 1.97, 1.18, 2, 0.934, 0.99876, 0.5, 4697, 6.25, 90000, 0, 0)
+WALKED = Result("pinched", True, 1.97, 1.18, 2, 0.934, 0.99876, 0.5, 4697, 6.25, 90000, 0, 2, 0)
 
 
 def test_a_second_run_in_the_same_folder_is_rejected(tmp_path: Path) -> None:

@@ -27,7 +27,7 @@ from atalante_tools.console.options import (
 )
 from atalante_tools.console.stop_request import stop_requested
 from atalante_tools.console.terminal import print_message, show_json
-from atalante_tools.session.certificates import announce, promise_fields, weakest
+from atalante_tools.session.certificates import announce, promise_fields, report_hand_overs, weakest
 from atalante_tools.session.law import Law, law_options
 from atalante_tools.session.recording import (
     RECORDING_OPTIONS,
@@ -214,6 +214,7 @@ def _walk_all(
                 factors = controller.statistics.factors or {options.xi}
                 certificate = weakest(controller.certificate(xi) for xi in factors)
                 walked.results.append(_result(certificate, controller, rig.hal, statistics))
+                report_hand_overs(name, controller.statistics)
                 if as_json:
                     show_json(asdict(walked.results[-1]))
                 walk.conclude()
@@ -337,5 +338,6 @@ def _result(certificate: Certificate, controller: AirwalkController, hal: Hal, s
         real_time_factor=round(statistics.real_time_factor, 2),
         frames=int(hal.record[hal.layout["frames"]][0]),
         crc_errors=hal.crc_errors,
+        hand_overs=walking.hand_overs,
         hand_overs_exceeded=walking.hand_overs_exceeded,
     )

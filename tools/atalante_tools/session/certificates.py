@@ -10,6 +10,7 @@ from atalante_tools.console.terminal import print_message
 if TYPE_CHECKING:
     from atalante_control.guide.certificate import Certificate
     from atalante_control.guide.disturbance import Mismatch
+    from atalante_control.guide.statistics import GuideStatistics
 
 
 def weakest(certificates: Iterable[Certificate]) -> Certificate:
@@ -56,6 +57,21 @@ def announce(certificates: Collection[Certificate], mismatch: Mismatch, leg: str
         )
     if any(certificate.certified for certificate in certificates):
         print_message(
-            "the promise includes joint torque and rate limits, delay, the torque carried over a stance change, and errors of "
-            f"friction ({100.0 * mismatch.friction:g} %) and inertia ({100.0 * mismatch.inertia:g} %); it is made for the {leg}"
+            "the promise includes joint torque and rate limits, delay, the torque jump at a stance change, and errors of "
+            f"friction ({100.0 * mismatch.friction:g} %) and inertia ({100.0 * mismatch.inertia:g} %); it is made for the {leg}, "
+            "and for steps that start inside the hand-over box. Steps that start outside are counted"
+        )
+
+
+def report_hand_overs(name: str, statistics: GuideStatistics) -> None:
+    """Print in how many steps the certificate did not apply. Print nothing if it applied in every step.
+
+    Args:
+        name: Name of the guide shape.
+        statistics: Statistics of the guide.
+    """
+    if statistics.hand_overs_exceeded:
+        print_message(
+            f"{name}: the certificate did not apply to {statistics.hand_overs_exceeded} of {statistics.hand_overs} steps: at the "
+            "stance change, an angle, a speed, an acceleration or a torque jump was larger than the certificate assumes"
         )

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 from atalante_tools.console.options import Target
 from atalante_tools.console.stop_request import stop_requested
 from atalante_tools.console.terminal import print_message, show_json
-from atalante_tools.session.certificates import announce, weakest
+from atalante_tools.session.certificates import announce, report_hand_overs, weakest
 from atalante_tools.session.dial import Dial
 from atalante_tools.session.recording import (
     EndpointReport,
@@ -197,6 +197,8 @@ def _walk(
             robot_process=robot_process is not None,
             cpu_per_second=round(processor / (statistics.cycles * PERIOD), 4),
         )
+        if weakest_guide is not None:
+            report_hand_overs(weakest_guide.shape, controller.statistics.guide)
         if as_json:
             show_json(asdict(result))
         else:

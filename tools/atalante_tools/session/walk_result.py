@@ -47,7 +47,10 @@ class WalkResult:
     outside_cycles: int  # number of guided cycles with a joint outside the guide
     #: fraction of the guided time in which the backup torque of the guide (spring and damper) acts; None if no step was guided
     filter_active: float | None
-    hand_overs_exceeded: int  # number of guided steps that started with a larger deviation than the certificate assumes
+    hand_overs: int  # number of steps with a certified guide whose start was compared with the hand-over box
+    hand_overs_exceeded: (
+        int  # number of these steps that started outside the hand-over box, so the certificate did not apply
+    )
     full_assist: bool  # whether a diagnostic made the HAL ramp the assistance factor to 1 (state FULL_ASSIST)
     lateral_m: float  # sideways deviation from the walking line at the last landing, positive to the left
     yaw_deg: float  # heading of the soles relative to the walking line at the last landing, positive to the left
@@ -76,6 +79,7 @@ def guide_fields(certificate: Certificate | None, statistics: GuideStatistics) -
         "inside": round(statistics.inside_fraction, 6) if counted else None,
         "outside_cycles": statistics.cycles - statistics.inside,
         "filter_active": round(statistics.active_fraction, 3) if counted else None,
+        "hand_overs": statistics.hand_overs,
         "hand_overs_exceeded": statistics.hand_overs_exceeded,
     }
 
