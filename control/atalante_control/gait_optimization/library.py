@@ -84,6 +84,9 @@ class Grid:
             )
         for index in corners:
             self.subject(index)
+        # A step duration between two valid ones can be invalid, because it must be a whole number of milliseconds.
+        for level in range(len(self.step_duration)):
+            self.subject(tuple(level * (name == "step_duration") for name in self.names()))
 
     @staticmethod
     def names() -> tuple[str, ...]:

@@ -152,6 +152,7 @@ def test_invalid_grid_file_is_rejected(tmp_path: Path, content: str) -> None:
         ({"mass": (60.0, 70.0)}, "mass must have at least 3 levels, got"),
         ({"step_duration": (0.7, 0.9, 0.8)}, "levels of step_duration must be in ascending order, got"),
         ({"height": (1.4, 1.6, 1.8)}, "height of the patient must be 1.5 to 2 m, got 1.4 m"),
+        ({"step_duration": (0.7, 0.80005, 0.9)}, "step duration must be a whole number of milliseconds, got 0.80005 s"),
         ({"size": 63}, "size must be at least 64, the number of corners of the grid, got 63"),
         ({"step_length": (0.1, 0.2, 0.5)}, "step length must be 0.05 to 0.4 m, got 0.5 m"),
     ],
