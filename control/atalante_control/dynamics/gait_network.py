@@ -12,7 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from itertools import pairwise
+from itertools import pairwise, product
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -281,6 +281,11 @@ def _network(arrays: Mapping[str, npt.NDArray[Any]]) -> GaitNetwork:
             raise ArrayFileError(
                 f"the range of {name} must be within {least:g} to {most:g} {unit}, got {low[i]:g} to {high[i]:g} {unit}"
             )
+    for mass, height, _, _, thigh, shank in product(*zip(low.tolist(), high.tolist(), strict=True)):
+        try:
+            subject_of([mass, height, STEP_LENGTH_RANGE[0], STEP_DURATION_RANGE[0], thigh, shank])
+        except ValueError as error:
+            raise ArrayFileError(f"each patient in the range of the network must be valid, but {error}") from error
     if depth > LAYERS_MAX:
         raise ArrayFileError(f"the network must have at most {LAYERS_MAX} layers, got {depth}")
     for i, (weights, bias) in enumerate(layers):

@@ -182,6 +182,14 @@ def test_saved_network_is_loaded_bit_for_bit(tmp_path: Path) -> None:
             {"low": np.array([50.0, 1.5, 0.1, 0.1, 0.9, 0.95]), "high": np.array([90.0, 1.9, 0.2, 0.2, 1.1, 1.05])},
             "the range of step_duration must be within 0.4 to 2 s, got 0.1 to 0.2 s",
         ),
+        (
+            {"low": np.array([10.0, 1.5, 0.1, 0.8, 0.9, 0.95])},
+            "each patient in the range .*, but mass of the patient must be",
+        ),
+        (
+            {"low": np.array([50.0, 1.5, 0.1, 0.8, 0.5, 0.95])},
+            "each patient in the range .*, but thigh length of the patient",
+        ),
         ({"low": np.zeros(3)}, r"low must have shape \(6,\), got shape \(3,\)"),
         ({"weights_0": np.full((6, 5), np.nan)}, "weights_0 must be an array of finite 64-bit floats"),
         ({"weights_0": np.full((6, 5), np.inf)}, "weights_0 must be an array of finite 64-bit floats"),
