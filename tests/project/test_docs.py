@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import re
 import shlex
@@ -12,6 +13,7 @@ from pathlib import Path
 
 import click
 import pytest
+from click.testing import CliRunner
 
 from atalante_hal.bus.adapters import ADAPTERS
 from atalante_tools.cli import COMMANDS, cli
@@ -169,3 +171,13 @@ def test_adapter_page_agrees_with_the_adapter_table():
 
 def test_guide_shapes_image_is_at_most_120_kb():
     assert (DOCS / "img" / "guide_shapes.png").stat().st_size <= 120_000
+
+
+@pytest.mark.long
+@pytest.mark.parametrize(("column", "options"), [(1, ["--literal"]), (2, [])], ids=["literal", "default"])
+def test_ratios_of_the_demo_are_those_of_the_page_about_the_paper(column: int, options: list[str], tmp_path: Path):
+    rows = re.findall(r"^\| (\w+) \| ([\d.]+) \| ([\d.]+) \|$", PAGES["docs/reference/paper.md"], re.MULTILINE)
+    arguments = ["demo", *options, "--steps", "3", "--json", "--out", str(tmp_path / "demo")]
+    lines = CliRunner().invoke(cli, arguments).stdout.splitlines()
+    measured = {result["shape"]: result["max_ratio"] for result in map(json.loads, lines) if "shape" in result}
+    assert {row[0]: float(row[column]) for row in rows} == pytest.approx(measured, abs=0.006, rel=0.002)
