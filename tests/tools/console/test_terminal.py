@@ -3,11 +3,16 @@
 from __future__ import annotations
 
 import errno
+import fcntl
 import io
 import json
 import logging
 import math
+import os
+import select
+import struct
 import sys
+import termios
 
 import pytest
 
@@ -47,6 +52,31 @@ def test_a_progress_line_is_overwritten_on_a_terminal() -> None:
     progress.clear()
     progress.clear()
     assert terminal.getvalue() == "\ra long line\rshort      \r     \r"
+
+
+def test_a_progress_line_of_several_rows_is_overwritten_on_a_terminal() -> None:
+    """A row has 10 columns. The cursor moves up by one row for each further row of the last line."""
+    controller, end = os.openpty()
+    fcntl.ioctl(end, termios.TIOCSWINSZ, struct.pack("4H", 24, 10, 0, 0))
+
+    def written() -> str:
+        text = b""
+        while select.select([controller], (), (), 0.0)[0]:
+            text += os.read(controller, 1000)
+        return text.decode()
+
+    with os.fdopen(end, "w") as terminal:
+        progress = Progress(stream=terminal)
+        for text in ("x" * 21, "y" * 11, "z"):
+            progress.show(text)
+        progress.clear()
+        up = "\r\x1b[{}A".format
+        expected = f"\r{'x' * 21}{up(2)}{'y' * 11:21}{up(2)}{'z':11}{up(1)} \r"
+        assert written() == expected
+        progress.show("w" * 10)  # the cursor remains in the last column
+        progress.clear()
+        assert written() == f"\r{'w' * 10}\r{' ' * 10}\r"
+    os.close(controller)
 
 
 def test_progress_is_printed_as_separate_lines_in_a_log() -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import logging
+import os
 import sys
 import time
 from collections.abc import Callable, Mapping, Sequence
@@ -92,7 +93,8 @@ class Progress:
         self._period = period or (LIVE if self._live else LOGGED)
         self._begun = now()
         self._next = self._begun + self._period
-        self._width = 0
+        self._width = 0  # length of the last line [characters]
+        self._written = 0  # length of the last line with the spaces that overwrote an older line [characters]
 
     def due(self) -> bool:
         """Return whether it is time to print the next progress line.
@@ -105,8 +107,9 @@ class Progress:
         """Print a progress line and start the next period."""
         self._next = self._now() + self._period
         if self._live:
-            self._write("\r" + text.ljust(self._width))
-            self._width = len(text)
+            padded = text.ljust(self._width)
+            self._write(self._to_begin() + padded)
+            self._width, self._written = len(text), len(padded)
         else:
             self._write(text + "\n")
 
@@ -131,8 +134,19 @@ class Progress:
     def clear(self) -> None:
         """Erase the progress line on a terminal, before other text is printed."""
         if self._live and self._width:
-            self._write("\r" + " " * self._width + "\r")
-            self._width = 0
+            self._write(self._to_begin() + " " * self._width)
+            self._written = self._width
+            self._write(self._to_begin())
+            self._width = self._written = 0
+
+    def _to_begin(self) -> str:
+        """Return the control characters that move the cursor to the begin of the last line, which may cover several rows."""
+        try:
+            columns = os.get_terminal_size(self._stream.fileno()).columns
+        except OSError:
+            columns = 0
+        rows = (self._written - 1) // columns if columns and self._written else 0
+        return "\r" + (f"\x1b[{rows}A" if rows else "")
 
 
 def _is_number(cell: str) -> bool:
