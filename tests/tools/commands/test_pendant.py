@@ -857,6 +857,22 @@ def test_start_typed_after_answers_without_room_is_pressed_once_and_accepted(
     ]
 
 
+def test_stop_without_a_sync_is_reported_as_not_sent(world: World, capsys: pytest.CaptureFixture[str]) -> None:
+    class EndsTheHal(Keyboard):
+        def lines(self) -> list[str]:
+            world.running = operator.node.hal is not ACTIVE
+            return []
+
+    operator = world.session(keyboard=EndsTheHal(None))
+    operator.take_over()
+    operator.start_wanted = True
+    operator.run(2.0)
+    assert capsys.readouterr().err.splitlines()[-2:] == [
+        "no SYNC received on pcan test: waiting for a HAL",
+        "STOP was not sent, because no SYNC was received on pcan test; the HAL was last ACTIVE",
+    ]
+
+
 def test_start_typed_after_lost_syncs_is_pressed_once_and_accepted(
     world: World, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -184,14 +184,21 @@ class Session:
         return self.node.answered * PERIOD + self._absent + absent
 
     def press_stop(self) -> None:
-        """Press STOP for some cycles, then release the dead-man switch."""
+        """Press STOP for some cycles, then release the dead-man switch. Print whether the HAL could receive STOP."""
         self._start_typed = False
+        answered = self.node.answered
         self.node.press(Request.STOP)
         self.answer_syncs(STOP_SYNCS)
         self.node.dead_man = False
         self.answer_syncs(RELEASE_SYNCS)
-        if self.node.hal is not None:
+        if self.node.hal is None:
+            return
+        if self.node.answered > answered:
             print_message(f"STOP: the HAL is {self.node.hal.name}")
+        else:
+            print_message(
+                f"STOP was not sent, because no SYNC was received on {self._target}; the HAL was last {self.node.hal.name}"
+            )
 
     def execute(self, line: str) -> None:
         """Execute a command that the operator typed.
