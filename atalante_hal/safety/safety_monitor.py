@@ -27,7 +27,7 @@ from atalante_hal.safety.hold_stability import HoldStability, Measured
 from atalante_hal.safety.limiter import Limiter
 from atalante_hal.safety.message_monitor import GROUND_TOLERANCE, NO_TOLERANCE, MessageMonitor, Tolerance
 from atalante_hal.safety.plausibility import Plausibility
-from atalante_hal.safety.plausibility.finding import JOINT_MESSAGES, rows_of
+from atalante_hal.safety.plausibility.finding import IMU_NODES, JOINT_MESSAGES, rows_of
 from atalante_hal.safety.start import (
     ENABLE_CYCLES,
     PROGRAM_ENDS,
@@ -59,6 +59,7 @@ RECALL_CYCLES = 6
 DRIVE_NODES = tuple(joint.upper() for joint in JOINTS)
 _ENABLED = np.full(len(JOINTS), float(DriveState.OPERATION_ENABLED)).tobytes()
 _FAULTY = (DriveState.FAULT, DriveState.FAULT_REACTION_ACTIVE)
+_IMPLAUSIBLE = frozenset({Dtc.IMU_IMPLAUSIBLE})
 _S = SupervisorState
 #: States in which START can change the state.
 #: In OFF and FINISH_STEP, START only acknowledges faults. In ACTIVE, START has no effect.
@@ -318,6 +319,7 @@ class SafetyMonitor:
         operator_stops = pendant.stop_requested or not pendant.dead_man
         walk_end_requested = self.walking and operator_stops and not pendant.hold_requested
         memory.close_cycle(cycle)
+        state.implausible_imus = frozenset(map(IMU_NODES.index, memory.nodes_of(_IMPLAUSIBLE)))
         self._duplicate_found |= Dtc.HAL_DUPLICATE in memory.confirmed and state.supervisor in (_S.OFF, _S.READY)
         self._process_start(nodes_ready)
         self.conditions = Conditions(

@@ -215,6 +215,7 @@ class WalkController:
         """Clear all data of the last walk."""
         self.phase, self._since, self._loaded, self._stopping, self._landed = Phase.POSTURE, cycle, 0, False, False
         self._stance, self._finishing = RIGHT, False
+        self._distrusted = False  # whether the pelvis IMU was implausible in this walk
         self._stage.stance, self._stage.double, self._stage.steering = RIGHT, True, 0.0
         self._assisted, self._promised = False, False
         #: Angle deviations [rad] and speed deviations [rad/s] of hip and knee at the start of the step.
@@ -375,8 +376,9 @@ class WalkController:
     def _measure(self, state: State) -> None:
         """Select the measurements of this cycle.
 
-        If the data of the pelvis IMU is too old, the torso IMU is used. If the data of one foot is too old, the load on this foot
-        is estimated.
+        If the data of the pelvis IMU is too old, the torso IMU is used. The torso IMU is also used for the rest of the walk if
+        the HAL has found the readings of the pelvis IMU implausible, but not those of the torso IMU. If the data of one foot is
+        too old, the load on this foot is estimated.
 
         Args:
             state: measured state of the robot.
@@ -384,8 +386,11 @@ class WalkController:
         if state is not self._state:
             self._bind(state)
         lost = bool(state.imu_rows) and state.age[state.imu_rows[_PELVIS]] > _SENSOR_AGE
-        self._measured = self._measured_by[_TORSO if lost else _PELVIS]
-        if self.config.heading_reference and not lost:
+        implausible = state.implausible_imus
+        self._distrusted = self._distrusted or (_PELVIS in implausible and _TORSO not in implausible)
+        replaced = lost or self._distrusted
+        self._measured = self._measured_by[_TORSO if replaced else _PELVIS]
+        if self.config.heading_reference and not replaced:
             self._observer.follow_heading(state.imu_quaternion[_PELVIS].tolist())
         feet = [side for side, row in enumerate(state.foot_rows) if state.age[row] > _SENSOR_AGE]
         if len(feet) == 1:

@@ -114,14 +114,17 @@ def test_delay_lowers_only_the_damping_of_the_sagittal_joints_of_a_stance_leg() 
 
 
 @pytest.mark.parametrize(
-    ("reference", "lost", "follows"), [(False, False, False), (True, False, True), (True, True, False)]
+    ("reference", "fault", "follows"),
+    [(False, "", False), (True, "", True), (True, "lost", False), (True, "implausible", False)],
 )
-def test_heading_follows_a_pelvis_imu_with_a_heading_reference(reference: bool, lost: bool, follows: bool) -> None:
-    """The controller ignores the heading of a pelvis IMU that is lost."""
+def test_heading_follows_a_pelvis_imu_with_a_heading_reference(reference: bool, fault: str, follows: bool) -> None:
+    """The controller ignores the heading of a pelvis IMU that is lost or implausible."""
     controller = WalkController(ROBOT, PATIENT, WALK, 3, WalkConfig(heading_reference=reference))
     state = hung(controller)
     state.imu_rows = (2, 3, 4, 5)
-    state.age[list(state.imu_rows)] = 100 if lost else 0
+    state.age[list(state.imu_rows)] = 100 if fault == "lost" else 0
+    if fault == "implausible":
+        state.implausible_imus = frozenset({IMUS.index("pelvis")})
     state.imu_gyro[:] = 0.0
     state.imu_quaternion[:] = math.cos(0.005), 0.0, 0.0, math.sin(0.005)
     before = controller._observer.rotation.copy()
@@ -131,6 +134,36 @@ def test_heading_follows_a_pelvis_imu_with_a_heading_reference(reference: bool, 
     rotation = controller._observer.rotation
     turned = math.atan2(rotation[1, 0], rotation[0, 0]) - math.atan2(before[1, 0], before[0, 0])
     assert turned > 1e-7 if follows else abs(turned) < 1e-9
+
+
+@pytest.mark.parametrize(
+    ("implausible", "replaced"),
+    [
+        ((), False),
+        (("torso",), False),
+        (("torso", "pelvis"), False),
+        (("pelvis",), True),
+        (("pelvis", "left_tibia"), True),
+    ],
+)
+def test_torso_imu_replaces_an_implausible_pelvis_imu_for_the_rest_of_the_walk(
+    implausible: tuple[str, ...], replaced: bool
+) -> None:
+    """The gyro of the pelvis has a constant error. The finding ends after one cycle, but the error remains."""
+    controller = WalkController(ROBOT, PATIENT, WALK, 3)
+    state, pelvis = hung(controller), IMUS.index("pelvis")
+    state.imu_gyro[:] = 0.0
+    state.imu_gyro[pelvis, 1] = 0.3
+    state.implausible_imus = frozenset(map(IMUS.index, implausible))
+    before = controller.vertical.copy()
+    for _ in range(200):
+        controller.update(state)
+        state.cycle += 1
+        state.implausible_imus = frozenset()
+    assert bool(abs(controller.vertical - before).max() < 1e-3) is replaced
+    controller.reset(state)
+    controller.update(state)
+    assert controller._measured is controller._measured_by[pelvis]
 
 
 def test_change_between_pelvis_imu_and_torso_imu_in_a_step_keeps_the_attitude() -> None:

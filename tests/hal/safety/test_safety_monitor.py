@@ -11,8 +11,9 @@ import numpy as np
 import pytest
 
 from atalante_dbc import Message, load
+from atalante_emulator.faults import Fault
 from atalante_hal.hal import BRIDGED_ERRORS, SATURATED_CYCLES
-from atalante_hal.robot import JOINTS
+from atalante_hal.robot import IMUS, JOINTS
 from atalante_hal.safety.diagnostics import Dtc
 from atalante_hal.safety.direction import DirectionProof
 from atalante_hal.safety.hold_stability import REVERSALS
@@ -81,6 +82,13 @@ def test_start_of_a_second_sender_is_ignored_if_the_next_frame_is_missing(rig):
     rig.cycle()
     rig.bus.to_hal = lambda frames: frames
     assert rig.run(20).supervisor is S.HOLD
+
+
+def test_state_names_the_implausible_imus_until_their_readings_are_plausible_again(rig):
+    rig.emulator.inject([Fault("imu_inverted", "IMU_PELVIS", 0, 300, axis="Z")])
+    assert rig.run(60).implausible_imus == frozenset()
+    assert rig.run(240).implausible_imus == {IMUS.index("pelvis")}
+    assert rig.run(2500).implausible_imus == frozenset()
 
 
 def test_pendant_sets_the_assistance_factor(make_rig):
