@@ -101,6 +101,9 @@ class WalkConfig:
     #: Value 0: for each leg while the robot stands. Value 1: for the ankle of the stance leg during a step.
     full_gains: Pair = (0.25, 0.5)
     settle: float = 1.0  # s, time for which both feet must be loaded before the robot walks
+    #: m, largest distance between the soles along the walk with which a robot on the ground may start a walk. The motion to the
+    #: standing pose moves both feet at once, so a robot with one foot ahead would fall.
+    stride: float = 0.05
     posture: float = 2.0  # s, duration of the motion from the measured pose to the standing pose
     shift: float = 1.5  # s, duration of a weight shift, onto one foot or back to both feet
     rest: float = 0.3  # s, wait after each weight shift

@@ -69,6 +69,10 @@ _SENSOR_AGE = 10
 _LOAD_ERROR = 0.15
 
 
+class StanceError(ValueError):
+    """Error for a pose on the ground from which a walk cannot start."""
+
+
 class WalkController:
     """Walking controller, which implements `atalante_hal.types.Controller`.
 
@@ -306,6 +310,9 @@ class WalkController:
 
         Args:
             state: measured state of the robot.
+
+        Raises:
+            StanceError: If the robot is on the ground with one foot ahead of the other, for example after HOLD in a step.
         """
         self._forget(state.cycle)
         self._constants.gains[:] = self.config.leg_gains(state.delay)
@@ -314,6 +321,7 @@ class WalkController:
         self._measure(state)
         self._load[:] = self._measured.force[:, :, 2].sum(axis=1)  # start value of the low-pass
         self._sense(self._measured, self._constants, self._stabiliser, self._parts)
+        self._require_stance()
         self._start(self._measured, self._table, self._parts)
         self._pid.store_request(state.torque if state.torque_sent is None else state.torque_sent)
 
@@ -348,6 +356,16 @@ class WalkController:
         self._watch_guide(cycle)
         self._velocity_before[:] = self._measured.qd
         return self._command
+
+    def _require_stance(self) -> None:
+        """Raise `StanceError` if the robot is on the ground with one foot ahead of the other."""
+        yaw = float(self._heading.mean())
+        ahead = math.cos(yaw) * float(self._step[0]) + math.sin(yaw) * float(self._step[1])
+        if abs(ahead) > self.config.stride and self._load.sum() > self._carrying:
+            raise StanceError(
+                "the feet must stand side by side at the start of a walk on the ground, got the right foot "
+                f"{abs(ahead):.2f} m {'ahead of' if ahead > 0.0 else 'behind'} the left foot: suspend the robot first"
+            )
 
     def _bind(self, state: State) -> None:
         """Give the kernels references to the arrays of a state.

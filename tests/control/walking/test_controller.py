@@ -12,7 +12,7 @@ import pytest
 from atalante_control.guide.shapes import CONSTANT
 from atalante_control.model import ExoskeletonParameters, urdf
 from atalante_control.walking.config import TURN_MAX, WalkConfig
-from atalante_control.walking.controller import WalkController
+from atalante_control.walking.controller import StanceError, WalkController
 from atalante_control.walking.lean import LeanConfig
 from atalante_control.walking.phases import STEPPING, Phase
 from atalante_control.walking.placement import PlacementConfig
@@ -134,6 +134,25 @@ def test_heading_follows_a_pelvis_imu_with_a_heading_reference(reference: bool, 
     rotation = controller._observer.rotation
     turned = math.atan2(rotation[1, 0], rotation[0, 0]) - math.atan2(before[1, 0], before[0, 0])
     assert turned > 1e-7 if follows else abs(turned) < 1e-9
+
+
+@pytest.mark.parametrize(("swung", "text"), [(0.15, "ahead of"), (-0.15, "behind")])
+@pytest.mark.parametrize("yaw", [0.0, 2.0])
+def test_walk_starts_on_the_ground_only_with_the_feet_side_by_side(swung: float, text: str, yaw: float) -> None:
+    """A robot that stands still after HOLD in a step has one foot ahead of the other."""
+    controller = WalkController(ROBOT, PATIENT, WALK, 3)
+    state, hips = hung(controller), [JOINTS.index("left_SH"), JOINTS.index("right_SH")]
+    state.imu_quaternion[:] = math.cos(yaw / 2.0), 0.0, 0.0, math.sin(yaw / 2.0)
+    state.foot_force[:, :, 2] = 190.0
+    for small in (0.0, swung / 10.0):
+        state.position[:] = controller.standing_pose
+        state.position[hips] += small, -small
+        controller.reset(state)
+    state.position[hips] += swung, -swung
+    with pytest.raises(StanceError, match=rf"got the right foot 0\.33 m {text} the left foot: suspend the robot first"):
+        controller.reset(state)
+    state.foot_force[:] = 0.0
+    controller.reset(state)
 
 
 @pytest.mark.parametrize(
