@@ -29,9 +29,8 @@ class Carry:
     limit: Annotated[Vector, len(JOINTS)]  # Nm, largest absolute value of `carried`
     #: Nm, torque jump at the stance change: `before` minus the computed torque of the first cycle
     jump: Annotated[Vector, len(JOINTS)]
-    carried: Annotated[
-        Vector, len(JOINTS)
-    ]  # Nm, torque to add in the first cycle after the stance change: `jump`, limited
+    #: Nm, torque to add in the first cycle after the stance change: `jump`, limited
+    carried: Annotated[Vector, len(JOINTS)]
 
 
 class CarryOver:

@@ -92,10 +92,8 @@ def branch() -> Branch | Continuation:
         theirs.close()
         return Branch(ours)
     ours.close()
-    for number in (
-        signal.SIGINT,
-        signal.SIGHUP,
-    ):  # signals of the terminal; this process ends when the run closes the pipe
+    # This process ignores the signals of the terminal. It ends when the run closes the pipe.
+    for number in (signal.SIGINT, signal.SIGHUP):
         signal.signal(number, signal.SIG_IGN)
     signal.signal(signal.SIGTERM, signal.SIG_DFL)
     try:

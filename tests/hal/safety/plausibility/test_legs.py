@@ -509,9 +509,8 @@ class TestExchange:
         angles = ([0.0, 0.03, 0.0, 0.0], [0.0, -0.03, 0.0, 0.0])
         drifted = ([0.0, -0.03, 0.0, 0.0], [0.0, 0.03, 0.0, 0.0])
         legs = self.legs(angles, angles)
-        for heading in np.arange(
-            0.0, 0.06, 9e-6
-        ).tolist():  # the IMUs turn the other way, as if the legs were exchanged
+        # The IMUs turn the other way, as if the legs were exchanged.
+        for heading in np.arange(0.0, 0.06, 9e-6).tolist():
             for leg, sign in enumerate((-1.0, 1.0)):
                 legs.now.quaternion[TIBIAE[leg]] = tibia_attitude(0.0, angles[leg][1] + sign * heading, 0.0)
                 (legs.legs.check_left, legs.legs.check_right)[leg](None)
