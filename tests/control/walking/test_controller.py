@@ -399,7 +399,7 @@ def test_vibration_shows_the_tracking_errors_of_the_guided_leg() -> None:
     for felt in guided:
         expected = [0.0] * len(MOTORS)
         for segment, share in zip(("thigh", "shank"), felt.shares, strict=True):
-            motor = f"{('left', 'right')[felt.swing]}_{segment}_{'front' if share > 0.0 else 'back'}"
+            motor = f"{('left', 'right')[felt.swing]}_{segment}_{'front' if share < 0.0 else 'back'}"
             expected[MOTORS.index(motor)] = min(1.0, abs(share) * (1.0 - math.exp(30.0 * (0.5 - 1.0))))
         assert felt.levels == pytest.approx(expected)
     assert not any(any(felt.levels) for felt in controller.felt if not felt.guided)
