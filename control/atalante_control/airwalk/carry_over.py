@@ -26,7 +26,7 @@ class Carry:
 
     pending: bool  # true until the first torque after the stance change is computed
     before: Annotated[Vector, len(JOINTS)]  # Nm, torque before the stance change
-    limit: Annotated[Vector, len(JOINTS)]  # Nm, largest absolute value of `carried`
+    limit: Annotated[Vector, len(JOINTS)]  # Nm, largest absolute value of `carried`; infinity for a joint without a guide
     #: Nm, torque jump at the stance change: `before` minus the computed torque of the first cycle
     jump: Annotated[Vector, len(JOINTS)]
     #: Nm, torque to add in the first cycle after the stance change: `jump`, limited
@@ -38,18 +38,22 @@ class CarryOver:
 
     Attributes:
         records: record that `add_carried` reads and updates, shape (1,).
-        blend: fade-out of the added torque, shape (n,). Element i is the fraction of `Carry.carried` that is added in cycle i
-            after the stance change. The fraction falls from 1 towards 0.
+        guided_blend: fade-out of the added torque of a joint with a guide, shape (n,). Element i is the fraction of
+            `Carry.carried` that is added in cycle i after the stance change. The fraction falls from 1 towards 0.
+        blends: fade-out of the added torques, shape (2, m). Row 0: joints without a guide. Row 1: joints with a guide.
     """
 
-    def __init__(self, duration: float) -> None:
-        """Compute the fade-out `blend`, and create the record of the state.
+    def __init__(self, duration: float, guided_duration: float) -> None:
+        """Compute the fade-outs, and create the record of the state.
 
         Args:
-            duration: time in which the added torque fades out [s]. With 0, no torque is added, and the command can jump.
+            duration: time in which the added torque of a joint without a guide fades out [s]. With 0, no torque is added, and
+                the command can jump.
+            guided_duration: the same for a joint with a guide [s].
         """
-        cycles = round(duration / PERIOD)
-        self.blend: Vector = 0.5 + 0.5 * np.cos(math.pi * np.arange(cycles) / max(1, cycles))
+        free, self.guided_blend = _fade_out(duration), _fade_out(guided_duration)
+        self.blends: Vector = np.zeros((2, max(len(free), len(self.guided_blend))))
+        self.blends[0, : len(free)], self.blends[1, : len(self.guided_blend)] = free, self.guided_blend
         self.records: Records[Carry] = zeros(Carry, 1)
         self.limit((), ())
 
@@ -68,10 +72,10 @@ class CarryOver:
         carry.before[:], carry.pending = before, True
 
     def limit(self, joints: Sequence[int], largest: Sequence[float]) -> None:
-        """Limit the added torques of some joints. The added torques of all other joints are not limited.
+        """Limit the added torques of the joints with a guide. The added torques of all other joints are not limited.
 
         Args:
-            joints: indices of the joints in JOINTS.
+            joints: indices of the joints with a guide in JOINTS.
             largest: largest absolute value of the added torque of each of these joints [Nm].
         """
         limit = self.records[0].limit
@@ -87,7 +91,14 @@ class CarryOver:
         self.records[0].pending = False
 
 
-def add_carried(carries: Records[Carry], blend: Vector, cycle: int, torque: Vector) -> None:
+def _fade_out(duration: float) -> Vector:
+    """Return the fade-out of an added torque, shape (n,), for a duration [s]."""
+    cycles = round(duration / PERIOD)
+    fading: Vector = 0.5 + 0.5 * np.cos(math.pi * np.arange(cycles) / max(1, cycles))
+    return fading
+
+
+def add_carried(carries: Records[Carry], blends: Vector, cycle: int, torque: Vector) -> None:
     """Add a torque to the torque command, so that the command does not jump at a stance change.
 
     The first call after a stance change computes the added torque: torque before the stance change minus `torque`, limited to
@@ -95,7 +106,7 @@ def add_carried(carries: Records[Carry], blend: Vector, cycle: int, torque: Vect
 
     Args:
         carries: `CarryOver.records`; `pending` is set to False.
-        blend: `CarryOver.blend`.
+        blends: `CarryOver.blends`.
         cycle: number of cycles since the stance change.
         torque: torque command, shape (12,) [Nm], updated.
     """
@@ -106,6 +117,7 @@ def add_carried(carries: Records[Carry], blend: Vector, cycle: int, torque: Vect
             carry.jump[joint] = jump
             carry.carried[joint] = min(max(jump, -limit), limit)
         carry.pending = False
-    if cycle < len(blend):
+    if cycle < blends.shape[1]:
         for joint in range(len(torque)):
-            torque[joint] += carry.carried[joint] * blend[cycle]
+            guided = 1 if carry.limit[joint] < math.inf else 0
+            torque[joint] += carry.carried[joint] * blends[guided, cycle]

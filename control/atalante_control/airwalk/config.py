@@ -28,14 +28,16 @@ class AirwalkConfig(StepGuideConfig):
     ankle_offset: float = math.radians(1.0)  # rad, offset added to the desired angles of both sagittal ankles
     startup: float = 2.0  # s, shortest duration of the motion from the measured pose to the first pose of the gait
     #: s, fade-out time of the torque that prevents a jump at a stance change (`carry_over`); with 0, the torque can jump
-    blend: float = 0.006
+    blend: float = 0.02
+    guided_blend: float = 0.006  # s, the same for sagittal hip and knee of a leg with a guide, as the certificate assumes
 
     def __post_init__(self) -> None:
         super().__post_init__()
         if not (math.isfinite(self.startup) and self.startup >= PERIOD):
             raise ValueError(f"startup must be at least one cycle ({PERIOD} s), got {self.startup!r}")
-        if not (self.blend == 0.0 or PERIOD <= self.blend < math.inf):
-            raise ValueError(f"blend must be 0 or at least one cycle ({PERIOD} s), got {self.blend!r}")
+        for name in ("blend", "guided_blend"):
+            if not ((value := getattr(self, name)) == 0.0 or PERIOD <= value < math.inf):
+                raise ValueError(f"{name} must be 0 or at least one cycle ({PERIOD} s), got {value!r}")
 
     @classmethod
     def literal(cls) -> AirwalkConfig:
@@ -53,4 +55,5 @@ class AirwalkConfig(StepGuideConfig):
             feedforward=0.0,  # the paper used no feedforward in its experiment in the air
             gentler=(),  # only the stiffest backup gains are used, no softer ones
             blend=0.0,  # the torque can jump at a stance change
+            guided_blend=0.0,
         )

@@ -21,8 +21,8 @@ points open. This controller decides them as follows:
 - *Carry-over.* At a stance change the torque jumps for three reasons: the re-centring sets the tracking error to zero, the
   control law of each leg changes, and the prediction of the guide filter, which is shorter near the end of a step, returns to
   its full length. The torque jump is compensated, and the compensation fades out within `blend`, so the command is continuous.
-  At hip and knee of a leg with a guide, the compensation is at most `HandOver.carried`, which the certificate assumes. A larger
-  jump remains in the command.
+  At hip and knee of a leg with a guide, it fades out within `guided_blend`, and it is at most `HandOver.carried`, as the certificate
+  assumes. A larger jump remains in the command.
 """
 
 from __future__ import annotations
@@ -111,10 +111,10 @@ class AirwalkController:
         swinging = [nominal[RIGHT], nominal[LEFT]]  # left leg, right leg
         self._feet = LevelFeet(robot, exoskeleton, articulated, deadbeat, swinging, config.ankle_offset)
         self.pid = Pid(config.gains)
-        self._carry = CarryOver(config.blend)
+        self._carry = CarryOver(config.blend, config.guided_blend)
         inertia = AssistedInertia(articulated, poses)
         leg = swing_leg(config, gait, inertia, self._gravity)
-        self._guides = StepGuides(config, robot, shape, leg, self._carry.blend, OVERLAP)
+        self._guides = StepGuides(config, robot, shape, leg, self._carry.guided_blend, OVERLAP)
         self.guide = self._guides.filters[-1]
         of_gait = gait if gait.feedforward is not None else suspended_gait(gait, exoskeleton, robot)
         self._literal = LiteralGuide(
@@ -143,7 +143,7 @@ class AirwalkController:
             cubics=self._feet.cubics,
             literal=self._literal.tables,
             carries=self._carry.records,
-            blend=self._carry.blend,
+            blends=self._carry.blends,
             outputs=outputs,
             telemetry=telemetry,
         )
@@ -193,12 +193,12 @@ class AirwalkController:
         return Choice(self._guides.filters[0], 0.0) if self.config.literal_law else self._guides.at(xi)
 
     @property
-    def blend(self) -> Vector:
-        """Return the fade-out factors of the carry-over, one for each cycle after a stance change, shape (n,).
+    def guided_blend(self) -> Vector:
+        """Return the fade-out factors of the carry-over of joints with a guide, shape (n,).
 
         Element i is the fraction of the carry-over torque that is still added in cycle i after the stance change.
         """
-        return self._carry.blend
+        return self._carry.guided_blend
 
     def certificate(self, xi: float) -> Certificate:
         """Return the certificate of the guide used at an assistance factor, see `StepGuides.certificate`.
@@ -229,6 +229,7 @@ class AirwalkController:
         """Clear all data of the last motion."""
         self._walking, self._assisting, self._stance, self._changed_at = False, False, RIGHT, 0
         self._carry.cancel()
+        self._carry.limit((), ())
         self.pid.reset()
         self._share.fill(1.0)
         self.pid.start_step(RIGHT, self._share)
@@ -292,7 +293,7 @@ class AirwalkController:
         else:
             holding = self._gravity.torque(state.position, state.imu_quaternion[_PELVIS].tolist())
             np.add(tracking, holding, out=torque)
-        add_carried(self._carry.records, self._carry.blend, cycle, torque)
+        add_carried(self._carry.records, self._carry.blends, cycle, torque)
         self.pid.store_request(torque)
         self.telemetry[:_N] = row[:_N]
         return self._command

@@ -48,7 +48,8 @@ class Parts(NamedTuple):
     cubics: Vector
     literal: LiteralTables  # tables of the control law as printed in the paper, see `LiteralGuide.tables`
     carries: Records[Carry]  # (1,) torque before and torque added after a stance change, see `CarryOver.records`
-    blend: Vector  # (n,) element i: fraction of `Carry.carried` that is added in cycle i after a stance change
+    #: (2, n) column i: fractions of `Carry.carried` that are added in cycle i after a stance change, see `CarryOver.blends`.
+    blends: Vector
     outputs: Records[Outputs]  # (1,) results of the cycle
     telemetry: Records[Telemetry]  # (1,) telemetry of the cycle
 
@@ -106,7 +107,7 @@ def run(
             torque[joint] += gravity[joint]
     if step.assisted:
         torque[hip], torque[knee] = assisted
-    add_carried(parts.carries, parts.blend, cycle, torque)
+    add_carried(parts.carries, parts.blends, cycle, torque)
     requested = parts.pids[0].requested
     for joint in range(len(requested)):
         requested[joint] = torque[joint]

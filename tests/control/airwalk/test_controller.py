@@ -421,6 +421,15 @@ def test_reset_controller_behaves_like_a_new_one():
     assert used.statistics == fresh.statistics
 
 
+def test_start_after_a_walk_with_a_guide_continues_from_any_measured_torque():
+    """The added torque is limited only at hip and knee of a leg with a guide, so not in the start motion."""
+    controller, state = airwalk(), blank_state(0.5)
+    walk(controller, STARTUP + 100)
+    state.position[:], state.torque[:] = START, 60.0
+    controller.reset(state)
+    np.testing.assert_allclose(controller.update(state).torque, state.torque, atol=1e-12)
+
+
 def test_telemetry_matches_the_names_and_lengths_of_its_fields():
     controller = airwalk("asymmetric")
     fields = dict(controller.telemetry_fields)
@@ -566,6 +575,7 @@ def test_intensities_scale_idealization_and_feedforward():
     [
         {"startup": 0.0},
         {"blend": float("nan")},
+        {"guided_blend": 0.0005},
         {"stiffness": (0.0, 1.0)},
         {"promise": (30.0, 0.0)},
         {"idealization": 1.5},

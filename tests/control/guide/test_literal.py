@@ -108,4 +108,4 @@ def test_literal_law_has_no_promise(xi: float):
 
 
 def test_literal_law_carries_no_torque_over_a_stance_change():
-    assert len(literal().blend) == 0
+    assert len(literal().guided_blend) == 0

@@ -29,7 +29,7 @@ def worst(shape: str, xi: float, factor: float, count: int, seed: int = 0) -> fl
             )
             for start in (Start(), corner):
                 guide.start_step(xi, start.deviation, start.rate, scale)
-                ratio, _, _ = run(guide.tables, path_of(guide, start, walking.blend), truth, pushes, mode)
+                ratio, _, _ = run(guide.tables, path_of(guide, start, walking.guided_blend), truth, pushes, mode)
                 largest = max(largest, ratio)
     return largest
 
