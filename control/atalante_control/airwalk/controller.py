@@ -21,8 +21,8 @@ points open. This controller decides them as follows:
 - *Carry-over.* At a stance change the torque jumps for three reasons: the re-centring sets the tracking error to zero, the
   control law of each leg changes, and the prediction of the guide filter, which is shorter near the end of a step, returns to
   its full length. The torque jump is compensated, and the compensation fades out within `blend`, so the command is continuous.
-  At hip and knee of a leg with a guide, it fades out within `guided_blend`, and it is at most `HandOver.carried`, as the certificate
-  assumes. A larger jump remains in the command.
+  At hip and knee of a leg with a guide, it fades out within `guided_blend`, and it is at most `HandOver.carried`, as the
+  certificate assumes. A larger jump remains in the command.
 """
 
 from __future__ import annotations
