@@ -26,7 +26,8 @@ class Carry:
 
     pending: bool  # true until the first torque after the stance change is computed
     before: Annotated[Vector, len(JOINTS)]  # Nm, torque before the stance change
-    limit: Annotated[Vector, len(JOINTS)]  # Nm, largest absolute value of `carried`; infinity for a joint without a guide
+    #: Nm, largest absolute value of `carried`; infinity for a joint without a guide
+    limit: Annotated[Vector, len(JOINTS)]
     #: Nm, torque jump at the stance change: `before` minus the computed torque of the first cycle
     jump: Annotated[Vector, len(JOINTS)]
     #: Nm, torque to add in the first cycle after the stance change: `jump`, limited

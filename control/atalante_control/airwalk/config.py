@@ -29,7 +29,8 @@ class AirwalkConfig(StepGuideConfig):
     startup: float = 2.0  # s, shortest duration of the motion from the measured pose to the first pose of the gait
     #: s, fade-out time of the torque that prevents a jump at a stance change (`carry_over`); with 0, the torque can jump
     blend: float = 0.02
-    guided_blend: float = 0.006  # s, the same for sagittal hip and knee of a leg with a guide, as the certificate assumes
+    #: s, the same for sagittal hip and knee of a leg with a guide, as the certificate assumes
+    guided_blend: float = 0.006
 
     def __post_init__(self) -> None:
         super().__post_init__()
