@@ -71,10 +71,8 @@ class HandOver:
     deviation: float = math.radians(2.7)  # rad, largest angle deviation |s(0)| of sagittal hip and knee
     rate: float = 0.25  # rad/s, largest speed deviation |s'(0)| of sagittal hip and knee
     torque: Pair = (65.0, 35.0)  # Nm, largest jump of the torques of sagittal hip and knee at a stance change
-    carried: Pair = (
-        25.0,
-        13.0,
-    )  # Nm, largest torque that the controller adds to sagittal hip and knee after a stance change
+    #: Nm, largest torque that the controller adds to sagittal hip and knee after a stance change
+    carried: Pair = (25.0, 13.0)
     #: rad/s2, largest joint acceleration before the stance change.
     #: This acceleration causes an error of the velocity that is measured after the stance change.
     acceleration: float = 20.0

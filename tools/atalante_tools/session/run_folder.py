@@ -45,9 +45,8 @@ class Result:
     frames: int
     crc_errors: int
     hand_overs: int  # number of steps with a certified guide whose start was compared with the hand-over box
-    hand_overs_exceeded: (
-        int  # number of these steps that started outside the hand-over box, so the certificate did not apply
-    )
+    #: number of these steps that started outside the hand-over box, so the certificate did not apply
+    hand_overs_exceeded: int
 
 
 @contextmanager

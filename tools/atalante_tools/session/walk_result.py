@@ -48,9 +48,8 @@ class WalkResult:
     #: fraction of the guided time in which the backup torque of the guide (spring and damper) acts; None if no step was guided
     filter_active: float | None
     hand_overs: int  # number of steps with a certified guide whose start was compared with the hand-over box
-    hand_overs_exceeded: (
-        int  # number of these steps that started outside the hand-over box, so the certificate did not apply
-    )
+    #: number of these steps that started outside the hand-over box, so the certificate did not apply
+    hand_overs_exceeded: int
     full_assist: bool  # whether a diagnostic made the HAL ramp the assistance factor to 1 (state FULL_ASSIST)
     lateral_m: float  # sideways deviation from the walking line at the last landing, positive to the left
     yaw_deg: float  # heading of the soles relative to the walking line at the last landing, positive to the left
