@@ -23,8 +23,8 @@ _TRUNK = IMUS.index("torso"), _PELVIS
 class Fall:
     """Check whether the robot has fallen.
 
-    A single faulty IMU causes no finding: if the values of both trunk IMUs are usable, both must show the lean. The finding is
-    confirmed if two evaluations in a row show the lean.
+    A single faulty IMU causes no finding: if the values of both trunk IMUs are usable, both must show the lean. If only one has
+    usable values, it decides. The finding is confirmed if two evaluations in a row show the lean.
 
     Args:
         now: signals decoded in this cycle.

@@ -23,7 +23,7 @@ from atalante_hal.safety.plausibility.encoders import EncoderChecks
 from atalante_hal.safety.plausibility.fall import Fall
 from atalante_hal.safety.plausibility.feet import FootChecks
 from atalante_hal.safety.plausibility.finding import JOINT_NODES, Ages, Rows, judged, signals_of
-from atalante_hal.safety.plausibility.imus import Imus
+from atalante_hal.safety.plausibility.imus import IMU_CYCLES, Imus
 from atalante_hal.safety.plausibility.inertial import Inertial
 from atalante_hal.safety.plausibility.knees import KNEE_IMUS, KNEE_JOINTS, Knees
 from atalante_hal.safety.plausibility.legs import Legs
@@ -121,7 +121,7 @@ class Plausibility:
         turns[2::SLOW] = [self._check_velocity] * (_PERIOD // SLOW)
         turns[4::SLOW] = [self._check_unchecked] * (_PERIOD // SLOW)
         turns[6] = self._support.evaluate
-        turns[14::SLOW] = [self._fall.evaluate] * (_PERIOD // SLOW)
+        turns[14::SLOW] = [self._check_fall] * (_PERIOD // SLOW)
         turns[12] = turns[12 + _INERTIAL_INTERVALS[0]] = self._check_inertial
         turns[1::FEET] = [self._check_feet] * (_PERIOD // FEET)
         turns[8], turns[24] = self._legs.check_left, self._legs.check_right
@@ -203,6 +203,14 @@ class Plausibility:
             ages = ages or self._rows.ages(self._image.age)
             ages.imu[frozen] = NEVER
         return self._inertial.evaluate(ages)
+
+    def _check_fall(self, ages: Ages | None) -> bool:
+        # An IMU whose values are lost or rejected must not hide a fall. Here its values are marked as too old.
+        if not self._settled:
+            ages = ages or self._rows.ages(self._image.age)
+            good = np.array([self._measured[row] for row in self._imu_rows])
+            ages.imu[self._cycle - good > IMU_CYCLES] = NEVER
+        return self._fall.evaluate(ages)
 
     def _check_feet(self, ages: Ages | None) -> bool:
         now = [0] * len(self._foot_ages) if ages is None else ages.foot.tolist()

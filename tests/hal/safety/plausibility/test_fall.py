@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 
 import numpy as np
 import pytest
@@ -13,6 +14,7 @@ from atalante_hal.safety.diagnostics import Dtc
 from atalante_hal.safety.plausibility import Finding
 from atalante_hal.safety.plausibility.fall import FALLEN, Fall
 from atalante_hal.safety.plausibility.finding import Ages, Signals
+from atalante_hal.safety.plausibility.imus import IMU_CYCLES
 from atalante_hal.wire.process_image import NEVER
 
 TORSO, PELVIS = IMUS.index("torso"), IMUS.index("pelvis")
@@ -88,3 +90,40 @@ def test_robot_that_falls_is_found_within_two_evaluations_by_the_schedule():
     robot = SimulatedRobot()
     robot.missing = {row("imu_torso"), row("imu_pelvis")}
     assert all(found.dtc is not Dtc.FALLEN for found in robot.run(64, lambda now: leaning(now, 1.2)))
+
+
+@pytest.mark.parametrize("imu", TRUNK)
+@pytest.mark.parametrize(
+    "rejected",
+    [
+        lambda now, imu: now.quaternion[imu].fill(0.0),
+        lambda now, imu: now.gyro[imu].fill(100.0),
+        lambda now, imu: now.gyro[imu].fill(0.01),
+    ],
+    ids=["no attitude", "saturated", "stuck"],
+)
+def test_trunk_imu_whose_values_are_rejected_does_not_hide_a_fall(rejected: Callable[[Signals, int], None], imu: int):
+    robot, other = SimulatedRobot(), TORSO + PELVIS - imu
+
+    def fall(now: Signals) -> None:
+        leaning(now, 1.2, imus=[other])
+        rejected(now, imu)
+
+    robot.run(300, lambda now: rejected(now, imu))
+    assert robot.until_found(Dtc.FALLEN, 40, fall) <= 32
+
+
+@pytest.mark.parametrize(("rejections", "expected"), [(IMU_CYCLES - 1, False), (IMU_CYCLES, True)])
+def test_trunk_imu_is_left_out_after_the_time_in_which_its_fault_is_confirmed(rejections: int, expected: bool):
+    robot = SimulatedRobot()
+    while robot.cycles % 32 != 14 - rejections:
+        robot.cycle()
+
+    def fall(now: Signals) -> None:
+        leaning(now, 1.2, imus=[TORSO])
+        now.quaternion[PELVIS] = 0.0
+
+    robot.run(rejections, fall)
+    assert all(found.dtc is not Dtc.FALLEN for found in robot.checks.findings)
+    robot.cycle(fall)
+    assert any(found.dtc is Dtc.FALLEN for found in robot.checks.findings) is expected
