@@ -120,7 +120,6 @@ class Dtc(StrEnum):
     TORQUE_TRACKING = "TORQUE_TRACKING", _R.LOWER, _S.ERROR, "a drive reports a torque that differs from its command"
     TORQUE_MOTION = "TORQUE_MOTION", _R.LOWER, _S.ERROR, "the motion of a joint contradicts the torque that was sent"
     HOLD_UNSTABLE = "HOLD_UNSTABLE", _R.LOWER, _S.ERROR, "a drive holds its position, but does not hold its joint"
-    FALLEN = "FALLEN", _R.HOLD, _S.ERROR, "the trunk leans so far that the robot has fallen"
     # Bus.
     BUS_FLOOD = "BUS_FLOOD", _R.HOLD, _S.ERROR, "too many frames arrived in a cycle"
     BUS_OFF = "BUS_OFF", _R.HOLD, _S.ERROR, "the CAN controller is bus-off"
@@ -151,6 +150,8 @@ class Dtc(StrEnum):
     DBC_INVALID = "DBC_INVALID", _R.NOT_READY, _S.ERROR, "the DBC was rejected"
     CONFIG_INVALID = "CONFIG_INVALID", _R.NOT_READY, _S.ERROR, "the configuration was rejected"
     GAIT_INVALID = "GAIT_INVALID", _R.NOT_READY, _S.ERROR, "the gait was rejected"
+    # New codes are appended here, because HAL_STATUS and recordings contain the position of a code in this list.
+    FALLEN = "FALLEN", _R.HOLD, _S.ERROR, "the trunk leans so far that the robot has fallen"
 
 
 #: Codes whose reaction is HOLD. A walking robot may make some more steps before HOLD, because the HAL can still control it.

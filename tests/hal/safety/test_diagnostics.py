@@ -77,6 +77,13 @@ def test_all_codes_fit_exactly_into_the_two_fields_of_a_record():
         assert max(low, high) < 1 << 53  # float64 represents the sum of all lower bits exactly
 
 
+def test_new_codes_do_not_change_the_numbers_of_the_other_codes():
+    """HAL_STATUS contains this number, and the hash of the DBC does not depend on it."""
+    assert list(Dtc).index(Dtc.GAIT_INVALID) == 68
+    assert number_of(Dtc.BUS_FLOOD.bit) == 48
+    assert number_of(Dtc.FALLEN.bit) == 70
+
+
 def test_worst_is_the_most_severe_reaction_of_the_codes():
     assert worst([]) is R.INFO
     assert worst([Dtc.FOOT_CELL, Dtc.ENC_STUCK, Dtc.BUS_OFF]) is R.LOWER
