@@ -78,6 +78,13 @@ def test_the_table_shows_no_tracking_error_for_a_single_step() -> None:
     assert one.split() == ["pinched", "yes", "1.97", "1.18", "1", "-", "-", "-", "4697", "6.2", "90000", "0", "0"]
 
 
+def test_the_table_shows_no_hand_overs_of_a_guide_without_a_certificate() -> None:
+    walked = Result("snap", False, None, None, 2, 0.934, 0.99876, 0.5, 4697, 6.25, 90000, 0, 0, 0)
+    head, row = results_table([walked]).splitlines()
+    assert head.split("  ")[-1].strip() == "steps outside box"
+    assert row.split()[1::11] == ["NO", "-"]
+
+
 @pytest.fixture(scope="module")
 def demo(tmp_path_factory: pytest.TempPathFactory) -> tuple[subprocess.CompletedProcess[str], Path]:
     out = tmp_path_factory.mktemp("demo")

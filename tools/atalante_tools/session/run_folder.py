@@ -122,7 +122,7 @@ def results_table(results: Sequence[Result]) -> str:
         results: One result per guide shape.
     """
     head = ["shape", "certified", "promise hip Nm", "promise knee Nm", "steps", "max |e|/q_bound", "inside %", "filter active %",
-            "cycles", "x real time", "frames", "CRC errors", "not certified steps"]  # fmt: skip
+            "cycles", "x real time", "frames", "CRC errors", "steps outside box"]  # fmt: skip
     rows = [
         [
             r.shape,
@@ -134,7 +134,7 @@ def results_table(results: Sequence[Result]) -> str:
             f"{r.real_time_factor:.1f}",
             str(r.frames),
             str(r.crc_errors),
-            str(r.hand_overs_exceeded),
+            str(r.hand_overs_exceeded) if r.hand_overs else "-",
         ]
         for r in results
     ]
