@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 from atalante_hal.bus import BusDown
 from atalante_hal.robot import IMUS
+from atalante_hal.safety.plausibility.fall import FALLEN
 
 if TYPE_CHECKING:
     from atalante_control.walking.controller import WalkController
@@ -16,8 +17,6 @@ if TYPE_CHECKING:
     from atalante_tools.session.rig import Rig
     from atalante_tools.session.walk_options import Push
 
-#: The robot has fallen if its pelvis leans by more than this angle [rad].
-FALLEN: Final = math.radians(35.0)
 #: Period of the observation [cycles]. In this time, the pelvis of a falling robot turns by less than 2 degrees.
 PERIOD_CYCLES: Final = 10
 #: After the HAL has left the state ACTIVE, the robot is observed for this time [cycles].
