@@ -395,20 +395,20 @@ class WalkController:
         """Select the measurements of this cycle.
 
         If the data of the pelvis IMU is too old, the torso IMU is used. The torso IMU is also used for the rest of the walk if
-        the HAL has found the readings of the pelvis IMU implausible, but not those of the torso IMU. If the data of one foot is
-        too old, the load on this foot is estimated.
+        the HAL has found the readings of the pelvis IMU implausible, but not those of the torso IMU, except while the data of the
+        torso IMU is too old. If the data of one foot is too old, the load on this foot is estimated.
 
         Args:
             state: measured state of the robot.
         """
         if state is not self._state:
             self._bind(state)
-        lost = bool(state.imu_rows) and state.age[state.imu_rows[_PELVIS]] > _SENSOR_AGE
+        lost = _is_lost(state, _PELVIS)
         implausible = state.implausible_imus
         self._distrusted = self._distrusted or (_PELVIS in implausible and _TORSO not in implausible)
-        replaced = lost or self._distrusted
+        replaced = lost or (self._distrusted and not _is_lost(state, _TORSO))
         self._measured = self._measured_by[_TORSO if replaced else _PELVIS]
-        if self.config.heading_reference and not replaced:
+        if self.config.heading_reference and not (lost or self._distrusted):
             self._observer.follow_heading(state.imu_quaternion[_PELVIS].tolist())
         feet = [side for side, row in enumerate(state.foot_rows) if state.age[row] > _SENSOR_AGE]
         if len(feet) == 1:
@@ -538,6 +538,11 @@ class WalkController:
         self.statistics.guide.hand_overs += 1
         self.statistics.guide.hand_overs_exceeded += not inside
         return not inside
+
+
+def _is_lost(state: State, imu: int) -> bool:
+    """Return whether the data of an IMU is too old."""
+    return bool(state.imu_rows) and bool(state.age[state.imu_rows[imu]] > _SENSOR_AGE)
 
 
 def _ratio(error: float, bound: float) -> float:

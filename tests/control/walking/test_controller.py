@@ -185,6 +185,18 @@ def test_torso_imu_replaces_an_implausible_pelvis_imu_for_the_rest_of_the_walk(
     assert controller._measured is controller._measured_by[pelvis]
 
 
+def test_lost_torso_imu_does_not_replace_an_implausible_pelvis_imu() -> None:
+    controller = WalkController(ROBOT, PATIENT, WALK, 3)
+    state, pelvis, torso = hung(controller), IMUS.index("pelvis"), IMUS.index("torso")
+    state.imu_rows = (2, 3, 4, 5)
+    state.implausible_imus = frozenset({pelvis})
+    for lost, used in (((), torso), ((torso,), pelvis), ((), torso), ((pelvis,), torso), ((pelvis, torso), torso)):
+        state.age[list(state.imu_rows)] = [11 if imu in lost else 10 for imu in range(len(IMUS))]
+        controller.update(state)
+        state.cycle += 1
+        assert controller._measured is controller._measured_by[used]
+
+
 def test_change_between_pelvis_imu_and_torso_imu_in_a_step_keeps_the_attitude() -> None:
     """The pelvis IMU is lost in the middle of the first periodic step and returns in the next step."""
     controller, errors = WalkController(ROBOT, PATIENT, WALK, 2), list[float]()
