@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import os
 import re
 import shlex
@@ -15,6 +16,9 @@ import click
 import pytest
 from click.testing import CliRunner
 
+from atalante_control.airwalk.config import AirwalkConfig
+from atalante_control.guide.disturbance import HandOver
+from atalante_control.walking.config import WALK_GUIDE
 from atalante_hal.bus.adapters import ADAPTERS
 from atalante_tools.cli import COMMANDS, cli
 
@@ -181,3 +185,21 @@ def test_ratios_of_the_demo_are_those_of_the_page_about_the_paper(column: int, o
     lines = CliRunner().invoke(cli, arguments).stdout.splitlines()
     measured = {result["shape"]: result["max_ratio"] for result in map(json.loads, lines) if "shape" in result}
     assert {row[0]: float(row[column]) for row in rows} == pytest.approx(measured, abs=0.006, rel=0.002)
+
+
+def test_hand_over_boxes_in_the_pages_are_those_of_the_controllers() -> None:
+    def row(name: str, box: HandOver, added: str) -> str:
+        jumps = f"{box.torque[0]:g}, {box.torque[1]:g} Nm"
+        limits = f"{math.degrees(box.deviation):.1f} degrees | {box.rate:g} rad/s | {box.acceleration:g} rad/s2"
+        return f"| {name} | {limits} | {jumps} | {added} |"
+
+    air, ground = AirwalkConfig(), WALK_GUIDE.hand_over
+    hip, knee = air.hand_over.carried
+    fading = f"fades out within {1000.0 * air.guided_blend:g} ms"
+    promises, paper = PAGES["docs/reference/guide-promises.md"], PAGES["docs/reference/paper.md"]
+    assert row("in the air", air.hand_over, f"at most {hip:g}, {knee:g} Nm, {fading}") in promises
+    assert row("on the ground", ground, "none") in promises
+    assert ground.carried == (0.0, 0.0)
+    assert f"fades out within {1000.0 * air.blend:g} ms; at hip and knee of a guided leg it {fading}" in paper
+    for page in (paper, PAGES["docs/glossary.md"]):
+        assert f"{hip:g} Nm and {knee:g} Nm" in page
