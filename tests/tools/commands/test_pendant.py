@@ -227,7 +227,7 @@ def test_a_damaged_sync_is_not_answered(world: World, network: Network) -> None:
 
 
 def test_keyboard_of_a_terminal_that_does_not_control_the_process_returns_no_lines() -> None:
-    """A terminal stops to control a process when the shell of the terminal ends."""
+    """A terminal stops controlling a process when the shell of the terminal ends."""
     terminal, end = os.openpty()
     os.write(terminal, b"hold\n")
     keyboard = Keyboard(end)

@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 
 #: Recommended length of a transmit queue [frames]. An interface that carries all four buses sends at least 26 frames per cycle.
 QUEUE: Final = 1000
-#: Begin of the names of virtual CAN interfaces. `ip link add` creates such an interface. For other names, an adapter is expected.
+#: Start of the names of virtual CAN interfaces. `ip link add` creates such an interface. For other names, an adapter is expected.
 VIRTUAL: Final = "vcan"
 #: MTU of a CAN FD interface [bytes].
 FD_MTU: Final = 72

@@ -108,7 +108,7 @@ class Progress:
         self._next = self._now() + self._period
         if self._live:
             padded = text.ljust(self._width)
-            self._write(self._to_begin() + padded)
+            self._write(self._to_start() + padded)
             self._width, self._written = len(text), len(padded)
         else:
             self._write(text + "\n")
@@ -134,13 +134,13 @@ class Progress:
     def clear(self) -> None:
         """Erase the progress line on a terminal, before other text is printed."""
         if self._live and self._width:
-            self._write(self._to_begin() + " " * self._width)
+            self._write(self._to_start() + " " * self._width)
             self._written = self._width
-            self._write(self._to_begin())
+            self._write(self._to_start())
             self._width = self._written = 0
 
-    def _to_begin(self) -> str:
-        """Return the control characters that move the cursor to the begin of the last line, which may cover several rows."""
+    def _to_start(self) -> str:
+        """Return the control characters that move the cursor to the start of the last line, which may cover several rows."""
         try:
             columns = os.get_terminal_size(self._stream.fileno()).columns
         except OSError:
