@@ -248,8 +248,9 @@ def refusal(interface: str, *, one_process: bool = False) -> str:
         one_process: Whether HAL and robot are in one process, as in a test.
 
     Returns:
-        One sentence that names the interface, the reason and the remedy. The text is empty if the interface can connect
-        HAL and robot. The check assumes that the driver and the adapter are present.
+        One sentence that names the interface, the reason and the remedy. For an unknown name, the remedy lists the interfaces
+        that can connect HAL and robot in two processes. The text is empty if the interface can connect HAL and robot. The
+        check assumes that the driver and the adapter are present.
     """
     adapter = ADAPTERS.get(interface)
     if adapter is None:
@@ -258,8 +259,8 @@ def refusal(interface: str, *, one_process: bool = False) -> str:
         # a python-can plug-in that is not in the table; `PythonCanBus` checks its CAN FD support
         if interface in can.VALID_INTERFACES:
             return ""
-        known = ", ".join(sorted(can.VALID_INTERFACES))
-        return f"there is no CAN interface {interface!r}; use one of {known}"
+        usable = ", ".join(name for name in sorted(can.VALID_INTERFACES) if not refusal(name))
+        return f"there is no CAN interface {interface!r}; use one of {usable}"
     remedy = "use a CAN FD adapter, or Linux vcan (`atalante doctor -i socketcan -c vcan0`)"
     if not adapter.can_fd:
         return f"{interface} supports classic CAN only in python-can, but this network requires CAN FD: {remedy}"

@@ -136,6 +136,13 @@ def test_interface_of_a_plug_in_is_not_rejected(monkeypatch: pytest.MonkeyPatch)
     assert refusal("candle") == ""
 
 
+def test_rejection_of_an_unknown_interface_lists_only_usable_interfaces() -> None:
+    for one_process in (False, True):
+        listed = refusal("pigeon", one_process=one_process).split("use one of ")[1].split(", ")
+        assert "socketcan" in listed
+        assert listed == [name for name in sorted(can.VALID_INTERFACES) if refusal(name) == ""]
+
+
 # -- on loopback -----------------------------------------------------------------------------------------------------
 
 

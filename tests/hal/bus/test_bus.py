@@ -469,7 +469,7 @@ def test_lost_virtual_bus_reports_the_number_of_sent_frames(code: int | None, mo
 @pytest.mark.parametrize(
     ("interface", "options", "sentence"),
     [
-        ("pigeon", {}, "no CAN interface 'pigeon'; use one of .*socketcan.*virtual"),
+        ("pigeon", {}, "no CAN interface 'pigeon'; use one of .*socketcan.*vector"),
         ("pcan", {}, "cannot open pcan:x for CAN FD: .*atalante doctor -i pcan"),
         (
             "virtual",
