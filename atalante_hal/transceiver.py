@@ -177,7 +177,7 @@ class Transceiver:
             if cycle is not None and (first or not cycle.begins(scratch, count)):
                 count = self._receive_rest(first, count, cycle, patience)
         except BusError as error:
-            self._find(Dtc.BUS_DOWN, True, 0.0, f"the bus {self.bus.name} cannot receive: {error}")
+            self._find(Dtc.BUS_DOWN, True, 0.0, f"{error}")
             count = first
             if cycle is not None:  # Without a pause, lock-step cycles on a failing bus would run as fast as possible.
                 time.sleep(min(patience, _DOUBTFUL_PATIENCE))
@@ -247,7 +247,7 @@ class Transceiver:
                 if count < RECEIVE_BUDGET:
                     break
         except BusError as error:
-            self._find(Dtc.BUS_DOWN, True, 0.0, f"the bus {self.bus.name} cannot receive: {error}")
+            self._find(Dtc.BUS_DOWN, True, 0.0, f"{error}")
         return np.concatenate(kept) if kept else new_frames(0)
 
     def acknowledge(self) -> None:
@@ -295,7 +295,7 @@ class Transceiver:
             self._full_this_cycle = True
             self._find(Dtc.BUS_TX_FULL, self._refused + 1 >= PERSISTENT, full.sent, f"{full}")
         if full is not error:
-            self._find(Dtc.BUS_DOWN, True, 0.0, f"the bus {self.bus.name} cannot send: {error}")
+            self._find(Dtc.BUS_DOWN, True, 0.0, f"{error}")
 
     def _find(self, dtc: Dtc, confirmed: bool, value: float, text: str) -> None:
         self._found.append(Finding(dtc, self._node, value, confirmed, text))

@@ -22,7 +22,7 @@ Stamps = npt.NDArray[np.int64]
 
 
 class BusError(Exception):
-    """Error of the bus; the message names the cause and the remedy.
+    """Error of the bus; the message names the bus, the cause and the remedy.
 
     Attributes:
         sent: Number of frames of the batch that were accepted; 0 unless `send` raised the error.

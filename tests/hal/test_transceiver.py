@@ -176,11 +176,11 @@ def test_full_queue_is_confirmed_after_five_cycles_in_a_row(desk: Desk):
 
 
 def test_bus_down_while_sending_is_confirmed_immediately(desk: Desk):
-    desk.bus.refuses = BusDown("gone")
+    desk.bus.refuses = BusDown("bench is down: gone")
     desk.transceiver.send(sync(desk))
     assert desk.evaluate() == {"BUS_DOWN": True}
     event = desk.memory.events[0]
-    assert (event.text, event.value, event.node) == ("the bus bench cannot send: gone", 0.0, "HAL")
+    assert (event.text, event.value, event.node) == ("bench is down: gone", 0.0, "HAL")
     assert desk.tap.sent_ids == []
     assert desk.evaluate() == {}
 
@@ -344,11 +344,11 @@ def test_flood_is_confirmed_after_five_cycles_in_a_row(desk: Desk):
 
 
 def test_bus_down_while_receiving_is_reported_and_not_raised(desk: Desk):
-    desk.bus.arrivals = [BusDown("gone")]
+    desk.bus.arrivals = [BusDown("bench is down: gone")]
     assert desk.transceiver.receive(1) == 1
     assert desk.evaluate() == {"BUS_DOWN": True}
     event = desk.memory.events[0]
-    assert (event.text, event.value, event.node) == ("the bus bench cannot receive: gone", 0.0, "HAL")
+    assert (event.text, event.value, event.node) == ("bench is down: gone", 0.0, "HAL")
     desk.bus.arrivals = [ids(1), BusDown("gone")]
     begun = desk.bus.clock.now
     assert desk.transceiver.receive(0, image(0, 1), 0.01) == 0
@@ -455,11 +455,11 @@ def test_number_of_queued_frames_is_bounded_under_a_flood(desk: Desk):
 
 
 def test_bus_down_while_queued_frames_are_received_is_reported_and_not_raised(desk: Desk):
-    desk.bus.arrivals = [BusDown("gone")]
+    desk.bus.arrivals = [BusDown("bench is down: gone")]
     assert len(desk.transceiver.receive_queued([])) == 0
     assert desk.evaluate() == {"BUS_DOWN": True}
     event = desk.memory.events[0]
-    assert (event.text, event.value) == ("the bus bench cannot receive: gone", 0.0)
+    assert (event.text, event.value) == ("bench is down: gone", 0.0)
 
 
 def test_queued_frames_before_a_bus_failure_are_kept(desk: Desk):

@@ -200,6 +200,6 @@ class DisturbedBus(WrappedBus):
         if refused is None:
             super().send(frames)
         elif refused.kind == "bus_down":
-            raise BusDown("injected fault: the interface is down")
+            raise BusDown(f"{self.name} is down: injected fault")
         else:
             raise BusFull("injected fault: the transmit queue is full")
