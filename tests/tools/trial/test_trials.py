@@ -17,6 +17,7 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 
+import atalante_tools.trial as trial_commands
 from atalante_control.dynamics.gait_network import DEFAULT_NETWORK, load_network, save_network
 from atalante_control.model import Patient
 from atalante_emulator.metabolism import MetabolismParameters
@@ -370,6 +371,23 @@ def test_protocol_has_a_trial_per_subject_condition_and_factor() -> None:
     passive = protocol_trials(replace(SETTING, literal=True), (0.5, 0.0), kinds=("passive",))
     assert passive == [trial for trial in trials if isinstance(trial, WalkTrial) and not trial.active]
     assert len(passive) == 16
+
+
+@pytest.mark.parametrize(
+    ("options", "law"),
+    [
+        ([], (False, 1.0, 1.0)),
+        (["--literal"], (True, 1.0, 0.0)),
+        (["--literal", "--feedforward", "0.5", "--idealization", "0.25"], (True, 0.25, 0.5)),
+    ],
+)
+def test_protocol_has_the_law_of_a_walk_with_the_same_options(
+    options: list[str], law: tuple[bool, float, float], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    conducted: list[WalkTrial] = []
+    monkeypatch.setattr(trial_commands, "_conduct", lambda experiment, trials, *others: conducted.extend(trials))
+    assert CliRunner().invoke(cli, ["trial", "protocol", *options]).exit_code == 0
+    assert {(trial.literal, trial.idealization, trial.feedforward) for trial in conducted} == {law}
 
 
 def test_robust_trials_are_drawn_from_the_seed_within_their_ranges() -> None:

@@ -1,4 +1,4 @@
-"""Options of the control law of `airwalk` and `walk`: `--idealization, --feedforward, --literal -> Law`."""
+"""Options of the control law of `airwalk`, `walk` and `trial`: `--idealization, --feedforward, --literal -> Law`."""
 
 from __future__ import annotations
 
@@ -36,8 +36,12 @@ class Law:
         return replace(config, idealization=self.idealization, feedforward=self.feedforward)
 
 
-def law_options() -> Callable[[_Command], _Command]:
-    """Return a decorator that adds the options of the control law to a command. The command gets the argument `law`."""
+def law_options(*, literal: bool = True) -> Callable[[_Command], _Command]:
+    """Return a decorator that adds the options of the control law to a command. The command gets the argument `law`.
+
+    Args:
+        literal: Whether to add `--literal`.
+    """
     options = [
         click.option(
             "--idealization",
@@ -53,16 +57,20 @@ def law_options() -> Callable[[_Command], _Command]:
             type=Between(0.0, 1.0),
             metavar="X",
             help="While the guide does not act, the exoskeleton produces this share (0 to 1) of the torques that accelerate "
-            "the leg along the gait. The patient must produce the rest.  [default: 1; 0 if --literal is given]",
-        ),
-        click.option(
-            "--literal",
-            is_flag=True,
-            help="Use the control law exactly as the paper prints it, for comparisons. The guides are then not certified.",
+            "the leg along the gait. The patient must produce the rest.  "
+            + ("[default: 1; 0 if --literal is given]" if literal else "[default: 1]"),
         ),
     ]
+    if literal:
+        options.append(
+            click.option(
+                "--literal",
+                is_flag=True,
+                help="Use the control law exactly as the paper prints it, for comparisons. The guides are then not certified.",
+            )
+        )
     return options_as("law", _law, options)
 
 
-def _law(idealization: float, feedforward: float | None, literal: bool) -> Law:
+def _law(idealization: float, feedforward: float | None, literal: bool = False) -> Law:
     return Law(idealization, (0.0 if literal else 1.0) if feedforward is None else feedforward, literal)

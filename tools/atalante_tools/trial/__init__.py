@@ -26,6 +26,7 @@ from atalante_tools.console.options import (
 from atalante_tools.console.outcome import Failed
 from atalante_tools.console.stop_request import check_stop
 from atalante_tools.console.terminal import Progress, print_message, show_json, table
+from atalante_tools.session.law import Law, law_options
 
 if TYPE_CHECKING:
     from atalante_tools.trial.findings import Finding, Result
@@ -51,9 +52,7 @@ class Walking:
     """Options of the experiments in which virtual subjects walk on the ground."""
 
     shape: str  # guide shape
-    #: share of the gravity, friction, Coriolis and centrifugal torques of the leg that the exoskeleton compensates, 0 to 1
-    idealization: float
-    feedforward: float  # share of the torques for the acceleration of the leg that the exoskeleton produces, 0 to 1
+    law: Law  # control law of the assisted joints
     network: Path | None  # file of the neural gait network; None means the network of the package
     haptics: bool  # whether active subjects respond to the vibration motors
 
@@ -75,17 +74,16 @@ def _running(experiment: str) -> Callable[[_Command], _Command]:
     return options_as("running", Running, options)
 
 
-def _walking() -> Callable[[_Command], _Command]:
-    """Return a decorator that adds the options of `Walking`. The command gets their values as the argument `walking`."""
+def _walking(*, literal: bool = False) -> Callable[[_Command], _Command]:
+    """Return a decorator that adds the options of `Walking`. The command gets their values as the argument `walking`.
+
+    Args:
+        literal: Whether to add `--literal`.
+    """
     options = [
         click.option("--shape", type=click.Choice(("constant", "pinched")), default="constant", show_default=True,
                      help="Shape of the guide. The guide of the paper is constant."),
-        click.option("--idealization", type=Between(0.0, 1.0), default=1.0, show_default=True, metavar="X",
-                     help="Share of gravity, friction, Coriolis and centrifugal torques of the leg that the exoskeleton "
-                          "compensates while the guide does not act, 0 to 1. The subject must produce the rest."),
-        click.option("--feedforward", type=Between(0.0, 1.0), default=1.0, show_default=True, metavar="X",
-                     help="The gait needs torques that accelerate the leg. Share of these torques that the exoskeleton "
-                          "produces while the guide does not act, 0 to 1. The subject must produce the rest."),
+        law_options(literal=literal),
         network_option,
         click.option("--haptics", is_flag=True,
                      help="Active subjects respond to the vibration motors: while a motor of a joint vibrates, they perceive an "
@@ -217,11 +215,6 @@ def faults(ids: tuple[str, ...], network: Path | None, running: Running, as_json
     help="Kind of the subjects.  [default: both]",
 )
 @click.option(
-    "--literal",
-    is_flag=True,
-    help="Use the control law as the paper prints it. With this law, no push is certified to keep the joints inside the guide.",
-)
-@click.option(
     "--xi",
     "factors",
     type=Between(0.0, 1.0),
@@ -235,12 +228,11 @@ def faults(ids: tuple[str, ...], network: Path | None, running: Running, as_json
     is_flag=True,
     help="Give the IMUs a heading reference, such as a magnetometer. The controller then estimates the drift of the gyro.",
 )
-@_walking()
+@_walking(literal=True)
 @_running("protocol")
 def protocol(
     masses: tuple[float, ...],
     kinds: tuple[str, ...],
-    literal: bool,
     factors: tuple[float, ...],
     heading_reference: bool,
     walking: Walking,
@@ -266,7 +258,6 @@ def protocol(
         masses = masses or QUICK_MASSES
     setting = replace(
         _setting(walking, running, QUICK_PROTOCOL if running.quick else PROTOCOL),
-        literal=literal,
         heading_reference=heading_reference,
     )
     trials = protocol_trials(setting, tuple(dict.fromkeys(factors)) or PROTOCOL_FACTORS, masses, kinds or KINDS)
@@ -363,10 +354,11 @@ def _setting(walking: Walking, running: Running, protocol: tuple[int, int, int])
     return WalkSetting(
         protocol,
         walking.shape,
-        walking.idealization,
-        walking.feedforward,
+        walking.law.idealization,
+        walking.law.feedforward,
         running.seed,
         running.engine,
+        walking.law.literal,
         network=_network(walking.network),
         haptics=walking.haptics,
     )
