@@ -390,6 +390,22 @@ def test_protocol_has_the_law_of_a_walk_with_the_same_options(
     assert {(trial.literal, trial.idealization, trial.feedforward) for trial in conducted} == {law}
 
 
+def test_protocol_rejects_factors_that_give_two_trials_the_same_name(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    names: list[str] = []
+    monkeypatch.setattr(
+        trial_commands, "_conduct", lambda experiment, trials, *others: names.extend(t.name for t in trials)
+    )
+    protocol = ["trial", "protocol", "--mass", "75", "--subject", "passive", "--out", str(tmp_path / "x")]
+    done = CliRunner().invoke(cli, [*protocol, "--xi", "0.5", "--xi", "0.50000001"])
+    assert done.exit_code == 2
+    assert "factors of --xi must differ in their first six digits, got 0.5 and 0.50000001" in done.stderr
+    assert names == []
+    assert CliRunner().invoke(cli, [*protocol, "--xi", "0.5", "--xi", "0.50", "--xi", "0.500001"]).exit_code == 0
+    assert names == ["walk-75kg-passive-xi0.5", "walk-75kg-passive-xi0.500001"]
+
+
 def test_robust_trials_are_drawn_from_the_seed_within_their_ranges() -> None:
     trials = [t for t in robust_trials(100, 60, 0, "mujoco") if isinstance(t, RobustTrial)]
     assert trials == robust_trials(100, 60, 0, "mujoco") != robust_trials(100, 60, 1, "mujoco")

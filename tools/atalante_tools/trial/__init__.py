@@ -253,14 +253,14 @@ def protocol(
         protocol_trials,
     )
 
-    masses = _known(masses)
+    masses, factors = _known(masses), _distinct(factors)
     if running.quick:
         masses = masses or QUICK_MASSES
     setting = replace(
         _setting(walking, running, QUICK_PROTOCOL if running.quick else PROTOCOL),
         heading_reference=heading_reference,
     )
-    trials = protocol_trials(setting, tuple(dict.fromkeys(factors)) or PROTOCOL_FACTORS, masses, kinds or KINDS)
+    trials = protocol_trials(setting, factors or PROTOCOL_FACTORS, masses, kinds or KINDS)
     _conduct("protocol", trials, protocol_findings, running, as_json)
 
 
@@ -346,6 +346,21 @@ def _known(masses: tuple[float, ...]) -> tuple[float, ...]:
     if unknown := [mass for mass in masses if mass not in known]:
         raise click.UsageError(f"--mass must be one of {', '.join(f'{mass:g}' for mass in known)}, got {unknown[0]:g}")
     return masses
+
+
+def _distinct(factors: tuple[float, ...]) -> tuple[float, ...]:
+    """Return `factors` without repeated values.
+
+    Raises:
+        UsageError: If two different factors have the same text in the name of a trial.
+    """
+    shown: dict[str, float] = {}
+    for xi in factors:
+        if shown.setdefault(f"{xi:g}", xi) != xi:
+            raise click.UsageError(
+                f"factors of --xi must differ in their first six digits, got {shown[f'{xi:g}']!r} and {xi!r}"
+            )
+    return tuple(shown.values())
 
 
 def _setting(walking: Walking, running: Running, protocol: tuple[int, int, int]) -> WalkSetting:
