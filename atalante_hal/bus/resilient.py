@@ -33,6 +33,7 @@ class ResilientBus(WrappedBus):
     Attributes:
         down: Error message of the link while it is lost; empty otherwise.
         losses: Number of losses so far.
+        reopens: Whether the bus opens the link again after the last loss. If False, the program must be restarted.
     """
 
     def __init__(self, bus: Bus, report: Callable[[str], None] = lambda message: None) -> None:
@@ -40,7 +41,7 @@ class ResilientBus(WrappedBus):
         self._report = report
         self.down = ""
         self.losses = 0
-        self._reopens = True  # whether the bus opens the lost link again
+        self.reopens = True
         self._reported = ""  # error message that was reported for the current loss; empty if none was reported
         self._changed_at = 0.0  # time of the last change of `down` [s]
 
@@ -103,7 +104,7 @@ class ResilientBus(WrappedBus):
 
     def _lost(self, error: BusDown) -> None:
         self.losses += not self.down
-        self._reopens, message = error.reopens, str(error)
+        self.reopens, message = error.reopens, str(error)
         if message != self.down:
             self.down, self._changed_at = message, time.monotonic()
         self._report_settled()
@@ -112,4 +113,4 @@ class ResilientBus(WrappedBus):
         """Report the error message if it was not reported yet and has not changed for `SETTLE_TIME`."""
         if self.down != self._reported and time.monotonic() - self._changed_at >= SETTLE_TIME:
             self._reported = self.down
-            self._report(f"{self.down}; waiting for the link" if self._reopens else self.down)
+            self._report(f"{self.down}; waiting for the link" if self.reopens else self.down)

@@ -831,6 +831,30 @@ def test_a_lost_link_releases_the_dead_man_until_start_is_typed(
     ]
 
 
+@pytest.mark.parametrize("reopens", [True, False])
+def test_pendant_names_start_only_if_its_lost_link_is_opened_again(
+    network: Network, monkeypatch: pytest.MonkeyPatch, reopens: bool
+) -> None:
+    class LostEnd(WireEnd):
+        def receive(self, frames: Frames, timeout: float = 0.0) -> int:
+            error = BusDown("pcan:x is down: gone; REMEDY")
+            error.reopens = reopens
+            raise error
+
+        def close(self) -> None:
+            pass
+
+    monkeypatch.setattr(pendant, "open_pendant_bus", lambda target: (network, LostEnd(Wire(), lambda: None)))
+    monkeypatch.setattr(pendant_session, "HAL_TIMEOUT", 0.1)
+    done = CliRunner().invoke(cli, ["pendant", "start", "-i", "pcan", "-c", "x", "--for", "0.3"])
+    assert done.exit_code == 0, done.output
+    released = [line for line in done.stderr.splitlines() if "dead-man switch" in line]
+    remedy = "; type start to press it again, with START" if reopens else ""
+    assert released == [f"the dead-man switch is released{remedy}"]
+    assert "REMEDY" in done.stderr
+    assert ("type start" in done.stderr) is reopens
+
+
 def test_start_typed_after_answers_without_room_is_pressed_once_and_accepted(
     world: World, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -161,7 +161,12 @@ def session(target: Target) -> Iterator[Session]:
     try:
         with stop_requested() as stop:
             yield Session(
-                PendantNode(network, bus), target, stop, Keyboard(_standard_input()), losses=lambda: bus.losses
+                PendantNode(network, bus),
+                target,
+                stop,
+                Keyboard(_standard_input()),
+                losses=lambda: bus.losses,
+                reopens=lambda: bus.reopens,
             )
     finally:
         bus.close()

@@ -52,6 +52,7 @@ class Session:
         keyboard: Keyboard,
         now: Callable[[], float] = time.monotonic,
         losses: Callable[[], int] = lambda: 0,
+        reopens: Callable[[], bool] = lambda: True,
     ) -> None:
         """Create a pendant session on an open bus.
 
@@ -62,6 +63,7 @@ class Session:
             keyboard: Reader of the lines that the user types.
             now: Clock [s].
             losses: Function that returns how often the link to the bus was lost so far.
+            reopens: Function that returns whether a lost link is opened again. If False, this program must be restarted.
         """
         self.node, self.stop = node, stop
         #: Whether START is pressed automatically as soon as the HAL is in READY or HOLD, as in `atalante pendant start`.
@@ -76,7 +78,7 @@ class Session:
         self._absent = 0.0
         self._hal: object = None
         self._pressed_at: int | None = None
-        self._losses, self._lost_before = losses, 0
+        self._losses, self._reopens, self._lost_before = losses, reopens, 0
 
     def listen(self) -> None:
         """Listen for SYNC of a HAL and for frames of another pendant, without sending."""
@@ -166,11 +168,15 @@ class Session:
             )
 
     def _release_after_loss(self) -> None:
-        """Release the dead-man switch after the link to the bus was lost, so that the operator must press it again."""
+        """Release the dead-man switch after the link to the bus was lost, so that the operator must press it again.
+
+        If the lost link is not opened again, `start` has no effect. The error message of the link then contains the remedy.
+        """
         self._lost_before = self._losses()
         self.node.dead_man = False
         self.start_wanted = self._start_typed = False
-        print_message("the dead-man switch is released; type start to press it again, with START")
+        remedy = "; type start to press it again, with START" if self._reopens() else ""
+        print_message(f"the dead-man switch is released{remedy}")
 
     def _elapsed(self) -> float:
         """Return the running time of the pendant [s].
