@@ -16,6 +16,7 @@ from atalante_emulator.faults import Fault
 from atalante_emulator.pendant import Operator
 from atalante_hal.bus import BusAbsent, BusDown
 from atalante_hal.bus.joined import JoinedBus
+from atalante_hal.bus.wrapped import WrappedBus
 from atalante_hal.robot import JOINTS, Robot
 from atalante_hal.types import Command, State, SupervisorState
 from atalante_hal.wire.cia402 import DriveState
@@ -28,8 +29,10 @@ from atalante_tools.session.pose_hold import PoseHold
 from atalante_tools.session.rig import (
     LOCKSTEP_PATIENCE,
     PATIENCE,
+    UNCONFIRMED,
     Rig,
     Watch,
+    final_state,
     join,
     open_buses,
     open_hal,
@@ -180,6 +183,59 @@ def test_signal_ends_the_run_in_hold_with_its_exit_code(network: Network, robot:
     with pytest.raises(SystemExit) as end:
         watch.conclude()
     assert end.value.code == 143
+
+
+class LosableBus(WrappedBus):
+    """Bus whose link is lost for ever as soon as `lost` is set."""
+
+    lost = False
+
+    def send(self, frames: Frames) -> None:
+        if self.lost:
+            raise BusDown(f"{self.name} is down: gone")
+        super().send(frames)
+
+    def receive(self, frames: Frames, timeout: float = 0.0) -> int:
+        if self.lost:
+            raise BusDown(f"{self.name} is down: gone")
+        return super().receive(frames, timeout)
+
+
+@pytest.mark.parametrize("resumes", [False, True])
+def test_no_hold_is_reported_as_confirmed_after_the_link_was_lost(
+    network: Network, robot: Robot, capsys: pytest.CaptureFixture[str], resumes: bool
+) -> None:
+    stop = StopRequest()
+    with embedded(network, robot) as rig:
+        rig.hal.bus = bus = LosableBus(rig.hal.bus)
+        watch = Watch(rig, stop, lambda state: False, lambda state: "moving", resumes=resumes)
+
+        def until(state: State) -> bool:
+            bus.lost = bus.lost or state.supervisor is ACTIVE
+            if state.supervisor is HOLD:
+                stop.ask(2)  # with `resumes`, the run waits in HOLD until Ctrl-C
+            return watch(state) or state.cycle > 2000
+
+        rig.run(PoseHold(robot), until=until)
+        assert final_state(rig) == UNCONFIRMED
+        with pytest.raises(SystemExit) as end:
+            watch.conclude()
+    assert end.value.code == 130
+    error = capsys.readouterr().err
+    assert error.endswith(f"stopped, {UNCONFIRMED}\n")
+    assert "the robot is in HOLD" not in error
+
+
+def test_lost_link_ends_the_run_without_a_confirmed_hold(network: Network, robot: Robot) -> None:
+    with embedded(network, robot) as rig:
+        rig.hal.bus = bus = LosableBus(rig.hal.bus)
+
+        def lose(state: State) -> None:
+            bus.lost = bus.lost or state.supervisor is ACTIVE
+
+        watch = watched(rig, seconds=1.0, each=lose)
+        with pytest.raises(Failed, match=f"the HAL went to HOLD: .* is down: gone; {UNCONFIRMED}"):
+            watch.conclude()
 
 
 def test_stop_of_the_operator_ends_the_run_as_failed(network: Network, robot: Robot) -> None:

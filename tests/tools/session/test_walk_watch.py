@@ -14,6 +14,7 @@ from atalante_hal.safety.start import PROGRAM_ENDS, stop_text
 from atalante_hal.types import SupervisorState
 from atalante_tools.console.outcome import Failed, FaultLatched
 from atalante_tools.console.stop_request import StopRequest
+from atalante_tools.session.rig import UNCONFIRMED
 from atalante_tools.session.walk_observation import AFTERMATH, Observation
 from atalante_tools.session.walk_watch import WalkWatch
 
@@ -164,6 +165,8 @@ def test_bus_that_is_down_ends_the_observation(walk: Walk) -> None:
     walk.halt("the bus is down")
     walk.hal.conditions.diagnostics = frozenset({Dtc.BUS_DOWN})
     assert walk.cycle(HOLD)
+    with pytest.raises(Failed, match=f"the HAL went to HOLD: the bus is down; {UNCONFIRMED}"):
+        walk.watch.conclude()
 
 
 def test_stop_of_the_operator_before_the_weight_shift_is_no_failure(

@@ -49,7 +49,7 @@ def command(joint: str, degrees: float, speed: float, seed: int, target: Target,
     """
     from atalante_hal.robot import JOINTS, load_robot
     from atalante_tools.session.pose_hold import Move, PoseHold
-    from atalante_tools.session.rig import Watch, open_hal
+    from atalante_tools.session.rig import Watch, final_state, open_hal
 
     index = find(joint, JOINTS, "joint")
     name = JOINTS[index]
@@ -93,7 +93,7 @@ def command(joint: str, degrees: float, speed: float, seed: int, target: Target,
         raise Failed(
             f"{name} must reach {degrees:g} degrees, got {math.degrees(reached):.1f}: check that the joint can move freely"
         )
-    print_message("the robot is in HOLD")
+    print_message(final_state(rig))
 
 
 def _angle(robot: Robot, index: int, name: str, degrees: float) -> float:

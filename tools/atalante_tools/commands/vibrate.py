@@ -52,7 +52,7 @@ def command(motor: str, level: float, seconds: float, target: Target, as_json: b
 
     from atalante_hal.robot import MOTORS, load_robot
     from atalante_tools.session.pose_hold import PoseHold
-    from atalante_tools.session.rig import Watch, open_hal
+    from atalante_tools.session.rig import Watch, final_state, open_hal
 
     index = find(motor, MOTORS, "motor")
     robot = load_robot()
@@ -85,7 +85,7 @@ def command(motor: str, level: float, seconds: float, target: Target, as_json: b
         )
     else:
         click.echo(f"{MOTORS[index]}: commanded {level:.2f}, measured at most {strongest:.2f}, for {seconds:g} s")
-    print_message("the robot is in HOLD")
+    print_message(final_state(rig))
     if controller.elapsed >= _CHECKED and strongest < _REACHED * level:
         raise Failed(
             f"{MOTORS[index]} must reach half of the commanded level {level:g}, but at most {strongest:.3f} was measured: "

@@ -41,6 +41,11 @@ if TYPE_CHECKING:
     from atalante_emulator.mechanics import Mechanics
     from atalante_emulator.pendant import Operator
 
+#: What is known about the drives if the bus is down when a run ends.
+UNCONFIRMED: Final = (
+    "no HOLD was confirmed, because the bus is down: each enabled drive holds its position by itself after its watchdog "
+    "timeout"
+)
 #: Longest wait for the answers to a SYNC in real time: half a cycle [s].
 PATIENCE: Final = 0.5e-3
 #: Longest wait for the answers to a SYNC in lock-step [s].
@@ -309,7 +314,7 @@ class Watch:
         if self._state is SupervisorState.FAULT:
             raise FaultLatched(f"the robot is in FAULT: {self._reason}")
         if not (self._finished or self._stopped):
-            raise Failed(f"the robot went to HOLD: {self._reason}")
+            raise left_active(self._rig, self._reason)
         if self._stop.wanted:
             exit_after_signal(self._rig, self._stop)
 
@@ -324,8 +329,33 @@ def exit_after_signal(rig: Rig, stop: StopRequest) -> NoReturn:
     Raises:
         SystemExit: Always.
     """
-    print_message(f"stopped, the robot is in {rig.hal.state.supervisor.name}")
+    print_message(f"stopped, {final_state(rig)}")
     raise SystemExit(stop.exit_code)
+
+
+def final_state(rig: Rig) -> str:
+    """Return a text for the user with the state of the robot at the end of a run.
+
+    While the bus is down, the state of the drives is unknown.
+
+    Args:
+        rig: Rig of the run.
+    """
+    if Dtc.BUS_DOWN in rig.hal.conditions.diagnostics:
+        return UNCONFIRMED
+    return f"the robot is in {rig.hal.state.supervisor.name}"
+
+
+def left_active(rig: Rig, reason: str) -> Failed:
+    """Return the error of a run in which the robot left ACTIVE early.
+
+    Args:
+        rig: Rig of the run.
+        reason: Reason why the HAL went to HOLD.
+    """
+    if Dtc.BUS_DOWN in rig.hal.conditions.diagnostics:
+        return Failed(f"the HAL went to HOLD: {reason}; {UNCONFIRMED}")
+    return Failed(f"the robot went to HOLD: {reason}")
 
 
 def waiting_for(rig: Rig) -> str:

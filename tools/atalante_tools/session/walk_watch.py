@@ -136,7 +136,7 @@ class WalkWatch:
             Failed: If the robot fell, went to HOLD during the walk, or ended the walk early without a request to stop.
         """
         from atalante_tools.console.outcome import FaultLatched
-        from atalante_tools.session.rig import exit_after_signal
+        from atalante_tools.session.rig import exit_after_signal, left_active
 
         if self.outcome == "fell":
             reason = f": {self._reason}" if self._reason else ""
@@ -144,7 +144,7 @@ class WalkWatch:
         if self.outcome == "fault":
             raise FaultLatched(f"the robot is in FAULT: {self._reason}")
         if self.outcome == "hold" and self._started and self._reason != PROGRAM_ENDS:
-            raise Failed(f"the robot went to HOLD: {self._reason}")
+            raise left_active(self._rig, self._reason)
         if self._stop.wanted:
             exit_after_signal(self._rig, self._stop)
         if self.outcome == "stopped":
