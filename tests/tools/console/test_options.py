@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import errno
 from pathlib import Path
 
 import pytest
 from click.testing import CliRunner
 
 from atalante_tools.cli import cli
+from atalante_tools.console.options import OutputFile
 
 PATIENT = ("--mass", "75", "--height", "175")
 
@@ -80,6 +82,63 @@ def test_an_invalid_option_value_is_rejected_before_any_work(arguments: list[str
     assert (result.exit_code, result.stdout) == (2, "")
     assert sentence in result.stderr
     assert result.stderr.count("\n") == 1
+
+
+@pytest.mark.parametrize(
+    ("arguments", "option"),
+    [
+        (["gait", "solve", *PATIENT], "--out=/proc/gait.json"),
+        (["gait", "solve", *PATIENT], "--plot=/proc/gait.png"),
+        (["gait", "fit", "--library", "none"], "--out=/proc/network.npz"),
+        (["guide", "check", "--quick"], "--table=/proc/table.md"),
+        (["guide", "check", "--quick"], "--results=/proc/results.jsonl"),
+        (["validate", "none.log"], "--html=/proc/report.html"),
+    ],
+)
+def test_output_file_in_a_folder_that_cannot_be_written_is_rejected(arguments: list[str], option: str) -> None:
+    result = CliRunner().invoke(cli, [*arguments, option])
+    assert (result.exit_code, result.stdout) == (2, "")
+    name, path = option.split("=")
+    assert f"'{name}': must be in a writable folder, got {path}: No such file or directory" in result.stderr
+    assert result.stderr.count("\n") == 1
+
+
+def test_existing_output_file_that_cannot_be_written_is_rejected(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    file = tmp_path / "gait.json"
+    file.write_text("old")
+    monkeypatch.setattr("os.access", lambda path, mode, **options: str(path) != str(file))  # root may write any file
+    result = CliRunner().invoke(cli, ["gait", "solve", *PATIENT, "--out", str(file)])
+    assert result.exit_code == 2
+    assert f"'--out': File '{file}' is not writable" in result.stderr
+    assert file.read_text() == "old"
+
+
+def test_accepted_output_file_is_not_created_by_the_check(tmp_path: Path) -> None:
+    assert OutputFile(".json").convert(str(tmp_path / "gait.json"), None, None) == tmp_path / "gait.json"
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    "arguments", [["faults", "campaign", "F56"], ["trial", "shapes", "--quick"], ["demo"]], ids=lambda words: words[0]
+)
+def test_output_folder_that_cannot_be_written_is_rejected_before_the_run(arguments: list[str]) -> None:
+    result = CliRunner().invoke(cli, [*arguments, "--out", "/proc"])
+    assert result.exit_code == 1
+    assert result.stderr == "atalante: /proc cannot be read or written: No such file or directory\n"
+
+
+def test_library_in_a_folder_that_cannot_be_written_starts_no_gait(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def refuse(folder: Path) -> None:
+        raise PermissionError(errno.EACCES, "Permission denied", str(folder))
+
+    monkeypatch.setattr("atalante_tools.gait.require_writable", refuse)
+    result = CliRunner().invoke(cli, ["gait", "library", "--out", str(tmp_path / "library")])
+    assert result.exit_code == 1
+    assert result.stderr == f"atalante: {tmp_path}/library cannot be read or written: Permission denied\n"
 
 
 def test_a_campaign_rejects_an_invalid_report_folder_before_it_runs(tmp_path: Path) -> None:

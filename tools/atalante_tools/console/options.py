@@ -77,6 +77,23 @@ class Between(click.FloatRange):
         return number
 
 
+def require_writable(folder: Path) -> None:
+    """Check that a file can be created in an existing folder.
+
+    Args:
+        folder: Folder of the file.
+
+    Raises:
+        OSError: If no file can be created. The error contains the path of the folder and the reason.
+    """
+    from tempfile import TemporaryFile
+
+    try:
+        TemporaryFile(dir=folder).close()
+    except OSError as error:
+        raise OSError(error.errno, error.strerror, str(folder)) from error
+
+
 class OutputFile(click.Path):
     """Option type for an output file in an existing folder. The suffix of the file must be one of the allowed suffixes.
 
@@ -84,20 +101,24 @@ class OutputFile(click.Path):
     """
 
     def __init__(self, *suffixes: str) -> None:
-        super().__init__(dir_okay=False)
+        super().__init__(dir_okay=False, readable=False, writable=True)
         self._suffixes = suffixes
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
         """Convert the option value to a path and return it.
 
         Raises:
-            click.BadParameter: If the suffix is not allowed or the folder does not exist.
+            click.BadParameter: If the suffix is not allowed, the folder does not exist, or the file cannot be written.
         """
         path = Path(str(super().convert(value, param, ctx)))
         if self._suffixes and path.suffix.lower() not in self._suffixes:
             self.fail(f"must end in {' or '.join(self._suffixes)}, got {path}", param, ctx)
         if not path.parent.is_dir():
             self.fail(f"must be in an existing folder, got {path}: create the folder {path.parent}", param, ctx)
+        try:
+            require_writable(path.parent)
+        except OSError as error:
+            self.fail(f"must be in a writable folder, got {path}: {error.strerror}", param, ctx)
         return path
 
 

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 import click
 
 from atalante_tools.console.names import find
-from atalante_tools.console.options import dask_option, engine_option, jobs_option, json_option
+from atalante_tools.console.options import dask_option, engine_option, jobs_option, json_option, require_writable
 from atalante_tools.console.outcome import Failed, InvalidUsage
 from atalante_tools.console.stop_request import check_stop
 from atalante_tools.console.terminal import Progress, print_message, show_json, table
@@ -199,6 +199,7 @@ def campaign_(
     scope = Scope(endurance, pairs and not ids, moments, 0 if ids else random_pairs, seed)
     tasks = plan(chosen, scope, engine)
     out.mkdir(parents=True, exist_ok=True)  # created now, so that an invalid folder is reported before the runs start
+    require_writable(out)
     begun = time.monotonic()
     print_message(f"{len(tasks)} runs on {f'the workers of {dask}' if dask else f'{jobs} processes'}")
     found = list(_done(tasks, jobs=jobs, dask=dask, engine=engine))

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import click
 
-from atalante_tools.console.options import SEED, OutputFile, json_option, length
+from atalante_tools.console.options import SEED, OutputFile, json_option, length, require_writable
 from atalante_tools.console.outcome import FAILED, Failed
 from atalante_tools.console.stop_request import stop_requested
 from atalante_tools.console.terminal import Progress, print_message, show_json, table
@@ -146,6 +146,7 @@ def library(out: Path, jobs: int, machine_code: bool, cluster: str | None, as_js
     except ValueError as error:
         raise click.UsageError(str(error)) from error
     collection = Library(out, grid)
+    require_writable(out)
     points, todo = len(grid.points()), len(collection.missing())
     print_message(f"{points} gaits in {out}, {points - todo} of them already solved")
     if rejected := collection.rejected():

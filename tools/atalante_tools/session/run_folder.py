@@ -14,6 +14,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from atalante_tools.console.options import require_writable
 from atalante_tools.console.outcome import Failed
 from atalante_tools.console.terminal import print_message, table
 
@@ -60,7 +61,7 @@ def run_folder(out: Path) -> Iterator[None]:
 
     Raises:
         Failed: If another run uses the folder.
-        OSError: If the folder cannot be created.
+        OSError: If the folder cannot be created, or no file can be created in it.
     """
     existed = out.exists()
     out.mkdir(parents=True, exist_ok=True)
@@ -72,6 +73,7 @@ def run_folder(out: Path) -> Iterator[None]:
             raise Failed(
                 f"another run writes into {out}: wait for its end, or choose another folder with --out"
             ) from None
+        require_writable(out)
         yield
     finally:
         os.close(folder)
