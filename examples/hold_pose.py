@@ -11,7 +11,8 @@ import sys
 import numpy as np
 
 from atalante_hal.types import Command
-from atalante_tools.console.options import Target
+from atalante_tools.console.options import target_of
+from atalante_tools.console.outcome import one_sentence
 from atalante_tools.session.rig import open_hal
 
 
@@ -29,7 +30,6 @@ class Spring:
         return Command(torque=2000 * (self.rest - state.position) - 20 * state.velocity, vibration=np.zeros(8))
 
 
-interface, channel = sys.argv[1:] or ("embedded", "")
-with open_hal(Target(interface, channel, lockstep=interface == "embedded")) as rig:
+with one_sentence(), open_hal(target_of(sys.argv[1:])) as rig:
     rig.run(Spring(), until=lambda state: state.time >= 2.0)
     print(rig.hal.reason, np.degrees(rig.hal.state.position).round(1))

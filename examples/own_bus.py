@@ -7,6 +7,7 @@ to the wrapped bus, so a subclass overrides only the members that it changes. Pr
 messages with the most frames.
 """
 
+import argparse
 from collections import Counter
 
 import atalante_dbc
@@ -40,6 +41,7 @@ class CountingBus(WrappedBus):
         return received
 
 
+argparse.ArgumentParser(description=__doc__).parse_args()  # no arguments
 network, robot = atalante_dbc.load(), load_robot()
 hal_end, robot_end = lockstep_pair()  # the two ends of a bus in this process
 bus, controller = CountingBus(hal_end), PoseHold(robot)

@@ -7,6 +7,8 @@ air. e is the tracking error, and q_bound is the distance from the desired traje
 below 1, hip and knee of the swing leg stayed inside the guide.
 """
 
+import argparse
+
 import numpy as np
 
 from atalante_control.airwalk.controller import AirwalkController
@@ -31,6 +33,7 @@ def waist(phase, half_width):
     return fraction, fraction
 
 
+argparse.ArgumentParser(description=__doc__).parse_args()  # no arguments
 robot = load_robot()
 gait = load_gait(AIRWALK_GAIT, robot)
 controller = AirwalkController(robot, gait, GuideShape("waist", "3 degrees at the middle of the step", waist))

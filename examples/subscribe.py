@@ -8,6 +8,7 @@ Waits for the HAL. Prints the cycle number and the twelve joint angles [rad], 10
 Stop it with Ctrl-C.
 """
 
+import argparse
 import json
 import os
 import signal
@@ -18,7 +19,9 @@ import zenoh
 from google.protobuf import descriptor_pb2, descriptor_pool, message_factory
 
 DESCRIPTORS = Path("atalante_hal/telemetry/messages.binpb")
-endpoint = sys.argv[1] if len(sys.argv) > 1 else "tcp/127.0.0.1:7447"
+parser = argparse.ArgumentParser(description=__doc__)
+parser.add_argument("endpoint", nargs="?", default="tcp/127.0.0.1:7447")
+endpoint = parser.parse_args().endpoint
 settings = {
     "mode": "client",
     "connect": {"endpoints": [endpoint], "timeout_ms": -1},  # -1: try again until the HAL answers
@@ -30,8 +33,11 @@ signal.signal(signal.SIGINT, signal.SIG_DFL)  # Ctrl-C ends the program, also wh
 pool = descriptor_pool.DescriptorPool()
 for file in descriptor_pb2.FileDescriptorSet.FromString(DESCRIPTORS.read_bytes()).file:
     pool.Add(file)
+try:
+    config = zenoh.Config.from_json5(json.dumps(settings))
+except zenoh.ZError:
+    parser.error(f"the endpoint must be like tcp/192.0.2.7:7447, got {endpoint}")
 print(f"connecting to {endpoint}", file=sys.stderr)
-config = zenoh.Config.from_json5(json.dumps(settings))
 with zenoh.open(config) as session, session.declare_subscriber("atalante/*/joint_states") as subscriber:
     for sample in subscriber:
         message_type = pool.FindMessageTypeByName(str(sample.encoding).split(";")[1])

@@ -47,6 +47,31 @@ def test_hold_pose_example_holds_until_the_program_ends():
     assert sum(bool(line.strip()) for line in body.splitlines()) <= 20
 
 
+@pytest.mark.parametrize(
+    ("name", "arguments", "sentence"),
+    [
+        ("hold_pose.py", ["socketcan"], "atalante: the arguments must be a CAN interface and a channel"),
+        ("hold_pose.py", ["a", "b", "c"], "atalante: the arguments must be a CAN interface and a channel"),
+        ("hold_pose.py", ["embedded", "x"], "atalante: the arguments must be a CAN interface and a channel"),
+        ("hold_pose.py", ["pigeon", "vcan0"], "atalante: there is no CAN interface 'pigeon'; use one of"),
+        ("hold_pose.py", ["socketcan", "a,b"], "atalante: a channel map with several channels must name the bus"),
+        ("own_bus.py", ["socketcan"], "own_bus.py: error: unrecognized arguments: socketcan"),
+        ("own_guide_shape.py", ["0.5"], "own_guide_shape.py: error: unrecognized arguments: 0.5"),
+        ("subscribe.py", ["pigeon"], "subscribe.py: error: the endpoint must be like tcp/192.0.2.7:7447, got pigeon"),
+        ("subscribe.py", ["tcp/127.0.0.1:7447", "x"], "subscribe.py: error: unrecognized arguments: x"),
+    ],
+)
+def test_example_with_wrong_arguments_ends_with_one_sentence_and_exit_code_2(
+    name: str, arguments: list[str], sentence: str
+):
+    command = [sys.executable, f"examples/{name}", *arguments]
+    done = subprocess.run(command, capture_output=True, text=True, cwd=ROOT, timeout=300)
+    assert (done.returncode, done.stdout) == (2, "")
+    *usage, last = done.stderr.splitlines()
+    assert last.startswith(sentence)
+    assert all(line.startswith("usage: ") for line in usage)
+
+
 def test_own_bus_example_counts_frames_in_both_directions():
     (line,) = (line for line in run("own_bus.py").splitlines() if line.startswith("HOLD "))
     assert "SYNC_LEFT_LEG" in line

@@ -13,6 +13,8 @@ from typing import TYPE_CHECKING, Any, Final, TypeVar
 
 import click
 
+from atalante_tools.console.outcome import InvalidUsage
+
 if TYPE_CHECKING:
     from atalante_control.gait.subject import Subject
     from atalante_control.model import Patient
@@ -364,6 +366,31 @@ class Target:
     def arguments(self) -> str:
         """Return the options `-i` and `-c` of this bus as text for the command line of another `atalante` command."""
         return f"-i {self.interface} -c {self.channel}"
+
+
+def target_of(arguments: Sequence[str]) -> Target:
+    """Return the bus and the clock of a program with the arguments `[INTERFACE CHANNEL]`.
+
+    Without arguments, the robot is embedded and the clock is lock-step. On a CAN bus, the clock is the wall clock.
+
+    Args:
+        arguments: Arguments of the program, for example `sys.argv[1:]`.
+
+    Raises:
+        InvalidUsage: If the number of arguments is wrong, or if the interface cannot connect HAL and robot.
+    """
+    from atalante_hal.bus.adapters import refusal
+
+    if not arguments:
+        return Target(EMBEDDED, "", lockstep=True)
+    if len(arguments) != 2 or EMBEDDED in arguments or not all(arguments):
+        raise InvalidUsage(
+            f"the arguments must be a CAN interface and a channel, such as socketcan vcan0, got {' '.join(arguments)!r}"
+        )
+    interface, channel = arguments
+    if refused := refusal(interface):
+        raise InvalidUsage(refused)
+    return Target(interface, channel, lockstep=False)
 
 
 def target_options(*, embedded: bool, clock: bool = True) -> Callable[[_Command], _Command]:

@@ -9,6 +9,8 @@ from __future__ import annotations
 
 import errno
 import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import IO, Any, Final
 
 import click
@@ -96,3 +98,22 @@ def failure_of(error: BaseException) -> Failed | None:
     if isinstance(error, OSError) and (error.filename is not None or error.errno in DISK):
         return Failed(f"{error.filename or 'the output file'} cannot be read or written: {error.strerror}")
     return None
+
+
+@contextmanager
+def one_sentence() -> Iterator[None]:
+    """Print a known error of the block as one sentence on stderr, and end the program with the exit code of the error.
+
+    The command line `atalante` does this for its commands. This function is for other programs, such as those in `examples/`.
+
+    Raises:
+        SystemExit: If the block raised a known error.
+    """
+    try:
+        yield
+    except Exception as error:
+        failure = error if isinstance(error, Failed) else failure_of(error)
+        if failure is None:
+            raise
+        failure.show()
+        raise SystemExit(failure.exit_code) from error
