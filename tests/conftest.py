@@ -33,9 +33,12 @@ from atalante_hal.safety.direction import pose_gains
 from atalante_hal.types import Command, State, SupervisorState
 from atalante_hal.wire.frame import Frames
 
-# A shell starts background jobs with SIGINT ignored. The tests interrupt programs, and processes inherit this setting.
+# A shell starts background jobs with SIGINT ignored, and `nohup` ignores SIGHUP. The tests send both signals to programs, and
+# processes inherit this setting.
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
     signal.signal(signal.SIGINT, signal.default_int_handler)
+if signal.getsignal(signal.SIGHUP) is signal.SIG_IGN:
+    signal.signal(signal.SIGHUP, signal.SIG_DFL)
 
 # Examples have no deadline, because the first example may compile functions.
 settings.register_profile("any time", deadline=None)
