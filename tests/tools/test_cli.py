@@ -72,7 +72,8 @@ def test_the_list_of_commands_is_complete_and_in_order() -> None:
     assert result.exit_code == 0
     listed = [line.split()[0] for line in result.stdout.split("Commands:\n")[1].splitlines() if line[2:3] != " "]
     assert listed == list(COMMANDS)
-    assert "0 ok, 1 failed, 2 usage error, 3 no device, 4 fault latched, 129 SIGHUP, 130" in " ".join(result.stdout.split())
+    text = " ".join(result.stdout.split())
+    assert "0 ok, 1 failed, 2 usage error, 3 no device, 4 fault latched, 129 SIGHUP, 130 Ctrl-C, 143 SIGTERM." in text
 
 
 @pytest.mark.parametrize("option", ["--help", "--version"])
