@@ -38,7 +38,9 @@ WALK_GAINS = PidGains(
 #: The controller adds no torque after a stance change, so the torque of the stance leg decreases with the rate of the limiter.
 WALK_GUIDE = StepGuideConfig(
     stiffness=(4500.0, 3300.0),
-    hand_over=HandOver(deviation=math.radians(1.0), rate=0.3, torque=(95.0, 52.0), carried=(0.0, 0.0)),
+    hand_over=HandOver(
+        deviation=math.radians(1.0), rate=0.3, torque=(95.0, 52.0), carried=(0.0, 0.0), acceleration=30.0
+    ),
 )
 
 
