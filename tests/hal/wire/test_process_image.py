@@ -284,7 +284,8 @@ def test_committed_frame_after_a_loss_is_not_a_further_frame():
 def test_further_frames_of_a_row_are_decoded_in_order_of_arrival():
     tx, rx, buffer = pair()
     row, own = rx.codec.rows["PENDANT_STATE"], slice(None)
-    dead_man = rx.codec.index("PENDANT_STATE", "DeadMan")
+    dead_man, position = rx.codec.index("PENDANT_STATE", "DeadMan"), rx.codec.index("LEFT_SK_STATE", "Position")
+    tx.values[position] = 2.0
     deliver(tx, rx, buffer)
     deliver(tx, rx, buffer)
     assert rx.decode_further_frames(row) == []
@@ -295,7 +296,9 @@ def test_further_frames_of_a_row_are_decoded_in_order_of_arrival():
     damaged = true.copy()
     damaged["data"][5] ^= 1
     deliver_frames(rx, buffer, [damaged, true, true, released])
-    assert [values[dead_man] for values in rx.decode_further_frames(row)] == [0.0]
+    (further,) = rx.decode_further_frames(row)
+    assert further[dead_man] == 0.0
+    assert further[position] == rx.values[position] == pytest.approx(2.0, abs=0.01)  # a value of another row is kept
     assert rx.values[dead_man] == 1.0
     assert rx.decode_further_frames(0) == []
     late, now = tx.seal()[row].copy(), tx.seal()[row].copy()
