@@ -18,6 +18,7 @@ uml_boot_limit=60
 uml_limit=${VCAN_LANE_SECONDS:-1500}
 qemu_limit=${VCAN_LANE_SECONDS:-2100}
 memory_mb=4096
+map_limit=1048576 # memory mappings of a process; Linux permits 65530 by default
 uml_guests=$(($(nproc) > 1 ? 2 : 1)) # a guest has one CPU
 
 say() { printf 'vcan lane: %s\n' "$*" >&2; }
@@ -148,6 +149,19 @@ halt -f
 EOF
 }
 
+# Permit more memory mappings until the end of this script. User-Mode Linux maps each page of a process of the guest separately,
+# so with the default of Linux, a process of the guest is killed when it has more than 256 MB.
+raise_map_limit() {
+    local file=/proc/sys/vm/max_map_count
+    map_limit_before=$(cat $file) # global: the trap needs it
+    [ "$map_limit_before" -lt $map_limit ] || return 0
+    if as_root sh -c "echo $map_limit >$file" 2>/dev/null; then
+        trap 'rm -rf "$result"; as_root sh -c "echo $map_limit_before >/proc/sys/vm/max_map_count"' EXIT
+    else
+        say "$file is $map_limit_before and cannot be changed; a test process with more than 256 MB would be killed"
+    fi
+}
+
 # Boot one User-Mode Linux in the background. $1: folder for its results. $2: arguments of pytest, quoted for the shell.
 boot_uml() {
     local folder=$1 memory=/dev/shm
@@ -172,6 +186,7 @@ in_uml() {
     install_missing "${uml_packages[@]}"
     [ -d /lib/modules ] || as_root mkdir -p /lib/modules # the guest mounts its own modules there
     [ $# = 0 ] || printf -v arguments '%q ' "$@"
+    raise_map_limit
     mkdir "$result/claims"
     "${CC:-cc}" -O2 -shared -fPIC -o "$result/uml_xstate.so" tests/vcan/uml_xstate.c
     say "this kernel has no usable SocketCAN; booting $uml_guests times User-Mode Linux $(linux.uml --version)"
