@@ -5,10 +5,10 @@
 
 Each cycle checks the encoders and the IMUs, and runs at most one slow check. If the new values of a joint or an IMU
 fail a check, they are rejected: the process image keeps the previous values, and the age of these values grows. Only the
-signals in `finding.JUDGED` are rejected, so the state, temperature and torque of a drive stay those of its last frame. The
-module `rejections` confirms the diagnostic if more than a fifth of the values of a sensor are rejected. Each check
-uses only the messages that it needs, and the ages of their values. So a fault of one message does not disable the
-checks of other messages.
+signals in `finding.JUDGED` are rejected, so the state, temperature and torque of a drive stay those of its last frame. If the
+drive is off, they are rejected, too, so a start waits for it. The module `rejections` confirms the diagnostic if more than a
+fifth of the values of a sensor are rejected. Each check uses only the messages that it needs, and the ages of their values.
+So a fault of one message does not disable the checks of other messages.
 """
 
 from __future__ import annotations
@@ -34,6 +34,7 @@ from atalante_hal.safety.plausibility.support import Support
 from atalante_hal.safety.plausibility.trunk import Trunk
 from atalante_hal.safety.plausibility.unchecked import Unchecked
 from atalante_hal.types import Vector
+from atalante_hal.wire.cia402 import DriveState
 from atalante_hal.wire.e2e import Check
 from atalante_hal.wire.process_image import NEVER, ReceiveImage
 
@@ -55,6 +56,13 @@ _LATE = 1
 _HELD = 4
 _FRESH = int(Check.SOME_LOST)
 #: Indices in JOINTS of SH and SK.
+#: States of a drive that is off.
+_OFF = (
+    DriveState.NOT_READY_TO_SWITCH_ON,
+    DriveState.SWITCH_ON_DISABLED,
+    DriveState.READY_TO_SWITCH_ON,
+    DriveState.SWITCHED_ON,
+)
 _HIPS_AND_KNEES = frozenset(joint for joint, name in enumerate(JOINTS) if name.endswith(("SH", "SK")))
 
 
@@ -96,6 +104,9 @@ class Plausibility:
         self._joint_rows, self._imu_rows = self._rows.joint.tolist(), self._rows.imu.tolist()
         #: Indices of the signals that are rejected together, by row of a joint or an IMU in the process image.
         self._judged = {row: judged(codec, row) for row in (*self._joint_rows, *self._imu_rows)}
+        #: Indices of all signals of a joint, and index of the state of its drive, by row in the process image.
+        self._whole = {row: np.flatnonzero(codec.row_of == row) for row in self._joint_rows}
+        self._drive_state = {row: codec.index(codec.messages[row].name, "DriveState") for row in self._joint_rows}
         self._foot_ages = [NEVER] * len(self._rows.foot)  # age of the values of each foot at its last check [cycles]
         #: Cycle in which the last good values of each joint and IMU were measured, by row in the process image.
         #: Not updated while `_settled` is True, because the last good values of all rows are then from the previous cycle.
@@ -233,7 +244,9 @@ class Plausibility:
             if self._accept(sensor, at - measured[row]):
                 measured[row] = at
             else:
-                image.refuse(row, self._judged[row])
+                # A start waits for a drive whose values are rejected: if the drive is off, its state is rejected, too.
+                off = row in self._whole and image.values_before[self._drive_state[row]] in _OFF
+                image.refuse(row, self._whole[row] if off else self._judged[row])
                 imu = sensor - len(self._joint_rows)
                 dtc = self._encoders.tolerated(sensor) if imu < 0 else self._imus.tolerated(imu)
                 if dtc is not None:

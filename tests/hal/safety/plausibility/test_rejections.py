@@ -13,6 +13,7 @@ from atalante_hal.safety.diagnostics import Dtc
 from atalante_hal.safety.plausibility.encoders import EncoderChecks
 from atalante_hal.safety.plausibility.finding import Signals
 from atalante_hal.safety.plausibility.rejections import Rejections
+from atalante_hal.wire.cia402 import DriveState
 from atalante_hal.wire.codec import group_of
 
 PELVIS = IMUS.index("pelvis")
@@ -48,19 +49,40 @@ def test_rejection_keeps_the_other_signals_of_the_frame(change: Change, message:
     codec, values = CODEC, robot.image.values
     own = np.flatnonzero(codec.row_of == codec.rows[message])
     groups = [group_of(codec.signals[index][1].name) for index in own.tolist()]
+    if "DriveState" in groups:
+        values[own[groups.index("DriveState")]] = DriveState.OPERATION_ENABLED
     before = values[own].copy()
     for cycle in range(cycles):
 
         def send(now: Signals, cycle: int = cycle) -> None:
-            values[own] = 50.0 + cycle + np.arange(len(own))
+            values[own] = 150.0 + cycle + np.arange(len(own))
             change(now)
 
         robot.cycle(send)
         assert robot.rejected == {codec.rows[message]: cycle + 1}
-        sent = 50.0 + cycle + np.arange(len(own))
+        sent = 150.0 + cycle + np.arange(len(own))
         expected = np.where([group in restored for group in groups], before, sent)
         assert values[own].tolist() == expected.tolist()
     assert restored < set(groups)
+
+
+@pytest.mark.parametrize("state", DriveState)
+def test_rejection_restores_the_whole_frame_of_a_drive_that_is_off(state: DriveState):
+    """A start waits for a drive whose values are rejected, so its state must not change until then."""
+    robot = SimulatedRobot()
+    values, at = robot.image.values, CODEC.index("LEFT_SA_STATE", "DriveState")
+    own = np.flatnonzero(CODEC.row_of == CODEC.rows["LEFT_SA_STATE"])
+    values[at] = state
+    before = values[own].copy()
+
+    def send(now: Signals) -> None:
+        values[own] = 50.0
+        jumped(now)
+
+    robot.cycle(send)
+    off = state in (0x00, 0x40, 0x21, 0x23)
+    assert bool(values[at] == state) == off
+    assert np.array_equal(values[own], before) == off
 
 
 def confirmed_after(robot: SimulatedRobot, change: Change, every: int, cycles: int) -> int | None:
