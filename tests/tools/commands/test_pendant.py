@@ -855,6 +855,27 @@ def test_pendant_names_start_only_if_its_lost_link_is_opened_again(
     assert ("type start" in done.stderr) is reopens
 
 
+#: Messages from the first ACTIVE on, if the operator types start once in HOLD.
+RESTARTED = [
+    "the HAL is ACTIVE",
+    "the HAL is HOLD",
+    "START pressed",
+    "the HAL is ACTIVE",
+    "STOP: the HAL is HOLD",
+]
+
+
+def messages(
+    world: World, node: PendantNode, keyboard: Keyboard, time: float, capsys: pytest.CaptureFixture[str]
+) -> list[str]:
+    """Take over, start, and run for a time [s]. Return the messages from the first ACTIVE on."""
+    operator = Session(node, TARGET, StopRequest(), keyboard, now=lambda: world.now)
+    operator.take_over()
+    operator.start_wanted = True
+    operator.run(time)
+    return capsys.readouterr().err.splitlines()[4:]
+
+
 def test_start_typed_after_answers_without_room_is_pressed_once_and_accepted(
     world: World, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -868,17 +889,7 @@ def test_start_typed_after_answers_without_room_is_pressed_once_and_accepted(
             end.full = 300 <= node.answered < 350
             return ["start"] if node.answered == 349 else []
 
-    operator = Session(node, TARGET, StopRequest(), TypesWhenFull(None), now=lambda: world.now)
-    operator.take_over()
-    operator.start_wanted = True
-    operator.run(0.7)
-    assert capsys.readouterr().err.splitlines()[4:] == [
-        "the HAL is ACTIVE",
-        "the HAL is HOLD",
-        "START pressed",
-        "the HAL is ACTIVE",
-        "STOP: the HAL is HOLD",
-    ]
+    assert messages(world, node, TypesWhenFull(None), 0.7, capsys) == RESTARTED
 
 
 def test_stop_without_a_sync_is_reported_as_not_sent(world: World, capsys: pytest.CaptureFixture[str]) -> None:
@@ -914,14 +925,4 @@ def test_start_typed_after_lost_syncs_is_pressed_once_and_accepted(
             assert world.hal.state.supervisor is HOLD
             return ["start"]
 
-    operator = Session(node, TARGET, StopRequest(), TypesAfterGap(None), now=lambda: world.now)
-    operator.take_over()
-    operator.start_wanted = True
-    operator.run(0.5)
-    assert capsys.readouterr().err.splitlines()[4:] == [
-        "the HAL is ACTIVE",
-        "the HAL is HOLD",
-        "START pressed",
-        "the HAL is ACTIVE",
-        "STOP: the HAL is HOLD",
-    ]
+    assert messages(world, node, TypesAfterGap(None), 0.5, capsys) == RESTARTED
