@@ -22,8 +22,8 @@ SPEED: Final = 0.1
 #: Until then the robot stays suspended, while the walking controller moves the legs to the standing pose.
 #: On the floor, the feet could not slide to their positions in the standing pose.
 DELAY: Final = 2.0
-#: Stiffness and damping of the sling. The crane multiplies both by the mass of the robot [kg], so every robot stretches the
-#: sling by the same length: 9.81 / 400 m = 25 mm.
+#: Stiffness and damping of the sling, per kg of robot mass.
+#: Every robot therefore stretches the sling by the same length: 9.81 / 400 m = 25 mm.
 STIFFNESS: Final = 400.0  # N/m per kg
 DAMPING: Final = 28.0  # N s/m per kg
 #: Rotational stiffness and damping with which the crane turns the pelvis upright, per kg of robot mass.

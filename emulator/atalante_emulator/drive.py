@@ -30,7 +30,7 @@ from atalante_hal.robot import JOINTS, LEG_JOINTS, SIDES, Robot
 from atalante_hal.types import PERIOD, Vector
 from atalante_hal.wire.cia402 import AUTOMATIC, Controlword, DriveState, next_state
 
-#: An enabled drive holds its joint by itself (local hold) after this time without a valid command or without SYNC [cycles].
+#: Timeout of the commands and of SYNC [cycles]. After a timeout, an enabled drive holds its joint without the HAL (local hold).
 WATCHDOG: Final = 5
 #: Interval of the slow tasks of the drives [cycles]. The slow tasks update temperatures and warnings.
 #: After a fault, they also check whether the joint has stopped.
@@ -101,9 +101,9 @@ class Drives:
         self.parameters = parameters
         self.signals = signals
         self.state = [DriveState.SWITCH_ON_DISABLED] * len(JOINTS)
-        #: latched[i] is True if drive i left OPERATION ENABLED by itself, for example because it holds its joint.
-        #: A latched drive ignores ENABLE_OPERATION. The HAL unlatches the drive by a controlword that changes its state,
-        #: or by QUICK_STOP after the cause of the error is gone.
+        #: latched[i] is True if drive i left OPERATION ENABLED without a command, for example to hold its joint.
+        #: A latched drive ignores ENABLE_OPERATION. Either of two controlwords ends this:
+        #: one that changes the drive state, or QUICK_STOP after the cause of the error is gone.
         self.latched = [False] * len(JOINTS)
         #: enable_delay[i]: number of ENABLE_OPERATION commands that drive i ignores before it enters OPERATION ENABLED.
         self.enable_delay = [0] * len(JOINTS)

@@ -312,11 +312,11 @@ class Emulator:
 
     @property
     def _lost_sync(self) -> bool:
-        """Whether a SYNC of the HAL arrived in this call of `poll`, although a fault may have removed it for the nodes."""
+        """Whether the HAL sent a SYNC in this call of `poll`. Also True if an injected fault removed the SYNC."""
         return self._link is not None and self._link.synced
 
     def _imperfect_cycle(self, count: int) -> bool:
-        """Process received frames when not all frames of the HAL are valid and on time.
+        """Process received frames if a frame of the HAL is missing, invalid or late.
 
         If a SYNC is among them, run one cycle, unless the emulator already ran this cycle.
 

@@ -130,8 +130,8 @@ class EngineDynamics(Closing):
         states = pybullet.getLinkStates(self._free, self._links, 0, 1, physicsClientId=self._client)
         masses = np.array(list(self.masses.values()))
         centre = masses @ np.array([root[0], *(state[0] for state in states)]) / masses.sum()
-        # `root` is the pose of a frame at the centre of mass of the pelvis (inertial frame). So the centre of mass of the robot
-        # is computed in the inertial frame first, and then in the URDF link frame of the pelvis.
+        # `root` is the pose of the inertial frame of the pelvis, whose origin is the centre of mass of the pelvis.
+        # Convert the centre of mass of the robot to this frame, and then to the URDF link frame of the pelvis.
         unturned = [0.0, 0.0, 0.0, 1.0]
         in_root = pybullet.multiplyTransforms(*pybullet.invertTransform(*root), centre.tolist(), unturned)[0]
         return np.array(pybullet.multiplyTransforms(*self._base_from_inertial, in_root, unturned)[0])

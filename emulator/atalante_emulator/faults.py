@@ -83,8 +83,8 @@ BATTERY: Final = "battery"
 _SUPPLIED: Final = f"drive or {BATTERY}"
 _ANY_TARGET: Final = "message, node or bus"
 
-#: Kinds of communication faults: name of the kind -> definition. The parameter `p` of a fault is the probability [0 to 1] that
-#: the fault affects a frame of its target.
+#: Kinds of communication faults: name of the kind -> definition.
+#: The parameter `p` of a fault is the probability (0 to 1) that the fault affects a frame of its target.
 LINK_KINDS: Final[Mapping[str, Kind]] = {
     "drop": Kind("frames are lost", _ANY_TARGET, {"p": _P}),
     "duplicate": Kind("frames are repeated", _ANY_TARGET, {"p": _P, "copies": _whole(1, 16, default=1)}),

@@ -115,7 +115,7 @@ class AttitudeError:
         self._next[:, 2] += self._heading
 
     def apply(self, share: float, quaternion: Vector) -> None:
-        """Turn the attitudes by the attitude errors.
+        """Rotate the attitudes by the attitude errors.
 
         Args:
             share: elapsed share of the current interval, 0 to 1.

@@ -129,7 +129,7 @@ class _Disturbance:
         earlier = self._held.pop(message.frame_id, None)
         if earlier is not None:
             return frame, earlier
-        # Keep `frame` until the next frame of the message arrives. In the last cycle of the fault, send `frame` at once.
+        # Keep `frame` until the next frame of the message arrives. In the last cycle of the fault, send `frame` immediately.
         if cycle + 1 < self.fault.end:
             self._held[message.frame_id] = frame
             return ()
@@ -240,8 +240,8 @@ class FaultyBus(WrappedBus):
             FaultError: If the target or a signal of a fault is not in the network.
         """
         super().__init__(bus)
-        #: Set to True when a SYNC of the HAL arrives, even if a fault removes it before the nodes receive it. The
-        #: emulator sets it to False.
+        #: Whether the HAL has sent a SYNC since the emulator last set this value to False.
+        #: Also True if a fault removed the SYNC, so that no node received it.
         self.synced = False
         self._clock, self._cycle, self._begun = clock, -1, -1
         self._all = [
@@ -360,7 +360,10 @@ class FaultyBus(WrappedBus):
                 channel.send(joined(frames))
 
     def _channel(self, bus: str) -> Bus:
-        """Return the channel of a bus. A `JoinedBus` cannot choose it, because an added frame may have any identifier."""
+        """Return the channel on which added frames of a bus are sent.
+
+        A `JoinedBus` selects a channel by the frame identifier, but an added frame may have any identifier.
+        """
         return self.bus.channel(bus) if isinstance(self.bus, JoinedBus) else self.bus
 
 

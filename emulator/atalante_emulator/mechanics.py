@@ -19,8 +19,8 @@ from atalante_emulator.virtual_operator import VirtualOperator
 from atalante_emulator.wearer import LimbParameters, PassiveWearer
 from atalante_hal.robot import JOINTS
 
-#: Parameters of the nodes if the robot stands on the ground. The IMUs have attitude errors: a walking controller must tolerate
-#: these errors.
+#: Parameters of the nodes if the robot stands on the ground.
+#: The IMUs have attitude errors, because a walking controller must tolerate such errors.
 GROUND_PARAMETERS: Final = EmulatorParameters(imu=ImuParameters(attitude_error=0.004, heading_drift=5.2e-5))
 #: Like `GROUND_PARAMETERS`, but each IMU also measures its heading, for example by a magnetometer. So no heading drifts.
 HEADING_REFERENCE_PARAMETERS: Final = replace(GROUND_PARAMETERS, imu=replace(GROUND_PARAMETERS.imu, heading_drift=0.0))

@@ -117,7 +117,7 @@ class Motors:
     def delay(self, motor: int, cycles: int) -> None:
         """Set the additional time until a setpoint reaches the current loop of a motor.
 
-        At the first call, no past setpoints may be recorded. Then the current setpoint counts as the setpoint of the past.
+        If no past setpoints are recorded at the first call, the current setpoint is used as past setpoint.
 
         Args:
             motor: index of the motor.

@@ -129,7 +129,7 @@ class NodeFaults:
     def _reset(self, fault: Fault, nodes: Nodes, cycle: int) -> None:
         """Keep a node in reset during the fault, and boot the node at the end of the fault.
 
-        During the fault, `link` drops the frames of the node. Only drives and the haptics node have an effect besides that.
+        During the fault, `link` drops the frames of the node. A drive or the haptics node is also reset in each cycle.
         """
         (node,) = nodes
         if cycle == fault.end:

@@ -1,4 +1,4 @@
-"""Sensor noise of the emulated nodes. The noise is drawn for many cycles at once to save time."""
+"""Sensor noise of the emulated nodes. To save time, one call draws the noise of many cycles."""
 
 from __future__ import annotations
 

@@ -30,9 +30,9 @@ from atalante_hal.types import PERIOD, Vector
 Pair = tuple[float, float]
 
 _SH, _SK, _LEG = LEG_JOINTS.index("SH"), LEG_JOINTS.index("SK"), len(LEG_JOINTS)
-#: Thresholds of the foot load, as fractions of the weight of robot and patient. Before the walk, a foot stands if its load
-#: exceeds `_STANDING`. During the walk, a foot is in the air when its load is below `_AIR`, and lands when its load exceeds
-#: `_LANDED`.
+#: Thresholds of the foot load, as fractions of the weight of robot and patient.
+#: Before the walk, a foot stands if its load exceeds `_STANDING`.
+#: During the walk, a foot is in the air when its load is below `_AIR`, and lands when its load exceeds `_LANDED`.
 _STANDING, _AIR, _LANDED = 0.25, 0.02, 0.1
 #: `_MOTORS[leg][segment]` contains the indices of two vibration motors in MOTORS: front and back of the segment.
 #: The legs are left and right. The segments are thigh and shank.

@@ -17,8 +17,8 @@ from atalante_hal.types import PERIOD, Vector
 
 #: MuJoCo's vector `qpos` starts with this number of elements for a free pelvis: position (3) and quaternion wxyz (4).
 _FREE: Final = 7
-#: Time at which a simulation starts [s]. A smaller time shows that MuJoCo has reset a simulation that diverged, because this
-#: also resets the time to 0.
+#: Time at which a simulation starts [s]. If a simulation diverges, MuJoCo resets the simulation and sets its time to 0.
+#: So a time below this value shows that the simulation has diverged.
 _START: Final = 1.0
 
 
@@ -35,7 +35,7 @@ class Contact(NamedTuple):
     #: Hardness of the contact from 0 (soft) to 1 (rigid). MuJoCo calls this value impedance.
     #: The first value applies when the shapes begin to touch, the second value when they are pressed deep into each other.
     solimp: tuple[float, float] = (0.99, 0.99)
-    impratio: float = 1.0  # ratio of the hardness against sliding to the hardness against sinking in
+    impratio: float = 1.0  # hardness against sliding, divided by hardness against sinking in
 
 
 class _Sensed(NamedTuple):
@@ -232,8 +232,8 @@ def _prepare(spec: Any, free: bool, ground: float | None, friction: float, conta
         friction: coefficient of friction between soles and floor.
         contact: contact model.
     """
-    # By default, MuJoCo merges a link on a fixed joint into its parent link. The IMU links would then not exist as bodies,
-    # and a fixed pelvis would become part of the world, without mass.
+    # By default, MuJoCo merges a link on a fixed joint into its parent link. The IMU links would then not exist as bodies.
+    # A fixed pelvis would become part of the world, without mass.
     spec.compiler.fusestatic = False
     option = spec.option
     option.timestep, option.gravity = PERIOD, [0.0, 0.0, -GRAVITY]

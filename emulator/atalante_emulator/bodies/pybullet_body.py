@@ -23,8 +23,8 @@ SOLVER_ITERATIONS = 50
 #: `pybullet.getLinkStates` returns a tuple for each link, with attitude, velocity and angular velocity at these indices.
 _ATTITUDE, _LINEAR, _ANGULAR = 5, 6, 7
 _BASE: Final = -1  # link index of the root link in PyBullet
-#: Number of elements of a row of contact data: pad index (1), normal vector (3), normal force [N] (1),
-#: first friction force [N] (1) and its direction (3), second friction force [N] (1) and its direction (3).
+#: Number of elements of a row of contact data. A row contains the pad index (1), the normal vector (3), the normal force (1),
+#: the first friction force (1) and its direction (3), the second friction force (1) and its direction (3). Forces are in N.
 _CONTACT: Final = 13
 #: Largest number of contacts in a time step: one for each contact pad, because a pad is a sphere and the floor is a plane.
 _CONTACTS: Final = len(FEET) * len(CELLS)
@@ -78,8 +78,8 @@ class PyBulletBody:
         Raises:
             ValueError: If the text is not a URDF, or a required joint or link is missing.
         """
-        # Each body has its own PyBullet client, so that equal inputs give identical motions. A shared client would have
-        # to return to its start state by `pybullet.restoreState`, and the motion after this call can differ.
+        # Each body has its own PyBullet client, so that equal inputs give identical motions.
+        # A shared client would need `pybullet.restoreState`, and after this call equal inputs can give different motions.
         self._client = pybullet.connect(pybullet.DIRECT)
         client = {"physicsClientId": self._client}
         pybullet.setPhysicsEngineParameter(
@@ -206,8 +206,8 @@ class PyBulletBody:
             state = self._link_states([self._index_of[link]])[0]
             centre, position, attitude = state[0], state[4], state[_ATTITUDE]
             velocity, rate = state[_LINEAR], state[_ANGULAR]
-        # PyBullet returns the velocity v of the centre of mass. The origin of the link frame has the velocity v + w x r,
-        # where w is the angular velocity and r the vector from the centre of mass to the origin.
+        # PyBullet returns the velocity v of the centre of mass. The origin of the link frame has the velocity v + w x r.
+        # w is the angular velocity, and r is the vector from the centre of mass to the origin.
         rx, ry, rz = (a - b for a, b in zip(position, centre, strict=True))
         (vx, vy, vz), (wx, wy, wz) = velocity, rate
         moved = vx + (wy * rz - wz * ry), vy + (wz * rx - wx * rz), vz + (wx * ry - wy * rx)
