@@ -37,8 +37,8 @@ def hal_cycle(effort: Effort) -> Measurement:
     recording = Recording(walk())
     nodes, baseline = VirtualNodes(recording), PythonCanHal(walk(), recording, FilterOnly(walk()))
 
-    # Both blocks measure processor time. A block of the baseline is long, so on a loaded machine the wall time would
-    # include the time of other processes.
+    # Both blocks measure processor time, not wall time.
+    # A block of the baseline is long, so its wall time on a loaded machine would include the time of other processes.
     def hal_block() -> float:
         recorded.bus.prepare(_BLOCK)
         start = time.thread_time()

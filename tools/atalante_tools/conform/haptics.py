@@ -182,7 +182,7 @@ def stays_in_range(tester: NodeTester) -> Outcome:
 
 
 def stops_without_commands(tester: NodeTester) -> Outcome:
-    """Test HAPTICS-07: on loss of commands, the amplitude of every motor falls by `LAG` in time, and then reaches 0."""
+    """Test HAPTICS-07: on loss of commands, the amplitude of every motor falls by `LAG` before a deadline, and then reaches 0."""
     bound = _stop_bound(tester)
     before, last_command = _settle(tester, 1.0), tester.cycle_number
     states = tester.states(tester.idle(2 * _SETTLED))
@@ -193,7 +193,7 @@ def stops_without_commands(tester: NodeTester) -> Outcome:
 
 
 def _stop_bound(tester: NodeTester) -> int:
-    """Return the age of the last command from which the state must show that the motors stop [cycles].
+    """Return the deadline for the motors to stop, in cycles since the last command.
 
     The command times out after the TimeoutTime of the DBC, and the next state may be sampled one state period later.
     """

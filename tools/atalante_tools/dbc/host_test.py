@@ -73,8 +73,8 @@ def run_host_test(build: Build, program: Path, images: int, seed: int) -> int:
     ) as process:
         assert process.stdin is not None
         assert process.stdout is not None
-        # The host test exits at the first difference, so the pipe to it breaks. Close the pipe inside `suppress`, because the
-        # rest of its buffer is written then.
+        # The host test exits at the first difference, and the pipe to the host test then breaks.
+        # Close the pipe inside `suppress`, because closing a pipe writes the rest of its buffer.
         with suppress(BrokenPipeError), process.stdin as pipe:
             pipe.write(vectors.header(images))
             for image in vectors.images(images):
@@ -248,8 +248,8 @@ def _size(build: Build, message: Message) -> int:
 def _message(build: Build, message: Message, other: Message) -> str:
     """Return the C test function of a message.
 
-    If the node receives the message, the function also checks the payloads of the images 0 and 1 with a wrong Data ID, the one
-    of the message `other`. The result must be a CRC error. If `other` is the same message, this check is left out.
+    If the node receives the message, the function also checks the payloads of the images 0 and 1 with the Data ID of the message
+    `other`. The result must be a CRC error. If `other` is the same message, this check is left out.
     """
     body = ""
     if received := build.received(message):

@@ -83,7 +83,7 @@ class Vectors:
         """Return an index array that reorders the bytes of an image (one payload per message) for the stream.
 
         The method `images` joins one array per kind of data, such as all payloads and all signal values. The stream has the
-        order of the messages instead. Element k is the index, in the joined arrays, of byte k of an image in the stream.
+        order of the messages instead. Byte k of an image in the stream is the byte of the joined arrays at the index `order[k]`.
         """
         build, codec = self._build, self._codec
         rows = len(build.messages)

@@ -28,8 +28,9 @@ class Absence:
         """
         self._clock, self._emulator = clock, emulator
         self._begun = 0  # number of HAL cycles that have begun
-        # Time by which the deadlines of the HAL cycles have moved [s]. A cycle that is late by more than one period moves all
-        # later deadlines by its whole delay. A cycle that is late by one period or less moves no deadline.
+        # Time by which the deadlines of the HAL cycles have moved [s].
+        # A cycle that is late by more than one period moves all later deadlines by its whole delay.
+        # A cycle that is late by one period or less moves no deadline.
         self._skipped = 0.0
         self._seen = 0  # cycle number of the robot at the end of the last call of `wait`
         self._alone = 0  # number of robot cycles since the last SYNC

@@ -26,11 +26,11 @@ _KNEE: Final = "LEFT_SK"
 _HIP: Final = "LEFT_SH"
 _IMU: Final = "IMU_TORSO"
 _COMMAND: Final = "COMMAND_LEFT_LEG"
-#: Time from the end of the fault to START [cycles], if a knee sinks in LOWER or FAULT. After this time the knee is at rest, so
-#: its drive can be enabled again.
+#: Time from the end of the fault to START [cycles], if a knee sinks in LOWER or FAULT.
+#: After this time, the knee is at rest, so its drive can be enabled again.
 _LOWERED: Final = 4500
-#: Time from the end of the fault to START [cycles], if the HAL has switched off the faulty drive. The joint of this drive may
-#: still be sinking when START is pressed. START enables the drive, and the drive then holds the joint.
+#: Time from the end of the fault to START [cycles], if the HAL has switched off the faulty drive.
+#: The joint of this drive may still be sinking when START is pressed. START enables the drive, which then holds the joint.
 _UNTIL_START: Final = 600
 #: Time from HOLD until all joints are at rest [cycles].
 _AT_REST: Final = 60
@@ -137,8 +137,8 @@ SCENARIOS: Final = (
         ),
         permanent=Case("one leg", (Fault("drop", "SYNC_LEFT_LEG"),)),
     ),
-    # A drive detects lost commands by the gap in the alive counter of the next command. Example: if the commands of the cycles
-    # 1 and 2 are lost, the command of cycle 3 shows the gap, so `detected` is 3.
+    # A drive detects lost commands by the gap in the alive counter of the next command.
+    # Example: if the commands of the cycles 1 and 2 are lost, the command of cycle 3 shows the gap, so `detected` is 3.
     Scenario("F24", tuple(Case(f"{n} frames", (Fault("drop", _COMMAND, 0, n),), detected=n + 1) for n in range(1, 5))),
     Scenario(
         "F25",
@@ -310,8 +310,8 @@ SCENARIOS: Final = (
             if joint != "TH"
         ),
     ),
-    # Only FH and SH have a case with a reversed motor. With a reversed motor, TH, SK, SA and HA exceed their velocity limits
-    # before the HAL can react.
+    # Only FH and SH have a case with a reversed motor.
+    # TH, SK, SA and HA with a reversed motor exceed their velocity limits before the HAL can react.
     Scenario(
         "F84",
         tuple(
@@ -361,10 +361,10 @@ SCENARIOS: Final = (
             )
         ),
     ),
-    # A faulty motor is visible only in the motion of its joint, because its drive still reports the commanded torque. HA moves
-    # little, because its commanded torque is less than its dry friction. So the detection takes longer for HA.
-    # There is no case with a reversed motor of SA, because this case would fail: SA exceeds the velocity limit of the test
-    # (`limit_violations`) sooner than the HAL can detect the fault.
+    # A faulty motor is visible only in the motion of its joint, because its drive still reports the commanded torque.
+    # HA moves little, because its commanded torque is less than its dry friction. So the detection takes longer for HA.
+    # There is no case with a reversed motor of SA, because this case would fail:
+    # SA exceeds the velocity limit of the test (`limit_violations`) before the HAL can detect the fault.
     Scenario(
         "F82",
         tuple(
@@ -397,7 +397,7 @@ SCENARIOS: Final = (
             for node, torque in ((_KNEE, 150.0), ("LEFT_HA", 25.0), ("LEFT_SA", 50.0))
         ),
     ),
-    # The encoder jumps in the first cycle, so the drive fails in a cycle whose position is rejected.
+    # The encoder also jumps in the cycle in which the drive fails, so the HAL rejects the position of this cycle.
     Scenario(
         "F87",
         (

@@ -9,7 +9,8 @@ pairs. The runs check what must be true for every fault at every moment:
   move a joint above its velocity limit, because the HAL cannot limit the speed while the drive holds its position. A motor
   that is too strong may exceed its torque limit by the same share.
 - No command lets a drive produce torque before the operator has pressed START.
-- If the fault begins after START, only the operator can cause a change to a less severe state, and each START only one.
+- If the fault begins after START, only the operator can cause a change to a less severe state. Each START
+  can cause only one such change.
 - During a start of the schedule, no joint moves by more than `SAG_MAX`. A wrong motor, a wrong encoder or a push moves its joint,
   and the inertia of this joint moves the other joints of the leg. So these faults have other limits in their leg (`SAG_OF`).
 - The run raises no exception.
@@ -39,14 +40,14 @@ from atalante_tools.faults.scenario import MID_SWING, Case, Stimulus, shifted
 from atalante_tools.faults.verdict import WALKING, automatic_improvements, exception_sentence, limit_violations
 
 _S = SupervisorState
-#: Largest accepted motion of a joint during a start [deg]. The motion is measured from the first cycle in which a drive is on, to
-#: ACTIVE or to the end of a start that fails.
+#: Largest accepted motion of a joint during a start [deg].
+#: The measurement begins when the first drive is on. It ends when the HAL is ACTIVE or the start has failed.
 SAG_MAX: Final = 1.0
 #: Events with which the HAL ends a start before ACTIVE.
 _ENDS_OF_START: Final = ("START_FAILED", "START_REFUSED")
 #: Kind of a fault that moves joints during a start -> largest accepted motion [deg] of every joint in the leg with the fault.
-#: A wrong motor or encoder moves its joint until the direction test finds the fault (F72). A push may exceed the torque that
-#: holds the joint, so the motion has no limit.
+#: A wrong motor or encoder moves its joint until the direction test finds the fault (F72).
+#: A push may exceed the torque that holds the joint, so the motion has no limit.
 SAG_OF: Final = {
     "torque_wrong": 5.0,
     "torque_weak": 5.0,
@@ -56,8 +57,8 @@ SAG_OF: Final = {
     "value": 5.0,
     "push": math.inf,
 }
-#: Kinds of motor faults. Until the HAL finds a motor fault, the fault may move a joint above its velocity limit. So the speed
-#: is not checked for `FOUND` cycles after a motor fault begins, and for `FOUND` cycles after each later START.
+#: Kinds of motor faults. Until the HAL finds a motor fault, a joint may move faster than its velocity limit.
+#: So the speed is not checked for `FOUND` cycles after a motor fault begins, and for `FOUND` cycles after each later START.
 _MOTOR: Final = ("torque_wrong", "torque_weak")
 #: Number of cycles within which the HAL must find a faulty motor: time limit of F84 in FAULTS.md.
 FOUND: Final = 200
@@ -69,8 +70,8 @@ _STOPPED: Final = 60
 _RESTART: Final = 200
 #: Longest wait for the end of a fault [cycles]. The run continues after this wait, even if the fault is permanent.
 _LONGEST: Final = 400
-#: Number of cycles to the next press of START, from the end of the wait for the fault (`_LONGEST`), or from the last START of
-#: the schedule if that START is later.
+#: Number of cycles to the first press of START after the fault.
+#: The cycles count from the end of the fault or of the wait (`_LONGEST`), or from a later START of the schedule.
 _REST: Final = 60
 #: Number of cycles from the second press of START after the fault to the end of the run.
 _END: Final = 300

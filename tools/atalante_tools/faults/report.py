@@ -29,7 +29,7 @@ class Line:
     id: str
     passed: bool
     state: str
-    cycles: int | None  # cycles from fault to reaction; without reaction: from fault to diagnostic; without both: None
+    cycles: int | None  # cycles from the fault to the reaction, otherwise to the diagnostic; None if there was neither
     bound: int  # time limit for `cycles`
     dtc: str
     cases: int

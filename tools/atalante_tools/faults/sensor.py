@@ -18,7 +18,7 @@ _KNEE: Final = "LEFT_SK"
 _STILL: Final = "RIGHT_FH"
 _IMUS: Final = tuple(f"IMU_{name.upper()}" for name in IMUS)
 _FEET: Final = tuple(f"FOOT_{name.upper()}" for name in FEET)
-#: Probability that a frame arrives twice. The HAL tolerates this probability permanently. Above 0.2, it reports a fault (F63).
+#: Probability that a frame arrives twice. The HAL tolerates this probability permanently. Above 0.2, the HAL reports F63.
 _OFTEN: Final = 0.15
 #: Part of a case name -> permanent communication fault during which the HAL must still detect a drifting encoder.
 #: Two of the delayed messages, from a joint drive and from the pelvis IMU, are inputs of the sensor checks.
@@ -88,7 +88,7 @@ def _every(cycles: int, kind: str, target: str, count: int, **parameters: float)
 
 
 def _never_ready(name: str, fault: Fault, *, node: str) -> Case:
-    """Return a case of an IMU that is faulty from power-on: the HAL stays in OFF, and START is refused."""
+    """Return a case of an IMU that is faulty from power-on: the HAL stays in OFF and rejects START."""
     return Case(
         f"{name}, from power-on",
         (fault,),
@@ -110,8 +110,8 @@ SCENARIOS: Final = (
         "F27",
         (
             *(Case(node, _stuck(node, 200), node=node) for node in ("LEFT_SH", "RIGHT_SH")),
-            # A stuck knee encoder makes the guide command the largest torque of the drive. With a large torque, the HAL detects a
-            # stuck encoder within 20 cycles.
+            # With a stuck knee encoder, the guide commands the largest torque of the drive.
+            # At a large torque, the HAL detects a stuck encoder within 20 cycles.
             *(
                 Case(f"{_KNEE} at {phase:g} T", _stuck(_KNEE, 200), node=_KNEE, phase=phase, detected=20, reacted=20)
                 for phase in (0.1, MID_SWING, 0.65, 0.8)

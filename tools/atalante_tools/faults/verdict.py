@@ -165,7 +165,7 @@ def limit_violations(run: Observation, unlimited: Sequence[range] = (), strength
 
 
 def automatic_improvements(run: Observation, until: int, starts: Sequence[int] = ()) -> list[str]:
-    """Return a sentence if the HAL changed to a less severe state by itself after the first faulty cycle.
+    """Return a sentence if the HAL changed to a less severe state without the operator, after the first faulty cycle.
 
     Each START may change the state only once, and within `ENABLE_CYCLES` cycles. READY to OFF is always accepted, because
     nothing moves.

@@ -69,8 +69,8 @@ class Start(NamedTuple):
 
     deviation: Pair  # angle minus nominal angle, of hip and knee [rad]
     rate: Pair  # speed minus nominal speed, of hip and knee [rad/s]
-    #: difference of two torques of hip and knee [Nm]: the motor torque before the stance change, minus the torque that gives the
-    #: nominal acceleration after the stance change
+    #: difference of two torques of hip and knee [Nm]: the motor torque before the stance change,
+    #: minus the torque that gives the nominal acceleration after the stance change
     carried: Pair
     ahead: Pair  # real speed minus measured speed, of hip and knee [rad/s]; a filter delays the measured speed
 

@@ -15,9 +15,9 @@ from atalante_tools.session.body import engine_hint, no_banner
 
 #: Number of random states in which Pinocchio and PyBullet are compared.
 STATES = 100
-#: Torques and mass matrices from Pinocchio and PyBullet are compared. The model check fails if the relative difference of an
-#: array is at least this fraction. The relative difference is the largest difference between corresponding elements,
-#: divided by the largest element.
+#: The model check compares torques and mass matrices from Pinocchio and PyBullet.
+#: The check fails if the relative difference of an array is at least this fraction.
+#: The relative difference is the largest difference of two corresponding elements, divided by the largest element.
 AGREEMENT = 1e-6
 
 

@@ -42,10 +42,10 @@ class PendantNode:
     Attributes:
         hal: State of the HAL in the last SYNC. None if no SYNC was received.
         cycles: Number of received SYNCs.
-        answered_in_row: Number of SYNCs that this node answered since the last gap. A gap is a rejected SYNC, see
-            `PendantReader.gaps`, an answer for which the transmit queue had no room, or a `poll` with several waiting SYNCs, of
-            which only the last gets an answer. Silence in a takeover is no gap. After a gap, the HAL may ignore requests of the
-            pendant until enough consecutive answers were received.
+        answered_in_row: Number of SYNCs that this node answered since the last gap. There are three kinds of gap: a rejected
+            SYNC (see `PendantReader.gaps`), an answer for which the transmit queue had no room, and a `poll` with several
+            waiting SYNCs, because only the last of them gets an answer. Silence in a takeover is no gap. After a gap, the HAL
+            may ignore requests of the pendant until it has received enough consecutive answers.
         answered: Number of answered SYNCs. Answers for which the transmit queue had no room are included.
         found_another: Whether another pendant sent before `start_sending()`.
     """

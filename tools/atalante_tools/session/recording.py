@@ -189,8 +189,8 @@ def start_telemetry(
         record_rate=outputs.record_rate,
         can_log=outputs.can_log,
         lock_step=target.lockstep,
-        # Number of cycles in the ring buffer. The telemetry process may pause while a run in lock-step continues faster than
-        # real time, so the buffer must hold several seconds of the run.
+        # Number of cycles in the ring buffer. The buffer must hold several seconds of the run,
+        # because the telemetry process may pause while a run in lock-step continues faster than real time.
         slots=8192,
         **outputs.outlet,
     )

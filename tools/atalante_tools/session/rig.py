@@ -41,7 +41,7 @@ if TYPE_CHECKING:
     from atalante_emulator.mechanics import Mechanics
     from atalante_emulator.pendant import Operator
 
-#: What is known about the drives if the bus is down when a run ends.
+#: Text about the state of the drives, printed if the bus is down when a run ends.
 UNCONFIRMED: Final = (
     "no HOLD was confirmed, because the bus is down: each enabled drive holds its position by itself after its watchdog "
     "timeout"

@@ -51,16 +51,17 @@ class WalkResult:
     #: number of these steps that started outside the hand-over box, so the certificate did not apply
     hand_overs_exceeded: int
     full_assist: bool  # whether a diagnostic made the HAL ramp the assistance factor to 1 (state FULL_ASSIST)
-    lateral_m: float  # sideways deviation from the walking line at the last landing, positive to the left
-    yaw_deg: float  # heading of the soles relative to the walking line at the last landing, positive to the left
+    lateral_m: float  # sideways deviation from the walking line at the last landing [m], positive to the left
+    yaw_deg: float  # heading of the soles relative to the walking line at the last landing [deg], left positive
     #: true value of `lateral_m` at the end of the walk; None if the robot is real or fell
     true_lateral_m: float | None
     true_yaw_deg: float | None  # true value of `yaw_deg` at the end of the walk; None if the robot is real or fell
-    #: root mean square of the angle between the true and the estimated vertical during the walk; None if the robot is real
+    #: root mean square of the angle between true and estimated vertical during the walk [deg]; None if the robot is real
     attitude_rms_deg: float | None
-    distance_m: float  # distance that the robot walked along the walking line
+    distance_m: float  # distance that the robot walked along the walking line [m]
     unnoticed: int  # number of steps in which no landing of the foot was detected
-    max_dcm_error_m: float  # largest distance between the measured and the nominal divergent component of motion (DCM)
+    #: largest distance between the measured and the nominal divergent component of motion (DCM) [m]
+    max_dcm_error_m: float
     diagnostics: dict[str, int]  # number of occurrences of each diagnostic of the HAL
     real_time_factor: float
     robot_process: bool  # whether the emulated robot ran in a process of its own, in parallel with the HAL

@@ -51,8 +51,8 @@ _LEAD: Final = 5
 _FALLEN: Final = 300
 #: Number of cycles after which a walk ends at the latest. A walk without a fault lasts about 10000 cycles.
 _LONGEST: Final = 20_000
-#: The robot is at rest if two conditions are true for `_RESTED` cycles: its pelvis and its joints are slower than `_STILL`
-#: [m/s, rad/s], and each foot carries a load of at least `_LOADED` [N].
+#: The robot is at rest if two conditions are true for `_RESTED` cycles:
+#: pelvis and joints are slower than `_STILL` [m/s, rad/s], and each foot carries a load of at least `_LOADED` [N].
 _STILL, _RESTED, _LOADED = 0.01, 500, 50.0
 #: A walk has the outcome "walked" if a foot lands `_LANDINGS` times after the end of the fault,
 #: and the robot then continues to walk for `_WALKED` cycles. A complete walk has this outcome, too.

@@ -26,7 +26,7 @@ _PHASES: Final = np.linspace(0.1, 0.8, 29)
 #: Two metabolic rates count as equal if their means differ by at most this fraction of the rate of quiet standing.
 SAME: Final = 0.02
 STANDING: Final = 1.44  # metabolic rate of quiet standing [W/kg]
-#: `TREND`: A value falls with the assistance factor if the rank correlation of both is between -1 and -`TREND`.
+#: `TREND`: A value counts as falling with a rising assistance factor if the rank correlation of both is at most -`TREND`.
 #: `ASYMMETRY`: On each day of the sweep, the factor falls from 1 to 0 and then rises to 1, so each factor above 0 has two walks.
 #: The mean absolute difference between the two walks, divided by the range of all values, must be at most `ASYMMETRY`.
 TREND, ASYMMETRY = 0.8, 0.25
@@ -44,8 +44,8 @@ CERTIFIED, ROBUST = 0.95, 0.98
 SIDEWAYS, SIDEWAYS_WITH_REFERENCE = 1.5, 0.5
 #: The root mean square error of the estimated vertical must be below this angle in every walk [deg].
 ATTITUDE: Final = 0.5
-#: The robot must withstand a push of 0.2 s at every phase of a step: with the force `PUSH_WORST` in every direction [N],
-#: and with the force `PUSH_FORWARD` forwards [N].
+#: Forces of a push of 0.2 s that the robot must withstand at every phase of a step [N].
+#: `PUSH_WORST` applies to every direction, `PUSH_FORWARD` to a push forwards.
 PUSH_WORST, PUSH_FORWARD = 200.0, 300.0
 
 

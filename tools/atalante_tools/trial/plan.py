@@ -53,7 +53,7 @@ FRICTION: Final = (0.25, 0.8)
 #: Length of `RobustTrial.delay`. In `robustness`, state messages, command messages and motor torques can each be one cycle late.
 #: Longer delays are not tried, because a drive times out when its last command is five cycles old.
 #: If commands are one cycle late, four consecutive lost frames cause this timeout.
-#: If commands are later, fewer lost frames cause it than the fault matrix intends.
+#: If commands were two or more cycles late, even fewer lost frames would cause this timeout.
 LATE_PARTS: Final = 3
 #: Probability with which a frame is lost in `robustness`.
 LOSS: Final = 0.01
@@ -219,7 +219,7 @@ class WalkSetting:
             active: whether the subject is active.
             xi: assistance factor in the last part of the walk.
             index: number of the trial in the experiment.
-            order: place in the sweep, such as "day2-03".
+            order: position in the sweep, such as "day2-03".
         """
         return WalkTrial(
             patient.mass, patient.height, active, xi, self.protocol, self.shape, self.idealization, self.feedforward,

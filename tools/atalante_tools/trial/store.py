@@ -47,7 +47,7 @@ def stored(trial: Trial, folder: Path) -> Result | None:
         result: Result = json.loads(path.read_bytes())
     except ValueError:  # no JSON, or no text
         return None
-    expected = json.loads(json.dumps({"trial": fields(trial), "versions": versions()}))  # with lists in place of tuples
+    expected = json.loads(json.dumps({"trial": fields(trial), "versions": versions()}))  # JSON makes lists of tuples
     valid = (
         isinstance(result, dict) and "outcome" in result and {name: result.get(name) for name in expected} == expected
     )

@@ -48,7 +48,7 @@ _HEX_PAIR = np.full(1 << 16, 0xFFFF, np.uint16)
 _HEX_PAIR.reshape(256, 256)[:] = np.where(
     (_HEX < 16) & (_HEX < 16)[:, None], _HEX.astype(np.uint16) << 4 | _HEX[:, None], 0xFFFF
 )
-#: Element k (0 to 8) is a mask of the k highest bytes of a 64-bit word: the last k of eight characters read by `word`.
+#: Element k (0 to 8) is a mask of the k highest bytes of a 64-bit word. They are the last k characters of `_Lines.word`.
 _TAIL = np.array([0, *((((1 << 8 * k) - 1) << 64 - 8 * k) for k in range(1, 9))], np.uint64)
 _ZEROS = np.uint64(0x3030303030303030)
 _LINE = re.compile(

@@ -32,7 +32,7 @@ LEGAL = {(int(state), int(after)) for (state, _), after in TRANSITIONS.items()} 
     (int(a), int(b)) for a, b in _SPONTANEOUS
 }
 #: Pairs (drive state, controlword) without a check of the response, because the drive may ignore the controlword.
-#: ENABLE_OPERATION: a drive that stopped by itself may ignore this controlword until it receives QUICK_STOP.
+#: ENABLE_OPERATION: a drive that stopped without a command may ignore this controlword until it receives QUICK_STOP.
 #: FAULT_RESET: a drive may ignore this controlword while the cause of the fault persists.
 EXEMPT = {(int(_S.QUICK_STOP_ACTIVE), int(_C.ENABLE_OPERATION)), (int(_S.FAULT), int(_C.FAULT_RESET))}
 _NOTHING = -1

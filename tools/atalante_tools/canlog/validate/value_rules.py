@@ -24,7 +24,7 @@ from atalante_tools.canlog.stream import Stream
 from atalante_tools.canlog.validate.findings import Findings
 from atalante_tools.canlog.validate.project import Project
 
-#: Smallest integer that float64 may have rounded.
+#: From this integer on, float64 may round an integer.
 _EXACT: Final = 2**53
 #: The value table of a field of at most this length [bit] is stored as a lookup array over all raw codes.
 #: The value table of a longer field is stored as a list of the valid codes.
@@ -272,8 +272,8 @@ def is_limited(limits: Field) -> bool:
 def raw_bounds(limits: Field) -> tuple[int, int]:
     """Return the smallest and the largest raw code inside the DBC range.
 
-    A tolerance of 1e-6 of a raw code is added, because the DBC limits are rounded decimals. For a limit of 2^53 or more, which
-    float64 may have rounded, the rounding error is added, too.
+    A tolerance of 1e-6 of a raw code is added, because the DBC limits are rounded decimals. float64 may have rounded a limit of
+    2^53 or more. For such a limit, the rounding error is added, too.
     """
     assert limits.minimum is not None
     assert limits.maximum is not None
@@ -282,7 +282,7 @@ def raw_bounds(limits: Field) -> tuple[int, int]:
 
 @lru_cache(maxsize=4096)  # cached, because many signals of a DBC have equal limits
 def _codes_within(minimum: float, maximum: float, factor: float, offset: float, codes: range) -> tuple[int, int]:
-    # Fractions of the decimals, because the rounding errors of float64 would exceed a raw code in wide fields.
+    # Compute with exact fractions. In a wide field, the rounding errors of float64 would exceed one raw code.
     scale, zero = Fraction(str(factor)), Fraction(str(offset))
     limits = []
     for limit in (minimum, maximum):
@@ -297,8 +297,8 @@ def _float_limits(limits: Field) -> tuple[float, float]:
     """Return the smallest and the largest physical value inside the DBC range of a float field.
 
     The raw value of each limit is rounded to the float format of the field. Therefore a limit that the format cannot
-    represent, such as 0.1, is valid. For float64, a tolerance of 1e-9 of each limit is added, because the DBC limits are
-    rounded decimals, and at least the rounding error of the offset.
+    represent, such as 0.1, is valid. For float64, a tolerance is added to each limit, because the DBC limits are rounded
+    decimals. The tolerance is 1e-9 of the limit, but at least the rounding error of the offset.
     """
     assert limits.minimum is not None
     assert limits.maximum is not None

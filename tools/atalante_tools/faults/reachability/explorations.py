@@ -38,8 +38,8 @@ NOTHING, RELEASED, STOPPED, HELD = range(4)
 RECEIVED_HOLD: Final = 2
 #: If no new pendant frame arrives after a stop action, the HAL may still enable a drive for this number of cycles.
 SILENT_PENDANT: Final = LOST - 1
-#: Ages of late pendant frames that the search tries [cycles]. From age `LOST` on, the data of the frame has timed out. From age
-#: 16 on, the E2E check rejects the frame.
+#: Ages of late pendant frames that the search tries [cycles].
+#: From age `LOST` on, the data of the frame has timed out. From age 16 on, the E2E check rejects the frame.
 _LATE: Final = (*range(1, LOST + 2), 16)
 _BUTTONS: Final = (Request.START, Request.STOP, Request.HOLD)
 #: Largest stored number of cycles since the stop action. Larger numbers are stored as this number.
@@ -100,8 +100,8 @@ class Cycle(NamedTuple):
 
 
 #: All results that pendant frames can have in one cycle: result -> one example of frames that cause the result.
-#: A result consists of the state of the reception, the inputs of the operator, and whether the HAL received a press of START from
-#: the genuine pendant (not from a second sender).
+#: A result consists of the state of the reception, the inputs of the operator, and a bool: whether the HAL received
+#: a press of START from the genuine pendant, not from a second sender.
 _Receptions = dict[tuple[Reception, Inputs, bool], tuple[PendantFrame, ...]]
 
 

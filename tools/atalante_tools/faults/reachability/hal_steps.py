@@ -40,16 +40,17 @@ _TAG: Final = _CYCLE & 0xFF
 _PRESSES, _ROGUE_PRESSES = 10, 12
 #: Time in which a pressed START can still change the supervisor state: no time, one cycle, or several cycles.
 NO_START, LAST_START, START = 0, 1, 2
-#: `NO_START`, `LAST_START` or `START` -> number of cycles in which a pressed START can still change the supervisor state. The
-#: search writes this number into `SafetyMonitor.start_cycles_left`.
+#: `NO_START`, `LAST_START` or `START` -> number of cycles in which a pressed START can still change the supervisor state.
+#: The search writes this number into `SafetyMonitor.start_cycles_left`.
 START_CYCLES: Final = {NO_START: 0, LAST_START: 1, START: 100}
 #: Whether the HAL trusts the pendant -> error counters of the pendant (`Qualification`) that the search tries.
 QUALIFICATIONS: Final = {
     False: (Qualification(0, 0, False), Qualification(0, REQUALIFY - 1, False)),
     True: (SETTLED, Qualification(FULL - 4, 0, True)),
 }
-#: Last frame that the HAL checked for a press of a button: no frame, the last accepted frame, an earlier frame, or a frame of a
-#: second sender. If the next frame has another RequestCounter than the checked frame, a button was pressed.
+#: Last frame that the HAL checked for a press of a button:
+#: no frame, the last accepted frame, an earlier frame, or a frame of a second sender.
+#: If the next frame has another RequestCounter than the checked frame, a button was pressed.
 _NONE, _LATEST, _OLDER, _ROGUE = range(4)
 #: `_NONE`, `_LATEST`, `_OLDER` or `_ROGUE` -> RequestCounter (counter of button presses) in the checked frame.
 _EVALUATED: Final = {_NONE: None, _LATEST: _PRESSES, _OLDER: _PRESSES - 1, _ROGUE: _ROGUE_PRESSES}

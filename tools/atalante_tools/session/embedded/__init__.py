@@ -150,7 +150,7 @@ class EmbeddedRobot(Closing):
             if not self._open:
                 os.sched_setaffinity(0, self._cores)
         if not self._begun:
-            self._child.kill()  # the child has not created the robot yet, so it can be ended at once
+            self._child.kill()  # the child has not created the robot yet, so it can be ended immediately
         try:
             self._child.wait(_END)
         except subprocess.TimeoutExpired:
