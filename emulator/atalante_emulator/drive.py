@@ -102,8 +102,8 @@ class Drives:
         self.signals = signals
         self.state = [DriveState.SWITCH_ON_DISABLED] * len(JOINTS)
         #: latched[i] is True if drive i left OPERATION ENABLED without a command, for example to hold its joint.
-        #: A latched drive ignores ENABLE_OPERATION. Either of two controlwords ends this:
-        #: one that changes the drive state, or QUICK_STOP after the cause of the error is gone.
+        #: A latched drive ignores ENABLE_OPERATION. A controlword that changes the drive state unlatches the drive.
+        #: QUICK_STOP also unlatches the drive, if the cause of the error is gone.
         self.latched = [False] * len(JOINTS)
         #: enable_delay[i]: number of ENABLE_OPERATION commands that drive i ignores before it enters OPERATION ENABLED.
         self.enable_delay = [0] * len(JOINTS)

@@ -54,7 +54,7 @@ _REJECTED = (Check.CRC, Check.LENGTH, Check.RANGE, Check.INVALID)
 _HALF_TURN = 128
 #: The HAL sends one SYNC on each bus. After the first SYNC, the emulator waits at most this time for all other SYNCs [s].
 _SYNC_SKEW = 200e-6
-#: Without SYNC, `run` catches up with real time by at most this number of cycles before it polls the bus and `stop` again.
+#: To catch up with real time, `run` simulates at most this number of cycles without SYNC. Then it polls the bus and `stop`.
 _CATCH_UP = 20
 
 
