@@ -67,7 +67,7 @@ def test_file_of_the_user_is_kept(name: str, tmp_path: Path):
 @pytest.mark.parametrize(
     ("file", "changes", "error"),
     [
-        ("3robot.dbc", {}, "must begin with a letter .*, got 3robot.c: rename the DBC file"),
+        ("3robot.dbc", {}, "must begin with a letter, because .*, got 3robot.c: rename the DBC file"),
         ("Host_Test.dbc", {}, "must differ from host_test.c"),
         (
             "robot.dbc",

@@ -21,8 +21,8 @@ if TYPE_CHECKING:
     from atalante_tools.commands.observer import NodeReport, Observer, Report
 
 _BLANK: Final = "-"
-#: Listening time before the measurement begins [s]. SocketCAN reports lost frames only with a later frame.
-#: During this time, it reports the frames that were lost while the buses were opened. The measurement does not count them.
+#: Listening time before the measurement begins [s]. The measurement excludes frames that were lost while the buses were opened.
+#: SocketCAN reports these losses with a later frame, which arrives within this time.
 WARM_UP: Final = 0.1
 
 

@@ -23,8 +23,8 @@ if TYPE_CHECKING:
 
 #: The exit code after a signal is this number plus the signal number (shell convention).
 SIGNALLED = 128
-#: Stop signals whose repetition ends the process. A SIGHUP after another stop signal has no effect,
-#: because the shell and the kernel may both send SIGHUP when a terminal closes.
+#: Stop signals that end the process if they arrive after another stop signal.
+#: SIGHUP is not in the list, because the shell and the kernel may both send SIGHUP when a terminal closes.
 _SIGNALS = (signal.SIGINT, signal.SIGTERM)
 
 

@@ -75,8 +75,8 @@ def _check_names(build: Build) -> None:
     file = f"{build.name}.c"
     if not build.name[0].isalpha() or file == _HOST_TEST:
         raise Failed(
-            f"name of the C file must differ from {_HOST_TEST}, and must begin with a letter because all C names begin with it, "
-            f"got {file}: rename the DBC file"
+            f"name of the C file must differ from {_HOST_TEST} and must begin with a letter, because it is the prefix of all "
+            f"C names, got {file}: rename the DBC file"
         )
     _check_distinct("messages", [m.name for m in build.messages])
     for message in build.messages:

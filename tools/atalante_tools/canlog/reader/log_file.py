@@ -7,9 +7,9 @@ from pathlib import Path
 
 from atalante_tools.canlog.reader.chunk import Channels
 
-#: File suffix -> three properties: the format records the direction of frames, the format records the CAN FD flags,
-#: and python-can reads all bus errors in the log.
-#: python-can does not read the bus errors in the ER records of .trc and in the CAN FD error objects of .blf.
+#: File suffix -> three properties. First: the format records the direction of frames.
+#: Second: the format records the CAN FD flags. Third: python-can reads all bus errors in the log.
+#: python-can skips the ER records of .trc and the CAN FD error objects of .blf.
 FORMATS = {
     ".log": (True, True, True),
     ".asc": (True, True, True),

@@ -37,7 +37,7 @@ class Finding:
     @property
     def first_s(self) -> float:
         """Return the time stamp of the first violation in the log [s]."""
-        # Python rounds the quotient of two integers once. The divisor 1e9 would round the time stamp to float first.
+        # Python rounds the quotient of two integers only once. With the divisor 1e9, the time stamp would be rounded, too.
         return self.first / 10**9
 
     @property
