@@ -86,6 +86,7 @@ class Run:
             self.codes = {event.code for event in self.events}
 
 
+@pytest.mark.sample(2)
 @pytest.mark.parametrize("cell", ["RL", "all"])
 @pytest.mark.parametrize("foot", range(2))
 def test_f76_wrong_sign_of_cells_is_found_when_the_robot_is_set_down(robot, cell: str, foot: int) -> None:
@@ -111,6 +112,7 @@ def test_f78_exchanged_feet_are_found_before_the_first_step(robot) -> None:
     assert all(min(load) > 50.0 for load, _ in run.forces[-128:])  # both feet are still on the ground
 
 
+@pytest.mark.sample(2)
 @pytest.mark.parametrize(
     ("joint", "rate"), [("LEFT_SA", 2.5), ("RIGHT_SA", -2.5), ("LEFT_HA", -2.5), ("RIGHT_HA", 2.5)]
 )
@@ -126,6 +128,7 @@ def test_f79_drift_of_an_ankle_encoder_is_found_while_the_robot_stands(robot, jo
     assert S.FULL_ASSIST in run.states
 
 
+@pytest.mark.sample(2)
 @pytest.mark.parametrize("engine", ENGINES)
 @pytest.mark.parametrize("patient", [PATIENT, None], ids=["patient", "empty"])
 def test_f81_exchanged_imus_of_the_trunk_are_found(robot, engine: str, patient: Patient | None) -> None:
@@ -143,6 +146,7 @@ def test_f81_exchanged_imus_of_the_trunk_are_found(robot, engine: str, patient: 
         assert run.states[-1] is S.FULL_ASSIST
 
 
+@pytest.mark.sample(2)
 @pytest.mark.parametrize("engine", ENGINES)
 def test_f86_robot_that_falls_goes_to_hold_and_cannot_start_again(robot, engine: str) -> None:
     presses = dict.fromkeys(range(7000, 8000, 300), "start")
@@ -159,6 +163,7 @@ def test_f86_robot_that_falls_goes_to_hold_and_cannot_start_again(robot, engine:
     assert run.states[-1] >= S.HOLD
 
 
+@pytest.mark.sample(2)
 @pytest.mark.parametrize("engine", ENGINES)
 def test_robot_that_stands_in_hold_can_start_again(robot, engine: str) -> None:
     run = Run(

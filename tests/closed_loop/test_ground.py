@@ -33,6 +33,7 @@ class Log:
             self.data += int(frame["can_id"]).to_bytes(4, "little") + frame["data"][: frame["len"]].tobytes()
 
 
+@pytest.mark.sample(2)
 @pytest.mark.parametrize("engine", ENGINES)
 def test_robot_set_down_stands_with_its_full_weight(network, robot, engine: str) -> None:
     logs = []

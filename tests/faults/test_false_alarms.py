@@ -41,6 +41,7 @@ def test_walk_without_a_fault_has_no_false_alarm(number: int, name: str, monkeyp
     assert QuietTask(number, "pybullet")().failed is name.startswith("ground")
 
 
+@pytest.mark.sample(3)
 @pytest.mark.parametrize("axis", ["X", "Y", "Z"])
 def test_walk_with_askew_tibia_imus_has_no_false_alarm(robot: Robot, axis: str) -> None:
     """The IMUs are turned by -1 and 1 degree, so the errors of both legs are opposite. The walk begins slowly."""

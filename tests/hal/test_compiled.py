@@ -111,6 +111,7 @@ def run_twice(script: str, folder: Path) -> list[subprocess.CompletedProcess[str
     ]
 
 
+@pytest.mark.long
 def test_second_process_does_not_compile_a_function_that_creates_arrays_again(tmp_path: Path) -> None:
     (tmp_path / "kernel.py").write_text("def double(x):\n    return 2.0 * x\n")
     script = (
@@ -276,6 +277,7 @@ def first(outer: Outer) -> float:
 """
 
 
+@pytest.mark.sample(2)
 @pytest.mark.parametrize("future", ["", "from __future__ import annotations\n"], ids=["types", "texts"])
 def test_reordered_fields_of_a_record_are_compiled_again(tmp_path: Path, future: str) -> None:
     script = (
@@ -318,6 +320,7 @@ print(compiled(product)(2.0 * np.eye(2), np.ones((2, 2))).tolist())
 """
 
 
+@pytest.mark.long
 def test_blas_is_loaded_only_for_a_function_that_needs_it(tmp_path: Path) -> None:
     (tmp_path / "script.py").write_text(WITHOUT_BLAS)
     result = subprocess.run(

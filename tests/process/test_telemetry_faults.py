@@ -191,6 +191,7 @@ def test_f48_stopped_subscriber_does_not_affect_the_loop(driven: DrivenRobot, tm
     driven.compare()
 
 
+@pytest.mark.sample(2)
 @pytest.mark.parametrize("how", [signal.SIGKILL, signal.SIGSTOP])
 def test_f49_killed_or_stopped_telemetry_is_restarted(driven: DrivenRobot, how: signal.Signals, tmp_path: Path) -> None:
     path = tmp_path / "run.mcap"
@@ -234,6 +235,7 @@ def listen_at(endpoint: str) -> socket.socket:
     return listener
 
 
+@pytest.mark.sample(2)
 @pytest.mark.parametrize("configured", [False, True], ids=["default endpoint", "configured endpoint"])
 def test_f49_restart_with_a_taken_port_continues_the_recording(
     driven: DrivenRobot, configured: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch

@@ -76,6 +76,7 @@ def test_warm_start_is_faster_and_gives_the_same_gait(solved: SolvedGait) -> Non
     np.testing.assert_allclose(warm.gait.coefficients, cold.gait.coefficients, atol=math.radians(0.01))
 
 
+@pytest.mark.sample(2)
 @pytest.mark.parametrize("kind", ["start", "stop"])
 def test_start_and_stop_steps_join_the_periodic_gait(solved: SolvedGait, kind: Kind) -> None:
     step = solve(SUBJECT, kind=kind)

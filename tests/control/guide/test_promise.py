@@ -49,6 +49,7 @@ def test_joints_stay_inside_under_the_promised_torque_at_every_factor(shape: str
         assert 0.5 < worst(shape, xi, 1.0, 10, seed=1) <= 1.0
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("shape", ["constant", "pinched"])
 def test_push_of_twice_the_promise_leaves_a_narrow_guide(shape: str):
     assert worst(shape, 0.9, 2.0, 4) > 1.0

@@ -43,6 +43,7 @@ def hung(controller: WalkController) -> State:
     return robot.state
 
 
+@pytest.mark.sample(2)
 @pytest.mark.parametrize("engine", ["pybullet", "mujoco"])
 def test_patient_walks_from_standing_to_standing(engine: str) -> None:
     controller, phases = walked(engine, 3)
@@ -221,6 +222,7 @@ def test_change_between_pelvis_imu_and_torso_imu_in_a_step_keeps_the_attitude() 
     assert controller.max_dcm_error < 0.01
 
 
+@pytest.mark.long
 def test_steering_in_a_turn_keeps_the_transverse_hips_within_their_limits() -> None:
     """The joints do not move, so the heading error grows from step to step, and steering requests its largest offset."""
     controller = WalkController(ROBOT, PATIENT, WALK, 4, WalkConfig(turn=TURN_MAX))
@@ -283,13 +285,14 @@ def pushed(
         body.close()
 
 
-@pytest.mark.sample(2)
+@pytest.mark.long
 @pytest.mark.parametrize(("direction", "force"), [(90.0, 210.0), (270.0, 180.0)], ids=["left", "right"])
 def test_robot_withstands_a_push_only_with_foot_placement_step_timing_and_lean(direction: float, force: float) -> None:
     assert pushed(PlacementConfig().dead_zone, direction, force)
     assert not pushed(math.inf, direction, force)
 
 
+@pytest.mark.long
 def test_ankle_of_a_pushed_robot_keeps_the_centre_of_pressure_within_the_sole() -> None:
     foot, arms = ExoskeletonParameters(), list[float]()
 
@@ -340,6 +343,7 @@ def test_stop_before_the_weight_shift_ends_the_walk_without_a_step(phase: Phase)
     assert phases == [Phase.POSTURE, Phase.STAND, Phase.REST]
 
 
+@pytest.mark.sample(2)
 @pytest.mark.parametrize("xi", [0.0, 0.5])
 def test_swing_leg_stays_inside_the_certified_guide(xi: float) -> None:
     controller, phases = walked("mujoco", 3, xi=xi)
@@ -376,6 +380,7 @@ class RecordingController(WalkController):
         return command
 
 
+@pytest.mark.long
 def test_count_of_the_cycles_outside_falls_in_a_step_without_a_guide() -> None:
     """In step 1, a torque beyond the promise moves the swing leg out of its guide. Step 2 has full assistance, step 3 a guide."""
     controller = WalkController(ROBOT, PATIENT, WALK, 4, WalkConfig(), CONSTANT)

@@ -779,6 +779,7 @@ def into(rig, state: S) -> None:
     rig.until(state, 5)
 
 
+@pytest.mark.sample(3)
 @pytest.mark.parametrize("cycles", HEAD_STARTS)
 def test_press_in_off_has_no_effect_in_ready(make_rig, cycles: int):
     ready = make_rig(starts=False)

@@ -285,6 +285,7 @@ def test_a_pendant_that_keeps_sending_prevents_the_takeover_and_the_repeated_fra
     assert hardware.answered == world.hal.state.cycle
 
 
+@pytest.mark.sample(2)
 @pytest.mark.parametrize("request_", [Request.STOP, Request.HOLD])
 def test_stop_and_hold_work_against_a_replay_that_displaced_the_pendant(world: World, request_: Request) -> None:
     pendant, replay = world.active(), world.node()
@@ -345,6 +346,7 @@ def garbage(world: World) -> Callable[[], None]:
     return send
 
 
+@pytest.mark.sample(3)
 @pytest.mark.parametrize("age", [0, 1, 2, 100, 128, 255])
 def test_one_replayed_frame_does_not_stop_a_pendant(world: World, age: int) -> None:
     node = world.active()
@@ -375,7 +377,7 @@ def test_garbage_in_every_cycle_does_not_stop_a_pendant(world: World) -> None:
     assert node.answered == world.hal.state.cycle
 
 
-@pytest.mark.sample(7)
+@pytest.mark.sample(3)
 @pytest.mark.parametrize("older", [False, True])
 @pytest.mark.parametrize("offset", [0, 1, 2, 5, 30, 49, 77, 120])
 def test_one_pendant_is_left_and_motion_requires_its_dead_man(world: World, offset: int, older: bool) -> None:

@@ -314,6 +314,7 @@ def test_table_shows_hal_state_joints_and_bus_load(monkeypatch: pytest.MonkeyPat
     assert result.stderr == ""
 
 
+@pytest.mark.sample(2)
 @pytest.mark.parametrize(("lost_at", "code"), [(300, 0), (100, 1)])
 def test_lost_link_is_in_the_first_line_of_the_table(
     monkeypatch: pytest.MonkeyPatch, traffic: list[Frames], lost_at: int, code: int

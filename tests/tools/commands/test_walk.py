@@ -38,7 +38,7 @@ def test_walk_with_a_heading_reference_stands() -> None:
     assert result["yaw_deg"] == pytest.approx(result["true_yaw_deg"], abs=1.0)
 
 
-@pytest.mark.sample(2)
+@pytest.mark.long
 @pytest.mark.parametrize(("turn", "xi"), [(3.0, 1.0), (-3.0, 0.5)])
 def test_line_turns_before_each_step(turn: float, xi: float) -> None:
     code, out, errors = run("--steps", "8", "--turn", str(turn), "--xi", str(xi), "--engine", "mujoco", "--json")
@@ -170,6 +170,7 @@ def test_dial_falls_linearly_from_full_assistance(full: int) -> None:
     assert factors == ([1.0] * full + [0.8, 0.6, 0.4, 0.2, 0.2, 0.2, 0.2])[:8]
 
 
+@pytest.mark.sample(2)
 @pytest.mark.parametrize("xi", ["1", "0.5"])
 def test_literal_law_of_the_paper_falls_without_an_operator(xi: str) -> None:
     code, out, _ = run("--literal", "--steps", "10", "--xi", xi, "--engine", "mujoco", "--json")
@@ -179,12 +180,14 @@ def test_literal_law_of_the_paper_falls_without_an_operator(xi: str) -> None:
     assert result["certified"] in ((None,) if xi == "1" else (False,))
 
 
+@pytest.mark.long
 def test_guide_without_a_promise_is_reported_as_not_certified() -> None:
     _, out, errors = run("--steps", "1", "--xi", "0.5", "--shape", "snap", "--engine", "mujoco", "--json")
     assert json.loads(out)["certified"] is False
     assert "snap: NOT CERTIFIED at Xi 0.5" in errors
 
 
+@pytest.mark.long
 def test_robot_that_is_pushed_over_ends_with_code_1() -> None:
     code, out, errors = run("--steps", "3", "--engine", "mujoco", "--push", "1000", "--push-direction", "90", "--json")
     result = json.loads(out)

@@ -32,6 +32,7 @@ NODE = "LEFT_SK"
 SK = 3  # index of its joint
 
 
+@pytest.mark.sample(3)
 @pytest.mark.parametrize("node", ["LEFT_FH", NODE, "RIGHT_HA"])
 def test_emulated_drive_passes_every_requirement(node: str, make_setup: MakeSetup):
     results = make_setup(node).examine()
@@ -269,7 +270,7 @@ BROKEN: dict[str, tuple[Callable[[MakeSetup, Patch], NodeSetup], dict[str, Verdi
 }
 
 
-@pytest.mark.sample(6)
+@pytest.mark.sample(12)
 @pytest.mark.parametrize("name", BROKEN)
 def test_defective_drive_fails_only_its_requirement(name: str, make_setup: MakeSetup, monkeypatch: Patch):
     broken, expected = BROKEN[name]

@@ -430,7 +430,7 @@ BROKEN: dict[str, tuple[Break, str]] = {
 _REST = ("NODE-03", "NODE-04", "NODE-07", "NODE-08", "NODE-09", "NODE-10")
 
 
-@pytest.mark.sample(6)
+@pytest.mark.sample(12)
 @pytest.mark.parametrize("name", BROKEN)
 def test_defective_node_fails_only_its_requirement(name: str, make_setup: MakeSetup, monkeypatch: Patch):
     broken, expected = BROKEN[name]

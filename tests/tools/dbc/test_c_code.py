@@ -53,6 +53,7 @@ def test_makefile_of_the_user_is_kept(tmp_path: Path):
         assert CliRunner().invoke(cli, arguments).exit_code == 0
 
 
+@pytest.mark.sample(5)
 @pytest.mark.parametrize("name", ["atalante.c", "atalante.h", "host_test.c", "vectors.bin", "vectors.json"])
 def test_file_of_the_user_is_kept(name: str, tmp_path: Path):
     build = Build.of(DBC_FILE, "PENDANT")

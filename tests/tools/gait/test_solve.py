@@ -87,6 +87,7 @@ def test_plot_and_animation_are_written(result: tuple[Result, Path], tmp_path: P
         assert animation.n_frames == 21  # 25 frames per second over 0.8 s, with the first and the last frame
 
 
+@pytest.mark.long
 def test_text_output_has_torques_residuals_and_verification() -> None:
     outcome = run(*PATIENT, "--kind", "stop")
     assert outcome.exit_code == 0, outcome.output
@@ -95,6 +96,7 @@ def test_text_output_has_torques_residuals_and_verification() -> None:
     assert "FAIL" not in outcome.stdout
 
 
+@pytest.mark.sample(2)
 @pytest.mark.parametrize("network", [[], ["--network", str(DEFAULT_NETWORK)]], ids=["solver", "network"])
 def test_walk_is_one_file_with_three_verified_steps(tmp_path: Path, network: list[str]) -> None:
     outcome = run(*PATIENT, "--kind", "walk", *network, "--out", str(tmp_path / "walk.json"), "--json")

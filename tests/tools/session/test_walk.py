@@ -29,6 +29,7 @@ ROBOT = load_robot()
 PATIENT = Patient(75.0, 1.75)
 
 
+@pytest.mark.long
 def test_low_supply_in_a_step_ends_in_hold_on_both_feet() -> None:
     controller = WalkController(ROBOT, PATIENT, load_walk(DEFAULT_WALK, ROBOT), 100)
     low_supply = Fault("under_voltage", BATTERY, start=7600, volts=40.0)

@@ -134,6 +134,7 @@ def test_f41_robot_with_both_feet_on_the_ground_stands_when_the_hal_is_killed() 
     assert (swing["outcome"], swing["state"], swing["codes"][0]) == ("fell", "LOWER", "CYCLE_GAP")
 
 
+@pytest.mark.long
 def test_force_cell_of_the_swing_foot_that_is_stuck_at_400_n_causes_no_fall() -> None:
     trial = next(trial for trial in fault_trials(("F33",), False, 0, "mujoco") if trial.case == "FOOT_LEFT FL at 400 N")
     (run,) = run_fault(replace(trial, moments=("phase 0.5",)))["runs"]

@@ -495,6 +495,7 @@ def test_pushes_have_16_directions_and_8_phases() -> None:
     assert list(PUSH_FORCES) == sorted(PUSH_FORCES)
 
 
+@pytest.mark.long
 def test_largest_push_is_the_last_one_before_the_robot_falls(monkeypatch: pytest.MonkeyPatch) -> None:
     # Walks with the same push are equal, so each is walked once. `forces` of the trial does not affect a walk.
     walks: dict[Push, tuple[str, dict[str, int]]] = {}
