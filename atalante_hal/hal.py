@@ -33,15 +33,15 @@ from atalante_hal.wire.process_image import NEVER, ReceiveImage
 
 #: TORQUE_SATURATED is confirmed if the limiter changes a torque in more than this number of consecutive cycles.
 SATURATED_CYCLES = 200
-#: While the robot walks on the ground, the HAL sends the last torques again after a controller exception,
-#: for up to this number of exceptions in consecutive cycles.
+#: Largest number of consecutive controller exceptions that the HAL bridges while the robot walks on the ground.
+#: In each of these cycles, the HAL sends the last torques again.
 #: The next consecutive exception confirms CONTROLLER_LOST, which leads to HOLD.
-#: The number is equal to the number of lost commands in a row that a drive bridges.
+#: A drive bridges the same number of lost commands in a row.
 BRIDGED_ERRORS = 4
 #: Longest total wait for the nodes' answers while `Hal.stop` puts the robot into HOLD [s].
 STOP_PATIENCE = 1.0
 
-#: Quantities of a drive that are used although another value of its frame is out of its range, for example an invalid position.
+#: Quantities of a drive that are used even if another value in the same frame is out of range, such as an invalid position.
 _INDEPENDENT = ("DriveState", "Temperature", "Torque")
 
 _S = SupervisorState

@@ -103,7 +103,7 @@ def _fields(codec: Codec, controller_fields: Sequence[tuple[str, int]]) -> list[
     ]
 
 
-#: Quantity in a signal name of the DBC -> name of its record field, which begins with the device that measures the quantity.
+#: Quantity in a DBC signal name -> name of its record field. The field name begins with the device that measures the quantity.
 _FIELD_NAMES = {
     "Position": "motor_position",
     "Velocity": "motor_velocity",

@@ -97,7 +97,7 @@ class Thresholds:
     #: Largest plausible torque [Nm] that a drive reports while it is off.
     #: While a drive is on, a reported torque of up to `torque_max` plus this value is plausible.
     idle_torque: float
-    #: Largest number of frames in a cycle in addition to one of each cyclic message. A larger number raises BUS_FLOOD.
+    #: Largest number of additional frames in a cycle, besides one frame of each cyclic message. More frames raise BUS_FLOOD.
     surplus_frames: float
 
 

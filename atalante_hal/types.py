@@ -59,8 +59,9 @@ class State:
     vibration: Vector  # (8,) measured level, 0 to 1
     #: One element per cyclic message: True if the data is new and plausible, and the sender is trusted (see `e2e.qualify`).
     valid: npt.NDArray[np.bool_]
-    #: One element per cyclic message: age of the data [cycles], counted from the SYNC that the message answers. If the values of
-    #: a joint or an IMU were rejected, age of its last accepted motion. State, temperature and torque of a drive may be newer.
+    #: One element per cyclic message: age of the data [cycles], counted from the SYNC that the message answers.
+    #: If the values of a joint or an IMU were rejected: age of its last accepted motion.
+    #: State, temperature and torque of this drive may be newer.
     age: npt.NDArray[np.int64]
     joints_valid: bool  # True if all twelve joint states are valid
     imu_rows: tuple[int, ...] = ()  # indices of the IMU messages in `valid` and `age`; empty if unknown
@@ -92,8 +93,8 @@ class Command:
     #: True if `outside` was True in too many cycles, although the guide is certified (calculated to keep the joints inside).
     #: While `outside` and `guide_left` are True, GUIDE_OUTSIDE is confirmed, and the state FULL_ASSIST follows.
     guide_left: bool = False
-    #: True if a step starts with a larger deviation (angle, speed, acceleration or torque jump) than the certificate of the guide
-    #: was calculated for.
+    #: True if a step starts with a larger deviation than the certificate of the guide was calculated for.
+    #: Deviations: angle, speed, acceleration and torque jump.
     #: The HAL then reports GUIDE_OUTSIDE as a pending diagnostic, to which the robot does not react.
     hand_over_exceeded: bool = False
 

@@ -1,4 +1,4 @@
-"""Lines of .asc logs in the form that the reader of python-can reads completely, for the replay and the log reader."""
+"""Correction of the lines of an .asc log, so that python-can reads every frame. The replay and the log reader use it."""
 
 from __future__ import annotations
 
@@ -9,10 +9,10 @@ _FDF, _REMOTE = 0x1000, 0x10
 
 
 def asc_lines(file: Iterable[str]) -> Iterator[str]:
-    """Yield the lines of an .asc log such that the reader of python-can reads every frame once and with its format.
+    """Yield the lines of an .asc log, corrected so that python-can reads every frame once and in the right format.
 
-    - This reader takes the first line after the header for a part of the header. If that is a frame, it would be lost, so a
-      header line is inserted.
+    - python-can takes the first line after the header for a part of the header. A frame in this line would be lost, so a
+      header line is inserted before it.
     - A line with the direction TxRq is a request to send. It is omitted, because the sent frame has its own line.
     - A classic frame of a CAN FD channel is written as the line of a classic channel.
 
@@ -30,7 +30,9 @@ def asc_lines(file: Iterable[str]) -> Iterator[str]:
 
 
 def _classic_line(words: Sequence[str]) -> str:
-    """Return the line of a classic frame of a CAN FD channel in the form of a classic channel; empty for any other line.
+    """Convert the line of a classic frame on a CAN FD channel to the line format of a classic channel.
+
+    The result is empty for any other line.
 
     The words are: time, "CANFD", channel, direction, identifier, name (optional), BRS, ESI, DLC, length, data, duration, length
     in bits, flags (hexadecimal), and further numbers.

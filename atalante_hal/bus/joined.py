@@ -62,7 +62,7 @@ class JoinedBus:
         self._capacity = capacity
         self._batches = Batches()
         self._shares: dict[bytes, list[Share]] = {}
-        #: one list for each receive buffer `frames` that was used so far: `frames`, `frames[1:]`, `frames[2:]`, ...
+        #: for each receive buffer `frames`: list of its slices `frames`, `frames[1:]`, `frames[2:]`, ...
         #: after i frames were received on some channels, the next channel writes into the slice `frames[i:]`
         self._tails: list[list[Frames]] = []
         #: index of the channel that is read first; it changes in each call, so a busy channel cannot block the others

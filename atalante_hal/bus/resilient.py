@@ -13,7 +13,7 @@ from atalante_hal.bus.joined import JoinedBus
 from atalante_hal.bus.wrapped import WrappedBus
 from atalante_hal.wire.frame import Frames
 
-#: If `receive` finds the link lost, it sleeps for at most this time [s]. Its next call tries the link again.
+#: While the link is lost, each call of `receive` tries the link once, and waits for at most this time [s].
 RETRY_PERIOD = 0.1
 #: An error message of a lost link is reported after its text has stayed the same for this time [s].
 #: A removed interface causes the error "down" and soon afterwards the error "removed". So only "removed" is reported.
@@ -80,7 +80,7 @@ class ResilientBus(WrappedBus):
             count = super().receive(frames, timeout)
         except BusDown as error:
             self._lost(error)
-            waited = time.monotonic() - begin  # [s], not 0 for a `JoinedBus`, which waits before it raises the error
+            waited = time.monotonic() - begin  # [s]; a `JoinedBus` waits before it raises the error
             time.sleep(max(min(timeout, RETRY_PERIOD) - waited, 0.0))
             return 0
         self._update_down(proven=count > 0)

@@ -40,7 +40,7 @@ _END_WORDS = 8
 _HEADER_BYTES = mmap.PAGESIZE
 #: A waiting bus end polls for this time [s] before it sleeps. The computing time of one control cycle is shorter.
 _POLL_TIME = 500e-6
-#: If a wait took longer than `_POLL_TIME`, the bus end sleeps at once, without polling, in this number of following waits.
+#: After a wait longer than `_POLL_TIME`, the bus end does not poll in this number of following waits. It sleeps at once.
 _WAITS_WITHOUT_POLLING = 32
 #: Longest sleep of a waiting bus end before it reads the shared memory again [ms].
 #: A sleep must be limited, because a wake-up byte may arrive before the new value in the shared memory is visible.

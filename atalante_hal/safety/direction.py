@@ -18,20 +18,20 @@ these two joints may not be detected.
 during the test. With a wrong sign, this control pushes its joint away. A joint that moves by more than `TRAVEL` ends
 the start.
 
-*Result.* The mobility of a joint is the inverse of its effective inertia: the least-squares fit of the position by
-the double integral of the sent torque and a polynomial of time. The joints of a test share the delay of their
-torques, so the delay is the one that explains their motions best, all together. The delay that explains both tests with
-short pulses best is more exact, and a controller can use this delay (`State.delay`). Motions against the torque do not
-count: a foot that bounces off the floor may move as if its torque were late and reversed. A joint with a mobility of
-at least `MOBILITY` follows its torque. A mobility of at most -`MOBILITY` shows a wrong sign. A joint between these
-limits does not follow its torque. A disturbance may spoil a test, so a joint fails only after `TRIALS` tests. The
-legs of a suspended robot whose drives are off sink onto their end stops within some seconds, and the leg weight presses
-joints onto the end stops. So the pulse of a repeated test is `BOOST` times larger for a joint within the position
-tolerance of its limit. If the foot of a leg carries load, the joints of the leg may be blocked. A foot that only touches
-the floor hits the floor during the pulse, and the impact stops the ankle. An impact lasts one or two cycles, so the
-impact hardly changes the mean force. A joint whose foot carried load or hit the floor stays untested. An offset of a single cell
-is no load and no impact, because load acts on at least two cells, and an impact is short. Each start tests all joints again,
-because motors and encoders may have been exchanged since the last one.
+*Result.* The mobility of a joint is the inverse of its effective inertia. It follows from a least-squares fit of the position:
+mobility times the double integral of the sent torque, plus a polynomial of time. All joints of a test have the same delay from
+torque to motion. The test uses the delay with which the torques explain the motions of these joints best. Both tests with short
+pulses together give a more exact delay, which a controller can use (`State.delay`). A motion against the torque has no effect
+on the delay: a foot that bounces off the floor may move as if its torque were late and reversed. A joint with a mobility of at
+least `MOBILITY` follows its torque. A mobility of at most -`MOBILITY` shows a wrong sign. A joint between these limits does not
+follow its torque. A disturbance may spoil a test, so a joint fails only after `TRIALS` tests. The legs of a suspended robot
+whose drives are off sink onto their end stops within some seconds, and the leg weight presses joints onto the end stops. So the
+pulse of a repeated test is `BOOST` times larger for a joint within the position tolerance of its limit. If the foot of a leg
+carries load, the joints of the leg may be blocked. A foot that only touches the floor hits the floor during the pulse, and the
+impact stops the ankle. An impact lasts one or two cycles, so the impact hardly changes the mean force. A joint whose foot
+carried load or hit the floor stays untested. An offset of a single cell is no load and no impact, because load acts on at least
+two cells, and an impact is short. Each start tests all joints again, because motors and encoders may have been exchanged since
+the last one.
 """
 
 from __future__ import annotations
@@ -65,11 +65,12 @@ DAMPING = (0.5, 0.5, 0.6, 0.25, 0.25, 0.25)
 INTEGRAL = 0.03
 #: A joint that moves farther than this from its initial position ends the start [rad].
 TRAVEL = math.radians(1.5)
-#: A foot is loaded if its mean force during a test exceeds `LOAD * cell_free`, and that of at least two cells half of this limit.
+#: A foot is loaded if two conditions hold. The mean force on the foot during a test exceeds `LOAD * cell_free`.
+#: The mean force on at least two cells of the foot exceeds half of `LOAD * cell_free`.
 #: `LOAD * cell_free` is about four times the rms noise of the mean force. The noise of a cell is half as large.
 LOAD = 1.0 / 3.0
-#: The forces on a foot in two consecutive cycles are added. If the sum, and its change from the median force of the test, exceed
-#: `HIT * cell_free`, the foot hit the floor.
+#: The forces on a foot in two consecutive cycles are added. The foot hit the floor if the sum exceeds `HIT * cell_free`.
+#: The sum must also differ from twice the median force of the test by more than `HIT * cell_free`.
 #: `HIT * cell_free` is about four times the rms noise of the sum.
 #: If the floor stops a moving ankle, the sum is at least 1.5 times `HIT * cell_free`.
 HIT = 2.0
@@ -80,8 +81,8 @@ BOOST = 6.0
 TRIALS = 2
 #: A joint follows its torque if its mobility (acceleration per torque) is at least this [1/(kg m2)].
 #: One value for each joint in LEG_JOINTS.
-#: Each joint of a suspended robot has at least about twice this mobility: with straight legs and with bent legs,
-#: without a patient and with a patient of 110 kg.
+#: Each joint of a suspended robot has at least about twice this mobility, with straight legs and with bent legs.
+#: This applies without a patient, and with a patient of 110 kg.
 MOBILITY = (0.045, 0.23, 0.075, 0.56, 4.6, 6.8)
 
 

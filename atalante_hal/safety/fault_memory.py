@@ -117,7 +117,7 @@ class FaultMemory:
     def raise_dtc(
         self, cycle: int, dtc: Dtc, node: str, *, value: float = 0.0, confirmed: bool = True, text: str = ""
     ) -> None:
-        """Mark a diagnostic as active in this cycle, and log an event if it, its confirmation or its error code is new.
+        """Mark a diagnostic as active in this cycle. Log an event if the diagnostic, its confirmation or its error code is new.
 
         A pending fault does not change the value and text of a fault that is already confirmed in this cycle.
 

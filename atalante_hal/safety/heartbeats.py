@@ -141,7 +141,7 @@ class Heartbeats:
             self._suspect(row, rival=conflict)
             if rejected:
                 self.quiet = False
-            if rejected and not conflict:  # a frame with a conflict is committed
+            if rejected and not conflict:  # the image commits the values of a frame with the result CONFLICT
                 continue
             if frame_id in self._status_of:
                 self._take_status(self._status_of[frame_id])

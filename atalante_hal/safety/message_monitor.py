@@ -238,8 +238,8 @@ class MessageMonitor:
         sender, two_senders = self._senders[row], self._check_senders(cycle, memory, row, rival)
         tolerated, timeout = self._legs[row] in tolerance.legs, self._timeouts[row]
         fresh = check <= Check.SOME_LOST
-        # `tolerance.longer` delays the timeout only in cycles without an accepted frame. An accepted frame gets no extra time,
-        # because the plausibility checks ignore data that is at least as old as the DBC timeout.
+        # `tolerance.longer` delays the timeout only in cycles without an accepted frame.
+        # An accepted frame gets no extra time: the plausibility checks ignore data that is at least as old as the DBC timeout.
         late = age >= timeout + tolerance.longer * (tolerated and not fresh)
         # Impossible signal values do not reduce the trust, because the frame was transmitted correctly.
         good = (fresh or check >= Check.RANGE) and not rival

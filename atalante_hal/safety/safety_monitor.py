@@ -149,13 +149,13 @@ class SafetyMonitor:
         self.torque_tracking = TorqueTracking(robot.breakaway)
         self.torque_motion: TorqueMotion | None = None
         #: DBC names of the drives that stay off until a start passes its direction test (attribute `proof`).
-        #: These are drives with a wrong torque, drives that did not hold their joints, drives whose joints failed the test, and
-        #: drives that were off when START was pressed in READY, or before any start had passed the test.
+        #: 1. Drives with a wrong torque, drives that did not hold their joints, and drives whose joints failed the test.
+        #: 2. Drives that were off when START was pressed in READY, or before any start had passed the test.
         #: A start enables these drives for the test. If the start fails, the drives are switched off again.
         self._kept_off: set[str] = set()
         self._tested = False  # True after a start has passed the direction test
-        #: True if `evaluate` may skip the next cycle. The cycle is skipped only if all data are fresh, there is no fault, and
-        #: the values of pendant and drives are unchanged.
+        #: True if `evaluate` may skip the next cycle.
+        #: A cycle is skipped only if all data are fresh, there is no fault, and the values of pendant and drives are unchanged.
         self._steady = False
         self._reports: list[Finding] = []  # faults that loop and controller reported since the last `evaluate`
         self._acknowledged = False  # True if START was pressed in this cycle
@@ -414,9 +414,9 @@ class SafetyMonitor:
     def _process_start(self, nodes_ready: bool) -> None:
         """Process a START until the state changes, the start is refused, or `ENABLE_CYCLES` cycles have passed.
 
-        If a start in READY fails, or a start before any start has passed the direction test, the drives that were off before the
-        start are switched off again, because their directions are not tested yet. If a later start in HOLD fails, only the
-        drives in `_kept_off` are switched off again, because the other drives have already moved the robot.
+        A start that fails switches drives off again. If it began in READY, or if no start has passed the direction test yet,
+        these are the drives that were off before the start, because their directions are not tested yet. If a later start in
+        HOLD fails, these are only the drives in `_kept_off`, because the other drives have already moved the robot.
 
         Args:
             nodes_ready: True if every required node is trusted and has sent a status message.
@@ -432,7 +432,7 @@ class SafetyMonitor:
             if not self.start_cycles_left:  # do not restart the direction test if START is pressed again during a start
                 self._proof_begun = False
                 if state.supervisor is _S.READY or not self._tested:
-                    # The direction of a drive that is off now is not tested yet, or not since the robot was in READY.
+                    # A drive that is off now has not passed the direction test yet, or not since the robot was in READY.
                     # So the drive is switched off again if the start fails.
                     on = powered(state.drive_state).tolist()
                     self._kept_off.update(node for node, is_on in zip(DRIVE_NODES, on, strict=True) if not is_on)
@@ -542,8 +542,8 @@ class SafetyMonitor:
         elif before is not _S.FINISH_STEP:  # the HOLD after FINISH_STEP keeps the reason of FINISH_STEP
             self.reason = entry_text(after, self.missing(), self._pendant.stop_requested)
         if after is _S.ACTIVE and before not in MOVING:
-            # The fault memory merges equal events within a short time into one event. Stop merging here, so that the reason for
-            # the next HOLD gets its own event even if it equals the reason for the last HOLD.
+            # The fault memory merges equal events within a short time into one event. This merging ends here.
+            # So the reason for the next HOLD gets its own event, even if it equals the reason for the last HOLD.
             memory.log_repeats(state.cycle, final=True)
         if after is _S.ACTIVE and before not in MOVING and not self.enabling:
             self._limiter.restart(state.torque)

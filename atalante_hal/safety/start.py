@@ -23,21 +23,21 @@ from atalante_hal.wire.cia402 import Controlword, DriveState, controlword_toward
 
 #: All drives must be in OPERATION ENABLED within this time after START [cycles].
 ENABLE_CYCLES = 200
-#: A start ends if no drive changes its state for this time [cycles]. The time suffices even if four commands in a row and
-#: then four answers in a row are lost.
+#: A start ends if no drive changes its state for this time [cycles].
+#: The time suffices even if four commands in a row and then four answers in a row are lost.
 STALLED_CYCLES = 10
 #: Largest speed of a joint at which START is accepted in HOLD [rad/s]. The test of the joint directions needs joints at rest.
 #: The limit does not apply to a joint whose drive is off: the start first lets this drive stop and hold the sinking joint.
 AT_REST = 0.3
 #: Prefix of the event text for a refused START.
 REFUSED = "START refused: "
-#: End of the sentence that explains FINISH_STEP if the operator ends a walk on the ground. The next HOLD keeps this sentence.
 #: Reason of a HOLD that the program requests because it is ending.
 PROGRAM_ENDS = "the program is ending"
+#: End of the sentence that explains FINISH_STEP if the operator ends a walk on the ground. The next HOLD keeps this sentence.
 WALK_ENDS = ", so the walk ends on both feet"
 _S = SupervisorState
-#: States in which START acknowledges faults, but enables no drive. In these states, an active diagnostic does not end the start,
-#: because an acknowledged fault may stay active for some cycles.
+#: States in which START acknowledges faults, but enables no drive.
+#: In these states, an active diagnostic does not end the start: an acknowledged fault may stay active for some cycles.
 _ACKNOWLEDGING = (_S.LOWER, _S.FAULT)
 #: States in which START enables the drives.
 _ENABLING = (_S.READY, _S.HOLD)

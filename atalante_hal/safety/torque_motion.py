@@ -44,8 +44,8 @@ from atalante_hal.types import State, Vector
 
 #: Interval between two checks of a leg [cycles]. The legs are checked alternately.
 INTERVAL: Final = 4
-#: A faulty motor produces s times the sent torque. The share s is in one of these two ranges. The first range is for reversed
-#: (s < 0), dead (s = 0) and weak motors. The second range is for motors that are too strong.
+#: A faulty motor produces s times the sent torque. The share s is in one of these two ranges.
+#: First range: reversed (s < 0), dead (s = 0) and weak motors. Second range: motors that are too strong.
 SHARES: Final = ((-1.5, 0.6), (1.4, 2.2))
 #: A motor is suspected if E > `RATIO` * (F + error^2), see the module docstring.
 #: E is the mean square error of the explanation "external torque", F of the explanation "faulty motor".
@@ -57,15 +57,15 @@ CONFIRM: Final = 2
 BAND: Final = 2.0
 _BAND_SHARE: Final = 0.2
 #: Values of `BAND` and `_BAND_SHARE` for the other joints of the leg. They give a wider limit.
-#: While another joint exceeds this limit, the deviation of a joint is discarded,
-#: because a wrong sensor or an unmeasured load on the leg changes the produced torques of several joints.
+#: While another joint exceeds this limit, the deviation of a joint is discarded.
+#: Reason: a wrong sensor or an unmeasured load on the leg changes the produced torques of several joints.
 OTHER_BAND: Final = 4.5
 _OTHER_SHARE: Final = 0.25
 #: Decay factors of the two sets of `Deviations.sums`. Each check multiplies a set by its factor, and then adds the new torques.
 #: The set with 0.8 covers about the last 5 checks (20 cycles), the set with 0.96 about the last 25 checks (100 cycles).
 DECAY: Final = (0.8, 0.96)
-#: Number of checks at the start of a deviation that are not added to `Deviations.sums`. The torques of these checks are averages
-#: that also contain cycles before the deviation.
+#: Number of checks at the start of a deviation that are not added to `Deviations.sums`.
+#: The torques of these checks are averages that also contain cycles before the deviation.
 LEFT_OUT: Final = 2
 #: A deviation ends if more than this number of consecutive checks find no deviation.
 PAUSE: Final = 5

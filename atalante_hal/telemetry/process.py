@@ -138,8 +138,8 @@ class Recording:
 
     files: tuple[str, ...]  # file names in order; each restart of the subprocess begins a new file
     complete: bool  # True if there is one file, with an index and with all cycles
-    #: Number of cycles that are not in the files. If a subprocess was killed, this number can be too high,
-    #: by at most the cycles of one MCAP chunk.
+    #: Number of cycles that are not in the files.
+    #: If a subprocess was killed, this number can be too high, by at most the cycles of one MCAP chunk.
     missing_cycles: int
 
 

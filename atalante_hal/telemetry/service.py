@@ -31,9 +31,10 @@ if TYPE_CHECKING:  # only for type checks, because protobuf and python-can may n
 _POLL = 0.005  # s, polling period of empty rings
 _WRITER_CHECK = 0.2  # s, shortest time between two checks whether the writer's process exists
 _DROPPED_EVERY = 1.0  # s, shortest time between two reports of lost cycles
-#: Largest number of records in one batch. 64 records of the frame ring contain the frames of about 128 cycles. After each batch,
-#: the control loop sees progress, and a writer that waits for a free slot continues. So a batch must take much less time than
-#: `process.HANGS_AFTER` and `TelemetryConfig.patience`.
+#: Largest number of records in one batch. 64 records of the frame ring contain the frames of about 128 cycles.
+#: The counter of the read records changes once per batch. It shows the control loop that this process does not hang.
+#: A writer that waits for a free slot continues when this counter changes.
+#: So a batch must take much less time than `process.HANGS_AFTER` and `TelemetryConfig.patience`.
 _RECORDS_PER_BATCH, _FRAME_RECORDS_PER_BATCH = 128, 64
 
 
@@ -124,8 +125,8 @@ class Service:
 
     def _handle_batch(self) -> None:
         """Process the oldest records of each ring."""
-        # Read the events before `_begin_runs` reads the notes, because the control loop announces each run in a note before it
-        # writes events of the run. In the opposite order, an event could be read whose run is still unknown.
+        # The control loop announces each run in a note, and then writes the events of the run.
+        # So read the events before `_begin_runs` reads the notes. In the opposite order, the run of an event could be unknown.
         events = [unpack(bytes(event)) for event in self._events.read()]
         event_times = self._events.times.tolist()
         records = self._records.read(_RECORDS_PER_BATCH)

@@ -21,8 +21,9 @@ from atalante_hal.wire.frame import FLAG_BRS, FLAG_FDF, WORDS, Frames, new_frame
 
 Words = npt.NDArray[np.int64]
 
-# Rows of `SignalTable.plan`. WORD, SHIFT, MASK: position of the bits of a signal. LARGEST: largest code that these bits can have.
-# LOW, HIGH: smallest and largest code in the DBC range of a signal. INVALID: code by which a sender marks a value as invalid.
+# Rows of `SignalTable.plan`. WORD, SHIFT, MASK: position of the bits of a signal. LARGEST: largest code that fits into the bits.
+# LOW, HIGH: smallest and largest code in the DBC range of a signal.
+# INVALID: code with which a sender marks a value as invalid.
 WORD, SHIFT, MASK, LARGEST, LOW, HIGH, INVALID = range(7)
 #: Rows of `SignalTable.scales`: physical value = (raw code + BASE) * FACTOR + OFFSET.
 BASE, FACTOR, OFFSET = range(3)

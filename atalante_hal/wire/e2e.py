@@ -180,7 +180,7 @@ GOOD_CYCLE = 1
 #: Limit of the error counter. At this value the message is no longer trusted.
 FULL = 64
 #: A message is trusted after this number of good cycles in a row.
-#: Until then, its values are not used: for example, the inputs of a pendant (remote control) are ignored.
+#: The values of a message that is not trusted are not used. For example, the inputs of the pendant are ignored.
 REQUALIFY = 16
 #: Increase of the counter in `suspect` in a cycle in which two senders sent the same message.
 #: After 64 / 16 = 4 cycles with two senders in a row, the counter reaches `FULL`. Then two senders are confirmed.

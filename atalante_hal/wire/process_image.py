@@ -140,7 +140,8 @@ class ReceiveImage:
         self.values = np.full(self.codec.size, np.nan) if values is None else values
         #: `Check` of each row in this cycle, shape (rows,).
         self.check: npt.NDArray[np.uint8] = np.full(count, Check.NO_DATA, np.uint8)
-        #: Age of the values of each row [cycles], shape (rows,). If `refuse` has restored signals, their age.
+        #: Age of the values of each row [cycles], shape (rows,).
+        #: If `refuse` has restored earlier values of a row: age of the restored values.
         self.age: npt.NDArray[np.int64] = np.full(count, NEVER)
         self.crc_errors = 0
         #: Row and `Check` of each frame that was rejected in this cycle.
@@ -557,9 +558,8 @@ def classify_frame(words: Words, row: int, offset: int, e2e: E2EState, tag: int,
         return _CRC
     counter = int(octets[begin + COUNTER_BYTE])
     in_time = tag == _NO_TAG or tag - counter & 0xFF < _TOO_OLD
-    # `back` is True if the sender is back after at least 128 cycles without an accepted frame, and this frame answers one of the
-    # last 16 SYNCs (`_TOO_OLD`). Then every counter is accepted, because after 128 cycles a comparison with the last counter
-    # does not show whether this frame is new or old.
+    # `back` is True if no frame was accepted for at least 128 cycles, and this frame answers one of the last 16 SYNCs.
+    # Then every counter is accepted: after 128 cycles, a comparison with the last counter does not show whether a frame is new.
     back = tag != _NO_TAG and in_time and expected[row] != NOTHING and silent[row] >= _HALF_TURN
     result = classify_counter(expected[row], counter)
     if back and result == _REPEATED:

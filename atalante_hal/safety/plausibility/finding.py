@@ -23,13 +23,15 @@ JOINT_NODES, IMU_NODES, FOOT_NODES = (
     tuple(message.removesuffix("_STATE") for message in messages)
     for messages in (JOINT_MESSAGES, IMU_MESSAGES, FOOT_MESSAGES)
 )
-#: Quantities of a joint or IMU message that are rejected together if one of them is implausible, because checks and controllers
-#: need values of one time. Joints: position and velocity of one encoder, for the limiter, the velocity check and the controllers.
+#: Quantities of a joint or IMU message that are rejected together if one of them is implausible.
+#: Reason: checks and controllers need values that were measured at the same time.
+#: Joints: the limiter, the velocity check and the controllers need position and velocity of the same time.
 #: IMUs: the inertial, trunk, knee and motion checks compare attitude, angular velocity and specific force with each other.
-#: All other signals of the frame are used, so a drive that fails or gets hot causes its reaction also while its encoder is wrong.
-#: No check needs a torque of the same time as a rejected position: `Stillness` uses only accepted values, and the other checks
-#: compare the torque with the commands, or with the drive state of the same frame. `HoldStability` accepts a position that is
-#: up to four cycles older than the torque.
+#: All other signals of the frame are used. So the reaction to a failed or hot drive follows even if its encoder is wrong.
+#: If a position is rejected, the torque of the frame is still used. No check needs both values of the same time:
+#: - `Stillness` uses only accepted values.
+#: - `HoldStability` accepts a position that is up to four cycles older than the torque.
+#: - All other checks compare the torque with the commands, or with the drive state of the same frame.
 JUDGED = frozenset({"Position", "Velocity", "Quaternion", "Gyro", "Accel"})
 
 

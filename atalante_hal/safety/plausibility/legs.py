@@ -56,8 +56,9 @@ STANDSTILL_SAMPLES = 2
 EXCHANGE_SAMPLES = 2
 #: Encoders count as exchanged if the error of each leg agrees with the difference between the left and the right reading.
 #: The constant is the largest deviation from this agreement, as a fraction of the difference.
-#: Example: the left encoder reads 5 degrees, the right encoder 2 degrees. If they are exchanged, the left error (encoder minus
-#: IMU) is 3 degrees and the right error is -3 degrees. Each error may deviate by 0.35 * 3 degrees.
+#: Example: the left encoder reads 5 degrees, and the right encoder reads 2 degrees.
+#: If they are exchanged, the left error (encoder minus IMU) is 3 degrees, and the right error is -3 degrees.
+#: Each error may deviate by 0.35 * 3 degrees.
 _AGREEMENT = 0.35
 #: Drift of the angle between pelvis IMU and tibia IMU that the standstill check tolerates in each sample [rad].
 #: The drift of intact IMUs is less than a tenth of this value.
@@ -231,8 +232,9 @@ class Legs:
                 continue
             change = comparison.errors[axis] - moved.errors[axis]
             turned = max(abs(angle - moved.angles[i]) for i, angle in enumerate(comparison.angles))
-            # If an encoder is stuck while the leg turns, the error (encoder minus IMU) changes. So an encoder counts as stuck
-            # only if both the change and the turn exceed `allowed`. If only the error changes, the encoder has jumped or drifts.
+            # If an encoder is stuck while the leg turns, the error (encoder minus IMU) changes.
+            # So an encoder counts as stuck only if both the change and the turn exceed `allowed`.
+            # If the error changes but the leg does not turn, the encoder has jumped or drifts.
             allowed = self._attitude_change + self._misalignment * turned + comparison.uncertainty + moved.uncertainty
             if min(abs(change), turned) <= allowed:
                 self._turned[joint] = 0

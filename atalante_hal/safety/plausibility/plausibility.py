@@ -3,12 +3,12 @@
     process image -> one slow check in turn (standstill, velocity, feet, legs, support, soles, inertial, fall, `Unchecked`)
     -> jump, range, IMUs, trunk, knees -> state
 
-Each cycle checks the encoders and the IMUs, and runs at most one slow check. If the new values of a joint or an IMU
-fail a check, they are rejected: the process image keeps the previous values, and the age of these values grows. Only the
-signals in `finding.JUDGED` are rejected, so the state, temperature and torque of a drive stay those of its last frame. If the
-drive is off, they are rejected, too, so a start waits for it. The module `rejections` confirms the diagnostic if more than a
-fifth of the values of a sensor are rejected. Each check uses only the messages that it needs, and the ages of their values.
-So a fault of one message does not disable the checks of other messages.
+Each cycle checks the encoders and the IMUs, and runs at most one slow check. If the new values of a joint or an IMU fail a
+check, they are rejected: the process image keeps the previous values, and the age of these values grows. Only the signals in
+`finding.JUDGED` are rejected, so state, temperature and torque of a drive are still updated. If the drive is off, all signals
+of its frame are rejected, so a start waits until its values are accepted. The module `rejections` confirms the diagnostic if
+more than a fifth of the values of a sensor are rejected. Each check uses only the messages that it needs, and the ages of their
+values. So a fault of one message does not disable the checks of other messages.
 """
 
 from __future__ import annotations
@@ -55,7 +55,6 @@ _LATE = 1
 #: Largest age of a value that the knee checks use [cycles]. If a value is older, the filters of the knee checks restart.
 _HELD = 4
 _FRESH = int(Check.SOME_LOST)
-#: Indices in JOINTS of SH and SK.
 #: States of a drive that is off.
 _OFF = (
     DriveState.NOT_READY_TO_SWITCH_ON,
@@ -63,6 +62,7 @@ _OFF = (
     DriveState.READY_TO_SWITCH_ON,
     DriveState.SWITCHED_ON,
 )
+#: Indices in JOINTS of SH and SK.
 _HIPS_AND_KNEES = frozenset(joint for joint, name in enumerate(JOINTS) if name.endswith(("SH", "SK")))
 
 
@@ -244,7 +244,7 @@ class Plausibility:
             if self._accept(sensor, at - measured[row]):
                 measured[row] = at
             else:
-                # A start waits for a drive whose values are rejected: if the drive is off, its state is rejected, too.
+                # If the drive is off, its state is rejected, too. So a start waits until the values of the drive are accepted.
                 off = row in self._whole and image.values_before[self._drive_state[row]] in _OFF
                 image.refuse(row, self._whole[row] if off else self._judged[row])
                 imu = sensor - len(self._joint_rows)

@@ -22,7 +22,7 @@ from atalante_hal.safety.plausibility.finding import JOINT_NODES, Ages, Signals
 from atalante_hal.wire.process_image import NEVER
 
 #: Number of consecutive samples with a tilted sole after which an ankle encoder is reported. A foot is sampled every 32 cycles.
-#: In such a sample, the forces show a flat foot, but the ankle encoders and the tibia IMU show a tilted sole.
+#: The sole of a sample is tilted if the forces show a flat foot, but the ankle encoders and the tibia IMU show a tilt.
 SOLE_SAMPLES = 4
 #: A foot counts as flat on the floor only if its load exceeds this multiple of `cell_free` (largest force of an unloaded cell).
 _LOAD = 4.0

@@ -60,7 +60,7 @@ _DRIVEN = 1e-5
 #: A joint whose distance to a position limit is below this angle [rad] is regarded as being at its end stop.
 _AT_STOP = 0.005
 #: If the last forces of a foot are older than this number of cycles, the foot may have left the ground or landed since then.
-#: So the records of its ankle joints are cleared.
+#: The `Drive` records of the ankles of such a foot are cleared.
 _FORCES_VALID = 5
 _NEVER = 1 << 30
 #: Index of each ankle joint in JOINTS.

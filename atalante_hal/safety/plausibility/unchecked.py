@@ -22,7 +22,7 @@ from atalante_hal.wire.e2e import Check
 from atalante_hal.wire.process_image import NEVER
 
 #: Time for which a check may lack usable data before its diagnostic is confirmed [cycles].
-#: With usable data, the slowest check needs the same time to detect a fault.
+#: The slowest check detects a fault within the same time, if its data is usable.
 UNCHECKED_CYCLES = 128
 #: Number of encoders per leg that are compared with the IMUs.
 _COMPARED = 4
