@@ -18,7 +18,7 @@ class AirwalkConfig(StepGuideConfig):
         ValueError: If a parameter is out of range.
     """
 
-    #: Whether the assistive torque follows the formulas of the paper (`guide.literal`) and the baseline adds no gravity torque.
+    #: Whether the control law of the paper is used: assistive torque of `guide.literal`, baseline without gravity torque.
     #: If true, it is not proven that the joints stay inside the guide when a disturbance torque acts.
     literal_law: bool = False
     gains: PidGains = AIR_GAINS
@@ -29,7 +29,7 @@ class AirwalkConfig(StepGuideConfig):
     startup: float = 2.0  # s, shortest duration of the motion from the measured pose to the first pose of the gait
     #: s, fade-out time of the torque that prevents a jump at a stance change (`carry_over`); with 0, the torque can jump
     blend: float = 0.02
-    #: s, the same for sagittal hip and knee of a leg with a guide, as the certificate assumes
+    #: s, fade-out time of this torque at sagittal hip and knee of a leg with a guide; the certificate assumes the same time
     guided_blend: float = 0.006
 
     def __post_init__(self) -> None:

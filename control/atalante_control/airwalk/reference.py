@@ -109,8 +109,8 @@ class StartMotion:
 
     #: Largest speed of a joint in the first quintic, as a fraction of the velocity limit of the joint.
     SPEED_SHARE = 0.5
-    #: Duration of the second quintic [s]. The joint moves back in proportion to this duration, so a long one would move joints
-    #: beyond their position limits.
+    #: Duration of the second quintic [s]. The angle by which a joint moves back is proportional to this duration.
+    #: With a much longer duration, joints would move beyond their position limits.
     RUN_UP = 0.5
     #: Largest slope of the quintic 10 x^3 - 15 x^4 + 6 x^5 for x from 0 to 1.
     _STEEPEST = 1.875

@@ -29,15 +29,15 @@ from atalante_hal.types import Vector
 
 FORMAT = "atalante-gait-network/3"
 DEFAULT_NETWORK = Path(__file__).parents[1] / "gaits" / "network.npz"
-#: Inputs of the network in this order: name -> unit. `thigh` and `shank` are ratios: the segment length of the patient divided by
-#: the segment length that Winter's table of body proportions gives for the height of the patient.
+#: Inputs of the network in this order: name -> unit. `thigh` and `shank` are ratios of segment lengths.
+#: Ratio: length of the segment divided by the length that Winter's table of body proportions gives for the patient's height.
 INPUTS = {"mass": "kg", "height": "m", "step_length": "m", "step_duration": "s", "thigh": "", "shank": ""}
 LEG_SEGMENTS = ("thigh", "shank")  # body segments whose length is an input
 OUTPUTS = len(JOINTS) * (DEGREE + 1)
 LAYERS_MAX = 4
 WIDTH_MAX = 128  # largest number of neurons of a layer
 #: rad, a network file is rejected if a joint angle jumps by more than this value at the stance change (rounding tolerance).
-#: The check computes the jump for the bias and for each weight row of the last layer, each taken as the control points of a gait.
+#: The check takes the bias and each weight row of the last layer as the control points of a gait, and computes its jump.
 _PERIODICITY_DEFECT = 1e-9
 _ANGLE_MAX = 2.0 * np.pi  # rad, largest accepted absolute value of a control point
 #: An input may be beyond its range by this fraction of the bound, because the ratios `thigh` and `shank` have rounding errors.

@@ -204,8 +204,8 @@ def _derivatives(block: _Block, p: Symbol) -> tuple[Any, _Entries, _Entries]:
         ("hessian", curvature, [block.x, p, lam]),
     ):
         rows, columns = matrix.sparsity().get_triplet()
-        # Common subexpressions are not eliminated, because the elimination would save only 3 % of the operations, but
-        # take most of the build time.
+        # Common subexpressions are not eliminated.
+        # The elimination would take most of the build time, and save only 3 % of the operations.
         function = casadi.Function(name, arguments, [casadi.vertcat(*matrix.nonzeros())])
         entries.append(_Entries(function, np.array(rows, np.intp), np.array(columns, np.intp)))
     return casadi.Function("values", [block.x, p], [block.expression]), entries[0], entries[1]

@@ -24,8 +24,9 @@ class Requirements:
     #: Between nodes, and in gaits interpolated by the gait network, the centre of pressure can be up to 3.2 mm outside this area.
     cell_share: float = 0.7
     yaw_lever: float = 0.03  # m, largest ratio of yaw moment about the sole centre to vertical ground force
-    #: m, smallest height of the swing sole at mid-swing. At time t of a step with duration T, the smallest height is
-    #: clearance * sin(pi t / T)^2. In start and stop steps, the smallest height is clearance * sin(pi t / T)^4.
+    #: m, smallest height of the swing sole at mid-swing.
+    #: Smallest height at time t of a periodic step with duration T: clearance * sin(pi t / T)^2.
+    #: Smallest height at time t of a start or stop step with duration T: clearance * sin(pi t / T)^4.
     clearance: float = 0.05
     corridor: tuple[float, float] = (0.17, 0.28)  # m, smallest and largest lateral distance between the ankles
     roll: float = math.radians(5.0)  # rad, largest roll of the pelvis
@@ -37,12 +38,13 @@ class Requirements:
     corner_speed: tuple[float, float] = -0.03, 0.0
     #: m/s, limit of the forward speed and of the lateral speed of each corner of the landing sole
     corner_slide: float = 0.025
-    #: rad/s, largest jump of a joint speed at the impact. The gait network keeps 40 % of the jump (`fit.JUMP_KEPT`) and adds a
-    #: fit error. The remaining jump plus the fit error must be at most `VELOCITY_JUMP`.
+    #: rad/s, largest jump of a joint speed at the impact.
+    #: A gait of the gait network keeps 40 % of the jump (`fit.JUMP_KEPT`), and has a fit error in addition.
+    #: The remaining jump plus the fit error must be at most `VELOCITY_JUMP`.
     impact_jump: float = 0.6 * VELOCITY_JUMP
     sinking: float = 0.01  # m/s, largest downward speed of the rear foot after the impact
-    # Weights of the cost. The sum of (joint torque / 100 Nm)^2 has weight 1. With `tilt_weight` and `pressure_weight` = 0,
-    # similar subjects get very different swing motions.
+    # Weights of the cost. The sum of (joint torque / 100 Nm)^2 has weight 1.
+    # With `tilt_weight` = 0 and `pressure_weight` = 0, similar subjects get very different swing motions.
     acceleration_weight: float = 3e-3  # weight of the squared joint accelerations in rad/s2
     tilt_weight: float = 5.0  # weight of the squared tilt of the swing sole in rad
     pressure_weight: float = 20.0  # weight of (horizontal ground moment about the sole centre / 1500 Nm)^2

@@ -277,8 +277,8 @@ class StepProblem:
         if around is not None:
             end, next_one = (-1, -2) if self.kind == "start" else (0, 1)
             pose, other = around.coefficients[:, end], around.coefficients[:, next_one]
-            # Joint speed = constant * (difference of two control points) / (step duration). So for the same joint speed, a step
-            # that lasts twice as long needs twice the difference.
+            # Joint speed = constant * (difference of two control points) / (step duration).
+            # So for the same joint speed, a step that lasts twice as long needs twice the difference.
             points = {"gait pose": pose, "gait speed": pose + (other - pose) * TRANSITION / around.duration}
             for group in self.program.groups:
                 if group.name in points:
@@ -315,8 +315,8 @@ class StepProblem:
         def within(value: Symbol, lever: float) -> Symbol:
             return casadi.vertcat(force[2] - value / lever, force[2] + value / lever)
 
-        # The friction cone is written with squares, because the norm of the horizontal force is not differentiable at 0. The
-        # division by `_FORCE` gives the unit N.
+        # The friction cone is written with squares, because the norm of the horizontal force is not differentiable at 0.
+        # The division by `_FORCE` gives the unit N.
         cone = (force[2] ** 2 - (force[0] ** 2 + force[1] ** 2) / requirements.friction**2) / _FORCE
         return [
             _positive("ground friction", "N", _FORCE, cone),

@@ -21,7 +21,7 @@ from atalante_hal.types import Vector
 
 Pair = tuple[float, float]
 
-#: Slope of the conversion of a ratio x (torque / limit or speed / limit) to 1 - STEEPNESS * (1 - x): 0.9 becomes 0.6, 1 stays 1.
+#: A ratio x (torque / limit or speed / limit) is converted to 1 - STEEPNESS * (1 - x). Example: 0.9 becomes 0.6, 1 stays 1.
 #: Normal walking already uses most of the allowed torque and speed.
 #: With the converted ratio, the weight of the backup torque rises later, only close to the limit.
 STEEPNESS = 4.0
@@ -63,8 +63,7 @@ class Guard:
     lag: Annotated[Vector, 2]  # rad/s, estimated error of the measured velocities of hip and knee: true minus measured
     state: Annotated[Vector, STATES]  # state of the last cycle, see `backup_policy`
     #: Absolute values of the elements of `state`. The effect of model errors is proportional to these values.
-    #: Exception: elements 2 and 3 of `state` are the error rates of hip and knee. Elements 2 and 3 of this vector are
-    #: abs(true error rate - measured error rate).
+    #: Exception: elements 2 and 3 are abs(true error rate - measured error rate) of hip and knee.
     magnitude: Annotated[Vector, STATES]
     compression: Annotated[Vector, (COMPRESSED, STATES)]  # matrix from the state to the compressed state
     compressed: Annotated[Vector, COMPRESSED]  # compressed state of the last cycle
@@ -72,8 +71,8 @@ class Guard:
     #: safety value 1 - `largest_ratio`^2 of the last cycle; at h >= 0, the backup policy can keep both joints inside the guide
     h: float
     rate: float  # 1/s, rate of change of the safety value h, after a low-pass filter
-    #: Weight of the backup torque in the last cycle. `tick` writes a value in [0, 1]. The literal law
-    #: (`literal.assistive_torque`) can write a value outside [0, 1].
+    #: Weight of the backup torque in the last cycle. `tick` writes a value in [0, 1].
+    #: The literal law (`literal.assistive_torque`) can write a value outside [0, 1].
     gate: float
     #: rad, distances from q_des to the bounds: hip upper, hip lower, knee upper, knee lower
     bounds: Annotated[Vector, 4]
@@ -140,8 +139,8 @@ class GuideTables(NamedTuple):
     #: (starts, rows, 12) largest changes of torque [Nm] and speed [rad/s] due to disturbances. Columns: see the class docstring.
     #: Example: few_reach[2, 3] is the change few[3].lag cycles ahead, if the prediction starts in one of the cycles 8 to 11.
     few_reach: Vector
-    #: (n, COLUMNS) values of gait and guide in each cycle of a step. In the air, additional rows after the end of the step
-    #: contain the first cycles of the next step, because predictions reach into the next step.
+    #: (n, COLUMNS) values of gait and guide in each cycle of a step.
+    #: In the air, additional rows contain the first cycles of the next step, because predictions reach into the next step.
     step: Vector
 
 
@@ -206,7 +205,7 @@ def slide_maximum(table: Vector, first: int, end: int, cycles: int) -> None:
 
 
 class Motion(NamedTuple):
-    """Desired motion of every step, from which `write_motion` computes the desired motion of one step.
+    """Desired motion as a linear function of the deviations at the stance change. `write_motion` evaluates it for a step.
 
     Rows are cycles since the stance change. The columns are four values of hip and knee: acceleration (one command lag
     later), velocity after the low-pass of the drives, velocity, and torque.

@@ -47,8 +47,8 @@ class LiteralRecord:
     coulomb: Annotated[Vector, 2]  # Nm, Coulomb friction k_d
     viscous: Annotated[Vector, 2]  # Nm s/rad, viscous friction k_v
     push: Annotated[Vector, 2]  # Nm, largest absolute value of the external torque u_ext
-    #: s, determines how much a change of the safety value h changes the weight of the backup torque u_b: the weight is larger
-    #: while h falls, and smaller while h rises. With zeta = 0, the speed of h has no effect.
+    #: s, gain zeta: the weight of the backup torque u_b is larger while the safety value h falls, and smaller while h rises.
+    #: With zeta = 0, the rate of change of h has no effect.
     zeta: float
     idealization: float  # factor in [0, 1] on the torque u_i, which cancels friction and gravity (joint idealization)
     xi: float  # assistance factor of the step, from 0 (widest guide) to 1 (narrowest guide)
@@ -74,8 +74,8 @@ class LiteralConfig:
 
     gains: LegGains  # PID gains of the swing leg; kp and kd of SH and SK are also the gains of the backup torque u_b
     push: Pair  # Nm, largest absolute value of the external torque u_ext of sagittal hip and knee
-    #: s, determines how much a change of the safety value h changes the weight of the backup torque u_b: the weight is larger
-    #: while h falls, and smaller while h rises. With zeta = 0, the speed of h has no effect.
+    #: s, gain zeta: the weight of the backup torque u_b is larger while the safety value h falls, and smaller while h rises.
+    #: With zeta = 0, the rate of change of h has no effect.
     zeta: float
     idealization: float  # factor in [0, 1] on the torque u_i, which cancels friction and gravity (joint idealization)
     feedforward: float  # factor in [0, 1] on the feedforward torque u_f

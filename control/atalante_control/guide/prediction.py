@@ -143,8 +143,8 @@ class Prediction:
         whole = Grid(starts, START_CYCLES, np.arange(horizon + 1))
         few, none = whole._replace(lags=FEW), whole._replace(lags=FEW[:0])
 
-        # The largest change of the backup torque within one cycle, without the torque jump at the stance change.
-        # The limiter of the robot permits the rest for the decrease of the jump.
+        # `first_change`: largest change of the backup torque within one cycle, without the torque jump at the stance change.
+        # The limiter permits changes of up to `assumptions.rate`. The rest remains for the decrease of the torque jump.
         change = Effect(np.diff(lightest.pushed_feedback, axis=0, prepend=0.0), nothing, self.mass)
         first_change = run(change, mobilities, bounds, none, np.zeros((blocks, 0, 4)))
         remaining = hand_over.remaining(blend, assumptions.rate - first_change[:, :2] - first_change[:, 2:])
@@ -157,7 +157,7 @@ class Prediction:
         self.reach = np.zeros((blocks, len(whole.lags), 4))
         # `few_ahead`: largest changes of predicted torques [Nm] and speeds [rad/s] that disturbances can cause.
         # Axis 0: 0 torque, 1 speed of the loop without model errors, 2 largest speed of all loops in `family`.
-        # Axis 1: element k is for predictions that start in one of the `START_CYCLES` cycles from cycle k * START_CYCLES on.
+        # Axis 1: start of the prediction. Element k is for the start cycles k * START_CYCLES to (k + 1) * START_CYCLES - 1.
         # Axis 2: element i is for the prediction FEW[i] cycles ahead.
         # Axis 3: 0 hip and 1 knee due to model errors; 2 hip and 3 knee due to the disturbance torques `Assumptions.promise`.
         few_ahead = np.zeros((3, blocks, len(FEW), 4))

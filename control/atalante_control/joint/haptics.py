@@ -21,8 +21,8 @@ _FRONT = tuple(
     tuple(MOTORS.index(f"{side}_{segment}_front") for segment in ("thigh", "shank")) for side in ("left", "right")
 )
 
-#: Sign of the tracking error of SH and SK with which thigh and shank are in front of their desired positions. Both joints turn
-#: about the y axis, which points to the left, so a positive angle moves the segment backwards.
+#: Sign of the tracking errors of SH and SK if thigh and shank are in front of their desired positions.
+#: Both joints turn about the y axis, which points to the left. So a positive angle moves the segment backwards.
 _FRONT_SIGN = -1.0
 
 

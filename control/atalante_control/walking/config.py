@@ -19,8 +19,8 @@ from atalante_hal.types import Vector
 
 Pair = tuple[float, float]
 
-#: Default of `WalkConfig.steering`. The transverse hip turns by at most 3 degrees: by 0.5 rad per rad of heading error,
-#: plus 0.15 rad per metre of sideways deviation from the path.
+#: Default of `WalkConfig.steering`. The transverse hip turns by at most 3 degrees.
+#: It turns by 0.5 rad per rad of heading error, plus 0.15 rad per metre of sideways deviation from the path.
 STEERING = 0.5, 0.15, math.radians(3.0)
 
 _NO_INTEGRAL = (0.0,) * 6
@@ -53,8 +53,8 @@ class WalkConfig:
     """
 
     gains: PidGains = WALK_GAINS
-    #: If torques act d cycles late (`State.delay`), the derivative gains of the stance leg (SH, SK, SA) are multiplied by
-    #: 1 - damping_loss * d. Example: 0.75 for 3 cycles.
+    #: Loss of the derivative gains of the stance leg (SH, SK, SA) for each cycle by which torques act late (`State.delay`).
+    #: With a delay of d cycles, the gains are multiplied by 1 - damping_loss * d. Example: 0.75 for 3 cycles.
     #: With full gains and 3 cycles, the stance leg of a light patient oscillates with 50 Hz after a landing.
     damping_loss: float = 1.0 / 12.0
     impact: ImpactConfig = field(default_factory=ImpactConfig)
@@ -103,8 +103,8 @@ class WalkConfig:
     #: Value 0: for each leg while the robot stands. Value 1: for the ankle of the stance leg during a step.
     full_gains: Pair = (0.25, 0.5)
     settle: float = 1.0  # s, time for which both feet must be loaded before the robot walks
-    #: m, largest distance between the soles along the walk with which a robot on the ground may start a walk. The motion to the
-    #: standing pose moves both feet at once, so a robot with one foot ahead would fall.
+    #: m, largest distance between the soles, along the walk, with which a robot on the ground may start a walk.
+    #: The motion to the standing pose moves both feet at once, so a robot with one foot ahead would fall.
     stride: float = 0.05
     posture: float = 2.0  # s, duration of the motion from the measured pose to the standing pose
     shift: float = 1.5  # s, duration of a weight shift, onto one foot or back to both feet

@@ -160,8 +160,9 @@ class WalkController:
         placements: Records[Placement] = placed
         placements[0].low[:], placements[0].high[:] = _range(robot, config)
         leans: Records[Lean] = zeros(Lean, 1)
-        # `clock`: progress of the step, as a row of the table of the desired motion. `pace`: rows per cycle. Both arrays have
-        # the shape (1,) and share the memory of a record: Python reads an array element faster than a record field.
+        # `clock`: progress of the step, as a row of the table of the desired motion. `pace`: rows per cycle.
+        # Both arrays have the shape (1,) and share the memory of a record.
+        # Reason: Python reads an array element faster than a record field.
         self._clock, self._pace = placed["clock"], placed["pace"]
         outputs: Records[Outputs] = zeros(Outputs, 1)
         telemetry = zeros(Telemetry, 1)
@@ -394,9 +395,9 @@ class WalkController:
     def _measure(self, state: State) -> None:
         """Select the measurements of this cycle.
 
-        If the data of the pelvis IMU is too old, the torso IMU is used. The torso IMU is also used for the rest of the walk if
-        the HAL has found the readings of the pelvis IMU implausible, but not those of the torso IMU, except while the data of the
-        torso IMU is too old. If the data of one foot is too old, the load on this foot is estimated.
+        While the data of the pelvis IMU is too old, the torso IMU is used. The HAL can report that the readings of the pelvis IMU
+        are implausible, but those of the torso IMU are not. Then the torso IMU is used for the rest of the walk, except in cycles
+        in which only its data is too old. If the data of one foot is too old, the load on this foot is estimated.
 
         Args:
             state: measured state of the robot.
