@@ -18,7 +18,7 @@ class DbcError(ValueError):
 
 
 def decoded_text(content: bytes, errors: str = "strict") -> str:
-    """Return the text of a DBC file, which is UTF-8 (with or without byte order mark) or otherwise Windows-1252.
+    """Return the text of a DBC file in UTF-8, with or without byte order mark. Any other text is decoded as Windows-1252.
 
     Args:
         content: bytes of the file.

@@ -88,7 +88,7 @@ class _Lines:
         self._message = {name: number for number, _, name in self.messages}
 
     def message(self, message: RawMessage) -> int:
-        return self._message.get(message.name, 1)  # 1 if the definition is not on one line
+        return self._message.get(message.name, 1)  # line 1 if the definition is spread over several lines
 
     def signal(self, message: RawMessage, signal: RawSignal) -> int:
         return self._signal.get((message.name, signal.name), self.message(message))
