@@ -40,7 +40,7 @@ JUMP_KEPT = 0.4  # before the fit, the speed jump of each gait at the stance cha
 END_WEIGHT = 40.0  # weight of the squared angle errors at start and end of a step; the weight is 1 at the other samples
 ACCELERATION_WEIGHT = 5e-2  # s2, an acceleration error of 1 rad/s2 counts as much as an angle error of 0.05 rad
 #: Rms length to which the target vectors of the training are scaled. Smaller targets give a smaller training loss.
-#: L-BFGS would then stop too early, because it stops if an iteration reduces the loss by less than 2e-9.
+#: With smaller targets, L-BFGS would stop too early: it stops if an iteration reduces the loss by less than 2e-9.
 TARGET_SIZE = 10.0
 ALPHA = 1e-5  # penalty on the squared weights; keeps the gaits smooth between the subjects of the library
 SEED = 1  # seed of the initial weights

@@ -259,7 +259,7 @@ class Library:
             raise
 
     def _make_folders(self) -> None:
-        """Create the folders `gaits/` and `failed/`. A copy of a library by git has no empty folders."""
+        """Create the folders `gaits/` and `failed/` if they are missing, because git does not store empty folders."""
         for name in ("gaits", "failed"):
             (self.folder / name).mkdir(parents=True, exist_ok=True)
 

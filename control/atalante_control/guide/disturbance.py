@@ -32,7 +32,7 @@ from atalante_hal.types import Vector
 
 Pair = tuple[float, float]
 
-#: In each cycle, the mass matrix is evaluated at knee angles that are at most about this far apart [rad].
+#: Approximate largest distance between the knee angles at which the mass matrix is evaluated in a cycle [rad].
 _SPACING = math.radians(7.5)
 
 

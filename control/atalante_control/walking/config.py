@@ -55,7 +55,7 @@ class WalkConfig:
     gains: PidGains = WALK_GAINS
     #: Loss of the derivative gains of the stance leg (SH, SK, SA) for each cycle by which torques act late (`State.delay`).
     #: With a delay of d cycles, the gains are multiplied by 1 - damping_loss * d. Example: 0.75 for 3 cycles.
-    #: With full gains and 3 cycles, the stance leg of a light patient oscillates with 50 Hz after a landing.
+    #: With full gains and a delay of 3 cycles, the stance leg of a light patient oscillates with 50 Hz after a landing.
     damping_loss: float = 1.0 / 12.0
     impact: ImpactConfig = field(default_factory=ImpactConfig)
     #: Duration of the re-centring, as a fraction of the duration of the step or weight shift.
@@ -113,7 +113,7 @@ class WalkConfig:
     #: As `alpha`, but only for sagittal hip and knee in a guided step. With `alpha`, their drives would reach the torque limit.
     #: For all other joints, `alpha` applies. With `guided_alpha` for all joints, the robot would fall.
     guided_alpha: float = 0.5
-    #: s; at the start of a guided step, the smallest permitted weight of the backup torque falls from 1 to 0 during this time.
+    #: s, time in which the smallest permitted weight of the backup torque falls from 1 to 0 at the start of a guided step
     #: The backup torque holds the leg inside the guide.
     engage: float = 0.02
     #: s, duration of the change from the guide to the baseline controller, for sagittal hip and knee, after a guided step
