@@ -88,8 +88,8 @@ class Thresholds:
 
     supply_low: float  # V at a drive; below this voltage the battery is nearly empty
     supply_under: float  # V at a drive; below this voltage the drives may soon fail to hold
-    #: Walking is permitted while the torque limit of a hot drive is at least this share of its twin's torque limit.
-    #: The twin is the drive of the same joint in the other leg. Example: 0.5 of a twin's limit of 200 Nm is 100 Nm.
+    #: Walking is permitted while the torque limit of a hot drive is at least this share of the limit of the other leg's drive.
+    #: Example: with 0.5, a hot drive needs at least 100 Nm if the drive of the same joint in the other leg has 200 Nm.
     derated_imbalance: float
     full_assist_ramp: float  # s, time for the ramp of the assistance factor from 0 to 1 in FULL_ASSIST
     #: Largest accepted angle [rad] outside a position limit. A joint beyond this angle is out of range.
@@ -170,7 +170,7 @@ _KEYS = {
     "breakaway": _Key(1, 0.01, 400.0, "Nm"),
     "torque_error": _Key(1, 0.01, 100.0, "Nm"),
 }
-#: Table of the robot file -> key -> rule for the value of the key. `_KEYS` contains the keys of the table [joints].
+#: Table of the robot file -> its keys, each with the rule for its value. The keys of the table [joints] are in `_KEYS`.
 _TABLES = {
     "envelope": {
         "look_ahead": _Key(1, 1e-3, 1.0, "s"),

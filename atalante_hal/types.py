@@ -87,7 +87,7 @@ class Command:
     vibration: Vector  # (8,) level, 0 to 1
     step: int | None = None  # number of the walking step; None for a controller that does not walk
     walking: bool = False  # True while the robot walks on the ground; STOP then ends the walk before HOLD
-    #: True if a joint is outside the virtual guide, or is predicted to leave it or to exceed its torque or speed limit (h < 0).
+    #: True if h < 0: a joint is outside the virtual guide, or a prediction exceeds the guide, a torque limit or a speed limit.
     #: The HAL reports GUIDE_OUTSIDE. This diagnostic is pending (the robot does not react) unless `guide_left` is True.
     outside: bool = False
     #: True if `outside` was True in too many cycles, although the guide is certified (calculated to keep the joints inside).

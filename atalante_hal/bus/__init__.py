@@ -46,7 +46,7 @@ class BusError(Exception):
 
 
 class BusAbsent(BusError):  # noqa: N818
-    """Error of a bus that cannot be opened: the interface is missing or down, or has no CAN FD or no driver."""
+    """Error of a bus that cannot be opened: the interface is missing, is down, has no CAN FD, or has no driver."""
 
 
 class BusDown(BusError):  # noqa: N818

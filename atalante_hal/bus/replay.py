@@ -197,7 +197,7 @@ def _open(path: Path) -> can.io.generic.MessageReader:
 
 
 def _asc_text(path: Path) -> Any:
-    """Yield the lines of an .asc log, see `asc_lines`. The file is open until the last line, or until `close` of the generator.
+    """Yield the lines of an .asc log, see `asc_lines`. The file is closed after the last line, or by `close` of the generator.
 
     Args:
         path: Log file, also compressed as .gz.

@@ -295,8 +295,8 @@ class SocketCanBus:
         if code != LINK_DOWN and code not in LINK_REMOVED:
             return None
         self._drop_queued()
-        # A removed interface causes LINK_DOWN first and a code of LINK_REMOVED later, which `_drop_queued` may have dropped.
-        # So check whether the socket is still bound: the kernel unbinds the socket of a removed interface.
+        # If an interface is removed, the kernel reports LINK_DOWN first, and a code of LINK_REMOVED later.
+        # `_drop_queued` may have dropped the later code. So check whether the kernel has unbound the socket.
         if code == LINK_DOWN and self._is_bound():
             return BusDown(f"{self.name} is down: type `ip link set {self.name} up`")
         self._removed = f"{self.name} was removed: plug the adapter in again; the link is opened again when it is up"

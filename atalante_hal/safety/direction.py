@@ -184,8 +184,8 @@ class DirectionProof:
         # A delay that is fitted to one or two joints might make a motor with a wrong sign look like a late motor.
         self.late = 0
         #: Score of each delay in `LATENCIES`. The delay with the largest score explains the measured motions best.
-        #: A score is the sum over joints of the share of the motion (0 to 1) that the torque explains with this delay.
-        #: The sum contains the joints that passed a test of more than two joints with a short pulse.
+        #: Each joint adds a share (0 to 1) to the score: the part of its motion that the torque with this delay explains.
+        #: Only joints that passed a test of more than two joints with a short pulse count.
         self._explained = np.zeros(len(LATENCIES))
         self._position: list[Vector] = []  # joint positions in each cycle of the current test
         #: Vertical forces on the cells of each foot in each cycle of the current test, shape (2, 4) [N].

@@ -103,7 +103,7 @@ class Heartbeats:
         #: Nodes that were reset: they reported a state other than OPERATIONAL at least once since the last `evaluate`.
         #: The first status message of a node does not count.
         self._reset: set[str] = set()
-        #: Row of a message in the process image -> counter of the evidence that two nodes send this message, 0 to `FULL`.
+        #: Row of a message in the process image -> counter that rises if two nodes seem to send this message, 0 to `FULL`.
         #: At `FULL`, two senders are confirmed.
         self._evidence: defaultdict[int, int] = defaultdict(int)
         #: Nodes that sent a boot-up message. The safety monitor empties this set after each use.

@@ -432,7 +432,7 @@ class SafetyMonitor:
             if not self.start_cycles_left:  # do not restart the direction test if START is pressed again during a start
                 self._proof_begun = False
                 if state.supervisor is _S.READY or not self._tested:
-                    # A drive that is off now has not passed the direction test yet, or not since the robot was in READY.
+                    # The direction of a drive that is off now was never tested, or was last tested before the robot was in READY.
                     # So the drive is switched off again if the start fails.
                     on = powered(state.drive_state).tolist()
                     self._kept_off.update(node for node, is_on in zip(DRIVE_NODES, on, strict=True) if not is_on)

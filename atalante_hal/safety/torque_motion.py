@@ -74,7 +74,7 @@ PAUSE: Final = 5
 _PEAK_SHARE: Final = 0.8
 #: Factor by which each check with a deviation reduces `Deviations.peak`, so that an old maximum is forgotten.
 _PEAK_DECAY: Final = 0.97
-#: A motor is suspected only if element 0 of its `Deviations.sums`, the decaying number of checks, is at least this value.
+#: A motor is suspected only if the decaying number of its checks (element 0 of `Deviations.sums`) is at least this value.
 #: This takes three checks: they count at least 1 + 0.8 + 0.8^2 = 2.44. Two checks count at most 1 + 0.96 = 1.96.
 _LEAST_WEIGHT: Final = 2.4
 #: A joint closer to its position limit than this angle [rad] is at its end stop.

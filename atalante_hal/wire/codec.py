@@ -30,7 +30,8 @@ BASE, FACTOR, OFFSET = range(3)
 #: In `plan[INVALID, i]`, this number means that the DBC defines no invalid code for signal i.
 #: As result of `encode`, this number means that all values were encoded. Another result is the index of a failed signal.
 NO_CODE = -1
-# Results of `read_row`. INSIDE: all signals are in range. OUTSIDE: a signal is out of range, and no signal is marked as invalid.
+# Results of `read_row`. INSIDE: all signals are in range.
+# OUTSIDE: a signal is out of range, and no signal is marked as invalid.
 # MARKED_INVALID: a signal is out of range, and the sender marked at least one signal as invalid (with its invalid code).
 INSIDE, OUTSIDE, MARKED_INVALID = range(3)
 #: Adding and then subtracting this number rounds a float64 to an integer of at most 51 bits (`LONGEST_SIGNAL`).

@@ -61,7 +61,7 @@ from atalante_hal.wire.frame import (
 #: Bits in the header word of a frame. `_ESI`: flag ESI, the sender is error passive.
 #: `_PASSIVE`: flags ESI and FDF, a CAN FD frame from an error passive sender.
 _PASSIVE, _ESI = header_word(0, 0, FLAG_ESI | FLAG_FDF), header_word(0, 0, FLAG_ESI)
-#: Value of the argument `tag` if the senders do not answer a SYNC, so that each sender counts its own frames.
+#: Value of the argument `tag` for senders that do not answer a SYNC. Each of these senders counts its own frames.
 #: Otherwise `tag` is the alive counter expected in this cycle.
 _NO_TAG = -1
 #: Values of `Check` as plain integers. A value of at most `_FRESH` means new, usable data.

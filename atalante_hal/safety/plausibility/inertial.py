@@ -83,7 +83,7 @@ class Record(NamedTuple):
     #: Row 4: gyroscope of the torso minus gyroscope of the pelvis.
     rate_error: Vector
     rate: Vector  # (5, 3) mean square of the angular velocity [rad2/s2]; rows and columns as in `rate_error`
-    #: Mean of this difference, shape (3,): upward unit vector in torso axes minus upward unit vector in pelvis axes.
+    #: Mean difference, shape (3,): upward unit vector in torso axes minus upward unit vector in pelvis axes.
     tilt: Vector
 
 
