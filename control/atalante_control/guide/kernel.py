@@ -161,7 +161,7 @@ COLUMNS = 24
 #: Number of cycles after the prediction in which the guide must still be wider than the last predicted error.
 TAIL_CYCLES = 60
 #: Fraction of the guide width that must remain free in the last predicted cycle.
-#: Then the error is also inside the guide in the cycles after the prediction.
+#: This margin keeps the error inside the guide in the cycles after the prediction.
 TAIL_MARGIN = 0.03
 
 

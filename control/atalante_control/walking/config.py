@@ -62,7 +62,7 @@ class WalkConfig:
     #: In this time, the desired motion returns from the measured pose to the nominal motion.
     alpha: float = 0.3
     #: True: the periodic steps use the control law exactly as Gurriet et al., 2019, print it, see `WalkConfig.literal`.
-    #: The guide is then not certified.
+    #: With True, the guide is not certified.
     literal_law: bool = False
     #: m/m, the ankle stabiliser shifts the centre of pressure by this distance per metre of DCM error.
     #: DCM: divergent component of motion.
@@ -94,7 +94,7 @@ class WalkConfig:
     load_bandwidth: float = 35.0  # Hz, cut-off frequency of the low-pass of the vertical foot forces
     observer_bandwidth: float = 2.0  # rad/s, natural frequency of the attitude observer
     #: True: the heading of the pelvis IMU corrects the drift of the gyro, see `walking.heading`.
-    #: For this, the IMU must have a heading reference, such as a magnetometer.
+    #: With True, the IMU must have a heading reference, such as a magnetometer.
     #: False: the estimated heading is the integral of the gyro.
     heading_reference: bool = False
     loaded: float = 0.3  # smallest load with which a standing foot counts as loaded, as a fraction of the weight

@@ -65,7 +65,7 @@ _MARGIN = math.radians(1.0)
 #: Largest valid age of the message of an IMU or a foot [cycles], equal to the timeout of these messages in the DBC.
 _SENSOR_AGE = 10
 #: Largest expected difference between the weight and the load on the stance foot, as a fraction of the weight.
-#: While one foot swings, the two differ because the robot accelerates.
+#: While one foot swings, load and weight differ because the robot accelerates.
 _LOAD_ERROR = 0.15
 
 
