@@ -86,7 +86,7 @@ def specialised(function: Callable[P, R], *args: P.args, **kwargs: P.kwargs) -> 
         except _numba().core.errors.NumbaError:  # raised if the function creates an array, or if the call is wrong
             pass
     code = cast(Callable[P, R], _machine_code(function, args, True))
-    if not counted:  # compiled only with reference counts, so it creates an array
+    if not counted:  # compiles only with reference counts, so the function creates an array
         _CREATES_ARRAYS[function] = True
         _mark(function)
     return code

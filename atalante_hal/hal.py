@@ -34,7 +34,7 @@ from atalante_hal.wire.process_image import NEVER, ReceiveImage
 #: TORQUE_SATURATED is confirmed if the limiter changes a torque in more than this number of consecutive cycles.
 SATURATED_CYCLES = 200
 #: Largest number of consecutive controller exceptions that the HAL bridges while the robot walks on the ground.
-#: In each of these cycles, the HAL sends the last torques again.
+#: After a bridged exception, the HAL sends the last torques again.
 #: The next consecutive exception confirms CONTROLLER_LOST, which leads to HOLD.
 #: A drive bridges the same number of lost commands in a row.
 BRIDGED_ERRORS = 4

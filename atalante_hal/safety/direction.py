@@ -81,8 +81,8 @@ BOOST = 6.0
 TRIALS = 2
 #: A joint follows its torque if its mobility (acceleration per torque) is at least this [1/(kg m2)].
 #: One value for each joint in LEG_JOINTS.
-#: Each joint of a suspended robot has at least about twice this mobility, with straight legs and with bent legs.
-#: This applies without a patient, and with a patient of 110 kg.
+#: Each joint of a suspended robot has at least about twice this mobility.
+#: The bound holds for straight and bent legs, without a patient and with a patient of 110 kg.
 MOBILITY = (0.045, 0.23, 0.075, 0.56, 4.6, 6.8)
 
 

@@ -68,7 +68,7 @@ _RIVAL = (Check.CONFLICT, Check.WRONG_SEQUENCE)
 _INTACT = (*_RIVAL, Check.RANGE, Check.INVALID)
 _FRESH = int(Check.SOME_LOST)
 #: Check result of a rejected frame -> diagnostic that is confirmed when the leaky bucket of this disturbance is full.
-#: Each cycle with such a frame fills the bucket.
+#: Each cycle with such a rejected frame adds to the bucket.
 #: Exception: INVALID frames of an IMU confirm IMU_INVALID.
 _DISTURBANCES = {
     Check.REPEATED: Dtc.E2E_REPEAT_RATE,

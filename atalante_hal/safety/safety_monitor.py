@@ -465,8 +465,8 @@ class SafetyMonitor:
             return None
         self._stalled = 0
         if not self._proof_begun:
-            # The test starts from the torques sent last (`limiter.last`). So wait until `enabling` is True:
-            # only then do these torques follow the torques that the drives report.
+            # The test starts from the torques sent last (`limiter.last`).
+            # So wait until `enabling` is True: then the torques sent follow the torques that the drives report.
             if not self.enabling:
                 return None
             self._proof_begun = True

@@ -337,7 +337,7 @@ class ReceiveImage:
                 if check in _OUT_OF_RANGE:
                     outside[row] = index
         for row, index in outside.items():
-            if self.check[row] > _FRESH:  # otherwise an accepted frame of this cycle has better values
+            if self.check[row] > _FRESH:  # if another frame of the row was accepted in this cycle, its values remain
                 self._commit_independent(frames, index, row)
         return foreign
 

@@ -46,7 +46,7 @@ SLOW = 16
 #: Period of the schedule of all slow checks [cycles]. Each leg, each sole and the support are checked once per period.
 _PERIOD = 32
 #: Intervals between the inertial checks [cycles], used alternately.
-#: Both are odd, so the checks run alternately in even and in odd cycles.
+#: Both intervals are odd, so the checks run alternately in even and in odd cycles.
 #: A vibration of half the sampling rate of the IMUs then has no effect.
 _INERTIAL_INTERVALS = (15, 17)
 #: Largest age of values that the trunk check uses [cycles].
