@@ -60,7 +60,7 @@ class Message:
     bus: str
     send_type: str  # "cyclic" or "event"
     cycle_ms: int  # ms, period of a cyclic message; 0 for an event message
-    timeout_ms: int  # ms, age from which a receiver counts the message as missing; 0 if the message has no timeout
+    timeout_ms: int  # ms, timeout of the message at its receivers; 0 if the message has no timeout
     inhibit_ms: int  # ms, minimum time between two frames of an event message
     data_id: int  # AUTOSAR E2E Data ID
     comment: str
