@@ -30,7 +30,7 @@ class Carry:
     limit: Annotated[Vector, len(JOINTS)]
     #: Nm, torque jump at the stance change: `before` minus the computed torque of the first cycle
     jump: Annotated[Vector, len(JOINTS)]
-    #: Nm, torque to add in the first cycle after the stance change: `jump`, limited
+    #: Nm, torque to add in the first cycle after the stance change: `jump`, clipped to -`limit` and `limit`
     carried: Annotated[Vector, len(JOINTS)]
 
 
