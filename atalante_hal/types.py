@@ -60,8 +60,8 @@ class State:
     #: One element per cyclic message: True if the data is new and plausible, and the sender is trusted (see `e2e.qualify`).
     valid: npt.NDArray[np.bool_]
     #: One element per cyclic message: age of the data [cycles], counted from the SYNC that the message answers.
-    #: If the values of a joint or an IMU were rejected: age of its last accepted motion.
-    #: State, temperature and torque of this drive may be newer.
+    #: If the motion of a joint (position, velocity) or of an IMU (quaternion, gyro, acceleration) was rejected: age of the last
+    #: accepted motion. The state, temperature and torque of the drive may be newer.
     age: npt.NDArray[np.int64]
     joints_valid: bool  # True if all twelve joint states are valid
     imu_rows: tuple[int, ...] = ()  # indices of the IMU messages in `valid` and `age`; empty if unknown

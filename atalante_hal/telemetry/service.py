@@ -47,7 +47,8 @@ class Run:
 
     number: int
     name: str
-    #: Log time of cycle 0 of the run [ns]. On the wall clock, each record and each event has a time of day of its own.
+    #: Log time of cycle 0 of the run [ns]. Only in lock-step, the log times of records and events are computed from it.
+    #: In real time, the log time is the time of day at which a record or an event was written.
     start_ns: int
     first: int  # number of the first record of the run
 

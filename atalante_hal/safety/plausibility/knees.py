@@ -57,7 +57,8 @@ _SETTLING_TIME = 2.0
 #: u in `knee_error` is the filtered motion of the tibia IMU per radian of knee error. In a walk, its rms is about 0.012 m/rad.
 _LEAST_LEVER = 0.007
 #: An error of a knee angle is reported only if it explains more than this share of the mean square of v.
-#: v in `knee_error` is the filtered position of the tibia IMU, measured minus computed, without the effect of segment lengths.
+#: v in `knee_error` is the filtered difference between the measured and the computed position of the tibia IMU.
+#: The part of this difference that wrong segment lengths explain is subtracted from v.
 _SHARE = 0.25
 #: Number of low-passes for each axis of a leg.
 _FILTERS = 11

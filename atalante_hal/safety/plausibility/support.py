@@ -23,7 +23,7 @@ from atalante_hal.robot import FEET, IMUS, JOINTS, SIDES, Robot
 from atalante_hal.safety.diagnostics import Dtc, Finding
 from atalante_hal.safety.plausibility.finding import FOOT_NODES, Ages, Signals
 
-#: A foot is reported after this time [cycles] in which it alone carries load, although it is higher by more than `_HEIGHT`.
+#: A foot is reported if, for this time [cycles], it alone carries load and is more than `_HEIGHT` above the other foot.
 HEIGHT_CYCLES = 64
 #: The feet are reported as exchanged after this time [cycles] in which the robot leans away from the leg with clearly more load.
 WEIGHT_CYCLES = 128

@@ -275,7 +275,7 @@ class _Horizon:
         """
 
         def parts(lag: int) -> tuple[Vector, Vector]:
-            """Return the errors `free` (allowed) and `used` (due to disturbance torques), `lag` cycles after a prediction starts.
+            """Return `free` and `used`: the allowed error and the error due to disturbances, `lag` cycles after the start.
 
             `free`: largest allowed error minus the tracking error that the model errors can cause.
             `used`: tracking error that the requested disturbance torques can cause.

@@ -63,10 +63,10 @@ class GuideConfig:
     derivative_time: float = 0.005  # s, time constant of the low-pass filter on dh/dt
     release: float = 0.03  # s, shortest time in which the weight of the backup torque falls from 1 to 0
     #: Factor on the torque u_i, in [0, 1]. u_i cancels friction, gravity, centrifugal and Coriolis torques (joint idealization).
-    #: The factor applies while the backup torque has weight 0. If the weight rises to 1, the factor rises to 1, too.
+    #: This is the factor at weight 0 of the backup torque. The factor changes linearly with this weight, up to 1 at weight 1.
     idealization: float = 1.0
     #: Factor on the torque u_f, in [0, 1]. u_f accelerates the leg along q_des (feedforward).
-    #: The factor applies while the backup torque has weight 0. If the weight rises to 1, the factor rises to 1, too.
+    #: This is the factor at weight 0 of the backup torque. The factor changes linearly with this weight, up to 1 at weight 1.
     feedforward: float = 0.0
 
     def __post_init__(self) -> None:

@@ -290,7 +290,7 @@ class WalkController:
         return float(self._record.max_dcm_error)
 
     def prepare(self) -> None:
-        """Compute the guides for all assistance factors before a walk in real time, see `StepGuides.prepare`."""
+        """Compute the guides for all assistance factors. Must be called before a real-time walk, see `StepGuides.prepare`."""
         for section in self._sections:
             section.prepare()
 

@@ -29,7 +29,7 @@ class NodeReport:
 
     node: str
     kind: str
-    #: Time since the last frame of the node [ms]. Only its messages with the shortest period count. None before the first frame.
+    #: Time [ms] since the node sent one of its messages with the shortest period; None before the first of them.
     age_ms: int | None
     late: bool  # whether `age_ms` exceeds the message timeout in the DBC
     #: Time since the last status message of the node [ms]. None before the first status message.

@@ -94,7 +94,7 @@ class Progress:
         self._begun = now()
         self._next = self._begun + self._period
         self._width = 0  # length of the last line [characters]
-        self._written = 0  # length of the last line with the spaces that overwrote an older line [characters]
+        self._written = 0  # length of the last line and of the spaces written after it [characters]
 
     def due(self) -> bool:
         """Return whether it is time to print the next progress line.

@@ -121,7 +121,7 @@ _CHECK_OPTIONS = [
 @command.command(short_help="Search for the worst push within the promise of a guide.")
 @options_as("options", CheckOptions, [*_CHECK_OPTIONS, law_options(), json_option, subject_options])
 def check(options: CheckOptions, as_json: bool, subject: Subject | None) -> None:
-    """Search for the worst push up to the certified torques of each guide, and print a table of the results.
+    """For each guide, search for the worst push within the certified torques, and print a table of the results.
 
     A push acts on hip and knee of the swing leg at the same time. The torque at each joint is at most the certified torque, and
     its direction may change at any time. The result of a push is the ratio |e| / q_bound: the tracking error, divided by the
