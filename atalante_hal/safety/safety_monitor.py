@@ -17,7 +17,7 @@ import numpy as np
 from atalante_dbc import Network
 from atalante_hal.leg_model import LegModel
 from atalante_hal.pendant import Pendant
-from atalante_hal.robot import JOINTS, Robot
+from atalante_hal.robot import IMUS, JOINTS, Robot
 from atalante_hal.safety.diagnostics import Dtc, Finding, Reaction
 from atalante_hal.safety.direction import DirectionProof
 from atalante_hal.safety.events import Event
@@ -60,6 +60,10 @@ DRIVE_NODES = tuple(joint.upper() for joint in JOINTS)
 _ENABLED = np.full(len(JOINTS), float(DriveState.OPERATION_ENABLED)).tobytes()
 _FAULTY = (DriveState.FAULT, DriveState.FAULT_REACTION_ACTIVE)
 _IMPLAUSIBLE = frozenset({Dtc.IMU_IMPLAUSIBLE})
+#: Codes of an IMU whose values are not used.
+_REJECTED = frozenset({Dtc.IMU_INVALID, Dtc.IMU_SATURATED, Dtc.IMU_STUCK})
+#: DBC names of the IMUs of the trunk.
+_TRUNK_NODES = frozenset(IMU_NODES[IMUS.index(imu)] for imu in ("torso", "pelvis"))
 _S = SupervisorState
 #: States in which START can change the state.
 #: In OFF and FINISH_STEP, START only acknowledges faults. In ACTIVE, START has no effect.
@@ -332,7 +336,7 @@ class SafetyMonitor:
             start_wanted=self.start_cycles_left > 0,
             step_finished=self.step is None or self.step != self._finish[0] or cycle >= self._finish[1],
             walk_end_requested=walk_end_requested,
-            walk_ends=memory.walk_ends(DRIVE_NODES) if self.walking else frozenset(),
+            walk_ends=self._walk_ends() if self.walking else frozenset(),
         )
         before = state.supervisor
         after, reasons = next_state(before, self.conditions)
@@ -356,6 +360,16 @@ class SafetyMonitor:
                 or self._ending
             )
         )
+
+    def _walk_ends(self) -> frozenset[Dtc]:
+        """Return the confirmed codes with which a walking robot ends its walk on both feet (FINISH_STEP).
+
+        If the values of both trunk IMUs are rejected, the walking controller has only an estimate of the attitude, so the codes
+        of these IMUs end the walk, too.
+        """
+        memory = self.memory
+        ends = memory.walk_ends(DRIVE_NODES)
+        return ends | _REJECTED if _TRUNK_NODES.issubset(memory.nodes_of(_REJECTED)) else ends
 
     def _tolerance(self) -> Tolerance:
         """Return the tolerance of timeouts in this cycle.

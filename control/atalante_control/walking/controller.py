@@ -34,6 +34,9 @@ from atalante_control.walking.config import WalkConfig
 from atalante_control.walking.contact import ImpactDetector, contact_force
 from atalante_control.walking.dcm import Balance, Stabiliser
 from atalante_control.walking.kernel import (
+    SOLE,
+    TIBIA,
+    TRUNK,
     Constants,
     Measured,
     Outputs,
@@ -60,6 +63,7 @@ Pair = tuple[float, float]
 _N, _LEG = len(JOINTS), len(LEG_JOINTS)
 _TH, _SH, _SK = (LEG_JOINTS.index(name) for name in ("TH", "SH", "SK"))
 _PELVIS, _TORSO = IMUS.index("pelvis"), IMUS.index("torso")
+_TIBIAE = [IMUS.index(f"{side}_tibia") for side in FEET]
 #: Lean and foot placement request only joint angles that are at least this far inside the position limits [rad].
 _MARGIN = math.radians(1.0)
 #: Largest valid age of the message of an IMU or a foot [cycles], equal to the timeout of these messages in the DBC.
@@ -150,9 +154,21 @@ class WalkController:
         self._sent = np.zeros(_N)
         #: `State` object that owns the arrays in `_measured_by`. None before the first `reset` or `update`.
         self._state: State | None = None
-        self._measured = Measured(np.zeros(_N), np.zeros(_N), np.zeros(3), np.zeros(3), np.zeros(3), force, self._sent)
+        self._measured = Measured(
+            np.zeros(_N),
+            np.zeros(_N),
+            np.zeros(3),
+            np.zeros(3),
+            np.zeros(3),
+            force,
+            self._sent,
+            np.zeros((len(FEET), 3)),
+        )
         #: Index of the IMU in use (pelvis or torso) -> sensor arrays that the kernels read.
         self._measured_by = {_PELVIS: self._measured, _TORSO: self._measured}
+        #: Sensor arrays while the data of pelvis IMU and torso IMU is lost. `gyro` is an array of the controller.
+        self._without_trunk = self._measured
+        self._gyro_source = TRUNK
         stages: Records[Stage] = zeros(Stage, 1)
         sensed: Records[Sensed] = zeros(Sensed, 1)
         balances: Records[Balance] = zeros(Balance, 1)
@@ -381,15 +397,17 @@ class WalkController:
             TypeError: If an array is not a contiguous array of float64. The kernels do not check the type.
         """
         sent = self._sent if state.torque_sent is None else state.torque_sent
+        tibiae = state.imu_gyro[_TIBIAE[0] :]
         for imu, position in self._imus.items():
             gyro, accel = state.imu_gyro[imu], state.imu_accel[imu]
-            measured = Measured(state.position, state.velocity, position, gyro, accel, state.foot_force, sent)
+            measured = Measured(state.position, state.velocity, position, gyro, accel, state.foot_force, sent, tibiae)
             for name, array, like in zip(Measured._fields, measured, self._measured, strict=True):
                 if not (array.flags.carray and array.dtype == np.float64 and array.shape == like.shape):
                     raise TypeError(
                         f"{name} must be a contiguous array of {like.shape} float64, got {array.shape} {array.dtype}"
                     )
             self._measured_by[imu] = measured
+        self._without_trunk = self._measured_by[_PELVIS]._replace(gyro=np.zeros(3))
         self._state = state
 
     def _measure(self, state: State) -> None:
@@ -397,7 +415,8 @@ class WalkController:
 
         While the data of the pelvis IMU is too old, the torso IMU is used. The HAL can report that the readings of the pelvis IMU
         are implausible, but those of the torso IMU are not. Then the torso IMU is used for the rest of the walk, except in cycles
-        in which only its data is too old. If the data of one foot is too old, the load on this foot is estimated.
+        in which only its data is too old. If the data of both is too old, the angular velocity is computed from the stance leg
+        (`Stage.gyro_source`). If the data of one foot is too old, the load on this foot is estimated.
 
         Args:
             state: measured state of the robot.
@@ -409,6 +428,12 @@ class WalkController:
         self._distrusted = self._distrusted or (_PELVIS in implausible and _TORSO not in implausible)
         replaced = lost or (self._distrusted and not _is_lost(state, _TORSO))
         self._measured = self._measured_by[_TORSO if replaced else _PELVIS]
+        source = TRUNK
+        if lost and _is_lost(state, _TORSO):
+            self._measured = self._without_trunk
+            source = SOLE if any(_is_lost(state, tibia) for tibia in _TIBIAE) else TIBIA
+        if source != self._gyro_source:
+            self._stage.gyro_source = self._gyro_source = source
         if self.config.heading_reference and not (lost or self._distrusted):
             self._observer.follow_heading(state.imu_quaternion[_PELVIS].tolist())
         feet = [side for side, row in enumerate(state.foot_rows) if state.age[row] > _SENSOR_AGE]

@@ -46,6 +46,9 @@ _LEG = len(LEG_JOINTS)
 _FH, _TH, _SH, _SK, _SA, _HA = (LEG_JOINTS.index(name) for name in ("FH", "TH", "SH", "SK", "SA", "HA"))
 _ANKLES = (_SA, _HA)
 _FL, _FR, _RL, _RR = (CELLS.index(name) for name in ("FL", "FR", "RL", "RR"))
+#: Values of `Stage.gyro_source`: the angular velocity of the pelvis is that of an IMU of the trunk, or it is computed from the
+#: tibia IMU of the leg whose sole is at rest, or from this sole alone.
+TRUNK, TIBIA, SOLE = range(3)
 #: s, time constant with which a swing foot accelerates downwards if it has not landed at the nominal end of the step
 _REACH_RISE = 0.03
 
@@ -58,10 +61,12 @@ class Measured(NamedTuple):
     q: Vector  # (12,) rad, joint angles
     qd: Vector  # (12,) rad/s, joint speeds
     imu: Vector  # (3,) m, position of the IMU in the pelvis frame; the axes of IMU and pelvis are parallel
-    gyro: Vector  # (3,) rad/s, angular velocity of the IMU in the axes of the IMU
+    #: (3,) rad/s, angular velocity of the IMU in the axes of the IMU. `sense` writes it if `Stage.gyro_source` is not `TRUNK`.
+    gyro: Vector
     accel: Vector  # (3,) m/s2, specific force at the IMU in the axes of the IMU
     force: Vector  # (2, 4, 3) N, force at each force cell in the foot frame; the axes are foot, cell and x/y/z
     sent: Vector  # (12,) Nm, torque command of the previous cycle after the limiter
+    tibiae: Vector  # (2, 3) rad/s, angular velocities of the left and the right tibia IMU, in the axes of the IMU
 
 
 class Stage:
@@ -84,6 +89,7 @@ class Stage:
     #: Nm, torque of the virtual guide minus torque of the baseline controller, in the last cycle with the guide.
     #: Elements: sagittal hip and knee of the swing leg.
     excess: Annotated[Vector, 2]
+    gyro_source: int  # `TRUNK`, `TIBIA` or `SOLE`; may change in every cycle
 
 
 class Sensed:
@@ -170,9 +176,16 @@ def sense(measured: Measured, constants: Constants, stabiliser: Stabiliser, part
         sensed.bearing[side] = min(force, load[side])
     move(parts.chain, measured.q, measured.qd)
 
-    sole, gyro = soles[_resting_foot(stage, load)], measured.gyro
+    resting, gyro = _resting_foot(stage, load), measured.gyro
+    sole = soles[resting]
+    if stage.gyro_source != TRUNK:
+        _replace_gyro(resting, measured, parts)
     suspended = stage.double and load[0] + load[1] < 0.1 * constants.weight
     velocity = (0.0, 0.0, 0.0) if suspended else _velocity(measured.imu, sole.position, sole.linear, gyro)
+    if stage.gyro_source != TRUNK:
+        # Without an accelerometer, the attitude is the integral of the angular velocity: the velocity error must be 0.
+        for k in range(3):
+            parts.attitudes[0].velocity[k] = velocity[k]
     observe(parts.attitudes, gyro, measured.accel, velocity)
     rotation = parts.attitudes[0].rotation
 
@@ -186,6 +199,26 @@ def sense(measured: Measured, constants: Constants, stabiliser: Stabiliser, part
     step = rotated(rotation, (right[0] - left[0], right[1] - left[1], right[2] - left[2]))
     for k in range(3):
         sensed.step[k] = step[k]
+
+
+def _replace_gyro(resting: int, measured: Measured, parts: Parts) -> None:
+    """Compute the angular velocity of the pelvis without an IMU of the trunk, and write it into `Measured.gyro`.
+
+    A link of the leg whose sole is at rest has a known angular velocity. The velocities of the joints between this link and the
+    pelvis are subtracted. The link is the tibia, which has an IMU, or the foot, which does not turn.
+
+    Args:
+        resting: foot whose sole is at rest.
+        measured: measurements of the cycle; `gyro` is updated.
+        parts: arrays of the parts.
+    """
+    sole, turn = parts.chain.soles[resting], (0.0, 0.0, 0.0)
+    angular = sole.angular
+    if parts.stages[0].gyro_source == TIBIA:
+        shank, rate = parts.chain.links[sole.link - 2], measured.tibiae[resting]
+        turn, angular = rotated(shank.rotation, (rate[0], rate[1], rate[2])), shank.angular
+    for k in range(3):
+        measured.gyro[k] = turn[k] - angular[k]
 
 
 def _resting_foot(stage: Stage, load: Vector) -> int:

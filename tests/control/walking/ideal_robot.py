@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from atalante_control.gait.walk import DEFAULT_WALK, load_walk
@@ -45,13 +47,18 @@ class Ideal:
             age=np.zeros(22, np.int64),
             joints_valid=True,
             foot_rows=(0, 1),
+            imu_rows=(2, 3, 4, 5),
         )
         self._torque = zero.copy()
         self.push = zero.copy()  # torques on the joints, besides those of the motors [Nm]
 
     def cycle(self, controller: WalkController) -> Command:
         body, state = self.body, self.state
+        old = state.age[list(state.imu_rows)] > 0
+        last = [values[old] for values in self.signals]
         self._imus.sample(body.imu)
+        for values, kept in zip(self.signals, last, strict=True):
+            values[old] = kept
         state.position[:], state.velocity[:] = body.position, body.velocity
         received = state.age[list(state.foot_rows)] == 0
         state.foot_force[received] = body.sole_force[received]
@@ -75,11 +82,12 @@ def walk_with(
     *,
     finish_after: int | None = None,
     xi: float = 1.0,
-    lost_foot: int | None = None,
+    lost_feet: Sequence[int] = (),
+    lost_imus: Sequence[int] = (),
 ) -> list[Phase]:
     """Walk until the robot stands again; return the phases.
 
-    After `finish_after` steps, FINISH_STEP begins and the data of the foot `lost_foot` is no longer received.
+    After `finish_after` steps, FINISH_STEP begins and the data of `lost_feet` and `lost_imus` is no longer received.
     """
     body = make_body(engine, urdf(ExoskeletonParameters(), ROBOT, PATIENT), free=True, ground=0.0)
     try:
@@ -92,8 +100,11 @@ def walk_with(
                 phases.append(controller.phase)
             if finish_after is not None and controller.statistics.steps == finish_after:
                 robot.state.supervisor = SupervisorState.FINISH_STEP
-                if lost_foot is not None:
-                    robot.state.age[robot.state.foot_rows[lost_foot]] = 100
+                for row in (
+                    *(robot.state.foot_rows[i] for i in lost_feet),
+                    *(robot.state.imu_rows[i] for i in lost_imus),
+                ):
+                    robot.state.age[row] = 100
             assert robot.upright(), f"fell in {controller.phase.name} after {controller.statistics.steps} steps"
             assert robot.state.cycle < 30_000
     finally:

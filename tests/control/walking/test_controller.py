@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -24,11 +24,18 @@ from tests.control.walking.ideal_robot import PATIENT, ROBOT, WALK, Ideal, walk_
 
 
 def walked(
-    engine: str, steps: int, *, finish_after: int | None = None, xi: float = 1.0, lost_foot: int | None = None
+    engine: str,
+    steps: int,
+    *,
+    finish_after: int | None = None,
+    xi: float = 1.0,
+    lost_feet: Sequence[int] = (),
+    lost_imus: Sequence[int] = (),
 ) -> tuple[WalkController, list[Phase]]:
     """Walk as in `walk_with`; return the controller and its phases."""
     controller = WalkController(ROBOT, PATIENT, WALK, steps)
-    return controller, walk_with(controller, engine, finish_after=finish_after, xi=xi, lost_foot=lost_foot)
+    phases = walk_with(controller, engine, finish_after=finish_after, xi=xi, lost_feet=lost_feet, lost_imus=lost_imus)
+    return controller, phases
 
 
 def hung(controller: WalkController) -> State:
@@ -191,11 +198,33 @@ def test_lost_torso_imu_does_not_replace_an_implausible_pelvis_imu() -> None:
     state, pelvis, torso = hung(controller), IMUS.index("pelvis"), IMUS.index("torso")
     state.imu_rows = (2, 3, 4, 5)
     state.implausible_imus = frozenset({pelvis})
-    for lost, used in (((), torso), ((torso,), pelvis), ((), torso), ((pelvis,), torso), ((pelvis, torso), torso)):
+    for lost, used in (((), torso), ((torso,), pelvis), ((), torso), ((pelvis,), torso)):
         state.age[list(state.imu_rows)] = [11 if imu in lost else 10 for imu in range(len(IMUS))]
         controller.update(state)
         state.cycle += 1
         assert controller._measured is controller._measured_by[used]
+
+
+@pytest.mark.parametrize(("lost", "rate"), [((), 0.3), (("left_tibia",), 0.0), (("right_tibia",), 0.0)])
+def test_stance_leg_replaces_both_lost_trunk_imus_until_they_return(lost: tuple[str, ...], rate: float) -> None:
+    """The right tibia turns about the vertical. If a tibia IMU is lost, too, the stance foot counts as at rest."""
+    controller, trunk = WalkController(ROBOT, PATIENT, WALK, 3), [IMUS.index("torso"), IMUS.index("pelvis")]
+    state = hung(controller)
+    links, soles = controller._parts.chain.links, controller._parts.chain.soles
+    up, shank = controller.vertical.copy(), links[soles[1].link - 2].rotation
+    state.velocity[:], state.imu_gyro[:], state.foot_force[:, :, 2] = 0.0, 0.0, 100.0
+    state.imu_gyro[IMUS.index("right_tibia")] = 0.3 * shank.T @ up
+    for missing, gyro in (("torso", "pelvis", *lost), 9.0), ((), rate * up):
+        state.age[list(state.imu_rows)] = [11 if imu in missing else 10 for imu in IMUS]
+        state.imu_gyro[trunk] = gyro
+        before = controller._observer.rotation.copy()
+        for _ in range(100):
+            controller.update(state)
+            state.cycle += 1
+        rotation = controller._observer.rotation
+        turned = math.atan2(rotation[1, 0], rotation[0, 0]) - math.atan2(before[1, 0], before[0, 0])
+        assert turned == pytest.approx(0.1 * rate, abs=1e-3)
+        assert rotation[2] == pytest.approx(before[2], abs=1e-3)
 
 
 def test_change_between_pelvis_imu_and_torso_imu_in_a_step_keeps_the_attitude() -> None:
@@ -312,9 +341,17 @@ def test_ankle_of_a_pushed_robot_keeps_the_centre_of_pressure_within_the_sole() 
 @pytest.mark.sample(2)
 @pytest.mark.parametrize("foot", [0, 1])
 def test_robot_makes_a_stop_step_without_the_data_of_a_foot(foot: int) -> None:
-    controller, phases = walked("mujoco", 100, finish_after=1, lost_foot=foot)
+    controller, phases = walked("mujoco", 100, finish_after=1, lost_feet=[foot])
     assert phases[-3:] == [Phase.STOP, Phase.BACK, Phase.REST]
     assert controller.max_dcm_error < 0.05
+
+
+@pytest.mark.sample(1)
+@pytest.mark.parametrize("lost", [("torso", "pelvis"), IMUS])
+def test_robot_makes_a_stop_step_without_the_imus_of_the_trunk(lost: tuple[str, ...]) -> None:
+    controller, phases = walked("mujoco", 100, finish_after=1, lost_imus=list(map(IMUS.index, lost)))
+    assert phases[-3:] == [Phase.STOP, Phase.BACK, Phase.REST]
+    assert controller.max_dcm_error < 0.03
 
 
 def test_finish_step_ends_the_walk_with_a_stop_step() -> None:

@@ -318,6 +318,25 @@ def test_stop_while_walking_on_the_ground_has_a_time_limit(rig):
     assert rig.walk(3, step=7, walking=True).supervisor is S.HOLD
 
 
+@pytest.mark.parametrize(
+    ("imus", "expected"), [(("TORSO", "PELVIS"), S.FINISH_STEP), (("PELVIS", "LEFT_TIBIA"), S.FULL_ASSIST)]
+)
+@pytest.mark.parametrize(("kind", "cycles"), [("imu_invalid", 15), ("imu_saturated", 15), ("imu_frozen", 130)])
+def test_rejected_values_of_both_trunk_imus_end_a_walk_on_the_ground(
+    rig, kind: str, cycles: int, imus: tuple[str, ...], expected: S
+):
+    walking_on_the_ground(rig)
+    rig.emulator.inject([Fault(kind, f"IMU_{imu}") for imu in imus])
+    assert rig.walk(cycles, step=7, walking=True).supervisor is expected
+    assert rig.walk(3, step=8, walking=True).supervisor is (S.HOLD if expected is S.FINISH_STEP else expected)
+
+
+def test_rejected_values_of_both_trunk_imus_lead_to_full_assistance_in_the_air(rig):
+    rig.until(S.ACTIVE)
+    rig.emulator.inject([Fault("imu_invalid", "IMU_TORSO"), Fault("imu_invalid", "IMU_PELVIS")])
+    assert rig.walk(15, step=7).supervisor is S.FULL_ASSIST
+
+
 def test_hold_request_while_walking_leads_directly_to_hold(rig):
     walking_on_the_ground(rig)
     rig.operator.stop()
