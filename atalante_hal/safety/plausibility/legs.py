@@ -13,7 +13,9 @@ IMU has the same effect as a drift of an encoder. The heading of an IMU without 
 turns the attitude of the tibia relative to the pelvis about the vertical, so it affects all angles if the pelvis is tilted or
 FH is not 0. All checks therefore turn the attitude of the tibia back by an estimate of the heading drift. The estimate follows
 the error of TH by at most `_HEADING_DRIFT` per sample. If the encoder of TH drifts more slowly than this limit, the estimate
-follows this drift. So such a drift of the encoder of TH is not detected.
+follows this drift. So such a drift of the encoder of TH is not detected. An IMU that restarts reports another heading. The
+estimate is then measured again, so that the error of TH is the same as before the restart. So a drift of TH in the time without
+the IMU is not detected.
 
 *Standstill.* While the reading of an encoder is constant and its joint is at rest, the difference between encoders and
 IMUs about the axis of the joint is also constant. If the joint moves while its encoder is stuck, this difference changes by
@@ -44,7 +46,7 @@ import numpy.typing as npt
 from atalante_hal.robot import IMUS, JOINTS, LEG_JOINTS, SIDES, Robot
 from atalante_hal.safety.diagnostics import Dtc, Finding
 from atalante_hal.safety.plausibility.finding import JOINT_NODES, Ages, Signals
-from atalante_hal.safety.plausibility.inertial import turned_about_vertical
+from atalante_hal.safety.plausibility.inertial import to_world, turned_about_vertical
 from atalante_hal.types import Vector
 from atalante_hal.wire.process_image import NEVER
 
@@ -112,6 +114,9 @@ class Legs:
         self._attitude_change, self._misalignment = robot.sensors.attitude_change, robot.sensors.misalignment
         #: For each leg: estimated heading of the pelvis IMU minus heading of the tibia IMU [rad].
         self._heading_drift = [0.0 for _ in SIDES]
+        #: For each leg: errors of the last comparison [rad]; None before the first comparison.
+        self._errors: list[tuple[float, float, float] | None] = [None for _ in SIDES]
+        self._heading_lost = [False for _ in SIDES]  # for each leg: whether its heading must be measured again
         self.heading: Vector = np.tile([1.0, 0.0], (len(SIDES), 1))
         self.encoder_error: Vector = np.full(len(JOINTS), math.inf)
         self._contradicts = [[0] * len(_AXES) for _ in SIDES]
@@ -140,6 +145,17 @@ class Legs:
         self._exchanged.pop(index, None)
         if index < len(self._exchanges):
             self._exchanges[index] = 0
+
+    def restart_heading(self, imu: int) -> None:
+        """Measure the heading of an IMU again in the next comparison. Call it when the IMU has restarted.
+
+        Before the first comparison of a leg, the call has no effect on this leg.
+
+        Args:
+            imu: index of the IMU in IMUS.
+        """
+        for leg, tibia in enumerate(_TIBIAE):
+            self._heading_lost[leg] = self._heading_lost[leg] or imu in (_PELVIS, tibia)
 
     def check_left(self, ages: Ages | None) -> bool:
         """Check the left leg.
@@ -190,9 +206,12 @@ class Legs:
             pelvis = extrapolated(pelvis, now.gyro[_PELVIS].tolist(), self._period * cycles[-2])
             tibia = extrapolated(tibia, now.gyro[_TIBIAE[leg]].tolist(), self._period * cycles[-1])
         fh, th, sh, sk = angles.tolist()
+        if self._heading_lost[leg]:
+            self._measure_heading(leg, fh, th, pelvis, tibia)
         x, z, y = hip_angles(pelvis, turned_about_vertical(tibia, self.heading[leg].tolist()))
         turn = 2.0 * math.pi
         errors = math.remainder(fh - x, turn), math.remainder(th - z, turn), math.remainder(sh + sk - y, turn)
+        self._errors[leg] = errors
         w, i, j, k = pelvis
         upright = math.cos(x) * (1.0 - 2.0 * (i * i + j * j)) - 2.0 * math.sin(x) * (j * k + w * i)
         return _Comparison((x, z, y), errors, (fh, th, sh, sk), uncertainty, upright)
@@ -218,9 +237,32 @@ class Legs:
         A heading drift changes the angle of TH by `upright` times the drift, so this factor also gives the direction.
         """
         change = comparison.errors[_HEADING] * comparison.upright
-        self._heading_drift[leg] += max(-_HEADING_DRIFT, min(_HEADING_DRIFT, change))
-        half = 0.5 * self._heading_drift[leg]
-        self.heading[leg] = math.cos(half), math.sin(half)
+        self._set_heading(leg, self._heading_drift[leg] + max(-_HEADING_DRIFT, min(_HEADING_DRIFT, change)))
+
+    def _measure_heading(self, leg: int, fh: float, th: float, pelvis: Sequence[float], tibia: Sequence[float]) -> None:
+        """Measure the heading drift of a leg, with the errors of FH and TH of the last comparison.
+
+        The axis of SH and SK is the axis y of the tibia. Its direction follows from FH and TH.
+
+        Args:
+            leg: index in SIDES.
+            fh: encoder angle of FH [rad].
+            th: encoder angle of TH [rad].
+            pelvis: attitude of the pelvis IMU, quaternion wxyz.
+            tibia: attitude of the tibia IMU, quaternion wxyz.
+        """
+        self._heading_lost[leg] = False
+        errors = self._errors[leg]
+        if errors is None:
+            return
+        fh, th = fh - errors[0], th - errors[1]
+        axis = -math.sin(th), math.cos(th) * math.cos(fh), math.cos(th) * math.sin(fh)
+        expected, found = to_world(pelvis, axis), to_world(tibia, (0.0, 1.0, 0.0))
+        self._set_heading(leg, math.atan2(expected[1], expected[0]) - math.atan2(found[1], found[0]))
+
+    def _set_heading(self, leg: int, drift: float) -> None:
+        self._heading_drift[leg] = drift
+        self.heading[leg] = math.cos(0.5 * drift), math.sin(0.5 * drift)
 
     def _check_standstill(self, leg: int, comparison: _Comparison) -> None:
         stuck = []

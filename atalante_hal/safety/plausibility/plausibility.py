@@ -22,7 +22,7 @@ from atalante_hal.safety.diagnostics import Dtc, Finding
 from atalante_hal.safety.plausibility.encoders import EncoderChecks
 from atalante_hal.safety.plausibility.fall import Fall
 from atalante_hal.safety.plausibility.feet import FootChecks
-from atalante_hal.safety.plausibility.finding import JOINT_NODES, Ages, Rows, judged, signals_of
+from atalante_hal.safety.plausibility.finding import IMU_NODES, JOINT_NODES, Ages, Rows, judged, signals_of
 from atalante_hal.safety.plausibility.imus import IMU_CYCLES, Imus
 from atalante_hal.safety.plausibility.inertial import Inertial
 from atalante_hal.safety.plausibility.knees import KNEE_IMUS, KNEE_JOINTS, Knees
@@ -173,14 +173,18 @@ class Plausibility:
         return self.findings
 
     def reference(self, node: str) -> None:
-        """Skip the jump check for the next position of a joint whose drive has referenced its encoder.
+        """Adapt the checks to the restart of a drive or an IMU.
 
+        Skip the jump check for the next position of a joint whose drive has referenced its encoder.
         Also discard the finding that the encoders of this joint are exchanged between the legs. If the joint is SH or SK,
-        also discard the finding of the knee checks about its leg.
+        also discard the finding of the knee checks about its leg. The heading of a restarted IMU is measured again.
 
         Args:
-            node: DBC name of the drive; the name of any other node has no effect.
+            node: DBC name of the drive or the IMU; the name of any other node has no effect.
         """
+        if node in IMU_NODES:
+            self._legs.restart_heading(IMU_NODES.index(node))
+            self._knees.restart()
         if node not in JOINT_NODES:
             return
         if self._settled:

@@ -271,6 +271,54 @@ class TestDrift:
             assert one_leg.drifts() == pytest.approx(expected, abs=1e-12)
 
     @pytest.mark.parametrize("leg", [0, 1])
+    @pytest.mark.parametrize("imu", ["pelvis", "tibia"])
+    @pytest.mark.parametrize("turn", [-2.8, 0.05, 1.5])
+    def test_other_heading_of_a_restarted_imu_is_no_drift_and_an_offset_of_th_is_still_found(
+        self, leg: int, imu: str, turn: float
+    ):
+        one_leg, allowed = OneLeg(leg), ROBOT.sensors.attitude_error
+        restarted = PELVIS if imu == "pelvis" else TIBIAE[leg]
+
+        def compare(th: float, heading: float) -> None:
+            one_leg.show((0.2, -0.3, -0.5), (0.01, th, -0.02))
+            one_leg.now.quaternion[PELVIS] = tilted(0.2, -0.1, 0.5)
+            one_leg.now.quaternion[TIBIAE[leg]] = product(
+                tilted(0.2, -0.1, 0.5), one_leg.now.quaternion[TIBIAE[leg]].tolist()
+            )
+            one_leg.now.quaternion[restarted] = product(
+                tilted(0.0, 0.0, heading), one_leg.now.quaternion[restarted].tolist()
+            )
+            one_leg.compare(4)
+
+        one_leg.legs.restart_heading(restarted)  # has no effect before the first comparison
+        compare(0.0, 0.0)
+        compare(0.015, 0.0)
+        before = one_leg.legs.encoder_error.copy()
+        one_leg.legs.restart_heading(IMUS.index("torso"))
+        one_leg.legs.restart_heading(TIBIAE[1 - leg])
+        one_leg.legs.restart_heading(restarted)
+        compare(0.015, turn)
+        assert one_leg.drifts() == []
+        assert one_leg.legs.encoder_error == pytest.approx(before, abs=1e-4)
+        for error in (allowed - 1e-3, allowed + 1e-3, -allowed + 1e-3, -allowed - 1e-3):
+            compare(error, turn)
+            assert bool(one_leg.drifts()) is (abs(error) > allowed)
+
+    @pytest.mark.parametrize("imu", IMUS[1:])
+    def test_restart_of_an_imu_with_another_heading_causes_no_finding(self, imu: str):
+        robot, index = SimulatedRobot(), IMUS.index(imu)
+        robot.run(100)
+        robot.missing = {row(f"imu_{imu}")}
+        robot.run(50)
+        robot.missing = set()
+        robot.checks.reference(f"IMU_{imu.upper()}")
+
+        def turned(now: Signals) -> None:
+            now.quaternion[index] = product(tilted(0.0, 0.0, 0.7), now.quaternion[index].tolist())
+
+        assert [found for found in robot.run(500, turned) if found.dtc is Dtc.ENC_DRIFT] == []
+
+    @pytest.mark.parametrize("leg", [0, 1])
     @pytest.mark.parametrize("axis", [0, 2])
     def test_slow_drift_about_the_other_axes_is_found(self, leg: int, axis: int):
         one_leg, allowed = OneLeg(leg), ROBOT.sensors.attitude_error
