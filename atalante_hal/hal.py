@@ -231,7 +231,7 @@ class Hal:
             )
         safety_monitor.step, safety_monitor.walking = step, command.walking
         if command.outside:
-            safety_monitor.report(Dtc.GUIDE_OUTSIDE, "a joint is outside the virtual guide", command.guide_left)
+            safety_monitor.report(Dtc.GUIDE_OUTSIDE, Dtc.GUIDE_OUTSIDE.meaning, command.guide_left)
         if command.hand_over_exceeded:
             text = "a step started outside the hand-over box: the certificate of its guide does not apply to this step"
             safety_monitor.report(Dtc.GUIDE_OUTSIDE, text, False)

@@ -137,7 +137,12 @@ class Dtc(StrEnum):
     )
     CMD_NONFINITE = "CMD_NONFINITE", _R.HOLD, _S.ERROR, "the controller requested a torque of NaN or infinity"
     TORQUE_SATURATED = "TORQUE_SATURATED", _R.FULL_ASSIST, _S.WARNING, "the limiter cuts the torque"
-    GUIDE_OUTSIDE = "GUIDE_OUTSIDE", _R.FULL_ASSIST, _S.WARNING, "a joint is outside the virtual guide"
+    GUIDE_OUTSIDE = (
+        "GUIDE_OUTSIDE",
+        _R.FULL_ASSIST,
+        _S.WARNING,
+        "h < 0: a joint is outside the virtual guide, or is predicted to exceed its guide, torque or speed limit",
+    )
     CYCLE_GAP = "CYCLE_GAP", _R.HOLD, _S.ERROR, "the time between two cycles is too long"
     OVERRUN = "OVERRUN", _R.HOLD, _S.ERROR, "several consecutive cycles are late, or the loop falls behind the clock"
     OPERATOR_STOP = "OPERATOR_STOP", _R.HOLD, _S.INFO, "STOP pressed, dead-man switch released, or pendant timed out"

@@ -218,6 +218,16 @@ def test_joint_outside_the_guide_is_pending_and_outside_for_long_leads_to_full_a
     assert rig.events_of("GUIDE_OUTSIDE")[-1] == ("GUIDE_OUTSIDE", "warning")
 
 
+def test_text_of_a_negative_safety_value_does_not_claim_that_a_joint_is_outside(rig):
+    rig.until(S.ACTIVE)
+    rig.walk(1, outside=True)
+    (text,) = (event.text for event in rig.hal.events if event.code == "GUIDE_OUTSIDE")
+    assert (
+        text
+        == "h < 0: a joint is outside the virtual guide, or is predicted to exceed its guide, torque or speed limit"
+    )
+
+
 def test_step_start_outside_the_hand_over_box_is_pending(rig):
     rig.until(S.ACTIVE)
     assert rig.walk(5, hand_over_exceeded=True).supervisor is S.ACTIVE
