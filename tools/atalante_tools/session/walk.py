@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 from atalante_tools.console.options import Target
 from atalante_tools.console.stop_request import stop_requested
 from atalante_tools.console.terminal import print_message, show_json
-from atalante_tools.session.certificates import announce, report_hand_overs, weakest
+from atalante_tools.session.certificates import announce, report_hand_overs
 from atalante_tools.session.dial import Dial
 from atalante_tools.session.recording import (
     EndpointReport,
@@ -31,7 +31,14 @@ from atalante_tools.session.recording import (
 from atalante_tools.session.run_folder import run_folder
 from atalante_tools.session.walk_observation import Observation
 from atalante_tools.session.walk_options import WalkOptions, gaits_of, sections_of
-from atalante_tools.session.walk_result import WalkResult, diagnostics, guide_fields, show_result, write_result
+from atalante_tools.session.walk_result import (
+    WalkResult,
+    diagnostics,
+    guide_fields,
+    show_result,
+    weakest_guide,
+    write_result,
+)
 from atalante_tools.session.walk_watch import WalkWatch
 
 if TYPE_CHECKING:
@@ -171,10 +178,7 @@ def _walk(
         if recorder is not None and telemetry is not None:
             recorder.report_events()
             summary = close_telemetry(telemetry)
-        weakest_guide = None
-        if options.xi < 1.0:
-            factors = sorted(controller.statistics.guide.factors) or [options.xi]
-            weakest_guide = weakest(certificate for xi in factors for certificate in controller.certificates(xi))
+        weakest = weakest_guide(controller, options.xi)
         result = WalkResult(
             steps=controller.statistics.steps,
             step_lengths_m=[gait.parameters.get("step_length") for gait in walked],
@@ -183,7 +187,7 @@ def _walk(
             outcome=watch.outcome,
             engine=target.engine if target.embedded else None,
             xi=options.xi,
-            **guide_fields(weakest_guide, controller.statistics.guide),
+            **guide_fields(weakest, controller.statistics.guide),
             full_assist=watch.full_assist,
             lateral_m=round(controller.steering.lateral, 3),
             yaw_deg=round(math.degrees(controller.steering.yaw), 2),
@@ -197,8 +201,8 @@ def _walk(
             robot_process=robot_process is not None,
             cpu_per_second=round(processor / (statistics.cycles * PERIOD), 4),
         )
-        if weakest_guide is not None:
-            report_hand_overs(weakest_guide.shape, controller.statistics.guide)
+        if weakest is not None:
+            report_hand_overs(weakest.shape, controller.statistics.guide)
         if as_json:
             show_json(asdict(result))
         else:

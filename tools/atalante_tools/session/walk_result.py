@@ -10,13 +10,14 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from atalante_tools.console.terminal import print_message
-from atalante_tools.session.certificates import promise_fields
+from atalante_tools.session.certificates import promise_fields, weakest
 
 if TYPE_CHECKING:
     from pathlib import Path
 
     from atalante_control.guide.certificate import Certificate
     from atalante_control.guide.statistics import GuideStatistics
+    from atalante_control.walking.controller import WalkController
     from atalante_hal.hal import Hal
     from atalante_hal.telemetry.process import Recording
     from atalante_tools.session.walk_options import WalkOptions
@@ -36,6 +37,9 @@ class WalkResult:
     engine: str | None  # physics engine of the emulated robot; None means the real robot
     xi: float
     shape: str | None  # guide shape; None at Xi = 1, where there is no guide
+    #: Assistance factor of the guide with the smallest promise of all guided steps. The next three fields describe this guide.
+    #: None at Xi = 1, where there is no guide.
+    promise_xi: float | None
     certified: bool | None  # whether the guide is certified; None at Xi = 1, where there is no guide
     #: Certified disturbance torque at the sagittal hip [Nm]; None if no torques are certified.
     #: Hip and knee stay in the guide under disturbances up to `promise_hip_nm` at the hip and `promise_knee_nm` at the knee.
@@ -69,11 +73,24 @@ class WalkResult:
     cpu_per_second: float
 
 
+def weakest_guide(controller: WalkController, xi: float) -> Certificate | None:
+    """Return the certificate with the smallest promise of all guided steps; None if there is no guide.
+
+    Args:
+        controller: Controller after the walk.
+        xi: Assistance factor of the options. It applies if no step was guided. The pendant may have set other factors.
+    """
+    factors = sorted(controller.statistics.guide.factors) or ([xi] if xi < 1.0 else [])
+    certificates = [certificate for factor in factors for certificate in controller.certificates(factor)]
+    return weakest(certificates) if certificates else None
+
+
 def guide_fields(certificate: Certificate | None, statistics: GuideStatistics) -> dict[str, Any]:
     """Return the fields of `WalkResult` about the guide."""
     counted = statistics.cycles > 0
     return {
         "shape": None if certificate is None else certificate.shape,
+        "promise_xi": None if certificate is None else certificate.xi,
         **promise_fields(certificate),
         "max_ratio": round(statistics.max_ratio, 3) if counted else None,
         "inside": round(statistics.inside_fraction, 6) if counted else None,
@@ -101,7 +118,7 @@ def show_result(result: WalkResult) -> None:
     if result.max_ratio is not None:
         certified = "certified" if result.certified else "NOT CERTIFIED"
         guided = (
-            f"; {result.shape} at Xi {result.xi:g} ({certified}): largest |e|/q_bound {result.max_ratio:.3f}, "
+            f"; {result.shape} ({certified} at Xi {result.promise_xi:g}): largest |e|/q_bound {result.max_ratio:.3f}, "
             f"{result.outside_cycles} ms outside the guide"
         )
     click.echo(
