@@ -85,7 +85,7 @@ class Command:
 
     torque: Vector  # (12,) Nm at the joint
     vibration: Vector  # (8,) level, 0 to 1
-    step: int | None = None  # number of the walking step; None for a controller that does not walk
+    step: int | None = None  # number of the walking step; None while the controller does not walk
     walking: bool = False  # True while the robot walks on the ground; STOP then ends the walk before HOLD
     #: True if h < 0: a joint is outside the virtual guide, or a prediction exceeds the guide, a torque limit or a speed limit.
     #: The HAL reports GUIDE_OUTSIDE. This diagnostic is pending (the robot does not react) unless `guide_left` is True.

@@ -244,7 +244,7 @@ class WalkController:
         self._velocity_before, self._torque_before = np.zeros(_N), np.zeros(_N)
         self._outside = OutsideCount(self.config.guide.outside_cycles)
         self._stage.assisted = self._stage.literal = self._stage.placed = False
-        self._command.walking = False
+        self._command.step, self._command.walking = None, False
         self._command.vibration.fill(0.0)
         self._command.outside = self._command.guide_left = self._command.hand_over_exceeded = False
         self._load[:] = self._twist[:] = 0.0
@@ -486,10 +486,12 @@ class WalkController:
             self._stance = swing
         if phase in STEPPING:
             self._impact.start_step()
-        # In FINISH_STEP, a new step number makes the HAL hold all joints at their positions (HOLD).
+        # In FINISH_STEP, a new step number, or None, makes the HAL hold all joints at their positions (HOLD).
         # A robot on one foot would then fall. So the controller keeps the step number until the robot stands on both feet.
-        if phase is Phase.REST or (phase in STEPPING and not self._finishing):
-            self._command.step = (self._command.step or 0) + 1
+        if phase not in WALKING:
+            self._command.step = None
+        elif phase is Phase.SHIFT or (phase in STEPPING and not self._finishing):
+            self._command.step = 0 if phase is Phase.SHIFT else (self._command.step or 0) + 1
         self._command.walking = phase in WALKING
         stage.stance, stage.double = self._stance, phase not in STEPPING
         if phase is Phase.STEP and self.config.turn:

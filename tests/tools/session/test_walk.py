@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -58,13 +59,23 @@ def test_low_supply_in_a_step_ends_in_hold_on_both_feet() -> None:
     assert 1.0 - 2.0 * (x * x + y * y) > 0.99
 
 
-def test_stop_of_the_pendant_in_a_step_ends_the_walk_on_both_feet() -> None:
+@pytest.mark.parametrize(
+    ("begins", "finishing"),
+    [
+        (lambda controller: controller.phase is Phase.SHIFT, [Phase.SHIFT, Phase.BACK]),
+        (lambda controller: controller.reached(1, 0.3), [Phase.STEP, Phase.STOP, Phase.BACK]),
+    ],
+    ids=["weight shift", "step"],
+)
+def test_stop_of_the_pendant_in_a_walk_ends_it_on_both_feet(
+    begins: Callable[[WalkController], bool], finishing: list[Phase]
+) -> None:
     controller = WalkController(ROBOT, PATIENT, load_walk(DEFAULT_WALK, ROBOT), 3)
     operator = Operator()
     seen: list[tuple[SupervisorState, Phase]] = []
 
     def stopped(state: State) -> bool:
-        if controller.reached(1, 0.3) and state.supervisor is SupervisorState.ACTIVE:
+        if begins(controller) and state.supervisor is SupervisorState.ACTIVE:
             operator.stop()
         if not seen or seen[-1] != (state.supervisor, controller.phase):
             seen.append((state.supervisor, controller.phase))
@@ -81,8 +92,8 @@ def test_stop_of_the_pendant_in_a_step_ends_the_walk_on_both_feet() -> None:
         rig.run(controller, until=stopped)
         assert rig.emulator is not None
         x, y, _, _ = rig.emulator.body.motion("pelvis").attitude
-    finishing = [phase for supervisor, phase in seen if supervisor is SupervisorState.FINISH_STEP]
-    assert [phase for phase in finishing if phase is not Phase.REST] == [Phase.STEP, Phase.STOP, Phase.BACK]
+    finished = [phase for supervisor, phase in seen if supervisor is SupervisorState.FINISH_STEP]
+    assert [phase for phase in finished if phase is not Phase.REST] == finishing
     assert seen[-1] == (SupervisorState.HOLD, Phase.REST)
     assert 1.0 - 2.0 * (x * x + y * y) > 0.99
 
