@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import sys
 from pathlib import Path
 
 import pytest
@@ -101,6 +102,26 @@ def test_output_file_in_a_folder_that_cannot_be_written_is_rejected(arguments: l
     name, path = option.split("=")
     assert f"'{name}': must be in a writable folder, got {path}: No such file or directory" in result.stderr
     assert result.stderr.count("\n") == 1
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        ["gait", "solve", *PATIENT, "--plot=gait.png"],
+        ["gait", "solve", *PATIENT, "--animate=gait.gif"],
+        ["guide", "check", "--quick", "--plot=guide.png"],
+        ["model", "--show=model.png"],
+    ],
+)
+def test_picture_without_matplotlib_is_rejected_before_any_work(
+    arguments: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setitem(sys.modules, "matplotlib", None)
+    result = CliRunner().invoke(cli, arguments)
+    assert (result.exit_code, result.stdout) == (1, "")
+    remedy = "install it with `pip install 'atalante-hal[plot]'`"
+    assert result.stderr == f"atalante: a picture needs the package matplotlib: {remedy}\n"
 
 
 def test_existing_output_file_that_cannot_be_written_is_rejected(

@@ -13,7 +13,7 @@ from atalante_tools.console.options import OutputFile, json_option, subject_opti
 from atalante_tools.console.outcome import Failed
 from atalante_tools.console.stop_request import stop_requested
 from atalante_tools.console.terminal import Progress, print_message, show_json, table
-from atalante_tools.session.extra import extra
+from atalante_tools.session.extra import extra, require_matplotlib
 
 if TYPE_CHECKING:
     from atalante_control.gait.gait import Gait, Kind
@@ -80,6 +80,8 @@ def solve(
         raise click.UsageError("--network requires --kind walk")
     if kind == "walk" and (plot is not None or animate is not None):
         raise click.UsageError("--plot and --animate show a single step: use --kind periodic, start or stop")
+    if plot is not None or animate is not None:
+        require_matplotlib()
     from atalante_control.gait.gait import write_gait
 
     if kind == "walk":
@@ -212,12 +214,8 @@ def _verification(checks: tuple[GaitCheck, ...]) -> str:
 
 
 def _draw(solved: SolvedGait, subject: Subject, plot: Path | None, animate: Path | None) -> None:
-    try:
-        from atalante_tools.gait.figures import draw_animation, draw_plot
-    except ModuleNotFoundError as error:
-        raise Failed(
-            f"the picture needs the package {error.name}: install it with `pip install 'atalante-hal[plot]'`"
-        ) from error
+    from atalante_tools.gait.figures import draw_animation, draw_plot
+
     for draw, file, kind in ((draw_plot, plot, "plot"), (draw_animation, animate, "animation")):
         if file is not None:
             draw(solved.gait, subject.patient, file)

@@ -18,6 +18,7 @@ import click
 from atalante_tools.console.options import SEED, Between, OutputFile, json_option, options_as, subject_options
 from atalante_tools.console.outcome import Failed, InvalidUsage
 from atalante_tools.console.terminal import Progress, print_message, show_json, table
+from atalante_tools.session.extra import require_matplotlib
 from atalante_tools.session.law import Law, law_options
 from atalante_tools.session.shapes import SHAPE_HELP, SHAPE_NAMES, guide_shapes
 
@@ -139,6 +140,8 @@ def check(options: CheckOptions, as_json: bool, subject: Subject | None) -> None
             "--plot must not be combined with --results: a guide whose result is read from the file is not simulated, "
             "so it cannot be drawn"
         )
+    if options.plot is not None:
+        require_matplotlib()
     verdicts, last = [], None
     for verdict, checked in _all_checks(options, subject):
         verdicts.append(verdict)
@@ -208,15 +211,9 @@ def _all_checks(options: CheckOptions, subject: Subject | None) -> Iterator[tupl
 
 
 def _draw(checked: Checked, plot: Path) -> None:
-    """Draw the figure of a check.
+    """Draw the figure of a check."""
+    from atalante_tools.guide.figure import draw
 
-    Raises:
-        Failed: If matplotlib is not installed.
-    """
-    try:
-        from atalante_tools.guide.figure import draw
-    except ModuleNotFoundError as error:
-        raise Failed(f"a figure needs the package {error.name}; type: pip install 'atalante-hal[plot]'") from error
     draw(checked, plot)
     print_message(f"wrote {plot}")
 

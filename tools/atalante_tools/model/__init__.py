@@ -10,6 +10,7 @@ import click
 from atalante_tools.console.options import OutputFile, json_option, patient_options
 from atalante_tools.console.outcome import Failed
 from atalante_tools.console.terminal import print_message, show_json, table
+from atalante_tools.session.extra import require_matplotlib
 
 if TYPE_CHECKING:
     from atalante_control.model import Link, Patient
@@ -45,6 +46,8 @@ def command(patient: Patient | None, urdf_file: Path | None, picture: Path | Non
     Example: atalante model --mass 75 --height 175
              atalante model --mass 58 --height 1.62 --thigh 0.41 --urdf worn.urdf --show
     """
+    if picture is not None:
+        require_matplotlib()
     from atalante_control.model import ExoskeletonParameters, links, urdf
     from atalante_hal.robot import load_robot
     from atalante_tools.model.checks import model_checks
@@ -96,11 +99,7 @@ def _table(bodies: tuple[Link, ...]) -> str:
 
 
 def _draw(picture: Path, bodies: tuple[Link, ...]) -> None:
-    try:
-        from atalante_tools.model.picture import draw
-    except ModuleNotFoundError as error:
-        raise Failed(
-            f"the picture needs the package {error.name}: install it with `pip install 'atalante-hal[plot]'`"
-        ) from error
+    from atalante_tools.model.picture import draw
+
     draw(bodies, picture)
     print_message(f"picture in {picture}")

@@ -1,7 +1,8 @@
-"""Optional dependencies of the gait optimisation. The controller does not need these packages."""
+"""Optional dependencies of the commands: the packages of the gait optimisation, and matplotlib for pictures."""
 
 from __future__ import annotations
 
+import importlib
 from collections.abc import Iterator
 from contextlib import contextmanager
 
@@ -10,7 +11,7 @@ from atalante_tools.console.outcome import Failed
 
 @contextmanager
 def extra() -> Iterator[None]:
-    """Replace the import error of an optional dependency with an error that shows the install command.
+    """Replace the import error of a package of the gait optimisation with an error that shows the install command.
 
     Raises:
         Failed: If casadi, joblib or scikit-learn is not installed.
@@ -22,4 +23,18 @@ def extra() -> Iterator[None]:
             raise
         raise Failed(
             f"the gait optimisation needs the package {error.name}: install it with `pip install 'atalante-hal[gaits]'`"
+        ) from error
+
+
+def require_matplotlib() -> None:
+    """Check that a picture can be drawn. A command calls this function before its work, so that no result is lost.
+
+    Raises:
+        Failed: If matplotlib is not installed.
+    """
+    try:
+        importlib.import_module("matplotlib")
+    except ModuleNotFoundError as error:
+        raise Failed(
+            f"a picture needs the package {error.name}: install it with `pip install 'atalante-hal[plot]'`"
         ) from error
