@@ -12,6 +12,7 @@ import warnings
 from collections.abc import Callable, Generator, Iterable, Iterator
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import ExitStack, contextmanager
+from multiprocessing import resource_tracker
 from typing import Final, TypeVar
 
 _Task = TypeVar("_Task")
@@ -21,6 +22,7 @@ _CONNECT_TIMEOUT: Final = "10s"
 #: After this number of process crashes, the calls run one at a time. A crash then loses the result of one call only.
 _SHARED_LOSSES: Final = 3
 _REMEDY: Final = "repeat the command, if necessary with fewer --jobs"
+_TERMINAL_SIGNALS: Final = (signal.SIGINT, signal.SIGHUP)
 _LOKY_THREAD: Final = "ExecutorManagerThread"
 
 
@@ -43,7 +45,8 @@ def fan_out(
 ) -> Generator[_Result, None, None]:
     """Call a function for many tasks in parallel, and yield the results in the order of completion.
 
-    Only the calling process handles Ctrl-C. All other processes ignore Ctrl-C, and end when the iteration ends or is closed.
+    Only the calling process handles Ctrl-C and SIGHUP. All other processes ignore them, and end when the iteration ends or is
+    closed.
 
     Args:
         call: function to call, defined at module level, because other processes import it.
@@ -83,7 +86,7 @@ def fan_out(
             )
             results = None
             try:
-                with _without_terminal_signals():
+                with _terminal_signals_later():
                     results = pool(delayed(_numbered)(call, number, task) for number, task in calls)
                 for number, result in results:
                     del pending[number]
@@ -122,18 +125,29 @@ def _numbered(call: Callable[[_Task], _Result], number: int, task: _Task) -> tup
 
 
 @contextmanager
-def _without_terminal_signals() -> Iterator[None]:
-    """Ignore the signals of a terminal (SIGINT, SIGHUP) in the `with` block. Child processes that start in it ignore them, too.
+def _terminal_signals_later() -> Iterator[None]:
+    """Handle the signals of a terminal (SIGINT, SIGHUP) at the end of the `with` block. Child processes never handle them.
 
-    The parent process ends the child processes. The signals are ignored and not blocked, because the resource tracker of
-    joblib unblocks the signals for later processes.
+    The parent process ends the child processes. Processes and threads that start in the block inherit the signal mask, so the
+    signals stay blocked in them. A thread of the parent process that started before the block may receive a signal. Then a
+    handler stores the signal, and the signal is raised again at the end of the block.
     """
-    before = {number: signal.signal(number, signal.SIG_IGN) for number in (signal.SIGINT, signal.SIGHUP)}
+    from joblib.externals.loky.backend import resource_tracker as loky_tracker
+
+    arrived: list[int] = []
+    before = {number: signal.signal(number, lambda number, _: arrived.append(number)) for number in _TERMINAL_SIGNALS}
+    mask = signal.pthread_sigmask(signal.SIG_BLOCK, _TERMINAL_SIGNALS)
     try:
+        for tracker in (resource_tracker, loky_tracker):
+            tracker.ensure_running()  # the start of this process unblocks SIGINT before Python 3.12 and joblib 1.6
+        signal.pthread_sigmask(signal.SIG_BLOCK, _TERMINAL_SIGNALS)
         yield
     finally:
         for number, handler in before.items():
             signal.signal(number, handler)
+        for number in arrived:
+            signal.raise_signal(number)
+        signal.pthread_sigmask(signal.SIG_SETMASK, mask)
 
 
 @contextmanager

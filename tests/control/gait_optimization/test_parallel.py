@@ -7,11 +7,16 @@ import signal
 import sys
 import threading
 import time
+from collections.abc import Iterable
+from typing import Any
 
+import joblib
 import pytest
 from joblib.externals.loky.process_executor import _ExecutorManagerThread
 
 from atalante_control.gait_optimization.parallel import FanOutError, LostProcessError, fan_out
+
+TERMINAL_SIGNALS = {signal.SIGINT, signal.SIGHUP}
 
 
 def doubled(number: int) -> tuple[int, int]:
@@ -19,7 +24,7 @@ def doubled(number: int) -> tuple[int, int]:
 
 
 def handles_terminal_signals(_: int) -> bool:
-    return any(signal.getsignal(number) is not signal.SIG_IGN for number in (signal.SIGINT, signal.SIGHUP))
+    return not signal.pthread_sigmask(signal.SIG_BLOCK, ()) >= TERMINAL_SIGNALS
 
 
 def slow(seconds: float) -> int:
@@ -40,6 +45,36 @@ def test_two_jobs_run_in_other_processes_with_the_same_results() -> None:
 def test_worker_processes_ignore_ctrl_c_and_a_closed_terminal() -> None:
     assert not any(fan_out(handles_terminal_signals, range(4), jobs=2))
     assert handles_terminal_signals(0)
+
+
+@pytest.mark.parametrize("number", sorted(TERMINAL_SIGNALS))
+@pytest.mark.parametrize("in_thread", [False, True], ids=["blocked", "received by another thread"])
+def test_terminal_signal_during_the_start_of_the_processes_is_handled_after_it(
+    number: int, in_thread: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    received: list[int] = []
+    before = signal.signal(number, lambda arrived, _: received.append(arrived))
+    original = joblib.Parallel.__call__
+
+    def interrupted(pool: joblib.Parallel, calls: Iterable[Any]) -> Any:
+        if in_thread:
+            signal.pthread_sigmask(signal.SIG_UNBLOCK, {number})
+            signal.raise_signal(number)
+            signal.pthread_sigmask(signal.SIG_BLOCK, {number})
+        else:
+            os.kill(os.getpid(), number)
+        results = original(pool, calls)
+        assert received == []
+        return results
+
+    monkeypatch.setattr(joblib.Parallel, "__call__", interrupted)
+    try:
+        results = fan_out(handles_terminal_signals, range(4), jobs=2)
+        first = next(results)
+        assert received == [number]
+        assert not any([first, *results])
+    finally:
+        signal.signal(number, before)
 
 
 def test_closing_the_iteration_ends_its_processes_without_a_warning() -> None:
