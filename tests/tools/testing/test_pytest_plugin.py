@@ -136,7 +136,14 @@ def test_unwritable_can_log_does_not_hide_the_test_failure(run, pytester: pytest
     pytester.path.joinpath("taken").write_text("a file")
     result = run(FAILS_AND_PASSES, "--can-log-dir", "taken")
     result.assert_outcomes(passed=2, failed=1)
-    result.stdout.fnmatch_lines(["*on purpose*", "*cannot be created*"])
+    result.stdout.fnmatch_lines(["*on purpose*", "*CAN log not written*", "*cannot be created*"])
+
+
+def test_unwritable_can_log_of_a_passed_test_is_reported(run, pytester: pytest.Pytester):
+    pytester.path.joinpath("taken").write_text("a file")
+    result = run(FAILS_AND_PASSES, "--can-log", "always", "--can-log-dir", "taken")
+    result.stdout.fnmatch_lines(["*test_good: CAN log not written: *cannot be created*"])
+    result.stdout.no_fnmatch_line("*test_without_robot: CAN log*")
 
 
 # -- present and missing buses -----------------------------------------------------------------------------------------

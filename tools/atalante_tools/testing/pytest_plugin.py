@@ -30,6 +30,7 @@ if TYPE_CHECKING:
     from atalante_tools.testing.hil import Recording, Stepper
 
 _EMBEDDED = "embedded"
+_NO_LOG = "CAN log not written"
 _recording_key = pytest.StashKey["Recording"]()
 
 
@@ -72,7 +73,10 @@ def pytest_addoption(parser: pytest.Parser) -> None:
         help="which tests write their frames to a CAN log (default: failed)",
     )
     group.addoption(
-        "--can-log-dir", default="runs/can-logs", metavar="DIR", help="folder of the CAN logs (default: %(default)s)"
+        "--can-log-dir",
+        default="runs/can-logs",
+        metavar="DIR",
+        help="folder of the CAN logs, relative to the root directory of pytest (default: %(default)s)",
     )
 
 
@@ -115,10 +119,22 @@ def _write_log(item: pytest.Item, report: pytest.TestReport, recording: Recordin
     try:
         recording.save(path)
     except SinkError as error:
-        report.sections.append(("CAN log", str(error)))
+        report.sections.append((_NO_LOG, str(error)))
     else:
         report.sections.append(("CAN log", f"{len(recording)} frames in {path}"))
         report.user_properties.append(("can_log", str(path)))
+
+
+def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
+    """Print why the CAN log of a passed test was not written. Pytest prints the sections of failed tests only.
+
+    Args:
+        terminalreporter: reports of all tests.
+    """
+    for report in terminalreporter.stats.get("passed", ()):
+        for name, text in report.sections:
+            if name == _NO_LOG:
+                terminalreporter.write_line(f"{report.nodeid}: {_NO_LOG}: {text}")
 
 
 def _missing(request: pytest.FixtureRequest, reason: str) -> NoReturn:
