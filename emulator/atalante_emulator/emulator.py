@@ -189,7 +189,7 @@ class Emulator:
         #: _leg_syncs[leg]: index i of the SYNC that the drives of the leg receive.
         self._leg_syncs = [[m.name for m in syncs].index(f"SYNC_{side.upper()}_LEG") for side in SIDES]
         #: _answered[i]: copy of `_shares[i]` from the last cycle that `_imperfect_cycle` ran.
-        #: If SYNC i arrives only after this cycle has run, the nodes on the bus of SYNC i send this copy.
+        #: If another SYNC started this cycle and SYNC i arrives later, the nodes on the bus of SYNC i send this copy.
         self._answered = self._shares
         batch = new_frames(_BATCH)
         self._batch = batch.view(np.uint8).data

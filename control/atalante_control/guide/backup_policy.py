@@ -128,9 +128,10 @@ class Responses(NamedTuple):
     error: Vector  # (n + 1, 2, 10) matrix from the state to the predicted error e [rad]
     rate: Vector  # (n + 1, 2, 10) matrix from the state to the predicted rate e' [rad/s]
     feedback: Vector  # (n + 1, 2, 10) matrix from the state to the predicted feedback -Kv e - Dv e' [rad/s2]
-    pushed_error: Vector  # (n + 1, 2, 2) matrix from the acceleration in the first cycle to the error e [rad]
-    pushed_rate: Vector  # (n + 1, 2, 2) matrix from the acceleration in the first cycle to the rate e' [rad/s]
-    #: (n + 1, 2, 2) matrix from the acceleration in the first cycle to the feedback -Kv e - Dv e' [rad/s2]
+    #: Responses to a disturbance acceleration of hip and knee in the first cycle, shape (n + 1, 2, 2).
+    #: Matrix k gives the response after k cycles for 1 rad/s2. The responses are e [rad], e' [rad/s] and -Kv e - Dv e' [rad/s2].
+    pushed_error: Vector
+    pushed_rate: Vector
     pushed_feedback: Vector
 
 

@@ -36,7 +36,7 @@ _SH, _SK = LEG_JOINTS.index("SH"), LEG_JOINTS.index("SK")
 
 
 class SwingLeg(NamedTuple):
-    """Model of the swing leg in one step, and the torque w that a model with a fixed pelvis does not contain."""
+    """Model of the swing leg with a fixed pelvis in one step, and the additional torque w due to pelvis motion and patient."""
 
     leg: Leg  # model of sagittal hip and knee for the guide filter; `leg.gravity` is u_g + w
     #: (n + 1, 2) Nm, torque w of hip and knee. w carries the patient's leg and compensates the pelvis motion. Row: cycle.

@@ -222,7 +222,7 @@ class Adversary:
             )
 
     def _impulse_signs(self, joint: int, end: int, stiffness: Vector, damping: Vector) -> Vector:
-        """Predict how a short torque in each cycle before `end` changes the error of a joint in the cycle `end`.
+        """For each cycle before `end`, predict whether a torque in only this cycle raises or lowers the error in the cycle `end`.
 
         Args:
             joint: joint with the error: 0 for the hip, 1 for the knee.
