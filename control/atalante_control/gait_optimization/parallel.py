@@ -145,8 +145,8 @@ def _terminal_signals_later() -> Iterator[None]:
     finally:
         for number, handler in before.items():
             signal.signal(number, handler)
-        for number in arrived:
-            signal.raise_signal(number)
+        for stored in arrived:
+            signal.raise_signal(stored)
         signal.pthread_sigmask(signal.SIG_SETMASK, mask)
 
 
