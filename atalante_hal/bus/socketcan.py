@@ -31,6 +31,8 @@ SO_RXQ_OVFL: Final = 40
 SIOCGIFFLAGS: Final = 0x8913
 SIOCGIFMTU: Final = 0x8921
 IFF_UP: Final = 1
+#: Start of the names of virtual CAN interfaces. `ip link add` creates such an interface. For other names, an adapter is expected.
+VIRTUAL: Final = "vcan"
 #: Classes of error frames to receive (linux/can/error.h): transmit timeout, controller problem, bus-off, controller restarted.
 ERROR_FRAMES = 0x0001 | 0x0004 | 0x0040 | 0x0100
 LINK_DOWN: Final = errno.ENETDOWN
@@ -352,7 +354,7 @@ def require_channel(channel: str) -> None:
     """
     doctor = "run `atalante doctor`"
     create = f"type `ip link add {channel} type vcan && ip link set {channel} mtu 72 txqueuelen 1000 up`"
-    remedy = create if channel.startswith("vcan") else "plug the adapter in and load its driver"
+    remedy = create if channel.startswith(VIRTUAL) else "plug the adapter in and load its driver"
     try:
         raw = socket.socket(socket.AF_CAN, socket.SOCK_RAW, socket.CAN_RAW)
     except OSError as error:

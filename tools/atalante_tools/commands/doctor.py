@@ -27,8 +27,6 @@ if TYPE_CHECKING:
 
 #: Recommended length of a transmit queue [frames]. An interface that carries all four buses sends at least 26 frames per cycle.
 QUEUE: Final = 1000
-#: Start of the names of virtual CAN interfaces. `ip link add` creates such an interface. For other names, an adapter is expected.
-VIRTUAL: Final = "vcan"
 #: MTU of a CAN FD interface [bytes].
 FD_MTU: Final = 72
 #: SCHED_FIFO priority that the 1 kHz loop requests.
@@ -189,6 +187,8 @@ def _packages(machine: Machine, interface: str) -> Iterator[CheckResult]:
 
 
 def _socketcan(machine: Machine, needed: bool, channels: Sequence[str]) -> Iterator[CheckResult]:
+    from atalante_hal.bus.socketcan import VIRTUAL
+
     error = machine.can_socket()
     supported = error is None
     boot = "modprobe can-raw; without that module, use `make test-vcan`, which boots a kernel that has it"
@@ -209,6 +209,8 @@ def _socketcan(machine: Machine, needed: bool, channels: Sequence[str]) -> Itera
 
 
 def _interface(name: str, interface: Interface | None, needed: bool) -> CheckResult:
+    from atalante_hal.bus.socketcan import VIRTUAL
+
     if interface is None:
         text = "this interface does not exist"
         if name.startswith(VIRTUAL):
