@@ -10,7 +10,8 @@ from atalante_tools.console.outcome import Failed
 from atalante_tools.faults.tasks import Result, Task, run_task
 
 #: Longest accepted time between two results [s]. If no result comes within this time, the campaign fails.
-RESULT_TIMEOUT: Final = 300.0
+#: The first runs after an installation compile functions, which takes minutes on a busy machine.
+RESULT_TIMEOUT: Final = 900.0
 
 
 def results(tasks: Sequence[Task], *, jobs: int = 1, dask: str = "") -> Iterator[Result]:
