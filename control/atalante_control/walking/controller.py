@@ -71,6 +71,8 @@ _SENSOR_AGE = 10
 #: Largest expected difference between the weight and the load on the stance foot, as a fraction of the weight.
 #: While one foot swings, load and weight differ because the robot accelerates.
 _LOAD_ERROR = 0.15
+#: m, height above the stance foot up to which the swing foot counts as landed while the data of both feet is lost
+_LANDED_HEIGHT = 0.001
 
 
 class StanceError(ValueError):
@@ -148,7 +150,7 @@ class WalkController:
             toe=middle + half - config.edge,
         )
         force = np.zeros((len(FEET), len(CELLS), 3))
-        #: Foot forces of this cycle if the data of one foot is lost. They contain an estimate for this foot.
+        #: Foot forces of this cycle if the data of a foot is lost. They contain an estimate for this foot.
         self._forces = force.copy()
         #: Copy of the torque that the controller requested last, used if the `State` does not contain the sent torque.
         self._sent = np.zeros(_N)
@@ -416,7 +418,7 @@ class WalkController:
         While the data of the pelvis IMU is too old, the torso IMU is used. The HAL can report that the readings of the pelvis IMU
         are implausible, but those of the torso IMU are not. Then the torso IMU is used for the rest of the walk, except in cycles
         in which only its data is too old. If the data of both is too old, the angular velocity is computed from the stance leg
-        (`Stage.gyro_source`). If the data of one foot is too old, the load on this foot is estimated.
+        (`Stage.gyro_source`). If the data of a foot is too old, the load on this foot is estimated.
 
         Args:
             state: measured state of the robot.
@@ -441,6 +443,10 @@ class WalkController:
             self._forces[:] = state.foot_force
             self._forces[feet[0], :, 2] = self._load_without(feet[0]) / len(CELLS)
             self._measured = self._measured._replace(force=self._forces)
+        elif feet:
+            self._forces[:] = 0.0
+            self._forces[:, :, 2] = self._loads_without_feet()[:, None] / len(CELLS)
+            self._measured = self._measured._replace(force=self._forces)
         if state.torque_sent is None:
             self._sent[:] = self._pid.requested
 
@@ -456,6 +462,24 @@ class WalkController:
         weight = self._constants.weight
         missing = 1.0 - float(self._forces[1 - side, :, 2].sum()) / weight
         return weight * min(1.0, max(0.0, missing - _LOAD_ERROR) / (1.0 - _LOAD_ERROR))
+
+    def _loads_without_feet(self) -> Vector:
+        """Estimate the vertical loads on both feet without the data of the feet, from the kinematics of the last cycle.
+
+        In a step, the stance foot carries the weight until the swing foot is at most `_LANDED_HEIGHT` above the stance foot. With
+        both feet on the ground, the position of the centre of mass between the soles gives the loads.
+
+        Returns:
+            Loads on the left and the right foot, shape (2,) [N].
+        """
+        chain, step, weight = self._parts.chain, self._step, self._constants.weight
+        height = float(step[2]) if self._stance == LEFT else -float(step[2])
+        if self.phase in STEPPING and height > _LANDED_HEIGHT:
+            right = float(self._stance == RIGHT)
+        else:
+            lever = self._observer.rotation @ (chain.centre[0].position - chain.soles[LEFT].position)
+            right = min(1.0, max(0.0, float(lever[:2] @ step[:2] / (step[:2] @ step[:2]))))
+        return weight * np.array([1.0 - right, right])
 
     def _facts(self, elapsed: int) -> Facts:
         phase, nominal, landed = self.phase, len(self._table.rows) - 1, False

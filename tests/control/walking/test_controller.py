@@ -339,9 +339,9 @@ def test_ankle_of_a_pushed_robot_keeps_the_centre_of_pressure_within_the_sole() 
 
 
 @pytest.mark.sample(2)
-@pytest.mark.parametrize("foot", [0, 1])
-def test_robot_makes_a_stop_step_without_the_data_of_a_foot(foot: int) -> None:
-    controller, phases = walked("mujoco", 100, finish_after=1, lost_feet=[foot])
+@pytest.mark.parametrize("feet", [(0,), (1,), (0, 1)])
+def test_robot_makes_a_stop_step_without_the_data_of_a_foot(feet: tuple[int, ...]) -> None:
+    controller, phases = walked("mujoco", 100, finish_after=1, lost_feet=feet)
     assert phases[-3:] == [Phase.STOP, Phase.BACK, Phase.REST]
     assert controller.max_dcm_error < 0.05
 
@@ -352,6 +352,22 @@ def test_robot_makes_a_stop_step_without_the_imus_of_the_trunk(lost: tuple[str, 
     controller, phases = walked("mujoco", 100, finish_after=1, lost_imus=list(map(IMUS.index, lost)))
     assert phases[-3:] == [Phase.STOP, Phase.BACK, Phase.REST]
     assert controller.max_dcm_error < 0.03
+
+
+def test_centre_of_mass_gives_the_loads_of_lost_feet_that_stand() -> None:
+    """Frontal hip angles of 0.05 rad move the soles (0.21 m apart) to the left by 51 mm, the centre of mass by 11 mm."""
+    controller = WalkController(ROBOT, PATIENT, WALK, 3)
+    state = hung(controller)
+    state.age[list(state.foot_rows)] = 11
+    state.foot_force[:] = 9.0
+    for hip, expected in ((0.0, 0.5), (0.05, 0.5 - 0.04 / 0.21), (-0.05, 0.5 + 0.04 / 0.21)):
+        state.position[[JOINTS.index("left_FH"), JOINTS.index("right_FH")]] = hip
+        for _ in range(300):
+            controller.update(state)
+            state.cycle += 1
+        load = fields_of(controller)["load"]
+        assert load.sum() == pytest.approx(controller._constants.weight)
+        assert load[0] / load.sum() == pytest.approx(expected, abs=0.01)
 
 
 def test_finish_step_ends_the_walk_with_a_stop_step() -> None:

@@ -22,7 +22,10 @@ _TRUNK: Final = ("IMU_TORSO", "IMU_PELVIS")
 #: In fault F41, the HAL is killed. The HAL of a trial runs in the process of the trial, so the HAL pauses for 6 s instead.
 #: A pause has the same effect: the drives receive no frames. After the pause, the HAL is in HOLD and does not move the robot.
 _GROUND_CASES: Final = {
-    "F19": (Case("both IMUs of the trunk", tuple(Fault("silence", imu) for imu in _TRUNK)),),
+    "F19": (
+        Case("both IMUs of the trunk", tuple(Fault("silence", imu) for imu in _TRUNK)),
+        Case("both feet", tuple(Fault("silence", foot) for foot in FOOT_NODES)),
+    ),
     "F30": (Case("both IMUs of the trunk", tuple(Fault("imu_invalid", imu) for imu in _TRUNK)),),
     "F34": (
         Case("both feet report no load", _no_load(*FOOT_NODES)),
