@@ -42,16 +42,19 @@ def test_walk_without_a_fault_has_no_false_alarm(number: int, name: str, monkeyp
 
 
 @pytest.mark.sample(3)
-@pytest.mark.parametrize("axis", ["X", "Y", "Z"])
-def test_walk_with_askew_tibia_imus_has_no_false_alarm(robot: Robot, axis: str) -> None:
-    """The IMUs are turned by -1 and 1 degree, so the errors of both legs are opposite. The walk begins slowly."""
-    askew = [Fault("imu_turned", f"IMU_{side}_TIBIA", axis=axis, degrees=d) for side, d in (("LEFT", -1), ("RIGHT", 1))]
+@pytest.mark.parametrize(
+    ("axis", "degrees", "cycles"), [("X", 1, 2000), ("Y", 1, 2000), ("Z", 1, 2000), ("Y", 1.5, 4500)]
+)
+def test_walk_with_askew_tibia_imus_has_no_false_alarm(robot: Robot, axis: str, degrees: float, cycles: int) -> None:
+    """The IMUs are turned in opposite directions, so the errors of both legs are opposite. The walk begins slowly."""
+    turns = ("LEFT", -degrees), ("RIGHT", degrees)
+    askew = [Fault("imu_turned", f"IMU_{side}_TIBIA", axis=axis, degrees=turn) for side, turn in turns]
     controller = AirwalkController(robot, load_gait(AIRWALK_GAIT, robot), SHAPES["constant"], AirwalkConfig())
     fields = controller.telemetry_fields
     with open_hal(
         Target("embedded", "", lockstep=True), assistance_factor=0.5, controller_fields=fields, faults=askew
     ) as rig:
-        rig.run(controller, until=lambda state: state.cycle >= 2000)
+        rig.run(controller, until=lambda state: state.cycle >= cycles)
         assert "ACTIVE" in {event.code for event in rig.hal.events}
         assert diagnostics(rig.hal).keys() <= EXPECTED
 

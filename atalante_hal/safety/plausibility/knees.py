@@ -10,9 +10,11 @@ position, because gravity cancels:
 
 Integration and a high-pass of third order give the measured position (from the accelerometers) and the computed position in
 metres, without the constant errors of accelerometers and attitudes. The heading of the tibia IMU drifts relative to the pelvis
-IMU, so its attitude is corrected by the estimate of the module `legs`. A regression over about a second explains the difference
-of the two positions by two unknowns: the error of the knee angle, and the deviation of the segment lengths from their mean value
-`SEGMENT`, because both segments are adjusted to the patient.
+IMU, so its attitude is corrected by the estimate of the module `legs`. A tibia IMU that is mounted askew about y by the angle a
+turns the computed thigh and shank by a, which looks like an error of the knee angle of about 2 a. So the computed position uses
+an attitude of the tibia from which the angle a is removed, as the module `legs` has measured it. A regression over about a
+second explains the difference of the two positions by two unknowns: the error of the knee angle, and the deviation of the
+segment lengths from their mean value `SEGMENT`, because both segments are adjusted to the patient.
 
 The check needs a thigh that turns, so it cannot decide while the robot stands. It decides in each walk, also in the air. If the
 error of the knee angle explains only a small part of the difference, the cause is not the encoder, but for example a faulty
@@ -78,6 +80,7 @@ class Readings(NamedTuple):
     quaternion: Vector  # (4, 4) wxyz, sensor to world
     accel: Vector  # (4, 3) m/s2
     heading: Vector  # (2, 2) correction of the heading of both tibiae, see `Legs.heading`
+    tilt: Vector  # (2, 2) correction of the mounting of both tibia IMUs, see `Legs.tilt`
 
 
 class Filters(NamedTuple):
@@ -103,16 +106,17 @@ class Knees:
         robot: sensor thresholds of the robot.
         now: signals decoded in this cycle.
         heading: correction of the heading of both tibiae, shape (2, 2), see `Legs.heading`.
+        tilt: correction of the mounting of both tibia IMUs, shape (2, 2), see `Legs.tilt`.
         period: cycle time [s].
     """
 
-    def __init__(self, robot: Robot, now: Signals, heading: Vector, period: float) -> None:
+    def __init__(self, robot: Robot, now: Signals, heading: Vector, tilt: Vector, period: float) -> None:
         legs = len(SIDES)
         self._filters = Filters(np.zeros((legs, 3 * _FILTERS)), np.zeros(1), np.zeros((legs, 6)))
         self._error = np.zeros(legs)
         #: Arguments of the function `follow`. The array objects are the same in every call.
         self._arguments = (
-            Readings(now.position, robot.polarity / robot.gear, now.quaternion, now.accel, heading),
+            Readings(now.position, robot.polarity / robot.gear, now.quaternion, now.accel, heading, tilt),
             self._filters, self._error,
             2.0 * robot.sensors.attitude_error, period,
         )  # fmt: skip
@@ -247,11 +251,14 @@ def motion(leg: int, now: Readings) -> tuple[Vector3, Vector3, Vector3, Vector3]
     x, z = sine, -1.0 - cosine
     hip_to_imu = SEGMENT * x + TIBIA_IMU[0], side * TIBIA_IMU[1], SEGMENT * z + TIBIA_IMU[2]
     pelvis, shank = now.quaternion[_PELVIS], turned_about_vertical(now.quaternion[tibia], now.heading[leg])
+    w, i, j, k = shank
+    c, s = now.tilt[leg, 0], now.tilt[leg, 1]
+    leg_axes = c * w - s * j, c * i - s * k, c * j + s * w, c * k + s * i
     hx, hy, hz = to_world(pelvis, hip)
-    tx, ty, tz = to_world(shank, hip_to_imu)
+    tx, ty, tz = to_world(leg_axes, hip_to_imu)
     px, py, pz = to_world(pelvis, now.accel[_PELVIS])
     sx, sy, sz = to_world(shank, now.accel[tibia])
-    lever, growth = to_world(shank, (SEGMENT * cosine, 0.0, SEGMENT * sine)), to_world(shank, (x, 0.0, z))
+    lever, growth = to_world(leg_axes, (SEGMENT * cosine, 0.0, SEGMENT * sine)), to_world(leg_axes, (x, 0.0, z))
     return (hx + tx, hy + ty, hz + tz), lever, growth, (sx - px, sy - py, sz - pz)
 
 

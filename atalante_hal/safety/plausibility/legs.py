@@ -74,6 +74,8 @@ _TIBIAE = tuple(IMUS.index(f"{side}_tibia") for side in SIDES)
 _AXES = (("FH",), ("TH",), ("SH", "SK"))
 #: Index of TH in `_AXES`. The error of TH shows the heading drift of the IMUs.
 _HEADING = _AXES.index(("TH",))
+#: Index of SH and SK in `_AXES`. Their error in the first comparison shows how the IMUs are mounted.
+_SAGITTAL = _AXES.index(("SH", "SK"))
 #: For each of the first four joints of a leg: index of its axis in `_AXES`.
 _AXIS_OF = (0, 1, 2, 2)
 _HIPS = tuple(JOINTS.index(f"{side}_FH") for side in SIDES)
@@ -98,6 +100,9 @@ class Legs:
             if a value is too old, and always for SA and HA.
         heading: cosine and sine of half the angle by which the attitude of each tibia IMU must be turned about the vertical to
             correct its heading drift relative to the pelvis IMU, shape (2, 2).
+        tilt: cosine and sine of half the angle by which the attitude of each tibia IMU must be turned about its axis y, because
+            IMUs are mounted askew, shape (2, 2). The angle is the error of SH + SK in the first comparison. It is 0 if this
+            error exceeds `attitude_error`.
 
     Args:
         robot: sensor thresholds of the robot.
@@ -118,6 +123,7 @@ class Legs:
         self._errors: list[tuple[float, float, float] | None] = [None for _ in SIDES]
         self._heading_lost = [False for _ in SIDES]  # for each leg: whether its heading must be measured again
         self.heading: Vector = np.tile([1.0, 0.0], (len(SIDES), 1))
+        self.tilt: Vector = np.tile([1.0, 0.0], (len(SIDES), 1))
         self.encoder_error: Vector = np.full(len(JOINTS), math.inf)
         self._contradicts = [[0] * len(_AXES) for _ in SIDES]
         self._constant_samples = [constant_samples[hip : hip + len(_AXIS_OF)] for hip in _HIPS]
@@ -211,6 +217,9 @@ class Legs:
         x, z, y = hip_angles(pelvis, turned_about_vertical(tibia, self.heading[leg].tolist()))
         turn = 2.0 * math.pi
         errors = math.remainder(fh - x, turn), math.remainder(th - z, turn), math.remainder(sh + sk - y, turn)
+        if self._errors[leg] is None and abs(errors[_SAGITTAL]) <= self._attitude_error:
+            half = 0.5 * errors[_SAGITTAL]
+            self.tilt[leg] = math.cos(half), math.sin(half)
         self._errors[leg] = errors
         w, i, j, k = pelvis
         upright = math.cos(x) * (1.0 - 2.0 * (i * i + j * j)) - 2.0 * math.sin(x) * (j * k + w * i)

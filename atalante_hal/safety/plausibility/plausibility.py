@@ -95,7 +95,7 @@ class Plausibility:
         self._inertial = Inertial(robot, now, self._imus.limits, _INERTIAL_INTERVALS, period)
         self._trunk = Trunk(now, period)
         self._fall = Fall(now)
-        self._knees = Knees(robot, now, self._legs.heading, period)
+        self._knees = Knees(robot, now, self._legs.heading, self._legs.tilt, period)
         self._rows = Rows(codec)
         self._trunk_rows = self._rows.imu[[IMUS.index("torso"), IMUS.index("pelvis")]]
         self._knee_rows = np.concatenate((self._rows.joint[KNEE_JOINTS], self._rows.imu[KNEE_IMUS]))

@@ -100,7 +100,8 @@ class Walking:
         self.now = signals()
         self.now.quaternion[:, 0] = 1.0
         self.heading = np.tile([1.0, 0.0], (2, 1))
-        self.checks = Knees(ROBOT, self.now, self.heading, PERIOD)
+        self.tilt = self.heading.copy()
+        self.checks = Knees(ROBOT, self.now, self.heading, self.tilt, PERIOD)
         self.cycles = 0
 
     def change(self) -> None:
@@ -222,6 +223,27 @@ def test_drift_is_found_after_a_heading_drift_of_the_tibia_imus(drift: float, co
     assert [SIDES.index(finding.node.split("_")[0].lower()) for finding in robot.checks.findings()] == found
 
 
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+@pytest.mark.parametrize(("corrected", "drift", "found"), [(False, 2.5, 1), (True, 2.5, 0), (True, 6.0, 2)])
+def test_tibia_imus_askew_within_the_tolerance_do_not_change_the_error_of_the_knee(
+    sign: float, corrected: bool, drift: float, found: int
+):
+    """The tibia IMUs are turned about y by `attitude_error`, in opposite directions."""
+    robot, healthy = Walking(drift=(sign * drift, sign * drift)), walk()
+    quaternion, accel = healthy.quaternion.copy(), healthy.accel.copy()
+    for leg, angle in enumerate((ROBOT.sensors.attitude_error, -ROBOT.sensors.attitude_error)):
+        turn = pinocchio.Quaternion(pinocchio.AngleAxis(angle, np.array([0.0, 1.0, 0.0])))
+        accel[:, TIBIA + leg] = accel[:, TIBIA + leg] @ turn.matrix()
+        for cycle in range(STRIDE):
+            w, x, y, z = quaternion[cycle, TIBIA + leg]
+            quaternion[cycle, TIBIA + leg] = (pinocchio.Quaternion(w, x, y, z) * turn).coeffs()[[3, 0, 1, 2]]
+        if corrected:
+            robot.tilt[leg] = turn.inverse().coeffs()[[3, 1]]
+    robot.walk = Walk(healthy.position, quaternion, accel)
+    robot.run(5000)
+    assert len(robot.checks.findings()) == found
+
+
 class TestMotion:
     @pytest.mark.parametrize("leg", [0, 1])
     @pytest.mark.parametrize("cycle", range(0, STRIDE, 400))
@@ -246,13 +268,14 @@ class TestMotion:
         now.accel[:] = np.random.default_rng(cycle).standard_normal((4, 3))
         turn = pinocchio.Quaternion(pinocchio.AngleAxis(0.7, np.array([0.0, 0.0, 1.0])))
         w, x, y, z = now.quaternion[TIBIA + leg]
-        x, y, z, w = (turn.inverse() * pinocchio.Quaternion(w, x, y, z)).coeffs()
-        now.quaternion[TIBIA + leg] = w, x, y, z
-        heading = np.zeros((2, 2))
-        heading[leg] = turn.coeffs()[[3, 2]]
-        readings = Readings(now.position, 1.0 / GEAR, now.quaternion, now.accel, heading)
+        askew = pinocchio.Quaternion(pinocchio.AngleAxis(0.4, np.array([0.0, 1.0, 0.0])))
+        mounted = pinocchio.Quaternion(w, x, y, z) * askew.inverse()
+        now.quaternion[TIBIA + leg] = (turn.inverse() * mounted).coeffs()[[3, 0, 1, 2]]
+        heading, tilt = np.zeros((2, 2)), np.zeros((2, 2))
+        heading[leg], tilt[leg] = turn.coeffs()[[3, 2]], askew.coeffs()[[3, 1]]
+        readings = Readings(now.position, 1.0 / GEAR, now.quaternion, now.accel, heading, tilt)
         position, lever, growth, accel = motion(leg, readings)
-        now.quaternion[TIBIA + leg] = robot.quaternion[cycle, TIBIA + leg]
+        now.quaternion[TIBIA + leg] = mounted.coeffs()[[3, 0, 1, 2]]
         np.testing.assert_allclose(position, true(), atol=1e-9)
         np.testing.assert_allclose(lever, (true(step) - true(-step)) / (2.0 * step), atol=1e-8)
         np.testing.assert_allclose(growth, (true(length=SEGMENT + 1e-3) - true()) / 1e-3, atol=1e-8)

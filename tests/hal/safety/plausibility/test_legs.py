@@ -304,6 +304,20 @@ class TestDrift:
             compare(error, turn)
             assert bool(one_leg.drifts()) is (abs(error) > allowed)
 
+    @pytest.mark.parametrize("leg", [0, 1])
+    @pytest.mark.parametrize("error", [0.029, -0.029, 0.031, -0.031])
+    def test_first_error_of_sh_and_sk_is_the_angle_by_which_the_tibia_imu_is_mounted_askew(
+        self, leg: int, error: float
+    ):
+        one_leg, allowed = OneLeg(leg), ROBOT.sensors.attitude_error
+        assert one_leg.legs.tilt.tolist() == [[1.0, 0.0]] * 2
+        for later in (error, 0.01, -0.05):
+            one_leg.show((0.1, 0.2, 0.3), (0.005, -0.005, later))
+            one_leg.compare(10)
+            half = 0.5 * error if abs(error) <= allowed else 0.0
+            assert one_leg.legs.tilt[leg] == pytest.approx([math.cos(half), math.sin(half)], abs=1e-12)
+            assert one_leg.legs.tilt[1 - leg].tolist() == [1.0, 0.0]
+
     @pytest.mark.parametrize("imu", IMUS[1:])
     def test_restart_of_an_imu_with_another_heading_causes_no_finding(self, imu: str):
         robot, index = SimulatedRobot(), IMUS.index(imu)
