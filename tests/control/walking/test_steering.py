@@ -79,7 +79,7 @@ def test_turn_of_the_line_keeps_the_deviation_and_rotates_the_feet(turn: float) 
     assert steering.offset() == pytest.approx(min(max(expected, -limit), limit), abs=1e-12)
 
 
-@pytest.mark.parametrize("turn", [0.1, -0.1, math.nan])
+@pytest.mark.parametrize("turn", [0.053, -0.053, 0.1, math.nan])
 def test_turn_beyond_the_limit_is_rejected(turn: float) -> None:
-    with pytest.raises(ValueError, match=r"turn must be from -0\.0873 to 0\.0873 rad, got"):
+    with pytest.raises(ValueError, match=r"turn must be from -0\.0524 to 0\.0524 rad, got"):
         WalkConfig(turn=turn)

@@ -50,6 +50,15 @@ def test_line_turns_before_each_step(turn: float, xi: float) -> None:
     assert result["xi"] == 1.0 or result["inside"] == 1.0
 
 
+@pytest.mark.long
+@pytest.mark.parametrize("turn", ["3", "-3"])
+def test_tall_and_heavy_patient_turns_in_a_wide_guide(turn: str) -> None:
+    patient = "--mass", "91", "--height", "193", "--wearer", "passive"
+    code, out, errors = run("--steps", "16", "--turn", turn, "--xi", "0", "--shape", "constant", *patient, "--json")
+    result = json.loads(out)
+    assert (code, result["outcome"], result["steps"]) == (0, "stood", 16), errors
+
+
 def test_turn_is_refused_without_steering() -> None:
     code, _, errors = run("--turn", "2", "--literal")
     assert code == 2
@@ -204,6 +213,7 @@ def test_robot_that_is_pushed_over_ends_with_code_1() -> None:
         (("--protocol", "1,2,3"), "the assistance factor at the end of --protocol must be below 1, got 1: add --xi"),
         (("--shape", "nonsense", "--xi", "0.5"), "guide shape (or a file that ends in .toml)"),
         (("--can-log", "walk.txt"), "walk.txt"),
+        (("--turn", "5"), "5.0 is not in the range -3.0<=x<=3.0"),
         (("--record-rate", "3"), "must be a divisor of 1000"),
         (("--wearer", "passive", "-i", "socketcan", "-c", "vcan0"), "--wearer passive requires the emulated robot"),
         (("--mass", "75"), "a patient requires both --mass and --height"),

@@ -106,7 +106,7 @@ def _protocol(_ctx: click.Context, _param: click.Parameter, text: str | None) ->
 @gait_options
 @click.option(
     "--turn",
-    type=Between(-5.0, 5.0),
+    type=Between(-3.0, 3.0),
     default=0.0,
     show_default=True,
     metavar="DEG",
