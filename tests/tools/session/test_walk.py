@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from pathlib import Path
 
@@ -11,6 +12,7 @@ from atalante_control.gait.subject import Subject
 from atalante_control.gait.walk import DEFAULT_WALK, load_walk, write_walk
 from atalante_control.model import Patient
 from atalante_control.structured import dtype_of
+from atalante_control.walking.config import WalkConfig
 from atalante_control.walking.controller import WalkController
 from atalante_control.walking.phases import Phase
 from atalante_control.walking.telemetry import Telemetry
@@ -98,8 +100,9 @@ def test_stop_of_the_pendant_in_a_walk_ends_it_on_both_feet(
     assert 1.0 - 2.0 * (x * x + y * y) > 0.99
 
 
-def test_push_begins_at_its_phase_in_a_right_stance_step_and_lasts_its_duration() -> None:
-    controller = WalkController(ROBOT, PATIENT, load_walk(DEFAULT_WALK, ROBOT), 4)
+@pytest.mark.parametrize("turn", [0.0, math.radians(3.0)])
+def test_push_begins_at_its_phase_in_a_right_stance_step_and_acts_relative_to_the_line(turn: float) -> None:
+    controller = WalkController(ROBOT, PATIENT, load_walk(DEFAULT_WALK, ROBOT), 4, WalkConfig(turn=turn))
     push, rows = Push(20.0, 90.0, step=1, phase=0.5), list[dict[str, float]]()
     with open_hal(
         Target("embedded", "", True, MUJOCO),
@@ -116,7 +119,9 @@ def test_push_begins_at_its_phase_in_a_right_stance_step_and_lasts_its_duration(
         def observed(hal_state: int) -> Vector:
             force = wrench(hal_state)
             if force.any():
-                assert force.tolist() == pytest.approx([0.0, 20.0, 0.0, 0.0, 0.0, 0.0])
+                # The line turns before each of the first two steps.
+                x, y = -20.0 * math.sin(2.0 * turn), 20.0 * math.cos(2.0 * turn)
+                assert force.tolist() == pytest.approx([x, y, 0.0, 0.0, 0.0, 0.0])
                 record = controller.telemetry.view(dtype_of(Telemetry))
                 rows.append({name: float(record[name][0]) for name in ("step", "stance", "elapsed")})
             return force

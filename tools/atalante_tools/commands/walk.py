@@ -126,7 +126,7 @@ def _protocol(_ctx: click.Context, _param: click.Parameter, text: str | None) ->
     default=0.0,
     show_default=True,
     metavar="DEG",
-    help="Direction of the push [deg]: 0 is forwards, 90 to the left. Requires --push.",
+    help="Direction of the push relative to the walking line [deg]: 0 is forwards, 90 to the left. Requires --push.",
 )
 @click.option(
     "--friction",

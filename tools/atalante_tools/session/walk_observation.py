@@ -43,6 +43,7 @@ class Observation:
         self.fell = False
         self._rig, self._controller, self._push = rig, controller, push
         self._push_begun: int | None = None  # cycle in which the push began
+        self._push_angle = 0.0  # direction of the push in world axes [rad]
         self._squares, self._count = 0.0, 0  # sum of the squared attitude errors [rad2], and number of these errors
         self._origin: Stance | None = None
         self._moved = False  # whether the controller has moved the robot
@@ -120,9 +121,10 @@ class Observation:
             if not controller.reached(step, push.phase):
                 return wrench
             self._push_begun = cycle
+            # The direction is relative to the desired line, which `turn` has turned before each step so far.
+            self._push_angle = math.radians(push.direction) + controller.config.turn * controller.steps_begun
         if (cycle - self._push_begun + 1) * PERIOD <= push.duration:
-            angle = math.radians(push.direction)
-            wrench[:2] = push.force * math.cos(angle), push.force * math.sin(angle)
+            wrench[:2] = push.force * math.cos(self._push_angle), push.force * math.sin(self._push_angle)
         return wrench
 
 

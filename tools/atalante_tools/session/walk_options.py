@@ -30,7 +30,7 @@ class Push:
     """Push at the pelvis of the emulated robot. The push begins at a given phase of a periodic step."""
 
     force: float  # force of the push [N]
-    direction: float  # direction of the push [deg]: 0 is forwards, 90 is to the left
+    direction: float  # direction of the push relative to the desired line [deg]: 0 is forwards, 90 is to the left
     duration: float = 0.2  # duration of the push [s]
     step: int | None = None  # index of the pushed step, from 0; None means the middle step of the walk
     phase: float = 0.3  # phase of the push: time since the start of the step divided by the duration of the step
