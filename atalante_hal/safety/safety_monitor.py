@@ -227,6 +227,9 @@ class SafetyMonitor:
     def accept(self, frames: Frames) -> list[int]:
         """Process the status messages, emergencies and unknown frames of a cycle.
 
+        Call this method before the plausibility checks of the cycle. They must know which nodes have restarted: an IMU may then
+        report another heading.
+
         Args:
             frames: received frames of a cycle without the cyclic 1 ms messages, shape (n,).
 
@@ -234,6 +237,9 @@ class SafetyMonitor:
             Indices in `frames` of the frames that the DBC does not define as messages to the HAL.
         """
         unknown = self._heartbeats.accept(frames, self._state.cycle, self._state.vibration)
+        for node in self._heartbeats.booted:
+            self._plausibility.reference(node)
+        self._heartbeats.booted.clear()
         if not self._heartbeats.quiet:
             self._steady = False
         return unknown
@@ -297,9 +303,6 @@ class SafetyMonitor:
         message_monitor.evaluate(cycle, memory, self._tolerance())
         state.joints_valid = message_monitor.joints_valid
         self._heartbeats.evaluate(cycle, memory)
-        for node in self._heartbeats.booted:
-            self._plausibility.reference(node)
-        self._heartbeats.booted.clear()
         for finding in (*findings, *self._plausibility.findings, *self._reports):
             memory.raise_finding(cycle, finding)
         self._reports.clear()

@@ -331,6 +331,28 @@ def test_rejected_values_of_both_trunk_imus_end_a_walk_on_the_ground(
     assert rig.walk(3, step=8, walking=True).supervisor is (S.HOLD if expected is S.FINISH_STEP else expected)
 
 
+@pytest.mark.parametrize("turn", [8, 24], ids=["left leg", "right leg"])
+def test_values_in_the_cycle_of_the_boot_up_message_of_an_imu_may_have_another_heading(make_rig, turn: int):
+    """In this cycle, a leg is checked. The schedule of the checks repeats every 32 cycles."""
+    rig = make_rig(starts=False)
+    boot = 32 * 12 + turn + 1
+    rig.emulator.inject(
+        [
+            Fault("drop", "IMU_PELVIS_STATE", start=boot - 202, cycles=200),
+            Fault("imu_turned", "IMU_PELVIS", start=boot - 3, axis="Z", degrees=40.0),
+        ]
+    )
+    rig.run(boot - 1)
+    row = rig.hal.state.imu_rows[IMUS.index("pelvis")]
+    assert rig.hal.state.age[row] > 200
+    rig.emulator._heartbeats.boot("IMU_PELVIS", rig.emulator.cycle)
+    rig.run(1)
+    assert rig.hal.state.age[row] == 0
+    rig.run(300)
+    assert "NODE_RESET" in rig.codes()
+    assert "ENC_DRIFT" not in rig.codes()
+
+
 def test_rejected_values_of_both_trunk_imus_lead_to_full_assistance_in_the_air(rig):
     rig.until(S.ACTIVE)
     rig.emulator.inject([Fault("imu_invalid", "IMU_TORSO"), Fault("imu_invalid", "IMU_PELVIS")])
