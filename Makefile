@@ -20,7 +20,8 @@ demo-air:
 
 # The port differs from the default port, where subscribers expect the demo. After a failure, the walk compiles the functions.
 compile-ground:
-	@folder=$$(mktemp -d); trap 'rm -rf "$$folder"' EXIT; echo 'listen = "tcp/127.0.0.1:7499"' >"$$folder/telemetry.toml"; \
+	@folder=$$(mktemp -d); trap 'rm -rf "$$folder"' EXIT; trap 'exit 1' HUP INT TERM; \
+	  echo 'listen = "tcp/127.0.0.1:7499"' >"$$folder/telemetry.toml"; \
 	  $(BIN)/atalante walk --steps 1 --telemetry "$$folder/telemetry.toml" >/dev/null 2>&1 || true
 
 # Two short runs compile the numeric functions while `lint` runs, so the tests do not compile them in every process.
