@@ -86,7 +86,7 @@ class Run:
             self.codes = {event.code for event in self.events}
 
 
-@pytest.mark.sample(2)
+@pytest.mark.sample(3)
 @pytest.mark.parametrize("cell", ["RL", "all"])
 @pytest.mark.parametrize("foot", range(2))
 def test_f76_wrong_sign_of_cells_is_found_when_the_robot_is_set_down(robot, cell: str, foot: int) -> None:
@@ -112,7 +112,7 @@ def test_f78_exchanged_feet_are_found_before_the_first_step(robot) -> None:
     assert all(min(load) > 50.0 for load, _ in run.forces[-128:])  # both feet are still on the ground
 
 
-@pytest.mark.sample(2)
+@pytest.mark.sample(3)
 @pytest.mark.parametrize(
     ("joint", "rate"), [("LEFT_SA", 2.5), ("RIGHT_SA", -2.5), ("LEFT_HA", -2.5), ("RIGHT_HA", 2.5)]
 )
@@ -128,7 +128,7 @@ def test_f79_drift_of_an_ankle_encoder_is_found_while_the_robot_stands(robot, jo
     assert S.FULL_ASSIST in run.states
 
 
-@pytest.mark.sample(2)
+@pytest.mark.sample(3)
 @pytest.mark.parametrize("engine", ENGINES)
 @pytest.mark.parametrize("patient", [PATIENT, None], ids=["patient", "empty"])
 def test_f81_exchanged_imus_of_the_trunk_are_found(robot, engine: str, patient: Patient | None) -> None:
