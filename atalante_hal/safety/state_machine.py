@@ -30,7 +30,7 @@ class Conditions:
     #: True during a walk on the ground if STOP is requested, the dead-man is released, or the pendant has timed out.
     #: False if HOLD is requested.
     walk_end_requested: bool = False
-    #: confirmed diagnostics that lead to FINISH_STEP instead of HOLD, because the robot walks on the ground
+    #: confirmed diagnostics that lead to FINISH_STEP instead of HOLD or FULL_ASSIST, because the robot walks on the ground
     walk_ends: frozenset[Dtc] = frozenset()
 
 
@@ -61,7 +61,7 @@ def next_state(state: SupervisorState, conditions: Conditions) -> tuple[Supervis
     - ACTIVE, FULL_ASSIST, FINISH_STEP -> the state that the worst diagnostic demands, if this state is worse. In these
       three states, a released dead-man or `Conditions.stop_requested` adds the diagnostic `OPERATOR_STOP`
     - ACTIVE, FULL_ASSIST -> FINISH_STEP if the operator requests STOP or releases the dead-man while the robot walks on
-      the ground. The diagnostics in `Conditions.walk_ends` demand FINISH_STEP instead of HOLD
+      the ground. The diagnostics in `Conditions.walk_ends` demand FINISH_STEP instead of their reaction
     - FINISH_STEP -> HOLD when the step is finished
     - OFF -> READY if every required node is trusted and no diagnostic demands a reaction; otherwise READY -> OFF
     - only if START is pressed and the cause is gone: READY, HOLD, FULL_ASSIST -> ACTIVE; LOWER -> HOLD;

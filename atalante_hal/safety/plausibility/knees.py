@@ -60,7 +60,7 @@ _SETTLING_TIME = 2.0
 _LEAST_LEVER = 0.007
 #: An error of a knee angle is reported only if it explains more than this share of the mean square of v.
 #: v in `knee_error` is the filtered difference between the measured and the computed position of the tibia IMU.
-#: The part of this difference that wrong segment lengths explain is subtracted from v.
+#: v does not contain the part of this difference that wrong segment lengths explain.
 _SHARE = 0.25
 #: Number of low-passes for each axis of a leg.
 _FILTERS = 11

@@ -114,7 +114,7 @@ class WalkConfig:
     #: As `alpha`, but only for sagittal hip and knee in a guided step. With `alpha`, their drives would reach the torque limit.
     #: For all other joints, `alpha` applies. With `guided_alpha` for all joints, the robot would fall.
     guided_alpha: float = 0.5
-    #: s, time in which the smallest permitted weight of the backup torque falls from 1 to 0 at the start of a guided step
+    #: s, time in which the smallest permitted weight of the backup torque falls from 1 to 0 at the start of a guided step.
     #: The backup torque holds the leg inside the guide.
     engage: float = 0.02
     #: s, duration of the change from the guide to the baseline controller, for sagittal hip and knee, after a guided step

@@ -36,11 +36,11 @@ class WalkResult:
     outcome: str  # how the walk ended: stood, fell, stopped, hold or fault
     engine: str | None  # physics engine of the emulated robot; None means the real robot
     xi: float
-    shape: str | None  # guide shape; None at Xi = 1, where there is no guide
+    shape: str | None  # guide shape; None if `xi` is 1 and no step was guided
     #: Assistance factor of the guide with the smallest promise of all guided steps. The next three fields describe this guide.
-    #: None at Xi = 1, where there is no guide.
+    #: None if `shape` is None.
     promise_xi: float | None
-    certified: bool | None  # whether the guide is certified; None at Xi = 1, where there is no guide
+    certified: bool | None  # whether the guide is certified; None if `shape` is None
     #: Certified disturbance torque at the sagittal hip [Nm]; None if no torques are certified.
     #: Hip and knee stay in the guide under disturbances up to `promise_hip_nm` at the hip and `promise_knee_nm` at the knee.
     promise_hip_nm: float | None
