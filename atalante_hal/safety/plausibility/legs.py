@@ -23,6 +23,10 @@ the motion of the joint. The check uses this change, so that a stuck encoder is 
 `attitude_error`. The threshold also covers the effect of a misaligned IMU (`misalignment`) while the leg turns about
 another axis. If the readings of SH and SK are both constant, both are reported. Unlike the module `stillness`, the
 standstill check needs no torque, so it also covers a joint that other joints move.
+The attitude of an intact IMU has an error that changes slowly. This changes both the difference and the angles from the IMUs,
+as if the leg turned. So the check follows a slow change of the difference. It follows faster while the gyros agree with the
+velocities of the encoders, because a joint that turns while its encoder is stuck is seen by the gyros. If such a joint turns at
+less than 0.014 rad/s, it is reported as a drift when the difference exceeds `attitude_error`.
 
 *Exchange.* If the encoders of a joint are exchanged between the legs, each encoder reports the angle of the other leg. So the
 errors of both legs are opposite, and their size is the difference between the two readings. The joint is reported when
@@ -62,9 +66,15 @@ EXCHANGE_SAMPLES = 2
 #: If they are exchanged, the left error (encoder minus IMU) is 3 degrees, and the right error is -3 degrees.
 #: Each error may deviate by 0.35 * 3 degrees.
 _AGREEMENT = 0.35
-#: Drift of the angle between pelvis IMU and tibia IMU that the standstill check tolerates in each sample [rad].
-#: The drift of intact IMUs is less than a tenth of this value.
+#: Change of the error about an axis that the standstill check tolerates in each sample [rad], while the gyros contradict the
+#: encoders. The heading drift of intact IMUs is less than a tenth of this value.
 _IMU_DRIFT = 2e-5
+#: Like `_IMU_DRIFT`, while the gyros agree with the encoders. Random attitude errors of 4 mrad rms of both IMUs with a time
+#: constant of 10 s change the error by 0.11 mrad rms in a sample of 16 cycles.
+_IMU_WANDER = 2e-4
+#: The gyros agree with the encoders about an axis if the two angular velocities differ by at most this value [rad/s].
+#: It is 3.6 times the rms noise of the difference of two gyros.
+_GYRO_ERROR = 0.02
 #: The headings of intact IMUs drift slowly. The estimate of this drift changes by at most this angle in each sample [rad].
 #: A leg is sampled every 32 cycles, so the check follows at most 3e-4 rad/s.
 _HEADING_DRIFT = 1e-5
@@ -275,7 +285,9 @@ class Legs:
 
     def _check_standstill(self, leg: int, comparison: _Comparison) -> None:
         stuck = []
-        for index, constant in enumerate(self._constant_samples[leg].tolist()):
+        samples = self._constant_samples[leg].tolist()
+        rates: Sequence[float] = self._error_rates(leg, comparison) if any(samples) else ()
+        for index, constant in enumerate(samples):
             joint, axis = _HIPS[leg] + index, _AXIS_OF[index]
             moved = self._moved[joint]
             if not constant or moved is None:
@@ -289,12 +301,37 @@ class Legs:
             allowed = self._attitude_change + self._misalignment * turned + comparison.uncertainty + moved.uncertainty
             if min(abs(change), turned) <= allowed:
                 self._turned[joint] = 0
-                self._moved[joint] = _follow_imu_drift(moved, axis, change)
+                self._moved[joint] = _follow_imu_drift(moved, axis, change, rates[axis])
                 continue
             self._turned[joint] += 1
             if self._turned[joint] >= STANDSTILL_SAMPLES:
                 stuck.append(_stuck(joint, change))
         self._stuck[leg] = tuple(stuck)
+
+    def _error_rates(self, leg: int, comparison: _Comparison) -> tuple[float, float, float]:
+        """Return the velocities from the encoders minus those from the gyros, for FH, TH and SH + SK [rad/s].
+
+        The angular velocity of the tibia relative to the pelvis is the sum of the velocities of the joints about their axes. In
+        the pelvis frame, these are the axis x for FH, (0, -sin FH, cos FH) for TH, and the axis y of the tibia for SH + SK.
+
+        Args:
+            leg: index in SIDES.
+            comparison: comparison of this cycle.
+        """
+        now, tibia = self._now, _TIBIAE[leg]
+        attitude = turned_about_vertical(now.quaternion[tibia].tolist(), self.heading[leg].tolist())
+        w, i, j, k = now.quaternion[_PELVIS].tolist()
+        turning = to_world((w, -i, -j, -k), to_world(attitude, now.gyro[tibia].tolist()))
+        x, y, z = (now.gyro[_PELVIS] - turning).tolist()
+        fh, th, _ = comparison.angles
+        sagittal = (y * math.cos(fh) + z * math.sin(fh)) / math.cos(th)
+        four = slice(_HIPS[leg], _HIPS[leg] + len(_AXIS_OF))
+        velocity = (now.velocity[four] * self._to_joint[four]).tolist()
+        return (
+            velocity[0] + x + math.sin(th) * sagittal,
+            velocity[1] + z * math.cos(fh) - y * math.sin(fh),
+            velocity[2] + velocity[3] + sagittal,
+        )
 
     def _check_exchange(self, leg: int, comparison: _Comparison, ages: Ages | None) -> None:
         ours = comparison.errors
@@ -369,19 +406,22 @@ def extrapolated(quaternion: list[float], gyro: list[float], time: float) -> lis
     ]
 
 
-def _follow_imu_drift(moved: _Comparison, axis: int, change: float) -> _Comparison:
-    """Let the stored comparison `moved` follow a slow drift of the IMUs.
+def _follow_imu_drift(moved: _Comparison, axis: int, change: float, rate: float) -> _Comparison:
+    """Let the stored comparison `moved` follow a slow change of the attitude errors of the IMUs.
 
     Args:
         moved: comparison when the encoder reading of the joint last changed.
         axis: index in `_AXES`.
         change: change of the error about this axis since then [rad].
+        rate: velocity from the encoders minus that from the gyros about this axis [rad/s].
 
     Returns:
-        A copy of `moved`, whose error about the axis has changed by `change`, but by at most `_IMU_DRIFT`.
+        A copy of `moved`, whose error about the axis has changed by `change`, but by at most `_IMU_WANDER` if `rate` is at most
+        `_GYRO_ERROR`, and by at most `_IMU_DRIFT` otherwise.
     """
     errors = list(moved.errors)
-    errors[axis] += max(-_IMU_DRIFT, min(_IMU_DRIFT, change))
+    limit = _IMU_WANDER if abs(rate) <= _GYRO_ERROR else _IMU_DRIFT
+    errors[axis] += max(-limit, min(limit, change))
     return moved._replace(errors=(errors[0], errors[1], errors[2]))
 
 

@@ -25,6 +25,7 @@ from simulated_robot import (
     signs,
 )
 
+from atalante_emulator.imu import AttitudeError
 from atalante_emulator.mechanics import GROUND_PARAMETERS
 from atalante_hal.robot import IMUS, JOINTS, Robot
 from atalante_hal.safety.diagnostics import Dtc, Finding
@@ -775,9 +776,30 @@ class TestStandingEncoder:
     @pytest.mark.parametrize(
         ("change", "ignored"), [(0.5, 2e-5), (2.1e-5, 2e-5), (1e-5, 1e-5), (-1e-5, -1e-5), (-0.5, -2e-5)]
     )
-    def test_change_per_sample_without_turn_is_ignored_up_to_its_limit(self, axis: int, change: float, ignored: float):
+    @signs
+    def test_change_per_sample_without_turn_is_ignored_up_to_its_limit(
+        self, axis: int, change: float, ignored: float, sign: float
+    ):
+        self.check_ignored(axis, change, ignored, sign * float(np.nextafter(0.02, 1.0)))
+
+    @pytest.mark.parametrize("axis", range(3))
+    @pytest.mark.parametrize(
+        ("change", "ignored"), [(0.5, 2e-4), (2.1e-4, 2e-4), (1e-4, 1e-4), (-1e-4, -1e-4), (-0.5, -2e-4)]
+    )
+    @signs
+    def test_larger_change_per_sample_is_ignored_while_gyros_agree_with_encoders(
+        self, axis: int, change: float, ignored: float, sign: float
+    ):
+        self.check_ignored(axis, change, ignored, sign * 0.02)
+
+    def check_ignored(self, axis: int, change: float, ignored: float, rate: float) -> None:
+        """Check that the part `ignored` of a change of the error [rad] is ignored if the encoders turn at `rate` [rad/s].
+
+        The gyros report no turn.
+        """
         one_leg = OneLeg(0, attitude_error=0.0)
         angles, errors = [0.1, 0.2, 0.3], [0.1, 0.2, 0.3]
+        one_leg.now.velocity[axis] = rate
 
         def sample(turned: float, change: float) -> None:
             one_leg.show([angle + turned for angle in angles], [e + change * (i == axis) for i, e in enumerate(errors)])
@@ -791,6 +813,93 @@ class TestStandingEncoder:
         for _ in range(2):
             sample(0.5, 1.0)
         assert only(one_leg.stuck()).value == pytest.approx(ignored - 1.0, abs=1e-12)
+
+    @pytest.mark.parametrize("leg", [0, 1])
+    @pytest.mark.parametrize("index", range(4))
+    @pytest.mark.parametrize(
+        ("difference", "ignored"), [(0.0199, 2e-4), (-0.0199, 2e-4), (0.0201, 2e-5), (-0.0201, 2e-5)]
+    )
+    def test_gyros_are_compared_with_encoders_of_a_turning_robot(
+        self, leg: int, index: int, difference: float, ignored: float
+    ):
+        """Pelvis and joints turn fast. The heading of the tibia IMU has drifted. One encoder has another velocity."""
+        # With a negative `attitude_error`, the estimated heading drift does not change.
+        robot = replace(ROBOT, gear=np.full(12, 2.0), polarity=np.full(12, -1.0))
+        one_leg, joint, axis = OneLeg(leg, robot=robot, attitude_error=-1.0), 6 * leg + index, min(index, 2)
+        pelvis, angles, rates = tilted(0.3, -0.4, 0.9), (0.2, -0.3, 0.7), np.array([0.6, -0.8, 1.1, -0.4])
+        turning, half = np.array([0.5, -0.7, 0.9]), 0.35
+        x, y, z = np.eye(3)
+        to_pelvis = pinocchio.Quaternion(*tibia_attitude(*angles)).toRotationMatrix()
+        fh, th = (pinocchio.AngleAxis(angle, one).toRotationMatrix() for angle, one in ((0.2, x), (-0.3, z)))
+        turned = x * rates[0] + fh @ z * rates[1] + fh @ th @ y * (rates[2] + rates[3])
+        now = one_leg.now
+        now.gyro[PELVIS], now.gyro[TIBIAE[leg]] = turning, to_pelvis.T @ (turning + turned)
+        now.velocity[6 * leg : 6 * leg + 4] = rates
+        now.velocity[joint] += difference
+        now.velocity[:] *= -2.0
+        one_leg.legs.heading[leg] = math.cos(half), math.sin(half)
+
+        def sample(turned: float, change: float) -> float:
+            shown, errors = list(angles), [0.0, 0.0, 0.0]
+            shown[axis] -= turned
+            errors[axis] += change
+            one_leg.show(shown, errors)
+            now.position[:] *= -2.0
+            now.quaternion[PELVIS] = pelvis
+            tibia = product(pelvis, now.quaternion[TIBIAE[leg]].tolist())
+            now.quaternion[TIBIAE[leg]] = turned_about_vertical(tibia, (math.cos(half), -math.sin(half)))
+            one_leg.compare()
+            return sum(finding.value for finding in one_leg.stuck())
+
+        one_leg.standing[joint] = 0
+        sample(0.0, 0.0)
+        one_leg.standing[joint] = 1
+        assert [sample(0.0, 0.003), sample(0.03, 0.03)] == [0.0, 0.0]
+        assert sample(0.03, 0.03) == pytest.approx(ignored - 0.03, abs=1e-9)
+
+    @pytest.mark.parametrize("swing", [0.0, 0.1])
+    def test_attitude_errors_of_intact_imus_report_nothing_while_encoders_are_constant(self, swing: float):
+        """The drives are off for five minutes, with TH at its end stop. The robot swings with the crane."""
+        parameters, generator = GROUND_PARAMETERS.imu, np.random.default_rng(0)
+        drawn = 8  # samples of 16 cycles between two draws
+        error = AttitudeError(parameters, len(IMUS), drawn * 16 * PERIOD, generator)
+        one_leg = OneLeg(0)
+        one_leg.standing[:4] = 1
+        angles = (-0.01, 0.349, 0.2)
+        one_leg.show(angles, (0.0, 0.0, 0.0))
+        leg, now, both = tibia_attitude(*angles), one_leg.now, [PELVIS, TIBIAE[0]]
+        for sample in range(int(300.0 / (16 * PERIOD))):
+            if sample % drawn == 0:
+                error.draw()
+            phase = 3.0 * sample * 16 * PERIOD
+            pelvis = tilted(swing * math.sin(phase), 0.0)
+            attitudes = np.tile(IDENTITY, (len(IMUS), 1))
+            attitudes[both] = pelvis, product(pelvis, leg)
+            error.apply(sample % drawn / drawn, attitudes)
+            turning = np.array([3.0 * swing * math.cos(phase), 0.0, 0.0])
+            now.quaternion[:] = attitudes
+            now.gyro[:] = parameters.gyro_noise * generator.standard_normal((len(IMUS), 3))
+            now.gyro[PELVIS] += turning
+            now.gyro[TIBIAE[0]] += pinocchio.Quaternion(*leg).inverse() * turning
+            one_leg.compare()
+            assert one_leg.legs.findings() == ()
+
+    @joints
+    @signs
+    def test_slow_turn_of_a_joint_with_stuck_encoder_is_found(self, joint: int, sign: float):
+        """The joint turns slowly, without torque. An even slower turn is found as a drift."""
+        if JOINTS[joint].endswith(("SA", "HA")):  # no IMU is below this joint
+            return
+        for speed, dtc, cycles in ((0.035, Dtc.ENC_STUCK, 240), (0.01, Dtc.ENC_DRIFT, 3300)):
+            robot, turn = self.standing(joint)
+
+            def still(now: Signals, robot: SimulatedRobot = robot, turn=turn, speed: float = speed) -> None:
+                now.position[:] = MIDDLE * GEAR
+                now.velocity[:] = 0.0
+                turn(sign * speed * (robot.time - 0.04))
+
+            assert robot.until_found(dtc, cycles, still) > 150
+            assert {finding.dtc for finding in robot.checks.findings} == {dtc}
 
     @pytest.mark.parametrize("leg", [0, 1])
     @pytest.mark.parametrize(
