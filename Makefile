@@ -15,11 +15,11 @@ demo: .venv/installed-all ## walk in the air inside each guide shape, then on th
 	@$(MAKE) --no-print-directory -j 2 demo-air compile-ground
 	$(BIN)/atalante walk --steps 4 --xi 0.5 --wearer passive --out $(OUT)/walk
 
-demo-air:
+demo-air: .venv/installed-all ## the part of `demo` in the air
 	$(BIN)/atalante demo --out $(OUT)/demo
 
 # The port differs from the default port, where subscribers expect the demo. After a failure, the walk compiles the functions.
-compile-ground:
+compile-ground: .venv/installed-all ## compile the functions of a walk on the ground, as a part of `demo`
 	@folder=$$(mktemp -d); trap 'rm -rf "$$folder"' EXIT; trap 'exit 1' HUP INT TERM; \
 	  echo 'listen = "tcp/127.0.0.1:7499"' >"$$folder/telemetry.toml"; \
 	  $(BIN)/atalante walk --steps 1 --telemetry "$$folder/telemetry.toml" >/dev/null 2>&1 || true

@@ -346,6 +346,7 @@ def test_robot_makes_a_stop_step_without_the_data_of_a_foot(feet: tuple[int, ...
     assert controller.max_dcm_error < 0.05
 
 
+@pytest.mark.sample(2)
 @pytest.mark.parametrize("lost", [("torso", "pelvis"), IMUS])
 def test_robot_makes_a_stop_step_without_the_imus_of_the_trunk(lost: tuple[str, ...]) -> None:
     controller, phases = walked("mujoco", 100, finish_after=1, lost_imus=list(map(IMUS.index, lost)))

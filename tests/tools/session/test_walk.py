@@ -100,6 +100,7 @@ def test_stop_of_the_pendant_in_a_walk_ends_it_on_both_feet(
     assert 1.0 - 2.0 * (x * x + y * y) > 0.99
 
 
+@pytest.mark.sample(2)
 @pytest.mark.parametrize("turn", [0.0, math.radians(3.0)])
 def test_push_begins_at_its_phase_in_a_right_stance_step_and_acts_relative_to_the_line(turn: float) -> None:
     controller = WalkController(ROBOT, PATIENT, load_walk(DEFAULT_WALK, ROBOT), 4, WalkConfig(turn=turn))
