@@ -32,7 +32,7 @@ BASE, FACTOR, OFFSET = range(3)
 NO_CODE = -1
 # Results of `read_row`. INSIDE: all signals are in range.
 # OUTSIDE: a signal is out of range, and no signal is marked as invalid.
-# MARKED_INVALID: a signal is out of range, and the sender marked at least one signal as invalid (with its invalid code).
+# MARKED_INVALID: a signal is out of range, and the same or another signal has its invalid code.
 INSIDE, OUTSIDE, MARKED_INVALID = range(3)
 #: Adding and then subtracting this number rounds a float64 to an integer of at most 51 bits (`LONGEST_SIGNAL`).
 _ROUND = 1.5 * 2.0**52

@@ -118,7 +118,7 @@ class Inertial:
         )  # fmt: skip
         self._intervals = itertools.cycle(intervals)
         self._interval = 0  # time since the last call of `evaluate` [cycles]
-        #: Arguments of the function `follow` after the ages and the interval. The array objects are the same in every call.
+        #: Arguments of the function `follow` from the third on. The array objects are the same in every call.
         self._readings = (
             Readings(now.quaternion, now.gyro, now.accel), record, self._excess, limits,
             period, 2.0 * robot.sensors.attitude_error,

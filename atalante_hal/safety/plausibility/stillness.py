@@ -92,7 +92,7 @@ class Drive(NamedTuple):
     """
 
     cycles: Vector  # number of cycles since the encoder reading last changed
-    rest: Vector  # torque that holds the joint at rest [Nm], measured in the third cycle (`_AT_REST`) with a constant reading
+    rest: Vector  # torque that holds the joint [Nm]: the torque in the third cycle (`_AT_REST`) with an unchanged encoder reading
     low: Vector  # lowest torque since the encoder reading last changed [Nm]
     high: Vector  # highest torque since the encoder reading last changed [Nm]
     momentum: Vector  # angular momentum of the simulated joint [Nm s], at least 0

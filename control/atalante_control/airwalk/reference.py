@@ -60,7 +60,7 @@ class GaitReference:
         self._basis[0, :, :_N], self._basis[0, :, _N:] = c0[:end, None], c0d[:end, None]
         self._basis[1, :, :_N], self._basis[1, :, _N:] = c1[:end, None], c1d[:end, None]
         self._added = np.zeros_like(self._basis)
-        # `_angles` holds the angle deviations s(0) of the 12 joints twice: for the s columns and for the s' columns of `_basis`.
+        # `_angles` holds the angle deviations s(0) of the 12 joints twice, because s(0) scales the columns of s and those of s'.
         # `_rates` holds the speed deviations s'(0) in the same way.
         self._angles, self._rates = np.zeros(2 * _N), np.zeros(2 * _N)
 

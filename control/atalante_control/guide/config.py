@@ -41,8 +41,8 @@ class StepGuideConfig:
     #: Factor in [0, 1] on the feedforward torque u_f, which accelerates the leg along q_des.
     #: The factor applies while the backup torque has weight 0.
     feedforward: float = 1.0
-    #: Counter value above which the controller reports that the leg has left a guide with a promise.
-    #: The counter rises by 1 in each cycle with h < 0 in such a guide. In every other cycle it falls by 1, but not below 0.
+    #: If a counter exceeds this value, the controller reports that the leg has left its guide. The counter rises by 1 in each
+    #: cycle with h < 0 in a guide with certified torques. In every other cycle it falls by 1, but not below 0.
     outside_cycles: int = 150
     active: float = 0.05  # weight of the backup torque above which the filter is considered active
 

@@ -168,7 +168,7 @@ class WalkController:
         )
         #: Index of the IMU in use (pelvis or torso) -> sensor arrays that the kernels read.
         self._measured_by = {_PELVIS: self._measured, _TORSO: self._measured}
-        #: Sensor arrays while the data of pelvis IMU and torso IMU is lost. `gyro` is an array of the controller.
+        #: Arrays that the kernels read while the data of both trunk IMUs is lost. A kernel writes the computed rates into `gyro`.
         self._without_trunk = self._measured
         self._gyro_source = TRUNK
         stages: Records[Stage] = zeros(Stage, 1)

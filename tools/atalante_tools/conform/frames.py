@@ -85,7 +85,7 @@ class MessageSender:
 
     @property
     def counter(self) -> int:
-        """Return the alive counter of the last frame. Frames whose alive counter the caller chose do not count."""
+        """Return the alive counter of the last frame whose counter the caller did not choose."""
         return self._counter
 
 

@@ -46,7 +46,7 @@ LOG = (
     "rate_hip",
     "rate_knee",
 )
-#: Number of values to which a push can react (`Push.feedback`): tracking error and error rate, each of hip and knee.
+#: Number of values that can set the sign of a push (`Push.feedback`): tracking error and error rate, each of hip and knee.
 FEATURES = 4
 #: Unit of the error rate in `Push.feedback` [rad/s]: a rate of 0.5 rad/s counts as 1.
 RATE = 0.5

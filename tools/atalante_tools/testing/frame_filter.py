@@ -176,7 +176,7 @@ class FrameFilter(WrappedBus):
         try:
             self.bus.send(frames)
         except BusError as error:
-            # Store in the error the frames that the bus accepted.
+            # `error.accepted` must contain the frames that the bus accepted.
             # They can differ from the frames of the caller, because faults drop, delay or change frames.
             error.accepted = accepted = error.accepted_of(frames)
             if self.tap is not None and error.sent:

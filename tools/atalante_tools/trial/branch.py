@@ -71,7 +71,7 @@ class Continuation:
 
 
 class _NoAnswer:
-    """Message of the waiting process to the run: the process that continued the run ended without an answer.
+    """Message of the waiting process to its parent: the process that continued the run ended without an answer.
 
     Attributes:
         exit_code: exit code of the ended process; the negative number of the signal if a signal ended it.

@@ -14,8 +14,8 @@ from atalante_tools.canlog.validate.findings import Findings
 
 Steps = npt.NDArray[np.int64]
 
-#: Increment `REPEATED`: the alive counter did not change, so the frame repeats the previous frame.
-#: Increment `NO_STEP`: unknown, because the frame has no alive counter or is the first frame of its message.
+#: The increment is `REPEATED` if the alive counter did not change: the frame repeats the previous frame.
+#: The increment is `NO_STEP` if it is unknown: the frame has no alive counter or is the first frame of its message.
 REPEATED, NO_STEP = 0, -1
 
 

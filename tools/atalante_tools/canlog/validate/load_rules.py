@@ -126,7 +126,7 @@ class LoadRules:
         seconds = self._of_row[at]
         if self._keeps_flags:
             usual = known & (headers == self._plan.headers[rows])
-        else:  # the header does not show whether the frame is CAN FD, so a known message has the time of its layout
+        else:  # the log does not show which frames are CAN FD, so the DBC gives the wire time of a known message
             usual = known & ((chunk.frames["can_id"] & np.uint32(ID_REMOTE)) == 0)
         if not bool(usual.all()):
             self._time_unusual(chunk, np.flatnonzero(~usual), seconds)
