@@ -5,24 +5,14 @@ OUT ?= runs
 # The demo and the tests start many processes, so modules must be compiled only once.
 export PYTHONDONTWRITEBYTECODE :=
 
-.PHONY: help demo demo-air compile-ground test test-long compile test-vcan lowest fuzz coverage mutation lint docs bench messages supervisor-table clean
+.PHONY: help demo test test-long compile test-vcan lowest fuzz coverage mutation lint docs bench messages supervisor-table clean
 
 help: ## list all targets (default)
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / { printf "%-18s %s\n", $$1, $$2 }' $(firstword $(MAKEFILE_LIST))
 
-# The demo in the air uses one core. The other core compiles the functions of the walk on the ground in the meantime.
 demo: .venv/installed-all ## walk in the air inside each guide shape, then on the ground, on the emulated robot
-	@$(MAKE) --no-print-directory -j 2 demo-air compile-ground
-	$(BIN)/atalante walk --steps 4 --xi 0.5 --wearer passive --out $(OUT)/walk
-
-demo-air: .venv/installed-all ## the part of `demo` in the air
 	$(BIN)/atalante demo --out $(OUT)/demo
-
-# The port differs from the default port, where subscribers expect the demo. After a failure, the walk compiles the functions.
-compile-ground: .venv/installed-all ## compile the functions of a walk on the ground, as a part of `demo`
-	@folder=$$(mktemp -d); trap 'rm -rf "$$folder"' EXIT; trap 'exit 1' HUP INT TERM; \
-	  echo 'listen = "tcp/127.0.0.1:7499"' >"$$folder/telemetry.toml"; \
-	  $(BIN)/atalante walk --steps 1 --telemetry "$$folder/telemetry.toml" >/dev/null 2>&1 || true
+	$(BIN)/atalante walk --steps 4 --xi 0.5 --wearer passive --out $(OUT)/walk
 
 # Two short runs compile the numeric functions while `lint` runs, so the tests do not compile them in every process.
 # With worksteal, the tests of a file mostly run in one worker, so their shared fixtures are created only once.
