@@ -17,7 +17,7 @@ import numpy as np
 from atalante_dbc import Network
 from atalante_hal.leg_model import LegModel
 from atalante_hal.pendant import Pendant
-from atalante_hal.robot import IMUS, JOINTS, Robot
+from atalante_hal.robot import JOINTS, Robot
 from atalante_hal.safety.diagnostics import Dtc, Finding, Reaction
 from atalante_hal.safety.direction import DirectionProof
 from atalante_hal.safety.events import Event
@@ -27,7 +27,7 @@ from atalante_hal.safety.hold_stability import HoldStability, Measured
 from atalante_hal.safety.limiter import Limiter
 from atalante_hal.safety.message_monitor import GROUND_TOLERANCE, NO_TOLERANCE, MessageMonitor, Tolerance
 from atalante_hal.safety.plausibility import Plausibility
-from atalante_hal.safety.plausibility.finding import IMU_NODES, JOINT_MESSAGES, rows_of
+from atalante_hal.safety.plausibility.finding import IMU_NODES, JOINT_MESSAGES, TRUNK_NODES, rows_of
 from atalante_hal.safety.start import (
     ENABLE_CYCLES,
     PROGRAM_ENDS,
@@ -62,8 +62,6 @@ _FAULTY = (DriveState.FAULT, DriveState.FAULT_REACTION_ACTIVE)
 _IMPLAUSIBLE = frozenset({Dtc.IMU_IMPLAUSIBLE})
 #: Codes of an IMU whose values are not used.
 _REJECTED = frozenset({Dtc.IMU_INVALID, Dtc.IMU_SATURATED, Dtc.IMU_STUCK})
-#: DBC names of the IMUs of the trunk.
-_TRUNK_NODES = frozenset(IMU_NODES[IMUS.index(imu)] for imu in ("torso", "pelvis"))
 _S = SupervisorState
 #: States in which START can change the state.
 #: In OFF and FINISH_STEP, START only acknowledges faults. In ACTIVE, START has no effect.
@@ -372,7 +370,7 @@ class SafetyMonitor:
         """
         memory = self.memory
         ends = memory.walk_ends(DRIVE_NODES)
-        return ends | _REJECTED if _TRUNK_NODES.issubset(memory.nodes_of(_REJECTED)) else ends
+        return ends | _REJECTED if set(TRUNK_NODES).issubset(memory.nodes_of(_REJECTED)) else ends
 
     def _tolerance(self) -> Tolerance:
         """Return the tolerance of timeouts in this cycle.

@@ -23,6 +23,8 @@ JOINT_NODES, IMU_NODES, FOOT_NODES = (
     tuple(message.removesuffix("_STATE") for message in messages)
     for messages in (JOINT_MESSAGES, IMU_MESSAGES, FOOT_MESSAGES)
 )
+#: DBC names of the IMUs of the trunk.
+TRUNK_NODES = tuple(IMU_NODES[IMUS.index(imu)] for imu in ("torso", "pelvis"))
 #: Quantities of a joint or IMU message that are rejected together if one of them is implausible.
 #: Reason: checks and controllers need values that were measured at the same time.
 #: Joints: the limiter, the velocity check and the controllers need position and velocity of the same time.

@@ -6,7 +6,7 @@ from typing import Final
 
 from atalante_emulator.faults import Fault
 from atalante_hal.robot import CELLS
-from atalante_hal.safety.plausibility.finding import FOOT_NODES
+from atalante_hal.safety.plausibility.finding import FOOT_NODES, TRUNK_NODES
 from atalante_tools.faults.catalogue import SCENARIOS
 from atalante_tools.faults.scenario import MID_SWING, Case, HostFault
 from atalante_tools.trial.fault_plan import PERMANENT
@@ -17,16 +17,15 @@ def _no_load(*feet: str) -> tuple[Fault, ...]:
     return tuple(Fault("value", f"{foot}_STATE", 0, None, **{f"{cell}_ForceZ": 0.0 for cell in CELLS}) for foot in feet)
 
 
-_TRUNK: Final = ("IMU_TORSO", "IMU_PELVIS")
 #: Fault ID -> cases that are possible only in a walk on the ground.
 #: In fault F41, the HAL is killed. The HAL of a trial runs in the process of the trial, so the HAL pauses for 6 s instead.
 #: A pause has the same effect: the drives receive no frames. After the pause, the HAL is in HOLD and does not move the robot.
 _GROUND_CASES: Final = {
     "F19": (
-        Case("both IMUs of the trunk", tuple(Fault("silence", imu) for imu in _TRUNK)),
+        Case("both IMUs of the trunk", tuple(Fault("silence", imu) for imu in TRUNK_NODES)),
         Case("both feet", tuple(Fault("silence", foot) for foot in FOOT_NODES)),
     ),
-    "F30": (Case("both IMUs of the trunk", tuple(Fault("imu_invalid", imu) for imu in _TRUNK)),),
+    "F30": (Case("both IMUs of the trunk", tuple(Fault("imu_invalid", imu) for imu in TRUNK_NODES)),),
     "F34": (
         Case("both feet report no load", _no_load(*FOOT_NODES)),
         *(Case(f"{foot} reports no load", _no_load(foot), dtc="FOOT_CELL") for foot in FOOT_NODES),
