@@ -86,7 +86,7 @@ def specialised(function: Callable[P, R], *args: P.args, **kwargs: P.kwargs) -> 
         except _numba().core.errors.NumbaError:  # raised if the function creates an array, or if the call is wrong
             pass
     code = cast(Callable[P, R], _machine_code(function, args, True))
-    if not counted:  # compiles only with reference counts, so the function creates an array
+    if not counted:  # the function compiles only with reference counts, so it creates an array
         _CREATES_ARRAYS[function] = True
         _mark(function)
     return code
@@ -96,7 +96,7 @@ def _machine_code(function: Callable[..., Any], args: tuple[Any, ...], counted: 
     """Compile a function, call it once, and return its machine code for the types of the arguments."""
     dispatcher = _compiled(function, counted)
     dispatcher(*args)
-    if len(dispatcher.overloads) == 1:  # compiled for only one set of argument types, so take this version
+    if len(dispatcher.overloads) == 1:  # numba compiled the function for one set of types, so return this machine code
         (only,) = dispatcher.overloads.values()
         return only.entry_point
     return dispatcher.get_overload(tuple(dispatcher.typeof_pyval(arg) for arg in args))

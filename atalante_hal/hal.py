@@ -35,8 +35,8 @@ from atalante_hal.wire.process_image import NEVER, ReceiveImage
 SATURATED_CYCLES = 200
 #: Largest number of consecutive controller exceptions that the HAL bridges while the robot walks on the ground.
 #: After a bridged exception, the HAL sends the last torques again.
-#: The next consecutive exception confirms CONTROLLER_LOST, which leads to HOLD.
-#: A drive bridges the same number of lost commands in a row.
+#: If more than `BRIDGED_ERRORS` consecutive cycles have an exception, CONTROLLER_LOST is confirmed, which leads to HOLD.
+#: A drive bridges the same number (`BRIDGED_ERRORS`) of consecutive lost commands.
 BRIDGED_ERRORS = 4
 #: Longest total wait for the nodes' answers while `Hal.stop` puts the robot into HOLD [s].
 STOP_PATIENCE = 1.0
@@ -188,10 +188,10 @@ class Hal:
         self._transceiver.foreign(frames[~slow][first[:RECEIVE_BUDGET]])
 
     def _apply(self, verdict: Verdict) -> None:
-        """Apply the safety monitor's verdict on this cycle: set HalState, MaxTorque and the header of the record.
+        """Apply the result of the safety monitor in this cycle: set HalState, MaxTorque and the header of the record.
 
         Args:
-            verdict: Verdict of the current cycle.
+            verdict: Result of the safety monitor in this cycle.
         """
         self._commands.announce(verdict.supervisor)
         self._commands.limit[:] = verdict.torque_limit
@@ -237,7 +237,7 @@ class Hal:
             safety_monitor.report(Dtc.GUIDE_OUTSIDE, text, False)
         self._commands.drive(self._limiter.last, command.vibration)
         sent = self._send_command()
-        self._errors = 0  # reset at the end, because each statement above can raise an exception
+        self._errors = 0  # counts consecutive exceptions; each statement above can raise one, so reset the count last
         return sent
 
     def hold(self) -> Vector:
@@ -258,7 +258,7 @@ class Hal:
             state.supervisor in (_S.LOWER, _S.FAULT) or (state.supervisor is _S.HOLD and safety_monitor.start_prevented)
         ):
             # The operator acknowledged the faults with START. So each drive in FAULT is reset; the other drives continue to hold.
-            # In HOLD, a drive in FAULT needs the reset, too: until then, its emergency message is active and prevents the start.
+            # In HOLD, too, each drive in FAULT must be reset: its active emergency prevents the start until the drive is reset.
             control[state.drive_state == DriveState.FAULT] = Controlword.FAULT_RESET
             safety_monitor.enabling = False
         elif (

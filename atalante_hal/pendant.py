@@ -85,7 +85,7 @@ class Pendant:
         #: Assistance factor Xi in [0, 1]; None if the pendant sets no factor.
         self.assistance_factor: float | None = None
         #: RequestCounter of the last evaluated frame. None before the first frame and after a gap between cycles.
-        #: Also None after a cycle in which two pendants may have sent frames.
+        #: The RequestCounter is also None after a cycle in which two pendants may have sent frames.
         self._press: float | None = None
         self._pressed = False  # True while a press of START is stored until the pendant is qualified
 

@@ -45,7 +45,7 @@ class RobotError(ValueError):
 class Envelope:
     """Reduction of the torque near the limits of position and velocity, see `limiter`."""
 
-    look_ahead: float  # s, prediction time of the joint position, at constant velocity
+    look_ahead: float  # s, the limiter predicts the joint position this far ahead, at constant velocity
     #: If the predicted position is outside a position limit by this angle [rad] or more, the outward torque is 0.
     position_margin: float
     velocity_margin: float  # rad/s, excess over the velocity limit at which the accelerating torque is 0
@@ -71,7 +71,7 @@ class Sensors:
     #: Largest difference [rad] about each axis between the tibia attitude from the encoders and the tibia attitude from the IMUs.
     attitude_error: float
     #: While an encoder reading is constant, encoder angle minus IMU angle may change by at most this angle [rad].
-    #: If this difference changes by more, the joint moves although its encoder reading is constant, so the encoder is stuck.
+    #: If encoder angle minus IMU angle changes by more than `attitude_change`, the joint moves, so its constant encoder is stuck.
     attitude_change: float
     #: An IMU may be mounted askew. So this factor times the leg rotation [rad] is added to the limit `attitude_change`.
     #: Example: with a factor of 0.02, a leg rotation of 0.5 rad increases the limit by 0.01 rad.
@@ -89,7 +89,7 @@ class Thresholds:
     supply_low: float  # V at a drive; below this voltage the battery is nearly empty
     supply_under: float  # V at a drive; below this voltage the drives may soon fail to hold
     #: Walking is permitted while the torque limit of a hot drive is at least this share of the limit of the other leg's drive.
-    #: Example: with 0.5, a hot drive needs at least 100 Nm if the drive of the same joint in the other leg has 200 Nm.
+    #: Example: with 0.5, a hot drive needs a torque limit of at least 100 Nm if the same drive of the other leg has 200 Nm.
     derated_imbalance: float
     full_assist_ramp: float  # s, time for the ramp of the assistance factor from 0 to 1 in FULL_ASSIST
     #: Largest accepted angle [rad] outside a position limit. A joint beyond this angle is out of range.

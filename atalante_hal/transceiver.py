@@ -28,7 +28,7 @@ PERSISTENT = 5
 #: Time to listen for another HAL before the first SYNC [s].
 LISTEN = 0.2
 #: Shortened wait [s] for nodes that will probably not answer, for example because the last SYNC was not sent.
-#: The argument `patience` of `Transceiver.receive` describes all cases.
+#: `Transceiver.receive` lists all cases with a shortened wait, see its argument `patience`.
 _DOUBTFUL_PATIENCE = 0.1
 #: Class bit of an error frame that reports bus-off (linux/can/error.h).
 ERROR_BUS_OFF = 0x40
@@ -306,7 +306,7 @@ class Transceiver:
         missing = cycle.expected_ages()
         shortest = min(patience, _DOUBTFUL_PATIENCE)
         # If every node has timed out, `missing` is empty. In this case, receive frames until the bus is silent.
-        # Otherwise a late answer to this SYNC would be taken for an answer to the next SYNC.
+        # If the call did not wait, the HAL would regard a late answer to this SYNC as an answer to the next SYNC.
         until_silent = not missing
         begun = time.monotonic()
         while count < RECEIVE_BUDGET:

@@ -60,8 +60,9 @@ class State:
     #: One element per cyclic message: True if the data is new and plausible, and the sender is trusted (see `e2e.qualify`).
     valid: npt.NDArray[np.bool_]
     #: One element per cyclic message: age of the data [cycles], counted from the SYNC that the message answers.
-    #: If the motion of a joint (position, velocity) or of an IMU (quaternion, gyro, acceleration) was rejected: age of the last
-    #: accepted motion. The state, temperature and torque of the drive may be newer.
+    #: If the last received motion of a joint or an IMU was rejected, its element is the age of the last accepted motion.
+    #: Motion of a joint: position and velocity. Motion of an IMU: quaternion, gyro and acceleration.
+    #: The state, temperature and torque of a drive may be newer than the last accepted motion of its joint.
     age: npt.NDArray[np.int64]
     joints_valid: bool  # True if all twelve joint states are valid
     imu_rows: tuple[int, ...] = ()  # indices of the IMU messages in `valid` and `age`; empty if unknown
@@ -72,7 +73,7 @@ class State:
     #: Drives that hold their positions receive the torque 0, not the output of the limiter.
     torque_sent: Vector | None = None
     #: Number of cycles by which torques act late; 0 if every torque acts after the normal delay (`safety.direction.LATENCY`).
-    #: The test of the motors at START measures this number, see `safety.direction`.
+    #: The direction test of the motors at START measures this delay of the torques, see `safety.direction`.
     delay: int = 0
 
 
@@ -94,8 +95,8 @@ class Command:
     #: While `outside` and `guide_left` are True, GUIDE_OUTSIDE is confirmed, and the state FULL_ASSIST follows.
     guide_left: bool = False
     #: True if a step starts with a larger deviation than the certificate of the guide was calculated for.
-    #: Deviations: angle, speed, acceleration and torque jump.
-    #: The HAL then reports GUIDE_OUTSIDE as a pending diagnostic, to which the robot does not react.
+    #: The deviations at the start of the step are those of angle, speed and acceleration, and the torque jump.
+    #: If `hand_over_exceeded` is True, the HAL reports GUIDE_OUTSIDE as a pending diagnostic. The robot does not react to it.
     hand_over_exceeded: bool = False
 
 

@@ -172,7 +172,7 @@ _CONTROLLABLE = frozenset(
     }
 )
 #: Codes whose reaction is HOLD. If the affected node is a drive, the robot goes to HOLD at once.
-#: If the affected node is another node, such as an IMU or a foot, a walking robot may make some more steps before HOLD.
+#: If the affected node is not a drive, but for example an IMU or a foot, a walking robot may make some more steps before HOLD.
 #: Until the robot stands, the walking controller replaces the values of a lost IMU or of lost foot force sensors.
 _CONTROLLABLE_WITHOUT_SENSOR = frozenset(
     {

@@ -51,8 +51,8 @@ _SHORT = min(duration for _, duration in GROUPS)
 #: Delay [cycles] from a torque command to the first position that shows its effect, if no frame and no motor is late.
 LATENCY = 2
 #: Delays from torque to motion that the test tries [cycles]: `LATENCY` plus 0 to 3, because frames and motors may be late.
-#: Longer delays are not tried, because a reversed motor moves its joint almost like a correct motor that is 4 to 5 cycles late:
-#: in a pulse of 16 cycles, the largest and the smallest torque are 4.6 cycles apart.
+#: Longer delays are not tried, because a reversed motor moves its joint almost like a correct motor that is 4 to 5 cycles late.
+#: Reason: in a pulse of 16 cycles, the largest and the smallest torque are 4.6 cycles apart.
 LATENCIES = tuple(range(LATENCY, LATENCY + 4))
 #: Largest torque of the pulse, as a multiple of the breakaway torque `Robot.breakaway`. One value for each joint in LEG_JOINTS.
 #: The peaks of FH and SH are larger, because these joints move a whole leg.
@@ -65,14 +65,14 @@ DAMPING = (0.5, 0.5, 0.6, 0.25, 0.25, 0.25)
 INTEGRAL = 0.03
 #: A joint that moves farther than this from its initial position ends the start [rad].
 TRAVEL = math.radians(1.5)
-#: A foot is loaded if two conditions hold. The mean force on the foot during a test exceeds `LOAD * cell_free`.
-#: The mean force on at least two cells of the foot exceeds half of `LOAD * cell_free`.
+#: First condition for a loaded foot: the mean force on the foot during a test exceeds `LOAD * cell_free`.
+#: Second condition for a loaded foot: on at least two cells, the mean force exceeds half of `LOAD * cell_free`.
 #: `LOAD * cell_free` is about four times the rms noise of the mean force. The noise of a cell is half as large.
 LOAD = 1.0 / 3.0
-#: The forces on a foot in two consecutive cycles are added. The foot hit the floor if the sum exceeds `HIT * cell_free`.
-#: The sum must also differ from twice the median force of the test by more than `HIT * cell_free`.
-#: `HIT * cell_free` is about four times the rms noise of the sum.
-#: If the floor stops a moving ankle, the sum is at least 1.5 times `HIT * cell_free`.
+#: F is the sum of the forces on a foot in two consecutive cycles. The foot hit the floor if F exceeds `HIT * cell_free`.
+#: In addition, F must differ from twice the median force on the foot in the test by more than `HIT * cell_free`.
+#: `HIT * cell_free` is about four times the rms noise of F (sum of the forces on a foot in two consecutive cycles).
+#: If the floor stops a moving ankle, F (sum of the foot forces in two consecutive cycles) is at least 1.5 * `HIT * cell_free`.
 HIT = 2.0
 #: Factor by which the pulse is larger in the second test of a joint near its end stop.
 #: The leg weight may press the joint onto the end stop, so the normal pulse of the first test may not move the joint.
@@ -81,8 +81,8 @@ BOOST = 6.0
 TRIALS = 2
 #: A joint follows its torque if its mobility (acceleration per torque) is at least this [1/(kg m2)].
 #: One value for each joint in LEG_JOINTS.
-#: Each joint of a suspended robot has at least about twice this mobility.
-#: The bound holds for straight and bent legs, without a patient and with a patient of 110 kg.
+#: In a suspended robot, the mobility of each joint is at least about twice the value in `MOBILITY`.
+#: This factor of about 2 holds for straight and bent legs, without a patient and with a patient of 110 kg.
 MOBILITY = (0.045, 0.23, 0.075, 0.56, 4.6, 6.8)
 
 
@@ -180,12 +180,12 @@ class DirectionProof:
         #: Tests still to be done: indices in JOINTS of the tested joints, and duration of the pulse [cycles].
         self._tests: list[tuple[list[int], int]] = []
         self._trials = [0] * len(JOINTS)
-        # Extra delay [cycles], measured in tests of more than two joints and used in tests of one or two joints.
-        # A delay that is fitted to one or two joints might make a motor with a wrong sign look like a late motor.
+        # Extra delay [cycles], measured in tests of more than two joints. Tests of one or two joints only use it.
+        # Reason: a delay fitted to only one or two joints might make a motor with a wrong sign look like a late motor.
         self.late = 0
         #: Score of each delay in `LATENCIES`. The delay with the largest score explains the measured motions best.
         #: Each joint adds a share (0 to 1) to the score: the part of its motion that the torque with this delay explains.
-        #: Only joints that passed a test of more than two joints with a short pulse count.
+        #: A joint adds its share only if it passed a test with a short pulse and more than two joints.
         self._explained = np.zeros(len(LATENCIES))
         self._position: list[Vector] = []  # joint positions in each cycle of the current test
         #: Vertical forces on the cells of each foot in each cycle of the current test, shape (2, 4) [N].
@@ -254,7 +254,7 @@ class DirectionProof:
         if not travel.max() <= TRAVEL:
             far = np.flatnonzero(travel > 0.5 * TRAVEL)
             # Gravity makes both legs sag equally far, so a faulty joint moves farther than the same joint of the other leg.
-            # A faulty joint also moves its lighter neighbours. Light joints have a small stiffness `_kp`, so they count less.
+            # A faulty joint also moves its lighter neighbours. The factor `_kp` (stiffness) reduces the excess of light joints.
             excess = self._kp * np.abs(travel - np.roll(travel, len(LEG_JOINTS)))
             joint = int(far[np.argmax(excess[far])])
             self._fail(far.tolist())

@@ -27,7 +27,7 @@ from atalante_hal.wire.process_image import NEVER, ReceiveImage
 #: All other values mean that the node does not work, for example 4 (STOPPED) and 127 (PRE-OPERATIONAL).
 BOOT_UP, OPERATIONAL = 0, 5
 #: A frame has new data if its check result is at most this value: `Check.OK` (0) or `Check.SOME_LOST` (1).
-#: The constant is an integer, because numpy compares enum members ten times slower.
+#: `_FRESH` is a plain integer, because numpy compares enum members ten times slower.
 _FRESH = int(Check.SOME_LOST)
 #: Largest number of frames that `Heartbeats.essential` selects.
 _ESSENTIAL = 128
@@ -84,14 +84,14 @@ class Heartbeats:
         self._amplitude, self._amplitude_row = codec.slice("Amplitude"), codec.rows["HAPTICS_STATE"]
         self._seen = 0  # cycle of the last call of `image.new_cycle`
         #: Node -> diagnostic and error code of its active emergency. A cleared emergency is removed.
-        #: A new emergency replaces the entry, unless the new reaction is INFO or less severe than the old reaction.
+        #: A new emergency of a node replaces its old emergency, unless its reaction is INFO or less severe than the old reaction.
         self.emergencies: dict[str, tuple[Dtc, int]] = {}
         self._cleared: set[str] = set()  # nodes whose emergency was cleared in this cycle
         self._unreported: set[str] = set()  # nodes whose active emergency `evaluate` has not reported yet
         #: Nodes whose active emergency the last `evaluate` reported for the first time.
         self._just_reported: set[str] = set()
         #: Emergencies that were cleared before `evaluate` reported them, each as (node, diagnostic, error code).
-        #: The next `evaluate` reports them once.
+        #: The next `evaluate` reports each emergency in `_brief` once.
         self._brief: list[tuple[str, Dtc, int]] = []
         #: Events that the next `evaluate` raises only as pending diagnostics, each as (node, diagnostic, error code):
         #: - An emergency with the reaction INFO.
@@ -101,10 +101,10 @@ class Heartbeats:
         #: Nodes whose last status reports a state other than OPERATIONAL. A single BOOT_UP does not count.
         self._stopped: set[str] = set()
         #: Nodes that were reset: they reported a state other than OPERATIONAL at least once since the last `evaluate`.
-        #: The first status message of a node does not count.
+        #: The first status message of a node is ignored, because the first start of a node is not a reset.
         self._reset: set[str] = set()
         #: Row of a message in the process image -> counter that rises if two nodes seem to send this message, 0 to `FULL`.
-        #: At `FULL`, two senders are confirmed.
+        #: If the counter of a message reaches `FULL`, it is confirmed that two nodes send this message.
         self._evidence: defaultdict[int, int] = defaultdict(int)
         #: Nodes that sent a boot-up message. The safety monitor empties this set after each use.
         self.booted: set[str] = set()

@@ -44,20 +44,20 @@ SATURATED: Final = (0.9, 1.05)
 #: A drive is reported after this number of consecutive faulty cycles: cycles with overload, or with a motor without torque.
 OVERLOADED: Final = 20
 #: Overload is counted only while a joint is at least this far from the position in which the hold began [rad].
-#: A drive that reports a wrong torque but holds its joint keeps the joint within this distance, so no overload is counted.
+#: A drive that holds its joint keeps the joint within this distance. So a wrong reported torque alone is no overload.
 AWAY: Final = math.radians(1.0)
 #: A drive without torque is reported only if its joint is at least this far from the position in which the hold began [rad].
-#: At this distance, the stiffness of a working drive (`Robot.hold_kp`) demands more than half of `Robot.torque_max`.
+#: At the distance `SUNK`, a working drive with the stiffness `Robot.hold_kp` requests more than half of `Robot.torque_max`.
 SUNK: Final = math.radians(3.0)
 #: A drive without torque reports less than this share of its torque limit.
 POWERLESS: Final = 0.1
 #: If encoder and IMUs of a joint differ by more than this angle [rad], the encoder may be wrong.
-#: The drive is then not reported as a drive without torque, because the joint may not have moved.
+#: If its encoder may be wrong, a drive is not reported as a drive without torque, because the joint may not have moved.
 ENCODER_ERROR: Final = math.radians(1.0)
-#: A joint that moves back or slows down by more than this [rad/s] has a working drive. So the count of faulty cycles restarts.
-#: - Moves back: the joint moves faster than this towards the position in which the hold began.
-#: - Slows down: the joint moves away, but its speed is lower than in the first counted cycle by more than this.
-#: The value is larger than the noise of the velocities.
+#: The count of faulty cycles restarts if the joint moves back or slows down, because its drive then works.
+#: - Moves back: the joint moves towards the position in which the hold began, faster than `SLOWER` [rad/s].
+#: - Slows down: the joint moves away from this position, but slower by more than `SLOWER` [rad/s] than in the first faulty cycle.
+#: `SLOWER` is larger than the noise of the velocities.
 SLOWER: Final = 0.05
 #: `_watch_load` skips a joint in each cycle in which the values of the joint are older than this [cycles].
 AGE: Final = 4

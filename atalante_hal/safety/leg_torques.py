@@ -27,14 +27,14 @@ from atalante_hal.vectors import Vector3, cross, rotated
 
 #: Half of the time over which the acceleration is averaged [cycles].
 HALF: Final = 8
-#: Number of cycles that the averages need.
+#: Number of cycles whose values are stored, because the averages need them.
 SPAN: Final = 2 * HALF + 1
 #: A torque in `Sample.sent` of cycle n moves the joints in cycle n + DELAY, if no frame and no motor is late.
 DELAY: Final = 1
 #: A torque may move the joints up to this many cycles later than `DELAY`, because states, commands or motors are late.
 MORE: Final = 3
 #: No torques are computed from a position that is older than this [cycles].
-#: The limit is not 0, because the positions of a node that always answers one cycle late have the age 1.
+#: A node that always answers one cycle late has positions of age 1. `LATE` permits this age.
 LATE: Final = 1
 #: The pelvis IMU or a foot is stuck if its values have not changed for more than this number of cycles.
 #: No torques are computed from the values of a stuck sensor.

@@ -45,7 +45,7 @@ from atalante_hal.wire.process_image import NEVER, ReceiveImage
 #: Result of the E2E check of a rejected message -> diagnostic that becomes pending.
 PENDING = {
     Check.REPEATED: Dtc.E2E_REPEATED,
-    Check.CONFLICT: Dtc.E2E_REPEATED,  # only if the frame does not prove a second sender, see `rivals_of`
+    Check.CONFLICT: Dtc.E2E_REPEATED,  # unless the frame proves a second sender, see `rivals_of`
     Check.WRONG_SEQUENCE: Dtc.E2E_SEQUENCE,
     Check.CRC: Dtc.E2E_CRC,
     Check.LENGTH: Dtc.FRAME_LENGTH,
@@ -62,14 +62,14 @@ CONFIRMED = {
     Check.CONFLICT: Dtc.E2E_FROZEN,
 }
 #: E2E check results of rejected frames that may come from a second sender.
-#: If another intact frame of the same message arrives in the same cycle, two nodes send this message.
+#: If a message has a frame with such a result and another intact frame in the same cycle, two nodes send this message.
 _RIVAL = (Check.CONFLICT, Check.WRONG_SEQUENCE)
 #: Results of the E2E check of a rejected frame whose format and CRC are correct.
 _INTACT = (*_RIVAL, Check.RANGE, Check.INVALID)
 _FRESH = int(Check.SOME_LOST)
 #: Check result of a rejected frame -> diagnostic that is confirmed when the leaky bucket of this disturbance is full.
-#: Each cycle with such a rejected frame adds to the bucket.
-#: Exception: INVALID frames of an IMU confirm IMU_INVALID.
+#: The bucket fills in each cycle in which a frame of the message was rejected with this check result.
+#: Exception: frames of an IMU with the check result INVALID lead to the diagnostic IMU_INVALID.
 _DISTURBANCES = {
     Check.REPEATED: Dtc.E2E_REPEAT_RATE,
     Check.RANGE: Dtc.SIGNAL_RANGE,
@@ -87,8 +87,8 @@ class Tolerance(NamedTuple):
 
     #: Indices of the legs in SIDES. A brief timeout in these legs leads to FINISH_STEP instead of HOLD.
     legs: Collection[int] = ()
-    #: Extra time until a joint in these legs times out [cycles]: with 3, a DBC timeout of 5 cycles becomes 8 cycles.
-    #: An accepted frame gets no extra time: the joint times out if the data of this frame is at least as old as the DBC timeout.
+    #: Extra time until a joint in one of `legs` times out [cycles]: with 3, a DBC timeout of 5 cycles becomes 8 cycles.
+    #: In a cycle with an accepted frame of the joint, the DBC timeout applies without extra time.
     longer: int = 0
 
 
@@ -239,7 +239,7 @@ class MessageMonitor:
         tolerated, timeout = self._legs[row] in tolerance.legs, self._timeouts[row]
         fresh = check <= Check.SOME_LOST
         # `tolerance.longer` delays the timeout only in cycles without an accepted frame.
-        # An accepted frame gets no extra time: the plausibility checks ignore data that is at least as old as the DBC timeout.
+        # With an accepted frame, the DBC timeout applies, because the plausibility checks ignore data that is at least that old.
         late = age >= timeout + tolerance.longer * (tolerated and not fresh)
         # Impossible signal values do not reduce the trust, because the frame was transmitted correctly.
         good = (fresh or check >= Check.RANGE) and not rival

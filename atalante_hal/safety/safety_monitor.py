@@ -151,9 +151,9 @@ class SafetyMonitor:
         self.torque_tracking = TorqueTracking(robot.breakaway)
         self.torque_motion: TorqueMotion | None = None
         #: DBC names of the drives that stay off until a start passes its direction test (attribute `proof`).
-        #: 1. Drives with a wrong torque, drives that did not hold their joints, and drives whose joints failed the test.
-        #: 2. Drives that were off when START was pressed in READY, or before any start had passed the test.
-        #: A start enables these drives for the test. If the start fails, the drives are switched off again.
+        #: 1. Drives with a wrong torque, drives that did not hold their joints, drives whose joints failed the direction test.
+        #: 2. Drives that were off when START was pressed, if this was in READY, or if no start had passed the direction test yet.
+        #: A start enables the drives in `_kept_off` for the direction test. If the start fails, they are switched off again.
         self._kept_off: set[str] = set()
         self._tested = False  # True after a start has passed the direction test
         #: True if `evaluate` may skip the next cycle.
@@ -447,8 +447,8 @@ class SafetyMonitor:
             if not self.start_cycles_left:  # do not restart the direction test if START is pressed again during a start
                 self._proof_begun = False
                 if state.supervisor is _S.READY or not self._tested:
-                    # The direction of a drive that is off now was never tested, or was last tested before the robot was in READY.
-                    # So the drive is switched off again if the start fails.
+                    # A drive that is off now has not been tested since the robot entered READY, or has never been tested.
+                    # So each drive that is off now is switched off again if the start fails.
                     on = powered(state.drive_state).tolist()
                     self._kept_off.update(node for node, is_on in zip(DRIVE_NODES, on, strict=True) if not is_on)
             self.start_cycles_left = ENABLE_CYCLES if state.supervisor in _STARTABLE else 0
@@ -480,8 +480,8 @@ class SafetyMonitor:
             return None
         self._stalled = 0
         if not self._proof_begun:
-            # The test starts from the torques sent last (`limiter.last`).
-            # So wait until `enabling` is True: then the torques sent follow the torques that the drives report.
+            # The direction test starts from the torques that the HAL sent last (`limiter.last`).
+            # These torques must follow the torques that the drives report. So wait until `enabling` is True.
             if not self.enabling:
                 return None
             self._proof_begun = True
@@ -557,7 +557,7 @@ class SafetyMonitor:
         elif before is not _S.FINISH_STEP:  # the HOLD after FINISH_STEP keeps the reason of FINISH_STEP
             self.reason = entry_text(after, self.missing(), self._pendant.stop_requested)
         if after is _S.ACTIVE and before not in MOVING:
-            # The fault memory merges equal events within a short time into one event. This merging ends here.
+            # The fault memory merges equal events within a second into one event. `log_repeats` ends all merging here.
             # So the reason for the next HOLD gets its own event, even if it equals the reason for the last HOLD.
             memory.log_repeats(state.cycle, final=True)
         if after is _S.ACTIVE and before not in MOVING and not self.enabling:

@@ -24,20 +24,20 @@ from atalante_hal.wire.cia402 import Controlword, DriveState, controlword_toward
 #: All drives must be in OPERATION ENABLED within this time after START [cycles].
 ENABLE_CYCLES = 200
 #: A start ends if no drive changes its state for this time [cycles].
-#: The time suffices even if four commands in a row and then four answers in a row are lost.
+#: Even if four consecutive commands and then four consecutive answers of a drive are lost, the start does not end.
 STALLED_CYCLES = 10
 #: Largest speed of a joint at which START is accepted in HOLD [rad/s]. The test of the joint directions needs joints at rest.
-#: The limit does not apply to a joint whose drive is off: the start first lets this drive stop and hold the sinking joint.
+#: A joint whose drive is off may be faster, because it sinks. The start first lets its drive stop and hold the joint.
 AT_REST = 0.3
 #: Prefix of the event text for a refused START.
 REFUSED = "START refused: "
 #: Reason of a HOLD that the program requests because it is ending.
 PROGRAM_ENDS = "the program is ending"
-#: End of the sentence that explains FINISH_STEP if the operator ends a walk on the ground. The next HOLD keeps this sentence.
+#: If the operator ends a walk on the ground, the reason of FINISH_STEP ends with this text. The next HOLD keeps the reason.
 WALK_ENDS = ", so the walk ends on both feet"
 _S = SupervisorState
 #: States in which START acknowledges faults, but enables no drive.
-#: In these states, an active diagnostic does not end the start: an acknowledged fault may stay active for some cycles.
+#: In LOWER and FAULT, an active diagnostic does not end the start, because an acknowledged fault may stay active for some cycles.
 _ACKNOWLEDGING = (_S.LOWER, _S.FAULT)
 #: States in which START enables the drives.
 _ENABLING = (_S.READY, _S.HOLD)
@@ -88,7 +88,7 @@ def refusal(robot: Robot, request: StartRequest) -> Refusal | None:
     """Return the reason to end the current start in this cycle; None if the start may continue.
 
     In the cycle in which START is pressed, diagnostics are ignored in all states except OFF, because the same START may
-    have acknowledged them. A released dead-man, a STOP or the end of the program ends the start at once.
+    have acknowledged them. A released dead-man switch, a STOP or the end of the program ends the start at once.
 
     Args:
         robot: torque limits, and `idle_torque`, the largest torque that an idle drive may report.
@@ -228,7 +228,7 @@ def stop_text(stop_requested: bool) -> str:
     """Return the reason of an operator stop, as one sentence.
 
     Args:
-        stop_requested: True if STOP or HOLD was requested, False if the dead-man is not pressed.
+        stop_requested: True if STOP or HOLD was requested, False if the dead-man switch is not pressed.
     """
     return "the operator asked to stop" if stop_requested else "the dead-man was released or the pendant is lost"
 

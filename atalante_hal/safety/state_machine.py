@@ -20,14 +20,14 @@ class Conditions:
     diagnostics: frozenset[Dtc] = frozenset()
     nodes_ready: bool = False  # every required node is trusted and has sent its status
     #: True if all twelve drives are in OPERATION ENABLED and the direction test of the joints has ended.
-    #: In FULL_ASSIST, which has no direction test, OPERATION ENABLED is sufficient.
+    #: In FULL_ASSIST, there is no direction test: True if all twelve drives are in OPERATION ENABLED.
     drives_enabled: bool = False
     dead_man: bool = False  # the pendant has not timed out and its dead-man switch is pressed
     #: True if HOLD is requested, if STOP is requested outside a walk on the ground, or if the program is ending.
     stop_requested: bool = False
     start_wanted: bool = False  # START was pressed, and this press can still change the state
     step_finished: bool = False  # the walking step has ended, the robot does not walk, or FINISH_STEP took too long
-    #: True during a walk on the ground if STOP is requested, the dead-man is released, or the pendant has timed out.
+    #: True during a walk on the ground if STOP is requested, the dead-man switch is released, or the pendant has timed out.
     #: False if HOLD is requested.
     walk_end_requested: bool = False
     #: confirmed diagnostics that lead to FINISH_STEP instead of HOLD or FULL_ASSIST, because the robot walks on the ground
@@ -59,8 +59,8 @@ def next_state(state: SupervisorState, conditions: Conditions) -> tuple[Supervis
     - any state -> FAULT if a diagnostic demands FAULT
     - any state except OFF, READY and FAULT -> LOWER if a diagnostic demands LOWER
     - ACTIVE, FULL_ASSIST, FINISH_STEP -> the state that the worst diagnostic demands, if this state is worse. In these
-      three states, a released dead-man or `Conditions.stop_requested` adds the diagnostic `OPERATOR_STOP`
-    - ACTIVE, FULL_ASSIST -> FINISH_STEP if the operator requests STOP or releases the dead-man while the robot walks on
+      three states, a released dead-man switch or `Conditions.stop_requested` adds the diagnostic `OPERATOR_STOP`
+    - ACTIVE, FULL_ASSIST -> FINISH_STEP if the operator requests STOP or releases the dead-man switch while the robot walks on
       the ground. The diagnostics in `Conditions.walk_ends` demand FINISH_STEP instead of their reaction
     - FINISH_STEP -> HOLD when the step is finished
     - OFF -> READY if every required node is trusted and no diagnostic demands a reaction; otherwise READY -> OFF

@@ -47,8 +47,8 @@ INTERVAL: Final = 4
 #: A faulty motor produces s times the sent torque. The share s is in one of these two ranges.
 #: First range: reversed (s < 0), dead (s = 0) and weak motors. Second range: motors that are too strong.
 SHARES: Final = ((-1.5, 0.6), (1.4, 2.2))
-#: A motor is suspected if E > `RATIO` * (F + error^2), see the module docstring.
-#: E is the mean square error of the explanation "external torque", F of the explanation "faulty motor".
+#: A motor is suspected if E > `RATIO` * (F + error^2). error is `Robot.torque_error`. E and F are mean square errors.
+#: E belongs to the explanation "external torque", F to the explanation "faulty motor" (see the module docstring).
 RATIO: Final = 2.5
 #: Number of consecutive checks that must suspect the motor before the drive is reported.
 CONFIRM: Final = 2
@@ -56,26 +56,26 @@ CONFIRM: Final = 2
 #: `Robot.torque_error` is the rms error with which the produced torque of a joint is known [Nm].
 BAND: Final = 2.0
 _BAND_SHARE: Final = 0.2
-#: Values of `BAND` and `_BAND_SHARE` for the other joints of the leg. They give a wider limit.
-#: While another joint exceeds this limit, the deviation of a joint is discarded.
-#: Reason: a wrong sensor or an unmeasured load on the leg changes the produced torques of several joints.
+#: The deviation of a joint is discarded while another joint of the same leg deviates, too.
+#: For the other joint, `OTHER_BAND` and `_OTHER_SHARE` replace `BAND` and `_BAND_SHARE`, so its limit is wider.
+#: Reason: if a sensor is wrong or a load on the leg is not measured, several joints deviate although their motors are intact.
 OTHER_BAND: Final = 4.5
 _OTHER_SHARE: Final = 0.25
 #: Decay factors of the two sets of `Deviations.sums`. Each check multiplies a set by its factor, and then adds the new torques.
 #: The set with 0.8 covers about the last 5 checks (20 cycles), the set with 0.96 about the last 25 checks (100 cycles).
 DECAY: Final = (0.8, 0.96)
 #: Number of checks at the start of a deviation that are not added to `Deviations.sums`.
-#: The torques of these checks are averages that also contain cycles before the deviation.
+#: In these first checks, the torques are averages that also contain cycles before the deviation.
 LEFT_OUT: Final = 2
 #: A deviation ends if more than this number of consecutive checks find no deviation.
 PAUSE: Final = 5
 #: A check is not added to `Deviations.sums` if its deviation is below this fraction of `Deviations.peak`, the recent maximum.
-#: A push on the joint may then be ending.
+#: Reason: a decreasing deviation may come from a push on the joint that is ending.
 _PEAK_SHARE: Final = 0.8
 #: Factor by which each check with a deviation reduces `Deviations.peak`, so that an old maximum is forgotten.
 _PEAK_DECAY: Final = 0.97
 #: A motor is suspected only if the decaying number of its checks (element 0 of `Deviations.sums`) is at least this value.
-#: This takes three checks: they count at least 1 + 0.8 + 0.8^2 = 2.44. Two checks count at most 1 + 0.96 = 1.96.
+#: Three checks are enough: their decaying number is at least 1 + 0.8 + 0.8^2 = 2.44. Two checks reach at most 1 + 0.96 = 1.96.
 _LEAST_WEIGHT: Final = 2.4
 #: A joint closer to its position limit than this angle [rad] is at its end stop.
 _AT_STOP: Final = 0.005

@@ -20,7 +20,7 @@ from atalante_hal.safety.events import SEVERITIES, Event
 from atalante_hal.telemetry.schema import message_class
 
 #: Joints that the guide assists: sagittal hip (SH) and sagittal knee (SK) of the leg in the air.
-#: Element 0 applies while the robot stands on the left leg, element 1 while the robot stands on the right leg.
+#: Element 0: joints while the robot stands on the left leg. Element 1: joints while the robot stands on the right leg.
 ASSISTED = (("right_SH", "right_SK"), ("left_SH", "left_SK"))
 #: Key: field of the message `Guide`. Value: name of the same quantity in the telemetry of the controller.
 _GUIDE_FIELDS = {"error": "error", "bound": "q_bound", "h": "h", "lambda": "lambda", "desired_position": "q_des"}

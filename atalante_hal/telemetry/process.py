@@ -79,7 +79,7 @@ class TelemetryConfig:
     slots: int = 1024
     patience: float = 5.0  # s, longest wait of the loop for the recorder or the CAN log in lock-step
     certificate: Path | None = None  # TLS certificate, see `access.Access`
-    private_key: Path | None = None  # key of the certificate, see `access.Access`
+    private_key: Path | None = None  # private key of the TLS certificate, see `access.Access`
     client_ca: Path | None = None  # authority that signs the subscriber certificates, see `access.Access`
     users: Path | None = None  # users and passwords, see `access.Access`
 
@@ -139,7 +139,7 @@ class Recording:
     files: tuple[str, ...]  # file names in order; each restart of the subprocess begins a new file
     complete: bool  # True if there is one file, with an index and with all cycles
     #: Number of cycles that are not in the files.
-    #: If a subprocess was killed, this number can be too high, by at most the cycles of one MCAP chunk.
+    #: If a subprocess was killed, `missing_cycles` can be too high by at most the number of cycles in one MCAP chunk.
     missing_cycles: int
 
 

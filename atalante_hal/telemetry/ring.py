@@ -37,8 +37,8 @@ from atalante_hal.memory import anonymous_file
 MAGIC = int.from_bytes(b"ATLRING\0", "little")
 VERSION = 2
 
-# Each name is the index of a 64-bit word in the header of a ring. Line 1: constants. Line 2: words that only the writer changes.
-# Line 3: words that only the reader changes. The words of each line are in a cache line of their own.
+# Each name is the index of a 64-bit word in the header of a ring. The words form three groups: constants, words that only the
+# writer changes, and words that only the reader changes. Each group has its own cache line of the processor.
 _MAGIC, _VERSION, _RECORD_SIZE, _STRIDE, _SLOTS, _META_LENGTH, _NOTES_SIZE, _DATA = range(8)
 _WRITTEN, _CLOSED, _WRITER_PID, _NOTES_LENGTH, _LOSSLESS = range(8, 13)
 _READ, _LOST, _READER_PID, _KEPT = range(16, 20)

@@ -32,8 +32,8 @@ _POLL = 0.005  # s, polling period of empty rings
 _WRITER_CHECK = 0.2  # s, shortest time between two checks whether the writer's process exists
 _DROPPED_EVERY = 1.0  # s, shortest time between two reports of lost cycles
 #: Largest number of records in one batch. 64 records of the frame ring contain the frames of about 128 cycles.
-#: The counter of the read records changes once per batch. It shows the control loop that this process does not hang.
-#: A writer that waits for a free slot continues when this counter changes.
+#: The counter of the read records changes once per batch. A change shows the control loop that this process does not hang.
+#: A writer that waits for a free slot of the ring continues when the counter of the read records changes.
 #: So a batch must take much less time than `process.HANGS_AFTER` and `TelemetryConfig.patience`.
 _RECORDS_PER_BATCH, _FRAME_RECORDS_PER_BATCH = 128, 64
 

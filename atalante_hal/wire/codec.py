@@ -27,8 +27,8 @@ Words = npt.NDArray[np.int64]
 WORD, SHIFT, MASK, LARGEST, LOW, HIGH, INVALID = range(7)
 #: Rows of `SignalTable.scales`: physical value = (raw code + BASE) * FACTOR + OFFSET.
 BASE, FACTOR, OFFSET = range(3)
-#: In `plan[INVALID, i]`, this number means that the DBC defines no invalid code for signal i.
-#: As result of `encode`, this number means that all values were encoded. Another result is the index of a failed signal.
+#: In `plan[INVALID, i]`, `NO_CODE` means that the DBC defines no invalid code for signal i.
+#: `encode` returns `NO_CODE` if all values were encoded, otherwise the index of a signal that could not be encoded.
 NO_CODE = -1
 # Results of `read_row`. INSIDE: all signals are in range.
 # OUTSIDE: a signal is out of range, and no signal is marked as invalid.
@@ -95,8 +95,8 @@ class Codec:
             mask, largest = (1 << s.length) - 1, (1 << s.length - s.signed) - 1
             invalid = NO_CODE if s.invalid_raw is None else s.invalid_raw
             plan.append((row * WORDS + 1 + s.start // 64, s.start % 64, mask, largest, low, high, invalid))
-            # If offset / factor is an integer, it is added to the raw code: offset -40 and factor 0.5 give (raw - 80) * 0.5.
-            # The sum raw - 80 has no rounding error. If offset / factor is not an integer, the formula is raw * factor + offset.
+            # If offset / factor is an integer, it is added to the raw code, because this sum has no rounding error.
+            # Example: offset -40 and factor 0.5 give (raw - 80) * 0.5. In all other cases, the formula is raw * factor + offset.
             code = s.offset / s.factor
             exact = code == round(code) and round(code) * s.factor == s.offset
             scales.append((code, s.factor, 0.0) if exact else (0.0, s.factor, s.offset))

@@ -182,8 +182,8 @@ FULL = 64
 #: A message is trusted after this number of good cycles in a row.
 #: The values of a message that is not trusted are not used. For example, the inputs of the pendant are ignored.
 REQUALIFY = 16
-#: Increase of the counter of `suspect` in each cycle with two senders of one message.
-#: After 64 / 16 = 4 cycles with two senders in a row, the counter reaches `FULL`. Then two senders are confirmed.
+#: `suspect` increases its counter by this value in each cycle in which a message has frames of two senders.
+#: After 64 / 16 = 4 consecutive cycles with frames of two senders, the counter reaches `FULL`. Then two senders are confirmed.
 RIVAL_CYCLE = 16
 
 

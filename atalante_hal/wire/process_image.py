@@ -62,7 +62,7 @@ from atalante_hal.wire.frame import (
 #: `_PASSIVE`: flags ESI and FDF, a CAN FD frame from an error passive sender.
 _PASSIVE, _ESI = header_word(0, 0, FLAG_ESI | FLAG_FDF), header_word(0, 0, FLAG_ESI)
 #: Value of the argument `tag` for senders that do not answer a SYNC. Each of these senders counts its own frames.
-#: Otherwise `tag` is the alive counter expected in this cycle.
+#: For senders that answer a SYNC, `tag` is the alive counter expected in this cycle.
 _NO_TAG = -1
 #: Values of `Check` as plain integers. A value of at most `_FRESH` means new, usable data.
 _FRESH = _SOME_LOST = int(Check.SOME_LOST)
@@ -141,11 +141,11 @@ class ReceiveImage:
         #: `Check` of each row in this cycle, shape (rows,).
         self.check: npt.NDArray[np.uint8] = np.full(count, Check.NO_DATA, np.uint8)
         #: Age of the values of each row [cycles], shape (rows,).
-        #: If `refuse` has restored earlier values of a row: age of the restored values.
+        #: If `refuse` has restored earlier values of a row, the age of the row is the age of these earlier values.
         self.age: npt.NDArray[np.int64] = np.full(count, NEVER)
         self.crc_errors = 0
         #: Row and `Check` of each frame that was rejected in this cycle.
-        #: With `restarts`, each frame that was committed with the result CONFLICT is also listed.
+        #: If the argument `restarts` is True, the list also contains the committed frames with the check result CONFLICT.
         self.refused: list[tuple[int, Check]] = []
         #: Row of each frame of this cycle in which the sender set the flag ESI (error passive). Damaged frames are included.
         self.error_passive: list[int] = []
@@ -240,7 +240,7 @@ class ReceiveImage:
         self.all_fresh = False
 
     def restart(self, row: int) -> None:
-        """Accept any alive counter in the next frame of a row, as in its first frame. Call this when its sender has restarted.
+        """Accept any alive counter in the next frame of a row. Call this when the sender of this message has restarted.
 
         Otherwise the first frame of the restarted sender is rejected as REPEATED if it equals the last frame before the restart.
 
@@ -337,7 +337,7 @@ class ReceiveImage:
                 if check in _OUT_OF_RANGE:
                     outside[row] = index
         for row, index in outside.items():
-            if self.check[row] > _FRESH:  # if another frame of the row was accepted in this cycle, its values remain
+            if self.check[row] > _FRESH:  # keep the values of another frame of the row that was accepted in this cycle
                 self._commit_independent(frames, index, row)
         return foreign
 

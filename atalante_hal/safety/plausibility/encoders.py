@@ -177,7 +177,7 @@ class EncoderChecks:
         return real
 
     def tolerated(self, joint: int) -> Dtc | None:
-        """Return the pending diagnostic of a rejected position; None if the diagnostic is confirmed.
+        """Return ENC_JUMP, the pending diagnostic of a rejected position; None if ENC_JUMP is already confirmed.
 
         Args:
             joint: index of the joint in JOINTS.

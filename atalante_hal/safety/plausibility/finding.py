@@ -30,10 +30,10 @@ TRUNK_NODES = tuple(IMU_NODES[IMUS.index(imu)] for imu in ("torso", "pelvis"))
 #: Joints: the limiter, the velocity check and the controllers need position and velocity of the same time.
 #: IMUs: the inertial, trunk, knee and motion checks compare attitude, angular velocity and specific force with each other.
 #: All other signals of the frame are used. So the reaction to a failed or hot drive follows even if its encoder is wrong.
-#: If a position is rejected, the torque of the frame is still used. No check needs both values of the same time:
-#: - `Stillness` uses only accepted values.
+#: If a position is rejected, the torque of its frame is still used, because no check needs position and torque of the same cycle:
+#: - `Stillness` uses the torque only in cycles in which the position was accepted.
 #: - `HoldStability` accepts a position that is up to four cycles older than the torque.
-#: - All other checks compare the torque with the commands, or with the drive state of the same frame.
+#: - All other checks compare the reported torque with the commands, or with the drive state of the same frame.
 JUDGED = frozenset({"Position", "Velocity", "Quaternion", "Gyro", "Accel"})
 
 
@@ -119,7 +119,7 @@ def signals_of(codec: Codec, values: Vector) -> Signals:
 
 
 def judged(codec: Codec, row: int) -> npt.NDArray[np.intp]:
-    """Return the indices of the signals in `JUDGED` of one message in the decoded values, shape (n,).
+    """Return the indices in the decoded values of those signals of a message whose quantity is in `JUDGED`, shape (n,).
 
     Args:
         codec: codec of the process image.

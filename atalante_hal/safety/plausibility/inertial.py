@@ -53,7 +53,7 @@ _FORCE_CLIP = 5.0
 #: Fast motions cause large accelerations, for example when the drives are switched off and the legs fall to their end stops.
 _MOVING_RATE = 0.5
 #: Largest rms difference between gyroscope and rate of change of the attitude while the IMU is at rest [rad/s].
-#: The same limit applies to the difference between the gyroscopes of torso and pelvis.
+#: `_RATE_ERROR` also limits the rms difference between the gyroscopes of torso and pelvis.
 _RATE_ERROR = 0.1
 #: While an IMU turns, its rms difference may be larger: the limit is sqrt(_RATE_ERROR^2 + _RATE_SHARE * mean square of its rate).
 _RATE_SHARE = 0.25

@@ -43,7 +43,7 @@ PELVIS_IMU = (-0.164, -0.015, 0.191)
 FRONTAL_HIP = 0.089
 #: Position (x, y) of joint TH of the left leg relative to joint FH, in the axes of the frontal hip [m].
 #: Joint SH lies 0.135 m in front of joint TH, along the axis x of the transverse hip.
-#: The distance 0.135 m is equal to -x of this constant, so `motion` uses x for both positions.
+#: The distance 0.135 m is equal to -x of `TRANSVERSE_HIP`, so `motion` uses x for the positions of TH and SH.
 TRANSVERSE_HIP = (-0.135, 0.169)
 #: Position (x, y, z) of the left tibia IMU in the axes of the tibia [m].
 #: Each coordinate has its own origin: x is relative to joint SK, y to joint SH, and z to joint SA.
@@ -60,7 +60,7 @@ _SETTLING_TIME = 2.0
 _LEAST_LEVER = 0.007
 #: An error of a knee angle is reported only if it explains more than this share of the mean square of v.
 #: v in `knee_error` is the filtered difference between the measured and the computed position of the tibia IMU.
-#: v does not contain the part of this difference that wrong segment lengths explain.
+#: v does not contain the part of this position difference that wrong segment lengths explain.
 _SHARE = 0.25
 #: Number of low-passes for each axis of a leg.
 _FILTERS = 11
@@ -96,7 +96,7 @@ class Filters(NamedTuple):
 
     low: Vector  # (2, 33) outputs of the low-passes: for each leg, three axes with `_FILTERS` low-passes each
     time: Vector  # (1,) time since the start, up to `_SETTLING_TIME` [s]
-    moments: Vector  # (2, 6) for each leg: running means of ss, sg, gg, sd, gd and dd
+    moments: Vector  # (2, 6) for each leg: running means of the products of s, g and d: ss, sg, gg, sd, gd, dd
 
 
 class Knees:
@@ -218,7 +218,7 @@ def knee_error(moments: Vector, limit: float, before: float) -> float:
         before: last result, which is returned if the thigh does not turn [rad].
     """
     ss, sg, gg, sd, gd, dd = moments[0], moments[1], moments[2], moments[3], moments[4], moments[5]
-    # Means of u * u, u * v and v * v (see the docstring), each multiplied by gg to avoid divisions.
+    # uu, uv and vv are gg times the means of u * u, u * v and v * v (see the docstring). The factor gg avoids divisions.
     uu, uv, vv = ss * gg - sg * sg, sd * gg - sg * gd, dd * gg - gd * gd
     if uu <= _LEAST_LEVER**2 * gg:
         return before
@@ -246,7 +246,7 @@ def motion(leg: int, now: Readings) -> tuple[Vector3, Vector3, Vector3, Vector3]
     y, z = y * math.cos(fh) + side * FRONTAL_HIP, y * math.sin(fh)
     hip = x - PELVIS_IMU[0], y - PELVIS_IMU[1], z - PELVIS_IMU[2]
     # `hip_to_imu` is the vector from joint SH to the tibia IMU, in the axes of the tibia.
-    # (x, z) is the direction from hip to knee, (sine, -cosine), plus the direction from knee to ankle, (0, -1).
+    # (x, z) is the sum of two unit vectors: (sine, -cosine) from hip to knee, and (0, -1) from knee to ankle.
     sine, cosine = math.sin(sk), math.cos(sk)
     x, z = sine, -1.0 - cosine
     hip_to_imu = SEGMENT * x + TIBIA_IMU[0], side * TIBIA_IMU[1], SEGMENT * z + TIBIA_IMU[2]

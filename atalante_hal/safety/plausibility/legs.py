@@ -60,31 +60,29 @@ DRIFT_SAMPLES = 4
 STANDSTILL_SAMPLES = 2
 #: Number of consecutive samples after which exchanged encoders are reported. Both legs are compared in every sample.
 EXCHANGE_SAMPLES = 2
-#: Encoders count as exchanged if the error of each leg agrees with the difference between the left and the right reading.
-#: The constant is the largest deviation from this agreement, as a fraction of the difference.
-#: Example: the left encoder reads 5 degrees, and the right encoder reads 2 degrees.
-#: If they are exchanged, the left error (encoder minus IMU) is 3 degrees, and the right error is -3 degrees.
-#: Each error may deviate by 0.35 * 3 degrees.
+#: If the encoders of a joint are exchanged between the legs, the left error (encoder minus IMU) is d, and the right error is -d.
+#: d is the left encoder reading minus the right encoder reading. Each error may deviate from d or -d by `_AGREEMENT` * |d|.
+#: Example: with encoder readings of 5 degrees (left) and 2 degrees (right), an error may deviate by 0.35 * (5 - 2) degrees.
 _AGREEMENT = 0.35
-#: Change of the error about an axis that the standstill check tolerates in each sample [rad], while the gyros contradict the
-#: encoders. The heading drift of intact IMUs is less than a tenth of this value.
+#: The standstill check ignores a change of the error (encoder minus IMU) of up to this angle per sample [rad].
+#: `_IMU_DRIFT` applies while the gyros contradict the encoders. The heading drift of intact IMUs is less than a tenth of this.
 _IMU_DRIFT = 2e-5
-#: Like `_IMU_DRIFT`, while the gyros agree with the encoders. Random attitude errors of 4 mrad rms of both IMUs with a time
-#: constant of 10 s change the error by 0.11 mrad rms in a sample of 16 cycles.
+#: `_IMU_WANDER` replaces `_IMU_DRIFT` while the gyros agree with the encoders [rad].
+#: If each IMU has random attitude errors of 4 mrad rms (time constant 10 s), the error changes by 0.11 mrad rms in 16 cycles.
 _IMU_WANDER = 2e-4
 #: The gyros agree with the encoders about an axis if the two angular velocities differ by at most this value [rad/s].
-#: It is 3.6 times the rms noise of the difference of two gyros.
+#: `_GYRO_ERROR` is 3.6 times the rms noise of the difference of two gyros.
 _GYRO_ERROR = 0.02
 #: The headings of intact IMUs drift slowly. The estimate of this drift changes by at most this angle in each sample [rad].
-#: A leg is sampled every 32 cycles, so the check follows at most 3e-4 rad/s.
+#: The heading drift of a leg is estimated every 32 cycles, so the estimate follows a drift of at most 3e-4 rad/s.
 _HEADING_DRIFT = 1e-5
 _PELVIS = IMUS.index("pelvis")
 _TIBIAE = tuple(IMUS.index(f"{side}_tibia") for side in SIDES)
 #: Angles of a leg that are compared with the IMUs: angle of FH, angle of TH, sum of the angles of SH and SK.
 _AXES = (("FH",), ("TH",), ("SH", "SK"))
-#: Index of TH in `_AXES`. The error of TH shows the heading drift of the IMUs.
+#: Index of TH in `_AXES`. The encoder angle of TH minus its angle from the IMUs shows the heading drift of the IMUs.
 _HEADING = _AXES.index(("TH",))
-#: Index of SH and SK in `_AXES`. Their error in the first comparison shows how the IMUs are mounted.
+#: Index of the sum SH + SK in `_AXES`. Its error (encoders minus IMUs) in the first comparison shows how askew the IMUs are.
 _SAGITTAL = _AXES.index(("SH", "SK"))
 #: For each of the first four joints of a leg: index of its axis in `_AXES`.
 _AXIS_OF = (0, 1, 2, 2)
@@ -163,7 +161,7 @@ class Legs:
             self._exchanges[index] = 0
 
     def restart_heading(self, imu: int) -> None:
-        """Measure the heading of an IMU again in the next comparison. Call it when the IMU has restarted.
+        """Request a new measurement of the heading of an IMU in the next comparison. Call this when the IMU has restarted.
 
         Before the first comparison of a leg, the call has no effect on this leg.
 
@@ -251,7 +249,7 @@ class Legs:
         self._drifts[leg] = tuple(drifts)
 
     def _follow_heading(self, leg: int, comparison: _Comparison) -> None:
-        """Let the estimated heading drift of a leg follow the error of TH.
+        """Change the estimated heading drift of a leg so that the error of TH (encoder minus IMU) decreases.
 
         A heading drift changes the angle of TH by `upright` times the drift, so this factor also gives the direction.
         """
@@ -259,7 +257,7 @@ class Legs:
         self._set_heading(leg, self._heading_drift[leg] + max(-_HEADING_DRIFT, min(_HEADING_DRIFT, change)))
 
     def _measure_heading(self, leg: int, fh: float, th: float, pelvis: Sequence[float], tibia: Sequence[float]) -> None:
-        """Measure the heading drift of a leg, with the errors of FH and TH of the last comparison.
+        """Measure the heading drift of a leg. Assume that FH and TH have the same errors as in the last comparison.
 
         The axis of SH and SK is the axis y of the tibia. Its direction follows from FH and TH.
 
@@ -296,7 +294,7 @@ class Legs:
             change = comparison.errors[axis] - moved.errors[axis]
             turned = max(abs(angle - moved.angles[i]) for i, angle in enumerate(comparison.angles))
             # If an encoder is stuck while the leg turns, the error (encoder minus IMU) changes.
-            # So an encoder counts as stuck only if both the change and the turn exceed `allowed`.
+            # So an encoder counts as stuck only if the change of its error and the turn of its leg both exceed `allowed`.
             # If the error changes but the leg does not turn, the encoder has jumped or drifts.
             allowed = self._attitude_change + self._misalignment * turned + comparison.uncertainty + moved.uncertainty
             if min(abs(change), turned) <= allowed:
@@ -407,7 +405,7 @@ def extrapolated(quaternion: list[float], gyro: list[float], time: float) -> lis
 
 
 def _follow_imu_drift(moved: _Comparison, axis: int, change: float, rate: float) -> _Comparison:
-    """Let the stored comparison `moved` follow a slow change of the attitude errors of the IMUs.
+    """Return a copy of `moved` whose error (encoder minus IMU) follows a slow drift of the IMUs.
 
     Args:
         moved: comparison when the encoder reading of the joint last changed.

@@ -47,10 +47,10 @@ SLOW = 16
 _PERIOD = 32
 #: Intervals between the inertial checks [cycles], used alternately.
 #: Both intervals are odd, so the checks run alternately in even and in odd cycles.
-#: A vibration of half the sampling rate of the IMUs then has no effect.
+#: Reason: a vibration at half the sampling rate of the IMUs changes its sign in each cycle, so it cancels in the means.
 _INERTIAL_INTERVALS = (15, 17)
 #: Largest age of values that the trunk check uses [cycles].
-#: If a node always answers one cycle late, its values have the age 1 in every cycle.
+#: A node that always answers one cycle late has values of age 1. The trunk check accepts this age.
 _LATE = 1
 #: Largest age of a value that the knee checks use [cycles]. If a value is older, the filters of the knee checks restart.
 _HELD = 4
@@ -109,7 +109,7 @@ class Plausibility:
         self._drive_state = {row: codec.index(codec.messages[row].name, "DriveState") for row in self._joint_rows}
         self._foot_ages = [NEVER] * len(self._rows.foot)  # age of the values of each foot at its last check [cycles]
         #: Cycle in which the last good values of each joint and IMU were measured, by row in the process image.
-        #: Not updated while `_settled` is True, because the last good values of all rows are then from the previous cycle.
+        #: Not updated while `_settled` is True. In this time, the last good values of all rows are from the previous cycle.
         self._measured = dict.fromkeys((*self._joint_rows, *self._imu_rows), -NEVER)
         #: Measured force of each faulty cell, by (foot, cell), shape (3,) [N]. In the process image, this force is set to 0.
         self._measured_forces: dict[tuple[int, int], Vector] = {}

@@ -22,12 +22,12 @@ from atalante_hal.safety.plausibility.finding import JOINT_NODES, Ages, Signals
 from atalante_hal.wire.process_image import NEVER
 
 #: Number of consecutive samples with a tilted sole after which an ankle encoder is reported. A foot is sampled every 32 cycles.
-#: The sole of a sample is tilted if the forces show a flat foot, but the ankle encoders and the tibia IMU show a tilt.
+#: A sample shows a tilted sole if the forces are those of a flat foot, but ankle encoders and tibia IMU give a tilted sole.
 SOLE_SAMPLES = 4
 #: A foot counts as flat on the floor only if its load exceeds this multiple of `cell_free` (largest force of an unloaded cell).
 _LOAD = 4.0
 #: Largest distance of the centre of pressure from the middle of a flat foot: along the foot, across the foot.
-#: The unit of each axis is the distance of a force cell from the middle. The sole ends at 1.1 along the foot, and at 2.0 across.
+#: Unit: distance of a force cell from the middle of the foot. The edge of the sole is at 1.1 along the foot, and at 2.0 across.
 _CENTRE = (0.8, 1.4)
 #: Outward rotation of the foot about the vertical axis of the tibia [rad].
 TOE_OUT = math.radians(8.0)

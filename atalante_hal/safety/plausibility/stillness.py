@@ -52,15 +52,15 @@ FROZEN_CYCLES = 100
 _TURN = 0.01
 #: Upper bound of the inertia about any joint [kg m2], including the knee of a leg that carries robot and patient.
 _INERTIA = 100.0
-#: A joint is at rest after this number of cycles with a constant reading.
-#: Within this time, an unbalanced torque would have moved the joint.
+#: A joint counts as at rest after this number of cycles with a constant encoder reading.
+#: If the torques on the joint were not in balance, they would have moved the joint within `_AT_REST` cycles.
 _AT_REST = 3
 #: When a joint has turned by this angle [rad], its encoder reading must have changed. The angle is 20 encoder counts.
 _DRIVEN = 1e-5
 #: A joint whose distance to a position limit is below this angle [rad] is regarded as being at its end stop.
 _AT_STOP = 0.005
 #: If the last forces of a foot are older than this number of cycles, the foot may have left the ground or landed since then.
-#: The `Drive` records of the ankles of such a foot are cleared.
+#: If the last forces of a foot are older than `_FORCES_VALID`, the `Drive` records of its ankles are cleared.
 _FORCES_VALID = 5
 _NEVER = 1 << 30
 #: Index of each ankle joint in JOINTS.
@@ -119,7 +119,7 @@ class Stillness:
         self._values, self._now, self._age = image.values[where], now, image.age
         self._every = every
         #: Age of the values in the last sample [cycles], by row in the process image.
-        #: A message has newer values if its current age (`_age`) is lower.
+        #: A message has newer values than its last sample if its current age (`_age`) is below `_sampled_age`.
         self._sampled_age: Cycles = np.full(len(image.age), 2 * NEVER)
         self._row_of = codec.row_of[where]
         size = len(self._values)
@@ -127,7 +127,7 @@ class Stillness:
         self._same = np.empty(size, np.bool_)
         self._repeats = np.full(size, 0)
         # Convert the limits from cycles to samples. Example: with `every` = 16, 50 cycles become (50 - 15) // 16 = 2 samples.
-        # The 15 cycles are subtracted because they may pass between the first repeated reading and its sample.
+        # The 15 cycles are subtracted because the first repeated reading may be up to 15 cycles older than its sample.
         limit = np.full(size, _NEVER)
         limit[codec.slice("Position")] = self._to_stuck = (STUCK_CYCLES - every + 1) // every
         limit[codec.slice("Gyro")] = limit[codec.slice("Force")] = to_freeze = (FROZEN_CYCLES - every + 1) // every
@@ -157,7 +157,7 @@ class Stillness:
         for joint in range(len(JOINTS)):
             release(self._drive, joint)
         #: For each ankle joint: rotation vector by which its shank has turned while the encoder reading was constant [rad].
-        #: Shape (4, 3). The row of an ankle joint is 0 while its foot is not on the ground.
+        #: Shape (4, 3). The rotation vector of an ankle joint is 0 while its foot is not on the ground.
         self._turn = np.zeros((len(_ANKLES), 3))
         self._to_joint: Vector = robot.polarity / robot.gear
         self._low_stop, self._high_stop = robot.position_min + _AT_STOP, robot.position_max - _AT_STOP

@@ -22,7 +22,7 @@ from atalante_hal.wire.e2e import Check
 from atalante_hal.wire.process_image import NEVER
 
 #: Time for which a check may lack usable data before its diagnostic is confirmed [cycles].
-#: The slowest check detects a fault within the same time, if its data is usable.
+#: With usable data, even the slowest check detects a fault within `UNCHECKED_CYCLES`.
 UNCHECKED_CYCLES = 128
 #: Number of encoders per leg that are compared with the IMUs.
 _COMPARED = 4
@@ -89,7 +89,7 @@ class Unchecked:
 
 
 def _checks(rows: Rows) -> Iterator[_SensorCheck]:
-    """Yield these checks: one for each joint velocity, one for each leg, one for the trunk IMUs, one for each foot."""
+    """Yield the monitored checks: one for each joint velocity, one for each leg, one for the trunk IMUs, one for each foot."""
     joints, imus, feet = rows.joint.tolist(), rows.imu.tolist(), rows.foot.tolist()
     for joint, row in enumerate(joints):
         yield _SensorCheck(Dtc.ENC_VELOCITY, JOINT_NODES[joint], [row], f"the velocity of {JOINTS[joint]}")
