@@ -96,9 +96,9 @@ class Heartbeats:
         #: Events that the next `evaluate` raises only as pending diagnostics, each as (node, diagnostic, error code):
         #: - An emergency with the reaction INFO.
         #: - An emergency of a node that already has an active emergency with a more severe reaction.
-        #: - A frame from an error passive node; the error code is 0.
+        #: - A frame from an error passive node. The error code of this event is 0.
         self._notices: list[tuple[str, Dtc, int]] = []
-        #: Nodes whose last status reports a state other than OPERATIONAL. A single BOOT_UP does not count.
+        #: Nodes whose last status reports a state other than OPERATIONAL. A single BOOT_UP is ignored.
         self._stopped: set[str] = set()
         #: Nodes that were reset: they reported a state other than OPERATIONAL at least once since the last `evaluate`.
         #: The first status message of a node is ignored, because the first start of a node is not a reset.

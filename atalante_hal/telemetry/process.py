@@ -75,7 +75,7 @@ class TelemetryConfig:
     can_log: Path | None = None  # log file of all CAN frames; the file suffix determines the format; None for no log
     lock_step: bool = False  # True in virtual time (lock-step): the loop waits if recorder or CAN log are too slow
     #: Number of slots of the ring of cycle records: at one record per cycle, 1024 slots store the last 1023 cycles.
-    #: The ring of CAN frames has as many slots but fills more slowly: one record contains the frames of two or three cycles.
+    #: The ring of CAN frames has the same number of slots. Each of its records contains the frames of two or three cycles.
     slots: int = 1024
     patience: float = 5.0  # s, longest wait of the loop for the recorder or the CAN log in lock-step
     certificate: Path | None = None  # TLS certificate, see `access.Access`

@@ -55,10 +55,10 @@ _FILTER_TIME = 0.15
 _MEAN_TIME = 0.75
 #: Time that the filters need to settle after the start [s]. `Filters.moments` is updated only after this time.
 _SETTLING_TIME = 2.0
-#: An error of a knee angle is computed only while the thigh turns: the rms of u must exceed this value [m/rad].
+#: An error of a knee angle is computed only while the thigh turns: the rms of u in `knee_error` must exceed this value [m/rad].
 #: u in `knee_error` is the filtered motion of the tibia IMU per radian of knee error. In a walk, its rms is about 0.012 m/rad.
 _LEAST_LEVER = 0.007
-#: An error of a knee angle is reported only if it explains more than this share of the mean square of v.
+#: An error of a knee angle is reported only if it explains more than this share of the mean square of v in `knee_error`.
 #: v in `knee_error` is the filtered difference between the measured and the computed position of the tibia IMU.
 #: v does not contain the part of this position difference that wrong segment lengths explain.
 _SHARE = 0.25

@@ -65,7 +65,7 @@ EXCHANGE_SAMPLES = 2
 #: Example: with encoder readings of 5 degrees (left) and 2 degrees (right), an error may deviate by 0.35 * (5 - 2) degrees.
 _AGREEMENT = 0.35
 #: The standstill check ignores a change of the error (encoder minus IMU) of up to this angle per sample [rad].
-#: `_IMU_DRIFT` applies while the gyros contradict the encoders. The heading drift of intact IMUs is less than a tenth of this.
+#: `_IMU_DRIFT` applies while the gyros contradict the encoders. It is over ten times the heading drift of intact IMUs.
 _IMU_DRIFT = 2e-5
 #: `_IMU_WANDER` replaces `_IMU_DRIFT` while the gyros agree with the encoders [rad].
 #: If each IMU has random attitude errors of 4 mrad rms (time constant 10 s), the error changes by 0.11 mrad rms in 16 cycles.

@@ -25,7 +25,7 @@ from atalante_hal.safety.plausibility.finding import FOOT_NODES, Ages, Signals
 
 #: A foot is reported if, for this time [cycles], it alone carries load and is more than `_HEIGHT` above the other foot.
 HEIGHT_CYCLES = 64
-#: The feet are reported as exchanged after this time [cycles] in which the robot leans away from the leg with clearly more load.
+#: The feet are reported as exchanged if, for this time [cycles], the robot leans away from the leg with clearly more load.
 WEIGHT_CYCLES = 128
 #: Mean length of a thigh or a shank [m]. The real lengths are adjusted to the patient.
 SEGMENT = 0.4

@@ -35,7 +35,7 @@ _FILTER_TIME = 0.1
 _MEAN_TIME = 0.25
 #: Time that the filters need to settle after the start [s]. `Filters.moments` is updated only after this time.
 _SETTLING_TIME = 0.3
-#: The check makes no decision unless the filtered angular velocity of the trunk exceeds this value [rad/s rms].
+#: The check decides only while the filtered angular velocity of the trunk exceeds this value [rad/s rms].
 #: At rest, the noise of the gyroscopes is up to 0.004 rad/s rms.
 _LEAST_RATE = 0.008
 #: The IMUs count as exchanged if the height of the torso IMU, computed from the motion, is less than -`_SHARE` * `TORSO_HEIGHT`.
