@@ -180,7 +180,7 @@ class DirectionProof:
         #: Tests still to be done: indices in JOINTS of the tested joints, and duration of the pulse [cycles].
         self._tests: list[tuple[list[int], int]] = []
         self._trials = [0] * len(JOINTS)
-        # Extra delay [cycles], measured in tests of more than two joints. Tests of one or two joints only use it.
+        # Extra delay [cycles], measured in tests with a short pulse and more than two joints. Tests of one or two joints use it.
         # Reason: a delay fitted to only one or two joints might make a motor with a wrong sign look like a late motor.
         self.late = 0
         #: Score of each delay in `LATENCIES`. The delay with the largest score explains the measured motions best.
