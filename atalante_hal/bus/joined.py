@@ -119,7 +119,7 @@ class JoinedBus:
             raise BusDown(f"{self.name} is closed")
         _, headers = self._batches.to_send(frames)
         words = as_words(frames)
-        failures: dict[int, BusError] = {}  # error of each channel that raised one, by index of the channel
+        failures: dict[int, BusError] = {}  # error of each channel that failed, by index of the channel
         shares = self._shares.get(headers) or self._divide(headers, frames)
         for share in shares:
             as_words(share.frames)[:] = words[share.indices]
@@ -205,7 +205,7 @@ class JoinedBus:
         for tails in self._tails:
             if tails[0] is frames:
                 return tails
-        self._batches.to_fill(frames)  # raises TypeError if the argument is not an array of frames
+        self._batches.to_fill(frames)  # `to_fill` raises TypeError if `frames` is not an array of frames
         if len(self._tails) >= REMEMBERED:
             self._tails.clear()
         self._tails.append([frames, *(frames[offset:] for offset in range(1, len(frames)))])

@@ -227,7 +227,7 @@ def _size_defect(path: Path, stated: int, size: int | None) -> str:
 
 
 def _bytes(path: Path, count: int, whence: int) -> bytes:
-    """Return the first or the last bytes of a file.
+    """Return `count` bytes from the start of a file, or -`count` bytes from its end if `count` is negative.
 
     Args:
         path: File to read.

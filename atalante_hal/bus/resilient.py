@@ -80,7 +80,8 @@ class ResilientBus(WrappedBus):
             count = super().receive(frames, timeout)
         except BusDown as error:
             self._lost(error)
-            waited = time.monotonic() - begin  # [s]; a `JoinedBus` waits before it raises the error
+            # `JoinedBus.receive` waits for frames before it raises `BusDown`. The sleep is shorter by this waiting time [s].
+            waited = time.monotonic() - begin
             time.sleep(max(min(timeout, RETRY_PERIOD) - waited, 0.0))
             return 0
         self._update_down(proven=count > 0)

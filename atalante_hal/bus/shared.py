@@ -40,7 +40,7 @@ _END_WORDS = 8
 _HEADER_BYTES = mmap.PAGESIZE
 #: A waiting bus end polls for this time [s] before it sleeps. The computing time of one control cycle is shorter.
 _POLL_TIME = 500e-6
-#: After a wait longer than `_POLL_TIME`, the bus end does not poll in this number of following waits. It sleeps at once.
+#: After a wait longer than `_POLL_TIME`, the bus end sleeps at once, without polling, in this number of following waits.
 _WAITS_WITHOUT_POLLING = 32
 #: Longest sleep of a waiting bus end before it reads the shared memory again [ms].
 #: A sleep must be limited, because a wake-up byte may arrive before the new value in the shared memory is visible.
@@ -90,7 +90,7 @@ class SharedBus:
         self._sent = self._received = 0
         self._waits_without_polling = 0  # number of remaining waits in which this end sleeps at once, without polling
         self._closed = False
-        self._close_reason = ""  # text that the other end sent when it closed; empty if it sent none
+        self._close_reason = ""  # text that the other end sent when it closed; empty if it sent no text
         self._stamps: Stamps = np.zeros(size // FRAME_BYTES, np.int64)
         self._received_at = 0
         self._batches = Batches()
@@ -239,7 +239,7 @@ class SharedBus:
         self._map.close()
 
     def _wake_peer(self) -> None:
-        # Errors are ignored: a full socket already contains a wake-up, and the next `receive` detects a closed peer.
+        # Errors are ignored: a full socket already contains a wake-up byte, and the next `receive` detects a closed peer.
         with contextlib.suppress(OSError):
             self._wake_socket.send(_WAKE_UP)
 
@@ -316,14 +316,15 @@ class SharedBus:
             self._read_wake_ups()
 
     def _read_wake_ups(self) -> None:
-        """Read all wake-ups from the socket; raise `BusDown` if the other end is closed."""
+        """Read all wake-up bytes from the socket; raise `BusDown` if the other end is closed."""
         while True:
             try:
                 received = self._wake_socket.recv(_REASON_BYTES)
             except BlockingIOError:
                 return
             except ConnectionResetError:
-                # The other end closed before it had read all wake-ups. Its last message can still be read from the socket.
+                # The other end closed before it had read all wake-up bytes.
+                # The socket still contains the last message of the other end.
                 continue
             if not received:
                 raise BusDown(f"{self.name}: {self._close_reason or 'the other end is closed'}")

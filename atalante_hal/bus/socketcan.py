@@ -45,7 +45,7 @@ DROPPED_BATCHES: Final = 64
 NO_ROOM = (errno.ENOBUFS, errno.EAGAIN)
 
 #: Mask for the first 8 bytes of a received frame: keeps identifier, length and flags, and clears the two reserved bytes.
-#: The reserved bytes may contain garbage.
+#: In a received frame, the two reserved bytes may have any value.
 HEADER_FIELDS = np.uint64(0x0000_FFFF_FFFF_FFFF)
 #: FDF flag in the first 8 bytes of a frame. Older kernels leave this flag 0 in received CAN FD frames.
 FDF_IN_HEADER = np.uint64(FLAG_FDF << 40)
@@ -297,8 +297,8 @@ class SocketCanBus:
         if code != LINK_DOWN and code not in LINK_REMOVED:
             return None
         self._drop_queued()
-        # If an interface is removed, the kernel reports LINK_DOWN first, and a code of LINK_REMOVED later.
-        # `_drop_queued` may have dropped the later code. So check whether the kernel has unbound the socket.
+        # If an interface is removed, the kernel reports LINK_DOWN first, and one of the codes LINK_REMOVED later.
+        # `_drop_queued` may have dropped the code LINK_REMOVED. So check whether the kernel has unbound the socket.
         if code == LINK_DOWN and self._is_bound():
             return BusDown(f"{self.name} is down: type `ip link set {self.name} up`")
         self._removed = f"{self.name} was removed: plug the adapter in again; the link is opened again when it is up"

@@ -59,7 +59,7 @@ def _field(record: type, name: str, hint: object) -> tuple[Any, tuple[int, ...]]
     if get_origin(hint) is Annotated:
         array, shape = get_args(hint)
         # Up to Python 3.11, NDArray[scalar] is ndarray[shape, dtype[scalar]].
-        # In later versions, NDArray[scalar] can be an alias whose only argument is `scalar`.
+        # From Python 3.12 on, NDArray[scalar] can be an alias whose only argument is `scalar`.
         argument = get_args(array)[-1]
         scalar = get_args(argument)[0] if get_origin(argument) is np.dtype else argument
         return scalar, shape if isinstance(shape, tuple) else (shape,)

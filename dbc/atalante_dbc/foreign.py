@@ -34,8 +34,8 @@ _LARGEST_DATA_ID = 0xFFFF
 #: Values of GenMsgSendType for cyclic messages, in lower case. The empty text stands for a missing GenMsgSendType.
 _CYCLIC = ("", "cyclic", "cyclicx", "periodic", "fixedperiodic", "fixed_periodic")
 # Masks of the parameter group in a J1939 identifier. The PDU format (bits 16 to 23) selects the mask.
-# `_PGN_PEER`: PDU format below `_PDU2`. The identifier also contains a destination address.
-# `_PGN_BROADCAST`: PDU format of at least `_PDU2`. The identifier contains no destination address.
+# `_PGN_PEER` is for a PDU format below `_PDU2`. Such an identifier also contains a destination address.
+# `_PGN_BROADCAST` is for a PDU format of at least `_PDU2`. Such an identifier contains no destination address.
 _PGN_PEER, _PGN_BROADCAST, _PDU2 = 0x03FF0000, 0x03FFFF00, 240
 _QUOTED = re.compile(r'"[^"]*"')
 _WRITTEN = re.compile(r"\bBO_\s+(\d+)\s+(\w+)\s*:|\bSG_\s+(\w+)\s+(M|m\d+M?)?\s*:")
@@ -95,7 +95,7 @@ class Layout:
     inhibit_ms: float | None  # minimum time between two frames of an event message [ms]
     data_id: int | None  # Data ID of AUTOSAR E2E Profile 5; None if the message is not protected
     #: Mask of the identifier bits that distinguish the message from other messages.
-    #: J1939 message: bits of the parameter group. Any other message: all bits of the identifier.
+    #: For a J1939 message, these bits are the parameter group. For any other message, these bits are the whole identifier.
     pgn_mask: int
     #: Known raw values of each multiplexer: values that select a signal, and values with a name. Key: name of the multiplexer.
     multiplexers: Mapping[str, frozenset[int]]
@@ -189,7 +189,7 @@ class _DbcText:
         self.ids: Counter[int] = Counter()
         self.names: Counter[str] = Counter()
         self.signals: dict[int, Counter[str]] = {}
-        self.multiplexed: Counter[int] = Counter()  # frame id -> number of signals with a mark m0, m1, ...
+        self.multiplexed: Counter[int] = Counter()  # frame id -> number of signals with a multiplexer mark m0, m1, ...
         current = -1
         for match in _WRITTEN.finditer(_QUOTED.sub('""', text)):
             if match[1]:

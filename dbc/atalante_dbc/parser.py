@@ -88,7 +88,8 @@ class _Lines:
         self._message = {name: number for number, _, name in self.messages}
 
     def message(self, message: RawMessage) -> int:
-        return self._message.get(message.name, 1)  # line 1 if the definition is spread over several lines
+        # If the definition of a message is spread over several lines, `_message` has no entry for it, and line 1 is returned.
+        return self._message.get(message.name, 1)
 
     def signal(self, message: RawMessage, signal: RawSignal) -> int:
         return self._signal.get((message.name, signal.name), self.message(message))

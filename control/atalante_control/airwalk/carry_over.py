@@ -35,7 +35,9 @@ class Carry:
 
 
 class CarryOver:
-    """Carry-over: adds a torque after a stance change, so that the torque command does not jump, up to a limit.
+    """Carry-over: after a stance change, adds a torque that fades out, so that the torque command does not jump.
+
+    The added torque of a joint with a guide is limited, so a large jump remains in part.
 
     Attributes:
         records: record that `add_carried` reads and updates, shape (1,).

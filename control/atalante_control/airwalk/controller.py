@@ -182,10 +182,9 @@ class AirwalkController:
             self._guides.prepare()
 
     def choice(self, xi: float) -> Choice:
-        """Return the guide filter for an assistance factor, and the promise of this filter.
+        """Return the guide filter for an assistance factor, and the fraction of the requested torques for which it is certified.
 
-        The promise is a fraction of the requested disturbance torques (`config.promise`). The guide filter is certified for this
-        fraction.
+        The requested disturbance torques are `config.promise`. The literal law is certified for no torques (fraction 0).
 
         Args:
             xi: assistance factor in [0, 1].
@@ -239,7 +238,7 @@ class AirwalkController:
         self._promised = False
         #: Angle deviations [rad] and speed deviations [rad/s] of hip and knee at the start of the step.
         self._start: tuple[Pair, Pair] = (0.0, 0.0), (0.0, 0.0)
-        self._accelerations = np.zeros(2)  # rad/s2, of hip and knee before the stance change
+        self._accelerations = np.zeros(2)  # rad/s2, accelerations of hip and knee before the stance change
         self.telemetry.fill(0.0)
         self.statistics = AirwalkStatistics()
 
@@ -311,7 +310,7 @@ class AirwalkController:
         self._share[[hip, knee]] = 0.0 if self._assisting else 1.0
         self.pid.start_step(stance, self._share)
         self._start_guide(xi, self.reference.start_step(stance, state.position, state.velocity), (hip, knee))
-        # `_measured` still contains the speeds of the last cycle.
+        # `_measured` still contains the speeds of the previous cycle.
         self._accelerations[:] = (state.velocity[[hip, knee]] - self._measured.qd[[hip, knee]]) / PERIOD
         if self.config.flat_foot:
             self._feet.start_step(state, 1 - stance)

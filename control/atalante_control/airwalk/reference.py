@@ -61,7 +61,7 @@ class GaitReference:
         self._basis[1, :, :_N], self._basis[1, :, _N:] = c1[:end, None], c1d[:end, None]
         self._added = np.zeros_like(self._basis)
         # `_angles` holds the angle deviations s(0) of the 12 joints twice, because s(0) scales the columns of s and those of s'.
-        # `_rates` holds the speed deviations s'(0) in the same way.
+        # `_rates` holds the speed deviations s'(0) of the 12 joints twice, as factors of the columns of s and of those of s'.
         self._angles, self._rates = np.zeros(2 * _N), np.zeros(2 * _N)
 
     def start_step(self, stance: int, position: Vector, velocity: Vector) -> Deviation:
@@ -109,8 +109,9 @@ class StartMotion:
 
     #: Largest speed of a joint in the first quintic, as a fraction of the velocity limit of the joint.
     SPEED_SHARE = 0.5
-    #: Duration of the second quintic [s]. The angle by which a joint moves back is proportional to this duration.
-    #: With a much longer duration, joints would move beyond their position limits.
+    #: Duration of the second quintic [s], in which each joint moves back and then forwards to reach the speed of the gait.
+    #: The angle of the backward motion is proportional to the duration.
+    #: If the second quintic took much longer, joints would move back beyond their position limits.
     RUN_UP = 0.5
     #: Largest slope of the quintic 10 x^3 - 15 x^4 + 6 x^5 for x from 0 to 1.
     _STEEPEST = 1.875

@@ -37,7 +37,7 @@ OUTPUTS = len(JOINTS) * (DEGREE + 1)
 LAYERS_MAX = 4
 WIDTH_MAX = 128  # largest number of neurons of a layer
 #: rad, a network file is rejected if a joint angle jumps by more than this value at the stance change (rounding tolerance).
-#: The check takes the bias and each weight row of the last layer as the control points of a gait, and computes its jump.
+#: The check computes this jump for the bias and for each weight row of the last layer, as if they were control points of a gait.
 _PERIODICITY_DEFECT = 1e-9
 _ANGLE_MAX = 2.0 * np.pi  # rad, largest accepted absolute value of a control point
 #: An input may be beyond its range by this fraction of the bound, because the ratios `thigh` and `shank` have rounding errors.

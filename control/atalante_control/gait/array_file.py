@@ -140,7 +140,8 @@ def _array(name: str, content: bytes) -> Array:
     if len(data) != size:
         raise ArrayFileError(f"{name} with shape {shape} must have {size} bytes, got {len(data)}")
     if dtype.kind == "U":
-        data.decode("utf-32")  # invalid text raises an exception here; NumPy would raise it only on use of the text
+        # For invalid text, `decode` raises an exception here. NumPy would raise an exception only when the text is used.
+        data.decode("utf-32")
     array = np.frombuffer(data, dtype).reshape(shape).copy()
     array.setflags(write=False)
     return array

@@ -43,9 +43,9 @@ WALK_KINDS: tuple[Kind, ...] = ("start", "periodic", "stop")
 class WalkGaits(NamedTuple):
     """Right-stance steps of a walk. The mirrored steps are the left-stance steps."""
 
-    start: Gait  # begins at rest with the weight on the right foot; ends with the last angles and speeds of `step`
+    start: Gait  # start step: begins at rest with the weight on the right foot; ends with the last angles and speeds of `step`
     step: Gait  # periodic step
-    stop: Gait  # begins with the first angles and speeds of `step`; ends at rest with the weight on the stance foot
+    stop: Gait  # stop step: begins with the first angles and speeds of `step`; ends at rest with the weight on the stance foot
 
     @property
     def hash32(self) -> int:

@@ -90,7 +90,7 @@ class BackupPolicy:
     damping: Pair  # damping ratios of the two coupled modes of motion, the slower mode first
     #: kg m2, elements M11, M12 and M22 of the mass matrix of SH and SK at one knee angle in the middle of the swing.
     #: The gains Kv are computed from `mass` and are constant.
-    #: The joints therefore have the stiffness `stiffness` only at this knee angle.
+    #: The joints therefore have the stiffness `stiffness` only at the knee angle for which `mass` was computed.
     mass: tuple[float, float, float]
 
     def __post_init__(self) -> None:

@@ -77,7 +77,7 @@ class Limit(NamedTuple):
     """
 
     #: Largest allowed torques / requested torques; negative if the condition fails even without disturbance torques.
-    #: Example: if 30 and 18 Nm are requested at hip and knee, 0.8 allows 24 and 14.4 Nm.
+    #: Example: if 30 and 18 Nm are requested at hip and knee, a `scale` of 0.8 allows 24 and 14.4 Nm.
     scale: float
     what: str  # condition in words, for a message
 
@@ -197,7 +197,7 @@ def _pair(torque: Vector) -> JointTorque | None:
 
 
 def _limit(room: Vector, reach: Vector, steps: int, what: str) -> Limit:
-    """Compute the disturbance torques at which a quantity reaches a limit.
+    """Compute the disturbance torques at which the tracking error, torque, speed or torque change of a joint reaches its limit.
 
     The quantity is the tracking error, the torque, the speed or the torque change of SH and SK. The model errors use up a part
     of the room below the limit. The disturbance torques may use the rest. `Limit.scale` is therefore
@@ -239,9 +239,9 @@ class _Horizon:
         # Split the error one cycle after the prediction: factor * (error in the last predicted cycle) + remainder.
         self._factor = (beyond * rows[-1]).sum(axis=1) / (rows[-1] ** 2).sum(axis=1)
         remainder = beyond - self._factor[:, None] * rows[-1]
-        #: Three upper bounds of the remainder. Each bound is a tuple: (two predicted cycles, weights of shape (4, 2)).
-        #: The remainder of hip and knee is at most `errors @ weights`.
-        #: `errors` has four elements: |hip|, |knee| in the first of the two cycles, then |hip|, |knee| in the second cycle.
+        #: Three upper bounds of abs(remainder). Each bound is a tuple: (two predicted cycles, weights of shape (4, 2)).
+        #: abs(remainder) of hip and knee is at most `errors @ weights`. `errors` contains the errors in the two predicted cycles.
+        #: `errors` has four elements [rad]: |e| of hip and knee in the first cycle, then |e| of hip and knee in the second cycle.
         self._remainders: list[tuple[tuple[int, int], Vector]] = []
         for near, far in ((0.1, 0.3), (0.25, 0.5), (0.4, 0.7)):
             lags = round(near * self.cycles), round(far * self.cycles)
@@ -251,7 +251,7 @@ class _Horizon:
         self._reach = prediction.reach[self._starts // START_CYCLES]
 
     def limit(self, width: Vector, narrowest: Vector, following: Vector) -> Limit:
-        """Compute the disturbance torques at which the next error reaches the bound of the guide.
+        """Compute the disturbance torques at which the error one cycle after the prediction reaches the bound of the guide.
 
         The next error is the error one cycle after the last predicted cycle. `scale` is the ratio of the computed torques to the
         requested torques.

@@ -36,13 +36,14 @@ class StepGuideConfig:
     #: Example: with zeta = 0.01 s, dh/dt = -50 1/s raises the weight from 0 to 0.5.
     zeta: float = 0.01
     #: Factor in [0, 1] on the torque u_i, which cancels friction, gravity, centrifugal and Coriolis torques.
-    #: The factor applies while the backup torque has weight 0.
+    #: While the backup torque has the weight w, u_i is multiplied by `idealization` * (1 - w) + w.
     idealization: float = 1.0
     #: Factor in [0, 1] on the feedforward torque u_f, which accelerates the leg along q_des.
-    #: The factor applies while the backup torque has weight 0.
+    #: While the backup torque has the weight w, u_f is multiplied by `feedforward` * (1 - w) + w.
     feedforward: float = 1.0
-    #: If a counter exceeds this value, the controller reports that the leg has left its guide. The counter rises by 1 in each
-    #: cycle with h < 0 in a guide with certified torques. In every other cycle it falls by 1, but not below 0.
+    #: If a counter exceeds this value, the controller reports that the leg has left its guide.
+    #: The counter rises by 1 in each cycle in which the guide has certified torques and the safety value h is below 0.
+    #: In every other cycle, the counter falls by 1, but not below 0.
     outside_cycles: int = 150
     active: float = 0.05  # weight of the backup torque above which the filter is considered active
 

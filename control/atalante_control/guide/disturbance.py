@@ -1,4 +1,4 @@
-r"""Disturbances of the assisted leg and their largest effect under the backup policy: `leg, model errors, responses -> reach`.
+r"""Disturbances of the assisted leg and their largest effect under the backup policy: `leg, model errors, responses -> effect`.
 
 For each cycle of the step, this module bounds the torques at sagittal hip and knee (SH, SK) that the model does not explain. The
 bound is the sum of the promise (the disturbance torques of the certificate) and a budget. The budget is the sum of four torques:
@@ -74,7 +74,7 @@ class HandOver:
     #: Nm, largest torque that the controller adds to sagittal hip and knee after a stance change
     carried: Pair = (25.0, 13.0)
     #: rad/s2, largest joint acceleration before the stance change.
-    #: This acceleration causes an error of the velocity that is measured after the stance change.
+    #: A joint acceleration before a stance change causes an error of the velocity that is measured after the stance change.
     acceleration: float = 20.0
 
     def __post_init__(self) -> None:
@@ -88,7 +88,7 @@ class HandOver:
                 )
 
     def contains(self, angles: Pair, rates: Pair, accelerations: Pair, jumps: Pair) -> bool:
-        """Return whether a stance change is inside the box. Each argument contains a value of sagittal hip and knee.
+        """Return whether a stance change is inside the hand-over box. Each argument has two elements: sagittal hip, then knee.
 
         Args:
             angles: angle deviations s(0) [rad].
@@ -112,7 +112,7 @@ class HandOver:
         return np.outer(blend, np.minimum(self.carried, self.torque))
 
     def remaining(self, blend: Vector, decrease: Vector) -> Vector:
-        """Return how much of the largest torque jump the command still contains in each cycle, shape (n, 2) [Nm].
+        """Return how much of the torque jump at a stance change can remain in the command in each cycle, shape (n, 2) [Nm].
 
         The command contains the added torque. The limiter of the robot lets a larger jump decrease only slowly.
 
@@ -238,14 +238,16 @@ class Effect(NamedTuple):
     """
 
     #: (n, 2, 2) pushed[i]: effect, i cycles later, of a disturbance of 1 rad/s2 that lasts one cycle.
-    #: For an error or a speed, the effect is the change of this quantity.
-    #: For a torque or a torque change, the effect is an acceleration or a change of the acceleration, which `left` converts.
+    #: For an error or a speed, `pushed` contains the change of the error or of the speed.
+    #: For a torque, `pushed` contains an acceleration, which the mass matrices `left` convert to the torque.
+    #: For a torque change, `pushed` contains a change of the acceleration, which `left` converts to the torque change.
     pushed: Vector
-    #: (n, 2, 2) hidden[i]: change of a prediction i cycles ahead, if an acceleration of 1 rad/s2 causes a wrong start velocity.
+    #: (n, 2, 2) hidden[i]: change of the value predicted i cycles ahead, because the start velocity is measured wrongly.
+    #: The change is for the error of the start velocity that an acceleration of 1 rad/s2 causes.
     #: An empty array of shape (0, 2, 2) means that the start velocity is assumed to be exact.
     hidden: Vector
-    #: (n, 2, 2) left[k]: factor in cycle k of the step. For a torque or a torque change, the factor is the mass matrix.
-    #: For an error or a speed, the factor is the unit matrix.
+    #: (n, 2, 2) left[k]: matrix that converts `pushed` and `hidden` to the quantity in cycle k of the step.
+    #: For a torque or a torque change, left[k] is the mass matrix [kg m2]. For an error or a speed, left[k] is the unit matrix.
     left: Vector
 
 
@@ -253,7 +255,7 @@ class Grid(NamedTuple):
     """Set of predictions that `spread` examines: each start cycle is combined with each prediction length."""
 
     starts: int  # number of start cycles; the start cycles are 0 to starts - 1
-    #: number of start cycles that share one row of the result. Example: with 4, row 2 is the maximum for the start cycles 8 to 11
+    #: number of start cycles that share one row of the result. Example: if block = 4, row 2 is for the start cycles 8 to 11
     block: int
     lags: NDArray[np.int64]  # (lags,) prediction lengths [cycles], ascending
 

@@ -63,10 +63,10 @@ class GuideConfig:
     derivative_time: float = 0.005  # s, time constant of the low-pass filter on dh/dt
     release: float = 0.03  # s, shortest time in which the weight of the backup torque falls from 1 to 0
     #: Factor on the torque u_i, in [0, 1]. u_i cancels friction, gravity, centrifugal and Coriolis torques (joint idealization).
-    #: This is the factor at weight 0 of the backup torque. The factor changes linearly with this weight, up to 1 at weight 1.
+    #: While the backup torque has the weight w, u_i is multiplied by `idealization` * (1 - w) + w.
     idealization: float = 1.0
     #: Factor on the torque u_f, in [0, 1]. u_f accelerates the leg along q_des (feedforward).
-    #: This is the factor at weight 0 of the backup torque. The factor changes linearly with this weight, up to 1 at weight 1.
+    #: While the backup torque has the weight w, u_f is multiplied by `feedforward` * (1 - w) + w.
     feedforward: float = 0.0
 
     def __post_init__(self) -> None:
@@ -197,9 +197,9 @@ class GuideFilter:
 
 
 def tail(inverse: Vector) -> Vector:
-    """Return 1.03 / (smallest width of the guide in a cycle and the next `TAIL_CYCLES` cycles), shape (n, m) [1/rad].
+    """Return (1 + `TAIL_MARGIN`) / (smallest guide width in a cycle and the next `TAIL_CYCLES` cycles), shape (n, m) [1/rad].
 
-    Row k of the result is for the cycles k to k + `TAIL_CYCLES`. The factor 1.03 is 1 + `TAIL_MARGIN`.
+    Row k of the result is for the cycles k to k + `TAIL_CYCLES`.
 
     Args:
         inverse: 1 / width, shape (n, m) [1/rad]. Row k is cycle k. A width is the distance from q_des to a bound of the guide.

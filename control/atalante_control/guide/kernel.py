@@ -23,13 +23,13 @@ Pair = tuple[float, float]
 
 #: A ratio x (torque / limit or speed / limit) is converted to 1 - STEEPNESS * (1 - x). Example: 0.9 becomes 0.6, 1 stays 1.
 #: Normal walking already uses most of the allowed torque and speed.
-#: With the converted ratio, the weight of the backup torque rises later, only close to the limit.
+#: Due to the conversion, torque and speed raise the weight of the backup torque only close to their limits.
 STEEPNESS = 4.0
 #: Number of elements of the compressed state, a short form of the state of the leg.
-#: The tracking errors are predicted from the compressed state, because this is faster.
+#: The tracking errors are predicted from the compressed state, which is faster than from all 10 elements of the state.
 COMPRESSED = 5
 #: Number of consecutive predicted cycles in a `Block`.
-#: `Block.slack` bounds the effect of model errors in all these cycles.
+#: `Block.slack` bounds the effect of model errors in all cycles of the block.
 SLACK_CYCLES = 10
 #: Number of start cycles that share one row of `GuideTables.reach`. Example: predictions that start in cycle 8 to 11 use row 2.
 START_CYCLES = 4
@@ -51,7 +51,7 @@ class Guard:
     zeta: float
     smoothing: float  # weight of the new value in the low-pass filter of dh/dt (h: safety value)
     #: Largest decrease of the gate (weight of the backup torque) per cycle.
-    #: This limit prevents oscillations of the gate.
+    #: Without a limit of the decrease, the gate would oscillate.
     release: float
     #: factor in [0, 1] on the torque u_i, which cancels friction, gravity, centrifugal and Coriolis torques (joint idealization)
     idealization: float
@@ -62,8 +62,9 @@ class Guard:
     motor: Annotated[Vector, 2]  # Nm, estimated torques of the motors of hip and knee
     lag: Annotated[Vector, 2]  # rad/s, estimated error of the measured velocities of hip and knee: true minus measured
     state: Annotated[Vector, STATES]  # state of the last cycle, see `backup_policy`
-    #: Absolute values of the elements of `state`. The effect of model errors is proportional to these values.
-    #: Exception: elements 2 and 3 are abs(true error rate - measured error rate) of hip and knee.
+    #: Absolute values of the elements of `state`, except elements 2 and 3.
+    #: The effect of model errors is proportional to the elements of `magnitude`.
+    #: Elements 2 and 3 of `magnitude` are abs(true error rate - measured error rate) of hip and knee [rad/s].
     magnitude: Annotated[Vector, STATES]
     compression: Annotated[Vector, (COMPRESSED, STATES)]  # matrix from the state to the compressed state
     compressed: Annotated[Vector, COMPRESSED]  # compressed state of the last cycle
@@ -84,8 +85,7 @@ class Lag:
     A record has arrays of fixed shape, so the compiled loops are fast.
     """
 
-    #: Matrix from the five numbers `Guard.compressed` (state of the leg) to the predicted errors of hip and knee [rad]:
-    #: compressed @ ahead.
+    #: Matrix that predicts the errors of hip and knee [rad] from the compressed state: errors = `Guard.compressed` @ `ahead`.
     ahead: Annotated[Vector, (COMPRESSED, 2)]
 
 
@@ -151,17 +151,18 @@ BASE = 8  # columns 8 and 9 of `step`: torque that moves the leg along q_des [Nm
 MASS = 10  # columns 10 to 12 of `step`: mass matrix M11, M12 and M22 along q_des [kg m2]
 SPEED = 13  # columns 13 and 14 of `step`: velocity of q_des [rad/s]
 #: Column 15 of `step`: smallest allowed weight of the backup torque.
-#: This minimum falls from 1 to 0 in the first cycles of a step, while the filter takes over the joints.
+#: The smallest allowed weight falls from 1 to 0 in the first cycles of a step, so a step starts with the full backup torque.
 FLOOR = 15
-#: Columns 16 to 19 of `step`: 1.03 * maximum of columns 0 to 3 over this cycle and the next `TAIL_CYCLES` cycles [1/rad].
+#: Columns 16 to 19 of `step` [1/rad]: columns 0 to 3, maximum over this cycle and the next `TAIL_CYCLES` cycles.
+#: The maximum is multiplied by 1 + `TAIL_MARGIN`.
 TAIL = 16
-#: Columns 20 to 23 of `step`: maximum of columns 0 to 3 over `SLACK_CYCLES` cycles from this cycle on [1/rad].
+#: Columns 20 to 23 of `step` [1/rad]: columns 0 to 3, maximum over `SLACK_CYCLES` cycles from this cycle on.
 NEAR = 20
 COLUMNS = 24
 #: Number of cycles after the prediction in which the guide must still be wider than the last predicted error.
 TAIL_CYCLES = 60
 #: Fraction of the guide width that must remain free in the last predicted cycle.
-#: This margin keeps the error inside the guide in the cycles after the prediction.
+#: The free width keeps the error inside the guide in the cycles after the last predicted cycle.
 TAIL_MARGIN = 0.03
 
 
@@ -197,7 +198,7 @@ def slide_maximum(table: Vector, first: int, end: int, cycles: int) -> None:
     last, covered = len(table) - 1, 1  # each value is the maximum of `covered` rows of the original table
     while covered < cycles:
         shift = min(covered, cycles - covered)
-        for row in range(last):  # ascending, so `table[later]` still contains its old values
+        for row in range(last):  # rows are changed in ascending order, so row `later` still contains its old values
             later = min(row + shift, last)
             for column in range(first, end):
                 table[row, column] = max(table[row, column], table[later, column])
@@ -205,7 +206,7 @@ def slide_maximum(table: Vector, first: int, end: int, cycles: int) -> None:
 
 
 class Motion(NamedTuple):
-    """Desired motion as a linear function of the deviations at the stance change. `write_motion` evaluates it for a step.
+    """Desired motion as a linear function of the deviations at the stance change. `write_motion` evaluates this function.
 
     Rows are cycles since the stance change. The columns are four values of hip and knee: acceleration (one command lag
     later), velocity after the low-pass of the drives, velocity, and torque.
@@ -214,11 +215,13 @@ class Motion(NamedTuple):
     change. SH and SK have the same factors. The last factor is the acceleration s'', from which the torque follows.
     """
 
-    nominal: Vector  # (n, 8) motion without the offset, columns in pairs of hip and knee [rad/s2, rad/s, rad/s, Nm]
-    #: (n, 4) offset of the re-centring for s(0) = 1 rad.
-    #: Columns: acceleration one command lag later, velocity after the low-pass of the drives, velocity, acceleration.
+    #: (n, 8) nominal motion, without the re-centring offset s. Each quantity has two columns: hip, then knee.
+    #: Quantities: acceleration [rad/s2], velocity after the low-pass of the drives [rad/s], velocity [rad/s], torque [Nm].
+    nominal: Vector
+    #: (n, 4) re-centring offset s for s(0) = 1 rad and s'(0) = 0.
+    #: Columns: s'' one command lag later [rad/s2], s' after the low-pass of the drives [rad/s], s' [rad/s], s'' [rad/s2].
     of_deviation: Vector
-    of_rate: Vector  # (n, 4) offset of the re-centring for s'(0) = 1 rad/s; columns as in `of_deviation`
+    of_rate: Vector  # (n, 4) re-centring offset s for s'(0) = 1 rad/s and s(0) = 0; columns as in `of_deviation`
 
 
 def write_motion(step: Vector, motion: Motion, deviation: Pair, rate: Pair) -> None:
@@ -286,11 +289,11 @@ def leg_state(hip: int, q: Vector, qd: Vector, desired: Vector, sent: Vector, gr
 
 
 def tick(guide: GuideTables, cycle: int, leg: LegState) -> Pair:
-    """Compute the torques of sagittal hip and knee for one cycle: (1 - gate) u_free + gate u_B.
+    """Compute the torques of sagittal hip and knee for one cycle: mean of free torque and backup torque, weighted by the gate.
 
-    u_free is the sum of u_i and u_f, each multiplied by its intensity. u_B is the backup torque, see `backup_policy`.
-    The gate is the result of `damped_gate`, with two lower bounds: the value in column `FLOOR`, and the last gate minus
-    `Guard.release`. The second bound does not apply in the first cycle of a step.
+    The torques are (1 - gate) u_free + gate u_B. u_free is the sum of u_i and u_f, each multiplied by its intensity. u_B is the
+    backup torque, see `backup_policy`. The gate is the result of `damped_gate`, with two lower bounds: the value in column
+    `FLOOR`, and the last gate minus `Guard.release`. The second bound does not apply in the first cycle of a step.
 
     Args:
         guide: tables of the guide filter; the results of the tick are written to `GuideTables.guards`.
@@ -460,7 +463,7 @@ def bound_blocks(guide: GuideTables, cycle: int, blocks: int) -> int:
 
 
 def _few_ratio(guide: GuideTables, cycle: int, least: float) -> float:
-    """Return the largest ratio of a predicted torque or speed to its limit, converted with the slope `STEEPNESS`.
+    """Return 1 - STEEPNESS * (1 - r), where r is the largest ratio of a predicted torque or speed to its limit.
 
     Args:
         guide: tables of the guide filter.

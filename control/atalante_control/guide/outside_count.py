@@ -1,10 +1,13 @@
-"""Count of cycles outside the guide: `outside, promised -> whether the disturbance is larger than promised`."""
+"""Count of the cycles with a negative safety value h: `h < 0, guide has certified torques -> whether h < 0 for too long`."""
 
 from __future__ import annotations
 
 
 class OutsideCount:
-    """Count of the cycles outside a guide with a promise. In a guide without a promise, cycles outside are not counted."""
+    """Counter that rises in each cycle with h < 0 in a guide with certified torques, and falls in every other cycle.
+
+    If the safety value h is negative, the backup policy may not be able to keep the joints inside the guide.
+    """
 
     def __init__(self, largest: int) -> None:
         """Start with the count 0.
@@ -15,13 +18,13 @@ class OutsideCount:
         self._largest, self._cycles = largest, 0
 
     def update(self, outside: bool, promised: bool) -> bool:
-        """Count one cycle. Return whether the joints have been outside the guide for too many cycles.
+        """Count one cycle. Return whether the safety value h has been negative for too many cycles.
 
-        The count rises in a cycle outside a guide with a promise, and falls in every other cycle.
+        The count rises or falls by 1 in each cycle, and is at least 0.
 
         Args:
             outside: whether the safety value h of this cycle is negative; False in a cycle without a guide.
-            promised: whether the guide of this step has a promise.
+            promised: whether the guide of this step has certified disturbance torques (a promise).
         """
         self._cycles = self._cycles + 1 if outside and promised else max(0, self._cycles - 1)
         return promised and self._cycles > self._largest

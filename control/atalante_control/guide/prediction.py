@@ -44,7 +44,7 @@ class Assumptions:
     delays: tuple[int, int] = (1, 2)
     rate: float = 20.0  # Nm, largest change of the command within one cycle that the limiter of the robot permits
     horizon: int = 300  # number of predicted cycles
-    overlap: int = 100  # number of cycles of the next step in the tables; predictions can reach into them
+    overlap: int = 100  # number of cycles of the next step in the tables; predictions can end in the next step
 
     def __post_init__(self) -> None:
         """Check the ranges of the values.
@@ -68,8 +68,8 @@ class StartReach(NamedTuple):
     """
 
     error: Vector  # (n, 4) rad, tracking error; worst case over all inertia errors and delays
-    torque: Vector  # (n, 4) Nm, deviation of the backup torque, without inertia error and additional delay
-    speed: Vector  # (n, 4) rad/s, deviation of the joint speed, without inertia error and additional delay
+    torque: Vector  # (n, 4) Nm, deviation of the backup torque, for the inertia and delay of the model
+    speed: Vector  # (n, 4) rad/s, deviation of the joint speed, for the inertia and delay of the model
     worst_speed: Vector  # (n, 4) rad/s, deviation of the joint speed; worst case over all inertia errors and delays
     change: Vector  # (n, 4) Nm, change of the backup torque from one cycle to the next
 
@@ -113,7 +113,7 @@ class Prediction:
         last = len(leg.time) - 1
         self.cycles = last - assumptions.overlap
         horizon, hand_over = assumptions.horizon, assumptions.hand_over
-        longest = max(last, horizon + 1)  # `beyond` needs the cycle after the horizon, even if `last` is smaller
+        longest = max(last, horizon + 1)  # `self.beyond` is for the cycle after the horizon
         self.nominal = nominal = responses(policy, assumptions.loop, 1.0, longest)
         rows = nominal.error[: horizon + 1]
         _, _, basis = np.linalg.svd((rows * SIZES).reshape(-1, STATES), full_matrices=False)
@@ -144,7 +144,8 @@ class Prediction:
         few, none = whole._replace(lags=FEW), whole._replace(lags=FEW[:0])
 
         # `first_change`: largest change of the backup torque within one cycle, without the torque jump at the stance change.
-        # The limiter permits changes of up to `assumptions.rate`. The rest remains for the decrease of the torque jump.
+        # The command may change by at most `assumptions.rate` per cycle. The backup torque may change by `first_change`.
+        # So the torque jump can decrease by at least `assumptions.rate` - `first_change` per cycle.
         change = Effect(np.diff(lightest.pushed_feedback, axis=0, prepend=0.0), nothing, self.mass)
         first_change = run(change, mobilities, bounds, none, np.zeros((blocks, 0, 4)))
         remaining = hand_over.remaining(blend, assumptions.rate - first_change[:, :2] - first_change[:, 2:])
@@ -152,11 +153,11 @@ class Prediction:
         before = np.tile(hand_over.torque, (assumptions.delays[1], 1))
         bounds[:, :, 0] = leg.budget(assumptions.mismatch, hand_over, np.concatenate([before, remaining]))
 
-        # Each loop in `family` has another inertia error or delay. `reach` and `few_ahead[2]` are maxima over all these loops.
+        # The loops in `family` differ in inertia error and delay. `reach` and `few_ahead[2]` are maxima over all these loops.
         # Example: a joint moves faster if the leg is lighter than in the model, or if the command arrives later.
         self.reach = np.zeros((blocks, len(whole.lags), 4))
         # `few_ahead`: largest changes of predicted torques [Nm] and speeds [rad/s] that disturbances can cause.
-        # Axis 0: 0 torque, 1 speed of the loop without model errors, 2 largest speed of all loops in `family`.
+        # Axis 0: 0 torque and 1 speed, both of the loop without model errors; 2 largest speed of all loops in `family`.
         # Axis 1: start of the prediction. Element k is for the start cycles k * START_CYCLES to (k + 1) * START_CYCLES - 1.
         # Axis 2: element i is for the prediction FEW[i] cycles ahead.
         # Axis 3: 0 hip and 1 knee due to model errors; 2 hip and 3 knee due to the disturbance torques `Assumptions.promise`.
@@ -214,7 +215,7 @@ def prediction_of(policy: BackupPolicy, leg: Leg, assumptions: Assumptions, blen
 
 
 def _for_rate_difference(rows: Vector) -> Vector:
-    """Convert prediction matrices for a state with rate differences (true - measured error rate) instead of true error rates.
+    """Convert prediction matrices to a state whose elements 2 and 3 are true minus measured error rates, not true error rates.
 
     The given matrices multiply a state in which elements 2 and 3 are the true error rates of SH and SK. Elements 4 and 5 are the
     measured error rates. The returned matrices multiply a state in which elements 2 and 3 are the differences true - measured.

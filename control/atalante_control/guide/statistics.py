@@ -17,7 +17,7 @@ class GuideStatistics:
     #: Smallest safety value h among the first cycles of all steps.
     #: If h >= 0, the backup policy (spring and damper) can keep both joints inside the guide.
     min_h_at_start: float = 1.0
-    hand_overs: int = 0  # number of steps with a guide whose start was compared with the hand-over box
+    hand_overs: int = 0  # number of steps whose start was compared with the hand-over box
     #: Number of compared steps that start outside the hand-over box (`HandOver`). The certificate does not apply to them.
     hand_overs_exceeded: int = 0
     factors: set[float] = field(default_factory=set)  # assistance factors of all steps so far

@@ -24,14 +24,14 @@ from atalante_hal.robot import LEG_JOINTS, Robot
 from atalante_hal.types import Vector
 
 #: Knee angle [rad] at which the gains of the backup policy (spring and damper) are computed, in the middle of the swing.
-#: At other knee angles, the mass matrix and the stiffness of the joints are different, see `BackupPolicy.mass`.
+#: At any knee angle other than `_MIDDLE`, mass matrix and stiffness of the joints are different, see `BackupPolicy.mass`.
 _MIDDLE = math.radians(30.0)
 #: Indices of SH and SK of the left leg. SH and SK have the same limits in both legs.
 _ASSISTED = [LEG_JOINTS.index("SH"), LEG_JOINTS.index("SK")]
 #: If the requested torques cannot be certified, a filter assumes this fraction of the largest certifiable disturbance torques.
-#: With 1, a prediction would reach its limit even without a push, and the filter would apply the full backup torque.
+#: With the fraction 1, a prediction would reach its limit without a push, so the filter would apply the full backup torque.
 _MARGIN = 0.95
-#: Number of intervals from 0 to 1. A filter is chosen for the assistance factor at each end of an interval: 0, 0.01, ..., 1.
+#: Number of intervals between the assistance factors 0 and 1. A filter is chosen for each of the factors 0, 0.01, ..., 1.
 _FACTORS = 100
 
 
@@ -40,7 +40,7 @@ class Choice(NamedTuple):
 
     guide: GuideFilter
     #: Certified torques as a fraction of the torques that the configuration requests, in [0, 1].
-    #: The fraction is 0 if the certified torque at the hip is below `certificate.SMALLEST`.
+    #: `promise` is 0 if the certified torque at the hip would be below `certificate.SMALLEST`.
     promise: float
 
 

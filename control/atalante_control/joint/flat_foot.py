@@ -284,7 +284,7 @@ def write_level_ankle(
 
 
 def _write_targets(ankle: Ankle, cubics: Vector, cycle: int, target: tuple[Pair, Pair], desired: Vector) -> None:
-    """Add the faded deviation of the stance change to the flat-foot targets, and write the sums into `desired`."""
+    """Add the part of the start deviation that has not yet faded out to the flat-foot targets. Write the sums into `desired`."""
     (angles, rates), n = target, len(desired) // 2
     for i in range(2):
         angle, rate, joint = angles[i], rates[i], ankle.joints[i]

@@ -31,12 +31,12 @@ class ExoskeletonParameters:
     shank_length: float = 0.408  # m, from SK to SA
 
     pelvis_mass: float = 16.5  # kg, pelvis and back
-    frontal_hip_mass: float = 3.7  # kg, mass in one leg; all masses below are also per leg
+    frontal_hip_mass: float = 3.7  # kg, frontal hip link of one leg; all following masses are also for one leg
     transverse_hip_mass: float = 4.4
     thigh_mass: float = 9.0
     shank_mass: float = 11.0
     ankle_mass: float = 1.7
-    foot_mass: float = 3.2  # kg, including the force cells
+    foot_mass: float = 3.2  # kg, foot of one leg with its force cells
 
     fh_offset: Vector3 = (0.0, 0.089, 0.0)  # m, position of joint FH in the pelvis frame
     th_offset: Vector3 = (-0.135, 0.169, 0.0)  # m, position of joint TH in the frontal hip frame
