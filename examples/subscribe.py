@@ -24,9 +24,9 @@ parser.add_argument("endpoint", nargs="?", default="tcp/127.0.0.1:7447")
 endpoint = parser.parse_args().endpoint
 settings = {
     "mode": "client",
-    "connect": {"endpoints": [endpoint], "timeout_ms": -1},  # -1: try again until the HAL answers
+    "connect": {"endpoints": [endpoint], "timeout_ms": -1},  # -1: no timeout, retry until the HAL answers
     "scouting": {"multicast": {"enabled": False}, "gossip": {"enabled": False}},  # connect to the endpoint only
-    "transport": {"shared_memory": {"enabled": False}},  # Ctrl-C would leave shared memory in /dev/shm
+    "transport": {"shared_memory": {"enabled": False}},  # off, because Ctrl-C would leave shared memory in /dev/shm
 }
 
 signal.signal(signal.SIGINT, signal.SIG_DFL)  # Ctrl-C ends the program, also while `zenoh.open` waits
@@ -45,5 +45,6 @@ with zenoh.open(config) as session, session.declare_subscriber("atalante/*/joint
         try:
             print(states.cycle, dict(zip(states.name, states.position, strict=True)), flush=True)
         except BrokenPipeError:  # the program that reads the output has ended, for example `head`
-            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # Python flushes stdout again at the exit
+            # Python flushes stdout at the exit. With /dev/null as stdout, this flush raises no error.
+            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
             break

@@ -82,7 +82,7 @@ def fit(gaits: Sequence[Gait], grid: Grid, *, hidden: Sequence[int] = HIDDEN, it
     low, high = subjects.min(axis=0).round(12), subjects.max(axis=0).round(12)
     for name, least, most in zip(INPUTS, low, high, strict=True):
         if least == most:
-            raise FitError(f"{name} must have at least two values in the gaits, got only {least:g}")
+            raise FitError(f"{name} must have at least two values in the gaits, got {least:g} in all gaits")
     x = (subjects - low) * (2.0 / (high - low)) - 1.0
     points = np.array([gait.coefficients.ravel() for gait in gaits])
     measure = _metric(float(np.mean(grid.step_duration)))
@@ -129,9 +129,9 @@ def inputs(gait: Gait) -> Vector:
 
 
 def _metric(duration: float) -> Vector:
-    """Return the matrix M, shape (96, 96). The squared distance of two gaits is `d^T M d`.
+    """Return the matrix M of the squared distance `d^T M d` of two gaits, shape (96, 96). d is the control point difference.
 
-    d is the difference of the control points of the two gaits. The squared distance is the weighted mean of squared
+    d contains the control points of one gait minus those of the other gait. The squared distance is the weighted mean of squared
     errors along the step.
 
     Args:

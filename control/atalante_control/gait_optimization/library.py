@@ -37,7 +37,7 @@ FORMAT = "atalante-library/2"
 _ROOT_ITERATIONS = 60  # number of iterations that compute the constant g in `Grid.points`
 LEVELS_MIN = 3  # smallest number of levels of a parameter; with 2 levels, the joint angles of the network are wrong by 10 degrees
 
-#: Point of the grid: one number for each parameter, the index of the level of this parameter.
+#: Point of the grid, given by the index of the level of each parameter.
 Index = tuple[int, ...]
 #: Function that solves one gait. It must be defined at module level, because other processes import it.
 Solve = Callable[[Subject], SolvedGait]

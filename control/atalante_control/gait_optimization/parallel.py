@@ -126,7 +126,7 @@ def _numbered(call: Callable[[_Task], _Result], number: int, task: _Task) -> tup
 
 @contextmanager
 def _terminal_signals_later() -> Iterator[None]:
-    """Handle the signals of a terminal (SIGINT, SIGHUP) at the end of the `with` block. Child processes never handle them.
+    """Delay SIGINT and SIGHUP until the end of the `with` block. They stay blocked in child processes that start in the block.
 
     The parent process ends the child processes. Processes and threads that start in the block inherit the signal mask, so the
     signals stay blocked in them. A thread of the parent process that started before the block may receive a signal. Then a
@@ -139,7 +139,7 @@ def _terminal_signals_later() -> Iterator[None]:
     mask = signal.pthread_sigmask(signal.SIG_BLOCK, _TERMINAL_SIGNALS)
     try:
         for tracker in (resource_tracker, loky_tracker):
-            tracker.ensure_running()  # the start of this process unblocks SIGINT before Python 3.12 and joblib 1.6
+            tracker.ensure_running()  # Python before 3.12 and joblib before 1.6 unblock SIGINT when they start the tracker
         signal.pthread_sigmask(signal.SIG_BLOCK, _TERMINAL_SIGNALS)
         yield
     finally:
@@ -152,7 +152,7 @@ def _terminal_signals_later() -> Iterator[None]:
 
 @contextmanager
 def _without_loky_errors() -> Iterator[None]:
-    """Hide the traceback of a KeyError in a thread of loky, the process pool of joblib, inside the `with` block.
+    """Inside the `with` block, hide the traceback of a KeyError in a thread of loky. Loky is the process pool of joblib.
 
     Before loky ends its processes, it clears the table of pending calls. If the executor thread queues a call at that moment, the
     call is not in the table (`add_call_item_to_queue` in loky 3.6). The error has no effect, because all calls are cancelled.

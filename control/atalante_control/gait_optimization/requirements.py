@@ -39,8 +39,8 @@ class Requirements:
     #: m/s, limit of the forward speed and of the lateral speed of each corner of the landing sole
     corner_slide: float = 0.025
     #: rad/s, largest jump of a joint speed at the impact.
-    #: A gait of the gait network keeps 40 % of the jump (`fit.JUMP_KEPT`), and has a fit error in addition.
-    #: The remaining jump plus the fit error must be at most `VELOCITY_JUMP`.
+    #: The gaits of the gait network keep 40 % of this jump (`fit.JUMP_KEPT`). The fit error adds to the jump.
+    #: The sum of the kept jump and the fit error must be at most `VELOCITY_JUMP`.
     impact_jump: float = 0.6 * VELOCITY_JUMP
     sinking: float = 0.01  # m/s, largest downward speed of the rear foot after the impact
     # Weights of the cost. The sum of (joint torque / 100 Nm)^2 has weight 1.

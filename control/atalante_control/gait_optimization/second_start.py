@@ -23,7 +23,7 @@ from atalante_control.gait_optimization.step_problem import StepProblem
 from atalante_hal.robot import JOINTS, load_robot
 from atalante_hal.types import Vector
 
-MODERATE: Final = (0.15, 0.9)  # step length [m] and duration [s] of the gait from which the second start begins
+MODERATE: Final = (0.15, 0.9)  # step length [m] and duration [s] of the gait that is the second initial guess
 #: Relative tolerance: an angle is at a limit if its distance to the limit is at most 0.1 % of the joint range.
 #: A speed or a torque is at a limit if it is at least 99.9 % of the largest value that a gait may use.
 _AT_LIMIT: Final = 1e-3
@@ -69,7 +69,7 @@ def solve_with_second_start(subject: Subject, attempt: Attempt) -> SolvedGait:
 
 
 def joints_at_limits(solved: SolvedGait) -> list[str]:
-    """Return the joints at a limit in the last iterate of the optimiser. Each text names joint and quantity.
+    """Return the joints at a limit in the last iterate of the optimiser, as texts such as "torque of left_SK".
 
     Args:
         solved: result of the optimiser.

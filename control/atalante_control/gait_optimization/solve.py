@@ -43,7 +43,7 @@ _OPTIONS: dict[str, Any] = {
     "error_on_fail": False,
     "calc_lam_p": False,
     # CasADi must not build the function nlp_grad: the compiled functions lack the derivatives that nlp_grad requires.
-    # Only sensitivities of the solution need nlp_grad.
+    # CasADi uses nlp_grad only for sensitivities of the solution, which are not computed here.
     "no_nlp_grad": True,
 }
 #: IPOPT options of a warm start: a small initial barrier parameter mu, and bound multipliers computed from mu.

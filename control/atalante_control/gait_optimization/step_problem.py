@@ -278,7 +278,7 @@ class StepProblem:
             end, next_one = (-1, -2) if self.kind == "start" else (0, 1)
             pose, other = around.coefficients[:, end], around.coefficients[:, next_one]
             # Joint speed = constant * (difference of two control points) / (step duration).
-            # So for the same joint speed, a step that lasts twice as long needs twice the difference.
+            # So for the same joint speed, a step that lasts twice as long needs twice the difference of the control points.
             points = {"gait pose": pose, "gait speed": pose + (other - pose) * TRANSITION / around.duration}
             for group in self.program.groups:
                 if group.name in points:

@@ -81,7 +81,7 @@ class AttitudeObserver:
         self._observe(self.records, gyro, accel, velocity)
 
     def change_imu(self, gyro: Vector, offset: Vector) -> None:
-        """Convert the velocity to the position of another IMU on the pelvis.
+        """Replace the stored velocity of one IMU on the pelvis by the velocity of another IMU on the pelvis.
 
         Args:
             gyro: angular velocity of the pelvis in the axes of the pelvis, shape (3,) [rad/s].

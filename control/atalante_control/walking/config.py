@@ -20,13 +20,13 @@ from atalante_hal.types import Vector
 Pair = tuple[float, float]
 
 #: Default of `WalkConfig.steering`. The transverse hip turns by at most 3 degrees.
-#: It turns by 0.5 rad per rad of heading error, plus 0.15 rad per metre of sideways deviation from the path.
+#: The transverse hip turns by 0.5 rad per rad of heading error, plus 0.15 rad per metre of sideways deviation from the path.
 STEERING = 0.5, 0.15, math.radians(3.0)
 
 _NO_INTEGRAL = (0.0,) * 6
-#: Largest absolute value of `WalkConfig.turn` [rad]. With 5 degrees, a tall and heavy patient fell in guided steps at Xi = 0.
-#: An active patient of this size had DCM errors up to 0.15 m with 3 degrees, and 0.19 m with 4 degrees.
-#: `turn` is the angle by which the straight path of the robot turns before each periodic step.
+#: Largest absolute value of `WalkConfig.turn` [rad]: the angle by which the straight path turns before each periodic step.
+#: With a turn of 5 degrees, a passive patient of 91 kg and 1.93 m fell in guided steps at assistance factor 0.
+#: An active patient of 91 kg and 1.93 m had DCM errors up to 0.15 m with a turn of 3 degrees, and 0.19 m with 4 degrees.
 TURN_MAX = math.radians(3.0)
 #: Gains without integral terms. With integral terms, the robot began to limp after about 120 steps in MuJoCo.
 #: The PIDs act against the ankle stabiliser, so the integral terms of the two legs drifted apart.
@@ -36,7 +36,8 @@ WALK_GAINS = PidGains(
 #: Parameters of the guide on the ground.
 #: `stiffness` is larger than in the air, because the leg of the exoskeleton also carries the leg of the patient.
 #: `hand_over` (largest deviations at the start of a step for which the guide is certified) covers the deviations after a landing.
-#: The controller adds no torque after a stance change, so the torque of the stance leg decreases with the rate of the limiter.
+#: On the ground, the controller adds no torque that smooths the torque jump at a stance change (`carried` is 0).
+#: The torque limiter of the robot alone determines how fast the torque changes after a stance change.
 WALK_GUIDE = StepGuideConfig(
     stiffness=(4500.0, 3300.0),
     hand_over=HandOver(
@@ -60,23 +61,23 @@ class WalkConfig:
     damping_loss: float = 1.0 / 12.0
     impact: ImpactConfig = field(default_factory=ImpactConfig)
     #: Duration of the re-centring, as a fraction of the duration of the step or weight shift.
-    #: In this time, the desired motion returns from the measured pose to the nominal motion.
+    #: During the re-centring, the desired motion returns from the measured pose to the nominal motion.
     alpha: float = 0.3
     #: True: the periodic steps use the control law exactly as Gurriet et al., 2019, print it, see `WalkConfig.literal`.
-    #: With True, the guide is not certified.
+    #: If True, the guide of the periodic steps is not certified.
     literal_law: bool = False
     #: m/m, the ankle stabiliser shifts the centre of pressure by this distance per metre of DCM error.
     #: DCM: divergent component of motion.
     stabiliser: float = 2.5
     shift_limit: Pair = (0.12, 0.05)  # m, largest shift of the centre of pressure: along the walk; sideways
     #: m, smallest permitted distance from the centre of pressure to the front edge and to the rear edge of the stance sole.
-    #: The torque of the sagittal ankle is limited accordingly.
+    #: The torque of the sagittal ankle is limited so that the centre of pressure keeps this distance.
     edge: float = 0.005
     placement: PlacementConfig = field(default_factory=PlacementConfig)  # parameters of foot placement and step timing
     lean: LeanConfig = field(default_factory=LeanConfig)  # parameters of the lean of the trunk
     flat_foot: bool = True  # whether the ankle of the swing leg holds the sole level
     #: m/s, downward speed of a late swing foot (a swing foot that has not landed at the nominal end of the step).
-    #: Value 0: start step and periodic step. Value 1: stop step.
+    #: Value 0 applies to the start step and to the periodic step. Value 1 applies to the stop step.
     reach_speed: Pair = (0.3, 0.03)
     #: s, longest time for which a late swing foot moves down. Hip and knee stop earlier if the knee angle falls to `reach_knee`.
     reach_time: float = 0.2
@@ -85,8 +86,8 @@ class WalkConfig:
     reach_rate: float = 2.5
     reach_knee: float = 0.05  # rad, smallest knee angle while a late swing foot moves down
     #: Steering adds an offset to the transverse hip.
-    #: Value 0: offset per heading error [rad/rad]. Value 1: offset per sideways deviation from the path [rad/m].
-    #: Value 2: largest offset [rad], without a turn. A turn increases the largest offset by abs(`turn`).
+    #: Value 0: offset of the hip per heading error [rad/rad]. Value 1: offset per sideways deviation from the path [rad/m].
+    #: Value 2: largest offset of the hip [rad], without a turn. A turn increases the largest offset by abs(`turn`).
     steering: tuple[float, float, float] = STEERING
     #: rad, angle by which the straight path of the robot turns before each periodic step, positive to the left
     turn: float = 0.0
@@ -95,13 +96,13 @@ class WalkConfig:
     load_bandwidth: float = 35.0  # Hz, cut-off frequency of the low-pass of the vertical foot forces
     observer_bandwidth: float = 2.0  # rad/s, natural frequency of the attitude observer
     #: True: the heading of the pelvis IMU corrects the drift of the gyro, see `walking.heading`.
-    #: With True, the IMU must have a heading reference, such as a magnetometer.
+    #: If True, the pelvis IMU must have a heading reference, such as a magnetometer.
     #: False: the estimated heading is the integral of the gyro.
     heading_reference: bool = False
     loaded: float = 0.3  # smallest load with which a standing foot counts as loaded, as a fraction of the weight
     #: Smallest load on a foot with which the full stance gains apply, as a fraction of the weight.
-    #: With less load, the gains are between the swing gains (no load) and the stance gains.
-    #: Value 0: for each leg while the robot stands. Value 1: for the ankle of the stance leg during a step.
+    #: If the foot carries less load, the gains are between the swing gains (no load) and the stance gains.
+    #: Value 0 applies to each leg while the robot stands. Value 1 applies to the ankle of the stance leg during a step.
     full_gains: Pair = (0.25, 0.5)
     settle: float = 1.0  # s, time for which both feet must be loaded before the robot walks
     #: m, largest distance between the soles, along the walk, with which a robot on the ground may start a walk.
@@ -111,13 +112,15 @@ class WalkConfig:
     shift: float = 1.5  # s, duration of a weight shift, onto one foot or back to both feet
     rest: float = 0.3  # s, wait after each weight shift
     guide: StepGuideConfig = WALK_GUIDE
-    #: As `alpha`, but only for sagittal hip and knee in a guided step. With `alpha`, their drives would reach the torque limit.
-    #: For all other joints, `alpha` applies. With `guided_alpha` for all joints, the robot would fall.
+    #: Duration of the re-centring of swing hip and knee (SH, SK) in a guided step, as a fraction of the step duration.
+    #: With the shorter duration `alpha`, the drives of SH and SK would reach the torque limit.
+    #: For all other joints, the duration is `alpha`. With the longer `guided_alpha` for all joints, the robot would fall.
     guided_alpha: float = 0.5
     #: s, time in which the smallest permitted weight of the backup torque falls from 1 to 0 at the start of a guided step.
     #: The backup torque holds the leg inside the guide.
     engage: float = 0.02
-    #: s, duration of the change from the guide to the baseline controller, for sagittal hip and knee, after a guided step
+    #: s, time in which the torques of SH and SK change from the guide to the baseline controller.
+    #: The change begins at the nominal end of a guided step.
     release: float = 0.03
 
     @classmethod

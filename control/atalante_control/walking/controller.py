@@ -69,7 +69,7 @@ _MARGIN = math.radians(1.0)
 #: Largest valid age of the message of an IMU or a foot [cycles], equal to the timeout of these messages in the DBC.
 _SENSOR_AGE = 10
 #: Largest expected difference between the weight and the load on the stance foot, as a fraction of the weight.
-#: While one foot swings, load and weight differ because the robot accelerates.
+#: While one foot swings, the load on the stance foot differs from the weight, because the robot accelerates.
 _LOAD_ERROR = 0.15
 #: m, height above the stance foot up to which the swing foot counts as landed while the data of both feet is lost
 _LANDED_HEIGHT = 0.001
@@ -150,7 +150,7 @@ class WalkController:
             toe=middle + half - config.edge,
         )
         force = np.zeros((len(FEET), len(CELLS), 3))
-        #: Foot forces of this cycle if the data of a foot is lost. They contain an estimate for this foot.
+        #: Foot forces that the kernels read if the data of one or both feet is lost. The forces of a lost foot are estimates.
         self._forces = force.copy()
         #: Copy of the torque that the controller requested last, used if the `State` does not contain the sent torque.
         self._sent = np.zeros(_N)
@@ -179,8 +179,8 @@ class WalkController:
         placements[0].low[:], placements[0].high[:] = _range(robot, config)
         leans: Records[Lean] = zeros(Lean, 1)
         # `clock`: progress of the step, as a row of the table of the desired motion. `pace`: rows per cycle.
-        # Both arrays have the shape (1,) and share the memory of a record.
-        # Reason: Python reads an array element faster than a record field.
+        # `_clock` and `_pace` are arrays of shape (1,) that share the memory of the record of foot placement.
+        # The arrays exist because Python reads an array element faster than a record field.
         self._clock, self._pace = placed["clock"], placed["pace"]
         outputs: Records[Outputs] = zeros(Outputs, 1)
         telemetry = zeros(Telemetry, 1)
@@ -413,7 +413,7 @@ class WalkController:
         self._state = state
 
     def _measure(self, state: State) -> None:
-        """Select the measurements of this cycle.
+        """Select the sensor data that the kernels read in this cycle, and replace lost data by estimates.
 
         While the data of the pelvis IMU is too old, the torso IMU is used. The HAL can report that the readings of the pelvis IMU
         are implausible, but those of the torso IMU are not. Then the torso IMU is used for the rest of the walk, except in cycles
@@ -510,8 +510,8 @@ class WalkController:
             self._stance = swing
         if phase in STEPPING:
             self._impact.start_step()
-        # In FINISH_STEP, a new step number, or None, makes the HAL hold all joints at their positions (HOLD).
-        # A robot on one foot would then fall. So the controller keeps the step number until the robot stands on both feet.
+        # In FINISH_STEP, the HAL enters HOLD (all joints hold their positions) if the step number changes or becomes None.
+        # A robot on one foot falls in HOLD. So the controller keeps the step number until the robot stands on both feet.
         if phase not in WALKING:
             self._command.step = None
         elif phase is Phase.SHIFT or (phase in STEPPING and not self._finishing):
@@ -572,9 +572,10 @@ class WalkController:
         command.guide_left = self._outside.update(command.outside, self._promised)
 
     def _check_hand_over(self) -> bool:
-        """Return whether a step starts outside the hand-over box, and count the step in the statistics.
+        """Return whether a step starts with larger deviations than its guide is certified for, and count the step.
 
-        Only steps with a certified guide are checked. The torque jump is known after the first cycle of the step.
+        The guide is certified for deviations inside the hand-over box (`HandOver`). Only steps with a certified guide are checked
+        and counted. The torque jump is known after the first cycle of the step.
         """
         if not self._promised:
             return False
@@ -610,7 +611,7 @@ def _range(robot: Robot, config: WalkConfig) -> tuple[Vector, Vector]:
     """
     low, high = robot.position_min + _MARGIN, robot.position_max - _MARGIN
     low[[_SK, _LEG + _SK]] = config.reach_knee
-    # Steering without a turn comes within 0.4 degrees of the position limits of the transverse hip.
+    # The transverse hip may use its full range. Steering without a turn already moves it to 0.4 degrees from a position limit.
     turning = [_TH, _LEG + _TH]
     low[turning], high[turning] = robot.position_min[turning], robot.position_max[turning]
     return low, high

@@ -40,7 +40,7 @@ class HeadingConfig(NamedTuple):
     gyro_bias: float = 5.2e-5  # rad/s, standard deviation of the gyro bias at the start (0.003 deg/s)
     bias_walk: float = 1e-6  # rad/s/sqrt(s), standard deviation of the change of the gyro bias within 1 s
     #: Largest accepted difference between measured and predicted heading, in standard deviations.
-    #: With a larger difference, the measured heading is ignored.
+    #: If this difference is larger, the measured heading is ignored.
     outlier: float = 5.0
     interval: int = 100  # cycles between two updates
 

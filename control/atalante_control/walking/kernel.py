@@ -46,8 +46,8 @@ _LEG = len(LEG_JOINTS)
 _FH, _TH, _SH, _SK, _SA, _HA = (LEG_JOINTS.index(name) for name in ("FH", "TH", "SH", "SK", "SA", "HA"))
 _ANKLES = (_SA, _HA)
 _FL, _FR, _RL, _RR = (CELLS.index(name) for name in ("FL", "FR", "RL", "RR"))
-#: Values of `Stage.gyro_source`: the angular velocity of the pelvis is that of an IMU of the trunk, or it is computed from the
-#: tibia IMU of the leg whose sole is at rest, or from this sole alone.
+#: Values of `Stage.gyro_source`, the source of the angular velocity of the pelvis. TRUNK: IMU of the pelvis or the torso.
+#: TIBIA: tibia IMU and joint speeds of the leg whose sole is at rest. SOLE: joint speeds of this leg only.
 TRUNK, TIBIA, SOLE = range(3)
 #: s, time constant with which a swing foot accelerates downwards if it has not landed at the nominal end of the step
 _REACH_RISE = 0.03
@@ -73,7 +73,7 @@ class Stage:
     """Data of the current phase, written by the controller at the start of the phase."""
 
     stance: int  # stance leg, 0 left, 1 right
-    double: bool  # whether no foot swings, because both feet are on the ground or the robot is suspended
+    double: bool  # True: no foot swings, because both feet are on the ground or the robot is suspended
     steering: float  # rad, steering: offset of the transverse hip of the swing leg at the end of the step
     #: rad, joint angles at the start of the phase minus the angles in the first row of the phase table
     deviation: Annotated[Vector, len(JOINTS)]
@@ -89,7 +89,8 @@ class Stage:
     #: Nm, torque of the virtual guide minus torque of the baseline controller, in the last cycle with the guide.
     #: Elements: sagittal hip and knee of the swing leg.
     excess: Annotated[Vector, 2]
-    gyro_source: int  # `TRUNK`, `TIBIA` or `SOLE`; may change in every cycle
+    #: Source of the angular velocity of the pelvis: `TRUNK`, `TIBIA` or `SOLE`. It may change in every cycle.
+    gyro_source: int
 
 
 class Sensed:
@@ -126,7 +127,8 @@ class Assistance(NamedTuple):
     #: (n + 1, 2) Nm, torques of hip and knee that carry the patient's leg and compensate the pelvis motion. Row: cycle.
     #: `_assist` adds these torques to the gravity torques of the exoskeleton, unless `Stage.literal` is True.
     unmodelled: Vector
-    fade: Vector  # (m,) weights from 1 to 0 that fade out `Stage.excess`, one for each cycle after the step
+    #: (m,) weights from 1 to 0 that fade out `Stage.excess`. Row: cycle after the nominal end of the step.
+    fade: Vector
 
 
 class Parts(NamedTuple):
@@ -530,7 +532,7 @@ def _desired(cycle: int, placement: Placement, table: PhaseTable, stage: Stage, 
 
 
 def _lowered(cycles: float, longest: int) -> tuple[float, float]:
-    """Return how far a late swing foot has moved down [m], and the downward speed of the foot [m/s].
+    """Return the distance [m] and the speed [m/s] of a late swing foot that moves down with a final speed of 1 m/s.
 
     A late swing foot has not landed at the nominal end of the step. The speed rises from 0 to 1 m/s. The caller scales
     both results to the real final speed.

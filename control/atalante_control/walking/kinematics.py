@@ -1,4 +1,4 @@
-"""Kinematics of the soles and of the centre of mass, relative to the pelvis: `joint angles and speeds -> Soles, Centre`.
+"""Kinematics of the soles and of the centre of mass, relative to the pelvis: `joint angles and speeds -> Chain`.
 
 All results are in the axes of the pelvis frame and relative to the origin of this frame. The results do not contain the motion of
 the pelvis in the world. The attitude of the pelvis comes from the attitude observer. The velocity of the pelvis follows from the

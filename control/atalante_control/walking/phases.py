@@ -27,7 +27,7 @@ class Phase(IntEnum):
 
 #: Phases in which one foot swings.
 STEPPING = frozenset({Phase.START, Phase.STEP, Phase.STOP})
-#: Phases in which the robot must continue after a stop request until it stands on both feet.
+#: Phases in which a stop request does not end the walk at once. The walk continues until the robot stands on both feet.
 WALKING = STEPPING | {Phase.SHIFT, Phase.BACK}
 
 

@@ -44,7 +44,7 @@ _SHIFTING = (_FH, _SH, _SK)
 #: Number of joints from the pelvis to the ankle.
 _LINKS = LEG_JOINTS.index("SA") + 1
 #: m3, smallest absolute determinant of the ankle Jacobian with which the foot is shifted.
-#: Below this limit, the leg is almost straight (singular), and the foot is not shifted further.
+#: With a smaller determinant, the leg is almost straight (singular), and the foot is not shifted further.
 _SINGULAR = 1e-3
 #: `landing` compares `_RATES` + 1 phase rates from `slowest` to `fastest`, with a constant ratio between neighbouring rates.
 _RATES = 32
@@ -60,7 +60,7 @@ class PlacementConfig(NamedTuple):
     """
 
     #: m, foot placement and step timing ignore a DCM error that is predicted to be smaller than this value at the landing.
-    #: With infinity, foot placement and step timing are off.
+    #: If `dead_zone` is infinite, foot placement and step timing are off.
     dead_zone: float = 0.015
     forward: float = 0.15  # m, largest shift of the landing position forwards and backwards
     outward: float = 0.22  # m, largest shift of the landing position away from the stance foot
@@ -70,7 +70,7 @@ class PlacementConfig(NamedTuple):
     #: s, the DCM error is ignored for this time after the start of a step, because the new stance foot is not yet at rest
     settled: float = 0.08
     #: s, duration of the last part of a step, up to the nominal landing. In this part, the phase rate returns to 1.
-    #: In the last part, the landing offset follows from the present DCM error, not from the predicted error (`late_landing`).
+    #: In the last part of a step, the landing offset follows from the present DCM error, not from a prediction (`late_landing`).
     frozen: float = 0.05
     #: m, largest DCM error (forwards, sideways) whose growth ankle and trunk can stop. A larger error grows until the landing.
     capacity: Pair = (0.10, 0.08)
@@ -80,7 +80,7 @@ class PlacementConfig(NamedTuple):
     #: weight in `_cost` of the part of the needed landing offset that exceeds the limits `forward`, `outward` and `inward`
     missed: float = 30.0
     timing: float = 0.03  # m, weight in `_cost` of a landing before or after the nominal time
-    #: s, within this time after the first reaction, the goal of the swing leg changes from joint angles to foot positions.
+    #: s, time in which the goal of the swing leg changes from joint angles to foot positions, after the first reaction to a push.
     #: The foot positions are relative to the stance foot, so a tilt of the pelvis does not move the swing foot.
     hold: float = 0.1
     slew: float = 15.0  # 1/s, largest change of the phase rate per second
@@ -129,7 +129,7 @@ def predicted(error: float, gain: float, limit: float, exponent: float) -> float
         exponent: w t, natural frequency times time to the landing.
     """
     size = abs(error)
-    linear = limit / gain if gain > 0.0 else math.inf  # m, DCM error e at which k e reaches the limit L
+    linear = limit / gain if gain > 0.0 else math.inf  # m, DCM error at which the ankle stabiliser reaches its limit
     if size > linear:
         if size >= limit:
             return math.copysign(limit + (size - limit) * math.exp(exponent), error)

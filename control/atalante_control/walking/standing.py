@@ -44,9 +44,10 @@ class Shift(NamedTuple):
     ground, which also holds the weight of the patient.
     """
 
-    q: Vector  # (12, 8) rad, joint angles
-    feedforward: Vector  # (12, 8) Nm, static torques on the ground minus the gravity torques u_g
-    centre: Vector  # (3, 8) m, centre of mass relative to the middle between the soles, in the walking frame
+    q: Vector  # (12, 8) rad, control points of the joint angles
+    feedforward: Vector  # (12, 8) Nm, control points of the static torques on the ground minus the gravity torques u_g
+    #: (3, 8) m, control points of the centre of mass relative to the middle between the soles, in the walking frame
+    centre: Vector
 
 
 class Standing:

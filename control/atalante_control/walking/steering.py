@@ -64,7 +64,7 @@ class Steering:
         self.feet[0], self.feet[1] = -0.5 * right, 0.5 * right
 
     def land(self, side: int, step: Vector, headings: Vector) -> None:
-        """Update the position at the landing of a foot.
+        """Update the positions of the feet and the heading error at the landing of a foot.
 
         Args:
             side: foot that landed, 0 left, 1 right.
@@ -93,7 +93,7 @@ class Steering:
         """
         per_yaw, per_metre, largest = self._gains
         limit = largest + abs(self._turn)
-        lag = 1.5 * self._turn  # rad, lag of the mean heading behind the line in a steady turn
+        lag = 1.5 * self._turn  # rad, lag of the mean heading of the feet behind the line in a steady turn
         error = self.yaw + lag
         return -min(max(per_yaw * error + per_metre * self.lateral - self._turn, -limit), limit)
 

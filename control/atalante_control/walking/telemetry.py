@@ -31,17 +31,18 @@ class Telemetry:
     pressure_shift: Annotated[Vector, 2]  # m, shift of the centre of pressure that the ankle stabiliser requests
     load: Annotated[Vector, 2]  # N, filtered vertical force on the left and the right foot
     vertical: Annotated[Vector, 3]  # upward unit vector in the axes of the pelvis
-    feet: Annotated[Vector, 4]  # m, (x, y) of left and right sole, each at its own last landing; x is along the line
+    #: m, position (x, y) of the left sole, then of the right sole, each at its last landing. x is along the desired line.
+    feet: Annotated[Vector, 4]
     yaw: float  # rad, mean heading of the soles relative to the desired line at the last landing
     phase: float  # value of `phases.Phase`
     step: float  # number of completed steps
     stance: float  # 0 left, 1 right
     elapsed: float  # s, time since the start of the phase
     max_dcm_error: float  # m, largest error of the DCM in the steps so far
-    assistance_factor: float  # assistance factor: 0 (widest guide) to 1 (no guide); 1 outside the periodic gait
+    assistance_factor: float  # assistance factor: 0 (widest guide) to 1 (no guide); 1 in every phase without a guide
     # The controller reads the fields from `error` to `gate` as one vector.
     error: Annotated[Vector, 2]  # rad, q - q_des of sagittal hip and knee in the last cycle with a guide (swing leg)
-    q_bound: Annotated[Vector, 2]  # rad, largest tracking error inside the guide, in the direction of `error`
+    q_bound: Annotated[Vector, 2]  # rad, distance from q_des to the bound of the guide on the side of `error`
     h: float  # safety value h of the paper: at least 0 if the backup policy can keep both joints inside the guide
     gate: float  # weight of the backup torque, 0 (free motion) to 1 (full backup torque); published as `lambda`
 

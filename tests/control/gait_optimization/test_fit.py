@@ -95,7 +95,10 @@ def test_range_of_the_network_is_the_range_of_its_gaits() -> None:
     ("inputs", "sentence"),
     [
         ([], "a gait network must be fitted to at least two gaits, got 0"),
-        (2 * [[58.0, 1.62, 0.1, 0.7, 1.0, 1.0]], "mass must have at least two values in the gaits, got only 58"),
+        (
+            2 * [[58.0, 1.62, 0.1, 0.7, 1.0, 1.0]],
+            "mass must have at least two values in the gaits, got 58 in all gaits",
+        ),
         (
             [[58.0, 1.62, 0.1, 0.7, 0.95, 0.95], [65.0, 1.69, 0.12, 0.74, 1.0, 1.0]],
             "the gaits of different subjects must differ, got 2 equal gaits",
