@@ -19,19 +19,19 @@ from atalante_hal.types import PERIOD, SupervisorState, Vector
 #: Speed of the hook [m/s].
 SPEED: Final = 0.1
 #: The crane lowers the robot when the HAL has been in the states ACTIVE and FULL_ASSIST for this total time [s].
-#: Until then the robot stays suspended, while the walking controller moves the legs to the standing pose.
-#: On the floor, the feet could not slide to their positions in the standing pose.
+#: Before the robot is lowered, the walking controller moves the legs of the suspended robot to the standing pose.
+#: On the floor, the friction of the feet would prevent the motion of the legs to the standing pose.
 DELAY: Final = 2.0
 #: Stiffness and damping of the sling, per kg of robot mass.
-#: Every robot therefore stretches the sling by the same length: 9.81 / 400 m = 25 mm.
+#: The stiffness is proportional to the mass, so every robot stretches the sling by the same length: 9.81 / 400 m = 25 mm.
 STIFFNESS: Final = 400.0  # N/m per kg
 DAMPING: Final = 28.0  # N s/m per kg
 #: Rotational stiffness and damping with which the crane turns the pelvis upright, per kg of robot mass.
-#: The crane multiplies the moment by the fraction of the weight that the sling carries.
+#: The crane multiplies the moment on the pelvis by the fraction of the robot weight that the sling carries.
 RIGHTING: Final = 100.0  # Nm/rad per kg
 ATTITUDE_DAMPING: Final = 1.5  # Nm s/rad per kg
 #: The crane lowers the hook until the sling has this slack [m]. Then the crane exerts no force until a call of `lift`.
-#: The pelvis of a walking robot moves up and down by less than this slack, so the sling stays loose.
+#: The pelvis of a walking robot moves up and down by less than `SLACK`, so the sling stays loose.
 SLACK: Final = 0.15
 _ACTIVE: Final = (SupervisorState.ACTIVE, SupervisorState.FULL_ASSIST)
 

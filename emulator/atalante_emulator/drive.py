@@ -33,7 +33,7 @@ from atalante_hal.wire.cia402 import AUTOMATIC, Controlword, DriveState, next_st
 #: Timeout of the commands and of SYNC [cycles]. After a timeout, an enabled drive holds its joint without the HAL (local hold).
 WATCHDOG: Final = 5
 #: Interval of the slow tasks of the drives [cycles]. The slow tasks update temperatures and warnings.
-#: After a fault, they also check whether the joint has stopped.
+#: For a drive in FAULT REACTION ACTIVE, the slow tasks also check whether the joint has stopped.
 SLOW_CYCLES: Final = 100
 #: Names of the drive nodes, in the order of JOINTS.
 NODES: Final = tuple(joint.upper() for joint in JOINTS)
@@ -95,7 +95,7 @@ class Drives:
             robot: joint properties that the firmware uses: torque limits, gear ratios and hold gains.
             parameters: true parameters of the drives.
             signals: arrays to which the signals of the state frames are written.
-            outbox: list to which emergencies to send are appended. With None, the drives create a list.
+            outbox: list to which emergency messages to send are appended. With None, the drives create a list.
         """
         self._robot = robot
         self.parameters = parameters
@@ -103,7 +103,7 @@ class Drives:
         self.state = [DriveState.SWITCH_ON_DISABLED] * len(JOINTS)
         #: latched[i] is True if drive i left OPERATION ENABLED without a command, for example to hold its joint.
         #: A latched drive ignores ENABLE_OPERATION. A controlword that changes the drive state unlatches the drive.
-        #: QUICK_STOP also unlatches the drive, if the cause of the error is gone.
+        #: QUICK_STOP also unlatches the drive, but not in QUICK STOP ACTIVE or FAULT while the cause of an error persists.
         self.latched = [False] * len(JOINTS)
         #: enable_delay[i]: number of ENABLE_OPERATION commands that drive i ignores before it enters OPERATION ENABLED.
         self.enable_delay = [0] * len(JOINTS)
@@ -123,8 +123,8 @@ class Drives:
         #: The last controlwords of all drives, as bytes, if they changed no drive state and no error. Otherwise empty.
         #: When the HAL sends the same bytes again, the drives need not evaluate them.
         self._steady = b""
-        #: Joint position at which each drive holds its joint [rad]; NaN before the first encoder sample.
-        #: A change of the drive state sets the position to NaN. The next torque computation sets it to the measured position.
+        #: Joint position at which each drive holds its joint [rad]. NaN before the first encoder sample and after a state change.
+        #: `_without_command` replaces NaN by the measured joint position.
         self._hold_at = np.full(len(JOINTS), np.nan)
         self._target, self._limit = np.zeros((2, len(JOINTS)))
         self._own_limit = robot.torque_max.copy()  # torque limit of each drive at the current winding temperature [Nm]
@@ -213,12 +213,12 @@ class Drives:
         # Use the encoder velocity without low-pass: the delay of a low-pass would reduce the damping of the hold.
         speed = self.encoders.speed
         jumped = np.abs(speed) > self.parameters.jump_speed
-        # A joint speed above `jump_speed` means that the encoder jumped, not the joint.
-        # The hold position is then shifted by the jump, so that the torque does not change.
+        # A joint speed above `jump_speed` means that the encoder position jumped, not the joint.
+        # Shift the hold position by the jump of the encoder position, so that the hold torque does not change.
         if jumped.any():
             self._hold_at[jumped] += speed[jumped] * PERIOD
             speed[jumped] = 0.0
-        # The measured position already contains a jump of this cycle, so a new hold position is set after the shift above.
+        # Set new hold positions after the shift: the measured position already contains the jump, and must not be shifted.
         begins = np.isnan(self._hold_at)
         if begins.any():
             self._hold_at[begins] = self.encoders.angle[begins]
@@ -309,7 +309,8 @@ class Drives:
         self.errors.end(drive, code)
         if not self.latched[drive] and self.state[drive] not in _FAULTY:
             self.errors.acknowledge(drive)
-        # Delete the stored controlwords. They had no effect before, but the same controlwords can now acknowledge the error.
+        # Delete the stored controlwords, so that the next controlwords are evaluated even if they are the same as before.
+        # Controlwords that had no effect while the cause of the error persisted can now acknowledge the error.
         self._steady = b""
 
     def leave(self, drive: int, state: DriveState) -> None:

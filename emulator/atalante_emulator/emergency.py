@@ -23,15 +23,15 @@ COMMAND_REJECTED: Final = 0x8200  # protocol error: command with wrong CRC, leng
 COMMAND_TIMEOUT: Final = 0x8250  # command timed out
 
 #: Class of an error code (its first hex digit) -> value of the CiA 301 error register.
-#: In each value, bit 0 means "any error". A second bit stands for the class:
-#: bit 1 current (0x2), bit 2 voltage (0x3), bit 3 temperature (0x4), bit 4 communication (0x8), bit 5 device profile (0x7).
+#: In each value of the error register, bit 0 ("any error") and the bit of the class are set. The bits of the classes are:
+#: class 0x2 (current) bit 1, 0x3 (voltage) bit 2, 0x4 (temperature) bit 3, 0x7 (device profile) bit 5, 0x8 (communication) bit 4.
 _REGISTER: Final = {0x2: 0x03, 0x3: 0x05, 0x4: 0x09, 0x7: 0x21, 0x8: 0x11}
 _GENERIC: Final = 0x01
 
 # A warning has an age. `Errors.warn` starts a new warning at age 0, and `Errors.advance` adds 1 to the ages of all warnings.
-# At age 0 or 1, a warning is active: the next `Errors.warn` with its code only sets its age back to 0.
-# At age 2 (`_ENDED`), a warning ends: `Errors.advance` reports the end, and `Errors.warn` with its code does nothing.
-# At age 3 (`_REPEATABLE`), a warning is deleted: `Errors.warn` with its code starts and reports a new warning.
+# At age 0 or 1, a warning is active. `Errors.warn` with the same error code sets the age back to 0, and reports nothing.
+# At age 2 (`_ENDED`), `Errors.advance` reports the end of the warning. `Errors.warn` with the same error code does nothing.
+# At age 3 (`_REPEATABLE`), the warning is deleted. `Errors.warn` with the same error code then reports a new warning.
 _ENDED, _REPEATABLE = 2, 3
 
 
@@ -82,8 +82,8 @@ class Emergency(NamedTuple):
 class Errors:
     """Active errors of several nodes.
 
-    When an error or a warning begins, and when a warning or the last error of a node ends, an emergency is added to `outbox`, the
-    list of emergencies to send.
+    When an error or a warning begins, and when a warning or the last error of a node ends, an emergency message is added to
+    `outbox`, the list of emergency messages to send.
     """
 
     def __init__(self, nodes: Sequence[str], outbox: list[Emergency]) -> None:

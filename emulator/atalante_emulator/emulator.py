@@ -46,7 +46,7 @@ from atalante_hal.wire.process_image import ReceiveImage, TransmitImage
 
 #: Capacity of the receive buffer [frames]. The HAL sends seven or eight frames per cycle.
 _RECEIVE_BUDGET = 128
-#: Capacity of the transmit buffer [frames]. The nodes send 19 cyclic frames per cycle, slow messages and emergencies.
+#: Capacity of the transmit buffer [frames]. The nodes send 19 cyclic frames per cycle, and slow and emergency messages.
 _BATCH = 128
 #: The nodes reject a command frame if `ReceiveImage` found one of these errors in the frame.
 _REJECTED = (Check.CRC, Check.LENGTH, Check.RANGE, Check.INVALID)
@@ -165,13 +165,13 @@ class Emulator:
         self._sealed = False  # True if `_tx` already contains the finished frames for the next SYNC
         self._tag = 0  # alive counter in the frames for the next SYNC: low byte of the expected cycle number
         self._haptics_tx = TransmitImage([network.message("HAPTICS_STATE")])
-        self._emergencies: list[Emergency] = []  # emergencies to send in this cycle
+        self._emergencies: list[Emergency] = []  # emergency messages to send in this cycle
         self._emergency_tx = TransmitImage([m for m in sent if m.name.endswith("_EMCY")])
         self._heartbeats = Heartbeats(network, [m for m in sent if m.name.endswith("_STATUS")], self._emergency_tx)
 
         received = [m for m in network.sent_by("HAL") if m.cycle_ms == 1]
         syncs = [m for m in received if m.name.startswith("SYNC_")]
-        # List the commands before the SYNCs: a HAL in the same process delivers its frames in this order.
+        # `_rx` lists the commands before the SYNCs, because a HAL in the same process delivers its frames in this order.
         self._rx = ReceiveImage([m for m in received if m not in syncs] + syncs)
         self._rx.values.fill(0.0)  # initial values: no torque, no vibration, HAL state OFF
         self._scratch = new_frames(_RECEIVE_BUDGET)
@@ -188,8 +188,8 @@ class Emulator:
         self._whole = [self._tx.frames]
         #: _leg_syncs[leg]: index i of the SYNC that the drives of the leg receive.
         self._leg_syncs = [[m.name for m in syncs].index(f"SYNC_{side.upper()}_LEG") for side in SIDES]
-        #: _answered[i]: copy of `_shares[i]` from the last cycle that `_imperfect_cycle` ran.
-        #: If another SYNC started this cycle and SYNC i arrives later, the nodes on the bus of SYNC i send this copy.
+        #: _answered[i]: copy of the frames `_shares[i]`, made in the last cycle that `_imperfect_cycle` ran.
+        #: If SYNC i arrives after another SYNC has started the cycle, the nodes on the bus of SYNC i send `_answered[i]`.
         self._answered = self._shares
         batch = new_frames(_BATCH)
         self._batch = batch.view(np.uint8).data
@@ -499,12 +499,12 @@ class Emulator:
         self._sample_next()
 
     def _hal_state(self) -> int:
-        """Return the HAL state of the last SYNC; OFF if the last SYNC is `WATCHDOG` cycles old."""
+        """Return the HAL state of the last SYNC; OFF if the last SYNC is at least `WATCHDOG` cycles old."""
         heard = self._rx.age[self._hal_state_row] < WATCHDOG
         return int(self._rx.values[self._hal_state_index]) if heard else SupervisorState.OFF
 
     def _with_slow(self, parts: list[Frames]) -> list[Frames]:
-        """Return `parts` plus the status messages, the haptics message and the emergencies that are due in this cycle."""
+        """Return `parts` plus the status messages, the haptics message and the emergency messages that are due."""
         if self.cycle % self._haptics_cycles == 0:
             self._haptics.advance(self._level, int(self._rx.age[self._level_row]), self._haptics_cycles)
             parts = [*parts, self._haptics_tx.seal()]

@@ -131,7 +131,7 @@ class EngineDynamics(Closing):
         masses = np.array(list(self.masses.values()))
         centre = masses @ np.array([root[0], *(state[0] for state in states)]) / masses.sum()
         # `root` is the pose of the inertial frame of the pelvis, whose origin is the centre of mass of the pelvis.
-        # Convert the centre of mass of the robot to this frame, and then to the URDF link frame of the pelvis.
+        # Convert the centre of mass of the robot to this inertial frame, and then to the URDF link frame of the pelvis.
         unturned = [0.0, 0.0, 0.0, 1.0]
         in_root = pybullet.multiplyTransforms(*pybullet.invertTransform(*root), centre.tolist(), unturned)[0]
         return np.array(pybullet.multiplyTransforms(*self._base_from_inertial, in_root, unturned)[0])

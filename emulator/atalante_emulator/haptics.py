@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from atalante_hal.types import PERIOD, Vector
 
 #: Timeout of the vibration command [cycles], equal to the TimeoutTime of HAPTICS_COMMAND in the DBC.
-#: If the last command is this old, the node sets the commanded levels to 0.
+#: If the last valid command is at least `WATCHDOG` cycles old, the node sets the commanded levels to 0.
 WATCHDOG = 10
 
 

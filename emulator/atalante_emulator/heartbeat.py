@@ -41,7 +41,7 @@ class Heartbeats:
         self._emergencies = emergencies
         self._period = max(m.cycle_ms for m in messages)
         # Distribute the status messages over the period: node i sends its message `gap` cycles after node i - 1.
-        # So each cycle contains at most one regular status message.
+        # As a result, at most one node sends its regular status message in the same cycle.
         gap = self._period // len(messages)
         self._due: dict[int, _Status] = {}
         self._of: dict[str, _Status] = {}

@@ -101,7 +101,7 @@ class AttitudeError:
         self._next = self._slow.copy()
         self._last = self._next
         self._turn = compiled(_turn)
-        if self.active:  # compile `_turn` now: a compilation in the first cycle would delay it by more than 1 ms
+        if self.active:  # compile `_turn` now: compiling in the first cycle would delay this cycle by more than 1 ms
             self.apply(0.0, np.tile([1.0, 0.0, 0.0, 0.0], (count, 1)))
 
     def draw(self) -> None:

@@ -42,8 +42,7 @@ class _Disturbance:
 
     def __init__(self, fault: Fault, network: Network, seed: str) -> None:
         self.fault = fault
-        # A fault of kind `inject` sends copies of the last real frame.
-        # So it also receives the frames of the cycle before its start.
+        # A fault of kind `inject` also receives the frames of the cycle before its start: it sends copies of the last real frame.
         self.from_cycle = fault.start - (fault.kind == "inject")
         self.messages = {message.frame_id: message for message in messages_of(fault, network)}
         self.random = random.Random(seed)
@@ -59,7 +58,7 @@ class _Disturbance:
         self._chance = float(dict(fault.parameters).get("p", 1.0))
 
     def frames(self, frame: Frames, cycle: int) -> Sequence[Frames]:
-        """Apply the fault to a frame with the probability `p`. Return the frames to send instead, each of shape (1,).
+        """With the probability `p`, apply the fault to a frame. Return the frames to send instead, each of shape (1,).
 
         Args:
             frame: frame of a target message of the fault, shape (1,). The function may change this frame.
@@ -241,7 +240,7 @@ class FaultyBus(WrappedBus):
         """
         super().__init__(bus)
         #: Whether the HAL has sent a SYNC since the emulator last set this value to False.
-        #: Also True if a fault removed the SYNC, so that no node received it.
+        #: A SYNC also counts if an injected fault removed it, so that no node received it.
         self.synced = False
         self._clock, self._cycle, self._begun = clock, -1, -1
         self._all = [

@@ -53,7 +53,7 @@ class NodeFaults:
             drives: emulated drives.
             haptics: emulated haptics node.
             heartbeats: status messages of all nodes.
-            outbox: list to which the emergencies of nodes other than drives are appended.
+            outbox: list to which the emergency messages of nodes other than drives are appended.
 
         Raises:
             FaultError: If a target does not exist or is not emulated, or the fault does not apply to this kind of node.
@@ -85,7 +85,8 @@ class NodeFaults:
         self._position = position.copy()
         ending = [(fault, nodes) for fault, nodes in self._faults if cycle == fault.end]
         active = [(fault, nodes) for fault, nodes in self._faults if fault.start <= cycle < fault.end]
-        # Faults end before others act, so the end of one fault does not cancel another fault of the same node.
+        # First end the faults of `ending`, then apply the faults of `active`.
+        # Otherwise the end of a fault could cancel an active fault of the same node.
         for fault, nodes in ending + active:
             _EFFECTS[fault.kind](self, fault, nodes, cycle)
         return self._position
@@ -107,7 +108,7 @@ class NodeFaults:
         (node,), code = nodes, fault["code"]
         if node in NODES:
             if cycle < fault.end:
-                # Repeat the error in each cycle, because the drive itself can end it, for example when its winding is cool.
+                # Repeat the error in each cycle: the drive itself can end the error, for example when its winding is cool.
                 self._drives.fail(NODES.index(node), code, persists=True)
             else:
                 self._drives.recover(NODES.index(node), code)

@@ -75,9 +75,9 @@ class ActiveParameters:
     #: Source: Anderson, Madigan, Nussbaum, J. Biomech. 40, 2007.
     strength: Pair = (0.113, 0.087)
     fraction: float = 1.0  # strength of this patient as a fraction of the strength of an able-bodied person
-    #: Smallest amplitude (0 to 1) at which the patient feels a vibration motor. With infinity, the patient feels no motor.
-    #: While the patient feels a motor of the thigh, the patient perceives every error of the hip angle, however small.
-    #: While the patient feels a motor of the shank, the patient perceives every error of the knee angle.
+    #: Smallest amplitude (0 to 1) at which the patient feels a vibration motor. With infinity, the patient feels no vibration.
+    #: While the patient feels a vibration motor of the thigh, the patient perceives even the smallest hip angle error.
+    #: While the patient feels a vibration motor of the shank, the patient perceives even the smallest knee angle error.
     vibration: float = math.inf
 
     def __post_init__(self) -> None:
@@ -101,7 +101,7 @@ class ActiveTask:
     mass: float  # mass of the patient [kg]
     height: float  # height of the patient [m]
     #: Hip and knee angles that the swing leg must track, shape (n + 1, 2) [rad]. Row k is for cycle k of the step.
-    #: In row 0 the other foot has just landed. In row n the foot of the swing leg lands.
+    #: In row 0, the foot of the stance leg has just landed. In row n, the foot of the swing leg lands.
     swing: Sequence[Pair]
     seed: int = 0
     parameters: ActiveParameters = ActiveParameters()
@@ -150,7 +150,8 @@ class ActivePatient:
         #: Nominal minus true joint angle [rad], and the rate of this error [rad/s].
         self._error, self._slope = np.zeros((cycles, 2)), np.zeros((cycles, 2))
         #: Perception threshold of the joint angle error in each cycle [rad].
-        #: It is 0 while the patient feels a vibration motor (hip: motors of the thigh, knee: motors of the shank).
+        #: The threshold of the hip angle is 0 while the patient feels a vibration motor of the thigh.
+        #: The threshold of the knee angle is 0 while the patient feels a vibration motor of the shank.
         self._threshold = np.full((cycles, 2), parameters.threshold)
         self._amplitude = np.zeros(len(MOTORS)) if amplitude is None else amplitude
         # `_swing` is the swing leg (0 left, 1 right), or -1 before the first landing. With -1, no muscle acts.

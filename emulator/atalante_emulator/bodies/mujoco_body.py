@@ -18,7 +18,7 @@ from atalante_hal.types import PERIOD, Vector
 #: MuJoCo's vector `qpos` starts with this number of elements for a free pelvis: position (3) and quaternion wxyz (4).
 _FREE: Final = 7
 #: Time at which a simulation starts [s]. If a simulation diverges, MuJoCo resets the simulation and sets its time to 0.
-#: So a time below this value shows that the simulation has diverged.
+#: So a simulation time below `_START` shows that the simulation has diverged.
 _START: Final = 1.0
 
 
@@ -32,10 +32,10 @@ class Contact(NamedTuple):
 
     #: Time constant [s] and damping ratio of the spring that pushes the shapes apart.
     solref: tuple[float, float] = (0.02, 1.0)
-    #: Hardness of the contact from 0 (soft) to 1 (rigid). MuJoCo calls this value impedance.
-    #: The first value applies when the shapes begin to touch, the second value when they are pressed deep into each other.
+    #: Hardness of the contact from 0 (soft) to 1 (rigid): at first touch, and when the shapes have sunk deep into each other.
+    #: MuJoCo calls the hardness of a contact impedance.
     solimp: tuple[float, float] = (0.99, 0.99)
-    impratio: float = 1.0  # hardness against sliding, divided by hardness against sinking in
+    impratio: float = 1.0  # contact hardness against sliding, divided by contact hardness against sinking in
 
 
 class _Sensed(NamedTuple):
@@ -209,7 +209,7 @@ class MuJoCoBody:
         """
         self._torque[:] = torque
         # `mj_step2` moves the robot by one time step. `mj_step1` computes the sensor data of the new position.
-        # Without the last call, the sensor data would still belong to the position before the time step.
+        # Without `mj_step1`, the sensor data would still belong to the position before the time step.
         mujoco.mj_step2(self._model, self._data)
         mujoco.mj_step1(self._model, self._data)
         if self._data.time < _START:
@@ -233,7 +233,7 @@ def _prepare(spec: Any, free: bool, ground: float | None, friction: float, conta
         contact: contact model.
     """
     # By default, MuJoCo merges a link on a fixed joint into its parent link. The IMU links would then not exist as bodies.
-    # A fixed pelvis would become part of the world, without mass.
+    # By default, MuJoCo would also merge a fixed pelvis into the world body, and the mass of the pelvis would be lost.
     spec.compiler.fusestatic = False
     option = spec.option
     option.timestep, option.gravity = PERIOD, [0.0, 0.0, -GRAVITY]

@@ -23,8 +23,8 @@ SOLVER_ITERATIONS = 50
 #: `pybullet.getLinkStates` returns a tuple for each link, with attitude, velocity and angular velocity at these indices.
 _ATTITUDE, _LINEAR, _ANGULAR = 5, 6, 7
 _BASE: Final = -1  # link index of the root link in PyBullet
-#: Number of elements of a row of contact data. A row contains the pad index (1), the normal vector (3), the normal force (1),
-#: the first friction force (1) and its direction (3), the second friction force (1) and its direction (3). Forces are in N.
+#: Number of elements in a row of contact data: pad index (1), normal vector (3), normal force (1), two friction forces (4 each).
+#: Each friction force is stored as its size (1), followed by its direction (3). All forces are in N.
 _CONTACT: Final = 13
 #: Largest number of contacts in a time step: one for each contact pad, because a pad is a sphere and the floor is a plane.
 _CONTACTS: Final = len(FEET) * len(CELLS)
@@ -79,7 +79,7 @@ class PyBulletBody:
             ValueError: If the text is not a URDF, or a required joint or link is missing.
         """
         # Each body has its own PyBullet client, so that equal inputs give identical motions.
-        # A shared client would need `pybullet.restoreState`, and after this call equal inputs can give different motions.
+        # A shared client would need `pybullet.restoreState`. After such a call, equal inputs can give different motions.
         self._client = pybullet.connect(pybullet.DIRECT)
         client = {"physicsClientId": self._client}
         pybullet.setPhysicsEngineParameter(
@@ -158,8 +158,8 @@ class PyBulletBody:
             pybullet.changeDynamics(self._body, pad, lateralFriction=friction, **client)
 
     def _link_states(self, links: Sequence[int]) -> Any:
-        # Arguments 1, 1: return velocities, and compute the link poses from the current joint positions.
-        # With 0 as last argument, PyBullet would return the link poses of the previous time step.
+        # The first 1 requests velocities. The second 1 makes PyBullet compute the link poses from the current joint positions.
+        # If the second 1 were 0, `getLinkStates` would return the link poses of the previous time step.
         return pybullet.getLinkStates(self._body, links, 1, 1, physicsClientId=self._client)
 
     def reset(self, position: Sequence[float], base: Pose | None = None) -> None:
@@ -207,7 +207,7 @@ class PyBulletBody:
             centre, position, attitude = state[0], state[4], state[_ATTITUDE]
             velocity, rate = state[_LINEAR], state[_ANGULAR]
         # PyBullet returns the velocity v of the centre of mass. The origin of the link frame has the velocity v + w x r.
-        # w is the angular velocity, and r is the vector from the centre of mass to the origin.
+        # w is the angular velocity of the link, and r is the vector from the centre of mass to the origin of the link frame.
         rx, ry, rz = (a - b for a, b in zip(position, centre, strict=True))
         (vx, vy, vz), (wx, wy, wz) = velocity, rate
         moved = vx + (wy * rz - wz * ry), vy + (wz * rx - wx * rz), vz + (wx * ry - wy * rx)

@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 @click.option(
     "--one-process",
     is_flag=True,
-    help="Do not repeat a benchmark in several processes. --quick never repeats a benchmark.",
+    help="Run each benchmark once, in this process, instead of in several new processes. --quick implies this option.",
 )
 @json_option
 def command(names: tuple[str, ...], quick: bool, one_process: bool, as_json: bool) -> None:

@@ -28,8 +28,7 @@ from atalante_tools.canlog.validate.project import Project
 _CYCLES, _QUICK_CYCLES = 2000, 300
 #: Number of copies of the recording in the log of a normal run, and in the log of a quick run.
 _REPEATED, _QUICK_REPEATED = 25, 2
-#: Number of frames that the baseline of python-can and cantools decodes per block.
-#: This baseline is slow, so the number is small.
+#: Number of frames that the baseline of python-can and cantools decodes per block; small, because this baseline is slow.
 _SLICE = 30_000
 _MS = 1_000_000  # one millisecond [ns]
 _BEGIN = 1_700_000_000 * 1000 * _MS

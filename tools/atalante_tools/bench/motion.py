@@ -41,7 +41,7 @@ POSE: Final = 0.15
 #: Number of cycles from power-on to the measurement of a suspended robot. The robot starts to walk within these cycles.
 _BEFORE_WALKING: Final = 3000
 #: Number of cycles from power-on to the measurement of a robot on the ground.
-#: Within these cycles, the crane lowers the robot, and the robot shifts its weight.
+#: In the first `_BEFORE_STEPPING` cycles, the crane lowers the robot, and the robot shifts its weight.
 _BEFORE_STEPPING: Final = 8000
 #: While the robot walks, the upward axis of the pelvis must have at least this vertical component.
 _UPRIGHT: Final = 0.95

@@ -36,11 +36,11 @@ from atalante_tools.bench.measure import require
 
 #: Number of cycles after which an alive counter wraps to 0.
 TURN = 256
-#: Number of poses in the recording. The number has no common factor with 16: the HAL runs slow checks in every 16th cycle.
-#: With 16 poses, the slow checks would always read the same pose, and report constant sensor values as a fault.
+#: Number of recorded poses, which are played in turn, one per cycle. The number has no common factor with 16.
+#: Some checks of the HAL run in every 16th cycle. With 16 poses, they would always read the same pose and report a fault.
 POSES = 15
 #: Largest constant tracking error (recorded minus desired joint angle) [rad].
-#: With such small errors, the guide filter does not saturate: its output is not at a limit.
+#: With tracking errors of at most `ERROR`, the guide filter does not saturate: its output is not at a limit.
 ERROR = 0.01
 #: Largest rate of change of the tracking error [rad/s].
 ERROR_RATE = 0.05
@@ -128,7 +128,7 @@ class Recording:
         image.values[image.codec.slice("SupplyVoltage")] = 48.0
         gap = max(m.cycle_ms for m in slow) // len(slow)
         #: Messages with long periods: (message, period in cycles, phase in cycles).
-        #: The phases of the messages differ, so that a cycle has only few of these messages.
+        #: The phases differ, so that only few messages with long periods are sent in the same cycle.
         self.slow = tuple((m, m.cycle_ms, gap * row % m.cycle_ms) for row, m in enumerate(slow))
         self._slow = _seal(image, image.values[None, :])
         self._slow_turn = [0] * len(slow)

@@ -53,7 +53,7 @@ class Plan:
         count = len(self.layouts)
         headers = [header_word(_can_id(m), m.length, _flags(m)) for m in self.layouts]
         #: Identifier, length and flags that the frames of each message must have, as one number (`header_word`).
-        #: The number is 0 for an unsupported layout, and in the last element, which has the index `UNKNOWN` (-1).
+        #: `headers` is 0 for a message with an unsupported layout, and in the last element, which has the index `UNKNOWN` (-1).
         self.headers = np.array([*headers, *([0] * len(self.refused)), 0], np.uint64)
         self.lengths = np.array([m.length for m in self.layouts], np.int64)
         self.cycle_ns = np.array([1e6 * (m.cycle_ms or 0.0) if m.cyclic else 0.0 for m in self.layouts])
@@ -105,7 +105,7 @@ class Plan:
             extended[frame_id] = row
             if mask != _ALL_BITS:
                 # Two messages of one J1939 parameter group have the same masked identifier.
-                # This masked identifier is ambiguous, so it is treated as unknown.
+                # A masked identifier that several messages share is ambiguous, so it is treated as unknown.
                 known = groups.setdefault(mask, {})
                 known[frame_id & mask] = UNKNOWN if frame_id & mask in known else row
         self._standard = standard

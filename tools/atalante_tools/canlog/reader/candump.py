@@ -42,13 +42,13 @@ _NOT_HEX = 255
 _HEX = np.full(256, _NOT_HEX, np.uint8)
 _HEX[np.frombuffer(b"0123456789", np.uint8)] = np.arange(10)
 _HEX[np.frombuffer(b"ABCDEF", np.uint8)] = _HEX[np.frombuffer(b"abcdef", np.uint8)] = np.arange(10, 16)
-#: Value of each pair of hexadecimal digits; 0xFFFF for a pair with another character.
-#: The index is the pair of characters as a little-endian 16-bit number.
+#: Lookup table: two characters -> value (0 to 255) of the two hexadecimal digits, or 0xFFFF if a character is not such a digit.
+#: The index is the ASCII code of the first character plus 256 times the ASCII code of the second character.
 _HEX_PAIR = np.full(1 << 16, 0xFFFF, np.uint16)
 _HEX_PAIR.reshape(256, 256)[:] = np.where(
     (_HEX < 16) & (_HEX < 16)[:, None], _HEX.astype(np.uint16) << 4 | _HEX[:, None], 0xFFFF
 )
-#: Element k (0 to 8) is a mask of the k highest bytes of a 64-bit word. They are the last k characters of `_Lines.word`.
+#: Element k (0 to 8) is a mask of the k highest bytes of a 64-bit word, which are the last k of its eight characters.
 _TAIL = np.array([0, *((((1 << 8 * k) - 1) << 64 - 8 * k) for k in range(1, 9))], np.uint64)
 _ZEROS = np.uint64(0x3030303030303030)
 _LINE = re.compile(

@@ -16,7 +16,7 @@ from atalante_tools.canlog.reader.chunk import Chunk, concatenated
 from atalante_tools.canlog.reader.log_file import LogFile
 
 #: Number of bytes of the log that one call of `candump.parse` parses.
-#: The arrays that the parser creates for this number of bytes fit into the processor cache.
+#: The arrays that `candump.parse` creates for `_TEXT_BYTES` bytes of text fit into the processor cache.
 _TEXT_BYTES = 1 << 21
 
 

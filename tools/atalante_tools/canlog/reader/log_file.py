@@ -7,9 +7,8 @@ from pathlib import Path
 
 from atalante_tools.canlog.reader.chunk import Channels
 
-#: File suffix -> three properties. First: the format records the direction of frames.
-#: Second: the format records the CAN FD flags. Third: python-can reads all bus errors in the log.
-#: python-can skips the ER records of .trc and the CAN FD error objects of .blf.
+#: Suffix of a log format -> (format records the direction of frames, format records CAN FD flags, all bus errors are read).
+#: Some bus errors are not read: python-can skips the ER records of .trc and the CAN FD error objects of .blf.
 FORMATS = {
     ".log": (True, True, True),
     ".asc": (True, True, True),

@@ -11,7 +11,7 @@ from atalante_tools.canlog.plan import UNKNOWN, Plan, Rows
 from atalante_tools.canlog.reader.chunk import Chunk
 
 #: A channel is assigned to a bus if at least this share (0 to 1) of its frames are messages of the bus.
-#: Frames of messages that are unknown or unsupported do not count.
+#: This share is computed without the frames of unknown messages and of messages with an unsupported layout.
 _MAJORITY = 0.9
 
 

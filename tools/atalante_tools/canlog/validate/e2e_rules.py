@@ -39,7 +39,7 @@ class CrcRules:
         self._plan, self._findings = plan, findings
         lengths = np.where(plan.protected, plan.lengths, 0)
         #: Ranges of message indices: one range for each payload length that at least one message with a CRC has.
-        #: A range contains all messages of this length. `check` reports nothing for messages without a CRC.
+        #: A range also contains the messages of the same length that have no CRC. `check` ignores these messages.
         self._spans = [
             range(int(r[0]), int(r[-1]) + 1) for n in np.unique(lengths[lengths > 0]) for r in [_at(plan, n)]
         ]

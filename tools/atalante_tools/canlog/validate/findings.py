@@ -37,7 +37,7 @@ class Finding:
     @property
     def first_s(self) -> float:
         """Return the time stamp of the first violation in the log [s]."""
-        # Python rounds the quotient of two integers only once. With the divisor 1e9, the time stamp would be rounded, too.
+        # The divisor is an integer, so only the quotient is rounded. With the float 1e9, the time stamp would also be rounded.
         return self.first / 10**9
 
     @property

@@ -48,7 +48,7 @@ class FrameRules:
         #: Expected FDF and BRS flags of each message: 0, 1, or `UNKNOWN` if the DBC does not define the flag.
         fd = [UNKNOWN if m.fd is None else int(m.fd) for m in layouts]
         switch = [UNKNOWN if m.bit_rate_switch is None else int(m.bit_rate_switch) for m in layouts]
-        # For a frame of an unknown message, the code reads element 0 and ignores the result.
+        # For a frame of an unknown message, the rules read element 0 of these arrays, and ignore the result.
         # The additional last element of each array ensures that element 0 exists even if the DBC has no message.
         self._fd, self._switch = np.array([*fd, UNKNOWN], np.int8), np.array([*switch, UNKNOWN], np.int8)
         self._length, self._sender = np.append(plan.lengths, 0), np.append(plan.sender_of_row, UNKNOWN)

@@ -61,12 +61,12 @@ class LoadRules:
         #: For each chunk: numbers of the time windows that contain frames, shape (windows,).
         #: The number of a time window is its start time divided by its length.
         self._numbers: list[npt.NDArray[np.int64]] = []
-        #: For each chunk: sum of the wire times of all frames in a time window on a bus [s], shape (windows, buses).
+        #: For each chunk: sum of the wire times of the frames [s] per time window and column of `load`, shape (windows, columns).
         self._busy: list[npt.NDArray[np.float64]] = []
         #: Start time of each time window with at least one frame [s], set by `finish`. Shape (windows,).
         self.begins: npt.NDArray[np.float64] = np.zeros(0)
-        #: Bus load in each time window, set by `finish`; 1.0 if frames fill the whole window. Shape (windows, buses).
-        #: The first columns of `load` are the buses of the DBC. The further columns are log channels, for frames without a bus.
+        #: Bus load in each time window, set by `finish`; 1.0 if frames fill the whole window. Shape (windows, columns).
+        #: The first columns are the buses of the DBC. The further columns are the log channels, for frames whose bus is unknown.
         self.load: npt.NDArray[np.float64] = np.zeros((0, len(plan.buses)))
 
     @property

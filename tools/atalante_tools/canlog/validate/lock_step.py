@@ -38,7 +38,7 @@ class _Channel:
     """Last SYNC and last frame on one channel, which the lock-step clock needs for the next chunk."""
 
     #: Message index (position in the arrays of `Plan`) of the first SYNC received on this channel; -1 before this SYNC.
-    #: The clock reads the cycle number only from the message with this index.
+    #: The clock reads the cycle number only from the message with the index `sync`.
     sync: int = -1
     cycle: int = 0  # cycle number in the last SYNC
     begin: int = 0  # new stamp (robot time) of the last SYNC [ns]

@@ -33,7 +33,7 @@ class _Bus:
     #: Message index of a state message -> number of cycles from its second-last frame to its last frame.
     jump_of: dict[int, int] = field(default_factory=dict)
     #: Message index of a state message -> time stamp of a frame that was perhaps received before its SYNC [ns].
-    #: The next chunk shows whether the frame was received before its SYNC (see `_check_order`).
+    #: Only the next chunk shows whether such a state frame was indeed received before its SYNC (see `_check_order`).
     doubtful: dict[int, int] = field(default_factory=dict)
 
 

@@ -91,7 +91,7 @@ class Project:
 
 #: Rules with one threshold for each signal name, for example for `Position`. A rules file may add signal names.
 _OPEN = ("step",)
-#: Smallest and largest value of the thresholds that have a range, by rule and name.
+#: (rule, threshold name) -> smallest and largest valid value. Any other threshold must only be at least 0.
 _RANGE = {("bus-load", "window_s"): (0.001, 3600.0)}
 
 

@@ -24,10 +24,10 @@ from atalante_tools.canlog.stream import Stream
 from atalante_tools.canlog.validate.findings import Findings
 from atalante_tools.canlog.validate.project import Project
 
-#: From this integer on, float64 may round an integer.
+#: float64 represents every integer up to this value exactly, but rounds some of the larger integers.
 _EXACT: Final = 2**53
 #: The value table of a field of at most this length [bit] is stored as a lookup array over all raw codes.
-#: The value table of a longer field is stored as a list of the valid codes.
+#: The value table of a field of more than `_TABLE_BITS` bits is stored as a list of the valid codes.
 _TABLE_BITS = 16
 _WORD = 64
 _HASH_BITS = 32
@@ -232,8 +232,8 @@ class _FamilyChecks:
         self.low = np.array([low for low, _ in self.bounds.values()], np.int64)
         self.high = np.array([high for _, high in self.bounds.values()], np.int64)
         #: Field index -> raw code that means "no value". `_check_limits` searches the frames for each of these codes.
-        #: A field is left out if its limits exclude the code, because the check of the limits then finds the code.
-        #: A field in `special` is also left out, because all its values are checked.
+        #: `coded` omits a field if its code is outside the limits in `bounds`: the check of the limits then finds the code.
+        #: `coded` also omits the fields in `special`: `_check_special` compares every value of these fields with the code.
         self.coded = {
             p: code
             for p, f in fields
