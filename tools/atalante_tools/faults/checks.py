@@ -120,7 +120,7 @@ def start_is_rejected(run: Observation) -> str | None:
 
 
 def nothing_sags(run: Observation) -> str | None:
-    """Check that no joint moves by more than 1 deg while the robot starts again after the fault.
+    """Check that no joint moves by more than 1 deg while the robot restarts after the fault.
 
     The time from START of the operator until ACTIVE is checked. If the robot does not become ACTIVE, the check ends 40
     cycles after START.
@@ -162,7 +162,7 @@ def no_joint_is_too_fast(run: Observation) -> str | None:
 
 
 def start_fails_and_names_the_hip(run: Observation) -> str | None:
-    """Check that START soon fails with an event that names the left sagittal hip.
+    """Check that START fails within `_FAILED` cycles, with an event START_FAILED that names the left sagittal hip.
 
     In HOLD, all other drives must then hold. In READY, all other drives must be switched off again.
 

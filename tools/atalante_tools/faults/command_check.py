@@ -131,7 +131,7 @@ class Commands:
         return leg.cycle, leg.limit[:, joint % len(LEG_JOINTS)]
 
     def largest_step(self, joint: int) -> float:
-        """Return the largest change [Nm] of a joint's target torque between two consecutive cycles that both enable its drive.
+        """Return the largest change [Nm] of a joint's target torque between consecutive cycles whose commands enable the drive.
 
         Args:
             joint: index into JOINTS.

@@ -293,7 +293,7 @@ SCENARIOS: Final = (
             ),
         ),
     ),
-    # There is no case with TH. The left and the right TH are at nearly the same position, so exchanged encoders show no jump.
+    # The transverse hips (TH) have no case. Left and right TH have nearly the same position, so exchanged encoders show no jump.
     Scenario(
         "F85",
         tuple(
@@ -310,8 +310,8 @@ SCENARIOS: Final = (
             if joint != "TH"
         ),
     ),
-    # Only FH and SH have a case with a reversed motor.
-    # TH, SK, SA and HA with a reversed motor exceed their velocity limits before the HAL can react.
+    # Only the frontal hip (FH) and the sagittal hip (SH) have a case with a reversed motor.
+    # With a reversed motor, each other joint (TH, SK, SA, HA) exceeds its velocity limit before the HAL can react.
     Scenario(
         "F84",
         tuple(
@@ -362,9 +362,9 @@ SCENARIOS: Final = (
         ),
     ),
     # A faulty motor is visible only in the motion of its joint, because its drive still reports the commanded torque.
-    # HA moves little, because its commanded torque is less than its dry friction. So the detection takes longer for HA.
-    # There is no case with a reversed motor of SA, because this case would fail:
-    # SA exceeds the velocity limit of the test (`limit_violations`) before the HAL can detect the fault.
+    # The Henke ankle (HA) moves little, because its commanded torque is below its dry friction. So the detection takes longer.
+    # The sagittal ankle (SA) has no case with a reversed motor, because this case would fail the check `limit_violations`:
+    # SA would exceed the velocity limit before the HAL can detect the fault.
     Scenario(
         "F82",
         tuple(

@@ -28,7 +28,7 @@ _SHAPES: Final = ("constant", "pinched")
 _FACTORS: Final = (1.0, 0.75, 0.5, 0.25, 0.0)
 #: True mass of the patient, relative to the mass for which the gait and the model in the HAL are made.
 _MASSES: Final = (1.0, 0.9, 1.1)
-#: In every n-th walk on the ground, the muscles of the patient are active. This number is n.
+#: Number n: the muscles of the patient are active in every n-th walk on the ground.
 _ACTIVE: Final = 4
 
 

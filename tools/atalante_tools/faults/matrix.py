@@ -33,7 +33,8 @@ class Row:
     id: str
     fault: str  # description of the fault
     noticed_by: str  # check that detects the fault
-    cycles: str  # time limits as text, such as "1 / 5"; `detected` and `reacted` return the numbers
+    #: time limits [cycles] as text: "1 / 5" means that the diagnostic must be reported by cycle 1, and the reaction by cycle 5
+    cycles: str
     behaviour: str  # reaction in words
     state: SupervisorState  # final state of the HAL
     dtc: str  # diagnostic code; empty means no code

@@ -11,7 +11,7 @@ pairs. The runs check what must be true for every fault at every moment:
 - No command lets a drive produce torque before the operator has pressed START.
 - If the fault begins after START, only the operator can cause a change to a less severe state. Each START
   can cause only one such change.
-- During a start of the schedule, no joint moves by more than `SAG_MAX`. A wrong motor, a wrong encoder or a push moves its joint,
+- During a start of the schedule, no joint moves by more than `SAG_MAX`. A faulty motor, faulty encoder or push moves its joint,
   and the inertia of this joint moves the other joints of the leg. So these faults have other limits in their leg (`SAG_OF`).
 - The run raises no exception.
 """
@@ -43,11 +43,11 @@ _S = SupervisorState
 #: Largest accepted motion of a joint during a start [deg].
 #: The measurement begins when the first drive is on. It ends when the HAL is ACTIVE or the start has failed.
 SAG_MAX: Final = 1.0
-#: Events with which the HAL ends a start before ACTIVE.
+#: Codes of the events with which the HAL reports that a start ended without reaching ACTIVE.
 _ENDS_OF_START: Final = ("START_FAILED", "START_REFUSED")
 #: Kind of a fault that moves joints during a start -> largest accepted motion [deg] of every joint in the leg with the fault.
-#: A wrong motor or encoder moves its joint until the direction test finds the fault (F72).
-#: A push may exceed the torque that holds the joint, so the motion has no limit.
+#: A faulty motor or an exchanged encoder moves a joint until the direction test at the end of the start detects the fault (F72).
+#: With a push, the motion is not limited, because a push may be stronger than the torque that holds the joint.
 SAG_OF: Final = {
     "torque_wrong": 5.0,
     "torque_weak": 5.0,
@@ -58,7 +58,7 @@ SAG_OF: Final = {
     "push": math.inf,
 }
 #: Kinds of motor faults. Until the HAL finds a motor fault, a joint may move faster than its velocity limit.
-#: So the speed is not checked for `FOUND` cycles after a motor fault begins, and for `FOUND` cycles after each later START.
+#: No joint speed is checked for `FOUND` cycles after a motor fault begins, and for `FOUND` cycles after each later START.
 _MOTOR: Final = ("torque_wrong", "torque_weak")
 #: Number of cycles within which the HAL must find a faulty motor: time limit of F84 in FAULTS.md.
 FOUND: Final = 200
@@ -70,8 +70,8 @@ _STOPPED: Final = 60
 _RESTART: Final = 200
 #: Longest wait for the end of a fault [cycles]. The run continues after this wait, even if the fault is permanent.
 _LONGEST: Final = 400
-#: Number of cycles to the first press of START after the fault.
-#: The cycles count from the end of the fault or of the wait (`_LONGEST`), or from a later START of the schedule.
+#: Number of cycles from the end of the fault to the next press of START. A fault counts as ended after `_LONGEST` cycles.
+#: If the schedule has a START after the end of the fault, the cycles count from this START.
 _REST: Final = 60
 #: Number of cycles from the second press of START after the fault to the end of the run.
 _END: Final = 300
@@ -154,7 +154,7 @@ class MomentTask:
 
     moment: Moment
     cases: tuple[tuple[str, int], ...]  # for each case: its fault ID and its index in the scenario
-    delays: tuple[int, ...] = (0,)  # for each case: cycles from the moment to its start
+    delays: tuple[int, ...] = (0,)  # for each case: number of cycles from `moment` to the start of the case
     engine: str = PYBULLET
 
     def __call__(self) -> MomentVerdict:
@@ -175,7 +175,7 @@ class MomentTask:
         starts = [cycle for cycle in presses if cycle >= min(begins, default=math.inf)]
         unlimited = [range(cycle, cycle + FOUND) for cycle in (*begins, *starts)]
         failures = [*limit_violations(run, unlimited, _strength(stimuli)), *_premature(run, plan.starts[0])]
-        # `automatic_improvements` is valid only if the HAL receives START before the fault begins.
+        # The check `automatic_improvements` requires that the HAL receives the first START before the fault begins.
         # At BOOT and READY, the fault begins before the first START, and may delay the effect of START.
         if self.moment not in (Moment.BOOT, Moment.READY):
             failures += automatic_improvements(run, before, plan.starts)
@@ -251,7 +251,7 @@ def _sag_limits(stimuli: Sequence[Stimulus]) -> Vector:
     Args:
         stimuli: faults and actions of the run.
     """
-    limits = np.full((2, len(JOINTS) // 2), SAG_MAX)  # one row for each leg, as in `JOINTS`
+    limits = np.full((2, len(JOINTS) // 2), SAG_MAX)  # row 0: joints of the left leg; row 1: right leg
     for stimulus in stimuli:
         if isinstance(stimulus, Fault) and stimulus.kind in SAG_OF:
             nodes = {stimulus.target.removesuffix("_STATE"), dict(stimulus.parameters).get("other")}

@@ -29,7 +29,8 @@ class Line:
     id: str
     passed: bool
     state: str
-    cycles: int | None  # cycles from the fault to the reaction, otherwise to the diagnostic; None if there was neither
+    #: number of cycles from the fault to the reaction, or to the diagnostic if there was no reaction; None if there was neither
+    cycles: int | None
     bound: int  # time limit for `cycles`
     dtc: str
     cases: int

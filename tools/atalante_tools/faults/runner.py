@@ -45,7 +45,7 @@ ASSISTANCE: Final = 0.5
 _START: Final = 600
 #: Number of cycles between two presses of START after the fault. The first press ends FAULT, the second press ends HOLD.
 RECOVERY: Final = 100
-#: Number of cycles from the press of START that ends HOLD until the end of the run. The robot must become ACTIVE in this time.
+#: From this number of cycles after the START that ends HOLD on, the run ends as soon as the robot is not ACTIVE.
 _RESTART: Final = 300
 
 

@@ -21,7 +21,7 @@ _FEET: Final = tuple(f"FOOT_{name.upper()}" for name in FEET)
 #: Probability that a frame arrives twice. The HAL tolerates this probability permanently. Above 0.2, the HAL reports F63.
 _OFTEN: Final = 0.15
 #: Part of a case name -> permanent communication fault during which the HAL must still detect a drifting encoder.
-#: Two of the delayed messages, from a joint drive and from the pelvis IMU, are inputs of the sensor checks.
+#: Two of these faults delay messages that the sensor checks use: the messages of a joint drive and of the pelvis IMU.
 #: Frames are doubled at random, because the HAL stops the walk if a message arrives twice in every cycle (fault F63).
 _TOLERATED: Final = {
     "FOOT_LEFT often doubled": Fault("duplicate", "FOOT_LEFT_STATE", p=_OFTEN),
@@ -287,7 +287,7 @@ SCENARIOS: Final = (
                 recovers=False,
                 checks=(start_is_rejected,),
             ),
-            # The encoder drifts, so the controller moves the real joint the other way, to its end stop.
+            # The encoder drifts, so the controller moves the real joint in the opposite direction, to its end stop.
             # POSITION_RANGE: the reported position leaves its range.
             # TORQUE_MOTION: the torque does not move the joint, as with a dead motor.
             Case(

@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from atalante_tools.guide.promise_check import Checked, Effort, Verdict
 
 #: Values of the option --condition. They are a copy of the keys of `promise_check.CONDITIONS`.
-#: The help text does not import that module, because the import of the controller is slow.
+#: The help text uses this copy, because `promise_check` imports the controller, and this import is slow.
 CONDITION_NAMES = ("model", "friction", "mass", "both", "noise", "loss", "delay")
 #: Assistance factors Xi that are checked if the user gives no option --xi.
 FACTORS = (0.0, 0.25, 0.5, 0.75, 0.9, 0.95, 0.99)
@@ -108,7 +108,8 @@ _CHECK_OPTIONS = [
                  help="Steps on the emulated robot per guide.  [default: 60; with --quick: 0]"),
     click.option("--seed", type=SEED, default=0, show_default=True, metavar="N", help="Seed of the search and of the noise."),
     click.option("--quick", is_flag=True,
-                 help="Run a short search, by default only on the ideal plant and without pushes above the certified torques."),
+                 help="Run a short search: with fewer steps, without pushes above the limits of --push, and without steps on the "
+                      "emulated robot (unless --robot-steps is given)."),
     click.option("--plot", type=OutputFile(".png", ".svg", ".pdf"), metavar="FILE",
                  help="Draw the last guide with its bounds, the worst step, and the tracking errors from which the controller "
                       "can still keep the joints inside the guide (safe backward image)."),

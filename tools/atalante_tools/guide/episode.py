@@ -61,7 +61,8 @@ class Push(NamedTuple):
     """
 
     signs: Vector  # planned direction, positive or negative, in each cycle (row) at hip and knee (columns); shape (cycles + 1, 2)
-    feedback: Vector  # weight of each feature (columns) for the direction at hip and knee (rows); shape (2, FEATURES)
+    #: weights of the four `features` (columns) in the sums that give the directions at hip and knee (rows); shape (2, FEATURES)
+    feedback: Vector
 
 
 class Start(NamedTuple):
@@ -69,8 +70,8 @@ class Start(NamedTuple):
 
     deviation: Pair  # angle minus nominal angle, of hip and knee [rad]
     rate: Pair  # speed minus nominal speed, of hip and knee [rad/s]
-    #: difference of two torques of hip and knee [Nm]: the motor torque before the stance change,
-    #: minus the torque that gives the nominal acceleration after the stance change
+    #: torque jump at the stance change, of hip and knee [Nm]:
+    #: motor torque before the stance change minus torque for the nominal acceleration after the stance change
     carried: Pair
     ahead: Pair  # real speed minus measured speed, of hip and knee [rad/s]; a filter delays the measured speed
 
@@ -224,7 +225,8 @@ class Episode(NamedTuple):
     goal: Goal
     push: Push
     box: Vector  # largest push at hip and knee [Nm], shape (2,)
-    noise: Vector  # encoder noise, and random numbers that select lost frames, see `noise_of`; shape (cycles + 1, 4)
+    #: encoder noise [rad], and random numbers that select lost frames, see `noise_of`; shape (cycles + 1, 4)
+    noise: Vector
     before: Vector  # torque before the stance change [Nm], shape (2,)
     #: Angles of the twelve joints [rad], then their speeds [rad/s], shape (24,).
     #: All joints except SH and SK of the swing leg keep these values during the step. The values of SH and SK are not used.

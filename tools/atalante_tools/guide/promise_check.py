@@ -1,4 +1,4 @@
-"""Check of a guide: search for a push up to the promised torques that moves a joint out of the guide.
+"""Check of a guide: search for a push up to the certified torques that moves a joint out of the guide.
 
 `gait, shape, Xi -> Verdict`. The promise of a guide is one torque at the hip and one torque at the knee. The search
 (class `Adversary`) uses pushes up to these torques, unless `Task.push` gives other limits. At the start of a step, the leg
@@ -100,7 +100,7 @@ class Verdict:
     gait: str
     certified: bool
     #: Push limit at the hip [Nm]: `Task.push` if the task has one, otherwise the certified torque.
-    #: None if there is no limit, so that no search was possible.
+    #: None if the guide has no certified torques and `Task.push` is None. No push was then tried.
     promise_hip_nm: float | None
     #: Push limit at the knee [Nm], see `promise_hip_nm`.
     promise_knee_nm: float | None

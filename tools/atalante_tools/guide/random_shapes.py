@@ -39,7 +39,7 @@ def random_guide(seed: int, number: int) -> RandomGuide:
         "smooth": _smooth, "notched": _notched, "piecewise": _piecewise,
     }[kind]  # fmt: skip
     sides = [make(generator) for _ in range(4)]
-    if generator.random() < 0.5:  # upper and lower edge at the same distance from the desired trajectory
+    if generator.random() < 0.5:  # symmetric guide: both edges have the same distance from the desired angle
         sides[1], sides[3] = sides[0], sides[2]
     xi = float(generator.uniform(0.0, _LARGEST_FACTOR))
 
@@ -64,7 +64,7 @@ def _waves(phase: Vector, sizes: Vector, shifts: Vector) -> Vector:
 
 
 def _notched(generator: np.random.Generator) -> Callable[[Vector], Vector]:
-    """Return a guide width as a function of the phase: constant, but narrower in one to four notches (0.2 to 5 % of the step)."""
+    """Return a guide width as a function of the phase: constant except in one to four notches of 0.2 to 5 % of the step."""
     width, count = float(generator.uniform(0.5, _WIDE)), int(generator.integers(1, 5))
     centres, lengths = generator.random(count), 0.5 * 10.0 ** generator.uniform(-2.7, -1.3, count)
     depths = generator.uniform(_NARROW, 0.9, count)

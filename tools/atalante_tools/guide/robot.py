@@ -58,7 +58,7 @@ class RobotWalk:
     """Walk of the robot under pushes."""
 
     steps: tuple[RobotStep, ...]
-    stopped: str  # state of the HAL, and reason why the walk ended too early; empty if all steps were walked
+    stopped: str  # if the walk ended early: state of the HAL and reason; empty if all steps were walked
 
     @property
     def worst(self) -> RobotStep | None:
@@ -169,7 +169,7 @@ class _Hand:
         self._cycle += 1
 
     def _apply(self, emulator: Emulator, joint: int, push: float) -> None:
-        """Apply a push to a joint, and the additional friction of the condition.
+        """Apply a push to a joint, and the additional friction that `Condition.friction` requires.
 
         The emulated motor keeps its own friction, so the additional friction is added to the push as an external torque.
         """

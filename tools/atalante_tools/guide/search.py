@@ -181,7 +181,7 @@ class Adversary:
         linear combination of the errors and error rates of both joints.
         """
         for joint, (error, rate) in itertools.product((0, 1), ((0.0, 1.0), (1.0, 0.0), (1.0, 1.0))):
-            # The mass matrix couples the joints, so the worst push at the other joint may have either direction.
+            # Try both signs of the push at the joint `1 - joint`, because the mass matrix couples hip and knee.
             for other in (-1.0, 1.0):
                 feedback = np.zeros((2, FEATURES))
                 for i in range(2):
@@ -300,8 +300,8 @@ class Adversary:
         elif feedback.any() and change < 0.7:
             feedback += 0.3 * generator.standard_normal(feedback.shape)
         else:
-            # Replace the feedback of the push with the signs that the push had in the parent step.
-            # After this, single signs can be changed.
+            # If the motion set the signs of the push (`Push.feedback`), use the signs in the cycles of the parent step instead.
+            # The signs are then planned values (`Push.signs`), so that the signs of some cycles can be changed.
             if feedback.any():
                 signs, feedback = np.where(parent.walked.log[:, 4:6] >= 0.0, 1.0, -1.0), _no_feedback()
             begin, length = int(generator.integers(cycles)), int(1 + generator.exponential(30.0))

@@ -78,8 +78,8 @@ class Options:
     telemetry: Path | None
     law: Law  # control law of the assisted joints
     #: Patient and step parameters.
-    #: With a gait file, only the patient is used. None means that the patient comes from the file.
-    #: Without a gait file, patient and step parameters are inputs of the gait network. None means the default gait.
+    #: With a gait file, the step parameters of `subject` have no effect. If `subject` is None, the patient comes from the file.
+    #: Without a gait file, `subject` is the input of the gait network. If `subject` is None, the default gait is walked.
     subject: Subject | None = None
     files: GaitFiles = field(default_factory=GaitFiles)  # files of the gait
 
@@ -325,7 +325,7 @@ def _close(telemetry: TelemetryProcess, walked: Walked) -> None:
 def _result(certificate: Certificate, controller: AirwalkController, hal: Hal, statistics: Statistics) -> Result:
     walking = controller.statistics
     # After a single step, the statistics contain only the cycle in which this step ended. Such statistics are not reported.
-    # Without a guide (at the assistance factor 1), no cycle is counted.
+    # `walking.cycles` counts only the cycles with a guide. There is no guide at the assistance factor 1.
     counted = walking.steps >= 2 and walking.cycles > 0
     return Result(
         shape=certificate.shape,

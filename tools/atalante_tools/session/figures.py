@@ -38,7 +38,7 @@ def guide_shapes(recording: Path, picture: Path) -> None:
         picture: File to write.
     """
     steps: dict[str, dict[int, _Step]] = defaultdict(lambda: defaultdict(list))
-    last: dict[str, tuple[int, int]] = {}  # run name -> last step number and last stance leg
+    last: dict[str, tuple[int, int]] = {}  # run name -> number and stance leg of the last step in this run
     for run, guide, upper, lower in _guide_samples(recording):
         last[run] = guide.step, guide.stance
         if guide.stance == _RIGHT_STANCE and guide.name and guide.name[0] == _LEFT_HIP:

@@ -43,8 +43,8 @@ def gait_in_the_air(files: GaitFiles, subject: Subject | None, robot: Robot) -> 
         patient = patient_in(gait, files.gait) if subject is None else subject.patient
         if patient is not None:
             exoskeleton = exoskeleton.fitted(patient)
-        # The feedforward torques of a gait for the ground support the weight of the patient.
-        # Replace them with the torques of a walk in the air.
+        # A gait for the ground contains feedforward torques that support the weight of the patient.
+        # Replace these feedforward torques with the torques of a walk in the air.
         if gait.feedforward is not None:
             gait = suspended_gait(gait, exoskeleton, robot)
         return exoskeleton, gait, f"gait of {files.gait}: {gait.name}"
@@ -139,7 +139,7 @@ def with_start_and_stop(subject: Subject, step: Gait) -> WalkGaits:
             return solve_walk(subject, step)
         finally:
             # A stop signal raises `Stopped`, but the optimiser catches this exception.
-            # It then returns a wrong result or raises `GaitError`. So raise `Stopped` again.
+            # After a stop signal, the optimiser returns a wrong result or raises `GaitError`. So raise `Stopped` again.
             check_stop()
 
 

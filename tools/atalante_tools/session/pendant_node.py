@@ -139,8 +139,8 @@ class PendantNode:
             self._copy_signals()
         if self._takeover.silent and not was_silent:
             self._release_start()
-        # Only the last of several waiting SYNCs gets an answer, so the others remain without an answer.
-        # The count of consecutive answers then restarts from zero. It also restarts after a rejected SYNC.
+        # Only the last of several waiting SYNCs gets an answer.
+        # If several SYNCs were waiting, or a SYNC was rejected, the count of consecutive answers restarts from zero.
         if self._reader.gaps > gaps or synced > 1:
             self.answered_in_row = 0
         if not synced:

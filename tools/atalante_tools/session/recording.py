@@ -21,8 +21,8 @@ if TYPE_CHECKING:
     from atalante_hal.telemetry.process import Recording, TelemetryProcess, TelemetrySummary
     from atalante_tools.session.rig import Rig
 
-#: Longest wait for the telemetry process before a run on the wall clock [s].
-#: A process that is not ready in time begins to record during the run, as soon as it is ready.
+#: Longest wait for the telemetry process before a run in real time [s].
+#: A telemetry process that is not ready after this wait begins to record during the run, as soon as it is ready.
 _TELEMETRY_WAIT: Final = 5.0
 #: Time between two checks of the telemetry process [cycles].
 _TEND_CYCLES: Final = 250
@@ -189,8 +189,8 @@ def start_telemetry(
         record_rate=outputs.record_rate,
         can_log=outputs.can_log,
         lock_step=target.lockstep,
-        # Number of cycles in the ring buffer. The buffer must hold several seconds of the run,
-        # because the telemetry process may pause while a run in lock-step continues faster than real time.
+        # Size of the ring buffer [cycles]. The buffer must not overflow during a pause of the telemetry process.
+        # A run in lock-step continues during this pause, faster than real time, so the buffer holds several seconds of the run.
         slots=8192,
         **outputs.outlet,
     )

@@ -45,8 +45,9 @@ class Result:
     real_time_factor: float
     frames: int
     crc_errors: int
-    hand_overs: int  # number of steps with a certified guide whose start was compared with the hand-over box
-    #: number of these steps that started outside the hand-over box, so the certificate did not apply
+    #: number of steps with a certified guide in which the start deviation was compared with its range (hand-over box)
+    hand_overs: int
+    #: number of steps with a start deviation outside the hand-over box; the certificate does not apply to these steps
     hand_overs_exceeded: int
 
 

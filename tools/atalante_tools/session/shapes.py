@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from atalante_control.guide.shapes import GuideShape
 
 #: Names of the guide shapes, a copy of the keys of `atalante_control.guide.shapes.SHAPES`.
-#: The help text does not import that module, because the import of the controller is slow.
+#: The help text uses this copy, because the import of `atalante_control` is slow.
 SHAPE_NAMES: Final = "constant, widening, narrowing, pinched, asymmetric, snap"
 #: Description of a valid `--shape`, for help texts.
 SHAPE_HELP: Final = f"{SHAPE_NAMES}; or a shape file (FILE.toml)"

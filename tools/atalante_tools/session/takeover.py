@@ -22,7 +22,7 @@ from atalante_hal.wire.frame import Frames
 from atalante_hal.wire.process_image import ReceiveImage
 
 #: A new pendant sends for at least this time [cycles]. In this time, the older pendant can fall silent.
-#: If both pendants still send after this time, the new pendant may fall silent instead.
+#: If the older pendant still sends after `TAKEOVER_CYCLES`, the new pendant may fall silent.
 TAKEOVER_CYCLES: Final = 50
 #: After a pendant has resumed sending, it must send for at least this time before it may stop again [cycles].
 RETRY_CYCLES: Final = 8
@@ -31,7 +31,7 @@ DRAW_CYCLES: Final = 50
 #: A sending pendant falls silent and listens after this number of consecutive frames of another pendant.
 #: The HAL tolerates two senders for three cycles.
 PRESENT_FRAMES: Final = 2
-#: A silent pendant gives up, and never sends again, after this number of further consecutive frames of another pendant.
+#: If a silent pendant receives this number of consecutive frames of another pendant, it gives up and never sends again.
 LOST_FRAMES: Final = 3
 #: A silent pendant resumes sending if no frame of another pendant arrives for this time [cycles].
 #: The HAL reports a timeout after 5 cycles without a frame.
@@ -50,7 +50,7 @@ class Takeover:
     """
 
     def __init__(self, *, established: bool = False, quiet: int = QUIET_CYCLES, seed: int | None = None) -> None:
-        """Start as a listener, or as an established pendant that sends.
+        """Start as a new pendant that only listens, or as an established pendant that sends.
 
         Args:
             established: Whether this pendant sends from the beginning, and stops for each new pendant.
@@ -65,7 +65,7 @@ class Takeover:
         self._free_from = 0  # first cycle in which this pendant may stop sending
         self._quiet_from = 0  # first cycle of the current pause in the frames of other pendants
         self._received_at = -MAX_DELTA - 1  # cycle in which the newest frame of another pendant was received
-        # Number of frames of another pendant in a row, with at most `MAX_DELTA` cycles from one frame to the next.
+        # Number of consecutive frames of another pendant, with at most `MAX_DELTA` cycles from one frame to the next.
         # The count restarts when this pendant falls silent.
         self._received = 0
 

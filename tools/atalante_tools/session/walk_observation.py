@@ -26,7 +26,7 @@ _PELVIS: Final = IMUS.index("pelvis")
 
 
 class Observation:
-    """Observer of a walk: detects a fall, and measures the true path of an emulated robot. It also applies the push.
+    """Observer of a walk: detects a fall, measures the true deviation from the walking line, and applies the push.
 
     Attributes:
         fell: Whether the pelvis has leaned by more than `FALLEN`.
@@ -63,7 +63,7 @@ class Observation:
         return self.fell
 
     def _measured(self) -> float:
-        """Return the cosine of the angle between the pelvis axis and the vertical, as far as the HAL can measure it.
+        """Return the measured or estimated cosine of the angle between the z axis of the pelvis and the vertical.
 
         The controller estimates the vertical only while it moves the robot. After that, the attitude of the pelvis IMU is used.
         Before the start, a robot on a crane may lean, so the cosine is 1.
@@ -78,7 +78,7 @@ class Observation:
         return _upright(x, y)
 
     def _compare(self, access: Access) -> float:
-        """Return the cosine of the true angle between the pelvis axis and the vertical.
+        """Return the true cosine of the angle between the z axis of the pelvis and the vertical.
 
         While the controller walks, also add up the squared error of the vertical that the controller estimates.
         """
@@ -121,7 +121,7 @@ class Observation:
             if not controller.reached(step, push.phase):
                 return wrench
             self._push_begun = cycle
-            # The direction is relative to the desired line, which `turn` has turned before each step so far.
+            # `push.direction` is relative to the desired line. This line turns by the angle `turn` before each step.
             self._push_angle = math.radians(push.direction) + controller.config.turn * controller.steps_begun
         if (cycle - self._push_begun + 1) * PERIOD <= push.duration:
             wrench[:2] = push.force * math.cos(self._push_angle), push.force * math.sin(self._push_angle)

@@ -53,8 +53,8 @@ class WalkOptions:
     shape: str  # name or file of the guide shape
     passive: bool  # whether the emulated patient has the impedance of relaxed legs; False: the legs are masses only
     subject: Subject | None  # patient and step parameters; None means the values in the walk file
-    #: Gait file or network file of the user. If the user gives neither, the gaits come from the package:
-    #: from its walk file for the default subject, and from its gait network for every other subject.
+    #: Gait file or network file of the user. If the user gives neither, the gaits come from files of the package.
+    #: The package has a walk file for the default subject, and a gait network for every other subject.
     files: GaitFiles
     seed: int  # seed of the sensor noise
     friction: float  # coefficient of friction between soles and floor
@@ -68,7 +68,7 @@ class WalkOptions:
     #: Whether the emulated robot runs in a process of its own; None: only if enough processor cores are idle.
     robot_process: bool | None = None
     #: Whether the pelvis IMU has a heading reference, so that the measured heading does not drift.
-    #: The controller then corrects its estimated heading with the measured heading.
+    #: With a heading reference, the controller corrects its estimated heading with the measured heading.
     heading_reference: bool = False
     then: tuple[SpeedChange, ...] = ()  # speed changes, in walking order
     turn: float = 0.0  # angle by which the walking line turns before each periodic step, positive to the left [deg]

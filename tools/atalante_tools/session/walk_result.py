@@ -36,8 +36,8 @@ class WalkResult:
     outcome: str  # how the walk ended: stood, fell, stopped, hold or fault
     engine: str | None  # physics engine of the emulated robot; None means the real robot
     xi: float
-    shape: str | None  # guide shape; None if `xi` is 1 and no step was guided
-    #: Assistance factor of the guide with the smallest promise of all guided steps. The next three fields describe this guide.
+    shape: str | None  # guide shape; None if no step was guided and `xi` is 1
+    #: Assistance factor of the guide with the smallest certified hip torque. The next three fields describe this guide.
     #: None if `shape` is None.
     promise_xi: float | None
     certified: bool | None  # whether the guide is certified; None if `shape` is None
@@ -51,8 +51,9 @@ class WalkResult:
     outside_cycles: int  # number of guided cycles with a joint outside the guide
     #: fraction of the guided time in which the backup torque of the guide (spring and damper) acts; None if no step was guided
     filter_active: float | None
-    hand_overs: int  # number of steps with a certified guide whose start was compared with the hand-over box
-    #: number of these steps that started outside the hand-over box, so the certificate did not apply
+    #: number of steps with a certified guide in which the start deviation was compared with its range (hand-over box)
+    hand_overs: int
+    #: number of steps with a start deviation outside the hand-over box; the certificate does not apply to these steps
     hand_overs_exceeded: int
     full_assist: bool  # whether a diagnostic made the HAL ramp the assistance factor to 1 (state FULL_ASSIST)
     lateral_m: float  # sideways deviation from the walking line at the last landing [m], positive to the left
@@ -74,7 +75,7 @@ class WalkResult:
 
 
 def weakest_guide(controller: WalkController, xi: float) -> Certificate | None:
-    """Return the certificate with the smallest promise of all guided steps; None if there is no guide.
+    """Return the certificate with the smallest certified hip torque of all guided steps; None if there is no guide.
 
     Args:
         controller: Controller after the walk.

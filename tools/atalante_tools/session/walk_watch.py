@@ -106,7 +106,7 @@ class WalkWatch:
         if not self._started:
             return bool(self._stop.wanted) or fault
         if not self._halted:
-            hal.end()  # a START in this time must not begin a second walk
+            hal.end()  # a START after the end of the motion must not begin a second walk
             self._signals = self._stop.signals
             self._reason = hal.reason
             if not self._controller.walking and self._reason == stop_text(stop_requested=True):

@@ -100,8 +100,8 @@ class Cycle(NamedTuple):
 
 
 #: All results that pendant frames can have in one cycle: result -> one example of frames that cause the result.
-#: A result consists of the state of the reception, the inputs of the operator, and a bool: whether the HAL received
-#: a press of START from the genuine pendant, not from a second sender.
+#: A result has three parts: state of the reception, inputs of the operator, and whether the HAL received a genuine START.
+#: A genuine START is a press of START from the pendant, not from a second sender.
 _Receptions = dict[tuple[Reception, Inputs, bool], tuple[PendantFrame, ...]]
 
 

@@ -41,15 +41,15 @@ _PRESSES, _ROGUE_PRESSES = 10, 12
 #: Time in which a pressed START can still change the supervisor state: no time, one cycle, or several cycles.
 NO_START, LAST_START, START = 0, 1, 2
 #: `NO_START`, `LAST_START` or `START` -> number of cycles in which a pressed START can still change the supervisor state.
-#: The search writes this number into `SafetyMonitor.start_cycles_left`.
+#: The search writes the number from `START_CYCLES` into `SafetyMonitor.start_cycles_left`.
 START_CYCLES: Final = {NO_START: 0, LAST_START: 1, START: 100}
 #: Whether the HAL trusts the pendant -> error counters of the pendant (`Qualification`) that the search tries.
 QUALIFICATIONS: Final = {
     False: (Qualification(0, 0, False), Qualification(0, REQUALIFY - 1, False)),
     True: (SETTLED, Qualification(FULL - 4, 0, True)),
 }
-#: Last frame that the HAL checked for a press of a button:
-#: no frame, the last accepted frame, an earlier frame, or a frame of a second sender.
+#: Last frame that the HAL checked for a press of a button. `_NONE`: no frame. `_LATEST`: the last accepted frame.
+#: `_OLDER`: a frame before the last accepted frame. `_ROGUE`: a frame of a second sender.
 #: If the next frame has another RequestCounter than the checked frame, a button was pressed.
 _NONE, _LATEST, _OLDER, _ROGUE = range(4)
 #: `_NONE`, `_LATEST`, `_OLDER` or `_ROGUE` -> RequestCounter (counter of button presses) in the checked frame.
@@ -120,7 +120,7 @@ class Decision(NamedTuple):
 
     after: Supervision
     prevented: bool  # whether a diagnostic prevents the HAL from enabling drives
-    entered: bool  # whether the supervisor state changed; a change drops a stored START
+    entered: bool  # whether the supervisor state changed; a change deletes a stored START
 
 
 class _ScriptedPendant(Pendant):
@@ -193,7 +193,7 @@ class HalSteps:
             frames: frames that arrive, in order.
         """
         ages = (before.age,) if before.age < LOST else (LOST, 200, NEVER)
-        # While two senders are suspected, the HAL keeps no RequestCounter.
+        # While the HAL suspects two senders, it stores no RequestCounter, so `evaluated` is `_NONE`.
         two_senders = before.evaluated == _NONE or any(frame.sender == "rogue" for frame in frames)
         evidences = (0, FULL - 16) if two_senders else (0,)
         return tuple(
@@ -331,9 +331,9 @@ class HalSteps:
         monitor.memory = FaultMemory()
         monitor._reports.clear()
         monitor.start_cycles_left, monitor.enabling, monitor.moving, monitor.walking = 0, False, False, False
-        monitor.recalled = -RECALL_CYCLES  # skip the wait after QUICK_STOP, so that the search includes more STARTs
-        # `_stalled` counts cycles in which no drive changes its state. A high count ends a start. The search needs no count:
-        # in each cycle, the search tries both that the start ends (`LAST_START`) and that the start continues (`START`).
+        monitor.recalled = -RECALL_CYCLES  # no wait after QUICK_STOP, so that more STARTs lead to ACTIVE
+        # `_stalled` counts cycles in which no drive changes its state. A high count ends a start. The search does not count:
+        # in each cycle, it tries both possible results: the start ends (`LAST_START`), and the start continues (`START`).
         monitor._stalled = 0
         monitor._ending = monitor._duplicate_found = monitor._ramping = monitor._proof_begun = False
         monitor.lowered.clear()

@@ -98,7 +98,7 @@ class EmbeddedRobot(Closing):
             process_group=0,
         )
         self._begun = False
-        # Close the copy of the child's socket in this process. Otherwise the parent does not notice the end of the child.
+        # Close the copy of the child's socket in this process. Otherwise this process does not detect the end of the child.
         os.close(child_socket)
         self.bus = SharedBus("embedded", memory, parent_socket, 0)
         self.bus.patience = _PATIENCE

@@ -56,7 +56,7 @@ class Access(Protocol):
         """Turn the assistance dial of the emulated operator.
 
         Args:
-            factor: Assistance factor Xi, 0 to 1. With None, the HAL keeps its own factor.
+            factor: Assistance factor Xi, 0 to 1. With None, the factor of the HAL stays unchanged.
         """
 
     def attitude(self) -> tuple[float, float, float, float]:
@@ -115,7 +115,7 @@ class _Shared(NamedTuple):
 
     question: Vector  # request to the emulator: `_CYCLE`, `_ATTITUDE` or `_STANCE`, shape (1,)
     #: Number of calls of `assist` so far, and assistance factor of the last call, shape (2,).
-    #: The factor NaN means that the HAL keeps its own factor.
+    #: If the factor is NaN, the assistance factor of the HAL stays unchanged.
     dial: Vector
     pushes: Vector  # 1 if the pelvis is pushed, otherwise 0, shape (1,)
     wrench: Vector  # force [N] and moment [Nm] on the pelvis, shape (6,)
