@@ -18,7 +18,7 @@ from atalante_hal.wire.frame import Frames
 from atalante_tools.session.rig import PATIENCE
 
 #: Longest accepted time from a SYNC to the state frame of a node [us].
-#: The HAL waits just as long for the state frames after a SYNC (half a cycle), except in lock-step.
+#: This time is half a cycle. The HAL waits half a cycle for the state frames after a SYNC, except in lock-step.
 STATE_BUDGET: Final = PATIENCE * 1e6
 #: Longest accepted time from a SYNC to a command frame of the HAL [us]: one cycle.
 #: A drive applies a command at the next SYNC, so a later command frame misses this SYNC.
@@ -106,7 +106,7 @@ class BusTiming:
                     self._samples[key].append(stamp - since)
 
     def report(self) -> list[Latency]:
-        """Return one time distribution for each bus and kind of frame that has samples, in the order of the DBC messages."""
+        """Return one time distribution for each bus and kind of frame (state, command) with samples, in the order of the DBC."""
         return [self._latency(bus, kind) for bus, kind in self._wire if self._samples[bus, kind]]
 
     def _latency(self, bus: str, kind: str) -> Latency:

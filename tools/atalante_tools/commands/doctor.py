@@ -33,8 +33,8 @@ FD_MTU: Final = 72
 PRIORITY: Final = 50
 #: Linux file with the real-time limits of each user.
 LIMITS: Final = "/etc/security/limits.conf"
-#: Name of a Python package -> purpose of the package, and the pip extra of `atalante-hal` that installs it.
-#: The extra is "" if `atalante-hal` installs the package without an extra.
+#: Name of a Python package -> purpose of the package, and the pip extra of `atalante-hal` that installs the package.
+#: The empty text "" instead of an extra means that `pip install atalante-hal` already installs the package.
 PACKAGES: Final = {
     "pinocchio": ("the model of the controller", ""),
     "pybullet": ("the emulated robot", "[emulator]"),
@@ -226,7 +226,7 @@ def _interface(name: str, interface: Interface | None, needed: bool) -> CheckRes
     if not interface.up:
         return CheckResult(name, False, needed, "the interface is down", f"ip link set {name} up")
     if interface.queue < QUEUE:
-        # `needed` is False, because a short transmit queue overflows only if the receiver is slow for several cycles.
+        # A short transmit queue is no obstacle (`needed` is False). It overflows only if the receiver is slow for several cycles.
         text = f"CAN FD, up, but its transmit queue holds only {interface.queue} frames"
         return CheckResult(name, False, False, text, f"ip link set {name} txqueuelen {QUEUE}")
     return CheckResult(name, True, needed, f"CAN FD, up, txqueuelen {interface.queue}")

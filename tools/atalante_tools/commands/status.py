@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
 _BLANK: Final = "-"
 #: Listening time before the measurement begins [s]. The measurement excludes frames that were lost while the buses were opened.
-#: SocketCAN reports these losses with a later frame, which arrives within this time.
+#: SocketCAN reports the number of lost frames with the next frame that it receives. This frame arrives within `WARM_UP`.
 WARM_UP: Final = 0.1
 
 
@@ -60,7 +60,7 @@ def command(target: Target, seconds: float, watch: bool, as_json: bool) -> None:
 
     network, robot = atalante_dbc.load(), load_robot()
     with stop_requested() as stop:
-        # An observer takes about 1 s to create. An open bus would overflow meanwhile.
+        # Create the observer, which takes about 1 s, before the bus is opened. An open bus would lose frames in this time.
         listener = observer.Observer(network, robot, time.monotonic())
         bus = ResilientBus(join(network, open_buses(network, target)), print_message)
         try:
@@ -179,7 +179,7 @@ def _headline(report: Report, target: Target) -> str:
 
 
 def _received(node: NodeReport) -> str:
-    """Return when the node was received. Without a HAL, a node sends no states, but its status messages show that it runs."""
+    """Return as text whether and when a node was received. Without a HAL, a node sends status messages, but no states."""
     if node.age_ms is not None:
         return f"{node.age_ms} ms ago" if node.late else "yes"
     if node.status_age_ms is None:

@@ -59,14 +59,14 @@ def ignores_invalid_codes(tester: NodeTester) -> Outcome:
     message, target = tester.command.message, tester.limits.torque
     if target < 2.0 * NOISE:
         raise NotTested(f"the torque must be at least {2.0 * NOISE:g} Nm, got {target:g} Nm; set a larger --torque")
-    # A drive that obeys a command must produce a torque that differs from the noise.
+    # The torque limit is at least 2 * NOISE, so that the test can measure the torque of a drive that obeys the command.
     limit = max(target / 3.0, 2.0 * NOISE)
     axis.enable()
     for quantity in ("Controlword", "TargetTorque", "MaxTorque"):
         code = message.signal(axis.signal(quantity)).invalid_raw
         assert code is not None
-        # The invalid code of MaxTorque, decoded as a number, is a large torque.
-        # A drive that uses this number as its torque limit produces the target torque, and fails the test.
+        # Decoded as a number, the invalid code of MaxTorque is a large torque.
+        # A drive that uses the invalid code of MaxTorque as its torque limit produces the target torque, and fails the test.
         received = axis.run(6, _C.ENABLE_OPERATION, 0.0, limit)[2 * SHOWN :]
         for _ in range(2):
             received += axis.send(axis.command(_C.ENABLE_OPERATION, target, limit, raw={quantity: code}))
@@ -168,7 +168,7 @@ def latches_late_commands(tester: NodeTester) -> Outcome:
 
 
 def releases_only_when_acknowledged(tester: NodeTester) -> Outcome:
-    """Test DRIVE-14: the latched position hold ends only on QUICK_STOP followed by ENABLE_OPERATION."""
+    """Test DRIVE-14: after a loss of commands, the drive holds its position until QUICK_STOP and then ENABLE_OPERATION arrive."""
     axis = Axis(tester)
     _latch(axis)
     for controlword in (_C.ENABLE_OPERATION, _C.SHUTDOWN, _C.SWITCH_ON, _C.FAULT_RESET, _C.ENABLE_OPERATION):
@@ -186,7 +186,7 @@ def releases_only_when_acknowledged(tester: NodeTester) -> Outcome:
 
 
 def reports_the_latch(tester: NodeTester) -> Outcome:
-    """Test DRIVE-15: when the drive latches its position hold, it sends one emergency message."""
+    """Test DRIVE-15: after a loss of commands, the drive sends exactly one emergency message."""
     axis = Axis(tester)
     axis.enable()
     first = len(tester.received)
@@ -211,14 +211,12 @@ def latches_without_sync(tester: NodeTester) -> Outcome:
 
 
 def _latch(axis: Axis) -> None:
-    """Stop the commands, so that the drive latches its position hold.
+    """Stop the commands, so that the drive holds its position in QUICK STOP ACTIVE.
 
     Raises:
-        NotTested: If the drive does not latch its position hold.
+        NotTested: If the drive does not reach QUICK STOP ACTIVE.
     """
     axis.enable()
     received = axis.tester.states(axis.tester.idle(4 * LATCHED))
     if not received or state_of(received[-1]) != _S.QUICK_STOP_ACTIVE:
-        raise NotTested(
-            "the drive must latch its position hold if no commands arrive, but the drive did not latch; see DRIVE-13"
-        )
+        raise NotTested("the drive must be in QUICK STOP ACTIVE after a loss of commands, but it is not; see DRIVE-13")

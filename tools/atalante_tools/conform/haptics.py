@@ -131,7 +131,7 @@ def follows_like_a_lag(tester: NodeTester) -> Outcome:
         if len(rising) < 3:
             return Outcome(False, "a motor does not follow its level")
         squares = rising[:-1] @ rising[:-1]
-        # Least squares. A motor without lag has the factor 0.
+        # Fit the factor by least squares. The factor is 0 for a motor that is at its level in the next state frame.
         factor = float(rising[1:] @ rising[:-1] / squares) if squares else 0.0
         model = rising[0] * factor ** np.arange(len(rising))
         if factor:
@@ -167,7 +167,7 @@ def stays_in_range(tester: NodeTester) -> Outcome:
     found, passed = [], True
     for code in (201, 230, 254):
         _settle(tester, 0.5)
-        # The valid commands between the codes prevent a timeout of a node that ignores the codes.
+        # Every second command is valid. So a node that ignores the raw values above the DBC range does not time out.
         received = [
             frame
             for _ in range(_BAD)
@@ -182,7 +182,7 @@ def stays_in_range(tester: NodeTester) -> Outcome:
 
 
 def stops_without_commands(tester: NodeTester) -> Outcome:
-    """Test HAPTICS-07: on loss of commands, the amplitude of every motor falls by `LAG` before a deadline, and then reaches 0."""
+    """Test HAPTICS-07: without commands, every amplitude has fallen by at least `LAG` at the deadline, and is 0 at the end."""
     bound = _stop_bound(tester)
     before, last_command = _settle(tester, 1.0), tester.cycle_number
     states = tester.states(tester.idle(2 * _SETTLED))

@@ -101,7 +101,7 @@ class WallClock:
         self._deadline += PERIOD
         while (left := self._deadline - time.monotonic()) > 0.0:
             listen(left)
-        listen(0.0)  # frames that are still waiting after a late wake-up of this process belong to the old cycle
+        listen(0.0)  # if this process woke up late, the frames in the receive buffer belong to the old cycle
         delay = -left
         self.delay = max(self.delay, delay)
         if delay > PERIOD:
@@ -235,7 +235,7 @@ class NodeTester:
         return self.sync.frame(cycle, counter=counter, length=length, classic=classic, flip=flip)
 
     def _send(self, frames: Frames) -> None:
-        # Reuse one array per number of frames: a bus caches every array object that it sends.
+        # Use the same array again for the same number of frames, because a bus stores each new array object in its cache.
         outbox = self._outboxes.setdefault(len(frames), new_frames(len(frames)))
         as_words(outbox)[:] = as_words(frames)
         try:

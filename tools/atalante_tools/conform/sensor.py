@@ -161,7 +161,7 @@ def _has_no_error(name: str) -> Callable[[NodeTester], Outcome]:
 
 
 def _is_unloaded(cells: Sequence[str]) -> Callable[[NodeTester], Outcome]:
-    """Return a test which requires that the mean force on every axis of the cells is at most `UNLOADED`."""
+    """Return a test which requires that the magnitude of the mean force on every axis of the cells is at most `UNLOADED`."""
     names = [f"{cell}_Force{axis}" for cell in cells for axis in _VECTOR]
 
     def test(tester: NodeTester) -> Outcome:

@@ -69,7 +69,7 @@ class EmulatorTechnician:
         operator = self._operator
         match action:
             case Action.POWER_UP:
-                pass  # not needed, because the emulated node was just powered on
+                pass  # nothing to do, because the emulated robot is powered on at the start of the examination
             case Action.OVERHEAT | Action.COOL:
                 drive = [joint.upper() for joint in JOINTS].index(node)
                 self._emulator.drives.heat(drive, 150.0 if action is Action.OVERHEAT else 25.0)

@@ -74,7 +74,7 @@ def run_host_test(build: Build, program: Path, images: int, seed: int) -> int:
         assert process.stdin is not None
         assert process.stdout is not None
         # The host test exits at the first difference, and the pipe to the host test then breaks.
-        # Close the pipe inside `suppress`, because closing a pipe writes the rest of its buffer.
+        # Close the pipe inside `suppress`, because closing writes the rest of the buffer and can raise BrokenPipeError.
         with suppress(BrokenPipeError), process.stdin as pipe:
             pipe.write(vectors.header(images))
             for image in vectors.images(images):

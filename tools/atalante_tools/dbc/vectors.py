@@ -67,7 +67,7 @@ class Vectors:
         self._order = self._stream_order()
 
     def _half_steps(self) -> Vector:
-        """Return for each signal the value half a step above an even code, shape (signals,).
+        """Return for each signal the physical value half a quantisation step above an even raw code, shape (signals,).
 
         The value is the minimum of the signal if its range has no such code or if float64 arithmetic is not exact.
         """
@@ -80,7 +80,7 @@ class Vectors:
         return np.where(exact & (code < plan[HIGH]), value, self._minimum)
 
     def _stream_order(self) -> npt.NDArray[np.intp]:
-        """Return an index array that reorders the bytes of an image (one payload per message) for the stream.
+        """Return the order of the bytes of an image (one payload per message) in the stream, as an index array.
 
         The method `images` joins one array per kind of data, such as all payloads and all signal values. The stream has the
         order of the messages instead. Byte k of an image in the stream is the byte of the joined arrays at the index `order[k]`.
@@ -107,7 +107,7 @@ class Vectors:
         return np.array(order, np.intp)
 
     def header(self, images: int) -> bytes:
-        """Return the first bytes of the stream: magic number, network hash and number of images."""
+        """Return the header of the stream: magic number, network hash and number of images (one payload per message each)."""
         return HEADER.pack(MAGIC, self._build.network.hash32, images)
 
     def images(self, count: int) -> Iterator[bytes]:

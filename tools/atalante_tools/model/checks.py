@@ -16,7 +16,7 @@ from atalante_tools.session.body import engine_hint, no_banner
 #: Number of random states in which Pinocchio and PyBullet are compared.
 STATES = 100
 #: The model check compares torques and mass matrices from Pinocchio and PyBullet.
-#: The check fails if the relative difference of an array is at least this fraction.
+#: The check fails if the relative difference between an array of Pinocchio and that of PyBullet is at least `AGREEMENT`.
 #: The relative difference is the largest difference of two corresponding elements, divided by the largest element.
 AGREEMENT = 1e-6
 

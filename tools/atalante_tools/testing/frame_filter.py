@@ -177,7 +177,7 @@ class FrameFilter(WrappedBus):
             self.bus.send(frames)
         except BusError as error:
             # `error.accepted` must contain the frames that the bus accepted.
-            # They can differ from the frames of the caller, because faults drop, delay or change frames.
+            # The accepted frames can differ from the frames of the caller, because faults drop, delay or change frames.
             error.accepted = accepted = error.accepted_of(frames)
             if self.tap is not None and error.sent:
                 self.tap.sent(accepted)

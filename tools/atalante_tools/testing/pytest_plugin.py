@@ -126,7 +126,7 @@ def _write_log(item: pytest.Item, report: pytest.TestReport, recording: Recordin
 
 
 def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
-    """Print why the CAN log of a passed test was not written. Pytest prints the sections of failed tests only.
+    """Print why the CAN log of a passed test was not written. Pytest itself prints this reason only for failed tests.
 
     Args:
         terminalreporter: reports of all tests.

@@ -45,7 +45,7 @@ if TYPE_CHECKING:
     from atalante_hal.safety.events import Event
 
 #: The walk is forked this number of cycles before the fault begins.
-#: One cycle would be too few, because the emulated robot then already has the frames of the first faulty cycle.
+#: A fork one cycle before the fault would be too late: the emulated robot already has the frames of the first faulty cycle.
 _LEAD: Final = 5
 #: Number of cycles for which the HAL is observed after a fall.
 _FALLEN: Final = 300
@@ -55,7 +55,7 @@ _LONGEST: Final = 20_000
 #: pelvis and joints are slower than `_STILL` [m/s, rad/s], and each foot carries a load of at least `_LOADED` [N].
 _STILL, _RESTED, _LOADED = 0.01, 500, 50.0
 #: A walk has the outcome "walked" after `_LANDINGS` landings since the end of the fault and `_WALKED` more cycles of walking.
-#: A complete walk has this outcome, too.
+#: A walk that the robot completes has the outcome "walked", too.
 _WALKED: Final = 400
 _LANDINGS: Final = 2
 #: Phases of the walk that begin with the landing of a foot.
@@ -138,7 +138,7 @@ def _longest(trial: FaultTrial, case: Case, permanent: FaultRun) -> int:
 
     def falls(cycles: int) -> bool:
         # With the permanent fault, the robot falls after `fatal` cycles.
-        # A fault of this duration or longer still acts when the robot falls, so the robot falls, too.
+        # A fault that lasts `fatal` cycles or longer equals the permanent fault up to the fall. So the robot falls with it, too.
         if cycles >= fatal:
             return True
         stimuli = tuple(limited(stimulus, cycles) for stimulus in case.stimuli)

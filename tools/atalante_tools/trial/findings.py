@@ -26,16 +26,16 @@ _PHASES: Final = np.linspace(0.1, 0.8, 29)
 #: Two metabolic rates count as equal if their means differ by at most this fraction of the rate of quiet standing.
 SAME: Final = 0.02
 STANDING: Final = 1.44  # metabolic rate of quiet standing [W/kg]
-#: `TREND`: A value counts as falling with a rising assistance factor if the rank correlation of both is at most -`TREND`.
+#: `TREND`: If a value must fall with a rising assistance factor, the rank correlation of the two must be at most -`TREND`.
 #: `ASYMMETRY`: On each day of the sweep, the factor falls from 1 to 0 and then rises to 1, so each factor above 0 has two walks.
-#: The mean absolute difference between the two walks, divided by the range of all values, must be at most `ASYMMETRY`.
+#: The mean absolute difference between two walks with the same factor must be at most `ASYMMETRY` times the range of all values.
 TREND, ASYMMETRY = 0.8, 0.25
 #: Largest accepted coefficient of variation of the metabolic rates with full assistance in the walks of a sweep.
 VARIATION: Final = 0.05
 
 
-#: `CERTIFIED` is the smallest accepted share of guides that have a promise.
-#: A promise states the disturbance torques up to which the joints stay inside the guide.
+#: `CERTIFIED` is the smallest accepted share of guides with certified torques (a promise).
+#: The certified torques are the disturbance torques up to which the joints stay inside the guide.
 #: `ROBUST` is the smallest accepted share of walks of `robustness` in which the robot completes all steps and stands at the end.
 CERTIFIED, ROBUST = 0.95, 0.98
 #: Largest accepted sideways distance between the robot and its initial walking line at the end of a walk of `protocol` [m].
@@ -274,7 +274,7 @@ def normalised(result: Result) -> float:
 
 
 def step_variation(result: Result) -> float:
-    """Return how much the last steps of a walk differ from each other.
+    """Return the variation of the joint angle errors between the last steps of a walk, as a fraction of the guide half-width.
 
     The ratio e / q_bound is the angle error of a joint divided by the half-width of the guide. Its standard deviation over the
     steps is computed at each phase and for each joint. The result is the mean of these standard deviations.
@@ -381,13 +381,13 @@ def _trend(id_: str, claim: str, walks: Sequence[Result], value: Callable[[Resul
 
 
 def _symmetry(id_: str, claim: str, walks: Sequence[Result], value: Callable[[Result], float]) -> Finding:
-    """Test whether a value is nearly the same while the assistance factor falls and while it rises, and return the finding.
+    """Test that a value at a given assistance factor hardly depends on whether the factor falls or rises; return the finding.
 
     On each day of the sweep, the assistance factor falls from 1 to 0 and then rises to 1. Each factor above 0 therefore has two
     values. Days with a missing trial are left out.
     """
     days: dict[str, list[Result]] = {}
-    count = 0  # number of trials in a complete day
+    count = 0  # number of walks on a complete day of the sweep
     for walk in walks:
         day, position = walk["trial"]["order"].split("-")
         days.setdefault(day, []).append(walk)

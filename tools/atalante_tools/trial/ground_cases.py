@@ -19,7 +19,8 @@ def _no_load(*feet: str) -> tuple[Fault, ...]:
 
 #: Fault ID -> cases that are possible only in a walk on the ground.
 #: In fault F41, the HAL is killed. The HAL of a trial runs in the process of the trial, so the HAL pauses for 6 s instead.
-#: A pause has the same effect: the drives receive no frames. After the pause, the HAL is in HOLD and does not move the robot.
+#: A pause has the same effect on the drives as a killed HAL: the drives receive no frames.
+#: After the pause, the HAL is in HOLD and does not move the robot.
 _GROUND_CASES: Final = {
     "F19": (
         Case("both IMUs of the trunk", tuple(Fault("silence", imu) for imu in TRUNK_NODES)),

@@ -57,7 +57,7 @@ class Ending:
     """
 
     def __init__(self, rig: Rig, done: Callable[[], bool], observation: Observation | None = None) -> None:
-        """Create the end condition.
+        """Create the end condition of a trial.
 
         Args:
             rig: rig of the trial.

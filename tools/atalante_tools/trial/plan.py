@@ -38,7 +38,7 @@ SWEEP: Final = (1.0, 0.75, 0.5, 0.25, 0.0, 0.25, 0.5, 0.75, 1.0)
 QUICK_SWEEP: Final = (1.0, 0.5, 0.0, 0.5, 1.0)
 #: Number of days of the sweep, in a normal run and with `--quick`.
 DAYS, QUICK_DAYS = 3, 1
-#: Number of steps in each guide shape that have the right leg as stance leg, in a normal run and with `--quick`.
+#: Number of steps in each guide shape, in a normal run and with `--quick`. Only steps with the right leg as stance leg count.
 SHAPE_STEPS, QUICK_SHAPE_STEPS = 30, 2
 #: Duration of the trial on the treadmill [s].
 TREADMILL_TIME: Final = 300
@@ -50,16 +50,16 @@ QUICK_MASSES: Final = (58.0, 75.0)
 MASS_SHARE: Final = (0.9, 1.1)
 #: Range of the random coefficient of friction between soles and floor in `robustness`.
 FRICTION: Final = (0.25, 0.8)
-#: Length of `RobustTrial.delay`. In `robustness`, state messages, command messages and motor torques can each be one cycle late.
+#: Number of delays in `RobustTrial.delay`: of state messages, command messages and motor torques. Each delay is 0 or 1 cycle.
 #: Longer delays are not tried, because a drive times out when its last command is five cycles old.
-#: If commands are one cycle late, four consecutive lost frames cause this timeout.
-#: If commands were two or more cycles late, even fewer lost frames would cause this timeout.
+#: If commands are one cycle late, a drive times out after four consecutive lost frames.
+#: If commands were two or more cycles late, a drive would time out after even fewer lost frames.
 LATE_PARTS: Final = 3
 #: Probability with which a frame is lost in `robustness`.
 LOSS: Final = 0.01
 #: Force of a push in `robustness` [N].
 PUSH: Final = 100.0
-#: In `robustness`, each group of this number of steps contains one push, at a random time in the first 70 % of the group.
+#: Number of steps per push in `robustness`. The push begins at a random time in the first 70 % of these steps.
 PUSH_STEPS: Final = 10
 #: Number of trials and number of steps per trial of `robustness`, in a normal run and with `--quick`.
 ROBUST, QUICK_ROBUST = (100, 60), (2, 4)
@@ -175,7 +175,7 @@ class PushTrial:
 
 @dataclass(frozen=True)
 class TreadmillTrial:
-    """Baseline of the sweep: level walking without exoskeleton. No body is simulated.
+    """Baseline of the sweep: the subject walks on a level treadmill without exoskeleton. The motion is not simulated.
 
     An equation gives the metabolic rate. The emulated respirometer measures this rate.
     """
@@ -212,7 +212,7 @@ class WalkSetting:
     haptics: bool = False
 
     def walk(self, patient: Patient, active: bool, xi: float, index: int, order: str = "") -> WalkTrial:
-        """Return the trial of a subject.
+        """Return the walk of one subject with these settings.
 
         Args:
             patient: mass and height of the subject.
@@ -400,7 +400,7 @@ def versions() -> dict[str, str]:
 
 
 def key(trial: Trial) -> str:
-    """Return the key of a trial: a hash of its parameters and of all versions.
+    """Return the key of a trial: a hash of its kind, its parameters and all software versions (`versions`).
 
     Args:
         trial: trial to identify.
@@ -442,7 +442,7 @@ def source_hash(roots: Sequence[Path], ignored: Sequence[Path] = ()) -> str:
 
 
 def _content(file: Path) -> bytes:
-    """Return the bytes of a file. For Python, return its syntax tree, because comments and docstrings change no result."""
+    """Return the part of a file that can change a result: all bytes, or the syntax tree of a Python file without docstrings."""
     if file.suffix != ".py":
         return file.read_bytes()
     tree = ast.parse(file.read_bytes())

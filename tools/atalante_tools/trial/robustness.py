@@ -98,7 +98,7 @@ def robust_walk(trial: RobustTrial, recording: Path | None = None) -> dict[str, 
 
 
 def _parameters(trial: RobustTrial) -> EmulatorParameters:
-    """Return the parameters of the emulated nodes. The robot is on the ground, and its motors react late."""
+    """Return the parameters of a robot on the ground whose motors follow a new torque `trial.delay[2]` cycles late."""
     drive = replace(GROUND_PARAMETERS.drive, motor=MotorParameters(dead_time=trial.delay[2]))
     return replace(GROUND_PARAMETERS, drive=drive)
 
@@ -139,7 +139,7 @@ class Pushes:
         self._cycles = self.count = 0
 
     def wrench(self, _hal_state: int) -> Vector:
-        """Return force [N] and moment [Nm] in this cycle, shape (6,)."""
+        """Return force [N] and moment [Nm] of the push on the pelvis in this cycle, shape (6,); zeros without a push."""
         wrench = np.zeros(6)
         if self._cycles == 0 and self._controller.phase is not Phase.STEP:
             return wrench
@@ -163,7 +163,7 @@ class SafeEnding:
     """
 
     def __init__(self, rig: Rig, controller: WalkController) -> None:
-        """Create the end condition.
+        """Create the end condition of a walk.
 
         Args:
             rig: rig of the walk.

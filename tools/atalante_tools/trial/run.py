@@ -217,7 +217,7 @@ class Motion:
         self._rows: list[tuple[float, ...]] = []
 
     def sample(self) -> None:
-        """Store a sample if it is due."""
+        """Store a sample of the motion every `_SAMPLING` cycles of a periodic step."""
         state, controller = self._rig.hal.state, self._controller
         if state.cycle % _SAMPLING or controller.phase is not Phase.STEP:
             return
@@ -325,7 +325,7 @@ class Effort:
 
 
 def _respiration(rate: Vector, segments: Sequence[int], mass: float, seed: int) -> dict[str, Any]:
-    """Return the measurements of the respirometer. The subject stood still before the first sample.
+    """Return the measurements of the emulated respirometer. The subject stands still before the first second of `rate`.
 
     Args:
         rate: metabolic rate in each second, shape (n,) [W].
