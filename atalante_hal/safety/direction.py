@@ -67,7 +67,8 @@ INTEGRAL = 0.03
 TRAVEL = math.radians(1.5)
 #: First condition for a loaded foot: the mean force on the foot during a test exceeds `LOAD * cell_free`.
 #: Second condition for a loaded foot: on at least two cells, the mean force exceeds half of `LOAD * cell_free`.
-#: `LOAD * cell_free` is about four times the rms noise of the mean force. The noise of a cell is half as large.
+#: `LOAD * cell_free` is about four times the rms noise of the mean force on a foot.
+#: The rms noise of the mean force on one cell is half the rms noise of the mean force on the foot, which has four cells.
 LOAD = 1.0 / 3.0
 #: F is the sum of the forces on a foot in two consecutive cycles. The foot hit the floor if F exceeds `HIT * cell_free`.
 #: In addition, F must differ from twice the median force on the foot in the test by more than `HIT * cell_free`.

@@ -64,7 +64,7 @@ AGE: Final = 4
 
 
 class Measured(NamedTuple):
-    """Measurements of one cycle, shape (12,) each."""
+    """Measurements of one cycle. Each field has the shape (12,)."""
 
     position: Vector  # rad
     velocity: Vector  # rad/s
@@ -75,7 +75,7 @@ class Measured(NamedTuple):
 
 
 class Swings(NamedTuple):
-    """Record of the velocity reversals of all joints, shape (12,) each."""
+    """Record of the velocity reversals of all joints. Each field has the shape (12,)."""
 
     direction: npt.NDArray[np.int64]  # direction of the last motion faster than `SPEED`: 1, -1, or 0 if there is none
     age: npt.NDArray[np.int64]  # number of cycles since the joint first exceeded `SPEED` in its current direction
@@ -83,7 +83,7 @@ class Swings(NamedTuple):
 
 
 class Loads(NamedTuple):
-    """Record with which `_watch_load` detects overloaded drives and motors without torque, shape (12,) each."""
+    """Record with which `_watch_load` detects overloaded drives and motors without torque. Each field has the shape (12,)."""
 
     start: Vector  # position of the joint when the hold began [rad]; NaN if the drive does not hold its position
     speed: Vector  # speed in the first faulty cycle [rad/s]: > 0 if the joint moved away from `start`, < 0 if it moved back

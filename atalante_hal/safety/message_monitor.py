@@ -88,7 +88,8 @@ class Tolerance(NamedTuple):
     #: Indices of the legs in SIDES. A brief timeout in these legs leads to FINISH_STEP instead of HOLD.
     legs: Collection[int] = ()
     #: Extra time until a joint in one of `legs` times out [cycles]: with 3, a DBC timeout of 5 cycles becomes 8 cycles.
-    #: In a cycle with an accepted frame of the joint, the DBC timeout applies without extra time.
+    #: The extra time applies only in cycles in which no frame of the joint is accepted.
+    #: In a cycle in which a frame is accepted, the joint times out if the age of the new data reaches the DBC timeout.
     longer: int = 0
 
 
@@ -135,19 +136,30 @@ class MessageMonitor:
         return all(self.qualification[row].trusted for row in self._needed)
 
     def is_trusted(self, row: int) -> bool:
-        """Return whether the sender of the message in a row is trusted."""
+        """Return whether the sender of a message is trusted.
+
+        Args:
+            row: row of the message in the process image.
+        """
         return self.qualification[row].trusted
 
     def may_have_two_senders(self, row: int) -> bool:
         """Return whether accepted frames of a message may come from different senders.
 
-        This is True from a cycle with frames of two senders until `REQUALIFY` good cycles in a row. The diagnostic
-        NODE_DUPLICATE need not be confirmed.
+        The result becomes True in a cycle with frames of two senders. It becomes False after `REQUALIFY` consecutive good
+        cycles, or when the counter of `suspect` has fallen to 0. The diagnostic NODE_DUPLICATE has no effect on the result.
+
+        Args:
+            row: row of the message in the process image.
         """
         return self._evidence[row] > 0 and self.qualification[row].good < REQUALIFY
 
     def in_time(self, row: int) -> bool:
-        """Return whether the data of a row is younger than the timeout of its message."""
+        """Return whether the data of a message is younger than the DBC timeout of the message.
+
+        Args:
+            row: row of the message in the process image.
+        """
         return bool(self._image.age[row] < self._timeouts[row])
 
     def evaluate(self, cycle: int, memory: FaultMemory, tolerance: Tolerance = NO_TOLERANCE) -> None:

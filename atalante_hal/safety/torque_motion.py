@@ -45,7 +45,8 @@ from atalante_hal.types import State, Vector
 #: Interval between two checks of a leg [cycles]. The legs are checked alternately.
 INTERVAL: Final = 4
 #: A faulty motor produces s times the sent torque. The share s is in one of these two ranges.
-#: First range: reversed (s < 0), dead (s = 0) and weak motors. Second range: motors that are too strong.
+#: The first range of s covers reversed (s < 0), dead (s = 0) and weak motors.
+#: The second range of s covers motors that are too strong.
 SHARES: Final = ((-1.5, 0.6), (1.4, 2.2))
 #: A motor is suspected if E > `RATIO` * (F + error^2). error is `Robot.torque_error`. E and F are mean square errors.
 #: E belongs to the explanation "external torque", F to the explanation "faulty motor" (see the module docstring).
@@ -83,7 +84,7 @@ _LEG: Final = len(LEG_JOINTS)
 
 
 class Tolerances(NamedTuple):
-    """Properties of the joints that the check uses, shape (12,) each."""
+    """Properties of the joints that the check uses. Each field has the shape (12,)."""
 
     error: Vector  # Nm rms, error of the produced torque, which is computed from the motion
     low: Vector  # rad, position below which a joint is at its lower end stop

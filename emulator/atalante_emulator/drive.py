@@ -120,8 +120,9 @@ class Drives:
         self.encoders = Encoders(robot, parameters.velocity_bandwidth, signals.position, signals.velocity)
         self.motors = Motors(robot, parameters.motor, signals.torque, signals.temperature)
         self._slow_phase = 0
-        #: The last controlwords of all drives, as bytes, if they changed no drive state and no error. Otherwise empty.
-        #: When the HAL sends the same bytes again, the drives need not evaluate them.
+        #: Last controlwords of all drives that had no effect on any drive, as bytes. `_apply_controlword` describes the effects.
+        #: If the HAL sends the same bytes again, the drives need not evaluate them.
+        #: The bytes are deleted when a drive state or an error changes, because the same controlwords may then have an effect.
         self._steady = b""
         #: Joint position at which each drive holds its joint [rad]. NaN before the first encoder sample and after a state change.
         #: `_without_command` replaces NaN by the measured joint position.

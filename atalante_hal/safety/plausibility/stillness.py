@@ -83,7 +83,7 @@ class Readings(NamedTuple):
 
 
 class Drive(NamedTuple):
-    """Torques and simulated motion of each joint since its encoder reading last changed, shape (12,) each.
+    """Torques and simulated motion of each joint since its encoder reading last changed. Each field has the shape (12,).
 
     The simulation computes the smallest angle by which the torques turn a joint. The simulated joint starts at rest. If the
     torque changes by more than `breakaway`, the part of the change above `breakaway` accelerates the joint. If the torque

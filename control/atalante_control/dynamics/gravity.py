@@ -2,8 +2,8 @@
 
 Statics of a tree of links, as in the recursive Newton-Euler algorithm (Featherstone, Rigid Body Dynamics Algorithms, 5.3). The
 outward pass computes the direction of gravity in each link. The inward pass starts at the feet and sums the forces and moments
-that hold the links. The joint torque is the component of the summed moment about the joint axis. The tree of links
-comes from the Pinocchio model, which is also the reference in the tests.
+that are needed to hold the links against gravity. The joint torque is the component of the summed moment about the joint axis.
+The tree of links comes from the Pinocchio model, which is also the reference in the tests.
 """
 
 from __future__ import annotations
@@ -38,8 +38,8 @@ class LinkRecord:
     lever: Annotated[Vector, 3]  # m, position of the centre of mass
     rotation: Annotated[Vector, (3, 3)]  # rotation matrix from link to parent
     down: Annotated[Vector, 3]  # m/s2, gravitational acceleration
-    # Force [N] and moment about the joint [Nm] that hold the link and all links below this link, down to the foot.
-    # In the record of the pelvis, force and moment hold only the legs, not the pelvis.
+    # Force [N] and moment about the joint [Nm] that are needed to hold this link and all links below it against gravity.
+    # In the record of the pelvis, `force` and `moment` include the weight of both legs, but not the weight of the pelvis.
     force: Annotated[Vector, 3]
     moment: Annotated[Vector, 3]
 

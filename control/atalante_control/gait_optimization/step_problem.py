@@ -453,7 +453,10 @@ def _outside(values: Vector, bounds: tuple[Vector, Vector]) -> Vector:
 
 
 def _stacked(vectors: list[Symbol], components: slice) -> Symbol:
-    """Return the same components of several vectors in one column, one vector after the other."""
+    """Take the elements with the indices `components` from each vector, and return them stacked in one column.
+
+    The elements of the first vector come first, then the elements of the second vector, and so on.
+    """
     return casadi.vertcat(*(vector[components] for vector in vectors))
 
 

@@ -32,7 +32,8 @@ class StepGuideConfig:
     torque_reserve: float = 14.0
     #: rad/s, smallest allowed distance of a predicted speed from the velocity limit of the robot
     speed_reserve: float = 0.2
-    #: s, gain zeta: a falling safety value h raises the weight of the backup torque (h < 0: a joint may leave the guide).
+    #: s, gain zeta. If the safety value h is negative, a joint may leave the guide.
+    #: So the weight of the backup torque already rises while h falls, in proportion to zeta and -dh/dt.
     #: Example: with zeta = 0.01 s, dh/dt = -50 1/s raises the weight from 0 to 0.5.
     zeta: float = 0.01
     #: Factor in [0, 1] on the torque u_i, which cancels friction, gravity, centrifugal and Coriolis torques.

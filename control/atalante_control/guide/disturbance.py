@@ -32,7 +32,8 @@ from atalante_hal.types import Vector
 
 Pair = tuple[float, float]
 
-#: Approximate largest distance between the knee angles at which the mass matrix is evaluated in a cycle [rad].
+#: Approximate maximum spacing of the grid of knee angles for which the mass matrix is evaluated in each cycle [rad].
+#: Near the start of a step, the spacing may be larger, because the start deviation widens the grid but adds no angles.
 _SPACING = math.radians(7.5)
 
 
@@ -61,8 +62,9 @@ class HandOver:
     """Hand-over box: largest deviations at the start of a step for which the guide certificate holds.
 
     At a stance change, the torques that the controller computes for hip and knee jump. The old torque acts until the first new
-    command arrives. In the air, the controller then adds a torque that cancels the jump and fades out, but at most `carried`. On
-    the ground, the controller adds no such torque. `Leg.budget` contains the part of the jump that still acts, see `remaining`.
+    command arrives. In an airwalk (robot suspended), the controller then adds a torque that cancels the jump and fades out, but
+    at most `carried`. In a walk on the ground, the controller adds no such torque. `Leg.budget` contains the part of the jump
+    that still acts, see `remaining`.
 
     Raises:
         ValueError: If a value is negative or not finite.
@@ -141,8 +143,9 @@ class HandOver:
 class Leg(NamedTuple):
     """Data of one leg along its nominal trajectory.
 
-    The leg is the swing leg of a step. In the air, the data also contain the first cycles of the next step, because predictions
-    reach into the next step. In these cycles, the leg is the stance leg. The rows are cycles; the columns are SH and SK.
+    The leg is the swing leg of a step. In an airwalk (robot suspended), the data also contain the first cycles of the next step,
+    because predictions reach into the next step. In these cycles, the leg is the stance leg. The rows are cycles; the columns
+    are SH and SK.
     """
 
     deadbeat: Deadbeat  # re-centring of the gait

@@ -57,10 +57,12 @@ class GuideConfig:
     rate_limit: float  # Nm, largest allowed change of the backup torque within one cycle
     speed_limit: float  # rad/s, largest allowed speed of SH and SK, predicted with the inertia and delay of the model
     worst_speed_limit: float  # rad/s, largest allowed speed of SH and SK, predicted with the worst inertia and delay
-    #: s, gain zeta: a falling safety value h raises the weight of the backup torque (h < 0: a joint may leave the guide).
+    #: s, gain zeta. If the safety value h is negative, a joint may leave the guide.
+    #: So the weight of the backup torque already rises while h falls, in proportion to zeta and -dh/dt.
     #: Example: with zeta = 0.01 s, dh/dt = -50 1/s raises the weight from 0 to 0.5.
     zeta: float = 0.01
-    derivative_time: float = 0.005  # s, time constant of the low-pass filter on dh/dt
+    #: s, time constant of the low-pass filter for dh/dt, the rate of change of the safety value h
+    derivative_time: float = 0.005
     release: float = 0.03  # s, shortest time in which the weight of the backup torque falls from 1 to 0
     #: Factor on the torque u_i, in [0, 1]. u_i cancels friction, gravity, centrifugal and Coriolis torques (joint idealization).
     #: While the backup torque has the weight w, u_i is multiplied by `idealization` * (1 - w) + w.

@@ -46,10 +46,12 @@ class Guard:
     worst_speed_limit: float  # rad/s, largest allowed speed of SH and SK, predicted with the worst inertia and delay
     tracking: float  # share of a commanded torque change that a motor reaches within one cycle
     keep: float  # weight of the old value in the low-pass of the measured velocity
-    #: s, gain zeta: a falling safety value h raises the weight of the backup torque (h < 0: a joint may leave the guide).
+    #: s, gain zeta. If the safety value h is negative, a joint may leave the guide.
+    #: So the weight of the backup torque already rises while h falls, in proportion to zeta and -dh/dt.
     #: Example: with zeta = 0.01 s, dh/dt = -50 1/s raises the weight from 0 to 0.5.
     zeta: float
-    smoothing: float  # weight of the new value in the low-pass filter of dh/dt (h: safety value)
+    #: weight of the new value in the low-pass filter for `rate`, the rate of change of the safety value h
+    smoothing: float
     #: Largest decrease of the gate (weight of the backup torque) per cycle.
     #: Without a limit of the decrease, the gate would oscillate.
     release: float
@@ -140,7 +142,8 @@ class GuideTables(NamedTuple):
     #: Example: few_reach[2, 3] is the change few[3].lag cycles ahead, if the prediction starts in one of the cycles 8 to 11.
     few_reach: Vector
     #: (n, COLUMNS) values of gait and guide in each cycle of a step.
-    #: In the air, additional rows contain the first cycles of the next step, because predictions reach into the next step.
+    #: In an airwalk (robot suspended), additional rows contain the first cycles of the next step.
+    #: Reason: the predictions of an airwalk reach into the next step.
     step: Vector
 
 

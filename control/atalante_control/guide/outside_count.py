@@ -1,4 +1,4 @@
-"""Count of the cycles with a negative safety value h: `h < 0, guide has certified torques -> whether h < 0 for too long`."""
+"""Detection of a safety value h that is negative in too many cycles, by a counter with a limit."""
 
 from __future__ import annotations
 
@@ -18,9 +18,10 @@ class OutsideCount:
         self._largest, self._cycles = largest, 0
 
     def update(self, outside: bool, promised: bool) -> bool:
-        """Count one cycle. Return whether the safety value h has been negative for too many cycles.
+        """Count one cycle. Return whether the safety value h has been negative in too many cycles.
 
-        The count rises or falls by 1 in each cycle, and is at least 0.
+        The count rises or falls by 1 in each cycle, and is at least 0. The result is True if the count exceeds its limit and the
+        guide of this step has certified disturbance torques.
 
         Args:
             outside: whether the safety value h of this cycle is negative; False in a cycle without a guide.

@@ -284,7 +284,11 @@ def write_level_ankle(
 
 
 def _write_targets(ankle: Ankle, cubics: Vector, cycle: int, target: tuple[Pair, Pair], desired: Vector) -> None:
-    """Add the part of the start deviation that has not yet faded out to the flat-foot targets. Write the sums into `desired`."""
+    """Write the targets of the swing ankle plus the remaining start deviation into `desired`.
+
+    The start deviation is the deviation of the ankle from its targets at the stance change. It fades out within `len(cubics)`
+    cycles.
+    """
     (angles, rates), n = target, len(desired) // 2
     for i in range(2):
         angle, rate, joint = angles[i], rates[i], ankle.joints[i]

@@ -1,7 +1,7 @@
 """Detection of the stance change on the ground: `foot force, time in the step -> stance change`.
 
 On the ground a step ends when two conditions hold: the swing foot has carried load for several consecutive cycles, and
-a minimum fraction of the step has passed. In the air a step ends by time (`gait.step_over`).
+a minimum fraction of the step has passed. If the robot is suspended, a step ends by time (`gait.step_over`).
 """
 
 from __future__ import annotations

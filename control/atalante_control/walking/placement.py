@@ -77,7 +77,8 @@ class PlacementConfig(NamedTuple):
     bandwidth: float = 25.0  # rad/s, natural frequency of the critically damped motion of the landing offset
     speed: float = 1.2  # m/s, largest speed at which the landing offset changes
     acceleration: float = 25.0  # m/s2, largest acceleration of the landing offset
-    #: weight in `_cost` of the part of the needed landing offset that exceeds the limits `forward`, `outward` and `inward`
+    #: The needed landing offset may exceed the limits `forward`, `outward` and `inward`.
+    #: `_cost` multiplies the squared excess by this weight.
     missed: float = 30.0
     timing: float = 0.03  # m, weight in `_cost` of a landing before or after the nominal time
     #: s, time in which the goal of the swing leg changes from joint angles to foot positions, after the first reaction to a push.

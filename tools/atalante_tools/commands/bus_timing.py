@@ -21,7 +21,8 @@ from atalante_tools.session.rig import PATIENCE
 #: This time is half a cycle. The HAL waits half a cycle for the state frames after a SYNC, except in lock-step.
 STATE_BUDGET: Final = PATIENCE * 1e6
 #: Longest accepted time from a SYNC to a command frame of the HAL [us]: one cycle.
-#: A drive applies a command at the next SYNC, so a later command frame misses this SYNC.
+#: A drive applies a received command at the next SYNC, which is one cycle after the SYNC that the command answers.
+#: If the command frame takes longer than one cycle, the drive applies the command one cycle too late.
 COMMAND_BUDGET: Final = PERIOD * 1e6
 #: Node kinds that answer every SYNC with a state frame.
 _ANSWERING: Final = ("drive", "imu", "foot")

@@ -44,8 +44,8 @@ def command(target: Target, seconds: float, watch: bool, as_json: bool) -> None:
 
     The measured load counts each received frame with its longest possible wire time. The computed worst case counts every
     message of the DBC at its shortest period. "status only" marks a node that runs without a HAL: it sends status messages, but
-    no states, which answer the SYNC of the HAL. The command sends no frames. The exit code is 1 if no frame was received, and 4
-    if a fault is latched.
+    no state messages. State messages are answers to the SYNC of the HAL. The command sends no frames. The exit code is 1 if no
+    frame was received, and 4 if a fault is latched.
 
     \b
     Example: atalante status -i socketcan -c vcan0
@@ -179,7 +179,12 @@ def _headline(report: Report, target: Target) -> str:
 
 
 def _received(node: NodeReport) -> str:
-    """Return as text whether and when a node was received. Without a HAL, a node sends status messages, but no states."""
+    """Return the entry of a node in the table column "received".
+
+    The entry describes the message with the shortest period: "yes" if the message is not late, otherwise its age. If this
+    message has never been received, the entry describes the status message. Example: without a HAL, drives and sensors send
+    status messages, but no state messages, because state messages are answers to the SYNC of the HAL.
+    """
     if node.age_ms is not None:
         return f"{node.age_ms} ms ago" if node.late else "yes"
     if node.status_age_ms is None:

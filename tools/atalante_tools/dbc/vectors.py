@@ -1,6 +1,6 @@
 """Test vectors of a network, as binary stream or JSON: payloads, and the values that the Python codec decodes from them.
 
-An image is a set of payloads, one per message. The generated host test reads the binary stream, which is little endian.
+An image is a set of payloads, one payload per message. The generated host test reads the binary stream, which is little endian.
 The stream begins with 8 bytes magic, u32 network hash and u32 number of images; then the images follow. Each image
 contains the messages of the `Build` in DBC order:
 
@@ -80,8 +80,9 @@ class Vectors:
         return np.where(exact & (code < plan[HIGH]), value, self._minimum)
 
     def _stream_order(self) -> npt.NDArray[np.intp]:
-        """Return the order of the bytes of an image (one payload per message) in the stream, as an index array.
+        """Return the order of the bytes of an image in the stream, as an index array.
 
+        An image is a set of payloads, one payload per message.
         The method `images` joins one array per kind of data, such as all payloads and all signal values. The stream has the
         order of the messages instead. Byte k of an image in the stream is the byte of the joined arrays at the index `order[k]`.
         """
@@ -107,11 +108,15 @@ class Vectors:
         return np.array(order, np.intp)
 
     def header(self, images: int) -> bytes:
-        """Return the header of the stream: magic number, network hash and number of images (one payload per message each)."""
+        """Return the header of the stream: magic number, network hash and number of images.
+
+        Args:
+            images: number of images. An image is a set of payloads, one payload per message.
+        """
         return HEADER.pack(MAGIC, self._build.network.hash32, images)
 
     def images(self, count: int) -> Iterator[bytes]:
-        """Yield images (one payload per message) as bytes of the binary stream.
+        """Yield images as bytes of the binary stream. An image is a set of payloads, one payload per message.
 
         Image 0 contains the minimum of each signal, image 1 the maximum, image 2 the invalid code, and image 3 a half step. All
         further images contain random values.

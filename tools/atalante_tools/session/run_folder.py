@@ -45,9 +45,10 @@ class Result:
     real_time_factor: float
     frames: int
     crc_errors: int
-    #: number of steps with a certified guide in which the start deviation was compared with its range (hand-over box)
+    #: Number of steps whose start deviation was compared with its certified range (hand-over box).
+    #: The start deviation is compared only in steps with a certified guide.
     hand_overs: int
-    #: number of steps with a start deviation outside the hand-over box; the certificate does not apply to these steps
+    #: Number of steps whose start deviation was outside the hand-over box. The certificate does not apply to these steps.
     hand_overs_exceeded: int
 
 

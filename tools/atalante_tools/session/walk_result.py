@@ -51,9 +51,10 @@ class WalkResult:
     outside_cycles: int  # number of guided cycles with a joint outside the guide
     #: fraction of the guided time in which the backup torque of the guide (spring and damper) acts; None if no step was guided
     filter_active: float | None
-    #: number of steps with a certified guide in which the start deviation was compared with its range (hand-over box)
+    #: Number of steps whose start deviation was compared with its certified range (hand-over box).
+    #: The start deviation is compared only in steps with a certified guide.
     hand_overs: int
-    #: number of steps with a start deviation outside the hand-over box; the certificate does not apply to these steps
+    #: Number of steps whose start deviation was outside the hand-over box. The certificate does not apply to these steps.
     hand_overs_exceeded: int
     full_assist: bool  # whether a diagnostic made the HAL ramp the assistance factor to 1 (state FULL_ASSIST)
     lateral_m: float  # sideways deviation from the walking line at the last landing [m], positive to the left
