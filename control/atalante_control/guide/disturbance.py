@@ -296,9 +296,11 @@ def spread(effect: Effect, mobilities: Vector, bounds: Vector, grid: Grid, ahead
         reported = column < len(grid.lags) and grid.lags[column] == lag
         starts = min(grid.starts, count - lag) if reported else 0
         hides = reported and len(effect.hidden) > 0
-        both[0] = effect.pushed[lag]
-        if hides:
-            both[1] = effect.hidden[lag]
+        for r in range(2):  # elementwise: numba needs several seconds more to compile `both[0] = ...`
+            for c in range(2):
+                both[0, r, c] = effect.pushed[lag, r, c]
+                if hides:
+                    both[1, r, c] = effect.hidden[lag, r, c]
         for i in range(2 if hides else 1):
             for start in range(count - lag if i == 0 else starts):
                 end = start + lag

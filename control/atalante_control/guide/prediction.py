@@ -134,7 +134,7 @@ class Prediction:
         mobilities = leg.mobilities(hand_over, width)
         budget = leg.budget(assumptions.mismatch, hand_over, np.zeros((0, 2)))
         bounds = np.stack([budget, np.broadcast_to(assumptions.promise, budget.shape)], axis=2)
-        self.mass = leg.masses(leg.q[:, 1])
+        self.mass = np.ascontiguousarray(leg.masses(leg.q[:, 1]))
         self.torque = leg.torque() + leg.friction_torque()
         same = np.broadcast_to(np.eye(2), self.mass.shape).copy()
         nothing = np.zeros((0, 2, 2))
