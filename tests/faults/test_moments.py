@@ -165,6 +165,22 @@ def test_a_wrong_motor_may_move_a_joint_fast_until_it_is_found(
     assert len(patched(monkeypatch, fast, MomentTask(Moment.HOLD, (case,))).failures) == failures
 
 
+@pytest.mark.parametrize(("cycle", "failures"), [(moments.FOUND + 29, 0), (moments.FOUND + 30, 1)])
+def test_cycles_without_data_of_a_wrong_motor_do_not_count_until_it_is_found(
+    monkeypatch: pytest.MonkeyPatch, cycle: int, failures: int
+) -> None:
+    case = index("F84", "LEFT_SH in HOLD with 0 times its torque")
+    begins = moments.schedule(Moment.HOLD, ENGINE).begins + SCENARIOS["F84"].cases[case[1]].stimuli[1].start
+
+    def silent(run: Observation) -> None:
+        run.age[begins + 9 : begins + 39, run.messages.index("LEFT_SH_STATE")] = 5
+        run.age[begins + 49 : begins + 59, run.messages.index("LEFT_SH_STATE")] = 4
+        run.age[begins + 69 : begins + 79, run.messages.index("RIGHT_SH_STATE")] = 5
+        run.velocity[begins + cycle - 1, 3] = 1.25 * run.robot.velocity_max[3]
+
+    assert len(patched(monkeypatch, silent, MomentTask(Moment.HOLD, (case,))).failures) == failures
+
+
 @pytest.mark.parametrize(("moved", "failures"), [(4.0, 0), (6.0, 1)])
 def test_a_wrong_motor_may_move_a_joint_during_a_start(
     monkeypatch: pytest.MonkeyPatch, moved: float, failures: int
@@ -214,6 +230,11 @@ def test_state_that_improves_after_the_start_by_itself_fails(monkeypatch: pytest
     assert patched(monkeypatch, improve, MomentTask(moment, NO_EFFECT.cases)).failures == (
         f"the state must not improve without the operator, but it became HOLD in cycle {begins + 30}",
     )
+
+
+def test_start_of_a_case_may_end_hold() -> None:
+    verdict = MomentTask(Moment.WALKING, (index("F21", "same emergency before and after a restart"),))()
+    assert (verdict.state, verdict.failures) == ("ACTIVE", ())
 
 
 def test_motion_that_is_not_a_number_fails(monkeypatch: pytest.MonkeyPatch) -> None:

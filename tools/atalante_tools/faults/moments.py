@@ -36,7 +36,7 @@ from atalante_tools.console.options import PYBULLET
 from atalante_tools.faults.catalogue import SCENARIOS
 from atalante_tools.faults.observation import Observation
 from atalante_tools.faults.runner import RECOVERY, CaseRun, milestones, walk_cycle
-from atalante_tools.faults.scenario import MID_SWING, Case, Stimulus, shifted
+from atalante_tools.faults.scenario import MID_SWING, Case, OperatorAction, Stimulus, shifted
 from atalante_tools.faults.verdict import WALKING, automatic_improvements, exception_sentence, limit_violations
 
 _S = SupervisorState
@@ -58,10 +58,13 @@ SAG_OF: Final = {
     "push": math.inf,
 }
 #: Kinds of motor faults. Until the HAL finds a motor fault, a joint may move faster than its velocity limit.
-#: No joint speed is checked for `FOUND` cycles after a motor fault begins, and for `FOUND` cycles after each later START.
+#: No joint speed is checked for `FOUND` cycles after a motor fault begins, and for `FOUND` cycles after each later START. Cycles
+#: in which the HAL receives no data of the drive do not count, because another fault hides the motor fault (see `_SILENT`).
 _MOTOR: Final = ("torque_wrong", "torque_weak")
 #: Number of cycles within which the HAL must find a faulty motor: time limit of F84 in FAULTS.md.
 FOUND: Final = 200
+#: Data age [cycles] of a drive from which the HAL cannot find a motor fault of this drive. Such cycles do not count in `FOUND`.
+_SILENT: Final = 5
 #: Number of cycles from READY to the operator's START.
 _PAUSE: Final = 50
 #: Number of cycles from the operator's STOP to a fault that begins in HOLD.
@@ -171,14 +174,18 @@ class MomentTask:
         extremes, before = _extremes(run, plan.starts), run.last_before_start
         begins = [run.first + s.start for s in stimuli if s.kind in _MOTOR]
         restart = before + 1
-        presses = (*plan.starts, restart, restart + RECOVERY)
+        in_run = (
+            *plan.starts,
+            *(run.first + s.start for s in stimuli if isinstance(s, OperatorAction) and s.kind == "start"),
+        )
+        presses = (*in_run, restart, restart + RECOVERY)
         starts = [cycle for cycle in presses if cycle >= min(begins, default=math.inf)]
-        unlimited = [range(cycle, cycle + FOUND) for cycle in (*begins, *starts)]
+        unlimited = [_unlimited(run, cycle, stimuli) for cycle in (*begins, *starts)]
         failures = [*limit_violations(run, unlimited, _strength(stimuli)), *_premature(run, plan.starts[0])]
         # The check `automatic_improvements` requires that the HAL receives the first START before the fault begins.
         # At BOOT and READY, the fault begins before the first START, and may delay the effect of START.
         if self.moment not in (Moment.BOOT, Moment.READY):
-            failures += automatic_improvements(run, before, plan.starts)
+            failures += automatic_improvements(run, before, in_run)
         failures += _sag_violations(_sag(run, plan.starts), _sag_limits(stimuli))
         restarted = _S.ACTIVE in run.states[before:]
         return MomentVerdict(self.moment, names, run.state(before).name, restarted, extremes, tuple(failures))
@@ -229,6 +236,20 @@ def _observe(case: Case, plan: Schedule) -> Observation:
         case_run.presses[plan.stop].append("stop")
     case_run.execute(lambda state: state.cycle >= restart + RECOVERY + _END)
     return case_run.observation(restart)
+
+
+def _unlimited(run: Observation, begin: int, stimuli: Sequence[Stimulus]) -> range:
+    """Return the cycles in which no joint speed is checked: `FOUND` cycles with data of the faulty motors, from `begin` on.
+
+    Args:
+        run: observation of the run.
+        begin: first cycle: a motor fault begins, or the operator presses START.
+        stimuli: faults and actions of the run.
+    """
+    drives = [s.target for s in stimuli if isinstance(s, Fault) and s.kind in _MOTOR]
+    columns = [run.messages.index(f"{drive}_STATE") for drive in drives]
+    seen = np.flatnonzero((run.age[begin - 1 :, columns] < _SILENT).all(axis=1))
+    return range(begin, begin + int(seen[FOUND - 1]) + 1 if len(seen) >= FOUND else run.last + 1)
 
 
 def _strength(stimuli: Sequence[Stimulus]) -> Vector:
