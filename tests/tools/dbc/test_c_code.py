@@ -33,12 +33,28 @@ def compiler() -> None:
 
 
 @pytest.fixture(scope="module")
-def whole(tmp_path_factory: pytest.TempPathFactory) -> tuple[Build, Path, Path]:
-    """Generate and compile the whole network once; return build, folder and program."""
-    folder = tmp_path_factory.mktemp("c")
-    build = Build.of(DBC_FILE, None)
+def whole(tmp_path_factory: pytest.TempPathFactory) -> tuple[Build, Path]:
+    """Generate the code of the whole network once; return build and folder."""
+    return generated(None, tmp_path_factory.mktemp("whole"))
+
+
+@pytest.fixture(scope="module")
+def whole_program(whole: tuple[Build, Path]) -> Path:
+    """Compile the code of the whole network once, which takes 20 s; return the program."""
+    return compile_host_test(*whole)
+
+
+@pytest.fixture(scope="module")
+def drive(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
+    """Generate and compile the code of one drive once; return folder and program."""
+    build, folder = generated("LEFT_SK", tmp_path_factory.mktemp("drive"))
+    return folder, compile_host_test(build, folder)
+
+
+def generated(node: str | None, folder: Path) -> tuple[Build, Path]:
+    build = Build.of(DBC_FILE, node)
     write(build, folder, 0)
-    return build, folder, compile_host_test(build, folder)
+    return build, folder
 
 
 def test_makefile_of_the_user_is_kept(tmp_path: Path):
@@ -108,24 +124,24 @@ def test_names_that_are_no_names_in_c_are_rejected(file: str, changes: dict[str,
 
 
 @pytest.mark.long
-def test_c_and_python_agree_on_random_images_of_the_whole_network(whole):
-    build, _, program = whole
+def test_c_and_python_agree_on_random_images_of_the_whole_network(whole, whole_program):
+    build, _ = whole
     assert len(build.messages) == len(load().messages)
     # Every message is compared twice: unpacked and packed.
-    assert run_host_test(build, program, IMAGES, seed=1) == 2 * IMAGES * len(build.messages)
+    assert run_host_test(build, whole_program, IMAGES, seed=1) == 2 * IMAGES * len(build.messages)
 
 
 @pytest.mark.long
-def test_host_test_passes_on_the_vector_file(whole):
-    _, folder, program = whole
-    done = subprocess.run([program, folder / "vectors.bin"], capture_output=True, text=True, check=False)
+def test_host_test_passes_on_the_vector_file(whole, whole_program):
+    _, folder = whole
+    done = subprocess.run([whole_program, folder / "vectors.bin"], capture_output=True, text=True, check=False)
     assert (done.returncode, done.stdout) == (0, f"{2 * 100 * len(load().messages)} frames compared\n")
 
 
 @pytest.mark.parametrize("offset", [16 + 8, 16 + 8 + 1, -1], ids=["value range flag", "value", "payload"])
-def test_one_wrong_bit_in_the_vectors_fails_the_comparison(whole, offset: int, tmp_path: Path):
+def test_one_wrong_bit_in_the_vectors_fails_the_comparison(drive, offset: int, tmp_path: Path):
     # The first frame is an 8-byte SYNC: payload, range flag, values. The last byte belongs to the payload of a sent frame.
-    _, folder, program = whole
+    folder, program = drive
     content = bytearray((folder / "vectors.bin").read_bytes())
     content[offset] ^= 1
     wrong = tmp_path / "wrong.bin"
@@ -135,8 +151,8 @@ def test_one_wrong_bit_in_the_vectors_fails_the_comparison(whole, offset: int, t
     assert "not " in done.stdout
 
 
-def test_vectors_of_another_network_are_rejected(whole, tmp_path: Path):
-    _, folder, program = whole
+def test_vectors_of_another_network_are_rejected(drive, tmp_path: Path):
+    folder, program = drive
     content = bytearray((folder / "vectors.bin").read_bytes())
     content[8] ^= 1
     (tmp_path / "other.bin").write_bytes(content)
@@ -237,7 +253,7 @@ def test_unknown_node_is_rejected_with_a_similar_name():
 
 
 def test_missing_compiler_gives_the_install_command(whole, monkeypatch: pytest.MonkeyPatch):
-    build, folder, _ = whole
+    build, folder = whole
     monkeypatch.setenv("CC", "no-such-cc")
     with pytest.raises(Failed, match="apt-get install gcc"):
         compile_host_test(build, folder)
@@ -245,7 +261,7 @@ def test_missing_compiler_gives_the_install_command(whole, monkeypatch: pytest.M
 
 def test_json_vectors_equal_the_values_of_cantools(whole):
     """Cantools decodes the examples independently of the codec of this project."""
-    _, folder, _ = whole
+    _, folder = whole
     oracle = cantools.database.load_file(str(DBC_FILE), strict=False)
     vectors = json.loads((folder / "vectors.json").read_text())
     assert len(vectors) == 4 * len(load().messages)
@@ -267,7 +283,7 @@ def test_random_payloads_have_codes_inside_and_outside_their_range(whole):
     """The comparison of the range checks needs payloads of both kinds."""
     from atalante_tools.dbc.vectors import Vectors
 
-    build, _, _ = whole
+    build, _ = whole
     vectors = Vectors(build, 0)
     seen = np.zeros((2, len(build.messages)), bool)
     for _ in vectors.images(60):
