@@ -22,6 +22,8 @@ DESCRIPTORS = Path("atalante_hal/telemetry/messages.binpb")
 parser = argparse.ArgumentParser(description=__doc__)
 parser.add_argument("endpoint", nargs="?", default="tcp/127.0.0.1:7447")
 endpoint = parser.parse_args().endpoint
+if not DESCRIPTORS.is_file():
+    parser.error(f"the program must be started in the root of the project, got {Path.cwd()} without {DESCRIPTORS}")
 settings = {
     "mode": "client",
     "connect": {"endpoints": [endpoint], "timeout_ms": -1},  # -1: no timeout, retry until the HAL answers

@@ -72,6 +72,16 @@ def test_example_with_wrong_arguments_ends_with_one_sentence_and_exit_code_2(
     assert all(line.startswith("usage: ") for line in usage)
 
 
+def test_subscriber_example_outside_the_project_ends_with_one_sentence(tmp_path: Path):
+    command = [sys.executable, ROOT / "examples" / "subscribe.py"]
+    done = subprocess.run(command, capture_output=True, text=True, cwd=tmp_path, timeout=300)
+    assert (done.returncode, done.stdout) == (2, "")
+    assert done.stderr.splitlines()[-1] == (
+        "subscribe.py: error: the program must be started in the root of the project, "
+        f"got {tmp_path} without atalante_hal/telemetry/messages.binpb"
+    )
+
+
 def test_own_bus_example_counts_frames_in_both_directions():
     (line,) = (line for line in run("own_bus.py").splitlines() if line.startswith("HOLD "))
     assert "SYNC_LEFT_LEG" in line
