@@ -15,7 +15,8 @@ FH is not 0. All checks therefore turn the attitude of the tibia back by an esti
 the error of TH by at most `_HEADING_DRIFT` per sample. If the encoder of TH drifts more slowly than this limit, the estimate
 follows this drift. So such a drift of the encoder of TH is not detected. An IMU that restarts reports another heading. The
 estimate is then measured again, so that the error of TH is the same as before the restart. So a drift of TH in the time without
-the IMU is not detected.
+the IMU is not detected. If the drive of TH restarts in the same time, its encoder counts as referenced, and its old error is
+kept only if the heading is unchanged with it.
 
 *Standstill.* While the reading of an encoder is constant and its joint is at rest, the difference between encoders and
 IMUs about the axis of the joint is also constant. If the joint moves while its encoder is stuck, this difference changes by
@@ -86,6 +87,8 @@ _HEADING = _AXES.index(("TH",))
 _SAGITTAL = _AXES.index(("SH", "SK"))
 #: For each of the first four joints of a leg: index of its axis in `_AXES`.
 _AXIS_OF = (0, 1, 2, 2)
+#: Index of TH in LEG_JOINTS.
+_TH = LEG_JOINTS.index("TH")
 _HIPS = tuple(JOINTS.index(f"{side}_FH") for side in SIDES)
 
 
@@ -130,6 +133,8 @@ class Legs:
         #: For each leg: errors of the last comparison [rad]; None before the first comparison.
         self._errors: list[tuple[float, float, float] | None] = [None for _ in SIDES]
         self._heading_lost = [False for _ in SIDES]  # for each leg: whether its heading must be measured again
+        #: For each leg: whether the drive of TH has restarted since the last comparison.
+        self._referenced = [False for _ in SIDES]
         self.heading: Vector = np.tile([1.0, 0.0], (len(SIDES), 1))
         self.tilt: Vector = np.tile([1.0, 0.0], (len(SIDES), 1))
         self.encoder_error: Vector = np.full(len(JOINTS), math.inf)
@@ -148,14 +153,17 @@ class Legs:
         self._exchanged: dict[int, tuple[Finding, ...]] = {}
 
     def reference(self, joint: int) -> None:
-        """Discard the findings that the left and the right encoder of a joint are exchanged.
+        """Discard what is known about the old reference of an encoder.
 
+        These are the findings that the left and the right encoder of the joint are exchanged. If the joint is TH and an IMU also
+        restarts before the next comparison, this is also the error of TH, see `_measure_heading`.
         Call it when the drive of the joint has restarted and referenced its encoder.
 
         Args:
             joint: index of the joint in JOINTS.
         """
-        index = joint % len(LEG_JOINTS)
+        leg, index = divmod(joint, len(LEG_JOINTS))
+        self._referenced[leg] |= index == _TH
         self._exchanged.pop(index, None)
         if index < len(self._exchanges):
             self._exchanges[index] = 0
@@ -222,6 +230,7 @@ class Legs:
         fh, th, sh, sk = angles.tolist()
         if self._heading_lost[leg]:
             self._measure_heading(leg, fh, th, pelvis, tibia)
+        self._referenced[leg] = False
         x, z, y = hip_angles(pelvis, turned_about_vertical(tibia, self.heading[leg].tolist()))
         turn = 2.0 * math.pi
         errors = math.remainder(fh - x, turn), math.remainder(th - z, turn), math.remainder(sh + sk - y, turn)
@@ -259,7 +268,8 @@ class Legs:
     def _measure_heading(self, leg: int, fh: float, th: float, pelvis: Sequence[float], tibia: Sequence[float]) -> None:
         """Measure the heading drift of a leg. Assume that FH and TH have the same errors as in the last comparison.
 
-        The axis of SH and SK is the axis y of the tibia. Its direction follows from FH and TH.
+        If the drive of TH has restarted since the last comparison, assume that its encoder has the error 0.
+        Exception: with the old error, the heading is unchanged, and with the error 0, it is not. Then keep the old error.
 
         Args:
             leg: index in SIDES.
@@ -272,10 +282,17 @@ class Legs:
         errors = self._errors[leg]
         if errors is None:
             return
-        fh, th = fh - errors[0], th - errors[1]
-        axis = -math.sin(th), math.cos(th) * math.cos(fh), math.cos(th) * math.sin(fh)
-        expected, found = to_world(pelvis, axis), to_world(tibia, (0.0, 1.0, 0.0))
-        self._set_heading(leg, math.atan2(expected[1], expected[0]) - math.atan2(found[1], found[0]))
+        fh -= errors[0]
+        drift = heading_drift(fh, th - errors[_HEADING], pelvis, tibia)
+        if self._referenced[leg]:
+            referenced = heading_drift(fh, th, pelvis, tibia)
+            if self._is_heading(leg, referenced) or not self._is_heading(leg, drift):
+                drift = referenced
+        self._set_heading(leg, drift)
+
+    def _is_heading(self, leg: int, drift: float) -> bool:
+        """Return whether a measured heading drift agrees with the estimate of a leg."""
+        return abs(math.remainder(drift - self._heading_drift[leg], 2.0 * math.pi)) <= self._attitude_error
 
     def _set_heading(self, leg: int, drift: float) -> None:
         self._heading_drift[leg] = drift
@@ -381,6 +398,22 @@ def hip_angles(pelvis: Sequence[float], tibia: Sequence[float]) -> tuple[float, 
     sagittal = math.atan2(2.0 * (x * z + w * y), 1.0 - 2.0 * (y * y + z * z))
     fh = math.atan2(2.0 * (y * z + w * x), 1.0 - 2.0 * (x * x + z * z))
     return fh, th, sagittal
+
+
+def heading_drift(fh: float, th: float, pelvis: Sequence[float], tibia: Sequence[float]) -> float:
+    """Return the heading of the pelvis IMU minus the heading of a tibia IMU at known hip angles [rad].
+
+    The axis of SH and SK is the axis y of the tibia. Its direction follows from FH and TH.
+
+    Args:
+        fh: angle of FH [rad].
+        th: angle of TH [rad].
+        pelvis: attitude of the pelvis IMU, quaternion wxyz.
+        tibia: attitude of the tibia IMU, quaternion wxyz.
+    """
+    axis = -math.sin(th), math.cos(th) * math.cos(fh), math.cos(th) * math.sin(fh)
+    expected, found = to_world(pelvis, axis), to_world(tibia, (0.0, 1.0, 0.0))
+    return math.atan2(expected[1], expected[0]) - math.atan2(found[1], found[0])
 
 
 def extrapolated(quaternion: list[float], gyro: list[float], time: float) -> list[float]:

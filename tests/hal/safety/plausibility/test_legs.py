@@ -271,6 +271,25 @@ class TestDrift:
             expected = [error - sign * 100 * 1e-5] if found else []
             assert one_leg.drifts() == pytest.approx(expected, abs=1e-12)
 
+    @staticmethod
+    def tilted_leg(one_leg: OneLeg, imu: str) -> tuple[int, Callable[[float, float], None]]:
+        """Return the index of an IMU in IMUS, and a function that compares the leg four times while the pelvis is tilted.
+
+        The arguments of the function are the error of TH and the angle by which the heading of the IMU is wrong [rad].
+        """
+        tibia = TIBIAE[one_leg.leg]
+        restarted = PELVIS if imu == "pelvis" else tibia
+
+        def compare(th: float, heading: float) -> None:
+            one_leg.show((0.2, -0.3, -0.5), (0.01, th, -0.02))
+            quaternion = one_leg.now.quaternion
+            quaternion[PELVIS] = tilted(0.2, -0.1, 0.5)
+            quaternion[tibia] = product(tilted(0.2, -0.1, 0.5), quaternion[tibia].tolist())
+            quaternion[restarted] = product(tilted(0.0, 0.0, heading), quaternion[restarted].tolist())
+            one_leg.compare(4)
+
+        return restarted, compare
+
     @pytest.mark.parametrize("leg", [0, 1])
     @pytest.mark.parametrize("imu", ["pelvis", "tibia"])
     @pytest.mark.parametrize("turn", [-2.8, 0.05, 1.5])
@@ -278,19 +297,7 @@ class TestDrift:
         self, leg: int, imu: str, turn: float
     ):
         one_leg, allowed = OneLeg(leg), ROBOT.sensors.attitude_error
-        restarted = PELVIS if imu == "pelvis" else TIBIAE[leg]
-
-        def compare(th: float, heading: float) -> None:
-            one_leg.show((0.2, -0.3, -0.5), (0.01, th, -0.02))
-            one_leg.now.quaternion[PELVIS] = tilted(0.2, -0.1, 0.5)
-            one_leg.now.quaternion[TIBIAE[leg]] = product(
-                tilted(0.2, -0.1, 0.5), one_leg.now.quaternion[TIBIAE[leg]].tolist()
-            )
-            one_leg.now.quaternion[restarted] = product(
-                tilted(0.0, 0.0, heading), one_leg.now.quaternion[restarted].tolist()
-            )
-            one_leg.compare(4)
-
+        restarted, compare = self.tilted_leg(one_leg, imu)
         one_leg.legs.restart_heading(restarted)  # has no effect before the first comparison
         compare(0.0, 0.0)
         compare(0.015, 0.0)
@@ -318,6 +325,56 @@ class TestDrift:
             half = 0.5 * error if abs(error) <= allowed else 0.0
             assert one_leg.legs.tilt[leg] == pytest.approx([math.cos(half), math.sin(half)], abs=1e-12)
             assert one_leg.legs.tilt[1 - leg].tolist() == [1.0, 0.0]
+
+    @pytest.mark.parametrize("leg", [0, 1])
+    @pytest.mark.parametrize("imu", ["pelvis", "tibia"])
+    @pytest.mark.parametrize(("before", "turn"), [(0.1, -2.8), (0.1, 0.0), (-0.1, 0.3), (0.02, 0.0), (0.031, 0.015)])
+    def test_offset_of_th_ends_if_its_drive_is_referenced_while_an_imu_restarts(
+        self, leg: int, imu: str, before: float, turn: float
+    ):
+        one_leg, allowed = OneLeg(leg), ROBOT.sensors.attitude_error
+        restarted, compare = self.tilted_leg(one_leg, imu)
+        compare(0.0, 0.0)
+        compare(before, 0.0)
+        assert bool(one_leg.drifts()) is (abs(before) > allowed)
+        one_leg.legs.reference(6 * leg + 1)
+        one_leg.legs.restart_heading(restarted)
+        compare(0.0, turn)
+        assert one_leg.drifts() == []
+        assert abs(one_leg.legs.encoder_error[6 * leg + 1]) < 1e-3
+        for error in (allowed - 1e-3, allowed + 1e-3, -allowed + 1e-3, -allowed - 1e-3):
+            compare(error, turn)
+            assert bool(one_leg.drifts()) is (abs(error) > allowed)
+
+    @pytest.mark.parametrize("leg", [0, 1])
+    @pytest.mark.parametrize("imu", ["pelvis", "tibia"])
+    @pytest.mark.parametrize("sign", [1.0, -1.0])
+    @pytest.mark.parametrize(
+        ("restarts", "turn"),
+        [
+            (("TH", "imu"), 0.0), (("imu", "TH"), 0.025), (("TH",), 0.0), (("imu",), 0.8), (("TH", "compare", "imu"), 0.8),
+            (("imu", "compare", "TH"), 0.8), (("FH", "other TH", "imu"), 0.8),
+        ],
+    )  # fmt: skip
+    def test_offset_of_th_that_remains_is_still_found(
+        self, leg: int, imu: str, sign: float, restarts: tuple[str, ...], turn: float
+    ):
+        """The heading changes in the restart of the IMU by `turn`. An unchanged heading proves that the offset remains."""
+        one_leg, error, heading = OneLeg(leg), 0.1 * sign, 0.0
+        restarted, compare = self.tilted_leg(one_leg, imu)
+        drives = {"FH": 6 * leg, "TH": 6 * leg + 1, "other TH": 6 * (1 - leg) + 1}
+        compare(0.0, heading)
+        compare(error, heading)
+        for restart in restarts:
+            if restart == "imu":
+                one_leg.legs.restart_heading(restarted)
+                heading = turn
+            elif restart == "compare":
+                compare(error, heading)
+            else:
+                one_leg.legs.reference(drives[restart])
+        compare(error, heading)
+        assert one_leg.drifts() == pytest.approx([error], abs=2e-3)
 
     @pytest.mark.parametrize("imu", IMUS[1:])
     def test_restart_of_an_imu_with_another_heading_causes_no_finding(self, imu: str):
