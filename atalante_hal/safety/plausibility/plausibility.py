@@ -177,14 +177,17 @@ class Plausibility:
 
         Skip the jump check for the next position of a joint whose drive has referenced its encoder.
         Also discard the finding that the encoders of this joint are exchanged between the legs. If the joint is SH or SK,
-        also discard the finding of the knee checks about its leg. The heading of a restarted IMU is measured again.
+        also discard the finding of the knee checks about its leg. The heading of a restarted IMU is measured again. If it
+        is an IMU of the knee checks, their filters restart.
 
         Args:
             node: DBC name of the drive or the IMU; the name of any other node has no effect.
         """
         if node in IMU_NODES:
-            self._legs.restart_heading(IMU_NODES.index(node))
-            self._knees.restart()
+            imu = IMU_NODES.index(node)
+            self._legs.restart_heading(imu)
+            if imu in KNEE_IMUS:
+                self._knees.restart()
         if node not in JOINT_NODES:
             return
         if self._settled:

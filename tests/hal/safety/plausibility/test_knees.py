@@ -334,6 +334,15 @@ class TestInTheCycle:
         robot.run(4000, lambda now: self.drift(robot, now))
         assert self.nodes(robot) == {"LEFT_SK", "RIGHT_SK"}
 
+    @pytest.mark.parametrize(("imu", "found"), [("torso", True), ("pelvis", False), ("right_tibia", False)])
+    def test_only_restarts_of_its_imus_restart_the_check(self, imu: str, found: bool):
+        """The IMU restarts every 1.5 s. After each restart of the check, its filters settle for 2 s."""
+        robot = WalkingRobot()
+        for _ in range(3):
+            robot.run(1500, lambda now: self.drift(robot, now))
+            robot.checks.reference(f"IMU_{imu.upper()}")
+        assert bool(self.nodes(robot)) is found
+
     def test_drift_is_found(self):
         assert self.found()
 
