@@ -42,6 +42,7 @@ class _Status(NamedTuple):
     state: int  # index of NodeState in the values of the process image
     dbc_hash: int  # index of DbcHash in the values of the process image
     supply: int  # index of SupplyVoltage in the values of the process image
+    uptime: int  # index of Uptime in the values of the process image
 
 
 class Heartbeats:
@@ -81,6 +82,8 @@ class Heartbeats:
         self._emergency_ids = list(self._emergency_of)
         # All status messages have the same layout.
         (self._state_byte,) = {codec.messages[s.row].signal("NodeState").start // 8 for s in self._statuses}
+        #: Largest uptime of a node [s]. The uptime may continue with 0 after this value.
+        (self._last_uptime,) = {codec.messages[s.row].signal("Uptime").maximum for s in self._statuses}
         self._amplitude, self._amplitude_row = codec.slice("Amplitude"), codec.rows["HAPTICS_STATE"]
         self._seen = 0  # cycle of the last call of `image.new_cycle`
         #: Node -> diagnostic and error code of its active emergency. A cleared emergency is removed.
@@ -106,7 +109,8 @@ class Heartbeats:
         #: Row of a message in the process image -> counter that rises if two nodes seem to send this message, 0 to `FULL`.
         #: If the counter of a message reaches `FULL`, it is confirmed that two nodes send this message.
         self._evidence: defaultdict[int, int] = defaultdict(int)
-        #: Nodes that sent a boot-up message. The safety monitor empties this set after each use.
+        #: Nodes that restarted: they sent a boot-up message, or their uptime has decreased because this message was lost.
+        #: The safety monitor empties this set after each use.
         self.booted: set[str] = set()
         #: True when every required node (all but the pendant) has sent a status message.
         self.all_reported = False
@@ -269,7 +273,8 @@ class Heartbeats:
             self._stopped.discard(status.node)
         elif state != BOOT_UP or before == BOOT_UP:
             self._stopped.add(status.node)
-        if state == BOOT_UP:
+        uptime, uptime_before = values[status.uptime], self.image.values_before[status.uptime]
+        if state == BOOT_UP or uptime < uptime_before < self._last_uptime:
             self.booted.add(status.node)
             self.image.restart(status.emergency)
         if status.node not in self._reported:
@@ -319,7 +324,7 @@ class Heartbeats:
             self.quiet = False
 
 
-_SIGNALS = ("NodeState", "DbcHash", "SupplyVoltage")
+_SIGNALS = ("NodeState", "DbcHash", "SupplyVoltage", "Uptime")
 _REFUSED = {
     Check.REPEATED: Dtc.E2E_REPEATED,
     Check.CONFLICT: Dtc.NODE_DUPLICATE,

@@ -16,7 +16,8 @@ the error of TH by at most `_HEADING_DRIFT` per sample. If the encoder of TH dri
 follows this drift. So such a drift of the encoder of TH is not detected. An IMU that restarts reports another heading. The
 estimate is then measured again, so that the error of TH is the same as before the restart. So a drift of TH in the time without
 the IMU is not detected. If the drive of TH restarts in the same time, its encoder counts as referenced, and its old error is
-kept only if the heading is unchanged with it.
+kept only if the heading is unchanged with it. A restart is known from the boot-up message, or from the uptime in the next status
+message. So after an IMU was silent, its legs are not compared for `SILENT_SAMPLES` samples, unless a restart is known before.
 
 *Standstill.* While the reading of an encoder is constant and its joint is at rest, the difference between encoders and
 IMUs about the axis of the joint is also constant. If the joint moves while its encoder is stuck, this difference changes by
@@ -57,6 +58,9 @@ from atalante_hal.wire.process_image import NEVER
 
 #: Number of consecutive samples after which an encoder drift is reported.
 DRIFT_SAMPLES = 4
+#: Number of samples without a comparison of a leg after one of its IMUs was silent. In this time, at least one status message of
+#: the IMU arrives (every 100 cycles), which shows whether the IMU has restarted.
+SILENT_SAMPLES = 4
 #: Number of consecutive samples after which a stuck encoder is reported.
 STANDSTILL_SAMPLES = 2
 #: Number of consecutive samples after which exchanged encoders are reported. Both legs are compared in every sample.
@@ -133,6 +137,7 @@ class Legs:
         #: For each leg: errors of the last comparison [rad]; None before the first comparison.
         self._errors: list[tuple[float, float, float] | None] = [None for _ in SIDES]
         self._heading_lost = [False for _ in SIDES]  # for each leg: whether its heading must be measured again
+        self._waits = [0 for _ in SIDES]  # for each leg: number of samples until it is compared again
         #: For each leg: whether the drive of TH has restarted since the last comparison.
         self._referenced = [False for _ in SIDES]
         self.heading: Vector = np.tile([1.0, 0.0], (len(SIDES), 1))
@@ -199,6 +204,7 @@ class Legs:
         return self._check(1, ages)
 
     def _check(self, leg: int, ages: Ages | None) -> bool:
+        self._waits[leg] = max(0, self._waits[leg] - 1)
         comparison = self._compare(leg, ages)
         if comparison is None:
             self._record_errors(leg, (math.inf,) * len(_AXES))
@@ -221,6 +227,8 @@ class Legs:
         pelvis, tibia = now.quaternion[_PELVIS].tolist(), now.quaternion[_TIBIAE[leg]].tolist()
         if ages is not None:
             cycles = [*ages.joint[four].tolist(), *ages.imu[[_PELVIS, _TIBIAE[leg]]].tolist()]
+            if max(cycles[-2:]) >= NEVER and self._errors[leg] is not None:
+                self._waits[leg] = SILENT_SAMPLES + 1
             if max(cycles) >= NEVER:
                 return None
             uncertainty = self._velocity_error * self._period * sum(cycles)
@@ -230,6 +238,8 @@ class Legs:
         fh, th, sh, sk = angles.tolist()
         if self._heading_lost[leg]:
             self._measure_heading(leg, fh, th, pelvis, tibia)
+        elif self._waits[leg]:
+            return None
         self._referenced[leg] = False
         x, z, y = hip_angles(pelvis, turned_about_vertical(tibia, self.heading[leg].tolist()))
         turn = 2.0 * math.pi
@@ -278,7 +288,7 @@ class Legs:
             pelvis: attitude of the pelvis IMU, quaternion wxyz.
             tibia: attitude of the tibia IMU, quaternion wxyz.
         """
-        self._heading_lost[leg] = False
+        self._heading_lost[leg], self._waits[leg] = False, 0
         errors = self._errors[leg]
         if errors is None:
             return

@@ -452,6 +452,25 @@ def test_booted_node_is_listed(running: Nodes):
     assert running.heartbeats.booted == {"LEFT_SK"}
 
 
+def test_node_whose_uptime_decreases_is_listed_as_booted(running: Nodes):
+    """The boot-up message was lost. After 65535 s, the uptime of a node that has not restarted may continue with 0."""
+    for uptime, booted in (
+        (0, False),
+        (7, False),
+        (7, False),
+        (8, False),
+        (6, True),
+        (65535, False),
+        (0, False),
+        (65534, False),
+        (65533, True),
+    ):
+        running.heartbeats.booted.clear()
+        running.receive(running.frame("IMU_PELVIS", Uptime=uptime), running.frame("LEFT_SK", Uptime=3))
+        assert running.heartbeats.booted == ({"IMU_PELVIS"} if booted else set())
+        assert running.evaluate() == {}
+
+
 def test_same_emergency_after_a_restart_of_the_node_is_accepted(running: Nodes):
     emergency = running.frame("LEFT_SK", "EMCY", ErrorCode=0x7305)
     running.receive(emergency)

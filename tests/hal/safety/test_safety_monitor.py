@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import math
 import re
 from collections.abc import Callable
 from dataclasses import replace
@@ -1118,3 +1119,45 @@ def test_repeated_frame_is_not_a_second_sender(make_rig):
     assert rig.run(15).supervisor is S.ACTIVE
     assert rig.events_of("NODE_DUPLICATE") == []
     assert ("E2E_REPEATED", "info") in rig.events_of("E2E_REPEATED")
+
+
+@pytest.mark.sample(4)
+@pytest.mark.parametrize("imu", ["pelvis", "left_tibia"])
+@pytest.mark.parametrize("boot", [*range(1200, 1300, 9), 1300])
+def test_imu_whose_boot_up_message_is_lost_may_have_another_heading(make_rig, imu: str, boot: int):
+    """The next status message shows the restart. It arrives up to 100 cycles later, and a leg is checked every 32 cycles."""
+    rig = make_rig(starts=False)
+    node = f"IMU_{imu.upper()}"
+    first = rig.emulator.signals.index(f"{node}_STATE", "QuaternionW")
+
+    def turn(cycle: int, values: np.ndarray) -> None:
+        if cycle >= 1150:  # turn the attitude by 40 degrees about the vertical
+            (w, x, y, z), c, s = (
+                values[first : first + 4].copy(),
+                math.cos(math.radians(20.0)),
+                math.sin(math.radians(20.0)),
+            )
+            values[first : first + 4] = c * w - s * z, c * x - s * y, c * y + s * x, c * z + s * w
+
+    rig.emulator.before_send.append(turn)
+    rig.emulator.inject(
+        [Fault("reset", node, start=1100, cycles=boot - 1100), Fault("drop", f"{node}_STATUS", start=boot, cycles=1)]
+    )
+    rig.run(boot + 400)
+    assert not {"ENC_DRIFT", "ENC_STUCK", "NODE_RESET"} & set(rig.codes())
+    rig.operator.start()
+    assert rig.until(S.ACTIVE, 150).supervisor is S.ACTIVE
+
+
+def test_offset_of_th_from_the_time_without_an_imu_that_did_not_restart_is_found(make_rig):
+    rig = make_rig(starts=False)
+    rig.emulator.inject(
+        [
+            Fault("drop", "IMU_PELVIS_STATE", start=1000, cycles=1100),
+            Fault("encoder_drift", "LEFT_TH", start=1050, cycles=10_000, rate=0.05),
+        ]
+    )
+    rig.run(2050)
+    assert "ENC_DRIFT" not in rig.codes()
+    rig.run(350)
+    assert "LEFT_TH" in {event.node for event in rig.hal.events if event.code == "ENC_DRIFT"}

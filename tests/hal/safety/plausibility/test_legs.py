@@ -31,7 +31,7 @@ from atalante_hal.robot import IMUS, JOINTS, Robot
 from atalante_hal.safety.diagnostics import Dtc, Finding
 from atalante_hal.safety.plausibility.finding import Ages, Signals
 from atalante_hal.safety.plausibility.inertial import turned_about_vertical
-from atalante_hal.safety.plausibility.legs import Legs, hip_angles
+from atalante_hal.safety.plausibility.legs import SILENT_SAMPLES, Legs, hip_angles
 from atalante_hal.wire.process_image import NEVER
 
 PELVIS, TIBIAE = IMUS.index("pelvis"), [IMUS.index(f"{side}_tibia") for side in ("left", "right")]
@@ -107,6 +107,25 @@ class OneLeg:
     def drifts(self) -> list[float]:
         """Return the errors that are reported as a drift [rad]."""
         return [finding.value for finding in self.legs.findings() if finding.dtc is Dtc.ENC_DRIFT]
+
+
+def tilted_leg(one_leg: OneLeg, imu: str) -> tuple[int, Callable[[float, float], None]]:
+    """Return the index of an IMU in IMUS, and a function that compares the leg four times while the pelvis is tilted.
+
+    The arguments of the function are the error of TH and the angle by which the heading of the IMU is wrong [rad].
+    """
+    tibia = TIBIAE[one_leg.leg]
+    restarted = PELVIS if imu == "pelvis" else tibia
+
+    def compare(th: float, heading: float) -> None:
+        one_leg.show((0.2, -0.3, -0.5), (0.01, th, -0.02))
+        quaternion = one_leg.now.quaternion
+        quaternion[PELVIS] = tilted(0.2, -0.1, 0.5)
+        quaternion[tibia] = product(tilted(0.2, -0.1, 0.5), quaternion[tibia].tolist())
+        quaternion[restarted] = product(tilted(0.0, 0.0, heading), quaternion[restarted].tolist())
+        one_leg.compare(4)
+
+    return restarted, compare
 
 
 angles = st.floats(-1.2, 1.2)
@@ -271,25 +290,6 @@ class TestDrift:
             expected = [error - sign * 100 * 1e-5] if found else []
             assert one_leg.drifts() == pytest.approx(expected, abs=1e-12)
 
-    @staticmethod
-    def tilted_leg(one_leg: OneLeg, imu: str) -> tuple[int, Callable[[float, float], None]]:
-        """Return the index of an IMU in IMUS, and a function that compares the leg four times while the pelvis is tilted.
-
-        The arguments of the function are the error of TH and the angle by which the heading of the IMU is wrong [rad].
-        """
-        tibia = TIBIAE[one_leg.leg]
-        restarted = PELVIS if imu == "pelvis" else tibia
-
-        def compare(th: float, heading: float) -> None:
-            one_leg.show((0.2, -0.3, -0.5), (0.01, th, -0.02))
-            quaternion = one_leg.now.quaternion
-            quaternion[PELVIS] = tilted(0.2, -0.1, 0.5)
-            quaternion[tibia] = product(tilted(0.2, -0.1, 0.5), quaternion[tibia].tolist())
-            quaternion[restarted] = product(tilted(0.0, 0.0, heading), quaternion[restarted].tolist())
-            one_leg.compare(4)
-
-        return restarted, compare
-
     @pytest.mark.parametrize("leg", [0, 1])
     @pytest.mark.parametrize("imu", ["pelvis", "tibia"])
     @pytest.mark.parametrize("turn", [-2.8, 0.05, 1.5])
@@ -297,7 +297,7 @@ class TestDrift:
         self, leg: int, imu: str, turn: float
     ):
         one_leg, allowed = OneLeg(leg), ROBOT.sensors.attitude_error
-        restarted, compare = self.tilted_leg(one_leg, imu)
+        restarted, compare = tilted_leg(one_leg, imu)
         one_leg.legs.restart_heading(restarted)  # has no effect before the first comparison
         compare(0.0, 0.0)
         compare(0.015, 0.0)
@@ -333,7 +333,7 @@ class TestDrift:
         self, leg: int, imu: str, before: float, turn: float
     ):
         one_leg, allowed = OneLeg(leg), ROBOT.sensors.attitude_error
-        restarted, compare = self.tilted_leg(one_leg, imu)
+        restarted, compare = tilted_leg(one_leg, imu)
         compare(0.0, 0.0)
         compare(before, 0.0)
         assert bool(one_leg.drifts()) is (abs(before) > allowed)
@@ -361,7 +361,7 @@ class TestDrift:
     ):
         """The heading changes in the restart of the IMU by `turn`. An unchanged heading proves that the offset remains."""
         one_leg, error, heading = OneLeg(leg), 0.1 * sign, 0.0
-        restarted, compare = self.tilted_leg(one_leg, imu)
+        restarted, compare = tilted_leg(one_leg, imu)
         drives = {"FH": 6 * leg, "TH": 6 * leg + 1, "other TH": 6 * (1 - leg) + 1}
         compare(0.0, heading)
         compare(error, heading)
@@ -437,6 +437,47 @@ class TestEncoderError:
         ages.joint[1] = NEVER
         one_leg.compare(1, ages)
         assert np.isinf(one_leg.legs.encoder_error).all()
+        one_leg.compare()
+        assert np.isfinite(one_leg.legs.encoder_error[:4]).all()
+
+    @staticmethod
+    def silent(imu: int) -> Ages:
+        """Return the ages of new values, except those of one IMU."""
+        ages = Ages(np.zeros(12, np.int64), np.zeros(4, np.int64), np.zeros(2, np.int64))
+        ages.imu[imu] = NEVER
+        return ages
+
+    @pytest.mark.parametrize("leg", [0, 1])
+    @pytest.mark.parametrize("imu", ["pelvis", "tibia"])
+    @pytest.mark.parametrize("restarts", [False, True])
+    def test_leg_is_compared_after_a_status_message_of_an_imu_that_was_silent(self, leg: int, imu: str, restarts: bool):
+        """The status message arrives in each of the waiting times of up to `SILENT_SAMPLES` samples."""
+        for samples in range(SILENT_SAMPLES + 1):
+            one_leg = OneLeg(leg)
+            restarted, compare = tilted_leg(one_leg, imu)
+            error = one_leg.legs.encoder_error[6 * leg : 6 * leg + 4]
+            one_leg.compare(3, self.silent(restarted))
+            compare(0.0, 0.0)
+            assert np.isfinite(error).all(), "a leg is compared at once if it was never compared before"
+            one_leg.compare(3, self.silent(restarted))
+            for _ in range(samples):
+                one_leg.compare()
+                assert np.isinf(error).all()
+            if restarts:
+                one_leg.legs.restart_heading(restarted)
+                compare(0.0, 0.9)
+                assert one_leg.drifts() == []
+                assert np.isfinite(error).all()
+        if not restarts:
+            compare(0.05, 0.0)
+            assert one_leg.drifts() == pytest.approx([0.05], abs=2e-3)
+
+    def test_silent_imu_of_the_other_leg_has_no_effect(self):
+        one_leg = OneLeg(0)
+        one_leg.compare()
+        one_leg.compare(1, self.silent(TIBIAE[1]))
+        one_leg.compare(1, self.silent(IMUS.index("torso")))
+        assert np.isfinite(one_leg.legs.encoder_error[:4]).all()
 
 
 class TestExchange:
