@@ -41,7 +41,7 @@ def test_walk_without_a_fault_has_no_false_alarm(number: int, name: str, monkeyp
     assert QuietTask(number, "pybullet")().failed is name.startswith("ground")
 
 
-@pytest.mark.sample(3)
+@pytest.mark.sample(4)
 @pytest.mark.parametrize(
     ("axis", "degrees", "cycles"), [("X", 1, 2000), ("Y", 1, 2000), ("Z", 1, 2000), ("Y", 1.5, 4500)]
 )

@@ -100,6 +100,7 @@ def every_ratio(guide: GuideFilter, cycle: int) -> list[float]:
     return [max(0.0, *errors), *(1.0 - STEEPNESS * (1.0 - share) for share in shares)]
 
 
+@pytest.mark.sample(3)
 @pytest.mark.parametrize("shape", ["constant", "pinched", "asymmetric"])
 def test_largest_ratio_is_that_of_all_predicted_cycles(shape: str):
     """The kernel skips cycles whose ratio cannot be the largest."""

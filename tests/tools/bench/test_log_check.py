@@ -10,7 +10,8 @@ from atalante_tools.bench import log_check
 from atalante_tools.bench.measure import BenchmarkError, Effort, Measurement
 
 
-@pytest.mark.parametrize("run", [log_check.validate_log, log_check.validate_against_mdf])
+@pytest.mark.sample(2)
+@pytest.mark.parametrize("run", [log_check.validate_against_mdf, log_check.validate_log])
 def test_benchmark_measures_value_and_baseline(run: Callable[[Effort], Measurement]) -> None:
     measured = run(Effort(quick=True))
     assert measured.remarks == ()

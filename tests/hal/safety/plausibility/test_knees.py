@@ -122,6 +122,7 @@ class Walking:
         return changed
 
 
+@pytest.mark.sample(3)
 @pytest.mark.parametrize("leg", [0, 1])
 @pytest.mark.parametrize("drift", [6.0, -6.0])
 def test_opposite_drifts_of_hip_and_knee_are_found_and_the_finding_ends_after_the_repair(leg: int, drift: float):
@@ -149,6 +150,7 @@ def test_drifts_of_both_legs_are_found():
     assert [finding.node for finding in robot.checks.findings()] == ["LEFT_SK", "RIGHT_SK"]
 
 
+@pytest.mark.sample(5)
 @pytest.mark.parametrize("sign", [1.0, -1.0])
 @pytest.mark.parametrize("lengths", [(0.36, 0.38), (0.4, 0.4), (0.45, 0.45)])
 @pytest.mark.parametrize(("drift", "found"), [(0.0, False), (0.3 * LIMIT, False), (1.8 * LIMIT, True)])
@@ -188,6 +190,7 @@ def test_nothing_is_found_while_the_filters_settle():
     assert robot.run(600) != []
 
 
+@pytest.mark.sample(5)
 @pytest.mark.parametrize("imu", [PELVIS, TIBIA])
 @pytest.mark.parametrize(("scale", "offset"), [(1.0, 0.1), (1.1, 0.0), (0.9, 0.0)])
 @pytest.mark.parametrize("axis", range(3))
@@ -223,6 +226,7 @@ def test_drift_is_found_after_a_heading_drift_of_the_tibia_imus(drift: float, co
     assert [SIDES.index(finding.node.split("_")[0].lower()) for finding in robot.checks.findings()] == found
 
 
+@pytest.mark.sample(4)
 @pytest.mark.parametrize("sign", [1.0, -1.0])
 @pytest.mark.parametrize(("corrected", "drift", "found"), [(False, 2.5, 1), (True, 2.5, 0), (True, 6.0, 2)])
 def test_tibia_imus_askew_within_the_tolerance_do_not_change_the_error_of_the_knee(
