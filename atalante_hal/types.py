@@ -67,7 +67,8 @@ class State:
     joints_valid: bool  # True if all twelve joint states are valid
     imu_rows: tuple[int, ...] = ()  # indices of the IMU messages in `valid` and `age`; empty if unknown
     foot_rows: tuple[int, ...] = ()  # indices of the foot messages in `valid` and `age`; empty if unknown
-    #: Indices in `robot.IMUS` of the IMUs whose readings are implausible (confirmed `IMU_IMPLAUSIBLE`).
+    #: Indices in `robot.IMUS` of the IMUs whose readings contradict gravity or their own attitude (`IMU_IMPLAUSIBLE`).
+    #: If torso IMU and pelvis IMU only contradict each other, neither of them is in the set.
     implausible_imus: frozenset[int] = frozenset()
     #: (12,) Nm, last output of the torque limiter; None if unknown. Drives that follow the controller receive these torques.
     #: Drives that hold their positions receive the torque 0, not the output of the limiter.

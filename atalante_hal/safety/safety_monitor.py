@@ -59,8 +59,7 @@ RECALL_CYCLES = 6
 DRIVE_NODES = tuple(joint.upper() for joint in JOINTS)
 _ENABLED = np.full(len(JOINTS), float(DriveState.OPERATION_ENABLED)).tobytes()
 _FAULTY = (DriveState.FAULT, DriveState.FAULT_REACTION_ACTIVE)
-_IMPLAUSIBLE = frozenset({Dtc.IMU_IMPLAUSIBLE})
-#: Codes of an IMU whose values are not used.
+#: Codes of an IMU whose values are rejected.
 _REJECTED = frozenset({Dtc.IMU_INVALID, Dtc.IMU_SATURATED, Dtc.IMU_STUCK})
 _S = SupervisorState
 #: States in which START can change the state.
@@ -324,7 +323,7 @@ class SafetyMonitor:
         operator_stops = pendant.stop_requested or not pendant.dead_man
         walk_end_requested = self.walking and operator_stops and not pendant.hold_requested
         memory.close_cycle(cycle)
-        state.implausible_imus = frozenset(map(IMU_NODES.index, memory.nodes_of(_IMPLAUSIBLE)))
+        state.implausible_imus = self._plausibility.implausible_imus
         self._duplicate_found |= Dtc.HAL_DUPLICATE in memory.confirmed and state.supervisor in (_S.OFF, _S.READY)
         self._process_start(nodes_ready)
         self.conditions = Conditions(
@@ -365,12 +364,13 @@ class SafetyMonitor:
     def _walk_ends(self) -> frozenset[Dtc]:
         """Return the confirmed codes with which a walking robot ends its walk on both feet (FINISH_STEP).
 
-        If the values of both trunk IMUs are rejected, the walking controller has only an estimate of the attitude, so the codes
-        of these IMUs end the walk, too.
+        If the values of each trunk IMU are rejected or implausible, the walking controller has only an estimate of the attitude,
+        so the codes of these IMUs end the walk, too.
         """
         memory = self.memory
         ends = memory.walk_ends(DRIVE_NODES)
-        return ends | _REJECTED if set(TRUNK_NODES).issubset(memory.nodes_of(_REJECTED)) else ends
+        unusable = {*memory.nodes_of(_REJECTED), *(IMU_NODES[imu] for imu in self._state.implausible_imus)}
+        return ends | _REJECTED | {Dtc.IMU_IMPLAUSIBLE} if unusable.issuperset(TRUNK_NODES) else ends
 
     def _tolerance(self) -> Tolerance:
         """Return the tolerance of timeouts in this cycle.

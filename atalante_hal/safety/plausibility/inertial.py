@@ -146,6 +146,15 @@ class Inertial:
         """Return the current findings of the inertial checks."""
         return self._found
 
+    @property
+    def implausible(self) -> frozenset[int]:
+        """Return the indices in IMUS of the IMUs that contradict gravity or their own attitude.
+
+        If only torso IMU and pelvis IMU contradict each other, the wrong one is unknown, and the set contains neither of them.
+        """
+        force, rate = self._excess.force, self._excess.rate
+        return frozenset(imu for imu in range(len(IMUS)) if force[imu] or rate[imu])
+
 
 def follow(
     age: Cycles,

@@ -206,6 +206,11 @@ class Plausibility:
         """Return the index of the swing leg in FEET; None unless exactly one foot is on the ground."""
         return self._feet.swing
 
+    @property
+    def implausible_imus(self) -> frozenset[int]:
+        """Return the indices in IMUS of the IMUs that contradict gravity or their own attitude, see `Inertial.implausible`."""
+        return self._inertial.implausible
+
     def _sample(self, ages: Ages | None) -> bool:
         return self._stillness.sample(ages is None)
 

@@ -89,6 +89,16 @@ class AttitudeObserver:
         """
         self.records[0].velocity[:] += cross(gyro, offset)
 
+    def level(self, up: Vector, time: float) -> None:
+        """Correct roll and pitch. Call this method once per cycle.
+
+        Args:
+            up: measured upward unit vector in the axes of the pelvis, shape (3,).
+            time: time constant with which the error decays [s].
+        """
+        self.rotation[2] += PERIOD / time * (up - self.rotation[2])
+        _orthonormalise(self.rotation)
+
     def follow_heading(self, quaternion: Sequence[float]) -> None:
         """Correct the drift of the heading. Call this method once per cycle, if the IMU has a heading reference.
 

@@ -51,6 +51,7 @@ from atalante_control.walking.kinematics import Kinematics
 from atalante_control.walking.lean import Lean
 from atalante_control.walking.phases import STEPPING, WALKING, Facts, Phase, next_phase
 from atalante_control.walking.placement import Placement
+from atalante_control.walking.rotation import rotation_of
 from atalante_control.walking.section import Models, Section, SectionMotion
 from atalante_control.walking.steering import Steering
 from atalante_control.walking.telemetry import TELEMETRY_FIELDS, Telemetry, WalkStatistics
@@ -71,6 +72,9 @@ _SENSOR_AGE = 10
 #: Largest expected difference between the weight and the load on the stance foot, as a fraction of the weight.
 #: While one foot swings, the load on the stance foot differs from the weight, because the robot accelerates.
 _LOAD_ERROR = 0.15
+#: s, time constant with which the stance leg corrects the attitude after a trunk IMU was implausible. A correction
+#: in one cycle can move the ankles of the swing foot, which is held level, faster than their velocity limit.
+_LEVEL_TIME = 0.02
 #: m, height above the stance foot up to which the swing foot counts as landed while the data of both feet is lost
 _LANDED_HEIGHT = 0.001
 
@@ -238,7 +242,8 @@ class WalkController:
         """Clear all data of the last walk."""
         self.phase, self._since, self._loaded, self._stopping, self._landed = Phase.POSTURE, cycle, 0, False, False
         self._stance, self._finishing = RIGHT, False
-        self._distrusted = False  # whether the pelvis IMU was implausible in this walk
+        #: Indices in IMUS of the IMUs that were implausible in this walk.
+        self._distrusted: frozenset[int] = frozenset()
         self._stage.stance, self._stage.double, self._stage.steering = RIGHT, True, 0.0
         self._assisted, self._promised = False, False
         #: Angle deviations [rad] and speed deviations [rad/s] of hip and knee at the start of the step.
@@ -357,6 +362,9 @@ class WalkController:
         """
         imu = self._measured.imu
         self._measure(state)
+        if self._gyro_source != TRUNK and not self._distrusted.isdisjoint(self._imus):
+            # The attitude contains the error of the implausible data.
+            self._observer.level(self._vertical_of_stance_leg(state), _LEVEL_TIME)
         if self._measured.imu is not imu:
             self._observer.change_imu(self._measured.gyro, self._measured.imu - imu)
         self._sense(self._measured, self._constants, self._stabiliser, self._parts)
@@ -415,28 +423,26 @@ class WalkController:
     def _measure(self, state: State) -> None:
         """Select the sensor data that the kernels read in this cycle, and replace lost data by estimates.
 
-        While the data of the pelvis IMU is too old, the torso IMU is used. The HAL can report that the readings of the pelvis IMU
-        are implausible, but those of the torso IMU are not. Then the torso IMU is used for the rest of the walk, except in cycles
-        in which only its data is too old. If the data of both is too old, the angular velocity is computed from the stance leg
-        (`Stage.gyro_source`). If the data of a foot is too old, the load on this foot is estimated.
+        The data of an IMU is used unless it is too old, or the HAL has reported in this walk that it is implausible. The torso
+        IMU replaces the pelvis IMU. Without both, the walk ends with a stop step, and the angular velocity is computed from the
+        stance leg (`Stage.gyro_source`). If the data of a foot is too old, the load on this foot is estimated.
 
         Args:
             state: measured state of the robot.
         """
         if state is not self._state:
             self._bind(state)
-        lost = _is_lost(state, _PELVIS)
-        implausible = state.implausible_imus
-        self._distrusted = self._distrusted or (_PELVIS in implausible and _TORSO not in implausible)
-        replaced = lost or (self._distrusted and not _is_lost(state, _TORSO))
+        if state.implausible_imus:
+            self._distrusted |= state.implausible_imus
+        replaced, source = self._is_unusable(state, _PELVIS), TRUNK
         self._measured = self._measured_by[_TORSO if replaced else _PELVIS]
-        source = TRUNK
-        if lost and _is_lost(state, _TORSO):
+        if replaced and self._is_unusable(state, _TORSO):
             self._measured = self._without_trunk
-            source = SOLE if any(_is_lost(state, tibia) for tibia in _TIBIAE) else TIBIA
+            source = SOLE if any(self._is_unusable(state, tibia) for tibia in _TIBIAE) else TIBIA
+            self.stop()
         if source != self._gyro_source:
             self._stage.gyro_source = self._gyro_source = source
-        if self.config.heading_reference and not (lost or self._distrusted):
+        if self.config.heading_reference and not replaced:
             self._observer.follow_heading(state.imu_quaternion[_PELVIS].tolist())
         feet = [side for side, row in enumerate(state.foot_rows) if state.age[row] > _SENSOR_AGE]
         if len(feet) == 1:
@@ -449,6 +455,27 @@ class WalkController:
             self._measured = self._measured._replace(force=self._forces)
         if state.torque_sent is None:
             self._sent[:] = self._pid.requested
+
+    def _is_unusable(self, state: State, imu: int) -> bool:
+        """Return whether the data of an IMU is too old, or was implausible in this walk."""
+        lost = bool(state.imu_rows) and bool(state.age[state.imu_rows[imu]] > _SENSOR_AGE)
+        return lost or imu in self._distrusted
+
+    def _vertical_of_stance_leg(self, state: State) -> Vector:
+        """Return the upward unit vector in the axes of the pelvis, shape (3,), without the data of the trunk IMUs.
+
+        It follows from the encoders of the stance leg, and from the attitude that its tibia IMU reports. If a tibia IMU cannot be
+        used, the sole of the stance foot counts as level.
+
+        Args:
+            state: measured state of the robot.
+        """
+        sole = self._parts.chain.soles[self._stance]
+        if self._gyro_source == SOLE:
+            return sole.rotation[:, 2]
+        tibia = rotation_of(state.imu_quaternion[_TIBIAE[self._stance]].tolist())
+        up: Vector = self._parts.chain.links[sole.link - 2].rotation @ tibia[2]
+        return up
 
     def _load_without(self, side: int) -> float:
         """Estimate the vertical load on a foot whose data is lost [N] from the load on the other foot.
@@ -591,11 +618,6 @@ class WalkController:
         self.statistics.guide.hand_overs += 1
         self.statistics.guide.hand_overs_exceeded += not inside
         return not inside
-
-
-def _is_lost(state: State, imu: int) -> bool:
-    """Return whether the data of an IMU is too old."""
-    return bool(state.imu_rows) and bool(state.age[state.imu_rows[imu]] > _SENSOR_AGE)
 
 
 def _ratio(error: float, bound: float) -> float:

@@ -51,12 +51,15 @@ class Ideal:
         )
         self._torque = zero.copy()
         self.push = zero.copy()  # torques on the joints, besides those of the motors [Nm]
+        self.wrong_imus: list[int] = []  # IMUs whose gyroscope and accelerometer have the wrong sign
 
     def cycle(self, controller: WalkController) -> Command:
         body, state = self.body, self.state
         old = state.age[list(state.imu_rows)] > 0
         last = [values[old] for values in self.signals]
         self._imus.sample(body.imu)
+        for values in (self.signals.gyro, self.signals.accel):
+            values[self.wrong_imus] *= -1.0
         for values, kept in zip(self.signals, last, strict=True):
             values[old] = kept
         state.position[:], state.velocity[:] = body.position, body.velocity
@@ -84,10 +87,12 @@ def walk_with(
     xi: float = 1.0,
     lost_feet: Sequence[int] = (),
     lost_imus: Sequence[int] = (),
+    implausible_imus: Sequence[int] = (),
 ) -> list[Phase]:
     """Walk until the robot stands again; return the phases.
 
-    After `finish_after` steps, FINISH_STEP begins and the data of `lost_feet` and `lost_imus` is no longer received.
+    After `finish_after` steps, FINISH_STEP begins and the data of `lost_feet` and `lost_imus` is no longer received. From then
+    on, the readings of `implausible_imus` have the wrong sign, and the HAL reports this in the first cycle.
     """
     body = make_body(engine, urdf(ExoskeletonParameters(), ROBOT, PATIENT), free=True, ground=0.0)
     try:
@@ -99,6 +104,9 @@ def walk_with(
             if controller.phase is not phases[-1]:
                 phases.append(controller.phase)
             if finish_after is not None and controller.statistics.steps == finish_after:
+                first = robot.state.supervisor is not SupervisorState.FINISH_STEP
+                robot.state.implausible_imus = frozenset(implausible_imus if first else ())
+                robot.wrong_imus = list(implausible_imus)
                 robot.state.supervisor = SupervisorState.FINISH_STEP
                 for row in (
                     *(robot.state.foot_rows[i] for i in lost_feet),

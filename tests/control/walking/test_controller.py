@@ -13,9 +13,11 @@ from atalante_control.guide.shapes import CONSTANT
 from atalante_control.model import ExoskeletonParameters, urdf
 from atalante_control.walking.config import TURN_MAX, WalkConfig
 from atalante_control.walking.controller import StanceError, WalkController
+from atalante_control.walking.kernel import SOLE, TIBIA
 from atalante_control.walking.lean import LeanConfig
 from atalante_control.walking.phases import STEPPING, Phase
 from atalante_control.walking.placement import PlacementConfig
+from atalante_control.walking.rotation import about_z, rotation_of
 from atalante_control.walking.telemetry import TELEMETRY_FIELDS
 from atalante_emulator.bodies import hang, make_body
 from atalante_hal.robot import IMUS, JOINTS, MOTORS
@@ -31,10 +33,19 @@ def walked(
     xi: float = 1.0,
     lost_feet: Sequence[int] = (),
     lost_imus: Sequence[int] = (),
+    implausible_imus: Sequence[int] = (),
 ) -> tuple[WalkController, list[Phase]]:
     """Walk as in `walk_with`; return the controller and its phases."""
     controller = WalkController(ROBOT, PATIENT, WALK, steps)
-    phases = walk_with(controller, engine, finish_after=finish_after, xi=xi, lost_feet=lost_feet, lost_imus=lost_imus)
+    phases = walk_with(
+        controller,
+        engine,
+        finish_after=finish_after,
+        xi=xi,
+        lost_feet=lost_feet,
+        lost_imus=lost_imus,
+        implausible_imus=implausible_imus,
+    )
     return controller, phases
 
 
@@ -173,7 +184,6 @@ def test_walk_starts_on_the_ground_only_with_the_feet_side_by_side(swung: float,
     [
         ((), False),
         (("torso",), False),
-        (("torso", "pelvis"), False),
         (("pelvis",), True),
         (("pelvis", "left_tibia"), True),
     ],
@@ -198,16 +208,61 @@ def test_torso_imu_replaces_an_implausible_pelvis_imu_for_the_rest_of_the_walk(
     assert controller._measured is controller._measured_by[pelvis]
 
 
-def test_lost_torso_imu_does_not_replace_an_implausible_pelvis_imu() -> None:
+@pytest.mark.parametrize("implausible", ["pelvis", "torso"])
+def test_implausible_trunk_imu_does_not_replace_the_other_one(implausible: str) -> None:
+    """The finding ends after one cycle. Without the other IMU of the trunk, the stance leg replaces both."""
     controller = WalkController(ROBOT, PATIENT, WALK, 3)
-    state, pelvis, torso = hung(controller), IMUS.index("pelvis"), IMUS.index("torso")
-    state.imu_rows = (2, 3, 4, 5)
-    state.implausible_imus = frozenset({pelvis})
-    for lost, used in (((), torso), ((torso,), pelvis), ((), torso), ((pelvis,), torso)):
-        state.age[list(state.imu_rows)] = [11 if imu in lost else 10 for imu in range(len(IMUS))]
+    state, other = hung(controller), "torso" if implausible == "pelvis" else "pelvis"
+    intact = controller._measured_by[IMUS.index(other)]
+    state.implausible_imus = frozenset({IMUS.index(implausible)})
+    for lost, replaced in (
+        ((), False),
+        ((other,), True),
+        ((), False),
+        ((implausible,), False),
+        (("torso", "pelvis"), True),
+    ):
+        state.age[list(state.imu_rows)] = [11 if imu in lost else 10 for imu in IMUS]
         controller.update(state)
         state.cycle += 1
-        assert controller._measured is controller._measured_by[used]
+        state.implausible_imus = frozenset()
+        assert controller._measured is (controller._without_trunk if replaced else intact)
+
+
+@pytest.mark.parametrize(("implausible", "source"), [((), TIBIA), (("left_tibia",), SOLE), (("right_tibia",), SOLE)])
+def test_stance_leg_replaces_implausible_trunk_imus_and_corrects_the_attitude(
+    implausible: tuple[str, ...], source: int
+) -> None:
+    """The attitude is wrong by 0.1 rad about X, and the heading is 0.5 rad. The robot hangs still, with level soles."""
+    controller = WalkController(ROBOT, PATIENT, WALK, 3)
+    state, observer = hung(controller), controller._observer
+    state.imu_gyro[:] = 0.0
+    state.implausible_imus = frozenset(map(IMUS.index, ("torso", "pelvis", *implausible)))
+    before, wrong = controller.vertical.copy(), rotation_of((math.cos(0.05), math.sin(0.05), 0.0, 0.0))
+    observer.rotation[:] = about_z(0.5) @ observer.rotation @ wrong
+    for cycles, error in ((1, 0.095), (19, 0.1 / math.e), (180, 0.0)):
+        for _ in range(cycles):
+            controller.update(state)
+            state.cycle += 1
+            state.implausible_imus = frozenset()
+        assert abs(controller.vertical - before).max() == pytest.approx(error, abs=2e-3)
+    assert controller._measured is controller._without_trunk
+    assert controller._stage.gyro_source == source
+    assert math.atan2(observer.rotation[1, 0], observer.rotation[0, 0]) == pytest.approx(0.5, abs=2e-3)
+
+
+def test_attitude_is_not_corrected_after_the_loss_of_plausible_trunk_imus() -> None:
+    """A tibia IMU that is mounted askew has no effect on the attitude."""
+    controller = WalkController(ROBOT, PATIENT, WALK, 3)
+    state = hung(controller)
+    state.imu_gyro[:], state.imu_quaternion[:] = 0.0, (math.cos(0.01), math.sin(0.01), 0.0, 0.0)
+    state.age[list(state.imu_rows[:2])] = 11
+    before = controller.vertical.copy()
+    for _ in range(300):
+        controller.update(state)
+        state.cycle += 1
+    assert controller._stage.gyro_source == TIBIA
+    assert controller.vertical == pytest.approx(before, abs=1e-3)
 
 
 @pytest.mark.parametrize(("lost", "rate"), [((), 0.3), (("left_tibia",), 0.0), (("right_tibia",), 0.0)])
@@ -352,6 +407,28 @@ def test_robot_makes_a_stop_step_without_the_imus_of_the_trunk(lost: tuple[str, 
     controller, phases = walked("mujoco", 100, finish_after=1, lost_imus=list(map(IMUS.index, lost)))
     assert phases[-3:] == [Phase.STOP, Phase.BACK, Phase.REST]
     assert controller.max_dcm_error < 0.03
+
+
+@pytest.mark.sample(2)
+@pytest.mark.parametrize(("lost", "implausible"), [("pelvis", "torso"), ("torso", "pelvis")])
+def test_robot_makes_a_stop_step_without_one_trunk_imu_and_with_an_implausible_other_one(
+    lost: str, implausible: str
+) -> None:
+    controller, phases = walked(
+        "mujoco", 100, finish_after=1, lost_imus=[IMUS.index(lost)], implausible_imus=[IMUS.index(implausible)]
+    )
+    assert phases[-3:] == [Phase.STOP, Phase.BACK, Phase.REST]
+    assert controller.max_dcm_error < 0.03
+
+
+def test_walk_that_starts_without_the_feet_has_finite_loads() -> None:
+    """The first estimate of the loads uses the kinematics of the joint angles 0."""
+    controller = WalkController(ROBOT, PATIENT, WALK, 3)
+    state = hung(WalkController(ROBOT, PATIENT, WALK, 3))
+    state.age[list(state.foot_rows)] = 11
+    with np.errstate(all="raise"):
+        controller.reset(state)
+    assert controller._load.sum() == pytest.approx(controller._constants.weight)
 
 
 def test_centre_of_mass_gives_the_loads_of_lost_feet_that_stand() -> None:

@@ -14,11 +14,12 @@ import pytest
 from atalante_dbc import Message, load
 from atalante_emulator.faults import Fault
 from atalante_hal.hal import BRIDGED_ERRORS, SATURATED_CYCLES
-from atalante_hal.robot import IMUS, JOINTS
+from atalante_hal.robot import CELLS, IMUS, JOINTS
 from atalante_hal.safety.diagnostics import Dtc
 from atalante_hal.safety.direction import DirectionProof
 from atalante_hal.safety.hold_stability import REVERSALS
 from atalante_hal.safety.limiter import Limited, Limiter
+from atalante_hal.safety.plausibility.finding import FOOT_NODES
 from atalante_hal.safety.safety_monitor import FINISH_STEP_CYCLES, RECALL_CYCLES
 from atalante_hal.safety.start import ENABLE_CYCLES, STALLED_CYCLES, WALK_ENDS, stop_text
 from atalante_hal.safety.torque_tracking import CONFIRM, SPAN
@@ -90,6 +91,13 @@ def test_state_names_the_implausible_imus_until_their_readings_are_plausible_aga
     assert rig.run(60).implausible_imus == frozenset()
     assert rig.run(240).implausible_imus == {IMUS.index("pelvis")}
     assert rig.run(2500).implausible_imus == frozenset()
+
+
+def test_imu_of_the_trunk_is_not_implausible_because_it_cannot_be_compared_with_the_other_one(rig):
+    rig.until(S.ACTIVE)
+    rig.emulator.inject([Fault("imu_invalid", "IMU_PELVIS")])
+    assert rig.run(200).implausible_imus == frozenset()
+    assert "IMU_IMPLAUSIBLE" in rig.codes()
 
 
 def test_pendant_sets_the_assistance_factor(make_rig):
@@ -332,6 +340,24 @@ def test_rejected_values_of_both_trunk_imus_end_a_walk_on_the_ground(
     assert rig.walk(3, step=8, walking=True).supervisor is (S.HOLD if expected is S.FINISH_STEP else expected)
 
 
+@pytest.mark.parametrize(
+    ("kinds", "expected"),
+    [
+        ({"TORSO": "imu_invalid", "PELVIS": "imu_inverted"}, S.FINISH_STEP),
+        ({"PELVIS": "imu_frozen", "TORSO": "imu_inverted"}, S.FINISH_STEP),
+        ({"PELVIS": "imu_inverted", "TORSO": "imu_inverted"}, S.FINISH_STEP),
+        ({"PELVIS": "imu_invalid", "LEFT_TIBIA": "imu_inverted"}, S.FULL_ASSIST),
+    ],
+)
+def test_implausible_trunk_imu_without_the_other_one_ends_a_walk_on_the_ground(rig, kinds: dict[str, str], expected: S):
+    """The accelerometer has the wrong sign along the vertical."""
+    walking_on_the_ground(rig)
+    axis = {"imu_inverted": {"axis": "Z"}}
+    rig.emulator.inject([Fault(kind, f"IMU_{imu}", **axis.get(kind, {})) for imu, kind in kinds.items()])
+    assert rig.walk(1100, step=7, walking=True).supervisor is expected
+    assert rig.walk(3, step=8, walking=True).supervisor is (S.HOLD if expected is S.FINISH_STEP else expected)
+
+
 @pytest.mark.parametrize("turn", [8, 24], ids=["left leg", "right leg"])
 def test_values_in_the_cycle_of_the_boot_up_message_of_an_imu_may_have_another_heading(make_rig, turn: int):
     """In this cycle, a leg is checked. The schedule of the checks repeats every 32 cycles."""
@@ -374,6 +400,17 @@ def test_silent_imu_ends_a_walk_on_both_feet(rig):
     assert rig.walk(20, step=7, walking=True).supervisor is S.FINISH_STEP
     assert rig.walk(2, step=8).supervisor is S.HOLD
     assert "NODE_TIMEOUT" in rig.codes()
+
+
+def test_invalid_codes_of_both_feet_end_a_walk_on_both_feet(rig):
+    walking_on_the_ground(rig)
+    invalid = {f"{cell}_ForceZ": -32768 for cell in CELLS}
+    rig.emulator.inject([Fault("raw", f"{foot}_STATE", **invalid) for foot in FOOT_NODES])
+    state = rig.walk(15, step=7, walking=True)
+    assert state.supervisor is S.FINISH_STEP
+    assert (state.age[list(state.foot_rows)] > 10).all()
+    assert rig.walk(2, step=8).supervisor is S.HOLD
+    assert "SIGNAL_RANGE" in rig.codes()
 
 
 @pytest.mark.parametrize("drive", ["LEFT_SK", "RIGHT_SK"])

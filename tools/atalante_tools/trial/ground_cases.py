@@ -17,11 +17,19 @@ def _no_load(*feet: str) -> tuple[Fault, ...]:
     return tuple(Fault("value", f"{foot}_STATE", 0, None, **{f"{cell}_ForceZ": 0.0 for cell in CELLS}) for foot in feet)
 
 
+def _invalid(foot: str) -> Fault:
+    """Return a fault that sends the invalid code of the vertical force of all cells of a foot."""
+    return Fault("raw", f"{foot}_STATE", 0, None, **{f"{cell}_ForceZ": _INVALID_FORCE for cell in CELLS})
+
+
+#: Raw value of a CAN signal of a force cell with which a foot reports an invalid force.
+_INVALID_FORCE: Final = -0x8000
 #: Fault ID -> cases that are possible only in a walk on the ground.
 #: In fault F41, the HAL is killed. The HAL of a trial runs in the process of the trial, so the HAL pauses for 6 s instead.
 #: A pause has the same effect on the drives as a killed HAL: the drives receive no frames.
 #: After the pause, the HAL is in HOLD and does not move the robot.
 _GROUND_CASES: Final = {
+    "F12": (Case("both feet", tuple(_invalid(foot) for foot in FOOT_NODES)),),
     "F19": (
         Case("both IMUs of the trunk", tuple(Fault("silence", imu) for imu in TRUNK_NODES)),
         Case("both feet", tuple(Fault("silence", foot) for foot in FOOT_NODES)),
@@ -30,6 +38,13 @@ _GROUND_CASES: Final = {
     "F34": (
         Case("both feet report no load", _no_load(*FOOT_NODES)),
         *(Case(f"{foot} reports no load", _no_load(foot), dtc="FOOT_CELL") for foot in FOOT_NODES),
+    ),
+    "F80": (
+        Case(
+            "wrong sign of IMU_TORSO along X after the loss of IMU_PELVIS",
+            (Fault("imu_invalid", "IMU_PELVIS"), Fault("imu_inverted", "IMU_TORSO", 50, axis="X")),
+            first_faulty=50,
+        ),
     ),
     "F41": (Case("no frames for 6 s", (HostFault("late", 0, 1, 6.0),), dtc="CYCLE_GAP"),),
 }

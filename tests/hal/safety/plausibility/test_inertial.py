@@ -110,6 +110,7 @@ class TestForce:
         assert finding.text == (
             f"the accelerometer of the {IMUS[imu]} IMU contradicts gravity in the reported attitude by {error:.1f} m/s2"
         )
+        assert robot.checks.implausible == {imu}
 
     @imus
     @axes
@@ -181,6 +182,7 @@ class TestRate:
         robot.until_found(150, lambda now: now.gyro[imu].__imul__(gain))
         if not found:
             assert robot.checks.findings() == ()
+            assert robot.checks.implausible == frozenset()
             return
         finding = only(robot.checks.findings())
         assert (finding.dtc, finding.node, finding.confirmed) == (Dtc.IMU_IMPLAUSIBLE, IMU_NODES[imu], True)
@@ -189,6 +191,7 @@ class TestRate:
             f"the gyroscope of the {IMUS[imu]} IMU contradicts the change of its attitude by {finding.value:.2f} rad/s"
         )
         assert finding.text == text
+        assert robot.checks.implausible == {imu}
 
     @imus
     @axes
@@ -269,6 +272,7 @@ class TestPair:
         assert (finding.dtc, finding.node) == (Dtc.IMU_IMPLAUSIBLE, "IMU_TORSO")
         assert finding.text == f"torso IMU and pelvis IMU contradict each other by {finding.value:.2f} rad/s"
         assert 0.11 < finding.value < 0.22
+        assert robot.checks.implausible == frozenset()
 
     @pytest.mark.parametrize("imu", [TORSO, PELVIS])
     def test_pair_is_not_compared_if_one_imu_has_a_finding(self, imu: int):
@@ -292,6 +296,7 @@ class TestPair:
         for _ in range(30):
             robot.sample(change)
         assert [finding.node for finding in robot.checks.findings()] == ["IMU_RIGHT_TIBIA", "IMU_TORSO"]
+        assert robot.checks.implausible == {IMUS.index("right_tibia")}  # torso or pelvis: unknown
 
 
 class TestUnusedSamples:
@@ -392,6 +397,7 @@ class TestSchedule:
         robot = SimulatedRobot(amplitude=0.0)
         cycles = robot.until_found(Dtc.IMU_IMPLAUSIBLE, 300, lambda now: now.accel[imu].__imul__(-1.0))
         assert cycles == (76 if imu in (TORSO, PELVIS) else 268)
+        assert robot.checks.implausible_imus == {imu}
 
     @imus
     def test_wrong_gyroscope_is_found_although_a_message_is_late(self, imu: int):
