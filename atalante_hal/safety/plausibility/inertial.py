@@ -126,6 +126,9 @@ class Inertial:
         never = np.full(imus, NEVER)
         self._follow = specialised(follow, never, self._interval, *self._readings)
         self._found: tuple[Finding, ...] = ()
+        #: Indices in IMUS of the IMUs that contradict gravity or their own attitude. If only torso IMU and pelvis IMU contradict
+        #: each other, the wrong one is unknown, and the set contains neither of them.
+        self.implausible: frozenset[int] = frozenset()
 
     def evaluate(self, ages: Ages | None) -> bool:
         """Sample the IMUs and check them.
@@ -139,21 +142,14 @@ class Inertial:
         """
         implausible = self._follow(self._new if ages is None else ages.imu, self._interval, *self._readings)
         self._interval = next(self._intervals)
-        self._found = _findings(self._excess) if implausible else ()
+        self._found, self.implausible = (
+            (_findings(self._excess), _wrong(self._excess)) if implausible else ((), frozenset())
+        )
         return bool(self._found)
 
     def findings(self) -> tuple[Finding, ...]:
         """Return the current findings of the inertial checks."""
         return self._found
-
-    @property
-    def implausible(self) -> frozenset[int]:
-        """Return the indices in IMUS of the IMUs that contradict gravity or their own attitude.
-
-        If only torso IMU and pelvis IMU contradict each other, the wrong one is unknown, and the set contains neither of them.
-        """
-        force, rate = self._excess.force, self._excess.rate
-        return frozenset(imu for imu in range(len(IMUS)) if force[imu] or rate[imu])
 
 
 def follow(
@@ -386,7 +382,7 @@ def _findings(excess: Excess) -> tuple[Finding, ...]:
         elif rate:
             text = f"the gyroscope of the {IMUS[imu]} IMU contradicts the change of its attitude by {rate:.2f} rad/s"
             found.append(_finding(imu, rate, text))
-    if any(excess.force[imu] or excess.rate[imu] for imu in (_TORSO, _PELVIS)):
+    if not _wrong(excess).isdisjoint((_TORSO, _PELVIS)):
         return tuple(found)
     tilt, rate = float(excess.tilt[0]), float(excess.rate[-1])
     contradict = "torso IMU and pelvis IMU contradict each other"
@@ -395,6 +391,11 @@ def _findings(excess: Excess) -> tuple[Finding, ...]:
     elif rate:
         found.append(_finding(_TORSO, rate, f"{contradict} by {rate:.2f} rad/s"))
     return tuple(found)
+
+
+def _wrong(excess: Excess) -> frozenset[int]:
+    """Return the indices in IMUS of the IMUs that contradict gravity or their own attitude."""
+    return frozenset(imu for imu in range(len(IMUS)) if excess.force[imu] or excess.rate[imu])
 
 
 def _finding(imu: int, value: float, text: str) -> Finding:
