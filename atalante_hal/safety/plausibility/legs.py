@@ -17,7 +17,8 @@ follows this drift. So such a drift of the encoder of TH is not detected. An IMU
 estimate is then measured again, so that the error of TH is the same as before the restart. So a drift of TH in the time without
 the IMU is not detected. If the drive of TH restarts in the same time, its encoder counts as referenced, and its old error is
 kept only if the heading is unchanged with it. A restart is known from the boot-up message, or from the uptime in the next status
-message. So after an IMU was silent, its legs are not compared for `SILENT_SAMPLES` samples, unless a restart is known before.
+message. So after an IMU was silent, its legs are not compared for `SILENT_SAMPLES` samples, unless a restart is known before. A
+leg waits again only after `DRIFT_SAMPLES` comparisons. So an IMU that is silent again and again does not switch the checks off.
 
 *Standstill.* While the reading of an encoder is constant and its joint is at rest, the difference between encoders and
 IMUs about the axis of the joint is also constant. If the joint moves while its encoder is stuck, this difference changes by
@@ -138,6 +139,7 @@ class Legs:
         self._errors: list[tuple[float, float, float] | None] = [None for _ in SIDES]
         self._heading_lost = [False for _ in SIDES]  # for each leg: whether its heading must be measured again
         self._waits = [0 for _ in SIDES]  # for each leg: number of samples until it is compared again
+        self._comparisons = [0 for _ in SIDES]  # for each leg: number of samples with a comparison since the last wait
         #: For each leg: whether the drive of TH has restarted since the last comparison.
         self._referenced = [False for _ in SIDES]
         self.heading: Vector = np.tile([1.0, 0.0], (len(SIDES), 1))
@@ -209,6 +211,7 @@ class Legs:
         if comparison is None:
             self._record_errors(leg, (math.inf,) * len(_AXES))
         else:
+            self._comparisons[leg] += 1
             self._record_errors(leg, comparison.errors)
             self._check_drift(leg, comparison)
             self._check_standstill(leg, comparison)
@@ -227,8 +230,10 @@ class Legs:
         pelvis, tibia = now.quaternion[_PELVIS].tolist(), now.quaternion[_TIBIAE[leg]].tolist()
         if ages is not None:
             cycles = [*ages.joint[four].tolist(), *ages.imu[[_PELVIS, _TIBIAE[leg]]].tolist()]
-            if max(cycles[-2:]) >= NEVER and self._errors[leg] is not None:
-                self._waits[leg] = SILENT_SAMPLES + 1
+            if max(cycles[-2:]) >= NEVER and (
+                self._waits[leg] >= SILENT_SAMPLES or self._comparisons[leg] >= DRIFT_SAMPLES
+            ):
+                self._waits[leg], self._comparisons[leg] = SILENT_SAMPLES + 1, 0
             if max(cycles) >= NEVER:
                 return None
             uncertainty = self._velocity_error * self._period * sum(cycles)

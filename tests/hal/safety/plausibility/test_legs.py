@@ -31,7 +31,7 @@ from atalante_hal.robot import IMUS, JOINTS, Robot
 from atalante_hal.safety.diagnostics import Dtc, Finding
 from atalante_hal.safety.plausibility.finding import Ages, Signals
 from atalante_hal.safety.plausibility.inertial import turned_about_vertical
-from atalante_hal.safety.plausibility.legs import SILENT_SAMPLES, Legs, hip_angles
+from atalante_hal.safety.plausibility.legs import DRIFT_SAMPLES, SILENT_SAMPLES, Legs, hip_angles
 from atalante_hal.wire.process_image import NEVER
 
 PELVIS, TIBIAE = IMUS.index("pelvis"), [IMUS.index(f"{side}_tibia") for side in ("left", "right")]
@@ -471,6 +471,41 @@ class TestEncoderError:
         if not restarts:
             compare(0.05, 0.0)
             assert one_leg.drifts() == pytest.approx([0.05], abs=2e-3)
+
+    @pytest.mark.parametrize("leg", [0, 1])
+    @pytest.mark.parametrize("imu", ["pelvis", "tibia"])
+    @pytest.mark.parametrize("samples", [2, 4, SILENT_SAMPLES + 1, SILENT_SAMPLES + 4])
+    def test_imu_that_is_silent_again_and_again_does_not_hide_a_drift(self, leg: int, imu: str, samples: int):
+        """The IMU is silent in one of `samples` samples. The leg waits again only after `DRIFT_SAMPLES` comparisons."""
+        one_leg = OneLeg(leg)
+        silent = PELVIS if imu == "pelvis" else TIBIAE[leg]
+        one_leg.compare(DRIFT_SAMPLES)
+        one_leg.show((0.0, 0.0, 0.0), (0.05, 0.0, 0.0))
+        compared = []
+        for sample in range(5 * (SILENT_SAMPLES + DRIFT_SAMPLES)):
+            one_leg.compare(1, self.silent(silent) if sample % samples == 0 else None)
+            compared.append(math.isfinite(one_leg.legs.encoder_error[6 * leg]))
+            if sample == SILENT_SAMPLES + 2 * DRIFT_SAMPLES:
+                assert one_leg.drifts() == pytest.approx([0.05])
+        waits = "".join("x" if one else " " for one in compared).split("x")
+        assert len(max(waits)) <= SILENT_SAMPLES + 2
+        assert sum(len(wait) > SILENT_SAMPLES for wait in waits) >= 2, "the leg waits again"
+
+    @pytest.mark.parametrize("compared", [DRIFT_SAMPLES - 1, DRIFT_SAMPLES])
+    def test_leg_waits_only_after_some_comparisons(self, compared: int):
+        one_leg = OneLeg(0)
+        one_leg.compare(compared)
+        one_leg.compare(1, self.silent(PELVIS))
+        one_leg.compare()
+        assert math.isinf(one_leg.legs.encoder_error[0]) is (compared == DRIFT_SAMPLES)
+
+    def test_leg_waits_from_the_end_of_a_long_silence(self):
+        one_leg = OneLeg(0)
+        one_leg.compare(DRIFT_SAMPLES)
+        one_leg.compare(3 * SILENT_SAMPLES, self.silent(PELVIS))
+        for sample in range(SILENT_SAMPLES + 1):
+            one_leg.compare()
+            assert math.isinf(one_leg.legs.encoder_error[0]) is (sample < SILENT_SAMPLES)
 
     def test_silent_imu_of_the_other_leg_has_no_effect(self):
         one_leg = OneLeg(0)
