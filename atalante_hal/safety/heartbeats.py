@@ -103,7 +103,8 @@ class Heartbeats:
         self._notices: list[tuple[str, Dtc, int]] = []
         #: Nodes whose last status reports a state other than OPERATIONAL. A single BOOT_UP is ignored.
         self._stopped: set[str] = set()
-        #: Nodes that were reset: they reported a state other than OPERATIONAL at least once since the last `evaluate`.
+        #: Nodes that were reset: they restarted, see `booted`, or reported a state other than OPERATIONAL at least once since the
+        #: last `evaluate`.
         #: The first status message of a node is ignored, because the first start of a node is not a reset.
         self._reset: set[str] = set()
         #: Row of a message in the process image -> counter that rises if two nodes seem to send this message, 0 to `FULL`.
@@ -274,7 +275,8 @@ class Heartbeats:
         elif state != BOOT_UP or before == BOOT_UP:
             self._stopped.add(status.node)
         uptime, uptime_before = values[status.uptime], self.image.values_before[status.uptime]
-        if state == BOOT_UP or uptime < uptime_before < self._last_uptime:
+        restarted = state == BOOT_UP or uptime < uptime_before < self._last_uptime
+        if restarted:
             self.booted.add(status.node)
             self.image.restart(status.emergency)
         if status.node not in self._reported:
@@ -282,8 +284,9 @@ class Heartbeats:
             self.all_reported = self._reported.issuperset(self._needed)
             if self.all_reported:
                 self.quiet = False  # all required nodes have reported, so the safety monitor must evaluate this cycle
-        elif state != OPERATIONAL:
+        elif restarted or state != OPERATIONAL:
             self._reset.add(status.node)
+            self.quiet = False
 
     def _take_emergency(self, node: str, code: int) -> None:
         dtc = emergency(code)

@@ -452,7 +452,7 @@ def test_booted_node_is_listed(running: Nodes):
     assert running.heartbeats.booted == {"LEFT_SK"}
 
 
-def test_node_whose_uptime_decreases_is_listed_as_booted(running: Nodes):
+def test_node_whose_uptime_decreases_is_listed_as_booted_and_reported_as_reset(running: Nodes):
     """The boot-up message was lost. After 65535 s, the uptime of a node that has not restarted may continue with 0."""
     for uptime, booted in (
         (0, False),
@@ -468,7 +468,9 @@ def test_node_whose_uptime_decreases_is_listed_as_booted(running: Nodes):
         running.heartbeats.booted.clear()
         running.receive(running.frame("IMU_PELVIS", Uptime=uptime), running.frame("LEFT_SK", Uptime=3))
         assert running.heartbeats.booted == ({"IMU_PELVIS"} if booted else set())
-        assert running.evaluate() == {}
+        assert running.heartbeats.quiet is not booted
+        assert running.evaluate() == ({("NODE_RESET", "IMU_PELVIS"): True} if booted else {})
+        assert running.heartbeats.quiet
 
 
 def test_same_emergency_after_a_restart_of_the_node_is_accepted(running: Nodes):
