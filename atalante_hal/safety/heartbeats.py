@@ -2,8 +2,9 @@
 
     slow process image -> heartbeats -> fault memory
 
-The monitor follows CiA 301. Each heartbeat has a timeout. A boot-up message reports that the sender was reset. An emergency
-stays active until the sender reports error code 0, or until the operator acknowledges the emergency.
+The monitor follows CiA 301. Each heartbeat has a timeout. A boot-up message reports that the sender was reset. If this message is
+lost, the decreased uptime in the next status message shows the reset. An emergency stays active until the sender reports error
+code 0, or until the operator acknowledges the emergency.
 """
 
 from __future__ import annotations
@@ -110,7 +111,7 @@ class Heartbeats:
         #: Row of a message in the process image -> counter that rises if two nodes seem to send this message, 0 to `FULL`.
         #: If the counter of a message reaches `FULL`, it is confirmed that two nodes send this message.
         self._evidence: defaultdict[int, int] = defaultdict(int)
-        #: Nodes that restarted: they sent a boot-up message, or their uptime has decreased because this message was lost.
+        #: Nodes that restarted: they sent a boot-up message, or, if this message was lost, their uptime has decreased.
         #: The safety monitor empties this set after each use.
         self.booted: set[str] = set()
         #: True when every required node (all but the pendant) has sent a status message.

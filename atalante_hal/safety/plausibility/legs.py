@@ -16,9 +16,10 @@ the error of TH by at most `_HEADING_DRIFT` per sample. If the encoder of TH dri
 follows this drift. So such a drift of the encoder of TH is not detected. An IMU that restarts reports another heading. The
 estimate is then measured again, so that the error of TH is the same as before the restart. So a drift of TH in the time without
 the IMU is not detected. If the drive of TH restarts in the same time, its encoder counts as referenced, and its old error is
-kept only if the heading is unchanged with it. A restart is known from the boot-up message, or from the uptime in the next status
-message. So after an IMU was silent, its legs are not compared for `SILENT_SAMPLES` samples, unless a restart is known before. A
-leg waits again only after `DRIFT_SAMPLES` comparisons. So an IMU that is silent again and again does not switch the checks off.
+kept only if the heading is unchanged with it. A restart is known from the boot-up message, or from the decreased uptime in the
+next status message. So after an IMU was silent, its legs are not compared for `SILENT_SAMPLES` samples, unless a restart is
+known before. A leg waits again only after `DRIFT_SAMPLES` comparisons. So an IMU that is silent again and again does not switch
+the checks off.
 
 *Standstill.* While the reading of an encoder is constant and its joint is at rest, the difference between encoders and
 IMUs about the axis of the joint is also constant. If the joint moves while its encoder is stuck, this difference changes by
@@ -113,7 +114,7 @@ class Legs:
     Attributes:
         encoder_error: encoder angle of each joint minus its angle from the IMUs in the last sample of its leg, shape (12,) [rad].
             It is corrected for the heading drift. SH and SK both have the error of their sum. The error is infinite
-            if a value is too old, and always for SA and HA.
+            if a value is too old, while the leg waits after one of its IMUs was silent, and always for SA and HA.
         heading: cosine and sine of half the angle by which the attitude of each tibia IMU must be turned about the vertical to
             correct its heading drift relative to the pelvis IMU, shape (2, 2).
         tilt: cosine and sine of half the angle by which the attitude of each tibia IMU must be turned about its axis y, because
@@ -160,11 +161,11 @@ class Legs:
         self._exchanged: dict[int, tuple[Finding, ...]] = {}
 
     def reference(self, joint: int) -> None:
-        """Discard what is known about the old reference of an encoder.
+        """Discard the findings that the left and the right encoder of a joint are exchanged.
 
-        These are the findings that the left and the right encoder of the joint are exchanged. If the joint is TH and an IMU also
-        restarts before the next comparison, this is also the error of TH, see `_measure_heading`.
-        Call it when the drive of the joint has restarted and referenced its encoder.
+        If the joint is TH, and the IMU of its tibia or of the pelvis also restarts before the next comparison, the error of TH
+        from before no longer counts, see `_measure_heading`. Call this when the drive of the joint has restarted and referenced
+        its encoder.
 
         Args:
             joint: index of the joint in JOINTS.
@@ -224,7 +225,17 @@ class Legs:
         return any(self._drifts) or any(self._stuck) or bool(self._exchanged)
 
     def _compare(self, leg: int, ages: Ages | None) -> _Comparison | None:
-        """Compare the encoders and IMUs of a leg in this cycle; return None if a value is too old."""
+        """Compare the encoders and IMUs of a leg in this cycle.
+
+        If an IMU has restarted, its heading is measured first. If the values of an IMU are too old, the wait of the leg begins.
+
+        Args:
+            leg: index in SIDES.
+            ages: ages of the sensor values; None if all values are of this cycle.
+
+        Returns:
+            The comparison. None if a value is too old, or while the leg waits after one of its IMUs was silent.
+        """
         now, four, uncertainty = self._now, slice(_HIPS[leg], _HIPS[leg] + len(_AXIS_OF)), 0.0
         angles = now.position[four] * self._to_joint[four]
         pelvis, tibia = now.quaternion[_PELVIS].tolist(), now.quaternion[_TIBIAE[leg]].tolist()

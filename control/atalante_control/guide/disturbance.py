@@ -1,4 +1,4 @@
-r"""Disturbances of the assisted leg and their largest effect under the backup policy: `leg, model errors, responses -> effect`.
+r"""Disturbances of the assisted leg and their largest effect under the backup policy: `leg, model errors, responses -> change`.
 
 For each cycle of the step, this module bounds the torques at sagittal hip and knee (SH, SK) that the model does not explain. The
 bound is the sum of the promise (the disturbance torques of the certificate) and a budget. The budget is the sum of four torques:

@@ -1158,7 +1158,7 @@ def test_repeated_frame_is_not_a_second_sender(make_rig):
     assert ("E2E_REPEATED", "info") in rig.events_of("E2E_REPEATED")
 
 
-@pytest.mark.sample(4)
+@pytest.mark.sample(5)
 @pytest.mark.parametrize("imu", ["pelvis", "left_tibia"])
 @pytest.mark.parametrize("boot", [*range(1200, 1300, 9), 1300])
 def test_imu_whose_boot_up_message_is_lost_may_have_another_heading(make_rig, imu: str, boot: int):

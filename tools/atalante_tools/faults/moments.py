@@ -182,7 +182,7 @@ class MomentTask:
         starts = [cycle for cycle in presses if cycle >= min(begins, default=math.inf)]
         unlimited = [_unlimited(run, cycle, stimuli) for cycle in (*begins, *starts)]
         failures = [*limit_violations(run, unlimited, _strength(stimuli)), *_premature(run, plan.starts[0])]
-        # The check `automatic_improvements` requires that the HAL receives the first START before the fault begins.
+        # The check `automatic_improvements` requires that no fault delays the reception of START.
         # At BOOT and READY, the fault begins before the first START, and may delay the effect of START.
         if self.moment not in (Moment.BOOT, Moment.READY):
             failures += automatic_improvements(run, before, in_run)

@@ -173,8 +173,8 @@ def automatic_improvements(run: Observation, until: int, starts: Sequence[int] =
     Args:
         run: observation of the run.
         until: last cycle to check.
-        starts: cycles before `until` in which the operator pressed START. The HAL must have received each START before the
-            first faulty cycle.
+        starts: cycles before `until` in which the operator pressed START. No fault may delay the reception of a START by the
+            HAL.
     """
     for cycle in range(run.first + 1, until + 1):
         now, last = run.state(cycle), run.state(cycle - 1)

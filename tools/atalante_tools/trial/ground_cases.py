@@ -11,6 +11,9 @@ from atalante_tools.faults.catalogue import SCENARIOS
 from atalante_tools.faults.scenario import MID_SWING, Case, HostFault
 from atalante_tools.trial.fault_plan import PERMANENT
 
+#: Invalid code of the signals `<cell>_ForceZ` in the DBC (raw value).
+_INVALID_FORCE: Final = -0x8000
+
 
 def _no_load(*feet: str) -> tuple[Fault, ...]:
     """Return faults that set the vertical force of all cells of the given feet to zero."""
@@ -22,8 +25,6 @@ def _invalid(foot: str) -> Fault:
     return Fault("raw", f"{foot}_STATE", 0, None, **{f"{cell}_ForceZ": _INVALID_FORCE for cell in CELLS})
 
 
-#: Raw value of a CAN signal of a force cell with which a foot reports an invalid force.
-_INVALID_FORCE: Final = -0x8000
 #: Fault ID -> cases that are possible only in a walk on the ground.
 #: In fault F41, the HAL is killed. The HAL of a trial runs in the process of the trial, so the HAL pauses for 6 s instead.
 #: A pause has the same effect on the drives as a killed HAL: the drives receive no frames.
@@ -39,6 +40,7 @@ _GROUND_CASES: Final = {
         Case("both feet report no load", _no_load(*FOOT_NODES)),
         *(Case(f"{foot} reports no load", _no_load(foot), dtc="FOOT_CELL") for foot in FOOT_NODES),
     ),
+    "F41": (Case("no frames for 6 s", (HostFault("late", 0, 1, 6.0),), dtc="CYCLE_GAP"),),
     "F80": (
         Case(
             "wrong sign of IMU_TORSO along X after the loss of IMU_PELVIS",
@@ -46,7 +48,6 @@ _GROUND_CASES: Final = {
             first_faulty=50,
         ),
     ),
-    "F41": (Case("no frames for 6 s", (HostFault("late", 0, 1, 6.0),), dtc="CYCLE_GAP"),),
 }
 #: IDs of all faults with a case.
 FAULT_IDS: Final = tuple(sorted({*SCENARIOS, *_GROUND_CASES}))

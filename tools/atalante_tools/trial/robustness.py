@@ -156,7 +156,7 @@ class SafeEnding:
 
     Attributes:
         outcome: "stood", "fell", "hold" or "fault".
-        observation: observer that detects a fall, and measures the path of the robot.
+        observation: observer that detects a fall, and measures the true deviation from the walking line.
         state: state of the HAL in the last cycle.
         safe: whether the walk ended safely. Either the robot stood at the end, or the HAL stopped the controller and no drive
             follows a command.

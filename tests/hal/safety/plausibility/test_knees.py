@@ -226,7 +226,7 @@ def test_drift_is_found_after_a_heading_drift_of_the_tibia_imus(drift: float, co
     assert [SIDES.index(finding.node.split("_")[0].lower()) for finding in robot.checks.findings()] == found
 
 
-@pytest.mark.sample(4)
+@pytest.mark.sample(2)
 @pytest.mark.parametrize("sign", [1.0, -1.0])
 @pytest.mark.parametrize(("corrected", "drift", "found"), [(False, 2.5, 1), (True, 2.5, 0), (True, 6.0, 2)])
 def test_tibia_imus_askew_within_the_tolerance_do_not_change_the_error_of_the_knee(

@@ -1017,7 +1017,7 @@ class TestStandingEncoder:
             one_leg.compare()
             assert one_leg.legs.findings() == ()
 
-    @pytest.mark.sample(5)
+    @pytest.mark.sample(7)
     @joints
     @signs
     def test_slow_turn_of_a_joint_with_stuck_encoder_is_found(self, joint: int, sign: float):
